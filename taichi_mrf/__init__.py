@@ -1,0 +1,39 @@
+"""Probabilistic occupancy mapping with ray Markov random fields on Taichi.
+
+The public names are loaded when first used, so that ``import taichi_mrf`` costs nothing and the
+command line can print its help without starting Taichi.
+"""
+
+import importlib
+from typing import Any
+
+__version__ = "0.1.0"
+
+_PUBLIC = {
+    "init": "taichi_mrf.runtime",
+    "PinholeCamera": "taichi_mrf.camera",
+    "PolynomialNoise": "taichi_mrf.sensor.noise",
+    "PatchNoise": "taichi_mrf.sensor.noise",
+    "MRFMap": "taichi_mrf.maps.mrf",
+    "UNKNOWN": "taichi_mrf.queries.points",
+    "FREE": "taichi_mrf.queries.points",
+    "OCCUPIED": "taichi_mrf.queries.points",
+    "Frame": "taichi_mrf.frame",
+    "open_dataset": "taichi_mrf.datasets",
+    "Config": "taichi_mrf.config",
+    "TaichiMRFError": "taichi_mrf.errors",
+}
+
+__all__ = ["__version__", *_PUBLIC]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'taichi_mrf' has no attribute '{name}'")
+    value = getattr(importlib.import_module(_PUBLIC[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,320 @@
+"""Every parameter of the program, defined once.
+
+The YAML files, the command line and the sliders are all made from these dataclasses: a field's
+docstring is its help text, its default is the default, and its range is checked here. Nothing in
+this file needs Taichi, so that ``taichi-mrf --help`` answers at once.
+"""
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import yaml
+
+from taichi_mrf.errors import ConfigError
+
+Arch = Literal["auto", "cuda", "vulkan", "cpu"]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """What is known of the sensor. Depths are axial depth in metres."""
+
+    sigma: tuple[float, ...] = (0.001504, -0.00152, 0.0019)
+    """Standard deviation of the measured depth in metres: coefficients of a polynomial in depth, in
+    ascending powers. The default is the Kinect 1 (Nguyen, Izadi and Lovell 2012)."""
+
+    bias: tuple[float, ...] = (0.0,)
+    """Mean of measured minus true depth in metres: coefficients in ascending powers of the true depth."""
+
+    sigma_table: str | None = None
+    """A .npy file of shape (patches, degree + 1) with one sigma polynomial for each pixel patch, row by
+    row. It takes the place of ``sigma``; a relative path starts at the YAML file's folder."""
+
+    bias_table: str | None = None
+    """The same for the bias."""
+
+    patch: int = 20
+    """Side of a square pixel patch of the tables, in pixels."""
+
+    min_depth: float = 0.1
+    """Measurements nearer than this (metres) are ignored."""
+
+    max_depth: float = 10.0
+    """Rays end here (metres); a measurement beyond says only that the space up to here is free."""
+
+    def __post_init__(self) -> None:
+        _check(len(self.sigma) >= 1, "sensor.sigma", "needs at least one coefficient")
+        _check(all(map(math.isfinite, self.sigma)), "sensor.sigma", "holds a value that is not finite")
+        _check(len(self.bias) >= 1, "sensor.bias", "needs at least one coefficient")
+        _check(all(map(math.isfinite, self.bias)), "sensor.bias", "holds a value that is not finite")
+        _check(self.patch >= 1, "sensor.patch", "must be at least 1 pixel")
+        _check(self.min_depth >= 0, "sensor.min_depth", "must not be negative")
+        _check(self.max_depth > self.min_depth, "sensor.max_depth", "must be more than sensor.min_depth")
+
+
+@dataclass(frozen=True)
+class InferenceConfig:
+    """How the marginals are computed (MRFMap, sections III and IV)."""
+
+    sweeps: int = 3
+    """Gauss-Seidel sweeps over all keyframes."""
+
+    tolerance: float = 0.0
+    """Stop before the last sweep when no more than this share of the voxels moved by over 0.01."""
+
+    damping: float = 0.0
+    """Share of a keyframe's old message that is kept when it is renewed, 0 to below 1."""
+
+    surface_density: float = 2.1
+    """Prior: surfaces met per metre of ray, so that it means the same at every voxel size
+    (2.1 is the paper's probability of 0.1 at 5 cm)."""
+
+    prior: float | None = None
+    """Prior probability of occupied for each voxel; takes the place of ``surface_density``."""
+
+    likelihood: Literal["auto", "segment", "centre"] = "auto"
+    """Likelihood of the measurement given a surface in a voxel: averaged over the segment of the ray in
+    it, taken at the segment's centre, or (auto) averaged where sigma is less than the voxel size."""
+
+    outlier_floor: float = 1e-6
+    """Added to both sides of every message (per metre of depth): the share of measurements that no
+    surface explains, so that one wild pixel cannot veto all the others."""
+
+    end_sigmas: float = 3.0
+    """A ray ends this many sigma beyond its measurement, and bricks exist this many around it."""
+
+    segment_lengths: bool = True
+    """Weigh a voxel by the length that the ray spends in it (section IV-A). Without it every voxel
+    counts once, as eqs. 11 to 14 are printed."""
+
+    average: Literal["probability", "log_odds"] = "probability"
+    """What is averaged, weighted by length, over a keyframe's rays through a voxel."""
+
+    min_length: float = 0.02
+    """A voxel that a keyframe's rays cross for less than this many voxel sizes in sum keeps its old
+    message."""
+
+    message_clamp: float = 6.9
+    """Largest log-odds of a keyframe's message to a voxel (6.9 is a probability of 0.999)."""
+
+    cavity_clamp: float = 9.2
+    """Largest log-odds of a voxel as a keyframe's rays see it, without that keyframe's own message."""
+
+    message_precision: Literal["float16", "float32"] = "float16"
+    """How messages are stored. float16 halves the memory and moves beliefs by at most 0.006."""
+
+    def __post_init__(self) -> None:
+        _check(self.sweeps >= 0, "inference.sweeps", "must not be negative")
+        _check(0 <= self.tolerance <= 1, "inference.tolerance", "must lie between 0 and 1")
+        _check(0 <= self.damping < 1, "inference.damping", "must be at least 0 and less than 1")
+        _check(self.surface_density > 0, "inference.surface_density", "must be positive")
+        _check(self.prior is None or 0 < self.prior < 1, "inference.prior", "must lie between 0 and 1")
+        _check(self.outlier_floor >= 0, "inference.outlier_floor", "must not be negative")
+        _check(self.end_sigmas > 0, "inference.end_sigmas", "must be positive")
+        _check(self.min_length >= 0, "inference.min_length", "must not be negative")
+        _check(0 < self.message_clamp <= 30, "inference.message_clamp", "must lie between 0 and 30")
+        _check(0 < self.cavity_clamp <= 60, "inference.cavity_clamp", "must lie between 0 and 60")
+
+
+@dataclass(frozen=True)
+class KeyframeConfig:
+    """Which frames become keyframes (section V): those that have moved enough."""
+
+    rotation: float = 0.0
+    """Least rotation in radians (tangent norm) that makes a frame a keyframe."""
+
+    translation: float = 0.0
+    """Least translation in metres that makes a frame a keyframe. A frame needs either; with both at 0
+    every frame is one."""
+
+    against: Literal["last", "all"] = "last"
+    """Compare with the last keyframe, as in the paper, or with all earlier ones, so that a place that is
+    visited again adds nothing."""
+
+    def __post_init__(self) -> None:
+        _check(self.rotation >= 0, "keyframes.rotation", "must not be negative")
+        _check(self.translation >= 0, "keyframes.translation", "must not be negative")
+
+
+@dataclass(frozen=True)
+class VolumeConfig:
+    """Where the map may be, and when it counts as known."""
+
+    lower: tuple[float, float, float] | None = None
+    """Lowest corner of the mapped box in metres (world frame); no box means an unbounded map."""
+
+    upper: tuple[float, float, float] | None = None
+    """Highest corner of the mapped box in metres."""
+
+    dense_bricks: int = 256
+    """Vulkan only, which has no sparse fields: bricks along each side of the volume, around the first
+    keyframe. 256 at 2 cm are 41 m and take 128 MB."""
+
+    memory_limit_gb: float = 0.0
+    """Most memory for the map in GB; 0 means what the machine has free."""
+
+    min_evidence: float = 0.1
+    """A voxel whose log-odds lie nearer than this to the prior counts as unknown."""
+
+    def __post_init__(self) -> None:
+        _check((self.lower is None) == (self.upper is None), "volume.lower", "goes with volume.upper")
+        if self.lower is not None and self.upper is not None:
+            ok = all(a < b for a, b in zip(self.lower, self.upper, strict=True))
+            _check(ok, "volume.upper", "must lie above volume.lower on every axis")
+        _check(8 <= self.dense_bricks <= 1024, "volume.dense_bricks", "must lie between 8 and 1024")
+        _check(self.memory_limit_gb >= 0, "volume.memory_limit_gb", "must not be negative")
+        _check(self.min_evidence >= 0, "volume.min_evidence", "must not be negative")
+
+
+@dataclass(frozen=True)
+class RuntimeConfig:
+    """Where the kernels run."""
+
+    arch: Arch = "auto"
+    """Backend: cuda, vulkan, cpu, or auto for the first of these that there is."""
+
+    threads: int = 0
+    """CPU threads; 0 means all cores."""
+
+    debug: bool = False
+    """Let Taichi check array bounds (slow)."""
+
+    def __post_init__(self) -> None:
+        _check(self.threads >= 0, "runtime.threads", "must not be negative")
+
+
+@dataclass(frozen=True)
+class Config:
+    """All parameters of mapping a sequence."""
+
+    voxel_size: float = 0.05
+    """Side of a voxel in metres."""
+
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    """What is known of the sensor."""
+
+    inference: InferenceConfig = field(default_factory=InferenceConfig)
+    """How the marginals are computed."""
+
+    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
+    """Which frames become keyframes."""
+
+    volume: VolumeConfig = field(default_factory=VolumeConfig)
+    """Where the map may be."""
+
+    runtime: RuntimeConfig = field(default_factory=RuntimeConfig)
+    """Where the kernels run."""
+
+    def __post_init__(self) -> None:
+        ok = math.isfinite(self.voxel_size) and self.voxel_size > 0
+        _check(ok, "voxel_size", f"must be a positive number of metres, not {self.voxel_size}")
+
+
+def _check(ok: bool, name: str, problem: str) -> None:
+    if not ok:
+        raise ConfigError(f"{name} {problem}")
+
+
+def unknown_key(key: object, known: typing.Iterable[str], where: str) -> ConfigError:
+    """The error for a parameter that does not exist: it names the nearest one that does."""
+    known = list(known)
+    near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
+    hint = f"did you mean '{near[0]}'?" if near else f"known are: {', '.join(known)}"
+    return ConfigError(f"{where}: unknown parameter '{key}'; {hint}")
+
+
+def overridden(config: T, overrides: dict[str, Any], where: str) -> T:
+    """A dataclass instance with some fields replaced; an unknown name is a ConfigError."""
+    names = [f.name for f in dataclasses.fields(config)]  # type: ignore[arg-type]
+    for key in overrides:
+        if key not in names:
+            raise unknown_key(key, names, where)
+    return dataclasses.replace(config, **overrides)  # type: ignore[type-var]
+
+
+def from_dict(cls: type[T], values: Any, where: str) -> T:
+    """Build a configuration dataclass from parsed YAML.
+
+    ``where`` is the file, for error messages. Raises ConfigError for an unknown key (naming the
+    nearest), a value of the wrong type, or one outside its range.
+    """
+    if values is None:
+        values = {}
+    if not isinstance(values, dict):
+        raise ConfigError(f"{where}: expected a mapping of parameters, not {values!r}")
+    hints = typing.get_type_hints(cls)
+    arguments = {}
+    for key, value in values.items():
+        if key not in hints:
+            raise unknown_key(key, hints, where)
+        arguments[key] = _convert(value, hints[key], f"{where}: {key}")
+    try:
+        return cls(**arguments)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error
+
+
+def _convert(value: Any, hint: Any, where: str) -> Any:
+    """Check one YAML value against a field's type; whole numbers are accepted where numbers are."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if dataclasses.is_dataclass(hint):
+        return from_dict(typing.cast(type, hint), value, where)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        return _convert(value, next(a for a in arguments if a is not type(None)), where)
+    if origin is Literal:
+        if value not in arguments:
+            raise ConfigError(f"{where} must be one of {', '.join(map(str, arguments))}, not {value!r}")
+        return value
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise ConfigError(f"{where} must be a list, not {value!r}")
+        if arguments[-1] is not Ellipsis and len(value) != len(arguments):
+            raise ConfigError(f"{where} must have {len(arguments)} entries, not {len(value)}")
+        return tuple(_convert(v, arguments[0], where) for v in value)
+    if hint is float and isinstance(value, str):  # YAML 1.1 reads 1e-6 (without a point) as a string
+        try:
+            value = float(value)
+        except ValueError:
+            raise ConfigError(f"{where} must be a number, not {value!r}") from None
+    accepted = (int, float) if hint is float else hint
+    if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
+        raise ConfigError(f"{where} must be of type {hint.__name__}, not {value!r}")
+    return float(value) if hint is float else value
+
+
+def load(path: str | Path) -> Config:
+    """Read a YAML file. Table paths in it are relative to its folder. Raises ConfigError."""
+    path = Path(path)
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
+    config = from_dict(Config, values, str(path))
+    tables: dict[str, Any] = {
+        name: str((path.parent / table).resolve())
+        for name in ("sigma_table", "bias_table")
+        if (table := getattr(config.sensor, name)) is not None
+    }
+    return dataclasses.replace(config, sensor=dataclasses.replace(config.sensor, **tables))
+
+
+def to_yaml(config: Config) -> str:
+    """The effective configuration as YAML text that :func:`load` accepts unchanged."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {k: plain(v) for k, v in value.items()}
+        return [plain(v) for v in value] if isinstance(value, tuple) else value
+
+    return yaml.safe_dump(plain(dataclasses.asdict(config)), sort_keys=False)

@@ -1,0 +1,36 @@
+"""The exceptions that the library raises. Only the command line turns them into messages and exit codes."""
+
+
+class TaichiMRFError(Exception):
+    """Base of everything that this package raises on purpose; its text is one clear line for a person."""
+
+
+class ConfigError(TaichiMRFError):
+    """A parameter is unknown, of the wrong type or outside its range; the text names the field."""
+
+
+class BackendError(TaichiMRFError):
+    """The wanted Taichi backend is not to be had, or Taichi already runs on another one."""
+
+
+class CapacityError(TaichiMRFError):
+    """The map would need more memory or more space than there is; the text says how much."""
+
+
+class DatasetError(TaichiMRFError):
+    """A recording cannot be read; the text names the folder or the file."""
+
+
+class FrameError(DatasetError):
+    """One frame of a recording is broken; the text names the frame and the file.
+
+    With ``--skip-bad-frames`` these are counted in the report instead of ending the run.
+    """
+
+
+class KeyframeError(TaichiMRFError):
+    """A keyframe does not exist, is frozen, or was given data of the wrong shape."""
+
+
+class MapFileError(TaichiMRFError):
+    """A saved map cannot be read or written; the text names the file."""
