@@ -1,0 +1,76 @@
+"""Averages of many rays' messages, added up in any order with the same result.
+
+A voxel's average needs two sums over rays, of lengths and of lengths times messages. Both are kept as
+fixed-point numbers in the halves of one 64-bit integer, so that a ray's contribution is a single
+atomic addition. Integers make the sum exact: it does not depend on the order of the rays, and hence a
+map is the same, bit for bit, on one thread or many.
+"""
+
+import math
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.poses import Pose
+from taichi_mrf.voxels.layout import BRICK
+from taichi_mrf.voxels.types import F32, I32, Template
+from taichi_mrf.voxels.window import Window
+
+LONGEST = math.sqrt(3.0)
+"""Longest way through a voxel, in voxel sizes."""
+
+HALF_VOXEL = LONGEST / 2
+
+
+@ti.func
+def add_message(sums: Template, index: I32, length: F32, message: F32, scale: F32):
+    """Add one ray's message in [0, 1], weighted by the length of its way through the voxel."""
+    lengths = ti.cast(length * scale + 0.5, ti.i64)
+    messages = ti.cast(length * message * scale + 0.5, ti.i64)
+    ti.atomic_add(sums[index], (messages << 32) + lengths)
+
+
+@ti.func
+def low_half(packed: ti.i64):
+    """The lower 32 bits: the sum of lengths."""
+    return packed - ((packed >> 32) << 32)
+
+
+@ti.func
+def length_sum(packed: ti.i64, scale: F32) -> F32:
+    """The summed length, in voxel sizes."""
+    return ti.cast(low_half(packed), ti.f32) / scale
+
+
+@ti.func
+def mean_message(packed: ti.i64) -> F32:
+    """The length-weighted mean message, in [0, 1]."""
+    lengths = ti.cast(low_half(packed), ti.f32)
+    return ti.min(1.0, ti.cast(packed >> 32, ti.f32) / ti.max(lengths, 1.0))
+
+
+def finest_scale(
+    camera: PinholeCamera, rays: int, T_world_camera: Pose, window: Window, bricks: NDArray[np.int32]
+) -> float:
+    """The largest power of two by which lengths can be scaled before a sum could overflow 31 bits.
+
+    A voxel at a distance of D voxels lies in the cone of the sphere around it, which no more pixels
+    can meet than fit in the cone's solid angle at the image's corner, where pixels are densest.
+    ``bricks`` (n, 3) are those that the rays may meet.
+    """
+    centre = window.to_voxels(T_world_camera[:3, 3]) + np.asarray(window.lowest) * BRICK
+    low = bricks.astype(np.float64) * BRICK
+    beside = np.maximum(np.maximum(low - centre, centre - (low + BRICK)), 0.0)
+    nearest = float(np.sqrt((beside**2).sum(axis=1)).min()) if len(bricks) else 0.0
+    most = float(rays)
+    if nearest > 2.0:
+        distance = nearest + HALF_VOXEL  # of the voxel's centre
+        slant = float(camera.range_per_depth().max())
+        density = camera.fx * camera.fy * slant**3  # pixels for each unit of solid angle
+        radius = math.asin(HALF_VOXEL / distance)
+        solid_angle = 2 * math.pi * (1 - math.cos(radius))
+        rim = 2 * math.pi * radius * slant**2 * max(camera.fx, camera.fy)  # pixels cut by the cone's edge
+        most = min(most, density * solid_angle + rim + 4)
+    return 2.0 ** math.floor(math.log2(2**31 / (LONGEST * max(most, 1.0) + 1)))

@@ -1,0 +1,153 @@
+"""Which bricks a depth image sees: those that its rays cross, and those at the surfaces it measured.
+
+Bricks are allocated near measured surfaces only (section IV-B). The rays' way there is remembered too:
+it tells seen-free space from unknown space, and which bricks of other keyframes these rays cross.
+"""
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf.config import InferenceConfig, SensorConfig, VolumeConfig
+from taichi_mrf.errors import CapacityError
+from taichi_mrf.inference.keyframe import DepthImage, Footprint
+from taichi_mrf.poses import Pose
+from taichi_mrf.sensor.forward import depth_of_deviation, pixel_noise
+from taichi_mrf.sensor.noise import LEAST_SIGMA_M, evaluate
+from taichi_mrf.voxels.layout import flat
+from taichi_mrf.voxels.traversal import clip, make_ray, walk_bricks
+from taichi_mrf.voxels.types import (
+    F32,
+    I32,
+    F32Array,
+    F32Array3,
+    I32Array,
+    IVec3,
+    Mat3,
+    Struct,
+    Template,
+    Vec3,
+    Vec4,
+)
+from taichi_mrf.voxels.window import Window
+
+CROSSED, SURFACE = 1, 2
+TILE = 32
+"""Pixels along each side of the tiles from whose corners an image's extent in space is worked out."""
+
+
+def find_footprint(
+    image: DepthImage,
+    T_world_camera: Pose,
+    voxel_size: float,
+    sensor: SensorConfig,
+    inference: InferenceConfig,
+    volume: VolumeConfig,
+) -> Footprint:
+    """Follow every ray of an image from the camera to ``end_sigmas`` beyond its measurement.
+
+    Raises CapacityError if the space that the image sees has too many bricks at this voxel size.
+    """
+    lower_m, upper_m = visible_box(image, T_world_camera, sensor.max_depth, inference.end_sigmas)
+    if volume.lower is not None and volume.upper is not None:
+        lower_m, upper_m = np.maximum(lower_m, volume.lower), np.minimum(upper_m, volume.upper)
+    if image.rays == 0 or (lower_m >= upper_m).any():
+        nowhere = Window.covering(T_world_camera[:3, 3], T_world_camera[:3, 3], voxel_size)
+        return Footprint(nowhere, np.zeros(0, np.int32), np.zeros(0, np.int32), 1)
+    window = Window.covering(lower_m, upper_m, voxel_size)
+    if window.cells >= 2**31:
+        raise CapacityError(f"a view at a voxel size of {voxel_size:g} m has {window.cells:.3g} bricks")
+    centre, to_voxels = window.rays_of(T_world_camera)
+    box_lower, box_upper = window.clip_box(volume.lower, volume.upper)
+    marks = ti.ndarray(ti.i32, window.cells)
+    marks.fill(0)
+    longest = ti.ndarray(ti.i32, 1)
+    longest.fill(1)
+    _mark(
+        image.depth, image.camera.width, image.intrinsics, centre, to_voxels,
+        image.noise, image.noise_table.patch, image.noise_table.columns,
+        sensor.max_depth, inference.end_sigmas,
+        window.shape_vector, box_lower, box_upper, marks, longest,
+    )  # fmt: skip
+    marked = marks.to_numpy()
+    return Footprint(
+        window,
+        np.flatnonzero(marked & CROSSED).astype(np.int32),
+        np.flatnonzero(marked & SURFACE).astype(np.int32),
+        int(longest.to_numpy()[0]),
+    )
+
+
+def visible_box(
+    image: DepthImage, T_world_camera: Pose, max_depth: float, end_sigmas: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two corners, in metres, of an upright box around the camera and the ends of all its rays."""
+    camera = image.camera
+    depth = image.depth.to_numpy().reshape(camera.shape)
+    rows, columns = -(-camera.height // TILE), -(-camera.width // TILE)
+    padded = np.zeros((rows * TILE, columns * TILE), np.float32)
+    padded[: camera.height, : camera.width] = depth
+    farthest = padded.reshape(rows, TILE, columns, TILE).max(axis=(1, 3)).astype(np.float64)
+    # Generous: the end of a ray is never further than depth_of_deviation() lets it be, and no patch of
+    # the table is worse than the worst.
+    values = np.abs(evaluate(image.noise_table.coefficients[:, :, None], farthest.reshape(1, 1, -1)))
+    sigma, bias = np.maximum(values[:, 0], LEAST_SIGMA_M).max(axis=0), values[:, 1].max(axis=0)
+    ends = np.minimum(farthest + (3 * (end_sigmas * sigma + bias)).reshape(farthest.shape), max_depth)
+    ends[farthest <= 0] = 0.0
+    u = np.minimum(np.arange(columns + 1) * TILE, camera.width) - 0.5
+    v = np.minimum(np.arange(rows + 1) * TILE, camera.height) - 0.5
+    corners = [T_world_camera[:3, 3][None]]
+    for du in (0, 1):
+        for dv in (0, 1):
+            x = (u[du : du + columns][None, :] - camera.cx) / camera.fx * ends
+            y = (v[dv : dv + rows][:, None] - camera.cy) / camera.fy * ends
+            points = np.stack([x, y, ends], axis=-1).reshape(-1, 3)
+            corners.append(points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3])
+    cloud = np.concatenate(corners)
+    return cloud.min(axis=0), cloud.max(axis=0)
+
+
+@ti.dataclass
+class _Mark(Struct):
+    surface_begin: F32  # depth from which a brick is near the measured surface
+    bricks: I32
+
+
+@ti.func
+def _mark_brick(mark: Template, context: Template, ray: Template, brick: IVec3, t: F32, t_leave: F32):
+    kind = CROSSED
+    if t_leave > mark.surface_begin:
+        kind = CROSSED | SURFACE
+    cell = flat(brick, context[0])
+    if (context[1][cell] & kind) != kind:  # most bricks are marked already, and reading is cheaper
+        ti.atomic_or(context[1][cell], kind)
+    mark.bricks += 1
+    return 1
+
+
+@ti.kernel
+def _mark(
+    depth: F32Array, width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
+    noise: F32Array3, patch: I32, columns: I32,
+    max_depth: F32, end_sigmas: F32,
+    shape: IVec3, box_lower: Vec3, box_upper: Vec3, marks: I32Array, longest: I32Array,
+):  # fmt: skip
+    for pixel in range(depth.shape[0]):
+        measured = depth[pixel]
+        if measured > 0.0:
+            u, v = pixel % width, pixel // width
+            direction = to_voxels @ Vec3(
+                (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0
+            )
+            ray = make_ray(centre, direction)
+            noise_here = pixel_noise(noise, patch, columns, u, v)
+            begin, end = 0.0, ti.min(depth_of_deviation(measured, -end_sigmas, noise_here), max_depth)
+            clip(ray, begin, end, box_lower, box_upper)
+            mark = _Mark(depth_of_deviation(measured, end_sigmas, noise_here), 0)
+            walk_bricks(ray, begin, end, shape, marks, False, _mark_brick, mark, (shape, marks))
+            if end > begin:
+                # A step along the ray leaves a voxel through a face, or enters a brick anew.
+                faces = (end - begin) * (ti.abs(direction[0]) + ti.abs(direction[1]) + ti.abs(direction[2]))
+                steps = ti.cast(faces, ti.i32) + 4 + 2 * mark.bricks
+                if steps > longest[0]:
+                    ti.atomic_max(longest[0], steps)

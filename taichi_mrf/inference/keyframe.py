@@ -1,0 +1,103 @@
+"""A keyframe: a depth image, where it was taken, which bricks it touches, and what it says of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.poses import Pose
+from taichi_mrf.sensor.noise import NoiseTable
+from taichi_mrf.voxels.window import Window
+
+Cells = NDArray[np.int32]
+
+
+@dataclass
+class DepthImage:
+    """A depth image where kernels can reach it, with its camera and the camera's noise.
+
+    ``depth`` is (H * W) float32 axial depth in metres, 0 where there is no measurement.
+    """
+
+    depth: ti.Ndarray
+    camera: PinholeCamera
+    noise: ti.Ndarray
+    noise_table: NoiseTable
+    rays: int
+
+    @property
+    def intrinsics(self) -> ti.Vector:
+        """(fx, fy, cx, cy) as a kernel argument."""
+        c = self.camera
+        return ti.Vector([c.fx, c.fy, c.cx, c.cy], ti.f32)
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """What a depth image's rays cross, which depends on its pose and on nothing else in the map.
+
+    ``crossed`` are the window's cells (bricks) that any ray crosses, ``surface`` those among them near a
+    measured surface, both ascending. ``longest`` bounds the voxels on any one ray.
+    """
+
+    window: Window
+    crossed: Cells
+    surface: Cells
+    longest: int
+
+
+@dataclass
+class VisibleBricks:
+    """The bricks of the map that a keyframe's rays cross, in the order of its messages.
+
+    ``cells`` in the keyframe's window (ascending), ``slots`` in the pool, ``identity`` to tell whether
+    that is still the same brick, and ``version`` of the map's set of bricks at which this was true.
+    """
+
+    cells: Cells
+    slots: NDArray[np.int32]
+    identity: NDArray[np.int64]
+    version: int
+
+
+@dataclass
+class Keyframe:
+    """One keyframe of a map. ``messages`` is (bricks * 512) log-odds, in the order of ``visible``."""
+
+    id: int
+    name: str
+    image: DepthImage
+    T_world_camera: Pose
+    footprint: Footprint
+    visible: VisibleBricks
+    messages: ti.Ndarray | None = None
+
+    @property
+    def camera(self) -> PinholeCamera:
+        return self.image.camera
+
+    @property
+    def rays(self) -> int:
+        """Number of pixels that hold a measurement."""
+        return self.image.rays
+
+    @property
+    def depth_m(self) -> NDArray[np.float32]:
+        """(H, W) axial depth in metres, 0 where there is no measurement."""
+        return self.image.depth.to_numpy().reshape(self.camera.shape)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that this keyframe holds, its messages included."""
+        messages = 0 if self.messages is None else self.messages.shape[0] * 2
+        if self.messages is not None and self.messages.dtype == ti.f32:
+            messages *= 2
+        lists = (self.footprint.crossed, self.footprint.surface, self.visible.cells, self.visible.slots)
+        return (
+            self.image.depth.shape[0] * 4
+            + messages
+            + sum(a.nbytes for a in lists)
+            + self.visible.identity.nbytes
+        )

@@ -1,0 +1,85 @@
+"""In which order keyframes are swept, and how often.
+
+Loopy belief propagation stopped after a few sweeps depends on where it began and on the order of its
+messages. A map must depend on neither: full inference begins with no messages and takes the keyframes
+in an order that follows from what they hold and not from when they came, so that any history of adding,
+removing and moving keyframes ends in the map that the final set gives.
+"""
+
+import hashlib
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.inference.sweep import Sweeper
+from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.pool import BrickPool
+
+
+@dataclass(frozen=True)
+class InferProgress:
+    """Where inference stands, after each keyframe: both counts start at 1."""
+
+    sweep: int
+    sweeps: int
+    keyframe: int
+    keyframes: int
+    rays: int
+
+
+@dataclass(frozen=True)
+class InferReport:
+    """What inference did. ``residual`` is the share of the voxels seen whose marginal moved by more than
+    0.01 in the last sweep; ``complete`` is False if a progress callback stopped it."""
+
+    seconds: float
+    residual: float
+    sweeps: int
+    rays: int
+    complete: bool
+
+
+Progress = Callable[[InferProgress], bool]
+
+
+def content_key(keyframe: Keyframe) -> bytes:
+    """What a keyframe holds, as bytes to sort by: measurement, pose and camera, but not its number."""
+    digest = hashlib.blake2b(keyframe.T_world_camera.tobytes(), digest_size=16)
+    digest.update(repr(keyframe.camera).encode())
+    digest.update(keyframe.image.depth.to_numpy().tobytes())
+    return digest.digest()
+
+
+def run_sweeps(
+    keyframes: Sequence[Keyframe],
+    pool: BrickPool,
+    sweeper: Sweeper,
+    sweeps: int,
+    tolerance: float,
+    progress: Progress | None = None,
+) -> InferReport:
+    """Sweep over keyframes in the given order (Gauss-Seidel: each sees what the last has changed).
+
+    Stops after ``sweeps``, or when the residual is at most ``tolerance`` (above 0), or, between two
+    keyframes, when ``progress`` returns False.
+    """
+    begin = time.perf_counter()
+    residual, rays, done, complete = 0.0, 0, 0, True
+    for sweep in range(1, sweeps + 1):
+        moved = seen = 0
+        for number, keyframe in enumerate(keyframes, start=1):
+            changed = sweeper.sweep(keyframe, pool)
+            if changed is not None:
+                moved += int(changed.sum())
+                seen += len(changed) * VOXELS
+            rays += keyframe.rays
+            if progress is not None and not progress(
+                InferProgress(sweep, sweeps, number, len(keyframes), keyframe.rays)
+            ):
+                complete = False
+                break
+        residual, done = moved / max(seen, 1), sweep
+        if not complete or residual <= tolerance > 0:
+            break
+    return InferReport(time.perf_counter() - begin, residual, done, rays, complete)

@@ -1,0 +1,249 @@
+"""Sum-product belief propagation on the ray Markov random field: the method itself.
+
+    p(o, d) = 1/Z  prod_i phi(o_i)  prod_r psi_r(o_r, d_r)                                    (1)
+
+A voxel o_i is 1 if occupied; a ray r is a factor over all voxels that it crosses, and says how well the
+first occupied one among them explains the measured depth (eqs. 3 to 5). Equation numbers are those of
+Shankar & Michael, "MRFMap: Online Probabilistic 3D Mapping using Forward Ray Sensor Models" (RSS 2020);
+the supplement's are marked S.
+
+All rays of a keyframe send a voxel the same, average message (section IV-A), so a keyframe keeps one
+message for each voxel that it sees, and a sweep over it is four steps:
+
+    cavity     what all others believe of each voxel                    belief - own message      (6)
+    forward    follow each ray: which voxel may have made the measurement?                  (4), (11)
+    backward   tell each voxel what that implies for it                                    (13), (14)
+    finish     average over rays, renew the keyframe's message, update the beliefs          (7), (8)
+
+Messages and beliefs are log-odds. A voxel counts by the length l (in voxel sizes) that a ray spends in
+it: it lets the ray pass with probability (1 - m)^l where m is its probability of being occupied.
+"""
+
+import taichi as ti
+
+from taichi_mrf.inference.accumulators import add_message, length_sum, mean_message
+from taichi_mrf.sensor.forward import (
+    SUPPORT,
+    PixelNoise,
+    beyond_likelihood,
+    depth_of_deviation,
+    pixel_noise,
+    surface_likelihood,
+)
+from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
+from taichi_mrf.voxels.types import (
+    F32,
+    I32,
+    AnyArray,
+    F32Array,
+    F32Array3,
+    I32Array,
+    I64Array,
+    IVec3,
+    Mat3,
+    Struct,
+    Template,
+    Vec3,
+    Vec4,
+    Vec4Array,
+)
+
+TINY = 1e-30
+"""Keeps a ray that explains nothing, without an outlier floor, from dividing zero by zero."""
+
+MOVED = 0.01
+"""A marginal that changes by more than this counts as moved (the residual of a sweep)."""
+
+
+@ti.dataclass
+class ForwardPass(Struct):
+    """What is known of a ray on its way from the camera."""
+
+    measured: F32  # axial depth, metres
+    noise: PixelNoise
+    support: F32  # depth before which no surface can have made the measurement
+    voxels_per_depth: F32  # length of the ray, in voxels, for one metre of axial depth
+    visibility: F32  # prod_{k < i} (1 - m_k)^{l_k}
+    explained: F32  # sum_{j < i} of eq. 11
+    voxels: I32
+    trace: I32  # where this ray's steps are written down
+
+
+@ti.kernel
+def cavity(
+    slots: I32Array, belief: F32Array, messages: AnyArray, clamp: F32, log_free: F32Array, sums: I64Array
+):
+    """Eq. 6: what a voxel tells this keyframe's rays is all that it knows but from them.
+
+    Writes log(1 - m) for each voxel, and empties the sums.
+    """
+    for i in range(slots.shape[0] * VOXELS):
+        log_odds = belief[slots[i // VOXELS] * VOXELS + i % VOXELS] - ti.cast(messages[i], ti.f32)
+        log_free[i] = -softplus(ti.max(-clamp, ti.min(clamp, log_odds)))
+        sums[i] = 0
+
+
+@ti.kernel
+def send_messages(
+    depth: F32Array, width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
+    noise: F32Array3, patch: I32, columns: I32,
+    voxel_size: F32, max_depth: F32, end_sigmas: F32, floor: F32,
+    shape: IVec3, box_lower: Vec3, box_upper: Vec3, chunks: I32Array, bricks: I32Array,
+    log_free: F32Array, sums: I64Array, scale: F32, clamp: F32,
+    trace_voxel: I32Array, trace: Vec4Array, longest: I32, workers: I32, together: I32,
+    likelihood: Template, segment_lengths: Template, log_average: Template, block: Template,
+):  # fmt: skip
+    """Follow all rays of a keyframe there and back, and sum up what they tell each voxel.
+
+    A worker follows one ray after the other and writes each ray's steps into its own part of the trace,
+    so that the way back need not be walked again. ``longest`` is never less than a ray has voxels.
+    Neighbouring rays go to one worker in runs of ``together``.
+    """
+    ti.loop_config(block_dim=block)
+    for worker in range(workers):
+        pixels = depth.shape[0]
+        runs = (pixels + workers * together - 1) // (workers * together)
+        for turn in range(runs * together):
+            pixel = (turn // together * workers + worker) * together + turn % together
+            measured = 0.0
+            if pixel < pixels:
+                measured = depth[pixel]
+            if measured > 0.0:
+                u, v = pixel % width, pixel // width
+                direction = to_voxels @ Vec3(
+                    (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0
+                )
+                ray = make_ray(centre, direction)
+                here = pixel_noise(noise, patch, columns, u, v)
+
+                # The ray ends where its measurement has nothing more to say, or where the map does.
+                last = depth_of_deviation(measured, -end_sigmas, here)
+                begin, end = 0.0, ti.min(last, max_depth)
+                clip(ray, begin, end, box_lower, box_upper)
+
+                # Forward: eq. 11 for each voxel, from the camera outwards.
+                ahead = ForwardPass(
+                    measured, here, depth_of_deviation(measured, SUPPORT, here), direction.norm(),
+                    1.0, 0.0, 0, worker * longest,
+                )  # fmt: skip
+                walk_voxels(
+                    ray, begin, end, shape, chunks, bricks, _see_voxel, ahead,
+                    (log_free, trace_voxel, trace, voxel_size, likelihood, segment_lengths),
+                )  # fmt: skip
+
+                # What gets through to where the map ends may have met its surface there.
+                behind = 0.0
+                if end < last:
+                    behind = ahead.visibility * beyond_likelihood(measured, end, here)
+
+                # Backward: eqs. 13 and 14 for each voxel, from the far end.
+                for step in range(ahead.voxels):
+                    j = ahead.trace + ahead.voxels - 1 - step
+                    length, free, here_density, before = trace[j][0], trace[j][1], trace[j][2], trace[j][3]
+                    occupied = occupied_message(before, here_density, floor)
+                    empty = empty_message(before, behind, free, floor)
+                    message = occupied / (occupied + empty)
+                    if ti.static(log_average):
+                        log_odds = ti.log(occupied) - ti.log(empty)
+                        message = 0.5 + 0.5 * ti.max(-1.0, ti.min(1.0, log_odds / clamp))
+                    weight = 1.0
+                    if ti.static(segment_lengths):
+                        weight = length
+                    add_message(sums, trace_voxel[j], weight, message, scale)
+                    behind += (1.0 - free) * here_density
+
+
+@ti.func
+def _see_voxel(ahead: Template, context: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of the forward pass; ``near`` and ``far`` bound the ray's segment in it, in axial depth."""
+    length = (far - near) * ahead.voxels_per_depth
+    log_free = context[0][voxel]
+    free = ti.exp(length * log_free if ti.static(context[5]) else log_free)
+
+    # Eq. 4, and eq. 11: the voxel is seen, it is occupied, and it explains the measurement.
+    density = 0.0
+    if far > ahead.support:
+        density = ahead.visibility * surface_likelihood(
+            ahead.measured, near, far, ahead.noise, context[3], context[4]
+        )
+    j = ahead.trace + ahead.voxels
+    context[1][j] = voxel
+    context[2][j] = Vec4(length, free, density, ahead.explained)
+    ahead.explained += (1.0 - free) * density
+    ahead.visibility *= free
+    ahead.voxels += 1
+    return 1
+
+
+@ti.func
+def occupied_message(before: F32, here: F32, floor: F32) -> F32:
+    """Eq. 13: a voxel before this one made the measurement, or this one did if it is occupied."""
+    return before + here + (floor + TINY)
+
+
+@ti.func
+def empty_message(before: F32, behind: F32, free: F32, floor: F32) -> F32:
+    """Eq. 14: a voxel before this one made the measurement, or one behind it did if this one is empty.
+
+    ``behind`` was seen through this voxel and is divided by the chance of getting through.
+    """
+    return before + behind / ti.max(free, TINY) + (floor + TINY)
+
+
+@ti.kernel
+def finish(
+    slots: I32Array, belief: F32Array, messages: AnyArray, sums: I64Array, scale: F32,
+    clamp: F32, damping: F32, min_length: F32, moved: I32Array, log_average: Template,
+):  # fmt: skip
+    """Renew a keyframe's messages with the rays' averages (eq. 7), and the beliefs with them (eq. 8).
+
+    ``moved`` counts, for each brick, the voxels whose marginal changed by more than MOVED.
+    """
+    for i in range(slots.shape[0] * VOXELS):
+        if length_sum(sums[i], scale) > min_length:
+            mean = mean_message(sums[i])
+            log_odds = clamp * (2.0 * mean - 1.0)
+            if not ti.static(log_average):
+                least = logistic(-clamp)
+                mean = ti.max(least, ti.min(1.0 - least, mean))
+                log_odds = ti.log(mean / (1.0 - mean))
+            old = ti.cast(messages[i], ti.f32)
+            messages[i] = old + (1.0 - damping) * (log_odds - old)
+            # The belief takes what was stored, not what was meant, so that it stays the sum of messages.
+            change = ti.cast(messages[i], ti.f32) - old
+            j = slots[i // VOXELS] * VOXELS + i % VOXELS
+            before = belief[j]
+            belief[j] = before + change
+            if ti.abs(logistic(before + change) - logistic(before)) > MOVED:
+                moved[i // VOXELS] += 1
+
+
+@ti.kernel
+def withdraw(slots: I32Array, belief: F32Array, messages: AnyArray):
+    """Take a keyframe's messages out of the beliefs."""
+    for i in range(slots.shape[0] * VOXELS):
+        belief[slots[i // VOXELS] * VOXELS + i % VOXELS] -= ti.cast(messages[i], ti.f32)
+
+
+@ti.kernel
+def fold(slots: I32Array, evidence: F32Array, messages: AnyArray):
+    """Add a keyframe's messages to what inference starts from (freezing)."""
+    for i in range(slots.shape[0] * VOXELS):
+        evidence[slots[i // VOXELS] * VOXELS + i % VOXELS] += ti.cast(messages[i], ti.f32)
+
+
+@ti.func
+def logistic(x: F32) -> F32:
+    """Log-odds to probability."""
+    return 1.0 / (1.0 + ti.exp(-x))
+
+
+@ti.func
+def softplus(x: F32) -> F32:
+    """log(1 + e^x) without losing the digits of a small e^x: minus the log of being free."""
+    grown = ti.exp(-ti.abs(x))
+    tail = ti.log(1.0 + grown)
+    if grown < 1e-2:
+        tail = grown * (1.0 - grown * (0.5 - grown * (1.0 / 3.0)))
+    return ti.max(x, 0.0) + tail

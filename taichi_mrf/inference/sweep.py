@@ -1,0 +1,122 @@
+"""One sweep over one keyframe: the host's side of sum_product.py, with the scratch that it needs."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf import runtime
+from taichi_mrf.config import InferenceConfig, SensorConfig, VolumeConfig
+from taichi_mrf.inference import sum_product
+from taichi_mrf.inference.accumulators import finest_scale
+from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.sensor.forward import AUTO, CENTRE, SEGMENT
+from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.types import Vec4
+from taichi_mrf.voxels.window import WindowIndex
+
+LIKELIHOODS = {"auto": AUTO, "segment": SEGMENT, "centre": CENTRE}
+
+TRACE_BYTES = 20
+"""What one step of a ray leaves in the trace."""
+
+
+@dataclass(frozen=True)
+class Workers:
+    """How rays are dealt out: how many at a time, and how many neighbours in a run to one worker."""
+
+    number: int
+    together: int
+    block: int
+
+
+def workers_for(arch: str, software: bool, longest: int) -> Workers:
+    """On a CPU a worker is a strip of the image whose trace stays in the cache; on a GPU it is a thread,
+    neighbours take neighbouring rays, and the trace is bounded to half a GB."""
+    if arch == "cpu":
+        return Workers(64, 64, 1)
+    most = (512 << 20) // (TRACE_BYTES * longest)
+    # Mesa's software Vulkan loses iterations of long loops in larger blocks.
+    return Workers(max(256, min(65536, most)), 1, 8 if software else 128)
+
+
+class Sweeper:
+    """Runs sweeps; owns the scratch that all keyframes share, which grows to the largest of them."""
+
+    def __init__(
+        self, voxel_size: float, sensor: SensorConfig, inference: InferenceConfig, volume: VolumeConfig
+    ) -> None:
+        self.voxel_size, self.sensor, self.inference, self.volume = voxel_size, sensor, inference, volume
+        self.index = WindowIndex()
+        self.log_free = ti.ndarray(ti.f32, VOXELS)
+        self.sums = ti.ndarray(ti.i64, VOXELS)
+        self.moved = ti.ndarray(ti.i32, 1)
+        self.trace_voxel = ti.ndarray(ti.i32, 1)
+        self.trace = ti.ndarray(Vec4, 1)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the scratch."""
+        return (
+            self.log_free.shape[0] * 12
+            + self.moved.shape[0] * 4
+            + self.trace_voxel.shape[0] * TRACE_BYTES
+            + self.index.bricks.shape[0] * 4
+        )
+
+    def sweep(self, keyframe: Keyframe, pool: BrickPool) -> NDArray[np.int32] | None:
+        """Send one keyframe's messages anew. ``keyframe.messages`` must fit ``keyframe.visible``.
+
+        Returns how many voxels of each visible brick moved, or None if it sees no brick.
+        """
+        config, visible, footprint, image = (
+            self.inference,
+            keyframe.visible,
+            keyframe.footprint,
+            keyframe.image,
+        )
+        n = len(visible.slots)
+        if n == 0:
+            return None
+        messages = keyframe.messages
+        workers = workers_for(runtime.active() or "cpu", runtime.is_software(), footprint.longest)
+        self._reserve(n, workers.number * footprint.longest)
+        window = footprint.window
+        centre, to_voxels = window.rays_of(keyframe.T_world_camera)
+        box_lower, box_upper = window.clip_box(self.volume.lower, self.volume.upper)
+        scale = finest_scale(
+            image.camera, image.rays, keyframe.T_world_camera, window, window.bricks_of(visible.cells)
+        )
+        log_average = config.average == "log_odds"
+
+        sum_product.cavity(
+            visible.slots, pool.belief, messages, config.cavity_clamp, self.log_free, self.sums
+        )
+        self.index.fill(window, visible.cells, np.arange(n, dtype=np.int32))
+        sum_product.send_messages(
+            image.depth, image.camera.width, image.intrinsics, centre, to_voxels,
+            image.noise, image.noise_table.patch, image.noise_table.columns,
+            self.voxel_size, self.sensor.max_depth, config.end_sigmas, config.outlier_floor,
+            window.shape_vector, box_lower, box_upper, self.index.chunks, self.index.bricks,
+            self.log_free, self.sums, scale, config.message_clamp,
+            self.trace_voxel, self.trace, footprint.longest, workers.number, workers.together,
+            LIKELIHOODS[config.likelihood], config.segment_lengths, log_average, workers.block,
+        )  # fmt: skip
+        self.index.clear(window, visible.cells)
+        self.moved.fill(0)
+        sum_product.finish(
+            visible.slots, pool.belief, messages, self.sums, scale,
+            config.message_clamp, config.damping, config.min_length, self.moved, log_average,
+        )  # fmt: skip
+        return self.moved.to_numpy()[:n]
+
+    def _reserve(self, bricks: int, steps: int) -> None:
+        if bricks > self.moved.shape[0]:
+            self.log_free = ti.ndarray(ti.f32, bricks * VOXELS)
+            self.sums = ti.ndarray(ti.i64, bricks * VOXELS)
+            self.moved = ti.ndarray(ti.i32, bricks)
+        if steps > self.trace_voxel.shape[0]:
+            self.trace_voxel = ti.ndarray(ti.i32, steps)
+            self.trace = ti.ndarray(Vec4, steps)

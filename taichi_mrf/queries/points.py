@@ -1,0 +1,63 @@
+"""What the map says of points: how probable it is that they are occupied, and whether they are known."""
+
+import numpy as np
+import taichi as ti
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.voxels.layout import BRICK
+from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.topology import Topology
+from taichi_mrf.voxels.types import F32Array, I32Array
+
+UNKNOWN, FREE, OCCUPIED = 0, 1, 2
+"""What a place can be. Free is seen to be empty; unknown was never seen or nothing was learnt of it."""
+
+
+def point_log_odds(
+    points: ArrayLike, voxel_size: float, topology: Topology, pool: BrickPool, seen_free: float
+) -> NDArray[np.float32]:
+    """(N, 3) points in metres -> (N,) log-odds of being occupied.
+
+    Where no brick exists it is the prior if nobody has looked there, else ``seen_free``. A point that is
+    not finite raises ConfigError.
+    """
+    points_m = np.asarray(points, np.float64)
+    if points_m.ndim != 2 or points_m.shape[1] != 3:
+        raise ConfigError(f"points must be of shape (N, 3), not {points_m.shape}")
+    if not np.isfinite(points_m).all():
+        raise ConfigError("points hold a value that is not finite")
+    if len(points_m) == 0:
+        return np.zeros(0, np.float32)
+    # A point beyond 32 bits is further away than any map reaches.
+    voxels = np.clip(np.floor(points_m / voxel_size), -(2**30), 2**30).astype(np.int32)
+    bricks = np.ascontiguousarray(voxels // BRICK, np.int32)
+    slots = topology.slots(bricks)
+    log_odds = np.where(topology.crossings(bricks) > 0, seen_free, pool.prior_log_odds).astype(np.float32)
+    local = voxels - bricks * BRICK
+    numbers = ((local[:, 0] * BRICK + local[:, 1]) * BRICK + local[:, 2]).astype(np.int32)
+    _gather(pool.belief, slots, numbers, log_odds)
+    return log_odds
+
+
+def classify(log_odds: NDArray[np.float32], prior_log_odds: float, min_evidence: float) -> NDArray[np.int8]:
+    """(N,) log-odds -> (N,) UNKNOWN, FREE or OCCUPIED.
+
+    Occupied is more likely than not; of the rest, unknown is what lies within ``min_evidence`` of the
+    prior or above it: evidence for a surface that does not suffice.
+    """
+    state = np.where(log_odds < prior_log_odds - min_evidence, FREE, UNKNOWN)
+    known = np.abs(log_odds - prior_log_odds) > min_evidence
+    return np.where((log_odds > 0) & known, OCCUPIED, state).astype(np.int8)
+
+
+def probability(log_odds: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Log-odds to probability."""
+    return (0.5 * (1.0 + np.tanh(0.5 * log_odds))).astype(np.float32)
+
+
+@ti.kernel
+def _gather(belief: F32Array, slots: I32Array, numbers: I32Array, out: F32Array):
+    for i in range(slots.shape[0]):
+        if slots[i] >= 0:
+            out[i] = belief[slots[i] * (BRICK * BRICK * BRICK) + numbers[i]]

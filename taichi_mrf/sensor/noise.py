@@ -1,0 +1,156 @@
+"""What is known of a sensor's error: bias and standard deviation as functions of axial depth.
+
+``bias`` is the mean of measured minus true depth, ``sigma`` the standard deviation of the measured
+depth; both are polynomials of the true axial depth in metres, for the whole image or for each square
+patch of pixels (MRFMap, section IV-C).
+"""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.config import SensorConfig
+from taichi_mrf.errors import ConfigError
+
+TERMS = 5
+"""Coefficients of a polynomial in the kernels: up to degree 4, padded with zeros."""
+
+LEAST_SIGMA_M = 1e-3
+"""Fitted polynomials can fall to zero or below; no depth camera is more precise than this."""
+
+
+@dataclass(frozen=True)
+class NoiseTable:
+    """Noise in the form that kernels read.
+
+    ``coefficients`` is (patches, 2, TERMS) float32: sigma, then bias, ascending powers of axial depth.
+    Pixel (u, v) belongs to patch (v // patch) * columns + u // patch.
+    """
+
+    coefficients: NDArray[np.float32]
+    patch: int
+    columns: int
+
+
+class NoiseModel(Protocol):
+    """What MRFMap asks of a noise model."""
+
+    def table(self, camera: PinholeCamera) -> NoiseTable:
+        """The noise for one camera. Raises ConfigError if the model does not fit the camera."""
+
+
+class PolynomialNoise:
+    """The same bias and sigma for every pixel, as polynomials of axial depth."""
+
+    def __init__(self, sigma: Sequence[float], bias: Sequence[float] = (0.0,)) -> None:
+        """Coefficients in ascending powers of depth; metres."""
+        self.sigma = _padded(np.atleast_2d(np.asarray(sigma, np.float64)), "sigma")
+        self.bias = _padded(np.atleast_2d(np.asarray(bias, np.float64)), "bias")
+
+    def table(self, camera: PinholeCamera) -> NoiseTable:
+        """One patch that covers the image, whatever the camera."""
+        return _table(self.sigma, self.bias, max(camera.width, camera.height), 1)
+
+
+class PatchNoise:
+    """Learnt bias and sigma for each square patch of pixels of one camera."""
+
+    def __init__(self, sigma: ArrayLike, bias: ArrayLike, patch: int, camera: PinholeCamera) -> None:
+        """``sigma`` and ``bias`` are (rows * columns, degree + 1), patches row by row, ``patch`` pixels
+        wide and high (the last ones may hang over the image's edge).
+
+        Raises ConfigError if the number of patches does not fit the camera.
+        """
+        self.sigma = _padded(np.asarray(sigma, np.float64), "sigma")
+        self.bias = _padded(np.asarray(bias, np.float64), "bias")
+        self.patch = patch
+        self.camera = camera
+        self.columns = -(-camera.width // patch)
+        patches = self.columns * -(-camera.height // patch)
+        for name, rows in (("sigma", len(self.sigma)), ("bias", len(self.bias))):
+            if rows != patches:
+                raise ConfigError(
+                    f"the {name} table has {rows} patches, but {camera.width} x {camera.height} pixels in "
+                    f"patches of {patch} make {patches}"
+                )
+
+    def table(self, camera: PinholeCamera) -> NoiseTable:
+        if camera.shape != self.camera.shape:
+            raise ConfigError(
+                f"the noise table was learnt at {self.camera.width} x {self.camera.height} pixels, "
+                f"not {camera.width} x {camera.height}"
+            )
+        return _table(self.sigma, self.bias, self.patch, self.columns)
+
+
+def noise_from_config(config: SensorConfig, camera: PinholeCamera) -> NoiseModel:
+    """The noise model that a configuration describes. Raises ConfigError naming field and file."""
+    if config.sigma_table is None and config.bias_table is None:
+        return PolynomialNoise(config.sigma, config.bias)
+    patches = -(-camera.width // config.patch) * -(-camera.height // config.patch)
+    sigma, bias = np.asarray([config.sigma] * patches), np.asarray([config.bias] * patches)
+    if config.sigma_table is not None:
+        sigma = _load_table(config.sigma_table, "sensor.sigma_table")
+    if config.bias_table is not None:
+        bias = _load_table(config.bias_table, "sensor.bias_table")
+    return PatchNoise(sigma, bias, config.patch, camera)
+
+
+def evaluate(coefficients: NDArray[np.floating], depth_m: ArrayLike) -> NDArray[np.float64]:
+    """Values of (..., TERMS) polynomials at depths that broadcast with (...)."""
+    depth = np.asarray(depth_m, np.float64)
+    value = np.zeros(np.broadcast_shapes(coefficients.shape[:-1], depth.shape))
+    for term in range(coefficients.shape[-1] - 1, -1, -1):
+        value = value * depth + coefficients[..., term]
+    return value
+
+
+def warn_of_bad_sigma(table: NoiseTable, min_depth: float, max_depth: float) -> None:
+    """Warn, naming the patch, if sigma falls below LEAST_SIGMA_M somewhere in the working range.
+
+    Kernels clamp sigma there, so that a badly fitted patch is merely trusted a lot.
+    """
+    depths = np.linspace(min_depth, max_depth, 100)
+    sigma = evaluate(table.coefficients[:, None, 0, :].astype(np.float64), depths[None, :])
+    bad = np.flatnonzero((sigma <= 0).any(axis=1))
+    if len(bad) == 0:
+        return
+    row, column = divmod(int(bad[0]), table.columns)
+    depth = depths[np.argmin(sigma[bad[0]])]
+    which = f"patch (row {row}, column {column})" if len(table.coefficients) > 1 else "the polynomial"
+    warnings.warn(
+        f"sigma of {which} falls to {sigma[bad[0]].min():.4f} m at a depth of {depth:.2f} m and is clamped "
+        f"at {LEAST_SIGMA_M} m" + (f"; so do {len(bad) - 1} other patches" if len(bad) > 1 else ""),
+        stacklevel=2,
+    )
+
+
+def _table(sigma: NDArray[np.float64], bias: NDArray[np.float64], patch: int, columns: int) -> NoiseTable:
+    coefficients = np.ascontiguousarray(np.stack([sigma, bias], axis=1), dtype=np.float32)
+    return NoiseTable(coefficients, patch, columns)
+
+
+def _padded(coefficients: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+    if coefficients.ndim != 2 or coefficients.shape[1] < 1:
+        raise ConfigError(f"{name} must be of shape (patches, degree + 1), not {coefficients.shape}")
+    if coefficients.shape[1] > TERMS:
+        raise ConfigError(f"{name} has degree {coefficients.shape[1] - 1}; the highest is {TERMS - 1}")
+    if not np.isfinite(coefficients).all():
+        raise ConfigError(f"{name} holds a value that is not finite")
+    return np.pad(coefficients, ((0, 0), (0, TERMS - coefficients.shape[1])))
+
+
+def _load_table(path: str, field: str) -> NDArray[np.float64]:
+    try:
+        table = np.load(Path(path), allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{field}: {path} cannot be read as a .npy table: {error}") from error
+    if not isinstance(table, np.ndarray) or not np.issubdtype(table.dtype, np.number):
+        raise ConfigError(f"{field}: {path} holds no table of numbers")
+    return table.astype(np.float64)

@@ -1,0 +1,34 @@
+"""How much memory there is, asked before it is taken: a map that does not fit ends in a clear error."""
+
+import os
+
+from taichi_mrf.errors import CapacityError
+
+
+def available_bytes() -> int | None:
+    """Free memory of the machine in bytes, None where it cannot be asked."""
+    try:
+        with open("/proc/meminfo", encoding="ascii") as lines:
+            for line in lines:
+                if line.startswith("MemAvailable:"):
+                    return int(line.split()[1]) * 1024
+    except OSError:
+        pass
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")
+    except (ValueError, OSError, AttributeError):
+        return None
+
+
+def check_memory(wanted_bytes: float, what: str, limit_gb: float = 0.0) -> None:
+    """Raise CapacityError if an array of ``wanted_bytes`` is more than the limit, or than there is.
+
+    ``limit_gb`` of 0 means nine tenths of what the machine has free.
+    """
+    free = available_bytes()
+    limit = limit_gb * 1e9 if limit_gb > 0 else (0.9 * free if free is not None else None)
+    if limit is not None and wanted_bytes > limit:
+        raise CapacityError(
+            f"{what} would take {wanted_bytes / 1e9:.3g} GB of memory and {limit / 1e9:.3g} GB are to be "
+            "had; choose larger voxels, a smaller volume or a smaller sensor.max_depth"
+        )

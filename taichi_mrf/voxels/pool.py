@@ -1,0 +1,135 @@
+"""Where the voxels live: arrays of bricks that grow, and give bricks back.
+
+A brick has a slot; voxel v of the brick in slot s stands at s * 512 + v of each channel. The channels
+are Taichi ndarrays, which kernels take as arguments, and not fields, for which they would be compiled
+anew whenever the pool grows. What only the host needs (coordinates, owners, identities) is NumPy.
+"""
+
+import heapq
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf.errors import CapacityError
+from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.memory import check_memory
+from taichi_mrf.voxels.types import F32, I32, F32Array, I32Array
+
+GROWTH = 1.2
+"""A full pool grows by this factor: little enough that the slack does not show in the bytes a voxel."""
+
+MOST_BRICKS = 2**31 // VOXELS - 1
+"""Taichi refuses arrays of 2^31 elements."""
+
+
+class BrickPool:
+    """The map's bricks with their beliefs.
+
+    ``belief`` holds the log-odds of each voxel's marginal; ``evidence``, once something has been frozen,
+    the log-odds that inference starts from (prior plus frozen messages).
+    """
+
+    def __init__(self, prior_log_odds: float, memory_limit_gb: float = 0.0) -> None:
+        self.prior_log_odds = prior_log_odds
+        self.memory_limit_gb = memory_limit_gb
+        self.capacity = 0
+        self.belief = ti.ndarray(ti.f32, VOXELS)
+        self.evidence: ti.Ndarray | None = None
+        self.bricks = np.zeros((0, 3), np.int32)
+        self.owners = np.zeros(0, np.int32)
+        self.identity = np.zeros(0, np.int64)
+        self._free: list[int] = []
+        self._born = 0
+
+    @property
+    def in_use(self) -> NDArray[np.int32]:
+        """Slots of the bricks that exist, ascending."""
+        return np.flatnonzero(self.owners > 0).astype(np.int32)
+
+    @property
+    def bytes_per_voxel(self) -> int:
+        """Bytes of the channels for each allocated voxel."""
+        return 8 if self.evidence is not None else 4
+
+    def allocate(self, bricks: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Slots for new bricks, (n, 3) -> (n,), their voxels at the prior and owned by nobody yet.
+
+        The lowest free slots go first, so that equal histories give equal pools.
+        Raises CapacityError if the memory would not do.
+        """
+        missing = len(bricks) - len(self._free)
+        if missing > 0:
+            self._grow(self.capacity + missing)
+        slots = np.array([heapq.heappop(self._free) for _ in range(len(bricks))], np.int32)
+        self.bricks[slots] = bricks
+        # An identity is never given twice, so a slot that changes hands can be told from one that did not.
+        self.identity[slots] = self._born + np.arange(len(bricks))
+        self._born += len(bricks)
+        _fill_bricks(self.belief, slots, self.prior_log_odds)
+        if self.evidence is not None:
+            _fill_bricks(self.evidence, slots, self.prior_log_odds)
+        return slots
+
+    def release(self, slots: NDArray[np.int32]) -> None:
+        """Give bricks back; nobody may own them any more."""
+        self.identity[slots] = -1
+        self.owners[slots] = 0
+        for slot in slots.tolist():
+            heapq.heappush(self._free, slot)
+
+    def restart(self) -> None:
+        """Set all beliefs to what inference starts from."""
+        if self.evidence is not None:
+            self.belief.copy_from(self.evidence)
+        else:
+            self.belief.fill(self.prior_log_odds)
+
+    def keep_evidence(self) -> "ti.Ndarray":
+        """The evidence channel, made when something is frozen for the first time."""
+        if self.evidence is None:
+            self.evidence = ti.ndarray(ti.f32, max(1, self.capacity) * VOXELS)
+            self.evidence.fill(self.prior_log_odds)
+        return self.evidence
+
+    def _grow(self, bricks_needed: int) -> None:
+        capacity = max(bricks_needed, int(self.capacity * GROWTH), 256)
+        if bricks_needed > MOST_BRICKS:
+            raise CapacityError(
+                f"the map would hold {bricks_needed * VOXELS:.3g} voxels and the most is "
+                f"{MOST_BRICKS * VOXELS:.3g}; choose larger voxels"
+            )
+        capacity = min(capacity, MOST_BRICKS)
+        check_memory(
+            capacity * VOXELS * self.bytes_per_voxel,
+            f"{capacity * VOXELS / 1e6:.3g} million voxels",
+            self.memory_limit_gb,
+        )
+        self.belief = _grown(self.belief, self.capacity, capacity)
+        if self.evidence is not None:
+            self.evidence = _grown(self.evidence, self.capacity, capacity)
+        more = capacity - self.capacity
+        self.bricks = np.concatenate([self.bricks, np.zeros((more, 3), np.int32)])
+        self.owners = np.concatenate([self.owners, np.zeros(more, np.int32)])
+        self.identity = np.concatenate([self.identity, np.full(more, -1, np.int64)])
+        for slot in range(self.capacity, capacity):
+            heapq.heappush(self._free, slot)
+        self.capacity = capacity
+
+
+def _grown(old: "ti.Ndarray", old_capacity: int, capacity: int) -> "ti.Ndarray":
+    new = ti.ndarray(ti.f32, capacity * VOXELS)
+    _copy(old, new, old_capacity * VOXELS)
+    return new
+
+
+@ti.kernel
+def _copy(source: F32Array, target: F32Array, n: I32):
+    for i in range(n):
+        target[i] = source[i]
+
+
+@ti.kernel
+def _fill_bricks(channel: F32Array, slots: I32Array, value: F32):
+    for i in range(slots.shape[0] * VOXELS):
+        channel[slots[i // VOXELS] * VOXELS + i % VOXELS] = value

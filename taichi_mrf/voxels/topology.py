@@ -1,0 +1,230 @@
+"""Which bricks exist: the map's index from brick coordinates to slots in the pool.
+
+On CPU and CUDA it is a Taichi SNode tree, pointer -> pointer -> bitmasked: a bitmasked cell is a brick,
+the pointer cell above it a chunk of 8^3 bricks, and the pointer above that a region of 16^3 chunks,
+which together span 8192 bricks along each axis. Vulkan has no sparse SNodes, so there the same
+interface is served by dense arrays over a bounded volume. Nothing outside this file knows which of the
+two it is.
+
+Beside its slot each brick has a number of crossings: how many keyframes' rays pass through it. A brick
+without a slot that has been crossed is seen-free space, one that has not is unknown.
+"""
+
+from typing import Protocol
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf.errors import CapacityError
+from taichi_mrf.voxels.layout import BRICK, CHUNK, flat
+from taichi_mrf.voxels.types import I32, AnyArray, I32Array, IVec3, Template
+
+Bricks = NDArray[np.int32]
+"""(n, 3) brick coordinates in the world."""
+
+
+class Topology(Protocol):
+    """The interface that both kinds of index serve. All arguments are NumPy arrays of one length."""
+
+    def anchor(self, brick: Bricks) -> None:
+        """Tell where the map begins, (3,); a bounded index puts its volume around it, once."""
+
+    def insert(self, bricks: Bricks, slots: NDArray[np.int32]) -> None:
+        """Give bricks their slots. Raises CapacityError for a brick outside the volume."""
+
+    def erase(self, bricks: Bricks) -> None:
+        """Take bricks' slots away."""
+
+    def slots(self, bricks: Bricks) -> NDArray[np.int32]:
+        """The slot of each brick, -1 where it does not exist."""
+
+    def add_crossings(self, bricks: Bricks, number: int) -> None:
+        """Count ``number`` (+1 or -1) keyframes more that see through each brick."""
+
+    def crossings(self, bricks: Bricks) -> NDArray[np.int32]:
+        """How many keyframes see through each brick."""
+
+    def check(self, bricks: Bricks, voxel_size: float) -> None:
+        """Raise CapacityError, in metres, if any of the bricks lies outside the volume."""
+
+    def clear(self) -> None:
+        """Forget everything."""
+
+
+def create_topology(arch: str, dense_bricks: int) -> Topology:
+    """An empty index for a backend; ``dense_bricks`` bounds it where it has to be dense."""
+    if arch == "vulkan":
+        return DenseTopology(dense_bricks)
+    if _spare:
+        topology = _spare.pop()
+        topology.clear()
+        return topology
+    return SparseTopology()
+
+
+def recycle(topology: Topology) -> None:
+    """Keep the index of a map that is gone for the next map.
+
+    Taichi compiles a kernel anew for each SNode tree, so an old tree costs less than a new one. It is
+    cleared when it is taken again and not here: this runs when Python collects the map, where no
+    kernel may be launched.
+    """
+    if isinstance(topology, SparseTopology):
+        _spare.append(topology)
+
+
+@ti.data_oriented
+class SparseTopology:
+    """Pointer -> pointer -> bitmasked SNodes that hold a slot and a number of crossings a brick."""
+
+    REGIONS, REGION = 64, 16
+    HALF_SPAN = REGIONS * REGION * CHUNK // 2
+
+    def __init__(self) -> None:
+        self.slot = ti.field(ti.i32)  # slot + 1, because an inactive cell reads as 0
+        self.crossing = ti.field(ti.i32)
+        builder = ti.FieldsBuilder()
+        self.regions = builder.pointer(ti.ijk, self.REGIONS)
+        self.bricks = self.regions.pointer(ti.ijk, self.REGION).bitmasked(ti.ijk, CHUNK)
+        self.bricks.place(self.slot, self.crossing)
+        builder.finalize()
+
+    def anchor(self, brick: Bricks) -> None:
+        """A sparse index spans the same space wherever the map begins."""
+
+    def insert(self, bricks: Bricks, slots: NDArray[np.int32]) -> None:
+        self._write(bricks, slots + 1)
+
+    def erase(self, bricks: Bricks) -> None:
+        self._write(bricks, np.zeros(len(bricks), np.int32))
+
+    def slots(self, bricks: Bricks) -> NDArray[np.int32]:
+        out = np.zeros(len(bricks), np.int32)
+        self._read(bricks, out, 0)
+        return out - 1
+
+    def add_crossings(self, bricks: Bricks, number: int) -> None:
+        self._count(bricks, number)
+
+    def crossings(self, bricks: Bricks) -> NDArray[np.int32]:
+        out = np.zeros(len(bricks), np.int32)
+        self._read(bricks, out, 1)
+        return out
+
+    def check(self, bricks: Bricks, voxel_size: float) -> None:
+        if len(bricks) and max(-int(bricks.min()), int(bricks.max()) + 1) > self.HALF_SPAN:
+            reach = self.HALF_SPAN * BRICK * voxel_size
+            raise CapacityError(
+                f"the map would reach further than {reach:g} m from the world's origin, which is the limit "
+                f"at a voxel size of {voxel_size:g} m"
+            )
+
+    def clear(self) -> None:
+        self.regions.deactivate_all()
+
+    @ti.func
+    def _cell(self, bricks: Template, i: I32) -> IVec3:
+        return IVec3(bricks[i, 0], bricks[i, 1], bricks[i, 2]) + self.HALF_SPAN
+
+    @ti.func
+    def _in_span(self, cell: IVec3) -> I32:
+        return cell.min() >= 0 and cell.max() < 2 * self.HALF_SPAN
+
+    @ti.kernel
+    def _write(self, bricks: AnyArray, values: I32Array):
+        for i in range(values.shape[0]):
+            cell = self._cell(bricks, i)
+            # Writing a leaf activates its parents; ti.activate would not.
+            self.slot[cell] = values[i]
+            if values[i] == 0 and self.crossing[cell] == 0:
+                ti.deactivate(self.bricks, cell)
+
+    @ti.kernel
+    def _count(self, bricks: AnyArray, number: I32):
+        for i in range(bricks.shape[0]):
+            cell = self._cell(bricks, i)
+            self.crossing[cell] += number
+            if self.crossing[cell] == 0 and self.slot[cell] == 0:
+                ti.deactivate(self.bricks, cell)
+
+    @ti.kernel
+    def _read(self, bricks: AnyArray, out: I32Array, channel: I32):
+        for i in range(out.shape[0]):
+            cell = self._cell(bricks, i)
+            if self._in_span(cell):  # a query may ask for any point
+                if channel == 0:
+                    out[i] = self.slot[cell]
+                else:
+                    out[i] = self.crossing[cell]
+
+
+_spare: list[SparseTopology] = []
+
+
+class DenseTopology:
+    """Dense arrays of slots and crossings over a cube of bricks around the place where the map begins."""
+
+    def __init__(self, side: int) -> None:
+        self.side = side
+        self.lowest: Bricks | None = None
+        self.slot = ti.ndarray(ti.i32, side**3)
+        self.crossing = ti.ndarray(ti.i32, side**3)
+        self.clear()
+
+    def anchor(self, brick: Bricks) -> None:
+        if self.lowest is None:
+            centre_chunk = np.asarray(brick, np.int32) // CHUNK * CHUNK
+            self.lowest = (centre_chunk - self.side // 2).astype(np.int32)
+
+    def insert(self, bricks: Bricks, slots: NDArray[np.int32]) -> None:
+        _dense_write(self.slot, self._local(bricks), slots + 1, self.side, 0)
+
+    def erase(self, bricks: Bricks) -> None:
+        _dense_write(self.slot, self._local(bricks), np.zeros(len(bricks), np.int32), self.side, 0)
+
+    def slots(self, bricks: Bricks) -> NDArray[np.int32]:
+        out = np.zeros(len(bricks), np.int32)
+        _dense_read(self.slot, self._local(bricks), out, self.side)
+        return out - 1
+
+    def add_crossings(self, bricks: Bricks, number: int) -> None:
+        _dense_write(self.crossing, self._local(bricks), np.full(len(bricks), number, np.int32), self.side, 1)
+
+    def crossings(self, bricks: Bricks) -> NDArray[np.int32]:
+        out = np.zeros(len(bricks), np.int32)
+        _dense_read(self.crossing, self._local(bricks), out, self.side)
+        return out
+
+    def check(self, bricks: Bricks, voxel_size: float) -> None:
+        local = self._local(bricks)
+        if len(local) and (local.min() < 0 or local.max() >= self.side):
+            extent = self.side * BRICK * voxel_size
+            raise CapacityError(
+                f"the map would leave its volume of {extent:g} m around the first keyframe, which is "
+                f"bounded on Vulkan; raise volume.dense_bricks (now {self.side}) or use the CPU"
+            )
+
+    def clear(self) -> None:
+        self.slot.fill(0)
+        self.crossing.fill(0)
+        self.lowest = None
+
+    def _local(self, bricks: Bricks) -> Bricks:
+        lowest = self.lowest if self.lowest is not None else np.zeros(3, np.int32)
+        return np.ascontiguousarray(bricks - lowest, np.int32)
+
+
+@ti.kernel
+def _dense_write(index: I32Array, bricks: AnyArray, values: I32Array, side: I32, add: I32):
+    for i in range(values.shape[0]):
+        cell = flat(IVec3(bricks[i, 0], bricks[i, 1], bricks[i, 2]), IVec3(side))
+        index[cell] = values[i] + add * index[cell]
+
+
+@ti.kernel
+def _dense_read(index: I32Array, bricks: AnyArray, out: I32Array, side: I32):
+    for i in range(out.shape[0]):
+        cell = IVec3(bricks[i, 0], bricks[i, 1], bricks[i, 2])
+        if cell.min() >= 0 and cell.max() < side:
+            out[i] = index[flat(cell, IVec3(side))]

@@ -1,0 +1,195 @@
+"""Rays through the grid: Amanatides & Woo's traversal at three levels, with exact segment lengths.
+
+The same few functions step through chunks, bricks and voxels: a level only differs in the size of its
+cells. A ray first steps through chunks, inside a chunk that holds bricks through bricks, and inside a
+brick that exists through voxels, so that empty space costs one step for each chunk or brick.
+
+Coordinates are voxels from the corner of a window (window.py), so they stay small and float32 stays
+exact to about 1e-4 of a voxel however far from the world's origin the map has grown. A ray is
+origin + t * direction; what t means (axial depth or range) is up to whoever made the direction.
+"""
+
+import taichi as ti
+
+from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS, flat, voxel_in_brick
+from taichi_mrf.voxels.types import F32, I32, IVec3, Struct, Template, Vec3
+
+FAR = 1e30
+"""Stands for 1 / 0 and 'never': finite, because Taichi's fast maths may not keep infinities apart."""
+
+
+@ti.dataclass
+class Ray(Struct):
+    """A ray in a window: origin in voxels, direction in voxels for one unit of t."""
+
+    origin: Vec3
+    direction: Vec3
+    inverse: Vec3
+    step: IVec3
+
+
+@ti.dataclass
+class Walk(Struct):
+    """Where a ray stands on one level: its cell, and the t at which it leaves it through each axis."""
+
+    cell: IVec3
+    leave: Vec3
+
+
+@ti.func
+def make_ray(origin: Vec3, direction: Vec3) -> Ray:
+    """A ray with its steps and reciprocal direction worked out once."""
+    inverse = Vec3(FAR)
+    step = IVec3(1)
+    for axis in ti.static(range(3)):
+        if ti.abs(direction[axis]) > 1e-12:
+            inverse[axis] = 1.0 / direction[axis]
+        if direction[axis] < 0.0:
+            step[axis] = -1
+    return Ray(origin, direction, inverse, step)
+
+
+@ti.func
+def enter(ray: Ray, t: F32, size: Template, lowest: IVec3, highest: IVec3) -> Walk:
+    """Start on a level whose cells are ``size`` voxels wide, at t, inside the cells of the parent.
+
+    The cell is clamped into [lowest, highest]: a t that stands on the parent's face may round to either
+    side of it.
+    """
+    walk = Walk(IVec3(0), Vec3(0.0))
+    for axis in ti.static(range(3)):
+        position = ray.origin[axis] + t * ray.direction[axis]
+        cell = ti.floor(position * (1.0 / size), ti.i32)
+        cell = ti.max(lowest[axis], ti.min(highest[axis], cell))
+        walk.cell[axis] = cell
+        face = (cell + (1 if ray.step[axis] > 0 else 0)) * size
+        walk.leave[axis] = (face - ray.origin[axis]) * ray.inverse[axis]
+    return walk
+
+
+@ti.func
+def leave_at(walk: Walk) -> F32:
+    """The t at which the ray leaves its cell."""
+    return ti.min(walk.leave[0], walk.leave[1], walk.leave[2])
+
+
+@ti.func
+def advance(ray: Ray, walk: Template, size: Template):
+    """Step to the next cell, through the nearest face."""
+    if walk.leave[0] <= walk.leave[1] and walk.leave[0] <= walk.leave[2]:
+        walk.cell[0] += ray.step[0]
+        walk.leave[0] += size * ti.abs(ray.inverse[0])
+    elif walk.leave[1] <= walk.leave[2]:
+        walk.cell[1] += ray.step[1]
+        walk.leave[1] += size * ti.abs(ray.inverse[1])
+    else:
+        walk.cell[2] += ray.step[2]
+        walk.leave[2] += size * ti.abs(ray.inverse[2])
+
+
+@ti.func
+def within(cell: IVec3, lowest: IVec3, highest: IVec3) -> I32:
+    """Whether a cell lies in a box of cells, both ends included."""
+    return (
+        cell[0] >= lowest[0]
+        and cell[1] >= lowest[1]
+        and cell[2] >= lowest[2]
+        and cell[0] <= highest[0]
+        and cell[1] <= highest[1]
+        and cell[2] <= highest[2]
+    )
+
+
+@ti.func
+def clip(ray: Ray, t_begin: Template, t_end: Template, lower: Vec3, upper: Vec3):
+    """Cut [t_begin, t_end] to the part of the ray inside the box from ``lower`` to ``upper``."""
+    for axis in ti.static(range(3)):
+        t_low = (lower[axis] - ray.origin[axis]) * ray.inverse[axis]
+        t_high = (upper[axis] - ray.origin[axis]) * ray.inverse[axis]
+        t_begin = ti.max(t_begin, ti.min(t_low, t_high))
+        t_end = ti.min(t_end, ti.max(t_low, t_high))
+
+
+@ti.func
+def walk_bricks(
+    ray: Ray,
+    t_begin: F32,
+    t_end: F32,
+    shape: IVec3,
+    chunks: Template,
+    skip_empty: Template,
+    visit: Template,
+    state: Template,
+    context: Template,
+):
+    """Call ``visit(state, context, ray, brick, t, t_leave)`` for each brick of the window along the ray.
+
+    ``shape`` is the window's size in bricks, a multiple of CHUNK; ``chunks`` counts the bricks that
+    exist in each chunk, and with ``skip_empty`` an empty chunk is one step. The interval must lie
+    inside the window (:func:`clip`). The walk ends where ``visit`` returns 0.
+    """
+    last_chunk = shape // CHUNK - 1
+    t = t_begin
+    go = 1
+    chunk = enter(ray, t, CHUNK_VOXELS, IVec3(0), last_chunk)
+    while go == 1 and t < t_end and within(chunk.cell, IVec3(0), last_chunk):
+        t_chunk = ti.min(leave_at(chunk), t_end)
+        wanted = 1
+        if ti.static(skip_empty):
+            wanted = chunks[flat(chunk.cell, last_chunk + 1)]
+        if wanted > 0:
+            first = chunk.cell * CHUNK
+            last = first + (CHUNK - 1)
+            brick = enter(ray, t, BRICK, first, last)
+            while go == 1 and t < t_chunk and within(brick.cell, first, last):
+                t_brick = ti.min(leave_at(brick), t_chunk)
+                if t_brick > t:  # a ray through an edge touches cells for no length at all
+                    go = visit(state, context, ray, brick.cell, t, t_brick)
+                    t = t_brick
+                advance(ray, brick, BRICK)
+        t = ti.max(t, t_chunk)
+        advance(ray, chunk, CHUNK_VOXELS)
+
+
+@ti.func
+def walk_voxels(
+    ray: Ray,
+    t_begin: F32,
+    t_end: F32,
+    shape: IVec3,
+    chunks: Template,
+    bricks: Template,
+    visit: Template,
+    state: Template,
+    context: Template,
+):
+    """Call ``visit(state, context, index, t, t_leave)`` for each voxel of the window along the ray.
+
+    Only voxels of bricks that exist: ``bricks`` holds the slot of each brick of the window, -1 for none.
+    ``index`` is slot * 512 + the voxel's number in its brick. The segments [t, t_leave) follow each
+    other without overlap. The walk ends where ``visit`` returns 0.
+    """
+    walk_bricks(
+        ray, t_begin, t_end, shape, chunks, True, _cross_brick, state, (shape, bricks, visit, context)
+    )
+
+
+@ti.func
+def _cross_brick(
+    state: Template, context: Template, ray: Ray, brick: IVec3, t_enter: F32, t_leave: F32
+) -> I32:
+    go = 1
+    slot = context[1][flat(brick, context[0])]
+    if slot >= 0:
+        t = t_enter
+        first = brick * BRICK
+        last = first + (BRICK - 1)
+        voxel = enter(ray, t, 1, first, last)
+        while go == 1 and t < t_leave and within(voxel.cell, first, last):
+            t_voxel = ti.min(leave_at(voxel), t_leave)
+            if t_voxel > t:
+                index = slot * VOXELS + voxel_in_brick(voxel.cell, brick)
+                go = context[2](state, context[3], index, t, t_voxel)
+                t = t_voxel
+            advance(ray, voxel, 1)
+    return go

@@ -1,0 +1,121 @@
+"""A window: the box of bricks that one keyframe or one view looks at, as a dense index.
+
+Kernels that follow rays do not ask the topology: the bricks that matter to them are scattered into a
+small dense array first, which is faster to read, the same on every backend, and needs no compilation
+for each map. The window's corner is also the origin of the rays' coordinates, worked out in float64
+on the host, so that float32 is exact enough anywhere in the world.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf.poses import Pose
+from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, flat
+from taichi_mrf.voxels.memory import check_memory
+from taichi_mrf.voxels.types import I32, I32Array, IVec3
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Window:
+    """A box of bricks, aligned to chunks: its lowest brick in the world and its size in bricks."""
+
+    lowest: tuple[int, int, int]
+    shape: tuple[int, int, int]
+    voxel_size: float
+
+    @staticmethod
+    def covering(lower_m: ArrayLike, upper_m: ArrayLike, voxel_size: float) -> "Window":
+        """The smallest window around a box in metres. Raises CapacityError if it would not fit memory."""
+        chunk_m = voxel_size * BRICK * CHUNK
+        first = np.floor(np.asarray(lower_m, np.float64) / chunk_m)
+        last = np.floor(np.asarray(upper_m, np.float64) / chunk_m)
+        shape = (last - first + 1) * CHUNK
+        # Two int32 for each brick: the mark of the footprint and the index.
+        check_memory(8.0 * float(np.prod(shape)), f"a view at a voxel size of {voxel_size:g} m")
+        lowest = first.astype(np.int64) * CHUNK
+        return Window(
+            (int(lowest[0]), int(lowest[1]), int(lowest[2])),
+            (int(shape[0]), int(shape[1]), int(shape[2])),
+            voxel_size,
+        )
+
+    @property
+    def cells(self) -> int:
+        """Number of bricks in the box."""
+        return self.shape[0] * self.shape[1] * self.shape[2]
+
+    def bricks_of(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
+        """(n,) numbers of cells in the window -> (n, 3) brick coordinates in the world."""
+        return (np.stack(np.unravel_index(cells, self.shape), axis=1) + self.lowest).astype(np.int32)
+
+    def cells_of(self, bricks: NDArray[np.int32]) -> NDArray[np.int32]:
+        """(n, 3) brick coordinates -> (n,) numbers of cells, -1 outside the window."""
+        local = bricks - np.asarray(self.lowest)
+        inside = ((local >= 0) & (local < self.shape)).all(axis=1)
+        cells = np.full(len(bricks), -1, np.int32)
+        cells[inside] = np.ravel_multi_index(tuple(local[inside].T), self.shape)
+        return cells
+
+    def to_voxels(self, points_m: ArrayLike) -> Vector:
+        """World points in metres -> voxels from the window's corner."""
+        return np.asarray(points_m, np.float64) / self.voxel_size - np.asarray(self.lowest) * BRICK
+
+    def rays_of(self, T_world_camera: Pose) -> tuple[ti.Vector, ti.Matrix]:
+        """The camera in the window: its centre, and the matrix that turns a camera-frame direction of
+        one metre into voxels."""
+        return (
+            ti.Vector(self.to_voxels(T_world_camera[:3, 3]).tolist(), ti.f32),
+            ti.Matrix((T_world_camera[:3, :3] / self.voxel_size).tolist(), ti.f32),
+        )
+
+    def clip_box(self, lower_m: ArrayLike | None, upper_m: ArrayLike | None) -> tuple[ti.Vector, ti.Vector]:
+        """The part of the window that may hold voxels, as two corners in voxels."""
+        lower, upper = np.zeros(3), np.asarray(self.shape, np.float64) * BRICK
+        if lower_m is not None and upper_m is not None:
+            lower = np.maximum(lower, np.round(self.to_voxels(lower_m)))
+            upper = np.minimum(upper, np.round(self.to_voxels(upper_m)))
+        return ti.Vector(lower.tolist(), ti.f32), ti.Vector(upper.tolist(), ti.f32)
+
+    @property
+    def shape_vector(self) -> ti.Vector:
+        """The size in bricks as a kernel argument."""
+        return ti.Vector(list(self.shape), ti.i32)
+
+
+class WindowIndex:
+    """The dense index itself: one for all windows, filled before use and emptied after it."""
+
+    def __init__(self) -> None:
+        self.bricks = ti.ndarray(ti.i32, 1)
+        self.chunks = ti.ndarray(ti.i32, 1)
+        self._reset(1)
+
+    def _reset(self, cells: int) -> None:
+        self.bricks = ti.ndarray(ti.i32, cells)
+        self.bricks.fill(-1)
+        self.chunks = ti.ndarray(ti.i32, max(1, cells // VOXELS))
+        self.chunks.fill(0)
+
+    def fill(self, window: Window, cells: NDArray[np.int32], slots: NDArray[np.int32]) -> None:
+        """Enter bricks: ``slots[i]`` at cell ``cells[i]`` of the window."""
+        if window.cells > self.bricks.shape[0]:
+            self._reset(window.cells)
+        _scatter(window.shape_vector, cells, slots, 1, self.bricks, self.chunks)
+
+    def clear(self, window: Window, cells: NDArray[np.int32]) -> None:
+        """Take the same bricks out again, which costs less than filling the whole index."""
+        _scatter(window.shape_vector, cells, np.full(len(cells), -1, np.int32), 0, self.bricks, self.chunks)
+
+
+@ti.kernel
+def _scatter(shape: IVec3, cells: I32Array, slots: I32Array, mark: I32, bricks: I32Array, chunks: I32Array):
+    for i in range(cells.shape[0]):
+        cell = cells[i]
+        bricks[cell] = slots[i]
+        brick = IVec3(cell // (shape[1] * shape[2]), cell // shape[2] % shape[1], cell % shape[2])
+        chunks[flat(brick // CHUNK, shape // CHUNK)] = mark
