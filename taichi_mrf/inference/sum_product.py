@@ -91,7 +91,7 @@ def send_messages(
     voxel_size: F32, max_depth: F32, end_sigmas: F32, floor: F32,
     shape: IVec3, box_lower: Vec3, box_upper: Vec3, chunks: I32Array, bricks: I32Array,
     log_free: F32Array, sums: I64Array, scale: F32, clamp: F32,
-    trace_voxel: I32Array, trace: Vec4Array, longest: I32, workers: I32, together: I32,
+    trace_voxel: I32Array, trace: Vec4Array, longest: I32, workers: I32, together: I32, spread: I32,
     likelihood: Template, segment_lengths: Template, log_average: Template, block: Template,
 ):  # fmt: skip
     """Follow all rays of a keyframe there and back, and sum up what they tell each voxel.
@@ -100,11 +100,15 @@ def send_messages(
     so that the way back need not be walked again. ``longest`` is never less than a ray has voxels.
     Neighbouring rays go to one worker in runs of ``together``.
     """
-    ti.loop_config(block_dim=block)
-    for worker in range(workers):
+    if ti.static(block > 0):
+        ti.loop_config(block_dim=block)
+    for iteration in range(workers * spread):
+        worker = iteration // spread
         pixels = depth.shape[0]
-        runs = (pixels + workers * together - 1) // (workers * together)
-        for turn in range(runs * together):
+        turns = (pixels + workers * together - 1) // (workers * together) * together
+        if iteration % spread != 0:
+            turns = 0
+        for turn in range(turns):
             pixel = (turn // together * workers + worker) * together + turn % together
             measured = 0.0
             if pixel < pixels:

@@ -25,10 +25,12 @@ TRACE_BYTES = 20
 
 @dataclass(frozen=True)
 class Workers:
-    """How rays are dealt out: how many at a time, and how many neighbours in a run to one worker."""
+    """How rays are dealt out: to how many workers, how many neighbouring rays in a run, how many loop
+    iterations a worker stands for, and the block size on a GPU."""
 
     number: int
     together: int
+    spread: int
     block: int
 
 
@@ -36,10 +38,11 @@ def workers_for(arch: str, software: bool, longest: int) -> Workers:
     """On a CPU a worker is a strip of the image whose trace stays in the cache; on a GPU it is a thread,
     neighbours take neighbouring rays, and the trace is bounded to half a GB."""
     if arch == "cpu":
-        return Workers(64, 64, 1)
+        # Taichi gives a CPU thread no fewer than 512 iterations of a loop at a time.
+        return Workers(64, 64, 512, 0)
     most = (512 << 20) // (TRACE_BYTES * longest)
     # Mesa's software Vulkan loses iterations of long loops in larger blocks.
-    return Workers(max(256, min(65536, most)), 1, 8 if software else 128)
+    return Workers(max(256, min(65536, most)), 1, 1, 8 if software else 128)
 
 
 class Sweeper:
@@ -101,7 +104,7 @@ class Sweeper:
             self.voxel_size, self.sensor.max_depth, config.end_sigmas, config.outlier_floor,
             window.shape_vector, box_lower, box_upper, self.index.chunks, self.index.bricks,
             self.log_free, self.sums, scale, config.message_clamp,
-            self.trace_voxel, self.trace, footprint.longest, workers.number, workers.together,
+            self.trace_voxel, self.trace, footprint.longest, workers.number, workers.together, workers.spread,
             LIKELIHOODS[config.likelihood], config.segment_lengths, log_average, workers.block,
         )  # fmt: skip
         self.index.clear(window, visible.cells)

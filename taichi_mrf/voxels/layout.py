@@ -25,10 +25,9 @@ VOXELS = BRICK**3
 
 
 @ti.func
-def voxel_in_brick(cell: IVec3, brick: IVec3) -> I32:
-    """Number (0..511) of a voxel within its brick; both given on the same voxel and brick grids."""
-    local = cell - brick * BRICK
-    return (local[0] * BRICK + local[1]) * BRICK + local[2]
+def voxel_number(cell: IVec3) -> I32:
+    """Number (0..511) of a voxel in its brick, from its coordinates there (0..7)."""
+    return (cell[0] * BRICK + cell[1]) * BRICK + cell[2]
 
 
 @ti.func
@@ -38,7 +37,7 @@ def flat(cell: IVec3, shape: IVec3) -> I32:
 
 
 def offsets_in_brick() -> NDArray[np.int32]:
-    """(512, 3): the voxel of each number within a brick, the inverse of :func:`voxel_in_brick`."""
+    """(512, 3): the voxel of each number within a brick, the inverse of :func:`voxel_number`."""
     return np.stack(np.unravel_index(np.arange(VOXELS), (BRICK,) * 3), axis=1).astype(np.int32)
 
 

@@ -11,7 +11,7 @@ origin + t * direction; what t means (axial depth or range) is up to whoever mad
 
 import taichi as ti
 
-from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS, flat, voxel_in_brick
+from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS, flat, voxel_number
 from taichi_mrf.voxels.types import F32, I32, IVec3, Struct, Template, Vec3
 
 FAR = 1e30
@@ -50,19 +50,18 @@ def make_ray(origin: Vec3, direction: Vec3) -> Ray:
 
 
 @ti.func
-def enter(ray: Ray, t: F32, size: Template, lowest: IVec3, highest: IVec3) -> Walk:
-    """Start on a level whose cells are ``size`` voxels wide, at t, inside the cells of the parent.
+def enter(ray: Ray, t: F32, size: Template, first: IVec3, count: IVec3) -> Walk:
+    """Start on a level whose cells are ``size`` voxels wide, at t, inside the parent's cells.
 
-    The cell is clamped into [lowest, highest]: a t that stands on the parent's face may round to either
-    side of it.
+    These are ``count`` cells from ``first`` on, and the walk's cell is counted from there. It is clamped
+    among them: a t that stands on the parent's face may round to either side of it.
     """
     walk = Walk(IVec3(0), Vec3(0.0))
     for axis in ti.static(range(3)):
-        position = ray.origin[axis] + t * ray.direction[axis]
-        cell = ti.floor(position * (1.0 / size), ti.i32)
-        cell = ti.max(lowest[axis], ti.min(highest[axis], cell))
+        position = (ray.origin[axis] + t * ray.direction[axis]) * (1.0 / size)
+        cell = ti.max(0, ti.min(count[axis] - 1, ti.floor(position, ti.i32) - first[axis]))
         walk.cell[axis] = cell
-        face = (cell + (1 if ray.step[axis] > 0 else 0)) * size
+        face = (first[axis] + cell + (1 if ray.step[axis] > 0 else 0)) * size
         walk.leave[axis] = (face - ray.origin[axis]) * ray.inverse[axis]
     return walk
 
@@ -88,16 +87,15 @@ def advance(ray: Ray, walk: Template, size: Template):
 
 
 @ti.func
-def within(cell: IVec3, lowest: IVec3, highest: IVec3) -> I32:
-    """Whether a cell lies in a box of cells, both ends included."""
-    return (
-        cell[0] >= lowest[0]
-        and cell[1] >= lowest[1]
-        and cell[2] >= lowest[2]
-        and cell[0] <= highest[0]
-        and cell[1] <= highest[1]
-        and cell[2] <= highest[2]
-    )
+def within(cell: IVec3, count: IVec3) -> I32:
+    """Whether a cell lies among ``count`` cells."""
+    return cell.min() >= 0 and (count - cell).min() > 0
+
+
+@ti.func
+def inside_eight(cell: IVec3) -> I32:
+    """Whether a cell lies among the 8^3 of its parent."""
+    return ((cell[0] | cell[1] | cell[2]) & -8) == 0
 
 
 @ti.func
@@ -128,23 +126,22 @@ def walk_bricks(
     exist in each chunk, and with ``skip_empty`` an empty chunk is one step. The interval must lie
     inside the window (:func:`clip`). The walk ends where ``visit`` returns 0.
     """
-    last_chunk = shape // CHUNK - 1
+    chunk_shape = shape // CHUNK
     t = t_begin
     go = 1
-    chunk = enter(ray, t, CHUNK_VOXELS, IVec3(0), last_chunk)
-    while go == 1 and t < t_end and within(chunk.cell, IVec3(0), last_chunk):
+    chunk = enter(ray, t, CHUNK_VOXELS, IVec3(0), chunk_shape)
+    while go == 1 and t < t_end and within(chunk.cell, chunk_shape):
         t_chunk = ti.min(leave_at(chunk), t_end)
         wanted = 1
         if ti.static(skip_empty):
-            wanted = chunks[flat(chunk.cell, last_chunk + 1)]
+            wanted = chunks[flat(chunk.cell, chunk_shape)]
         if wanted > 0:
             first = chunk.cell * CHUNK
-            last = first + (CHUNK - 1)
-            brick = enter(ray, t, BRICK, first, last)
-            while go == 1 and t < t_chunk and within(brick.cell, first, last):
+            brick = enter(ray, t, BRICK, first, IVec3(CHUNK))
+            while go == 1 and t < t_chunk and inside_eight(brick.cell):
                 t_brick = ti.min(leave_at(brick), t_chunk)
                 if t_brick > t:  # a ray through an edge touches cells for no length at all
-                    go = visit(state, context, ray, brick.cell, t, t_brick)
+                    go = visit(state, context, ray, first + brick.cell, t, t_brick)
                     t = t_brick
                 advance(ray, brick, BRICK)
         t = ti.max(t, t_chunk)
@@ -175,20 +172,16 @@ def walk_voxels(
 
 
 @ti.func
-def _cross_brick(
-    state: Template, context: Template, ray: Ray, brick: IVec3, t_enter: F32, t_leave: F32
-) -> I32:
+def _cross_brick(state: Template, context: Template, ray: Ray, brick: IVec3, t_enter: F32, t_leave: F32):
     go = 1
     slot = context[1][flat(brick, context[0])]
     if slot >= 0:
         t = t_enter
-        first = brick * BRICK
-        last = first + (BRICK - 1)
-        voxel = enter(ray, t, 1, first, last)
-        while go == 1 and t < t_leave and within(voxel.cell, first, last):
+        voxel = enter(ray, t, 1, brick * BRICK, IVec3(BRICK))
+        while go == 1 and t < t_leave and inside_eight(voxel.cell):
             t_voxel = ti.min(leave_at(voxel), t_leave)
             if t_voxel > t:
-                index = slot * VOXELS + voxel_in_brick(voxel.cell, brick)
+                index = slot * VOXELS + voxel_number(voxel.cell)
                 go = context[2](state, context[3], index, t, t_voxel)
                 t = t_voxel
             advance(ray, voxel, 1)
