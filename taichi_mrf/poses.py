@@ -48,6 +48,8 @@ def nearest_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
         raise KeyframeError(f"the rotation of a pose is not one: |R^T R - I| is {deviation:.3g}")
     if np.linalg.det(R) < 0:
         raise KeyframeError("the rotation of a pose is a reflection (its determinant is -1)")
+    if deviation < 1e-12:  # leave a rotation as it is, to the last bit: a pose may come back to be moved
+        return R
     U, _, Vt = np.linalg.svd(R)
     return U @ Vt
 

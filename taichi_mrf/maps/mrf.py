@@ -22,10 +22,12 @@ from taichi_mrf.config import Config, InferenceConfig, SensorConfig, VolumeConfi
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.footprint import find_footprint
-from taichi_mrf.inference.keyframe import DepthImage, Footprint, Keyframe
+from taichi_mrf.inference.keyframe import DepthImage, Keyframe
+from taichi_mrf.inference.messages import carry_over, new_messages
 from taichi_mrf.inference.schedule import InferReport, Progress, content_key, run_sweeps
 from taichi_mrf.inference.sweep import Sweeper
-from taichi_mrf.inference.visible import find_visible, new_messages
+from taichi_mrf.maps.brick_book import BrickBook
+from taichi_mrf.maps.storage import MapContents, StoredKeyframe, read_contents, write_contents
 from taichi_mrf.poses import as_pose
 from taichi_mrf.queries.extract import extract_voxels
 from taichi_mrf.queries.points import classify, point_log_odds, probability
@@ -81,14 +83,14 @@ class MRFMap:
         self.prior = prior_probability(inference, self.voxel_size)
         prior_log_odds = math.log(self.prior / (1 - self.prior))
         self._pool = BrickPool(prior_log_odds, self.config.volume.memory_limit_gb)
-        self._topology = create_topology(runtime.active() or "cpu", self.config.volume.dense_bricks)
-        weakref.finalize(self, recycle, self._topology)
+        topology = create_topology(runtime.active() or "cpu", self.config.volume.dense_bricks)
+        weakref.finalize(self, recycle, topology)
+        self._book = BrickBook(topology, self._pool, self.voxel_size)
         self._sweeper = Sweeper(self.voxel_size, self.sensor, inference, self.config.volume)
         self._view = View(self._pool, self.voxel_size, self.config.volume)
         self._keyframes: dict[int, Keyframe] = {}
         self._frozen: dict[int, str] = {}
         self._next_id = 0
-        self._version = 0  # of the set of bricks
         self._messages_lost = False  # a loaded map has beliefs, but no messages
 
     @classmethod
@@ -160,9 +162,10 @@ class MRFMap:
             raise KeyframeError(
                 f"keyframe {id} ({keyframe.name}) has no messages to freeze: call infer first"
             )
+        messages = self._refresh(keyframe)
         if len(keyframe.visible.slots):
-            self._refresh(keyframe)
-            sum_product.fold(keyframe.visible.slots, self._pool.keep_evidence(), keyframe.messages)
+            sum_product.fold(keyframe.visible.slots, self._pool.keep_evidence(), messages)
+        self._book.freeze(keyframe.footprint)
         self._frozen[id] = keyframe.name
         del self._keyframes[id]
 
@@ -239,20 +242,66 @@ class MRFMap:
 
     def save(self, path: str | Path) -> None:
         """Write the map to one .npz file, beside it first and then into place. Raises MapFileError."""
-        from taichi_mrf.maps.storage import save_map
-
-        save_map(self, Path(path))
+        slots = self._pool.in_use
+        live = np.zeros(self._pool.capacity, np.int32)
+        for keyframe in self._keyframes.values():
+            surface = keyframe.footprint.window.bricks_of(keyframe.footprint.surface)
+            live[self._book.topology.slots(surface)] += 1
+        keyframes = [
+            StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera)
+            for k in self._keyframes.values()
+        ]
+        write_contents(
+            Path(path),
+            MapContents(
+                self.config,
+                self.noise,
+                self._pool.bricks[slots],
+                self._pool.read("belief", slots),
+                None if self._pool.evidence is None else self._pool.read("evidence", slots),
+                self._pool.owners[slots] - live[slots],
+                self._book.frozen_crossed,
+                self._frozen,
+                keyframes,
+                self._next_id,
+            ),
+        )
 
     @classmethod
     def load(cls, path: str | Path) -> "MRFMap":
         """Read a map that can be queried at once and extended. Raises MapFileError."""
-        from taichi_mrf.maps.storage import load_map
-
-        return load_map(Path(path))
+        contents = read_contents(Path(path))
+        config = contents.config
+        m = cls(
+            config.voxel_size,
+            contents.noise,
+            inference=config.inference,
+            volume=config.volume,
+            min_depth=config.sensor.min_depth,
+            max_depth=config.sensor.max_depth,
+        )
+        if len(contents.bricks):
+            m._book.topology.anchor(contents.bricks[len(contents.bricks) // 2])
+            m._book.topology.check(contents.bricks, m.voxel_size)
+            slots = m._book.create(contents.bricks)
+            m._pool.owners[slots] = contents.frozen_owners
+        m._book.see_for_good(contents.frozen_crossed)
+        m._frozen = dict(contents.frozen)
+        for stored in contents.keyframes:
+            image = m._upload(stored.depth_m, stored.camera)
+            T_world_camera = as_pose(stored.T_world_camera)
+            m._keyframes[stored.id] = m._place(stored.id, stored.name, image, T_world_camera)
+        if len(contents.bricks):
+            m._pool.write("belief", slots, contents.belief)
+            if contents.evidence is not None:
+                m._pool.write("evidence", slots, contents.evidence)
+        m._next_id = contents.next_id
+        m._messages_lost = bool(m._keyframes)
+        return m
 
     def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
         seen_free = self._pool.prior_log_odds - self.config.inference.message_clamp
-        return point_log_odds(points, self.voxel_size, self._topology, self._pool, seen_free)
+        return point_log_odds(points, self.voxel_size, self._book.topology, self._pool, seen_free)
 
     def _find(self, id: int) -> Keyframe:
         if id in self._frozen:
@@ -283,55 +332,33 @@ class MRFMap:
         return DepthImage(device_depth, camera, noise, table, int(valid.sum()))
 
     def _place(self, id: int, name: str, image: DepthImage, T_world_camera: NDArray[np.float64]) -> Keyframe:
-        """Find a keyframe's bricks, allocate those that are missing, and count its crossings."""
+        """Find out which bricks a keyframe needs and sees, and claim them."""
         footprint = find_footprint(
             image, T_world_camera, self.voxel_size, self.sensor, self.config.inference, self.config.volume
         )
-        crossed = footprint.window.bricks_of(footprint.crossed)
         camera_brick = np.floor(T_world_camera[:3, 3] / (self.voxel_size * BRICK))
-        self._topology.anchor(np.clip(camera_brick, -(2**30), 2**30).astype(np.int32))
-        self._topology.check(crossed, self.voxel_size)
-        surface = footprint.window.bricks_of(footprint.surface)
-        slots = self._topology.slots(surface)
-        missing = slots < 0
-        if missing.any():
-            slots[missing] = self._pool.allocate(surface[missing])
-            self._topology.insert(surface[missing], slots[missing])
-            self._version += 1
-        self._pool.owners[slots] += 1
-        self._topology.add_crossings(crossed, 1)
-        visible = find_visible(footprint, self._topology, self._pool, self._version)
-        return Keyframe(id, name, image, T_world_camera, footprint, visible)
+        self._book.topology.anchor(np.clip(camera_brick, -(2**30), 2**30).astype(np.int32))
+        self._book.claim(footprint)
+        return Keyframe(id, name, image, T_world_camera, footprint, self._book.visible(footprint))
 
     def _take_out(self, keyframe: Keyframe) -> None:
         """Undo :meth:`_place`, and withdraw the keyframe's messages."""
         if keyframe.messages is not None:
-            self._refresh(keyframe)
+            messages = self._refresh(keyframe)
             if len(keyframe.visible.slots):
-                sum_product.withdraw(keyframe.visible.slots, self._pool.belief, keyframe.messages)
-        footprint = keyframe.footprint
-        self._topology.add_crossings(footprint.window.bricks_of(footprint.crossed), -1)
-        self._disown(footprint)
+                sum_product.withdraw(keyframe.visible.slots, self._pool.belief, messages)
+        self._book.disclaim(keyframe.footprint)
 
-    def _disown(self, footprint: Footprint) -> None:
-        surface = footprint.window.bricks_of(footprint.surface)
-        slots = self._topology.slots(surface)
-        self._pool.owners[slots] -= 1
-        orphans = self._pool.owners[slots] == 0
-        if orphans.any():
-            self._topology.erase(surface[orphans])
-            self._pool.release(slots[orphans])
-            self._version += 1
-
-    def _refresh(self, keyframe: Keyframe) -> None:
-        """Bring a keyframe's list of bricks up to date; bricks that it did not know get no message yet."""
-        current = keyframe.visible
-        if current.version != self._version:
-            current = find_visible(keyframe.footprint, self._topology, self._pool, self._version)
-        if keyframe.messages is None or current is not keyframe.visible:
-            precision = self.config.inference.message_precision
-            keyframe.messages = new_messages(current, precision, keyframe.visible, keyframe.messages)
-            keyframe.visible = current
+    def _refresh(self, keyframe: Keyframe) -> "ti.Ndarray":
+        """Bring a keyframe's bricks and messages up to date; bricks new to it get no message yet."""
+        old, old_messages = keyframe.visible, keyframe.messages
+        if old.version != self._book.version:
+            keyframe.visible = self._book.visible(keyframe.footprint)
+        if old_messages is None or keyframe.visible is not old:
+            keyframe.messages = new_messages(keyframe.visible, self.config.inference.message_precision)
+            if old_messages is not None:
+                carry_over(old, old_messages, keyframe.visible, keyframe.messages)
+        return keyframe.messages
 
     def _restore_messages(self) -> None:
         """A loaded map has no messages, because they are large and follow from the images."""

@@ -5,7 +5,7 @@ import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.voxels.layout import BRICK
+from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology
 from taichi_mrf.voxels.types import F32Array, I32Array
@@ -33,10 +33,13 @@ def point_log_odds(
     voxels = np.clip(np.floor(points_m / voxel_size), -(2**30), 2**30).astype(np.int32)
     bricks = np.ascontiguousarray(voxels // BRICK, np.int32)
     slots = topology.slots(bricks)
-    log_odds = np.where(topology.crossings(bricks) > 0, seen_free, pool.prior_log_odds).astype(np.float32)
+    without_brick = np.where(topology.crossings(bricks) > 0, seen_free, pool.prior_log_odds).astype(
+        np.float32
+    )
+    log_odds = np.zeros(len(points_m), np.float32)
     local = voxels - bricks * BRICK
     numbers = ((local[:, 0] * BRICK + local[:, 1]) * BRICK + local[:, 2]).astype(np.int32)
-    _gather(pool.belief, slots, numbers, log_odds)
+    _gather(pool.belief, slots, numbers, without_brick, log_odds)
     return log_odds
 
 
@@ -57,7 +60,11 @@ def probability(log_odds: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 @ti.kernel
-def _gather(belief: F32Array, slots: I32Array, numbers: I32Array, out: F32Array):
+def _gather(
+    belief: F32Array, slots: I32Array, numbers: I32Array, without_brick: F32Array, log_odds: F32Array
+):
     for i in range(slots.shape[0]):
+        here = without_brick[i]
         if slots[i] >= 0:
-            out[i] = belief[slots[i] * (BRICK * BRICK * BRICK) + numbers[i]]
+            here = belief[slots[i] * VOXELS + numbers[i]]
+        log_odds[i] = here

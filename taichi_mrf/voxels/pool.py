@@ -92,6 +92,19 @@ class BrickPool:
             self.evidence.fill(self.prior_log_odds)
         return self.evidence
 
+    def read(self, channel: str, slots: NDArray[np.int32]) -> NDArray[np.float32]:
+        """The voxels of some bricks, (n, 512), from the channel "belief" or "evidence"."""
+        out = np.zeros(len(slots) * VOXELS, np.float32)
+        if len(slots):
+            _read_bricks(getattr(self, channel), slots, out)
+        return out.reshape(-1, VOXELS)
+
+    def write(self, channel: str, slots: NDArray[np.int32], values: NDArray[np.float32]) -> None:
+        """Set the voxels of some bricks, (n, 512)."""
+        if channel == "evidence":
+            self.keep_evidence()
+        _write_bricks(getattr(self, channel), slots, np.ascontiguousarray(values, np.float32).reshape(-1))
+
     def _grow(self, bricks_needed: int) -> None:
         capacity = max(bricks_needed, int(self.capacity * GROWTH), 256)
         if bricks_needed > MOST_BRICKS:
@@ -133,3 +146,15 @@ def _copy(source: F32Array, target: F32Array, n: I32):
 def _fill_bricks(channel: F32Array, slots: I32Array, value: F32):
     for i in range(slots.shape[0] * VOXELS):
         channel[slots[i // VOXELS] * VOXELS + i % VOXELS] = value
+
+
+@ti.kernel
+def _read_bricks(channel: F32Array, slots: I32Array, out: F32Array):
+    for i in range(slots.shape[0] * VOXELS):
+        out[i] = channel[slots[i // VOXELS] * VOXELS + i % VOXELS]
+
+
+@ti.kernel
+def _write_bricks(channel: F32Array, slots: I32Array, values: F32Array):
+    for i in range(slots.shape[0] * VOXELS):
+        channel[slots[i // VOXELS] * VOXELS + i % VOXELS] = values[i]

@@ -226,5 +226,7 @@ def _dense_write(index: I32Array, bricks: AnyArray, values: I32Array, side: I32,
 def _dense_read(index: I32Array, bricks: AnyArray, out: I32Array, side: I32):
     for i in range(out.shape[0]):
         cell = IVec3(bricks[i, 0], bricks[i, 1], bricks[i, 2])
+        found = 0
         if cell.min() >= 0 and cell.max() < side:
-            out[i] = index[flat(cell, IVec3(side))]
+            found = index[flat(cell, IVec3(side))]
+        out[i] = found  # always: on Vulkan what a kernel does not write comes back undefined
