@@ -1,0 +1,175 @@
+"""Text files of poses, in the layouts that depth-camera recordings use.
+
+- ``stamped``: ``stamp tx ty tz qx qy qz qw`` a line (TUM RGB-D, the freiburg files of ICL-NUIM)
+- ``rows``: the 3 x 4 or 4 x 4 matrix, row by row, in one line for each frame
+- ``log``: Choi's format (Redwood): a line of three integers, the first being the frame's number, then
+  the four rows of the 4 x 4 matrix
+
+Lines that are empty or start with ``#`` are left out. A file whose layout is broken is an error at
+once; a pose whose values make no rigid transform is one when that pose is asked for, so that a recording
+with one bad pose can still be used.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.errors import DatasetError, KeyframeError
+from taichi_mrf.poses import Pose, as_pose
+
+Layout = Literal["stamped", "rows", "log"]
+Line = tuple[int, list[float]]
+"""A line's number in its file (from 1) and its numbers."""
+
+
+@dataclass(frozen=True)
+class RecordedPose:
+    """One pose as it was written.
+
+    ``key`` is its stamp in seconds, or the frame's number where the layout counts frames. ``values``
+    are tx ty tz qx qy qz qw, (7,), or a matrix, (3, 4) or (4, 4). ``source`` is the file and the line.
+    """
+
+    key: float
+    values: NDArray[np.float64]
+    source: str
+
+    def T_world_camera(self) -> Pose:
+        """The pose, (4, 4), its rotation projected. Raises KeyframeError if it is no rigid transform."""
+        return as_pose(_from_quaternion(self.values) if self.values.shape == (7,) else self.values)
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """The poses of a file in its order."""
+
+    path: Path
+    layout: Layout
+    poses: tuple[RecordedPose, ...]
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Read a file of poses, recognising its layout by the first line.
+
+    Raises DatasetError, whose text names the file and the line, if it cannot be read, holds no pose,
+    or a line has too few or too many numbers or something that is not a number.
+    """
+    lines = _read_numbers(path)
+    if not lines:
+        raise DatasetError(f"{path}: holds no pose")
+    columns = len(lines[0][1])
+    if columns == 8:
+        return Trajectory(path, "stamped", tuple(_stamped(path, line) for line in lines))
+    if columns in (12, 16):
+        return Trajectory(path, "rows", tuple(_row(path, i, line) for i, line in enumerate(lines)))
+    if columns == 3:
+        blocks = (lines[i : i + 5] for i in range(0, len(lines), 5))
+        return Trajectory(path, "log", tuple(_log_block(path, block) for block in blocks))
+    raise DatasetError(
+        f"{path} line {lines[0][0]}: {columns} numbers; expected 8 (stamp, position, quaternion), "
+        "12 or 16 (a matrix), or 3 (the head of a .log block)"
+    )
+
+
+def is_trajectory(path: Path) -> bool:
+    """Whether the first lines of a text file look like one of the layouts."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            head = [_numbers(line) for line in file.readlines(4096) if _content(line)][:5]
+    except (OSError, ValueError):
+        return False
+    columns = [len(numbers) for numbers in head]
+    return columns == [3, 4, 4, 4, 4] or (bool(columns) and columns[0] in (8, 12, 16))
+
+
+def read_matrix_file(path: Path) -> Pose:
+    """The pose in a file of its own, as a 3 x 4 or 4 x 4 matrix.
+
+    Raises DatasetError if the file is missing or holds no such matrix, KeyframeError if that is no
+    rigid transform.
+    """
+    if not path.is_file():
+        raise DatasetError(f"{path}: the pose is missing")
+    numbers = [number for _, row in _read_numbers(path) for number in row]
+    if len(numbers) not in (12, 16):
+        raise DatasetError(f"{path}: holds {len(numbers)} numbers; a pose is a 4 x 4 matrix")
+    return as_pose(np.reshape(numbers, (-1, 4)))
+
+
+def _from_quaternion(values: NDArray[np.float64]) -> Pose:
+    """tx ty tz qx qy qz qw to a (4, 4) matrix; the quaternion is normalised."""
+    if not np.isfinite(values).all():
+        raise KeyframeError("a pose holds a value that is not finite (NaN or infinity)")
+    norm = np.linalg.norm(values[3:])
+    if norm < 1e-6:
+        raise KeyframeError("the quaternion of a pose is zero")
+    x, y, z, w = values[3:] / norm
+    T = np.eye(4)
+    T[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    T[:3, 3] = values[:3]
+    return T
+
+
+def _stamped(path: Path, line: Line) -> RecordedPose:
+    number, values = line
+    _expect(path, line, 8)
+    if not np.isfinite(values[0]):
+        raise DatasetError(f"{path} line {number}: the stamp is not finite")
+    return RecordedPose(values[0], np.array(values[1:]), f"{path} line {number}")
+
+
+def _row(path: Path, index: int, line: Line) -> RecordedPose:
+    number, values = line
+    if len(values) not in (12, 16):
+        _expect(path, line, 12)
+    return RecordedPose(index, np.reshape(values, (-1, 4)), f"{path} line {number}")
+
+
+def _log_block(path: Path, block: list[Line]) -> RecordedPose:
+    number, head = block[0]
+    _expect(path, block[0], 3)
+    if not head[0].is_integer():
+        raise DatasetError(f"{path} line {number}: a .log block starts with integers, not {head[0]}")
+    for line in block[1:]:
+        _expect(path, line, 4)
+    if len(block) < 5:
+        raise DatasetError(f"{path} line {number}: the file ends inside this pose")
+    return RecordedPose(head[0], np.array([values for _, values in block[1:]]), f"{path} line {number}")
+
+
+def _expect(path: Path, line: Line, count: int) -> None:
+    number, values = line
+    if len(values) != count:
+        raise DatasetError(f"{path} line {number}: {len(values)} numbers, expected {count}")
+
+
+def _read_numbers(path: Path) -> list[Line]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError:
+        raise DatasetError(f"{path}: not a text file") from None
+    lines = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        if _content(line):
+            try:
+                lines.append((number, _numbers(line)))
+            except ValueError:
+                raise DatasetError(f"{path} line {number}: holds something that is not a number") from None
+    return lines
+
+
+def _content(line: str) -> bool:
+    return bool(line.strip()) and not line.lstrip().startswith("#")
+
+
+def _numbers(line: str) -> list[float]:
+    return [float(word) for word in line.replace(",", " ").split()]

@@ -1,0 +1,302 @@
+"""What is wrong with a source or a frame is said in one line that names it; other frames stay readable."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from datasets_recordings import (
+    Content,
+    stamped_line,
+    write_image,
+    write_log,
+    write_numbered,
+    write_rows,
+    write_seven_scenes,
+    write_tum,
+)
+
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.errors import DatasetError, FrameError
+
+
+def refused(source: str | Path, **options: object) -> str:
+    """The text of the error on opening, which has to be one line and no FrameError."""
+    with pytest.raises(DatasetError) as caught:
+        open_dataset(source, **options)  # type: ignore[arg-type]
+    assert not isinstance(caught.value, FrameError)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A good 7-Scenes recording of five frames."""
+    return write_seven_scenes(tmp_path / "office", Content())
+
+
+def test_no_such_folder(tmp_path: Path) -> None:
+    text = refused(tmp_path / "nowhere")
+    assert str(tmp_path / "nowhere") in text
+    assert "synthetic:room" in text
+
+
+def test_an_empty_folder_says_what_was_looked_for(tmp_path: Path) -> None:
+    text = refused(tmp_path)
+    assert str(tmp_path) in text
+    assert "is empty" in text
+    for wanted in ("frame-NNNNNN.depth.png", "groundtruth.txt", ".log"):
+        assert wanted in text
+
+
+def test_a_folder_of_something_else(tmp_path: Path) -> None:
+    (tmp_path / "holiday.jpg").write_bytes(b"")
+    text = refused(tmp_path)
+    assert str(tmp_path) in text
+    assert "frame-NNNNNN.depth.png" in text
+
+
+def test_a_file_in_place_of_a_folder(folder: Path) -> None:
+    text = refused(folder / "camera.txt")
+    assert str(folder / "camera.txt") in text
+    assert "is a file" in text
+
+
+def test_a_folder_of_recordings_names_them(folder: Path) -> None:
+    assert "office" in refused(folder.parent).split("name one: ")[1]
+
+
+def test_a_built_in_that_does_not_exist() -> None:
+    assert "did you mean 'synthetic:room'" in refused("synthetic:rooms")
+    assert "built in are: synthetic:room" in refused("nonsense:whatever")
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_scale_that_is_none(folder: Path, scale: float) -> None:
+    assert "depth_scale" in refused(folder, depth_scale=scale)
+
+
+def test_a_time_gap_that_is_none(folder: Path) -> None:
+    assert "max_time_gap" in refused(folder, max_time_gap=-0.1)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "problem"),
+    [
+        ("camera.txt", "640 480 525", "holds 3 numbers"),
+        ("camera.txt", "640 480 fx fy 1 1", "not a number"),
+        ("camera.txt", "16 12 -14 15 7.5 5.5", "both must be positive"),
+        ("camera.txt", "16 12 nan 15 7.5 5.5", "fx is not finite"),
+        ("camera.txt", "16.5 12 14 15 7.5 5.5", "not in whole pixels"),
+        ("camera.txt", "nan 12 14 15 7.5 5.5", "not in whole pixels"),
+        ("camera.txt", "inf 12 14 15 7.5 5.5", "not in whole pixels"),
+        ("camera.yaml", "{width: 16, height: 12, fx: 14, fy: 15, cx: 7.5}", "cy is missing"),
+        ("camera.yaml", "{width: 16, height: 12, fx: 1, fy: 1, cx: 1, cy: 1, k: 2}", "unknown parameter 'k'"),
+        ("camera.yaml", "{width: wide, height: 12, fx: 1, fy: 1, cx: 1, cy: 1}", "width must be of type int"),
+        ("camera.yaml", "[1, 2", "not valid YAML"),
+        ("camera.yaml", "17", "expected a mapping"),
+        ("intrinsics.txt", "14 0.3 7.5\n0 15 5.5\n0 0 1", "without skew"),
+    ],
+)
+def test_a_camera_file_that_makes_no_sense(folder: Path, file: str, text: str, problem: str) -> None:
+    (folder / "camera.txt").unlink()
+    (folder / file).write_text(text)
+    error = refused(folder)
+    assert error.startswith(str(folder / file))
+    assert problem in error
+    assert error.count(file) == 1
+
+
+def test_tum_without_poses(tmp_path: Path) -> None:
+    write_tum(tmp_path, Content())
+    (tmp_path / "groundtruth.txt").unlink()
+    assert str(tmp_path / "groundtruth.txt") in refused(tmp_path)
+
+
+def test_tum_with_poses_of_another_day(tmp_path: Path) -> None:
+    write_tum(tmp_path, Content())
+    pose = stamped_line(17.0, np.eye(4))
+    (tmp_path / "groundtruth.txt").write_text(pose)
+    text = refused(tmp_path)
+    assert "none of 5 depth images" in text
+    assert "within 0.02 s" in text
+    assert "17.000" in text
+
+
+@pytest.mark.parametrize(
+    ("name", "lines", "problem"),
+    [
+        ("depth.txt", "# nothing", "lists no image"),
+        ("depth.txt", "1.0 depth/1.png\nyesterday depth/2.png", "line 2"),
+        ("depth.txt", "1.0 depth/1.png\n2.0", "line 2"),
+        ("depth.txt", "nan depth/1.png", "line 1"),
+        ("groundtruth.txt", "1 2 3", "line 1"),
+        ("groundtruth.txt", " ".join("1" * 12), "expected lines of stamp"),
+    ],
+)
+def test_tum_lists_that_are_broken(tmp_path: Path, name: str, lines: str, problem: str) -> None:
+    write_tum(tmp_path, Content())
+    (tmp_path / name).write_text(lines)
+    text = refused(tmp_path)
+    assert str(tmp_path / name) in text
+    assert problem in text
+
+
+def test_numbered_images_without_a_trajectory_or_with_two(tmp_path: Path) -> None:
+    content = Content()
+    write_numbered(tmp_path, content)
+    assert "without a trajectory" in refused(tmp_path)
+    write_rows(tmp_path / "a.txt", content.poses)
+    write_log(tmp_path / "b.log", content.poses)
+    assert "a.txt, b.log: keep one" in refused(tmp_path)
+
+
+def test_numbered_images_that_no_stamp_names(tmp_path: Path) -> None:
+    write_numbered(tmp_path, Content())
+    (tmp_path / "traj.txt").write_text(stamped_line(1305031102.5, np.eye(4)))
+    assert f"{tmp_path / 'traj.txt'}: has a pose for none of the 5 images" in refused(tmp_path)
+
+
+# Frame 3 of a 7-Scenes recording is damaged in turn; the error has to name it and the file.
+
+
+def replace_depth(image: np.ndarray) -> Callable[[Path], Path]:
+    return lambda folder: write_image(folder / "frame-000030.depth.png", image)
+
+
+def edit_depth(edit: Callable[[bytes], bytes]) -> Callable[[Path], Path]:
+    def apply(folder: Path) -> Path:
+        path = folder / "frame-000030.depth.png"
+        path.write_bytes(edit(path.read_bytes()))
+        return path
+
+    return apply
+
+
+def write_pose(text: str) -> Callable[[Path], Path]:
+    def apply(folder: Path) -> Path:
+        path = folder / "frame-000030.pose.txt"
+        path.write_text(text)
+        return path
+
+    return apply
+
+
+def remove(name: str) -> Callable[[Path], Path]:
+    def apply(folder: Path) -> Path:
+        (folder / name).unlink()
+        return folder / name
+
+    return apply
+
+
+def flip_byte(data: bytes) -> bytes:
+    middle = len(data) // 2
+    return data[:middle] + bytes([data[middle] ^ 0xFF]) + data[middle + 1 :]
+
+
+IDENTITY = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1"
+
+DAMAGES: dict[str, tuple[Callable[[Path], Path], str]] = {
+    "no image": (edit_depth(lambda _: b"this is no image"), "not a readable image"),
+    "empty file": (edit_depth(lambda _: b""), "the file is empty"),
+    "cut in the head": (edit_depth(lambda data: data[:20]), "cut short"),
+    "cut in the middle": (edit_depth(lambda data: data[: len(data) // 2]), "cut short"),
+    "cut at the end": (edit_depth(lambda data: data[:-3]), "cut short"),
+    "flipped bits": (edit_depth(flip_byte), "damaged"),
+    "8 bits": (replace_depth(np.zeros((12, 16), np.uint8)), "found 8-bit with 1 channel"),
+    "colour": (replace_depth(np.zeros((12, 16, 3), np.uint8)), "found 8-bit with 3 channels"),
+    "16-bit colour": (replace_depth(np.zeros((12, 16, 3), np.uint16)), "found 16-bit with 3 channels"),
+    "wrong size": (replace_depth(np.zeros((24, 32), np.uint16)), "32 x 24 pixels, the camera 16 x 12"),
+    "turned": (replace_depth(np.zeros((16, 12), np.uint16)), "12 x 16 pixels, the camera 16 x 12"),
+    "no depth": (remove("frame-000030.depth.png"), "the image is missing"),
+    "no pose": (remove("frame-000030.pose.txt"), "the pose is missing"),
+    "NaN": (write_pose(IDENTITY.replace("0 1 0 0", "0 nan 0 0")), "not finite"),
+    "infinite": (write_pose(IDENTITY.replace("0 0 1 0", "0 0 1 -inf")), "not finite"),
+    "scaled": (write_pose(IDENTITY.replace("0 1 0 0", "0 1.2 0 0")), "rotation of a pose is not one"),
+    "mirrored": (write_pose(IDENTITY.replace("0 1 0 0", "0 -1 0 0")), "reflection"),
+    "projective": (write_pose(IDENTITY.replace("0 0 0 1", "0 0 1 1")), "last row"),
+    "too short": (write_pose("1 0 0 0\n0 1 0 0"), "8 numbers"),
+    "no numbers": (write_pose("one 0 0 0"), "line 1"),
+    "broken colour": (
+        lambda f: write_image(f / "frame-000030.color.png", np.zeros((6, 8, 3), np.uint8)),
+        "8 x 6",
+    ),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_bad_frame_is_named_and_the_next_can_be_read(folder: Path, damage: str) -> None:
+    apply, problem = DAMAGES[damage]
+    path = apply(folder)
+    dataset = open_dataset(folder)
+    assert len(dataset) == 5
+    with pytest.raises(FrameError) as caught:
+        dataset.read(3)
+    text = str(caught.value)
+    assert text.startswith("frame frame-000030: ")
+    assert str(path) in text
+    assert problem in text
+    assert "\n" not in text
+    for index in (0, 1, 2, 4):
+        dataset.read(index)
+    frames = iter(dataset)
+    assert [next(frames).name for _ in range(3)] == ["frame-000000", "frame-000010", "frame-000020"]
+    with pytest.raises(FrameError):
+        next(frames)
+
+
+def test_a_bad_image_says_nothing_on_stderr(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """libpng and OpenCV would print their own complaints past Python."""
+    for damage in ("cut in the middle", "flipped bits", "no image", "empty file"):
+        write_seven_scenes(folder, Content())
+        DAMAGES[damage][0](folder)
+        with pytest.raises(FrameError):
+            open_dataset(folder).read(3)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_damaged_first_image_does_not_decide_the_size(folder: Path) -> None:
+    (folder / "camera.txt").unlink()
+    (folder / "camera-intrinsics.txt").write_text("14 0 7.5\n0 15 5.5\n0 0 1")
+    (folder / "frame-000000.depth.png").write_bytes(b"")
+    dataset = open_dataset(folder)
+    assert dataset.camera.shape == (12, 16)
+    with pytest.raises(FrameError, match="frame-000000"):
+        dataset.read(0)
+
+
+def test_a_nearly_orthonormal_rotation_is_projected(folder: Path) -> None:
+    write_pose(IDENTITY.replace("0 1 0 0", "0 1.0004 0 0"))(folder)
+    R = open_dataset(folder).read(3).T_world_camera[:3, :3]
+    np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)
+
+
+def test_a_bad_pose_of_a_trajectory_names_its_line(tmp_path: Path) -> None:
+    content = Content()
+    write_tum(tmp_path, content)
+    lines = (tmp_path / "groundtruth.txt").read_text().splitlines()
+    words = lines[3].split()
+    lines[3] = " ".join([words[0], "nan", *words[2:]])
+    (tmp_path / "groundtruth.txt").write_text("\n".join(lines))
+    dataset = open_dataset(tmp_path)
+    with pytest.raises(FrameError) as caught:
+        dataset.read(2)
+    assert f"{tmp_path / 'groundtruth.txt'} line 4: " in str(caught.value)
+    assert str(caught.value).startswith(f"frame {dataset.frame_names[2]}: ")
+    dataset.read(3)
+
+
+@pytest.mark.parametrize("first", [0, 180])
+def test_a_trajectory_that_ends_early(tmp_path: Path, first: int) -> None:
+    content = Content()
+    write_numbered(tmp_path, content, first=first)
+    write_rows(tmp_path / "T_world_camera.txt", content.poses[:3])
+    dataset = open_dataset(tmp_path)
+    assert len(dataset) == 5
+    for i in range(3):
+        np.testing.assert_allclose(dataset.read(i).T_world_camera, content.poses[i], atol=1e-9)
+    with pytest.raises(FrameError) as caught:
+        dataset.read(4)
+    assert f"frame {first + 4:05d}: {tmp_path / 'T_world_camera.txt'}: " in str(caught.value)
+    assert "has no pose for this image" in str(caught.value)

@@ -1,0 +1,153 @@
+"""The text formats of poses: every layout comes back as written, and every defect names its line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from taichi_mrf.datasets.trajectories import is_trajectory, read_matrix_file, read_trajectory
+from taichi_mrf.errors import DatasetError, KeyframeError
+
+
+def rotate(q: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A unit quaternion x y z w applied to a vector, by v + 2 w (u x v) + 2 u x (u x v)."""
+    u, w = q[:3], q[3]
+    return v + 2 * w * np.cross(u, v) + 2 * np.cross(u, np.cross(u, v))
+
+
+def random_poses(count: int) -> NDArray[np.float64]:
+    random = np.random.default_rng(count)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    for pose in poses:
+        Q, _ = np.linalg.qr(random.normal(size=(3, 3)))
+        pose[:3, :3] = Q * np.sign(np.linalg.det(Q))
+        pose[:3, 3] = random.normal(size=3)
+    return poses
+
+
+def write(path: Path, *lines: str) -> Path:
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def words(numbers: NDArray[np.float64]) -> str:
+    return " ".join(map(repr, np.ravel(numbers).tolist()))
+
+
+@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4), st.floats(0.01, 100))
+def test_quaternions_are_normalised_and_rotate_as_such(
+    tmp_path_factory: pytest.TempPathFactory, entries: list[float], scale: float
+) -> None:
+    q = np.array(entries)
+    norm = np.linalg.norm(q)
+    assume(norm > 1e-3)
+    path = tmp_path_factory.mktemp("q") / "groundtruth.txt"
+    write(path, "# comment", "", f"12.5 1 2 3 {words(scale * q)}")
+    (pose,) = read_trajectory(path).poses
+    T = pose.T_world_camera()
+    assert pose.key == 12.5
+    np.testing.assert_allclose(T[:3, 3], [1, 2, 3])
+    for v in np.eye(3):
+        np.testing.assert_allclose(T[:3, :3] @ v, rotate(q / norm, v), atol=1e-9)
+
+
+@pytest.mark.parametrize("rows", [3, 4])
+def test_rows_of_matrices(tmp_path: Path, rows: int) -> None:
+    poses = random_poses(5)
+    path = write(tmp_path / "T.txt", *(words(pose[:rows]) for pose in poses))
+    trajectory = read_trajectory(path)
+    assert trajectory.layout == "rows"
+    assert [pose.key for pose in trajectory.poses] == [0, 1, 2, 3, 4]
+    np.testing.assert_allclose([pose.T_world_camera() for pose in trajectory.poses], poses, atol=1e-12)
+
+
+def test_log_blocks(tmp_path: Path) -> None:
+    poses = random_poses(4)
+    lines = []
+    for i, pose in enumerate(poses):
+        lines += [f"{i} {i} {i + 1}", *(words(row) for row in pose)]
+    trajectory = read_trajectory(write(tmp_path / "livingroom.log", *lines))
+    assert trajectory.layout == "log"
+    assert [pose.key for pose in trajectory.poses] == [0, 1, 2, 3]
+    np.testing.assert_allclose([pose.T_world_camera() for pose in trajectory.poses], poses, atol=1e-12)
+    assert trajectory.poses[2].source.endswith("livingroom.log line 11")
+
+
+def test_one_matrix_in_a_file_of_its_own(tmp_path: Path) -> None:
+    (pose,) = random_poses(1)
+    path = write(tmp_path / "frame.pose.txt", *(words(row) for row in pose))
+    np.testing.assert_allclose(read_matrix_file(path), pose, atol=1e-12)
+
+
+GOOD = "0 1 2 3 0 0 0 1"
+
+
+@pytest.mark.parametrize(
+    ("lines", "problem"),
+    [
+        ([GOOD, "1 1 2 3 0 0 1"], "line 2: 7 numbers, expected 8"),
+        (["# head", GOOD, "1 1 2 three 0 0 0 1"], "line 3: holds something that is not a number"),
+        ([GOOD, "nan 1 2 3 0 0 0 1"], "line 2: the stamp is not finite"),
+        (["1 2 3 4 5"], "line 1: 5 numbers"),
+        (["# nothing else"], "holds no pose"),
+        (["0 0 1", "1 0 0 0", "0 1 0 0"], "line 1: the file ends inside this pose"),
+        (["0 0 1", "1 0 0 0", "0 1 0"], "line 3: 3 numbers, expected 4"),
+        (
+            ["0.5 0 1", "1 0 0 0", "0 1 0 0", "0 0 1 0", "0 0 0 1"],
+            "line 1: a .log block starts with integers",
+        ),
+        ([" ".join("1" * 12), " ".join("1" * 11)], "line 2: 11 numbers, expected 12"),
+    ],
+)
+def test_a_broken_layout_names_file_and_line(tmp_path: Path, lines: list[str], problem: str) -> None:
+    path = write(tmp_path / "poses.txt", *lines)
+    with pytest.raises(DatasetError) as caught:
+        read_trajectory(path)
+    assert str(path) in str(caught.value)
+    assert problem in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("line", "problem"),
+    [
+        ("1 1 2 3 0 0 0 0", "quaternion of a pose is zero"),
+        ("1 1 2 nan 0 0 0 1", "not finite"),
+        ("1 1 2 3 0 0 nan 1", "not finite"),
+        ("1 1 2 3 0 inf 0 1", "not finite"),
+    ],
+)
+def test_a_bad_pose_fails_alone_and_knows_its_line(tmp_path: Path, line: str, problem: str) -> None:
+    first, second, third = read_trajectory(write(tmp_path / "poses.txt", GOOD, line, GOOD)).poses
+    with pytest.raises(KeyframeError, match=problem):
+        second.T_world_camera()
+    assert second.source == f"{tmp_path / 'poses.txt'} line 2"
+    for good in (first, third):
+        np.testing.assert_array_equal(good.T_world_camera()[:3, 3], [1, 2, 3])
+
+
+def test_a_file_that_is_no_text_or_not_there(tmp_path: Path) -> None:
+    binary = tmp_path / "poses.txt"
+    binary.write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(DatasetError, match=r"poses\.txt: not a text file"):
+        read_trajectory(binary)
+    with pytest.raises(DatasetError, match=r"none\.txt: cannot be read"):
+        read_trajectory(tmp_path / "none.txt")
+    with pytest.raises(DatasetError, match=r"none\.txt: the pose is missing"):
+        read_matrix_file(tmp_path / "none.txt")
+    with pytest.raises(DatasetError, match="holds 3 numbers"):
+        read_matrix_file(write(tmp_path / "short.txt", "1 2 3"))
+
+
+def test_what_counts_as_a_trajectory(tmp_path: Path) -> None:
+    log = ["0 0 1", *["1 0 0 0"] * 4]
+    assert is_trajectory(write(tmp_path / "a.txt", "# c", GOOD))
+    assert is_trajectory(write(tmp_path / "b.txt", *log))
+    assert is_trajectory(write(tmp_path / "c.txt", " ".join("1" * 12)))
+    assert not is_trajectory(write(tmp_path / "d.txt", "640 480 525 525 319.5 239.5"))
+    assert not is_trajectory(write(tmp_path / "e.txt", "585 0 320", "0 585 240", "0 0 1"))
+    assert not is_trajectory(write(tmp_path / "f.txt", "0 depth/0.png 0 rgb/0.png"))
+    assert not is_trajectory(write(tmp_path / "g.txt", ""))
