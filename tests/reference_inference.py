@@ -1,0 +1,197 @@
+"""The inference of taichi_mrf in float64 NumPy, ray by ray and voxel by voxel, to compare kernels with.
+
+Written for clarity and from the equations, not from the kernels: it shares no code with them but the
+definition of parameters.
+"""
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.config import InferenceConfig
+
+Voxel = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """A sensor with constant sigma and bias, in metres."""
+
+    sigma: float
+    bias: float = 0.0
+
+    def segment_density(
+        self, measured: float, near: float, far: float, voxel_size: float, mode: str
+    ) -> float:
+        """Eq. 4, averaged over a segment or at its centre."""
+        if mode == "segment" or (mode == "auto" and self.sigma < voxel_size):
+            a, b = ((measured - d - self.bias) / self.sigma for d in (far, near))
+            return (normal_cdf(b) - normal_cdf(a)) / (far - near)
+        return self.density(measured, 0.5 * (near + far))
+
+    def density(self, measured: float, depth: float) -> float:
+        """Density of a measurement of a surface at ``depth``."""
+        e = (measured - depth - self.bias) / self.sigma
+        return math.exp(-0.5 * e * e) / math.sqrt(2 * math.pi) / self.sigma
+
+
+def normal_cdf(x: float) -> float:
+    return 0.5 * math.erfc(-x / math.sqrt(2))
+
+
+@dataclass(frozen=True)
+class Segment:
+    """What a ray spends in one voxel; ``near`` and ``far`` are axial depths, ``length`` is in voxels."""
+
+    voxel: Voxel
+    near: float
+    far: float
+    length: float
+
+
+@dataclass(frozen=True)
+class Ray:
+    """A ray with its measurement. ``beyond`` is the density of the measurement if the first surface lies
+    past the last segment."""
+
+    segments: list[Segment]
+    densities: list[float]
+    beyond: float
+
+
+def segments(
+    origin_m: NDArray[np.float64], direction: NDArray[np.float64], end: float, voxel_size: float
+) -> list[Segment]:
+    """Cut a ray at all grid planes; ``direction`` is what one metre of axial depth goes."""
+    o, d = origin_m / voxel_size, direction / voxel_size
+    cuts = {0.0, end}
+    for axis in range(3):
+        if d[axis] != 0:
+            a, b = sorted((o[axis], o[axis] + end * d[axis]))
+            planes = np.arange(math.ceil(a), math.floor(b) + 1)
+            cuts.update(t for t in ((planes - o[axis]) / d[axis]).tolist() if 0 < t < end)
+    out = []
+    for near, far in itertools.pairwise(sorted(cuts)):
+        i, j, k = np.floor(o + 0.5 * (near + far) * d).astype(int)
+        out.append(Segment((i, j, k), near, far, (far - near) * float(np.linalg.norm(d))))
+    return out
+
+
+def cast(
+    depth_m: NDArray[np.float32],
+    T: NDArray[np.float64],
+    camera: PinholeCamera,
+    voxel_size: float,
+    sensor: Gaussian,
+    config: InferenceConfig,
+    max_depth: float,
+) -> list[Ray]:
+    """All rays of a depth image, with the likelihood of each segment."""
+    rays = []
+    directions = camera.rays()
+    for v, u in np.argwhere(depth_m > 0):
+        measured = float(depth_m[v, u])
+        last = measured - sensor.bias + config.end_sigmas * sensor.sigma
+        end = min(last, max_depth)
+        cells = segments(T[:3, 3], T[:3, :3] @ directions[v, u], end, voxel_size)
+        density = [
+            sensor.segment_density(measured, s.near, s.far, voxel_size, config.likelihood) for s in cells
+        ]
+        beyond = 0.0
+        if end < last:
+            beyond = sensor.density(measured, max(end, measured - sensor.bias))
+        rays.append(Ray(cells, density, beyond))
+    return rays
+
+
+def logit(p: float) -> float:
+    return math.log(p / (1 - p))
+
+
+def logistic(x: float) -> float:
+    return 1 / (1 + math.exp(-x)) if x > -700 else 0.0
+
+
+def ray_messages(
+    ray: Ray, incoming: dict[Voxel, float], config: InferenceConfig
+) -> list[tuple[Voxel, float, float]]:
+    """Eqs. 11, 13 and 14 for one ray: (voxel, weight, probability of occupied) for each segment.
+
+    ``incoming`` are log-odds of the voxels as the ray sees them; voxels that it does not hold do not
+    exist, and the ray passes through them.
+    """
+    steps = []
+    visibility, explained = 1.0, 0.0
+    for segment, density in zip(ray.segments, ray.densities, strict=True):
+        if segment.voxel not in incoming:
+            continue
+        m = logistic(incoming[segment.voxel])
+        length = segment.length if config.segment_lengths else 1.0
+        free = (1 - m) ** length
+        steps.append((segment, free, density * visibility, explained))
+        explained += (1 - free) * density * visibility
+        visibility *= free
+    behind = ray.beyond * visibility
+    out = []
+    for segment, free, here, before in reversed(steps):
+        occupied = before + here + config.outlier_floor
+        empty = before + behind / free + config.outlier_floor
+        weight = segment.length if config.segment_lengths else 1.0
+        out.append((segment.voxel, weight, occupied / (occupied + empty)))
+        behind += (1 - free) * here
+    return out
+
+
+def infer(
+    keyframes: list[list[Ray]], voxels: set[Voxel], prior: float, config: InferenceConfig
+) -> dict[Voxel, float]:
+    """Gauss-Seidel sweeps over keyframes with average messages; returns each voxel's log-odds."""
+    belief = dict.fromkeys(voxels, logit(prior))
+    sent: list[dict[Voxel, float]] = [{} for _ in keyframes]
+    for _ in range(config.sweeps):
+        for rays, messages in zip(keyframes, sent, strict=True):
+            seen = {s.voxel for ray in rays for s in ray.segments if s.voxel in belief}
+            clamp = config.cavity_clamp
+            incoming = {v: min(clamp, max(-clamp, belief[v] - messages.get(v, 0.0))) for v in seen}
+            weights: dict[Voxel, float] = dict.fromkeys(seen, 0.0)
+            sums: dict[Voxel, float] = dict.fromkeys(seen, 0.0)
+            for ray in rays:
+                for voxel, weight, q in ray_messages(ray, incoming, config):
+                    if config.average == "log_odds":
+                        q = min(config.message_clamp, max(-config.message_clamp, logit(q)))
+                    weights[voxel] += weight
+                    sums[voxel] += weight * q
+            for voxel in seen:
+                if weights[voxel] <= config.min_length:
+                    continue
+                mean = sums[voxel] / weights[voxel]
+                if config.average == "probability":
+                    least = logistic(-config.message_clamp)
+                    mean = logit(min(1 - least, max(least, mean)))
+                old = messages.get(voxel, 0.0)
+                messages[voxel] = old + (1 - config.damping) * (mean - old)
+                belief[voxel] += messages[voxel] - old
+    return belief
+
+
+def enumerate_marginals(rays: list[Ray], prior: float, floor: float) -> dict[Voxel, float]:
+    """Eq. 1 summed over every assignment of the voxels: exact marginals of occupied.
+
+    A ray's factor is eq. 3 with the depth variable summed out: the density of the measurement at the
+    first occupied voxel, or beyond, plus the outlier floor.
+    """
+    voxels = sorted({s.voxel for ray in rays for s in ray.segments})
+    column = {v: i for i, v in enumerate(voxels)}
+    states = (np.arange(2 ** len(voxels))[:, None] >> np.arange(len(voxels))) & 1
+    weight = np.where(states == 1, prior, 1 - prior).prod(axis=1)
+    for ray in rays:
+        factor = np.full(len(states), ray.beyond)
+        # From the far end, so that the nearest occupied voxel has the last word.
+        for segment, density in zip(reversed(ray.segments), reversed(ray.densities), strict=True):
+            factor = np.where(states[:, column[segment.voxel]] == 1, density, factor)
+        weight = weight * (factor + floor)
+    return {v: float((weight * states[:, i]).sum() / weight.sum()) for v, i in column.items()}
