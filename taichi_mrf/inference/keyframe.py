@@ -64,7 +64,11 @@ class VisibleBricks:
 
 @dataclass
 class Keyframe:
-    """One keyframe of a map. ``messages`` is (bricks * 512) log-odds, in the order of ``visible``."""
+    """One keyframe of a map.
+
+    ``messages`` is (bricks * 512) log-odds, in the order of ``visible``; ``begins`` is (H * W), the depth
+    up to which each ray is known to cross none of these bricks.
+    """
 
     id: int
     name: str
@@ -72,6 +76,7 @@ class Keyframe:
     T_world_camera: Pose
     footprint: Footprint
     visible: VisibleBricks
+    begins: ti.Ndarray
     messages: ti.Ndarray | None = None
 
     @property
@@ -96,7 +101,7 @@ class Keyframe:
             messages *= 2
         lists = (self.footprint.crossed, self.footprint.surface, self.visible.cells, self.visible.slots)
         return (
-            self.image.depth.shape[0] * 4
+            self.image.depth.shape[0] * (4 + 2)
             + messages
             + sum(a.nbytes for a in lists)
             + self.visible.identity.nbytes

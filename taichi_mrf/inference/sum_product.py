@@ -52,6 +52,9 @@ from taichi_mrf.voxels.types import (
 TINY = 1e-30
 """Keeps a ray that explains nothing, without an outlier floor, from dividing zero by zero."""
 
+SLIGHTLY_LESS = 1.0 - 2.0**-9
+"""Keeps a depth, rounded to float16, from growing."""
+
 MOVED = 0.01
 """A marginal that changes by more than this counts as moved (the residual of a sweep)."""
 
@@ -66,6 +69,7 @@ class ForwardPass(Struct):
     voxels_per_depth: F32  # length of the ray, in voxels, for one metre of axial depth
     visibility: F32  # prod_{k < i} (1 - m_k)^{l_k}
     explained: F32  # sum_{j < i} of eq. 11
+    first: F32  # depth at which the ray enters its first voxel
     voxels: I32
     trace: I32  # where this ray's steps are written down
 
@@ -86,35 +90,39 @@ def cavity(
 
 @ti.kernel
 def send_messages(
-    depth: F32Array, width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
+    depth: F32Array, begins: AnyArray, width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
     noise: F32Array3, patch: I32, columns: I32,
     voxel_size: F32, max_depth: F32, end_sigmas: F32, floor: F32,
     shape: IVec3, box_lower: Vec3, box_upper: Vec3, chunks: I32Array, bricks: I32Array,
     log_free: F32Array, sums: I64Array, scale: F32, clamp: F32,
-    trace_voxel: I32Array, trace: Vec4Array, longest: I32, workers: I32, together: I32, spread: I32,
+    trace_voxel: I32Array, trace: Vec4Array, longest: I32, workers: I32, tile: I32, spread: I32,
     likelihood: Template, segment_lengths: Template, log_average: Template, block: Template,
 ):  # fmt: skip
     """Follow all rays of a keyframe there and back, and sum up what they tell each voxel.
 
     A worker follows one ray after the other and writes each ray's steps into its own part of the trace,
     so that the way back need not be walked again. ``longest`` is never less than a ray has voxels.
-    Neighbouring rays go to one worker in runs of ``together``.
+    ``begins`` holds the depth of each ray's first voxel, or less; the next sweep starts there.
+    Rays are dealt out in square tiles of the image, ``tile`` pixels wide, whose rays cross the same bricks.
     """
     if ti.static(block > 0):
         ti.loop_config(block_dim=block)
     for iteration in range(workers * spread):
         worker = iteration // spread
-        pixels = depth.shape[0]
-        turns = (pixels + workers * together - 1) // (workers * together) * together
+        height = depth.shape[0] // width
+        tiles_across = (width + tile - 1) // tile
+        tiles = tiles_across * ((height + tile - 1) // tile)
+        turns = (tiles + workers - 1) // workers * tile * tile
         if iteration % spread != 0:
             turns = 0
         for turn in range(turns):
-            pixel = (turn // together * workers + worker) * together + turn % together
+            number = turn // (tile * tile) * workers + worker
+            u = number % tiles_across * tile + turn % tile
+            v = number // tiles_across * tile + turn // tile % tile
             measured = 0.0
-            if pixel < pixels:
-                measured = depth[pixel]
+            if u < width and v < height:
+                measured = depth[v * width + u]
             if measured > 0.0:
-                u, v = pixel % width, pixel // width
                 direction = to_voxels @ Vec3(
                     (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0
                 )
@@ -123,18 +131,20 @@ def send_messages(
 
                 # The ray ends where its measurement has nothing more to say, or where the map does.
                 last = depth_of_deviation(measured, -end_sigmas, here)
-                begin, end = 0.0, ti.min(last, max_depth)
+                begin, end = ti.cast(begins[v * width + u], ti.f32), ti.min(last, max_depth)
                 clip(ray, begin, end, box_lower, box_upper)
 
                 # Forward: eq. 11 for each voxel, from the camera outwards.
                 ahead = ForwardPass(
                     measured, here, depth_of_deviation(measured, SUPPORT, here), direction.norm(),
-                    1.0, 0.0, 0, worker * longest,
+                    1.0, 0.0, end, 0, worker * longest,
                 )  # fmt: skip
                 walk_voxels(
                     ray, begin, end, shape, chunks, bricks, _see_voxel, ahead,
                     (log_free, trace_voxel, trace, voxel_size, likelihood, segment_lengths),
                 )  # fmt: skip
+
+                begins[v * width + u] = ahead.first * SLIGHTLY_LESS
 
                 # What gets through to where the map ends may have met its surface there.
                 behind = 0.0
@@ -163,7 +173,7 @@ def _see_voxel(ahead: Template, context: Template, voxel: I32, near: F32, far: F
     """One voxel of the forward pass; ``near`` and ``far`` bound the ray's segment in it, in axial depth."""
     length = (far - near) * ahead.voxels_per_depth
     log_free = context[0][voxel]
-    free = ti.exp(length * log_free if ti.static(context[5]) else log_free)
+    free = exp_of_negative(length * log_free if ti.static(context[5]) else log_free)
 
     # Eq. 4, and eq. 11: the voxel is seen, it is occupied, and it explains the measurement.
     density = 0.0
@@ -171,6 +181,8 @@ def _see_voxel(ahead: Template, context: Template, voxel: I32, near: F32, far: F
         density = ahead.visibility * surface_likelihood(
             ahead.measured, near, far, ahead.noise, context[3], context[4]
         )
+    if ahead.voxels == 0:
+        ahead.first = near
     j = ahead.trace + ahead.voxels
     context[1][j] = voxel
     context[2][j] = Vec4(length, free, density, ahead.explained)
@@ -209,9 +221,8 @@ def finish(
             mean = mean_message(sums[i])
             log_odds = clamp * (2.0 * mean - 1.0)
             if not ti.static(log_average):
-                least = logistic(-clamp)
-                mean = ti.max(least, ti.min(1.0 - least, mean))
-                log_odds = ti.log(mean / (1.0 - mean))
+                log_odds = ti.log(ti.max(mean, TINY) / ti.max(1.0 - mean, TINY))
+                log_odds = ti.max(-clamp, ti.min(clamp, log_odds))
             old = ti.cast(messages[i], ti.f32)
             messages[i] = old + (1.0 - damping) * (log_odds - old)
             # The belief takes what was stored, not what was meant, so that it stays the sum of messages.
@@ -219,7 +230,8 @@ def finish(
             j = slots[i // VOXELS] * VOXELS + i % VOXELS
             before = belief[j]
             belief[j] = before + change
-            if ti.abs(logistic(before + change) - logistic(before)) > MOVED:
+            # No marginal changes by more than a quarter of its log-odds' change.
+            if ti.abs(change) > 4.0 * MOVED and ti.abs(logistic(before + change) - logistic(before)) > MOVED:
                 moved[i // VOXELS] += 1
 
 
@@ -247,7 +259,20 @@ def logistic(x: F32) -> F32:
 def softplus(x: F32) -> F32:
     """log(1 + e^x) without losing the digits of a small e^x: minus the log of being free."""
     grown = ti.exp(-ti.abs(x))
-    tail = ti.log(1.0 + grown)
+    tail = 0.0
     if grown < 1e-2:
         tail = grown * (1.0 - grown * (0.5 - grown * (1.0 / 3.0)))
+    else:
+        tail = ti.log(1.0 + grown)
     return ti.max(x, 0.0) + tail
+
+
+@ti.func
+def exp_of_negative(x: F32) -> F32:
+    """e^x for x <= 0, by its series near 0: most voxels on a ray's way are nearly free."""
+    value = 0.0
+    if x > -0.05:
+        value = 1.0 + x * (1.0 + x * (0.5 + x * (1.0 / 6.0)))
+    else:
+        value = ti.exp(x)
+    return value

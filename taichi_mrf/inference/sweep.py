@@ -25,11 +25,11 @@ TRACE_BYTES = 20
 
 @dataclass(frozen=True)
 class Workers:
-    """How rays are dealt out: to how many workers, how many neighbouring rays in a run, how many loop
-    iterations a worker stands for, and the block size on a GPU."""
+    """How rays are dealt out: to how many workers, in square tiles of how many pixels a side, how many
+    loop iterations a worker stands for, and the block size on a GPU."""
 
     number: int
-    together: int
+    tile: int
     spread: int
     block: int
 
@@ -39,7 +39,7 @@ def workers_for(arch: str, software: bool, longest: int) -> Workers:
     neighbours take neighbouring rays, and the trace is bounded to half a GB."""
     if arch == "cpu":
         # Taichi gives a CPU thread no fewer than 512 iterations of a loop at a time.
-        return Workers(64, 64, 512, 0)
+        return Workers(64, 32, 512, 0)
     most = (512 << 20) // (TRACE_BYTES * longest)
     # Mesa's software Vulkan loses iterations of long loops in larger blocks.
     return Workers(max(256, min(65536, most)), 1, 1, 8 if software else 128)
@@ -99,12 +99,12 @@ class Sweeper:
         )
         self.index.fill(window, visible.cells, np.arange(n, dtype=np.int32))
         sum_product.send_messages(
-            image.depth, image.camera.width, image.intrinsics, centre, to_voxels,
+            image.depth, keyframe.begins, image.camera.width, image.intrinsics, centre, to_voxels,
             image.noise, image.noise_table.patch, image.noise_table.columns,
             self.voxel_size, self.sensor.max_depth, config.end_sigmas, config.outlier_floor,
             window.shape_vector, box_lower, box_upper, self.index.chunks, self.index.bricks,
             self.log_free, self.sums, scale, config.message_clamp,
-            self.trace_voxel, self.trace, footprint.longest, workers.number, workers.together, workers.spread,
+            self.trace_voxel, self.trace, footprint.longest, workers.number, workers.tile, workers.spread,
             LIKELIHOODS[config.likelihood], config.segment_lengths, log_average, workers.block,
         )  # fmt: skip
         self.index.clear(window, visible.cells)

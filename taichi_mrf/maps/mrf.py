@@ -339,7 +339,9 @@ class MRFMap:
         camera_brick = np.floor(T_world_camera[:3, 3] / (self.voxel_size * BRICK))
         self._book.topology.anchor(np.clip(camera_brick, -(2**30), 2**30).astype(np.int32))
         self._book.claim(footprint)
-        return Keyframe(id, name, image, T_world_camera, footprint, self._book.visible(footprint))
+        begins = ti.ndarray(ti.f16, image.depth.shape[0])
+        begins.fill(0)
+        return Keyframe(id, name, image, T_world_camera, footprint, self._book.visible(footprint), begins)
 
     def _take_out(self, keyframe: Keyframe) -> None:
         """Undo :meth:`_place`, and withdraw the keyframe's messages."""
@@ -354,6 +356,7 @@ class MRFMap:
         old, old_messages = keyframe.visible, keyframe.messages
         if old.version != self._book.version:
             keyframe.visible = self._book.visible(keyframe.footprint)
+            keyframe.begins.fill(0)
         if old_messages is None or keyframe.visible is not old:
             keyframe.messages = new_messages(keyframe.visible, self.config.inference.message_precision)
             if old_messages is not None:
