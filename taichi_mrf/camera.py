@@ -63,3 +63,9 @@ class PinholeCamera:
     def range_per_depth(self) -> NDArray[np.float64]:
         """Euclidean range of each pixel's ray for one metre of axial depth, (H, W), at least 1."""
         return np.linalg.norm(self.rays(), axis=-1)
+
+    def largest_slant(self) -> float:
+        """The largest entry of :meth:`range_per_depth`, which belongs to a corner of the image."""
+        x = max(abs(self.cx), abs(self.width - 1 - self.cx)) / self.fx
+        y = max(abs(self.cy), abs(self.height - 1 - self.cy)) / self.fy
+        return math.hypot(1.0, x, y)

@@ -128,11 +128,12 @@ class KeyframeConfig:
     """Which frames become keyframes (section V): those that have moved enough."""
 
     rotation: float = 0.0
-    """Least rotation in radians (tangent norm) that makes a frame a keyframe."""
+    """A frame that is rotated by more than this (radians, tangent norm) becomes a keyframe; 0 means that
+    rotation does not count."""
 
     translation: float = 0.0
-    """Least translation in metres that makes a frame a keyframe. A frame needs either; with both at 0
-    every frame is one."""
+    """A frame that is translated by more than this (metres) becomes a keyframe; 0 means that translation
+    does not count. With both at 0 every frame is a keyframe."""
 
     against: Literal["last", "all"] = "last"
     """Compare with the last keyframe, as in the paper, or with all earlier ones, so that a place that is
@@ -174,6 +175,19 @@ class VolumeConfig:
 
 
 @dataclass(frozen=True)
+class EvaluationConfig:
+    """How a finished map is checked against frames that were kept out of it."""
+
+    hold_out: int = 10
+    """One frame in so many is kept out of the map; its depth is compared afterwards with the depth that
+    the map predicts. 0 maps all frames and checks nothing."""
+
+    def __post_init__(self) -> None:
+        ok = self.hold_out == 0 or self.hold_out >= 2
+        _check(ok, "evaluation.hold_out", "must be 0, or at least 2 so that frames are left to map")
+
+
+@dataclass(frozen=True)
 class RuntimeConfig:
     """Where the kernels run."""
 
@@ -208,6 +222,9 @@ class Config:
 
     volume: VolumeConfig = field(default_factory=VolumeConfig)
     """Where the map may be."""
+
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    """How a finished map is checked."""
 
     runtime: RuntimeConfig = field(default_factory=RuntimeConfig)
     """Where the kernels run."""
@@ -300,9 +317,13 @@ def load(path: str | Path) -> Config:
         raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     except yaml.YAMLError as error:
         raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
-    config = from_dict(Config, values, str(path))
+    return with_absolute_tables(from_dict(Config, values, str(path)), path.parent)
+
+
+def with_absolute_tables(config: Config, folder: Path) -> Config:
+    """The same configuration with the paths of noise tables, if relative, taken from ``folder``."""
     tables: dict[str, Any] = {
-        name: str((path.parent / table).resolve())
+        name: str((folder / table).resolve())
         for name in ("sigma_table", "bias_table")
         if (table := getattr(config.sensor, name)) is not None
     }

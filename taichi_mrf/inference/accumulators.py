@@ -67,7 +67,7 @@ def finest_scale(
     most = float(rays)
     if nearest > 2.0:
         distance = nearest + HALF_VOXEL  # of the voxel's centre
-        slant = float(camera.range_per_depth().max())
+        slant = camera.largest_slant()
         density = camera.fx * camera.fy * slant**3  # pixels for each unit of solid angle
         radius = math.asin(HALF_VOXEL / distance)
         solid_angle = 2 * math.pi * (1 - math.cos(radius))

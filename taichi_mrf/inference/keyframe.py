@@ -66,8 +66,8 @@ class VisibleBricks:
 class Keyframe:
     """One keyframe of a map.
 
-    ``messages`` is (bricks * 512) log-odds, in the order of ``visible``; ``begins`` is (H * W), the depth
-    up to which each ray is known to cross none of these bricks.
+    ``messages`` is (bricks * 512) log-odds, in the order of ``visible``; ``begins`` is, for each
+    block of pixels, the depth up to which its rays cross none of these bricks, once it is known.
     """
 
     id: int
@@ -77,6 +77,7 @@ class Keyframe:
     footprint: Footprint
     visible: VisibleBricks
     begins: ti.Ndarray
+    begins_known: bool = False
     messages: ti.Ndarray | None = None
 
     @property
@@ -94,15 +95,14 @@ class Keyframe:
         return self.image.depth.to_numpy().reshape(self.camera.shape)
 
     @property
-    def nbytes(self) -> int:
-        """Bytes that this keyframe holds, its messages included."""
-        messages = 0 if self.messages is None else self.messages.shape[0] * 2
-        if self.messages is not None and self.messages.dtype == ti.f32:
-            messages *= 2
+    def image_bytes(self) -> int:
+        """Bytes of the depth image."""
+        return self.image.depth.shape[0] * 4
+
+    @property
+    def voxel_bytes(self) -> int:
+        """Bytes of messages and lists, which grow with the voxels that this keyframe sees."""
+        width = 4 if self.messages is not None and self.messages.dtype == ti.f32 else 2
+        messages = 0 if self.messages is None else self.messages.shape[0] * width
         lists = (self.footprint.crossed, self.footprint.surface, self.visible.cells, self.visible.slots)
-        return (
-            self.image.depth.shape[0] * (4 + 2)
-            + messages
-            + sum(a.nbytes for a in lists)
-            + self.visible.identity.nbytes
-        )
+        return messages + sum(a.nbytes for a in lists) + self.visible.identity.nbytes

@@ -52,8 +52,8 @@ from taichi_mrf.voxels.types import (
 TINY = 1e-30
 """Keeps a ray that explains nothing, without an outlier floor, from dividing zero by zero."""
 
-SLIGHTLY_LESS = 1.0 - 2.0**-9
-"""Keeps a depth, rounded to float16, from growing."""
+BLOCK = 4
+"""Pixels along each side of the blocks that share the depth of their first brick."""
 
 MOVED = 0.01
 """A marginal that changes by more than this counts as moved (the residual of a sweep)."""
@@ -90,31 +90,38 @@ def cavity(
 
 @ti.kernel
 def send_messages(
-    depth: F32Array, begins: AnyArray, width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
+    depth: F32Array, begins: F32Array, begins_known: I32,
+    width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
     noise: F32Array3, patch: I32, columns: I32,
     voxel_size: F32, max_depth: F32, end_sigmas: F32, floor: F32,
     shape: IVec3, box_lower: Vec3, box_upper: Vec3, chunks: I32Array, bricks: I32Array,
     log_free: F32Array, sums: I64Array, scale: F32, clamp: F32,
-    trace_voxel: I32Array, trace: Vec4Array, longest: I32, workers: I32, tile: I32, spread: I32,
-    likelihood: Template, segment_lengths: Template, log_average: Template, block: Template,
+    trace_voxel: I32Array, trace: Vec4Array, longest: I32, steps: I32Array,
+    workers: I32, tile: I32, spread: I32,
+    likelihood: Template, segment_lengths: Template, log_average: Template, block_dim: Template,
 ):  # fmt: skip
     """Follow all rays of a keyframe there and back, and sum up what they tell each voxel.
 
     A worker follows one ray after the other and writes each ray's steps into its own part of the trace,
     so that the way back need not be walked again. ``longest`` is never less than a ray has voxels.
-    ``begins`` holds the depth of each ray's first voxel, or less; the next sweep starts there.
+    ``steps`` receives each worker's number of voxels crossed.
+    ``begins`` holds, for each block of BLOCK x BLOCK pixels, the depth at which the first ray meets a
+    brick: learnt by the sweep that does not know it yet, and where later sweeps start.
     Rays are dealt out in square tiles of the image, ``tile`` pixels wide, whose rays cross the same bricks.
     """
-    if ti.static(block > 0):
-        ti.loop_config(block_dim=block)
+    if ti.static(block_dim > 0):
+        ti.loop_config(block_dim=block_dim)
     for iteration in range(workers * spread):
         worker = iteration // spread
         height = depth.shape[0] // width
+        blocks_across = (width + BLOCK - 1) // BLOCK
         tiles_across = (width + tile - 1) // tile
         tiles = tiles_across * ((height + tile - 1) // tile)
         turns = (tiles + workers - 1) // workers * tile * tile
         if iteration % spread != 0:
             turns = 0
+        else:
+            steps[worker] = 0
         for turn in range(turns):
             number = turn // (tile * tile) * workers + worker
             u = number % tiles_across * tile + turn % tile
@@ -131,7 +138,10 @@ def send_messages(
 
                 # The ray ends where its measurement has nothing more to say, or where the map does.
                 last = depth_of_deviation(measured, -end_sigmas, here)
-                begin, end = ti.cast(begins[v * width + u], ti.f32), ti.min(last, max_depth)
+                block = (v // BLOCK) * blocks_across + u // BLOCK
+                begin, end = 0.0, ti.min(last, max_depth)
+                if begins_known == 1:
+                    begin = begins[block]
                 clip(ray, begin, end, box_lower, box_upper)
 
                 # Forward: eq. 11 for each voxel, from the camera outwards.
@@ -144,7 +154,9 @@ def send_messages(
                     (log_free, trace_voxel, trace, voxel_size, likelihood, segment_lengths),
                 )  # fmt: skip
 
-                begins[v * width + u] = ahead.first * SLIGHTLY_LESS
+                if begins_known == 0 and ahead.first < begins[block]:
+                    ti.atomic_min(begins[block], ahead.first)
+                steps[worker] += ahead.voxels
 
                 # What gets through to where the map ends may have met its surface there.
                 behind = 0.0
@@ -259,10 +271,8 @@ def logistic(x: F32) -> F32:
 def softplus(x: F32) -> F32:
     """log(1 + e^x) without losing the digits of a small e^x: minus the log of being free."""
     grown = ti.exp(-ti.abs(x))
-    tail = 0.0
-    if grown < 1e-2:
-        tail = grown * (1.0 - grown * (0.5 - grown * (1.0 / 3.0)))
-    else:
+    tail = grown * (1.0 - grown * (0.5 - grown * (1.0 / 3.0)))
+    if grown >= 1e-2:
         tail = ti.log(1.0 + grown)
     return ti.max(x, 0.0) + tail
 
@@ -270,9 +280,7 @@ def softplus(x: F32) -> F32:
 @ti.func
 def exp_of_negative(x: F32) -> F32:
     """e^x for x <= 0, by its series near 0: most voxels on a ray's way are nearly free."""
-    value = 0.0
-    if x > -0.05:
-        value = 1.0 + x * (1.0 + x * (0.5 + x * (1.0 / 6.0)))
-    else:
+    value = 1.0 + x * (1.0 + x * (0.5 + x * (1.0 / 6.0)))
+    if x <= -0.05:
         value = ti.exp(x)
     return value

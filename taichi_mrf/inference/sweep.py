@@ -10,10 +10,11 @@ from taichi_mrf import runtime
 from taichi_mrf.config import InferenceConfig, SensorConfig, VolumeConfig
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.accumulators import finest_scale
-from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.inference.keyframe import DepthImage, Keyframe
 from taichi_mrf.sensor.forward import AUTO, CENTRE, SEGMENT
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.traversal import FAR
 from taichi_mrf.voxels.types import Vec4
 from taichi_mrf.voxels.window import WindowIndex
 
@@ -45,6 +46,14 @@ def workers_for(arch: str, software: bool, longest: int) -> Workers:
     return Workers(max(256, min(65536, most)), 1, 1, 8 if software else 128)
 
 
+def unknown_begins(image: DepthImage) -> "ti.Ndarray":
+    """The depth at which each block of an image's pixels meets its first brick: not known, so never."""
+    across, down = (-(-side // sum_product.BLOCK) for side in (image.camera.width, image.camera.height))
+    begins = ti.ndarray(ti.f32, across * down)
+    begins.fill(FAR)
+    return begins
+
+
 class Sweeper:
     """Runs sweeps; owns the scratch that all keyframes share, which grows to the largest of them."""
 
@@ -58,6 +67,7 @@ class Sweeper:
         self.moved = ti.ndarray(ti.i32, 1)
         self.trace_voxel = ti.ndarray(ti.i32, 1)
         self.trace = ti.ndarray(Vec4, 1)
+        self.steps = ti.ndarray(ti.i32, 1)
 
     @property
     def nbytes(self) -> int:
@@ -68,6 +78,11 @@ class Sweeper:
             + self.trace_voxel.shape[0] * TRACE_BYTES
             + self.index.bricks.shape[0] * 4
         )
+
+    @property
+    def voxel_steps(self) -> int:
+        """Voxels that the rays of the last sweep crossed, each ray's counted."""
+        return int(self.steps.to_numpy().sum(dtype=np.int64))
 
     def sweep(self, keyframe: Keyframe, pool: BrickPool) -> NDArray[np.int32] | None:
         """Send one keyframe's messages anew. ``keyframe.messages`` must fit ``keyframe.visible``.
@@ -85,7 +100,7 @@ class Sweeper:
             return None
         messages = keyframe.messages
         workers = workers_for(runtime.active() or "cpu", runtime.is_software(), footprint.longest)
-        self._reserve(n, workers.number * footprint.longest)
+        self._reserve(n, workers.number * footprint.longest, workers.number)
         window = footprint.window
         centre, to_voxels = window.rays_of(keyframe.T_world_camera)
         box_lower, box_upper = window.clip_box(self.volume.lower, self.volume.upper)
@@ -99,14 +114,17 @@ class Sweeper:
         )
         self.index.fill(window, visible.cells, np.arange(n, dtype=np.int32))
         sum_product.send_messages(
-            image.depth, keyframe.begins, image.camera.width, image.intrinsics, centre, to_voxels,
+            image.depth, keyframe.begins, int(keyframe.begins_known),
+            image.camera.width, image.intrinsics, centre, to_voxels,
             image.noise, image.noise_table.patch, image.noise_table.columns,
             self.voxel_size, self.sensor.max_depth, config.end_sigmas, config.outlier_floor,
             window.shape_vector, box_lower, box_upper, self.index.chunks, self.index.bricks,
             self.log_free, self.sums, scale, config.message_clamp,
-            self.trace_voxel, self.trace, footprint.longest, workers.number, workers.tile, workers.spread,
+            self.trace_voxel, self.trace, footprint.longest, self.steps,
+            workers.number, workers.tile, workers.spread,
             LIKELIHOODS[config.likelihood], config.segment_lengths, log_average, workers.block,
         )  # fmt: skip
+        keyframe.begins_known = True
         self.index.clear(window, visible.cells)
         self.moved.fill(0)
         sum_product.finish(
@@ -115,7 +133,7 @@ class Sweeper:
         )  # fmt: skip
         return self.moved.to_numpy()[:n]
 
-    def _reserve(self, bricks: int, steps: int) -> None:
+    def _reserve(self, bricks: int, steps: int, workers: int) -> None:
         if bricks > self.moved.shape[0]:
             self.log_free = ti.ndarray(ti.f32, bricks * VOXELS)
             self.sums = ti.ndarray(ti.i64, bricks * VOXELS)
@@ -123,3 +141,5 @@ class Sweeper:
         if steps > self.trace_voxel.shape[0]:
             self.trace_voxel = ti.ndarray(ti.i32, steps)
             self.trace = ti.ndarray(Vec4, steps)
+        if workers != self.steps.shape[0]:
+            self.steps = ti.ndarray(ti.i32, workers)

@@ -25,7 +25,7 @@ from taichi_mrf.inference.footprint import find_footprint
 from taichi_mrf.inference.keyframe import DepthImage, Keyframe
 from taichi_mrf.inference.messages import carry_over, new_messages
 from taichi_mrf.inference.schedule import InferReport, Progress, content_key, run_sweeps
-from taichi_mrf.inference.sweep import Sweeper
+from taichi_mrf.inference.sweep import Sweeper, unknown_begins
 from taichi_mrf.maps.brick_book import BrickBook
 from taichi_mrf.maps.storage import MapContents, StoredKeyframe, read_contents, write_contents
 from taichi_mrf.poses import as_pose
@@ -40,7 +40,8 @@ from taichi_mrf.voxels.topology import create_topology, recycle
 
 @dataclass(frozen=True)
 class MapStatistics:
-    """How large a map is. ``memory_mb`` counts its voxels, messages, images and scratch."""
+    """How large a map is. ``memory_mb`` counts its voxels, messages, images and scratch;
+    ``bytes_per_voxel`` what grows with the voxels: their channels, and all keyframes' messages."""
 
     keyframes: int
     frozen: int
@@ -223,12 +224,18 @@ class MRFMap:
         """Occupancy, visibility and omega (eqs. 15 to 18) along a ray, by range in metres."""
         return self._view.ray_profile(origin, direction, max_range or self.sensor.max_depth)
 
+    @property
+    def last_voxel_steps(self) -> int:
+        """Voxels that the rays of the last keyframe swept have crossed, each ray's counted."""
+        return self._sweeper.voxel_steps
+
     def statistics(self) -> MapStatistics:
         """How large the map is."""
         in_use = self._pool.in_use
         voxels = len(in_use) * VOXELS
-        held = sum(k.nbytes for k in self._keyframes.values())
-        total = self._pool.capacity * VOXELS * self._pool.bytes_per_voxel + held + self._sweeper.nbytes
+        of_voxels = self._pool.capacity * VOXELS * self._pool.bytes_per_voxel
+        of_voxels += sum(k.voxel_bytes for k in self._keyframes.values())
+        images = sum(k.image_bytes for k in self._keyframes.values())
         return MapStatistics(
             keyframes=len(self._keyframes),
             frozen=len(self._frozen),
@@ -236,8 +243,8 @@ class MRFMap:
             bricks=len(in_use),
             voxels=voxels,
             chunks=len(np.unique(self._pool.bricks[in_use] // BRICK, axis=0)),
-            memory_mb=total / 1e6,
-            bytes_per_voxel=total / max(voxels, 1),
+            memory_mb=(of_voxels + images + self._sweeper.nbytes) / 1e6,
+            bytes_per_voxel=of_voxels / max(voxels, 1),
         )
 
     def save(self, path: str | Path) -> None:
@@ -339,9 +346,9 @@ class MRFMap:
         camera_brick = np.floor(T_world_camera[:3, 3] / (self.voxel_size * BRICK))
         self._book.topology.anchor(np.clip(camera_brick, -(2**30), 2**30).astype(np.int32))
         self._book.claim(footprint)
-        begins = ti.ndarray(ti.f16, image.depth.shape[0])
-        begins.fill(0)
-        return Keyframe(id, name, image, T_world_camera, footprint, self._book.visible(footprint), begins)
+        return Keyframe(
+            id, name, image, T_world_camera, footprint, self._book.visible(footprint), unknown_begins(image)
+        )
 
     def _take_out(self, keyframe: Keyframe) -> None:
         """Undo :meth:`_place`, and withdraw the keyframe's messages."""
@@ -356,7 +363,8 @@ class MRFMap:
         old, old_messages = keyframe.visible, keyframe.messages
         if old.version != self._book.version:
             keyframe.visible = self._book.visible(keyframe.footprint)
-            keyframe.begins.fill(0)
+            keyframe.begins = unknown_begins(keyframe.image)
+            keyframe.begins_known = False
         if old_messages is None or keyframe.visible is not old:
             keyframe.messages = new_messages(keyframe.visible, self.config.inference.message_precision)
             if old_messages is not None:

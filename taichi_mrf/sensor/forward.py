@@ -12,8 +12,8 @@ from taichi_mrf.voxels.types import F32, I32, Struct, Template, Vec5
 AUTO, SEGMENT, CENTRE = 0, 1, 2
 """How a segment of the ray stands for its surface: see InferenceConfig.likelihood."""
 
-SUPPORT = 7.0
-"""Sigmas beyond which a measurement is impossible: a density of 1e-11 / sigma, far below any floor."""
+SUPPORT = 6.5
+"""Sigmas beyond which a measurement is impossible: a density of 3e-10 / sigma, far below any floor."""
 
 NORMALISER = 0.3989422804014327  # 1 / sqrt(2 pi)
 
@@ -76,7 +76,7 @@ def depth_of_deviation(measured: F32, sigmas: F32, noise: PixelNoise) -> F32:
     """
     reach = 3.0 * (ti.abs(sigmas) * sigma_at(noise, measured) + ti.abs(polynomial(noise.bias, measured)))
     depth = measured
-    for _ in ti.static(range(4)):
+    for _ in ti.static(range(3)):
         excess = measured - depth - polynomial(noise.bias, depth) - sigmas * sigma_at(noise, depth)
         gradient = 1.0 + slope(noise.bias, depth) + sigmas * slope(noise.sigma, depth)
         depth += excess / ti.max(gradient, 0.3)

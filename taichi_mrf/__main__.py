@@ -1,0 +1,8 @@
+"""``python -m taichi_mrf`` is the console program ``taichi-mrf``."""
+
+import sys
+
+from taichi_mrf.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

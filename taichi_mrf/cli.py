@@ -1,0 +1,69 @@
+"""The console program ``taichi-mrf``: parse, call, print. Errors become exit codes only here."""
+
+import os
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+
+import taichi_mrf
+from taichi_mrf.commands.bench import Bench
+from taichi_mrf.commands.flags import registry
+from taichi_mrf.commands.info import Info
+from taichi_mrf.commands.map import Map, file_settings
+from taichi_mrf.errors import TaichiMRFError
+
+PROGRAM = "taichi-mrf"
+COMING = ("live", "tune")
+"""Applications whose place is taken, but which a later version brings."""
+
+BAD_INPUT = 2
+ABORTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return the exit status: 0, or 2 after one line on stderr that says what is
+    wrong, or 128 plus the signal's number for a run that was stopped."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments == ["--version"]:
+        print(f"{PROGRAM} {taichi_mrf.__version__}")
+        return 0
+    try:
+        if arguments and arguments[0] in COMING:
+            raise TaichiMRFError(f"{arguments[0]} is not in this version yet")
+        return parse(arguments).run()
+    except TaichiMRFError as error:
+        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except BrokenPipeError:  # the reader of our output has seen enough, as in `| head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        print(f"{PROGRAM}: {error.filename or 'input or output'}: {error.strerror or error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print(f"{PROGRAM}: aborted", file=sys.stderr)
+        return ABORTED
+
+
+def parse(arguments: Sequence[str]) -> Map | Info | Bench:
+    """The command that the arguments ask for. Exits with status 2 where they cannot be parsed."""
+    settings = file_settings(arguments[1:]) if arguments[:1] == ["map"] else file_settings([])
+    commands = (
+        Annotated[
+            Map,
+            tyro.conf.subcommand(
+                "map", default=Map(tyro.MISSING, tyro.MISSING, settings=settings), prefix_name=False
+            ),
+        ]
+        | Annotated[Info, tyro.conf.subcommand("info", prefix_name=False)]
+        | Annotated[Bench, tyro.conf.subcommand("bench", default=Bench(), prefix_name=False)]
+    )
+    return tyro.cli(
+        commands,
+        prog=PROGRAM,
+        description="Probabilistic occupancy maps from depth cameras.",
+        args=arguments,
+        registry=registry,
+    )

@@ -1,0 +1,36 @@
+"""Ctrl-C that keeps the work: the first press asks a run to finish early, the second aborts it."""
+
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+
+class StopRequest:
+    """Whether, and by which signal, the run was asked to stop."""
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+
+    def __call__(self) -> bool:
+        return self.signal is not None
+
+
+@contextmanager
+def stop_on_signals(tell: Callable[[str], None]) -> Iterator[StopRequest]:
+    """While the block runs, SIGINT and SIGTERM only set the yielded request and tell so; a second one
+    raises KeyboardInterrupt."""
+    request = StopRequest()
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if request():
+            raise KeyboardInterrupt
+        request.signal = number
+        tell("Stopping: what is mapped so far will be kept. Once more to abort.")
+
+    saved = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield request
+    finally:
+        for number, handler in saved.items():
+            signal.signal(number, handler)

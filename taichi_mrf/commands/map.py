@@ -1,0 +1,87 @@
+"""``taichi-mrf map``: a sequence in, a folder with the map, a report and pictures out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from taichi_mrf import config as configuration
+from taichi_mrf.config import Config
+from taichi_mrf.errors import ConfigError
+
+CONFIG_FILE = "config.yaml"
+"""Name of the effective configuration in the folder of a run."""
+
+
+@dataclass(frozen=True)
+class Map:
+    """Map a recorded or built-in sequence.
+
+    Flags take precedence over the file of --config, and that over the defaults. Ctrl-C keeps what is
+    mapped (exit status 130).
+    """
+
+    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    """A folder, whose format is recognised, or a built-in sequence such as synthetic:room."""
+
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
+    """Folder for the results; it is made if need be."""
+
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
+    """A YAML file of parameters, such as those in configs/."""
+
+    every: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Look at every N-th frame only."""
+
+    limit: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Look at no more than N frames."""
+
+    skip_bad_frames: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Leave broken frames out and name them in the report, instead of stopping at the first."""
+
+    resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Go on with the map in DIR, with its parameters, after the last frame that is in it."""
+
+    pictures: bool = True
+    """Draw the map from above, in perspective, and against the measured depth."""
+
+    settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
+    """Parameters."""
+
+    def __post_init__(self) -> None:
+        for name in ("every", "limit"):
+            value = getattr(self, name)
+            if isinstance(value, int) and value < 1:
+                raise ConfigError(f"--{name} must be at least 1, not {value}")
+
+    def run(self) -> int:
+        """Map, write everything, and print the report. Raises TaichiMRFError."""
+        from taichi_mrf.commands.map_run import run_map
+
+        return run_map(self)
+
+
+@dataclass(frozen=True)
+class _Files:
+    """The flags that say which file the other flags change."""
+
+    config: Path | None = None
+    out: Path | None = None
+    resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+
+
+def file_settings(arguments: Sequence[str]) -> Config:
+    """The parameters before any flag: those of --config, or of the run that --resume goes on with.
+
+    Raises ConfigError if that file cannot be read.
+    """
+    if {"-h", "--help"} & set(arguments):
+        return Config()
+    files, _ = tyro.cli(_Files, args=list(arguments), return_unknown_args=True, add_help=False)
+    if files.config is not None:
+        return configuration.load(files.config)
+    if files.resume and files.out is not None and (files.out / CONFIG_FILE).is_file():
+        return configuration.load(files.out / CONFIG_FILE)
+    return Config()

@@ -1,0 +1,117 @@
+"""What a mapping run tells at its end: the contents of ``report.json``, and the same as a table."""
+
+import dataclasses
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+import taichi_mrf
+from taichi_mrf import runtime
+from taichi_mrf.datasets import Dataset
+from taichi_mrf.evaluation.held_out import HeldOutCheck
+from taichi_mrf.pipeline import MappingResult
+
+
+def run_report(
+    result: MappingResult, dataset: Dataset, source: str, check: HeldOutCheck | None
+) -> dict[str, Any]:
+    """The facts of a run as plain values, lengths in metres; ``accuracy`` is None without held-out frames."""
+    statistics = result.map.statistics()
+    choice = runtime.choice()
+    return {
+        "source": source,
+        "version": taichi_mrf.__version__,
+        "backend": choice.name if choice else None,
+        "device": choice.device if choice else None,
+        "interrupted": result.interrupted,
+        "frames": result.frames,
+        "keyframes": len(result.map.keyframes),
+        "rays": sum(keyframe.rays for keyframe in result.map.keyframes.values()),
+        "voxel_size": result.map.voxel_size,
+        "bricks": statistics.bricks,
+        "voxels": statistics.voxels,
+        "map_memory_mb": round(statistics.memory_mb, 3),
+        "peak_memory_mb": peak_memory_mb(),
+        "sweeps": result.sweeps,
+        "residual": result.residual,
+        "seconds": {stage: round(seconds, 3) for stage, seconds in result.seconds.items()},
+        "accuracy": None if check is None else {"frames": check.frames, **dataclasses.asdict(check.error)},
+        "skipped_frames": result.skipped,
+        "dropped_frames": dataset.dropped,
+        "notes": list(dataset.notes),
+    }
+
+
+def report_json(report: dict[str, Any]) -> str:
+    """The report as JSON text, in which numbers that are not finite are null."""
+    return json.dumps(_finite(report), indent=2) + "\n"
+
+
+def print_report(console: Console, report: dict[str, Any], written: list[Path]) -> None:
+    """The report as a table, then what should be known besides, then where the files lie."""
+    table = Table(show_header=False, title=f"Map of {report['source']}", title_justify="left")
+    table.add_column(style="bold")
+    table.add_column()
+    for name, text in _rows(report):
+        table.add_row(name, text)
+    console.print(table)
+    for note in report["notes"]:
+        console.print(f"Note: {note}", markup=False, soft_wrap=True)
+    for problem in report["skipped_frames"].values():
+        console.print(f"Skipped: {problem}", markup=False, soft_wrap=True)
+    if report["interrupted"]:
+        console.print("[yellow]Stopped before the end; --resume goes on from here.[/]")
+    for path in written:
+        console.print(str(path), markup=False, highlight=False, soft_wrap=True)
+
+
+def peak_memory_mb() -> float | None:
+    """The most memory that this process has held, in MB (10^6 bytes); None where it cannot be asked."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    unit = 1 if sys.platform == "darwin" else 1024
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6, 1)
+
+
+def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
+    seconds = ", ".join(f"{stage} {value:.1f}" for stage, value in report["seconds"].items())
+    peak = report["peak_memory_mb"]
+    return [
+        ("backend", f"{report['backend']} ({report['device']})"),
+        ("frames", f"{report['frames']}, {report['keyframes']} of them keyframes"),
+        ("rays", f"{report['rays']:,}"),
+        ("voxels", f"{report['voxels']:,} of {report['voxel_size']} m in {report['bricks']:,} bricks"),
+        (
+            "memory",
+            f"map {report['map_memory_mb']:.0f} MB" + (f", process {peak:.0f} MB at most" if peak else ""),
+        ),
+        ("seconds", seconds),
+        ("accuracy", _accuracy_text(report["accuracy"])),
+    ]
+
+
+def _accuracy_text(accuracy: dict[str, Any] | None) -> str:
+    if accuracy is None:
+        return "not checked: no frame was held out"
+    if not accuracy["pixels"]:
+        return f"{accuracy['frames']} held-out frames have no pixel in common with the map"
+    return (
+        f"median error {100 * accuracy['median_abs']:.2f} cm, RMS {100 * accuracy['rms']:.1f} cm, "
+        f"{100 * accuracy['unanswered']:.1f}% of pixels without an answer "
+        f"({accuracy['frames']} held-out frames)"
+    )
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,71 @@
+"""Configurations as text: the YAML that a run leaves beside its results, each field with its help.
+
+A field's help is the string under it in ``config.py``; it is read from there so that it is written once.
+"""
+
+import ast
+import dataclasses
+import inspect
+import textwrap
+from typing import Any
+
+import yaml
+
+from taichi_mrf.config import Config
+
+_WIDTH = 100
+
+
+def field_help(cls: type) -> dict[str, str]:
+    """The help text of each field of a configuration dataclass, as one line."""
+    body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
+    assert isinstance(body, ast.ClassDef)
+    texts = {}
+    for statement, below in zip(body.body, body.body[1:], strict=False):
+        if (
+            isinstance(statement, ast.AnnAssign)
+            and isinstance(statement.target, ast.Name)
+            and isinstance(below, ast.Expr)
+            and isinstance(below.value, ast.Constant)
+        ):
+            texts[statement.target.id] = " ".join(str(below.value.value).split())
+    return texts
+
+
+def commented_yaml(config: Config) -> str:
+    """All parameters as commented YAML, which :func:`taichi_mrf.config.load` reads back unchanged."""
+    return "".join(_section(config, ""))
+
+
+def differences(first: Any, second: Any, prefix: str = "") -> list[str]:
+    """Names (such as "sensor.patch") of the fields in which two configurations of one type differ."""
+    names: list[str] = []
+    for field in dataclasses.fields(first):
+        a, b = getattr(first, field.name), getattr(second, field.name)
+        if dataclasses.is_dataclass(a):
+            names += differences(a, b, f"{prefix}{field.name}.")
+        elif a != b:
+            names.append(prefix + field.name)
+    return names
+
+
+def _section(section: Any, indent: str) -> list[str]:
+    """The lines of one dataclass; nested ones are indented below their names."""
+    lines: list[str] = []
+    texts = field_help(type(section))
+    for field in dataclasses.fields(section):
+        value = getattr(section, field.name)
+        lines.append("\n" if lines else "")
+        lines += [f"{indent}# {line}\n" for line in textwrap.wrap(texts[field.name], _WIDTH - len(indent))]
+        if dataclasses.is_dataclass(value):
+            lines += [f"{indent}{field.name}:\n", *_section(value, indent + "  ")]
+        else:
+            lines.append(f"{indent}{field.name}: {_scalar(value)}\n")
+    return lines
+
+
+def _scalar(value: Any) -> str:
+    """One value in YAML's flow style, on one line."""
+    plain = list(value) if isinstance(value, tuple) else value
+    text = yaml.safe_dump(plain, default_flow_style=True, width=float("inf"))
+    return text.removesuffix("\n").removesuffix("\n...")

@@ -1,0 +1,218 @@
+"""Frames -> keyframes -> map -> events: how a sequence becomes a map.
+
+Whoever wants to watch (a progress bar, a viewer) is a listener: a function that is called with each
+event as it happens. The pipeline knows none of them.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from taichi_mrf.config import Config
+from taichi_mrf.datasets import Dataset
+from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.frame import Frame
+from taichi_mrf.inference.schedule import InferProgress
+from taichi_mrf.keyframes import KeyframeSelector
+from taichi_mrf.maps.mrf import MRFMap
+
+
+@dataclass(frozen=True)
+class FrameEvent:
+    """One frame has been dealt with: the ``number``-th (from 1) of ``frames``."""
+
+    name: str
+    number: int
+    frames: int
+
+
+@dataclass(frozen=True)
+class KeyframeAdded(FrameEvent):
+    """The frame is in the map as keyframe ``keyframe`` with ``rays`` measured pixels, not yet inferred."""
+
+    keyframe: int
+    rays: int
+
+
+@dataclass(frozen=True)
+class FramePassed(FrameEvent):
+    """The frame is no keyframe, for ``reason``."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class FrameSkipped(FrameEvent):
+    """The frame is broken, and was left out; ``problem`` says what is wrong with it."""
+
+    problem: str
+
+
+@dataclass(frozen=True)
+class KeyframeSwept:
+    """The messages of one more keyframe were renewed: the ``number``-th (from 1) of ``keyframes``."""
+
+    sweep: int
+    sweeps: int
+    number: int
+    keyframes: int
+    rays: int
+
+
+Event = FrameEvent | KeyframeSwept
+Listener = Callable[[Event], None]
+
+
+@dataclass
+class MappingResult:
+    """What :func:`map_sequence` made.
+
+    ``skipped`` tells for each broken frame by name what is wrong with it, ``held_out`` the dataset
+    indices of the frames that were kept out, ``seconds`` the time of each stage. ``interrupted`` is true
+    if the run was told to stop before its end; the map holds everything up to there.
+    """
+
+    map: MRFMap
+    frames: int = 0
+    held_out: list[int] = field(default_factory=list)
+    skipped: dict[str, str] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    sweeps: int = 0
+    residual: float | None = None
+    interrupted: bool = False
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Add the time that the block takes to a stage."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+
+def map_sequence(
+    dataset: Dataset,
+    config: Config,
+    listener: Listener = lambda event: None,
+    *,
+    every: int = 1,
+    limit: int | None = None,
+    skip_bad_frames: bool = False,
+    should_stop: Callable[[], bool] = lambda: False,
+    resume_from: MRFMap | None = None,
+) -> MappingResult:
+    """Map the frames 0, ``every``, 2 ``every``, ... of a dataset, ``limit`` of them at most.
+
+    All keyframes are added first, then the marginals are inferred. ``should_stop`` is asked between
+    keyframes. A run that it ends makes one sweep over the keyframes there are if it has not yet, so that
+    the map is usable. ``resume_from`` is the map of such a run, of this dataset: its keyframes are kept
+    and the frames after the last of them are added, which ends in the map of an undisturbed run.
+
+    Raises FrameError for a broken frame unless ``skip_bad_frames``, DatasetError if no frame became a
+    keyframe or the map to resume is of another recording, and what the map raises.
+    """
+    start = MRFMap.from_config(config, dataset.camera) if resume_from is None else resume_from
+    result = MappingResult(start)
+    indices = range(0, len(dataset), every)[:limit]
+    _add_keyframes(result, dataset, indices, config, listener, skip_bad_frames, should_stop)
+    if not result.map.keyframes:
+        raise DatasetError(_why_empty(dataset, result))
+    _infer(result, listener, should_stop)
+    return result
+
+
+def _add_keyframes(
+    result: MappingResult,
+    dataset: Dataset,
+    indices: range,
+    config: Config,
+    listener: Listener,
+    skip_bad_frames: bool,
+    should_stop: Callable[[], bool],
+) -> None:
+    """Allocate every selected frame, without inference."""
+    names = dataset.frame_names
+    mapped = {keyframe.name: keyframe for keyframe in result.map.keyframes.values()}
+    foreign = mapped.keys() - set(names)
+    if foreign:
+        raise DatasetError(f"the map to resume has a keyframe '{min(foreign)}', which {dataset.name} has not")
+    selector = KeyframeSelector(config.keyframes)
+    last_mapped = -1
+    for index in indices:
+        if names[index] in mapped:
+            selector.accept(mapped[names[index]].T_world_camera)
+            last_mapped = index
+
+    for number, index in enumerate(indices, start=1):
+        if should_stop():
+            result.interrupted = True
+            return
+        result.frames = number
+        place = (names[index], number, len(indices))
+        if names[index] in mapped:
+            listener(FramePassed(*place, reason="in the map already"))
+            continue
+        if _is_held_out(number, config.evaluation.hold_out):
+            result.held_out.append(index)
+            listener(FramePassed(*place, reason="kept out to check the map"))
+            continue
+        if index < last_mapped:
+            listener(FramePassed(*place, reason="looked at before"))
+            continue
+        frame = _read(result, dataset, index, skip_bad_frames)
+        if frame is None:
+            listener(FrameSkipped(*place, problem=result.skipped[names[index]]))
+        elif not selector.wants(frame.T_world_camera):
+            listener(FramePassed(*place, reason="too near to a keyframe"))
+        elif not (frame.depth_m > 0).any():
+            listener(FramePassed(*place, reason="holds no measurement"))
+        else:
+            with result.timed("adding"):
+                keyframe = result.map.add_keyframe(
+                    frame.depth_m, frame.T_world_camera, frame.camera, name=frame.name
+                )
+            selector.accept(frame.T_world_camera)
+            listener(KeyframeAdded(*place, keyframe, result.map.keyframes[keyframe].rays))
+
+
+def _infer(result: MappingResult, listener: Listener, should_stop: Callable[[], bool]) -> None:
+    """Run the sweeps. The first always runs to its end, so that no keyframe is without a say; a run that
+    was told to stop makes no other."""
+
+    def progress(step: InferProgress) -> bool:
+        listener(KeyframeSwept(step.sweep, step.sweeps, step.keyframe, step.keyframes, step.rays))
+        result.interrupted = result.interrupted or should_stop()
+        first_is_done = step.sweep > 1 or step.keyframe == step.keyframes
+        return not (result.interrupted and first_is_done)
+
+    with result.timed("inferring"):
+        report = result.map.infer(sweeps=1 if result.interrupted else None, progress=progress)
+    result.sweeps, result.residual = report.sweeps, report.residual
+
+
+def _is_held_out(number: int, hold_out: int) -> bool:
+    """Whether the ``number``-th frame (from 1) is kept out: the middle one of each ``hold_out``."""
+    return hold_out > 0 and (number - 1) % hold_out == hold_out // 2
+
+
+def _read(result: MappingResult, dataset: Dataset, index: int, skip_bad_frames: bool) -> Frame | None:
+    """A frame, or None if it is broken and may be skipped."""
+    with result.timed("reading"):
+        try:
+            return dataset.read(index)
+        except FrameError as error:
+            if not skip_bad_frames:
+                raise
+            result.skipped[dataset.frame_names[index]] = str(error)
+            return None
+
+
+def _why_empty(dataset: Dataset, result: MappingResult) -> str:
+    if result.interrupted:
+        return f"{dataset.name}: stopped before the first keyframe"
+    if result.skipped:
+        count, problem = len(result.skipped), next(iter(result.skipped.values()))
+        return f"{dataset.name}: no frame could be mapped; {count} are broken, the first: {problem}"
+    return f"{dataset.name}: has no frame to map"
