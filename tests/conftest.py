@@ -1,0 +1,61 @@
+"""What all tests share: the Taichi backend they run on, and where the real recordings lie.
+
+Taichi can be started once in a process, so each backend is a run of its own: ``pytest --arch vulkan``
+runs only the tests that use the ``backend`` fixture, on Vulkan (a software device will do).
+"""
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+from taichi_mrf import runtime
+from taichi_mrf.errors import BackendError
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+# Kernels compile inside the first example and machines are shared: nothing here is held to a time.
+UNTIMED = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("default", parent=UNTIMED)
+settings.register_profile("ci", parent=UNTIMED, derandomize=True)
+settings.load_profile("ci" if os.environ.get("CI") else "default")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--arch", choices=runtime.BACKENDS, default="cpu", help="the Taichi backend to test (default: cpu)"
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("--arch") == "cpu":
+        return
+    used = [item for item in items if "backend" in getattr(item, "fixturenames", ())]
+    config.hook.pytest_deselected(items=[item for item in items if item not in used])
+    items[:] = used
+
+
+@pytest.fixture(scope="session")
+def backend(request: pytest.FixtureRequest) -> str:
+    """Taichi, started on the backend of this run; the value is the backend's name."""
+    arch = request.config.getoption("--arch")
+    try:
+        return runtime.init(arch)
+    except BackendError as error:
+        pytest.fail(f"--arch {arch}: {error}", pytrace=False)
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """The root of the source tree."""
+    return REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of real recordings that lies beside the source tree on some machines."""
+    folder = REPOSITORY.parent / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip(f"the real recordings are not on this machine ({folder} does not exist)")
+    return folder

@@ -1,0 +1,20 @@
+"""The README's first example, as a person would paste it."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+
+def test_the_example_runs(tmp_path: Path, repository: Path) -> None:
+    text = (repository / "README.md").read_text(encoding="utf-8")
+    example = re.search(r"```python\n(.*?)```", text, re.DOTALL)
+    assert example is not None
+    # The same room on fewer pixels, and a folder that may be written to.
+    program = example[1].replace("frames=20", "frames=4&width=160&height=120")
+    program = program.replace('"map.npz"', repr(str(tmp_path / "map.npz")))
+    assert program.count(str(tmp_path)) == program.count("width=160") == 1
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "voxels are occupied" in done.stdout
+    assert (tmp_path / "map.npz").stat().st_size > 0
