@@ -1,7 +1,6 @@
 """Starting Taichi once, on the best backend that this machine has, and saying why it is that one.
 
-A process has one backend. Importing this module neither loads nor starts Taichi; it only sees to it that
-Taichi, whoever imports it later, does so without printing its banner.
+A process has one backend. Importing this module neither loads nor starts Taichi.
 """
 
 import contextlib
@@ -29,8 +28,8 @@ ABILITIES = {
     "cpu": "sparse map without bounds",
 }
 """What a map can do on each backend: Vulkan has no sparse fields."""
-
-os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+SOFTWARE_BLOCK = 8
+"""Mesa's software Vulkan loses iterations of long loops in larger thread blocks."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +95,16 @@ def is_software() -> bool:
     return _chosen is not None and _chosen.software
 
 
+def settle() -> None:
+    """Wait for the kernels in flight, on Vulkan.
+
+    Taichi 1.7.4 never frees an array there that is dropped while a kernel may still use it, so whoever
+    drops arrays right after using them calls this first. Elsewhere nothing needs to be waited for.
+    """
+    if active() == "vulkan":
+        _quiet_taichi().sync()
+
+
 def backends() -> list[BackendStatus]:
     """Every backend of this machine, without starting one. A software Vulkan device is listed as such."""
     found = []
@@ -125,7 +134,7 @@ def _started(arch: str, threads: int, debug: bool) -> Backend:
     for name in BACKENDS if arch == "auto" else (arch,):
         try:
             device, software = _device(name, allow_software=arch == "vulkan")
-            _start(name, threads, debug)
+            _start(name, software, threads, debug)
         except BackendError as error:
             if arch != "auto":
                 raise BackendError(f"{name} cannot be used: {error}") from error
@@ -146,10 +155,12 @@ def _device(name: str, allow_software: bool) -> tuple[str, bool]:
     return f"{platform.machine()}, {os.cpu_count()} cores", False
 
 
-def _start(name: str, threads: int, debug: bool) -> None:
+def _start(name: str, software: bool, threads: int, debug: bool) -> None:
     """Start Taichi on one backend, quietly. Raises BackendError if Taichi cannot."""
     ti = _quiet_taichi()
     options: dict[str, Any] = {"cpu_max_num_threads": threads} if threads else {}
+    if software:
+        options["default_gpu_block_dim"] = SOFTWARE_BLOCK
     arch = getattr(ti, name)
     with _quiet_start():
         if not ti.lang.misc.is_arch_supported(arch):

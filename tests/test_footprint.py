@@ -176,14 +176,11 @@ def test_an_image_of_nothing_and_one_of_a_single_pixel(value: float) -> None:
     image, T = uploaded(depth), POSES["oblique"]
     footprint = footprint_of(image, T)
     if value:
-        assert_single = rays_of(image, T, footprint.window, SENSOR.max_depth)
-        cells, near, far = segments(
-            assert_single.centre, assert_single.directions[0], 0.0, assert_single.end[0], BRICK
-        )
+        rays = rays_of(image, T, footprint.window, SENSOR.max_depth)
+        cells, _, far = segments(rays.centre, rays.directions[0], 0.0, rays.end[0], BRICK)
         expected = np.ravel_multi_index(tuple(cells.T), footprint.window.shape)
         np.testing.assert_array_equal(footprint.crossed, np.sort(expected))
-        beyond = np.sort(expected[far > assert_single.surface[0]])
-        np.testing.assert_array_equal(footprint.surface, beyond)
+        np.testing.assert_array_equal(footprint.surface, np.sort(expected[far > rays.surface[0]]))
     else:
         assert footprint.crossed.tolist() == footprint.surface.tolist() == []
         assert footprint.crossed.dtype == np.int32
@@ -317,7 +314,9 @@ def test_the_visible_box_holds_all_ray_ends(noise: Noise, pose: str, max_depth: 
     image = uploaded(depth, PolynomialNoise(noise.sigma, noise.bias), camera)
     T = POSES[pose]
     box = visible_box(image, T, max_depth, INFERENCE.end_sigmas)
-    assert_holds(box, np.concatenate([T[None, :3, 3], ray_ends(image, T, {noise: np.arange(depth.size)}, max_depth)]))
+    assert_holds(
+        box, np.concatenate([T[None, :3, 3], ray_ends(image, T, {noise: np.arange(depth.size)}, max_depth)])
+    )
 
 
 @pytest.mark.shared_data

@@ -97,7 +97,9 @@ def _surface(
 
 def single(*values: ArrayLike) -> list[NDArray[np.float32]]:
     """float32 arrays of one length, which both the engine and the oracle are given."""
-    return [np.ascontiguousarray(a) for a in np.broadcast_arrays(*(np.float32(v) for v in values))]
+    return [
+        np.ascontiguousarray(a) for a in np.broadcast_arrays(*(np.asarray(v, np.float32) for v in values))
+    ]
 
 
 def coefficients_of(noise: Noise) -> NDArray[np.float32]:
@@ -193,7 +195,7 @@ def test_depth_of_deviation_is_the_inverse_of_deviation(
     assume((np.diff(excess) < -0.5 * np.diff(around)).all())
     depth = engine(1, noise, measured, sigmas)
     expected = noise.depth_of_deviation(measured, sigmas)
-    scale = noise.sigma_at(expected)
+    scale = float(noise.sigma_at(expected))
     assert abs(depth[0] - expected) < 0.01 * scale + 4 * ROUNDING * measured
     if expected > 0:
         assert noise.deviation(measured, depth[0]) == pytest.approx(
@@ -215,9 +217,10 @@ def test_depth_of_deviation_is_bounded_for_wild_polynomials(
     measured: float, sigmas: float, sigma: tuple[float, ...], bias: tuple[float, ...]
 ) -> None:
     noise = Noise(sigma, bias)
-    depth = engine(1, noise, measured, sigmas)[0]
+    depth = float(engine(1, noise, measured, sigmas)[0])
     size = exact.polyval(measured, np.abs(sigma)) * abs(sigmas) + exact.polyval(measured, np.abs(bias))
-    reach = 3 * (abs(sigmas) * noise.sigma_at(measured) + abs(noise.bias_at(measured))) + 1e-5 * size
+    sigma_here, bias_here = float(noise.sigma_at(measured)), float(noise.bias_at(measured))
+    reach = 3 * (abs(sigmas) * sigma_here + abs(bias_here)) + 1e-5 * float(size)
     assert np.isfinite(depth)
     assert max(0.0, measured - reach) - 1e-5 <= depth <= measured + reach + 1e-5
 
@@ -259,9 +262,9 @@ def test_segment_likelihood_is_the_average_density(ratio: float) -> None:
 @pytest.mark.parametrize("mode", [SEGMENT, CENTRE])
 def test_likelihoods_with_noise_that_depends_on_depth(noise: Noise, mode: int) -> None:
     random = np.random.default_rng(1)
-    measured = random.uniform(0.4, 6, 5000)
-    near = np.maximum(measured + random.normal(size=5000) * 4 * noise.sigma_at(measured), 0.05)
-    measured, near, far = single(measured, near, near + random.uniform(0.1, 1.7, 5000) * VOXEL)
+    around = random.uniform(0.4, 6, 5000)
+    begin = np.maximum(around + random.normal(size=5000) * 4 * noise.sigma_at(around), 0.05)
+    measured, near, far = single(around, begin, begin + random.uniform(0.1, 1.7, 5000) * VOXEL)
     exact_noise = rounded(noise)
     centre = 0.5 * (near.astype(float) + far)
     if mode == SEGMENT:
@@ -291,10 +294,12 @@ def test_centre_likelihood_is_the_density_at_the_centre(ratio: float) -> None:
 @pytest.mark.parametrize("ratio", RATIOS)
 def test_auto_averages_where_sigma_is_less_than_a_voxel(ratio: float) -> None:
     noise = Noise((ratio * VOXEL,))
-    arguments = (noise, *segment_grid(ratio * VOXEL), VOXEL)
-    expected = likelihood(*arguments, SEGMENT if ratio < 1 else CENTRE)
-    np.testing.assert_array_equal(likelihood(*arguments, AUTO), expected)
-    assert (expected != likelihood(*arguments, CENTRE if ratio < 1 else SEGMENT)).any()
+    measured, near, far = segment_grid(ratio * VOXEL)
+    auto, averaged, centre = (
+        likelihood(noise, measured, near, far, VOXEL, mode) for mode in (AUTO, SEGMENT, CENTRE)
+    )
+    np.testing.assert_array_equal(auto, averaged if ratio < 1 else centre)
+    assert (averaged != centre).any()
 
 
 @pytest.mark.parametrize("ratio", [0.02, 0.1, 0.5, 0.99])

@@ -2,9 +2,11 @@
 
 # ruff: noqa: ANN202 - Taichi does not allow `-> None` on a kernel or a func.
 
+import dataclasses
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -89,7 +91,7 @@ def test_one_polynomial_holds_for_every_pixel_and_camera(
     assert table.coefficients.shape == (1, 2, TERMS)
     assert table.coefficients.dtype == np.float32
     for row, given_ in zip(table.coefficients[0], (sigma, bias), strict=True):
-        scale = polynomial.polyval(depth, np.abs(given_))
+        scale = float(polynomial.polyval(depth, np.abs(given_)))
         assert evaluate(row.astype(np.float64), depth) == pytest.approx(
             polynomial.polyval(depth, given_), abs=1e-6 * scale + 1e-30
         )
@@ -220,12 +222,14 @@ def test_a_configuration_without_tables_is_a_polynomial() -> None:
 def test_one_table_goes_with_the_other_polynomial(tmp_path: Path, which: str) -> None:
     path = tmp_path / "table.npy"
     np.save(path, numbered(12).astype(np.float32))
-    config = SensorConfig(sigma=(0.01, 0.002), bias=(0.5, 0.25), patch=16, **{f"{which}_table": str(path)})
+    config = SensorConfig(sigma=(0.01, 0.002), bias=(0.5, 0.25), patch=16)
+    table: dict[str, Any] = {f"{which}_table": str(path)}
+    config = dataclasses.replace(config, **table)
     found = noise_from_config(config, CAMERA).table(CAMERA).coefficients
     tabled, constant = (0, 1) if which == "sigma" else (1, 0)
     np.testing.assert_array_equal(found[:, tabled, :3], numbered(12).astype(np.float32))
     other = (0.5, 0.25) if which == "sigma" else (0.01, 0.002)
-    np.testing.assert_array_equal(found[:, constant, :2], np.tile(np.float32(other), (12, 1)))
+    np.testing.assert_array_equal(found[:, constant, :2], np.tile(np.array(other, np.float32), (12, 1)))
 
 
 def text_file(path: Path) -> None:

@@ -165,7 +165,8 @@ def test_a_brick_outside_the_dense_volume_is_not_inserted_as_another(backend: st
     lowest = -SIDE // 2
     outside, its_double = array([(lowest, lowest, lowest + SIDE)]), array([(lowest, lowest + 1, lowest)])
     with pytest.raises(CapacityError):
-        topology.insert(outside, np.array([3], np.int32))
+        topology.check(outside, 0.02)
+    topology.insert(outside, np.array([3], np.int32))
     assert topology.slots(its_double).tolist() == [-1]
 
 

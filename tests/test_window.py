@@ -83,7 +83,7 @@ def test_voxel_coordinates_are_exact_far_from_the_origin(
 def test_camera_rays_in_the_window_are_those_of_the_world(
     eye: np.ndarray, direction: np.ndarray, voxel_size: float
 ) -> None:
-    T = look_at(eye, eye + (1, 2, -0.5))
+    T = look_at(eye, eye + np.array([1, 2, -0.5]))
     window = Window.covering(eye - 10 * voxel_size, eye + 10 * voxel_size, voxel_size)
     centre, to_voxels = window.rays_of(T)
     np.testing.assert_allclose(centre.to_numpy(), window.to_voxels(eye), rtol=1e-6)

@@ -119,5 +119,5 @@ def bench_table(rows: "list[BenchRow]", title: str) -> "Table":
     line("bricks", [f"{r.bricks:,}" for r in rows])
     line("voxels", [f"{r.voxels:,}" for r in rows])
     line("bytes a voxel, all keyframes", [f"{r.bytes_per_voxel:.1f}" for r in rows])
-    line("peak memory, MB", [f"{r.peak_memory_mb:.0f}" for r in rows])
+    line("peak memory, MB", ["-" if r.peak_memory_mb is None else f"{r.peak_memory_mb:.0f}" for r in rows])
     return table

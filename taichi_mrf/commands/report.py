@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from taichi_mrf import runtime
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.evaluation.held_out import HeldOutCheck
 from taichi_mrf.pipeline import MappingResult
+from taichi_mrf.voxels.memory import peak_memory_mb
 
 
 def run_report(
@@ -68,16 +68,6 @@ def print_report(console: Console, report: dict[str, Any], written: list[Path]) 
         console.print("[yellow]Stopped before the end; --resume goes on from here.[/]")
     for path in written:
         console.print(str(path), markup=False, highlight=False, soft_wrap=True)
-
-
-def peak_memory_mb() -> float | None:
-    """The most memory that this process has held, in MB (10^6 bytes); None where it cannot be asked."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return None
-    unit = 1 if sys.platform == "darwin" else 1024
-    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6, 1)
 
 
 def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:

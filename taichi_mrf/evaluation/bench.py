@@ -4,14 +4,10 @@ The machine's noise is met with medians over keyframes. Both systems get the sam
 that holds a measurement.
 """
 
-import contextlib
-import resource
 import statistics
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import taichi as ti
@@ -20,6 +16,7 @@ from taichi_mrf.config import Config, InferenceConfig
 from taichi_mrf.frame import Frame
 from taichi_mrf.maps.mrf import MRFMap
 from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.memory import peak_memory_mb, reset_peak_memory
 
 SWEEPS = InferenceConfig.sweeps
 QUERY_POINTS = 100_000
@@ -45,7 +42,7 @@ class BenchRow:
     bricks: int
     voxels: int
     bytes_per_voxel: float
-    peak_memory_mb: float
+    peak_memory_mb: float | None
 
     @property
     def ratio(self) -> float | None:
@@ -125,7 +122,7 @@ def bench_mapping(
         bricks=size.bricks,
         voxels=size.bricks * VOXELS,
         bytes_per_voxel=size.bytes_per_voxel,
-        peak_memory_mb=peak_memory_mb() - begin_mb,
+        peak_memory_mb=None if begin_mb is None else (peak_memory_mb() or 0.0) - begin_mb,
     )
 
 
@@ -164,21 +161,3 @@ def _timed(call: Callable[[], object]) -> float:
 def _warm_median(call: Callable[[], object]) -> float:
     call()
     return statistics.median(_timed(call) for _ in range(5))
-
-
-def reset_peak_memory() -> None:
-    """Let the kernel forget the largest memory that this process has had, where it can (Linux)."""
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-
-
-def peak_memory_mb() -> float:
-    """The largest resident memory of this process since it was last reset, in MB."""
-    try:
-        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024 / 1e6
-    except OSError:
-        pass
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6

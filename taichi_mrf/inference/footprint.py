@@ -59,23 +59,18 @@ def find_footprint(
         raise CapacityError(f"a view at a voxel size of {voxel_size:g} m has {window.cells:.3g} bricks")
     centre, to_voxels = window.rays_of(T_world_camera)
     box_lower, box_upper = window.clip_box(volume.lower, volume.upper)
-    marks = ti.ndarray(ti.i32, window.cells)
-    marks.fill(0)
-    longest = ti.ndarray(ti.i32, 1)
-    longest.fill(1)
+    # NumPy arrays, which a kernel on the CPU writes in place: small voxels make the window large.
+    marks = np.zeros(window.cells, np.int32)
+    longest = np.ones(1, np.int32)
     _mark(
         image.depth, image.camera.width, image.intrinsics, centre, to_voxels,
         image.noise, image.noise_table.patch, image.noise_table.columns,
         sensor.max_depth, inference.end_sigmas,
         window.shape_vector, box_lower, box_upper, marks, longest,
     )  # fmt: skip
-    marked = marks.to_numpy()
-    return Footprint(
-        window,
-        np.flatnonzero(marked & CROSSED).astype(np.int32),
-        np.flatnonzero(marked & SURFACE).astype(np.int32),
-        int(longest.to_numpy()[0]),
-    )
+    crossed = np.flatnonzero(marks).astype(np.int32)
+    surface = crossed[marks[crossed] & SURFACE != 0]
+    return Footprint(window, crossed, surface, int(longest[0]))
 
 
 def visible_box(

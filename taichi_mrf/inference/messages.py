@@ -3,6 +3,7 @@
 import numpy as np
 import taichi as ti
 
+from taichi_mrf import runtime
 from taichi_mrf.inference.keyframe import VisibleBricks
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.types import AnyArray, I32Array
@@ -24,6 +25,7 @@ def carry_over(
     place = np.minimum(np.searchsorted(old.cells, visible.cells), len(old.cells) - 1)
     same = (old.cells[place] == visible.cells) & (old.identity[place] == visible.identity)
     _copy_bricks(np.where(same, place, -1).astype(np.int32), old_messages, messages)
+    runtime.settle()  # before the old ones are dropped
 
 
 @ti.kernel

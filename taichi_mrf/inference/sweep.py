@@ -42,8 +42,7 @@ def workers_for(arch: str, software: bool, longest: int) -> Workers:
         # Taichi gives a CPU thread no fewer than 512 iterations of a loop at a time.
         return Workers(64, 32, 512, 0)
     most = (512 << 20) // (TRACE_BYTES * longest)
-    # Mesa's software Vulkan loses iterations of long loops in larger blocks.
-    return Workers(max(256, min(65536, most)), 1, 1, 8 if software else 128)
+    return Workers(max(256, min(65536, most)), 1, 1, runtime.SOFTWARE_BLOCK if software else 128)
 
 
 def unknown_begins(image: DepthImage) -> "ti.Ndarray":
@@ -134,6 +133,7 @@ class Sweeper:
         return self.moved.to_numpy()[:n]
 
     def _reserve(self, bricks: int, steps: int, workers: int) -> None:
+        runtime.settle()
         if bricks > self.moved.shape[0]:
             self.log_free = ti.ndarray(ti.f32, bricks * VOXELS)
             self.sums = ti.ndarray(ti.i64, bricks * VOXELS)

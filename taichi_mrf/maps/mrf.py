@@ -167,6 +167,7 @@ class MRFMap:
         if len(keyframe.visible.slots):
             sum_product.fold(keyframe.visible.slots, self._pool.keep_evidence(), messages)
         self._book.freeze(keyframe.footprint)
+        runtime.settle()  # before its arrays are dropped
         self._frozen[id] = keyframe.name
         del self._keyframes[id]
 
@@ -357,6 +358,7 @@ class MRFMap:
             if len(keyframe.visible.slots):
                 sum_product.withdraw(keyframe.visible.slots, self._pool.belief, messages)
         self._book.disclaim(keyframe.footprint)
+        runtime.settle()  # before its arrays are dropped
 
     def _refresh(self, keyframe: Keyframe) -> "ti.Ndarray":
         """Bring a keyframe's bricks and messages up to date; bricks new to it get no message yet."""

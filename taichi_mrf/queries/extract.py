@@ -6,6 +6,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from taichi_mrf import runtime
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.queries.points import probability
 from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
@@ -36,6 +37,7 @@ def extract_voxels(
     log_odds = np.zeros(total, np.float32)
     if total:
         _collect(pool.belief, slots, threshold, (ends - counts).astype(np.int32), rows, numbers, log_odds)
+    runtime.settle()
     corners = pool.bricks[slots].astype(np.float64) * BRICK
     centres = (corners[rows] + offsets_in_brick()[numbers] + 0.5) * voxel_size
     return centres.reshape(-1, 3), probability(log_odds)

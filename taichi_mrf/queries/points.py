@@ -4,6 +4,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf import runtime
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.pool import BrickPool
@@ -40,6 +41,7 @@ def point_log_odds(
     local = voxels - bricks * BRICK
     numbers = ((local[:, 0] * BRICK + local[:, 1]) * BRICK + local[:, 2]).astype(np.int32)
     _gather(pool.belief, slots, numbers, without_brick, log_odds)
+    runtime.settle()
     return log_odds
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf import runtime
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import VolumeConfig
 from taichi_mrf.errors import ConfigError
@@ -67,10 +68,12 @@ class View:
         lower, upper = window[0].clip_box(self.volume.lower, self.volume.upper)
         _render(
             camera.width, ti.Vector([camera.fx, camera.fy, camera.cx, camera.cy], ti.f32), centre, to_voxels,
-            max_depth, window[0].shape_vector, lower, upper,
+            max_depth, self.pool.prior_log_odds + self.volume.min_evidence,
+            window[0].shape_vector, lower, upper,
             self.index.chunks, self.index.bricks, self.pool.belief, depth,
         )  # fmt: skip
         self.index.clear(*window)
+        runtime.settle()
         depth[depth <= 0] = np.nan
         return depth.reshape(camera.shape)
 
@@ -100,6 +103,7 @@ class View:
             self.index.chunks, self.index.bricks, self.pool.belief, *out, count,
         )  # fmt: skip
         self.index.clear(*window)
+        runtime.settle()
         return RayProfile(*[a[: count[0]].copy() for a in out])
 
     def _fill(self, points_m: NDArray[np.float64]) -> tuple[Window, NDArray[np.int32]] | None:
@@ -125,6 +129,7 @@ class View:
 @ti.dataclass
 class _Look(Struct):
     per_t: F32  # voxels for one unit of t
+    learnt: F32  # log-odds above which a voxel is more than its prior
     visibility: F32
     best: F32
     depth: F32
@@ -134,7 +139,8 @@ class _Look(Struct):
 def _look(look: Template, context: Template, voxel: I32, near: F32, far: F32):
     density = softplus(context[0][voxel])  # alpha times the voxel size
     omega = density * look.visibility
-    if omega > look.best:
+    # What was never seen dims the ray as eq. 15 has it, but is no surface.
+    if omega > look.best and context[0][voxel] > look.learnt:
         look.best = omega
         look.depth = 0.5 * (near + far)
     look.visibility *= ti.exp(-density * (far - near) * look.per_t)
@@ -144,7 +150,7 @@ def _look(look: Template, context: Template, voxel: I32, near: F32, far: F32):
 @ti.kernel
 def _render(
     width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
-    max_depth: F32, shape: IVec3, lower: Vec3, upper: Vec3,
+    max_depth: F32, learnt: F32, shape: IVec3, lower: Vec3, upper: Vec3,
     chunks: I32Array, bricks: I32Array, belief: F32Array, depth: F32Array,
 ):  # fmt: skip
     """The segment's middle at the argmax of omega (eq. 18, section III-D), for every pixel."""
@@ -157,7 +163,7 @@ def _render(
         ray = make_ray(centre, direction)
         begin, end = 0.0, max_depth
         clip(ray, begin, end, lower, upper)
-        look = _Look(direction.norm(), 1.0, 0.0, 0.0)
+        look = _Look(direction.norm(), learnt, 1.0, 0.0, 0.0)
         walk_voxels(ray, begin, end, shape, chunks, bricks, _look, look, (belief,))
         depth[pixel] = look.depth if look.visibility < 0.5 else 0.0
 

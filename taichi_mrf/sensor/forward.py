@@ -147,11 +147,8 @@ def surface_likelihood(
 def beyond_likelihood(measured: F32, depth: F32, noise: PixelNoise) -> F32:
     """Density of the measurement if the first surface lies somewhere beyond ``depth``.
 
-    For rays that leave the map: as likely as the likeliest surface out there, which is one at the
-    measurement if that lies beyond, else one at ``depth``.
+    For rays that leave the map: as likely as the likeliest surface out there, which is the one that the
+    measurement would show if that lies beyond, else one at ``depth``.
     """
-    excess = deviation(measured, depth, noise)
-    density = NORMALISER
-    if excess < 0.0:
-        density = normal_density(excess)
-    return density / sigma_at(noise, depth)
+    surface = ti.max(depth, depth_of_deviation(measured, 0.0, noise))
+    return normal_density(deviation(measured, surface, noise)) / sigma_at(noise, surface)

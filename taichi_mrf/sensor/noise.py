@@ -6,6 +6,7 @@ patch of pixels (MRFMap, section IV-C).
 """
 
 import warnings
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,6 +70,8 @@ class PatchNoise:
         """
         self.sigma = _padded(np.asarray(sigma, np.float64), "sigma")
         self.bias = _padded(np.asarray(bias, np.float64), "bias")
+        if patch < 1:
+            raise ConfigError(f"the noise tables' patch must be at least 1 pixel, not {patch}")
         self.patch = patch
         self.camera = camera
         self.columns = -(-camera.width // patch)
@@ -112,9 +115,9 @@ def evaluate(coefficients: NDArray[np.floating], depth_m: ArrayLike) -> NDArray[
 
 
 def warn_of_bad_sigma(table: NoiseTable, min_depth: float, max_depth: float) -> None:
-    """Warn, naming the patch, if sigma falls below LEAST_SIGMA_M somewhere in the working range.
+    """Warn, naming the patch, if sigma falls to zero or below somewhere in the working range.
 
-    Kernels clamp sigma there, so that a badly fitted patch is merely trusted a lot.
+    Kernels clamp it at LEAST_SIGMA_M, so that a badly fitted patch is merely trusted a lot.
     """
     depths = np.linspace(min_depth, max_depth, 100)
     sigma = evaluate(table.coefficients[:, None, 0, :].astype(np.float64), depths[None, :])
@@ -149,7 +152,7 @@ def _padded(coefficients: NDArray[np.float64], name: str) -> NDArray[np.float64]
 def _load_table(path: str, field: str) -> NDArray[np.float64]:
     try:
         table = np.load(Path(path), allow_pickle=False)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ConfigError(f"{field}: {path} cannot be read as a .npy table: {error}") from error
     if not isinstance(table, np.ndarray) or not np.issubdtype(table.dtype, np.number):
         raise ConfigError(f"{field}: {path} holds no table of numbers")

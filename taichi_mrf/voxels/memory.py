@@ -1,6 +1,9 @@
 """How much memory there is, asked before it is taken: a map that does not fit ends in a clear error."""
 
+import contextlib
 import os
+import sys
+from pathlib import Path
 
 from taichi_mrf.errors import CapacityError
 
@@ -18,6 +21,27 @@ def available_bytes() -> int | None:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")
     except (ValueError, OSError, AttributeError):
         return None
+
+
+def reset_peak_memory() -> None:
+    """Let the system forget the most memory that this process has held, where it can (Linux)."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+
+
+def peak_memory_mb() -> float | None:
+    """The most memory that this process has held since the last reset, in MB (10^6 bytes); None where it
+    cannot be asked."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+            if line.startswith("VmHWM:"):
+                return round(int(line.split()[1]) * 1024 / 1e6, 1)
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    unit = 1 if sys.platform == "darwin" else 1024
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6, 1)
 
 
 def check_memory(wanted_bytes: float, what: str, limit_gb: float = 0.0) -> None:

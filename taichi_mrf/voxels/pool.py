@@ -11,6 +11,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from taichi_mrf import runtime
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.memory import check_memory
@@ -105,19 +106,24 @@ class BrickPool:
             self.keep_evidence()
         _write_bricks(getattr(self, channel), slots, np.ascontiguousarray(values, np.float32).reshape(-1))
 
+    def _affordable(self) -> int:
+        """Bricks that the memory limit, if there is one, has room for."""
+        if self.memory_limit_gb <= 0:
+            return MOST_BRICKS
+        return int(self.memory_limit_gb * 1e9) // (VOXELS * self.bytes_per_voxel)
+
     def _grow(self, bricks_needed: int) -> None:
-        capacity = max(bricks_needed, int(self.capacity * GROWTH), 256)
         if bricks_needed > MOST_BRICKS:
             raise CapacityError(
                 f"the map would hold {bricks_needed * VOXELS:.3g} voxels and the most is "
                 f"{MOST_BRICKS * VOXELS:.3g}; choose larger voxels"
             )
-        capacity = min(capacity, MOST_BRICKS)
         check_memory(
-            capacity * VOXELS * self.bytes_per_voxel,
-            f"{capacity * VOXELS / 1e6:.3g} million voxels",
+            bricks_needed * VOXELS * self.bytes_per_voxel,
+            f"{bricks_needed * VOXELS / 1e6:.3g} million voxels",
             self.memory_limit_gb,
         )
+        capacity = max(bricks_needed, min(MOST_BRICKS, int(self.capacity * GROWTH), self._affordable()), 256)
         self.belief = _grown(self.belief, self.capacity, capacity)
         if self.evidence is not None:
             self.evidence = _grown(self.evidence, self.capacity, capacity)
@@ -133,6 +139,7 @@ class BrickPool:
 def _grown(old: "ti.Ndarray", old_capacity: int, capacity: int) -> "ti.Ndarray":
     new = ti.ndarray(ti.f32, capacity * VOXELS)
     _copy(old, new, old_capacity * VOXELS)
+    runtime.settle()
     return new
 
 

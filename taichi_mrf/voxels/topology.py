@@ -31,7 +31,7 @@ class Topology(Protocol):
         """Tell where the map begins, (3,); a bounded index puts its volume around it, once."""
 
     def insert(self, bricks: Bricks, slots: NDArray[np.int32]) -> None:
-        """Give bricks their slots. Raises CapacityError for a brick outside the volume."""
+        """Give bricks their slots; they must have passed :meth:`check`."""
 
     def erase(self, bricks: Bricks) -> None:
         """Take bricks' slots away."""
@@ -54,24 +54,24 @@ class Topology(Protocol):
 
 def create_topology(arch: str, dense_bricks: int) -> Topology:
     """An empty index for a backend; ``dense_bricks`` bounds it where it has to be dense."""
-    if arch == "vulkan":
-        return DenseTopology(dense_bricks)
-    if _spare:
-        topology = _spare.pop()
+    key = dense_bricks if arch == "vulkan" else 0
+    if _spare.get(key):
+        topology = _spare[key].pop()
         topology.clear()
         return topology
-    return SparseTopology()
+    return DenseTopology(dense_bricks) if arch == "vulkan" else SparseTopology()
 
 
 def recycle(topology: Topology) -> None:
     """Keep the index of a map that is gone for the next map.
 
-    Taichi compiles a kernel anew for each SNode tree, so an old tree costs less than a new one. It is
+    Taichi compiles a kernel anew for each SNode tree, so an old tree costs less than a new one, and a dense
+    index is large. It is
     cleared when it is taken again and not here: this runs when Python collects the map, where no
     kernel may be launched.
     """
-    if isinstance(topology, SparseTopology):
-        _spare.append(topology)
+    key = topology.side if isinstance(topology, DenseTopology) else 0
+    _spare.setdefault(key, []).append(topology)
 
 
 @ti.data_oriented
@@ -159,7 +159,8 @@ class SparseTopology:
                     out[i] = self.crossing[cell]
 
 
-_spare: list[SparseTopology] = []
+_spare: dict[int, list[Topology]] = {}
+"""Indices without a map, by the side of a dense one, 0 for sparse ones."""
 
 
 class DenseTopology:
@@ -218,8 +219,9 @@ class DenseTopology:
 @ti.kernel
 def _dense_write(index: I32Array, bricks: AnyArray, values: I32Array, side: I32, add: I32):
     for i in range(values.shape[0]):
-        cell = flat(IVec3(bricks[i, 0], bricks[i, 1], bricks[i, 2]), IVec3(side))
-        index[cell] = values[i] + add * index[cell]
+        cell = IVec3(bricks[i, 0], bricks[i, 1], bricks[i, 2])
+        if cell.min() >= 0 and cell.max() < side:
+            index[flat(cell, IVec3(side))] = values[i] + add * index[flat(cell, IVec3(side))]
 
 
 @ti.kernel

@@ -44,8 +44,8 @@ def make_ray(origin: Vec3, direction: Vec3) -> Ray:
     for axis in ti.static(range(3)):
         if ti.abs(direction[axis]) > 1e-12:
             inverse[axis] = 1.0 / direction[axis]
-        if direction[axis] < 0.0:
-            step[axis] = -1
+            if direction[axis] < 0.0:
+                step[axis] = -1
     return Ray(origin, direction, inverse, step)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf import runtime
 from taichi_mrf.poses import Pose
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, flat
 from taichi_mrf.voxels.memory import check_memory
@@ -35,8 +36,8 @@ class Window:
         first = np.floor(np.asarray(lower_m, np.float64) / chunk_m)
         last = np.floor(np.asarray(upper_m, np.float64) / chunk_m)
         shape = (last - first + 1) * CHUNK
-        # Two int32 for each brick: the mark of the footprint and the index.
-        check_memory(8.0 * float(np.prod(shape)), f"a view at a voxel size of {voxel_size:g} m")
+        # Three int32 for each brick: the footprint's mark, the cells that it finds, and the index.
+        check_memory(12.0 * float(np.prod(shape)), f"a view at a voxel size of {voxel_size:g} m")
         lowest = first.astype(np.int64) * CHUNK
         return Window(
             (int(lowest[0]), int(lowest[1]), int(lowest[2])),
@@ -96,6 +97,7 @@ class WindowIndex:
         self._reset(1)
 
     def _reset(self, cells: int) -> None:
+        runtime.settle()
         self.bricks = ti.ndarray(ti.i32, cells)
         self.bricks.fill(-1)
         self.chunks = ti.ndarray(ti.i32, max(1, cells // VOXELS))

@@ -49,11 +49,11 @@ class Noise:
         return (np.asarray(measured, np.float64) - z - self.bias_at(z)) / self.sigma_at(z)
 
     def depth_of_deviation(self, measured: ArrayLike, sigmas: float) -> NDArray[np.float64]:
-        """The depth at which :meth:`deviation`, which must fall with depth, is ``sigmas``; by bisection.
+        """The depth at which :meth:`deviation` is ``sigmas``, by bisection.
 
-        0 if it is not reached before the camera.
+        It must fall with depth up to twice the measurement and 2 m. 0 where it is less from the camera on.
         """
-        far = 4.0 * np.asarray(measured, np.float64) + 10.0
+        far = 2.0 * np.asarray(measured, np.float64) + 2.0
         near = np.zeros_like(far)
         for _ in range(60):
             middle = 0.5 * (near + far)
@@ -67,8 +67,8 @@ class Noise:
 
     def density_over(self, measured: ArrayLike, near: ArrayLike, far: ArrayLike) -> NDArray[np.float64]:
         """Density averaged over a segment of depths, with the sigma of its centre."""
-        near_, far_ = np.asarray(near, np.float64), np.asarray(far, np.float64)
+        near_, far_, measured_ = (np.asarray(x, np.float64) for x in (near, far, measured))
         sigma = self.sigma_at(0.5 * (near_ + far_))
-        high = (measured - near_ - self.bias_at(near_)) / sigma
-        low = (measured - far_ - self.bias_at(far_)) / sigma
+        high = (measured_ - near_ - self.bias_at(near_)) / sigma
+        low = (measured_ - far_ - self.bias_at(far_)) / sigma
         return normal_between(low, high) / (sigma * (high - low))

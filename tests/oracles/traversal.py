@@ -10,7 +10,7 @@ Cells = NDArray[np.int64]
 def clip_to_box(
     origin: ArrayLike, direction: ArrayLike, begin: float, end: float, lower: ArrayLike, upper: ArrayLike
 ) -> tuple[float, float]:
-    """The part of [begin, end] where origin + t * direction lies in the half-open box; begin >= end if none."""
+    """The part of [begin, end] where origin + t * direction lies in the half-open box; empty if none."""
     for o, d, low, high in zip(
         np.asarray(origin, np.float64), np.asarray(direction, np.float64), np.asarray(lower, np.float64),
         np.asarray(upper, np.float64), strict=True,

@@ -1,0 +1,51 @@
+# Two commands do everything on a machine that has Python 3.10 to 3.13 and make:
+#   make run    install, map the built-in room, show the results
+#   make test   install what the tests need, then lint, type-check and test on every backend there is
+
+VENV ?= .venv
+BIN := $(VENV)/bin
+OUT ?= runs/demo
+SOURCE ?= synthetic:room
+
+# The first interpreter that answers, is of a supported version and can make virtual environments.
+USABLE := import ensurepip, sys, venv; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))
+CANDIDATES := python3.13 python3.12 python3.11 python3.10 python3 python
+PYTHON ?= $(shell for python in $(CANDIDATES); do \
+	$$python -c "$(USABLE)" >/dev/null 2>&1 && { echo $$python; break; }; done)
+
+.PHONY: run test lint clean
+
+run: $(VENV)/.installed
+	@$(BIN)/taichi-mrf map "$(SOURCE)" --out "$(OUT)"
+
+test: lint
+	@for arch in $$($(BIN)/python tests/backends.py); do \
+		echo "== pytest on $$arch"; \
+		$(BIN)/python -m pytest --arch $$arch || exit 1; \
+	done
+
+lint: $(VENV)/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+clean:
+	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis *.egg-info
+
+$(VENV)/.created:
+	@test -n "$(PYTHON)" || { \
+		echo "No Python 3.10 to 3.13 with the venv module was found (tried: $(CANDIDATES))." >&2; \
+		echo "Install one (Debian and Ubuntu: apt install python3-venv), or: make PYTHON=/path/to/python" >&2; \
+		exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	@touch $@
+
+$(VENV)/.installed: $(VENV)/.created pyproject.toml
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e .
+	@touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[bench]" 2>/dev/null \
+		|| echo "OctoMap (extra: bench) has no wheel for this Python: its comparison is left out."
+	@touch $@

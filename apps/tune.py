@@ -1,0 +1,8 @@
+"""Find the parameters of a sensor in the browser: the application behind ``taichi-mrf tune``."""
+
+import sys
+
+from taichi_mrf.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main(["tune", *sys.argv[1:]]))

@@ -1,0 +1,400 @@
+"""Queries of maps made by hand, against NumPy: points, voxels, rendered depth, and the profile of a ray."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from oracles.traversal import clip_to_box, segments
+
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.config import VolumeConfig
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.maps.mrf import MRFMap
+from taichi_mrf.poses import Pose, look_at
+from taichi_mrf.queries.extract import extract_voxels
+from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN, classify, point_log_odds, probability
+from taichi_mrf.queries.view import View
+from taichi_mrf.sensor.noise import PolynomialNoise
+from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.topology import Topology, create_topology
+
+pytestmark = pytest.mark.usefixtures("backend")
+
+VOXEL = 0.05
+BRICK_M = VOXEL * BRICK
+PRIOR = -2.2
+SEEN_FREE = PRIOR - 6.9
+
+CAMERA = PinholeCamera(width=48, height=36, fx=40, fy=42, cx=23.2, cy=17.9)
+
+
+@dataclass(frozen=True)
+class HandMade:
+    """Bricks (n, 3) with their log-odds (n, 8, 8, 8), in a pool and a topology."""
+
+    bricks: NDArray[np.int32]
+    log_odds: NDArray[np.float32]
+    pool: BrickPool
+    topology: Topology
+
+    def at(self, voxels: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Log-odds of voxels (n, 3), NaN where no brick is."""
+        place = {tuple(brick): i for i, brick in enumerate(self.bricks.tolist())}
+        rows = np.array([place.get(tuple(b), -1) for b in (voxels // BRICK).tolist()], np.int64)
+        values = self.log_odds[(rows, *(voxels % BRICK).T)].astype(np.float64)
+        return np.where(rows >= 0, values, np.nan)
+
+
+def made(backend: str, bricks: NDArray[np.int32], log_odds: NDArray[np.float32], dead: int = 0) -> HandMade:
+    """``dead`` bricks before them have been released again and keep their old values in the pool."""
+    pool, topology = BrickPool(PRIOR), create_topology(backend, 64)
+    topology.anchor(bricks[0])
+    ghosts = pool.allocate(np.zeros((dead, 3), np.int32) + np.arange(dead)[:, None].astype(np.int32))
+    slots = pool.allocate(bricks)
+    values = pool.belief.to_numpy().reshape(-1, VOXELS)
+    values[ghosts] = 8.0
+    values[slots] = log_odds.reshape(-1, VOXELS)
+    pool.belief.from_numpy(values.reshape(-1))
+    pool.owners[slots] = 1
+    pool.release(ghosts)
+    topology.insert(bricks, slots)
+    return HandMade(bricks, log_odds, pool, topology)
+
+
+@pytest.fixture(scope="module")
+def random_map(backend: str) -> HandMade:
+    """Sixty bricks around (-1, 2, 0) m, mostly thin, with some dense voxels."""
+    random = np.random.default_rng(0)
+    corner = np.array([-6, 2, -4])
+    cells = np.stack(np.unravel_index(random.choice(216, 60, replace=False), (6, 6, 6)), axis=1)
+    log_odds = random.normal(-4, 1.5, (60, BRICK, BRICK, BRICK))
+    log_odds[random.random(log_odds.shape) < 0.03] = 2.0
+    return made(backend, (corner + cells).astype(np.int32), log_odds.astype(np.float32), dead=7)
+
+
+def points_in(bricks: NDArray[np.int32], count: int, seed: int) -> NDArray[np.float64]:
+    """Points (n, 3) in metres in and around some bricks, none within rounding of a voxel's face."""
+    random = np.random.default_rng(seed)
+    low, high = (bricks.min(axis=0) - 1) * BRICK, (bricks.max(axis=0) + 2) * BRICK
+    return (random.integers(low, high, (count, 3)) + random.uniform(0.001, 0.999, (count, 3))) * VOXEL
+
+
+def test_point_log_odds_are_those_of_the_points_voxel(random_map: HandMade) -> None:
+    points = points_in(random_map.bricks, 5000, seed=1)
+    found = point_log_odds(points, VOXEL, random_map.topology, random_map.pool, SEEN_FREE)
+    expected = random_map.at(np.floor(points / VOXEL).astype(np.int64))
+    assert 500 < np.isfinite(expected).sum() < 4500
+    np.testing.assert_array_equal(found, np.nan_to_num(expected, nan=PRIOR).astype(np.float32))
+
+
+def test_crossed_bricks_that_do_not_exist_are_seen_free(backend: str) -> None:
+    """A brick with a slot answers with its voxels, however many rays cross it."""
+    bricks = np.array([[0, 0, 0], [-1, 0, 0]], np.int32)
+    hand = made(backend, bricks, np.full((2, BRICK, BRICK, BRICK), 0.75, np.float32))
+    hand.topology.add_crossings(np.array([[0, 0, 0], [1, 0, 0], [0, -1, 0]], np.int32), 1)
+    centres = (np.array([[0, 0, 0], [-1, 0, 0], [1, 0, 0], [0, -1, 0], [5, 5, 5]]) + 0.5) * BRICK_M
+    found = point_log_odds(centres, VOXEL, hand.topology, hand.pool, SEEN_FREE)
+    np.testing.assert_allclose(found, [0.75, 0.75, SEEN_FREE, SEEN_FREE, PRIOR], rtol=1e-6)
+    hand.topology.add_crossings(np.array([[1, 0, 0]], np.int32), -1)
+    found = point_log_odds(centres, VOXEL, hand.topology, hand.pool, SEEN_FREE)
+    np.testing.assert_allclose(found, [0.75, 0.75, PRIOR, SEEN_FREE, PRIOR], rtol=1e-6)
+
+
+@pytest.mark.parametrize("far", [1e3, -1e5, 1e12, -1e300])
+def test_points_beyond_all_maps_are_unseen(random_map: HandMade, far: float) -> None:
+    points = np.array([[far, 0, 0], [0, far, 0], [0, 0, far], [far, far, far]])
+    found = point_log_odds(points, VOXEL, random_map.topology, random_map.pool, SEEN_FREE)
+    np.testing.assert_allclose(found, PRIOR)
+
+
+@pytest.mark.parametrize(
+    ("points", "problem"),
+    [
+        (np.zeros(3), r"shape \(N, 3\), not \(3,\)"),
+        (np.zeros((2, 2)), r"not \(2, 2\)"),
+        (np.full((1, 3), np.nan), "not finite"),
+        (np.full((1, 3), np.inf), "not finite"),
+    ],
+)
+def test_wrong_points_are_refused(random_map: HandMade, points: NDArray, problem: str) -> None:
+    with pytest.raises(ConfigError, match=problem):
+        point_log_odds(points, VOXEL, random_map.topology, random_map.pool, SEEN_FREE)
+
+
+def test_no_points_have_no_answers(random_map: HandMade) -> None:
+    found = point_log_odds(np.zeros((0, 3)), VOXEL, random_map.topology, random_map.pool, SEEN_FREE)
+    assert found.shape == (0,)
+    assert found.dtype == np.float32
+
+
+@given(st.lists(st.floats(-60, 60, width=32), min_size=1), st.floats(-6, 3), st.floats(0, 2))
+def test_states_follow_their_definition(log_odds: list[float], prior: float, evidence: float) -> None:
+    values = np.array(log_odds, np.float32)
+    for value, state in zip(values.tolist(), classify(values, prior, evidence).tolist(), strict=True):
+        if np.isclose(abs(value - prior), evidence, atol=1e-5):
+            continue
+        learnt = abs(value - prior) > evidence
+        more_likely_than_not = value > 0
+        if learnt and more_likely_than_not:
+            assert state == OCCUPIED
+        elif learnt and value < prior:
+            assert state == FREE
+        else:
+            assert state == UNKNOWN
+
+
+@given(st.lists(st.floats(-80, 80, width=32), min_size=1))
+def test_probability_is_the_logistic_function(log_odds: list[float]) -> None:
+    found = probability(np.array(log_odds, np.float32))
+    np.testing.assert_allclose(found, 1 / (1 + np.exp(-np.array(log_odds))), rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("least", [0.0, 0.02, 0.5, 0.85, 1.0])
+def test_extracted_voxels_are_those_of_the_probability(random_map: HandMade, least: float) -> None:
+    centres, found = extract_voxels(random_map.pool, VOXEL, least)
+    n, i, j, k = np.nonzero(probability(random_map.log_odds) >= least)
+    voxels = random_map.bricks[n].astype(np.int64) * BRICK + np.stack([i, j, k], axis=1)
+    assert len(found) == len(voxels)
+    assert (least == 0.0) == (len(found) == random_map.log_odds.size)
+    order = np.lexsort(np.floor(centres / VOXEL).T)
+    expected_order = np.lexsort(voxels.T)
+    np.testing.assert_allclose(centres[order], (voxels[expected_order] + 0.5) * VOXEL, atol=1e-9)
+    expected = probability(random_map.log_odds)[n, i, j, k]
+    np.testing.assert_allclose(found[order], expected[expected_order], rtol=1e-6)
+
+
+def test_an_empty_map_has_no_voxels() -> None:
+    centres, found = extract_voxels(BrickPool(PRIOR), VOXEL, 0.5)
+    assert centres.shape == (0, 3)
+    assert found.shape == (0,)
+
+
+@pytest.mark.parametrize("least", [-0.1, 1.1, float("nan")])
+def test_a_probability_outside_its_range_is_refused(random_map: HandMade, least: float) -> None:
+    with pytest.raises(ConfigError, match="min_probability must lie between 0 and 1"):
+        extract_voxels(random_map.pool, VOXEL, least)
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Eqs. 15 to 18 along a ray, over the voxels that exist."""
+
+    near: NDArray[np.float64]
+    far: NDArray[np.float64]
+    occupancy: NDArray[np.float64]
+    visibility: NDArray[np.float64]
+    omega: NDArray[np.float64]
+
+
+def profile_of(
+    hand: HandMade, origin: NDArray, direction: NDArray, end: float, speed: float = 1.0
+) -> Profile:
+    """``speed`` is metres for one unit of t; the direction is metres for one unit of t, too."""
+    cells, near, far = segments(origin / VOXEL, direction / VOXEL, 0.0, end)
+    log_odds = hand.at(cells)
+    exists = np.isfinite(log_odds)
+    near, far, log_odds = near[exists], far[exists], log_odds[exists]
+    alpha = np.log1p(np.exp(log_odds)) / VOXEL  # -ln(1 - p) / voxel size
+    passed = np.exp(-np.cumsum(alpha * (far - near) * speed))
+    visibility = np.concatenate([[1.0], passed[:-1]])[: len(near)]
+    return Profile(near, far, 1 / (1 + np.exp(-log_odds)), visibility, alpha * visibility)
+
+
+def rays_into(hand: HandMade, count: int, seed: int) -> list[tuple[NDArray, NDArray]]:
+    """Origins and unit directions, of rays from around the map through it and from inside it."""
+    random = np.random.default_rng(seed)
+    low, high = hand.bricks.min(axis=0) * BRICK_M, (hand.bricks.max(axis=0) + 1) * BRICK_M
+    origins = random.uniform(low - 1.5, high + 1.5, (count, 3))
+    directions = random.uniform(low, high, (count, 3)) - origins
+    return list(zip(origins, directions / np.linalg.norm(directions, axis=1)[:, None], strict=True))
+
+
+def test_ray_profiles_follow_eqs_15_to_18(random_map: HandMade) -> None:
+    view = View(random_map.pool, VOXEL, VolumeConfig())
+    met = 0
+    for number, (origin, direction) in enumerate(rays_into(random_map, 120, seed=2)):
+        found = view.ray_profile(origin, direction * (1 + number), 3.0)  # its length does not matter
+        expected = profile_of(random_map, origin, direction, 3.0)
+        # Corners that are cut by less than a thousandth of a voxel may be there or not.
+        mine, theirs = found.length > 1e-3 * VOXEL, expected.far - expected.near > 1e-3 * VOXEL
+        assert mine.sum() == theirs.sum()
+        met += mine.sum()
+        middle = 0.5 * (expected.near + expected.far)
+        for name, value, tolerance in (
+            ("distance", middle, 1e-4),
+            ("length", expected.far - expected.near, 1e-3 * VOXEL),
+            ("occupancy", expected.occupancy, 1e-5),
+            ("visibility", expected.visibility, 2e-3),
+            ("omega", expected.omega, 4e-3 * max(1, expected.omega.max(initial=0))),
+        ):
+            np.testing.assert_allclose(getattr(found, name)[mine], value[theirs], rtol=0, atol=tolerance)
+        assert (np.diff(found.distance) > 0).all()
+    assert met > 1000
+
+
+def test_a_profile_ends_at_its_range_and_at_the_volume(random_map: HandMade) -> None:
+    lower, upper = (-2.0, 1.0, -1.2), (-0.5, 2.0, 0.4)
+    view = View(random_map.pool, VOXEL, VolumeConfig(lower=lower, upper=upper))
+    longest = 0.0
+    for origin, direction in rays_into(random_map, 30, seed=3):
+        found = view.ray_profile(origin, direction, 1.7)
+        begin, end = clip_to_box(origin, direction, 0.0, 1.7, lower, upper)
+        cells, near, far = segments(origin / VOXEL, direction / VOXEL, begin, end)
+        lengths = (far - near)[np.isfinite(random_map.at(cells))]
+        assert found.length.sum() == pytest.approx(lengths.sum(), abs=1e-3)
+        if len(found.distance):
+            assert found.distance[0] > begin
+            assert found.distance[-1] < end
+        longest = max(longest, lengths.sum())
+    assert longest > 0.5
+
+
+def test_a_ray_that_meets_no_brick_has_an_empty_profile(random_map: HandMade) -> None:
+    view = View(random_map.pool, VOXEL, VolumeConfig())
+    for origin in ((0.0, -5.0, 0.0), (500.0, 0.0, 0.0)):
+        found = view.ray_profile(origin, (0, -1, 0), 10.0)
+        assert len(found.distance) == len(found.omega) == 0
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction"),
+    [((0, 0, 0), (0, 0, 0)), ((0, 0), (1, 0, 0)), ((0, 0, 0), (np.nan, 0, 1)), ((0, np.inf, 0), (1, 0, 0))],
+)
+def test_what_is_no_ray_is_refused(random_map: HandMade, origin: tuple, direction: tuple) -> None:
+    with pytest.raises(ConfigError, match="origin and a direction of three finite numbers"):
+        View(random_map.pool, VOXEL, VolumeConfig()).ray_profile(origin, direction, 5.0)
+
+
+VIEWS = [
+    look_at((0.9, 0.3, -0.1), (-1.2, 2.0, -0.4)),
+    look_at((-1.21, 1.93, 3.1), (-1.2, 2.0, 0.0)),
+    look_at((-1.3, 2.1, -0.45), (-3.0, 2.5, -0.5)),
+]
+
+
+def rendered_by_oracle(hand: HandMade, camera: PinholeCamera, T: Pose, max_depth: float) -> NDArray:
+    """(H * W, 3): depth of the largest omega, how much larger it is than the next, and what gets through."""
+    out = np.zeros((camera.height * camera.width, 3))
+    directions = camera.rays().reshape(-1, 3)
+    for row, local in zip(out, directions, strict=True):
+        profile = profile_of(hand, T[:3, 3], T[:3, :3] @ local, max_depth, float(np.linalg.norm(local)))
+        row[:] = (0, 1, 1)
+        if len(profile.omega):
+            alpha = profile.omega[-1] / profile.visibility[-1]
+            span = (profile.far[-1] - profile.near[-1]) * np.linalg.norm(local)
+            best = profile.omega.argmax()
+            others = np.delete(profile.omega, best).max(initial=0)
+            row[0] = 0.5 * (profile.near[best] + profile.far[best])
+            row[1] = 1 - others / profile.omega[best]
+            row[2] = profile.visibility[-1] * np.exp(-alpha * span)
+    return out
+
+
+@pytest.mark.parametrize("number", range(len(VIEWS)))
+def test_rendered_depth_is_the_largest_omegas(random_map: HandMade, number: int) -> None:
+    T = VIEWS[number]
+    found = View(random_map.pool, VOXEL, VolumeConfig()).render_depth(CAMERA, T, 5.0)
+    assert found.shape == CAMERA.shape
+    assert found.dtype == np.float32
+    found = found.reshape(-1)
+    depth, margin, through = rendered_by_oracle(random_map, CAMERA, T, 5.0).T
+    # Where half of the ray gets through, or two voxels explain it equally well, rounding may decide.
+    clear = (np.abs(through - 0.5) > 0.01) & (margin > 0.01)
+    assert clear.mean() > 0.8
+    np.testing.assert_array_equal(np.isnan(found)[clear], (through > 0.5)[clear])
+    seen = clear & (through < 0.5)
+    assert 100 < seen.sum() < len(found) - 100
+    np.testing.assert_allclose(found[seen], depth[seen], atol=1e-3 * VOXEL)
+
+
+def test_an_empty_map_and_a_view_away_from_it_show_nothing(random_map: HandMade) -> None:
+    for pool, T in (
+        (BrickPool(PRIOR), VIEWS[0]),
+        (random_map.pool, look_at((3, -3, 0), (9, -9, 0))),
+    ):
+        assert np.isnan(View(pool, VOXEL, VolumeConfig()).render_depth(CAMERA, T, 4.0)).all()
+
+
+WALL_AT = 2.055
+"""The wall stands in the middle of a layer of voxels, at y = 2.775 m."""
+
+WALL_CAMERA = CAMERA.scaled(2.5)
+"""At the wall, some six rays a voxel."""
+
+
+@pytest.fixture(scope="module")
+def wall_map(backend: str) -> MRFMap:
+    """One picture of a wall square to the camera; its left third has no measurement."""
+    depth = np.full(WALL_CAMERA.shape, WALL_AT, np.float32)
+    depth[:, : WALL_CAMERA.width // 3] = 0
+    m = MRFMap(VOXEL, PolynomialNoise((0.01,)), surface_density=2.1)
+    m.add_keyframe(depth, WALL_POSE, WALL_CAMERA)
+    m.infer()
+    return m
+
+
+WALL_POSE = look_at((-3.31, 0.72, 1.13), (-3.31, 5.0, 1.13))
+"""Looks along +y."""
+
+
+def along(pixels: NDArray, depth: float) -> NDArray[np.float64]:
+    """World points on rays (n, 2 pixels: u, v) at an axial depth."""
+    local = WALL_CAMERA.rays()[pixels[:, 1], pixels[:, 0]] * depth
+    return local @ WALL_POSE[:3, :3].T + WALL_POSE[:3, 3]
+
+
+SEEN = np.stack(np.meshgrid(np.arange(50, 110), np.arange(10, 80)), axis=-1).reshape(-1, 2)
+UNSEEN = np.stack(np.meshgrid(np.arange(0, 30), np.arange(10, 80)), axis=-1).reshape(-1, 2)
+
+
+def test_a_walls_map_is_free_before_occupied_at_and_unknown_behind(wall_map: MRFMap) -> None:
+    prior = -np.expm1(-2.1 * VOXEL)
+    assert wall_map.prior == pytest.approx(prior)
+    for depth in (0.4, 1.0, 1.5, 1.9):
+        before = along(SEEN, depth)
+        assert (wall_map.occupancy(before) < 0.5 * prior).all()
+        assert (wall_map.state(before) == FREE).all()
+    at_wall = along(SEEN, WALL_AT)
+    assert (wall_map.state(at_wall) == OCCUPIED).mean() > 0.99
+    for nobody in (along(SEEN, 3.0), along(UNSEEN, 1.0), along(UNSEEN, WALL_AT), -along(SEEN, 1.0)):
+        np.testing.assert_allclose(wall_map.occupancy(nobody), prior, atol=1e-6)
+        assert (wall_map.state(nobody) == UNKNOWN).all()
+
+
+def test_a_walls_voxels_lie_at_the_wall(wall_map: MRFMap) -> None:
+    centres, found = wall_map.voxels(min_probability=0.5)
+    assert len(centres) > 500
+    assert (found >= 0.5).all()
+    assert (np.abs(centres[:, 1] - (WALL_POSE[1, 3] + WALL_AT)) < 1.01 * VOXEL).all()
+    np.testing.assert_allclose(wall_map.occupancy(centres), found, rtol=1e-6)
+    assert len(wall_map.voxels(0.0)[0]) == wall_map.statistics().voxels
+
+
+def test_a_wall_is_rendered_where_it_stands_and_only_where_it_was_seen(wall_map: MRFMap) -> None:
+    depth = wall_map.render_depth(WALL_CAMERA, WALL_POSE)
+    seen = depth[10:80, 50:110]
+    assert np.isfinite(seen).all()
+    assert np.abs(seen - WALL_AT).max() <= 0.5 * VOXEL
+    # Bricks at the edge of what was seen hold voxels at the prior, half a metre of which stops a ray.
+    brick_in_pixels = BRICK_M / WALL_AT * WALL_CAMERA.fx
+    edge = WALL_CAMERA.width // 3 - int(1.2 * brick_in_pixels)
+    assert edge > 10
+    assert np.isnan(depth[:, :edge]).all()
+    nearer = look_at((-3.0, 1.4, 1.2), (-3.0, 5.0, 1.2))
+    from_there = wall_map.render_depth(WALL_CAMERA, nearer)[25:65, 45:75]
+    assert np.abs(from_there - (WALL_POSE[1, 3] + WALL_AT - 1.4)).max() <= 0.5 * VOXEL
+
+
+def test_a_wall_in_a_profile(wall_map: MRFMap) -> None:
+    direction = along(SEEN[2000:2001], 1.0)[0] - WALL_POSE[:3, 3]
+    profile = wall_map.ray_profile(WALL_POSE[:3, 3], direction)
+    per_depth = np.linalg.norm(direction)
+    assert abs(profile.distance[profile.omega.argmax()] / per_depth - WALL_AT) <= 0.5 * VOXEL
+    before = profile.distance < (WALL_AT - 2 * VOXEL) * per_depth
+    assert (profile.visibility[before] > 0.95).all()
+    assert (np.diff(profile.visibility) <= 0).all()
+    assert profile.visibility[-1] < 0.2
