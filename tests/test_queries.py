@@ -276,8 +276,13 @@ VIEWS = [
 ]
 
 
+LEARNT = np.log1p(np.exp(PRIOR + VolumeConfig.min_evidence))
+"""What -ln(1 - p) is where the log-odds are as far above the prior as they are in unknown space."""
+
+
 def rendered_by_oracle(hand: HandMade, camera: PinholeCamera, T: Pose, max_depth: float) -> NDArray:
-    """(H * W, 3): depth of the largest omega, how much larger it is than the next, and what gets through."""
+    """(H * W, 3): depth of the largest omega among voxels of more than the prior (0 if there is none), how
+    much larger it is than the next, and what gets through."""
     out = np.zeros((camera.height * camera.width, 3))
     directions = camera.rays().reshape(-1, 3)
     for row, local in zip(out, directions, strict=True):
@@ -286,10 +291,13 @@ def rendered_by_oracle(hand: HandMade, camera: PinholeCamera, T: Pose, max_depth
         if len(profile.omega):
             alpha = profile.omega[-1] / profile.visibility[-1]
             span = (profile.far[-1] - profile.near[-1]) * np.linalg.norm(local)
-            best = profile.omega.argmax()
-            others = np.delete(profile.omega, best).max(initial=0)
-            row[0] = 0.5 * (profile.near[best] + profile.far[best])
-            row[1] = 1 - others / profile.omega[best]
+            learnt = profile.omega / profile.visibility * VOXEL > LEARNT
+            omega = np.where(learnt, profile.omega, 0.0)
+            best = omega.argmax()
+            others = np.delete(omega, best).max(initial=0)
+            if learnt.any():
+                row[0] = 0.5 * (profile.near[best] + profile.far[best])
+                row[1] = 1 - others / omega[best]
             row[2] = profile.visibility[-1] * np.exp(-alpha * span)
     return out
 
@@ -305,8 +313,9 @@ def test_rendered_depth_is_the_largest_omegas(random_map: HandMade, number: int)
     # Where half of the ray gets through, or two voxels explain it equally well, rounding may decide.
     clear = (np.abs(through - 0.5) > 0.01) & (margin > 0.01)
     assert clear.mean() > 0.8
-    np.testing.assert_array_equal(np.isnan(found)[clear], (through > 0.5)[clear])
-    seen = clear & (through < 0.5)
+    surface = (through < 0.5) & (depth > 0)
+    np.testing.assert_array_equal(np.isnan(found)[clear], ~surface[clear])
+    seen = clear & surface
     assert 100 < seen.sum() < len(found) - 100
     np.testing.assert_allclose(found[seen], depth[seen], atol=1e-3 * VOXEL)
 

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from taichi_mrf import runtime
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.voxels.layout import VOXELS
@@ -82,4 +83,5 @@ def run_sweeps(
         residual, done = moved / max(seen, 1), sweep
         if not complete or residual <= tolerance > 0:
             break
+    runtime.settle()
     return InferReport(time.perf_counter() - begin, residual, done, rays, complete)

@@ -41,8 +41,10 @@ def workers_for(arch: str, software: bool, longest: int) -> Workers:
     if arch == "cpu":
         # Taichi gives a CPU thread no fewer than 512 iterations of a loop at a time.
         return Workers(64, 32, 512, 0)
+    if software:
+        return Workers(1024, 1, 1, runtime.SOFTWARE_BLOCK)
     most = (512 << 20) // (TRACE_BYTES * longest)
-    return Workers(max(256, min(65536, most)), 1, 1, runtime.SOFTWARE_BLOCK if software else 128)
+    return Workers(max(256, min(65536, most)), 1, 1, 128)
 
 
 def unknown_begins(image: DepthImage) -> "ti.Ndarray":
