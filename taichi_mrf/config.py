@@ -94,7 +94,7 @@ class InferenceConfig:
     """Weigh a voxel by the length that the ray spends in it (section IV-A). Without it every voxel
     counts once, as eqs. 11 to 14 are printed."""
 
-    average: Literal["probability", "log_odds"] = "probability"
+    average: Literal["probability", "log_odds"] = "log_odds"
     """What is averaged, weighted by length, over a keyframe's rays through a voxel."""
 
     min_length: float = 0.02

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-import reference_inference as reference
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
+from oracles import inference as reference
+from oracles.forward import Noise
 
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import InferenceConfig
@@ -78,7 +79,7 @@ def well_cut(rays: list[reference.Ray], longest: int) -> bool:
 def test_one_ray_equals_enumeration(seed: int, depth: float, sigma: float, prior: float, bias: float) -> None:
     rng = np.random.default_rng(seed)
     T = random_pose(rng)
-    sensor, config = reference.Gaussian(sigma, bias), InferenceConfig(prior=prior, **EXACT)
+    sensor, config = Noise((sigma,), (bias,)), InferenceConfig(prior=prior, **EXACT)
     rays = reference.cast(image(depth), T, ONE_PIXEL, VOXEL, sensor, config, max_depth=0.75)
     assume(well_cut(rays, 12))
     m = MRFMap(VOXEL, PolynomialNoise((sigma,), (bias,)), inference=config, max_depth=0.75)
@@ -95,7 +96,7 @@ def test_two_rays_that_share_one_voxel_equal_enumeration(
 ) -> None:
     rng = np.random.default_rng(seed)
     shared = (rng.integers(-20, 20, 3) + rng.uniform(0.2, 0.8, 3)) * VOXEL
-    sensor, config = reference.Gaussian(sigma), InferenceConfig(prior=prior, **EXACT)
+    sensor, config = Noise((sigma,)), InferenceConfig(prior=prior, **EXACT)
     poses, rays = [], []
     for depth in depths:
         direction = rng.normal(size=3)
@@ -148,7 +149,7 @@ def test_loops_equal_the_numpy_schedule(
         min_length=0.0,
         outlier_floor=1e-3,
     )
-    sensor = reference.Gaussian(sigma, 0.01)
+    sensor = Noise((sigma,), (0.01,))
     m = MRFMap(VOXEL, PolynomialNoise((sigma,), (0.01,)), inference=config, max_depth=1.5)
     rays = {}
     middle = rng.uniform(-1, 1, 3)
@@ -179,7 +180,7 @@ def test_messages_with_lengths_are_those_of_the_factor(
     must send the same message."""
     rng = np.random.default_rng(seed)
     T = random_pose(rng)
-    sensor = reference.Gaussian(sigma)
+    sensor = Noise((sigma,))
     config = InferenceConfig(prior=prior, **{**EXACT, "segment_lengths": True})
     (ray,) = reference.cast(image(depth), T, ONE_PIXEL, VOXEL, sensor, config, max_depth=0.75)
     assume(well_cut([ray], 12))

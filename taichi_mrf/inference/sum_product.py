@@ -122,6 +122,7 @@ def send_messages(
             turns = 0
         else:
             steps[worker] = 0
+        largest = ti.exp(clamp)
         for turn in range(turns):
             number = turn // (tile * tile) * workers + worker
             u = number % tiles_across * tile + turn % tile
@@ -171,8 +172,7 @@ def send_messages(
                     empty = empty_message(before, behind, free, floor)
                     message = occupied / (occupied + empty)
                     if ti.static(log_average):
-                        log_odds = ti.log(occupied) - ti.log(empty)
-                        message = 0.5 + 0.5 * ti.max(-1.0, ti.min(1.0, log_odds / clamp))
+                        message = clamped_log_odds(occupied, empty, clamp, largest)
                     weight = 1.0
                     if ti.static(segment_lengths):
                         weight = length
@@ -217,6 +217,20 @@ def empty_message(before: F32, behind: F32, free: F32, floor: F32) -> F32:
     ``behind`` was seen through this voxel and is divided by the chance of getting through.
     """
     return before + behind / ti.max(free, TINY) + (floor + TINY)
+
+
+@ti.func
+def clamped_log_odds(occupied: F32, empty: F32, clamp: F32, largest: F32) -> F32:
+    """log(occupied / empty), clamped, and moved from [-clamp, clamp] to [0, 1] for the accumulators.
+
+    ``largest`` is e^clamp: most messages lie beyond the clamp, where no logarithm need be taken.
+    """
+    message = 1.0
+    if occupied * largest <= empty:
+        message = 0.0
+    elif occupied < empty * largest:
+        message = 0.5 + 0.5 * ti.log(occupied / empty) / clamp
+    return message
 
 
 @ti.kernel

@@ -4,13 +4,14 @@ Written for clarity and from the equations, not from the kernels: it shares no c
 definition of parameters.
 """
 
-import itertools
 import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from oracles.forward import Noise
+from oracles.traversal import segments
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import InferenceConfig
 
@@ -18,38 +19,10 @@ Voxel = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
-class Gaussian:
-    """A sensor with constant sigma and bias, in metres."""
-
-    sigma: float
-    bias: float = 0.0
-
-    def segment_density(
-        self, measured: float, near: float, far: float, voxel_size: float, mode: str
-    ) -> float:
-        """Eq. 4, averaged over a segment or at its centre."""
-        if mode == "segment" or (mode == "auto" and self.sigma < voxel_size):
-            a, b = ((measured - d - self.bias) / self.sigma for d in (far, near))
-            return (normal_cdf(b) - normal_cdf(a)) / (far - near)
-        return self.density(measured, 0.5 * (near + far))
-
-    def density(self, measured: float, depth: float) -> float:
-        """Density of a measurement of a surface at ``depth``."""
-        e = (measured - depth - self.bias) / self.sigma
-        return math.exp(-0.5 * e * e) / math.sqrt(2 * math.pi) / self.sigma
-
-
-def normal_cdf(x: float) -> float:
-    return 0.5 * math.erfc(-x / math.sqrt(2))
-
-
-@dataclass(frozen=True)
 class Segment:
-    """What a ray spends in one voxel; ``near`` and ``far`` are axial depths, ``length`` is in voxels."""
+    """What a ray spends in one voxel, in voxel sizes."""
 
     voxel: Voxel
-    near: float
-    far: float
     length: float
 
 
@@ -63,30 +36,12 @@ class Ray:
     beyond: float
 
 
-def segments(
-    origin_m: NDArray[np.float64], direction: NDArray[np.float64], end: float, voxel_size: float
-) -> list[Segment]:
-    """Cut a ray at all grid planes; ``direction`` is what one metre of axial depth goes."""
-    o, d = origin_m / voxel_size, direction / voxel_size
-    cuts = {0.0, end}
-    for axis in range(3):
-        if d[axis] != 0:
-            a, b = sorted((o[axis], o[axis] + end * d[axis]))
-            planes = np.arange(math.ceil(a), math.floor(b) + 1)
-            cuts.update(t for t in ((planes - o[axis]) / d[axis]).tolist() if 0 < t < end)
-    out = []
-    for near, far in itertools.pairwise(sorted(cuts)):
-        i, j, k = np.floor(o + 0.5 * (near + far) * d).astype(int)
-        out.append(Segment((i, j, k), near, far, (far - near) * float(np.linalg.norm(d))))
-    return out
-
-
 def cast(
     depth_m: NDArray[np.float32],
     T: NDArray[np.float64],
     camera: PinholeCamera,
     voxel_size: float,
-    sensor: Gaussian,
+    noise: Noise,
     config: InferenceConfig,
     max_depth: float,
 ) -> list[Ray]:
@@ -95,16 +50,30 @@ def cast(
     directions = camera.rays()
     for v, u in np.argwhere(depth_m > 0):
         measured = float(depth_m[v, u])
-        last = measured - sensor.bias + config.end_sigmas * sensor.sigma
+        direction = T[:3, :3] @ directions[v, u]
+        last = float(noise.depth_of_deviation(measured, -config.end_sigmas))
         end = min(last, max_depth)
-        cells = segments(T[:3, 3], T[:3, :3] @ directions[v, u], end, voxel_size)
-        density = [
-            sensor.segment_density(measured, s.near, s.far, voxel_size, config.likelihood) for s in cells
-        ]
+        cells, near, far = segments(T[:3, 3], direction, 0.0, end, voxel_size)
+        lengths = (far - near) * np.linalg.norm(direction) / voxel_size
+        centre = 0.5 * (near + far)
+        averaged = noise.sigma_at(centre) < voxel_size
+        if config.likelihood != "auto":
+            averaged = np.full(len(cells), config.likelihood == "segment")
+        density = np.where(
+            averaged, noise.density_over(measured, near, far), noise.density_at(measured, centre)
+        )
         beyond = 0.0
         if end < last:
-            beyond = sensor.density(measured, max(end, measured - sensor.bias))
-        rays.append(Ray(cells, density, beyond))
+            likeliest = max(end, float(noise.depth_of_deviation(measured, 0.0)))
+            beyond = float(noise.density_at(measured, likeliest))
+        voxels = [(int(i), int(j), int(k)) for i, j, k in cells]
+        rays.append(
+            Ray(
+                [Segment(*each) for each in zip(voxels, lengths.tolist(), strict=True)],
+                density.tolist(),
+                beyond,
+            )
+        )
     return rays
 
 
