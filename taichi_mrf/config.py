@@ -94,6 +94,10 @@ class InferenceConfig:
     """Weigh a voxel by the length that the ray spends in it (section IV-A). Without it every voxel
     counts once, as eqs. 11 to 14 are printed."""
 
+    rays_per_voxel: float = 0.0
+    """Rays that a keyframe casts at least at a voxel that faces it: where a voxel covers more pixels, only
+    every second, third, ... of them is cast. 0 casts every pixel."""
+
     average: Literal["probability", "log_odds"] = "log_odds"
     """What is averaged, weighted by length, over a keyframe's rays through a voxel."""
 
@@ -118,6 +122,7 @@ class InferenceConfig:
         _check(self.prior is None or 0 < self.prior < 1, "inference.prior", "must lie between 0 and 1")
         _check(self.outlier_floor >= 0, "inference.outlier_floor", "must not be negative")
         _check(self.end_sigmas > 0, "inference.end_sigmas", "must be positive")
+        _check(self.rays_per_voxel >= 0, "inference.rays_per_voxel", "must not be negative")
         _check(self.min_length >= 0, "inference.min_length", "must not be negative")
         _check(0 < self.message_clamp <= 30, "inference.message_clamp", "must lie between 0 and 30")
         _check(0 < self.cavity_clamp <= 60, "inference.cavity_clamp", "must lie between 0 and 60")

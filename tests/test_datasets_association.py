@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 
 from taichi_mrf.datasets.association import associate
 
-stamps = st.lists(st.floats(0, 2), max_size=30)
+# No subnormal numbers: Taichi's kernels make the processor take them for zero.
+stamps = st.lists(st.floats(0, 2, allow_subnormal=False), max_size=30)
 
 
 def greedy_oracle(a: list[float], b: list[float], gap: float) -> list[int | None]:
@@ -19,12 +20,12 @@ def greedy_oracle(a: list[float], b: list[float], gap: float) -> list[int | None
     return out
 
 
-@given(stamps, stamps, st.floats(0, 0.5))
+@given(stamps, stamps, st.floats(0, 0.5, allow_subnormal=False))
 def test_equals_trying_all_pairs(a: list[float], b: list[float], gap: float) -> None:
     assert associate(a, b, gap) == greedy_oracle(a, b, gap)
 
 
-@given(stamps, stamps, st.floats(0, 0.5))
+@given(stamps, stamps, st.floats(0, 0.5, allow_subnormal=False))
 def test_gap_uniqueness_and_no_one_left_out_needlessly(a: list[float], b: list[float], gap: float) -> None:
     partners = associate(a, b, gap)
     given_away = [j for j in partners if j is not None]

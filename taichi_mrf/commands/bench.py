@@ -82,7 +82,10 @@ class Bench:
         where = f"{choice.name}, {choice.device}" if choice else ""
         console.print(bench_table(rows, f"{self.source}, {count} keyframes, on {where}"))
         if self.json is not None:
-            figures = [dataclasses.asdict(row) | {"ratio": row.ratio} for row in rows]
+            figures = [
+                dataclasses.asdict(row) | {"ratio": row.ratio, "ratio_in_full": row.ratio_in_full}
+                for row in rows
+            ]
             write_text(self.json, json.dumps({"device": where, "rows": figures}, indent=2) + "\n")
         return 0
 
@@ -102,13 +105,17 @@ def bench_table(rows: "list[BenchRow]", title: str) -> "Table":
     def milliseconds(value: float | None) -> str:
         return "-" if value is None else f"{value * 1e3:.1f}"
 
+    def ratio(value: float | None) -> str:
+        return "-" if value is None else f"{value:.2f}"
+
     line("allocate, ms", [milliseconds(r.allocate) for r in rows])
     line("visible bricks, ms", [milliseconds(r.visible) for r in rows])
-    line("first sweep, ms", [milliseconds(r.first_sweep) for r in rows])
-    line("later sweep, ms", [milliseconds(r.sweep) for r in rows])
-    line("add a keyframe, 3 sweeps, ms", [milliseconds(r.add) for r in rows])
+    line("3 sweeps over it, ms", [milliseconds(r.sweeps) for r in rows])
+    line("add a keyframe (all of these), ms", [milliseconds(r.add) for r in rows])
     line("OctoMap, ms", [milliseconds(r.octomap) for r in rows])
-    line("ratio to OctoMap", ["-" if r.ratio is None else f"{r.ratio:.2f}" for r in rows])
+    line("ratio to OctoMap", [ratio(r.ratio) for r in rows])
+    line("one whole sweep, ms", [milliseconds(r.sweep) for r in rows])
+    line("ratio with 3 whole sweeps", [ratio(r.ratio_in_full) for r in rows])
     line("rays a sweep", [f"{r.rays:,}" for r in rows])
     line("million rays a second", [f"{r.rays / r.sweep / 1e6:.2f}" for r in rows])
     line("voxel steps a sweep", [f"{r.voxel_steps:,.0f}" for r in rows])

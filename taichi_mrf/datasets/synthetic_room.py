@@ -1,6 +1,6 @@
 """``synthetic:room``: a furnished room that needs no download, with ground truth and a simulated sensor.
 
-Options follow a question mark, ``synthetic:room?frames=60&width=320&height=240&noise=none&seed=1``; the
+Options follow a question mark, ``synthetic:room?frames=60&width=640&height=480&noise=none&seed=1``; the
 fields of :class:`RoomOptions` are all there are.
 """
 
@@ -28,20 +28,20 @@ from taichi_mrf.sensor.simulate import KINECT_1, simulate
 
 NAME = "synthetic:room"
 FRAMES_PER_SECOND = 5.0
-"""Sets the stamps only; at 60 frames the camera then takes 12 s for its round."""
+"""Sets the stamps only; at 40 frames the camera then takes 8 s for its round."""
 
 
 @dataclass(frozen=True)
 class RoomOptions:
     """What the name of the built-in room may be followed by."""
 
-    frames: int = 60
+    frames: int = 40
     """Views, evenly spread over the camera's closed way."""
 
-    width: int = 640
+    width: int = 320
     """Columns of the images; the field of view across is always that of a Kinect 1."""
 
-    height: int = 480
+    height: int = 240
     """Rows of the images."""
 
     noise: Literal["kinect", "none"] = "kinect"

@@ -24,16 +24,21 @@ QUERY_POINTS = 100_000
 
 @dataclass(frozen=True)
 class BenchRow:
-    """One voxel size. Times are medians in seconds for a keyframe, or for a call of a query."""
+    """One voxel size. Times are medians in seconds for a keyframe, or for a call of a query.
+
+    ``add`` is all that a new keyframe costs: ``allocate``, ``visible`` and ``sweeps``, which are three of
+    them over it alone; as nothing else changes between them, the second and third have nothing to do.
+    ``sweep`` is a whole one, after other keyframes have changed the beliefs.
+    """
 
     voxel_size: float
     keyframes: int
     rays: int
     allocate: float
     visible: float
-    first_sweep: float
-    sweep: float
+    sweeps: float
     add: float
+    sweep: float
     octomap: float | None
     occupancy: float
     render_depth: float
@@ -43,6 +48,16 @@ class BenchRow:
     voxels: int
     bytes_per_voxel: float
     peak_memory_mb: float | None
+
+    @property
+    def add_in_full(self) -> float:
+        """What adding a keyframe would cost if each of the three sweeps had to be carried out."""
+        return self.allocate + self.visible + SWEEPS * self.sweep
+
+    @property
+    def ratio_in_full(self) -> float | None:
+        """The same against OctoMap's insertion."""
+        return None if self.octomap is None else self.add_in_full / self.octomap
 
     @property
     def ratio(self) -> float | None:
@@ -71,8 +86,8 @@ def bench_mapping(
     reset_peak_memory()
     begin_mb = peak_memory_mb()
     m = MRFMap.from_config(config, frames[0].camera)
-    times: dict[str, list[float]] = {name: [] for name in ("allocate", "visible", "first", "sweep", "add")}
-    octomap_times, steps, rays = [], [], 0
+    times: dict[str, list[float]] = {name: [] for name in ("allocate", "visible", "sweeps", "add")}
+    octomap_times, rays = [], 0
     octomap = _octomap_inserter(config.voxel_size) if with_octomap else None
     for number, frame in enumerate(frames, start=1):
         start = time.perf_counter()
@@ -82,20 +97,26 @@ def bench_mapping(
         m.infer(sweeps=0, keyframes=[k])
         ti.sync()
         ready = time.perf_counter()
-        sweeps = [_timed(lambda: m.infer(sweeps=1, keyframes=[k])) for _ in range(SWEEPS)]  # noqa: B023
+        m.infer(sweeps=SWEEPS, keyframes=[k])
+        ti.sync()
+        done = time.perf_counter()
         times["allocate"].append(added - start)
         times["visible"].append(ready - added)
-        times["first"].append(sweeps[0])
-        times["sweep"].append(statistics.median(sweeps[1:]))
-        times["add"].append(ready - start + sum(sweeps))
-        steps.append(m.last_voxel_steps)
+        times["sweeps"].append(done - ready)
+        times["add"].append(done - start)
         rays += m.keyframes[k].rays
         if octomap is not None:
             octomap_times.append(octomap(frame))
         if progress is not None:
             progress(number)
-    # Full inference gives every keyframe a message for every brick that it sees: the most memory.
+    # Full inference gives every keyframe a message for every brick that it sees: the most memory, and the
+    # time that a sweep takes when all others have changed what this keyframe is told.
     m.infer(sweeps=1)
+    sweeps, steps = [], []
+    for k in m.keyframes:
+        m.infer(sweeps=0, keyframes=[k])
+        sweeps.append(_timed(lambda: m.infer(sweeps=1, keyframes=[k])))  # noqa: B023
+        steps.append(m.last_voxel_steps)
     size = m.statistics()
     points = np.random.default_rng(0).choice(m.voxels(0.0)[0], QUERY_POINTS)
     view = frames[len(frames) // 2]
@@ -111,8 +132,8 @@ def bench_mapping(
         rays=rays // len(frames),
         allocate=statistics.median(times["allocate"]),
         visible=statistics.median(times["visible"]),
-        first_sweep=statistics.median(times["first"]),
-        sweep=statistics.median(times["sweep"]),
+        sweeps=statistics.median(times["sweeps"]),
+        sweep=statistics.median(sweeps),
         add=statistics.median(times["add"]),
         octomap=statistics.median(octomap_times) if octomap_times else None,
         occupancy=occupancy,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from taichi_mrf.config import InferenceConfig, SensorConfig, VolumeConfig
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.inference.keyframe import DepthImage, Footprint
+from taichi_mrf.inference.rays import is_cast, stride_metres
 from taichi_mrf.poses import Pose
 from taichi_mrf.sensor.forward import depth_of_deviation, pixel_noise
 from taichi_mrf.sensor.noise import LEAST_SIGMA_M, evaluate
@@ -63,7 +64,8 @@ def find_footprint(
     marks = np.zeros(window.cells, np.int32)
     longest = np.ones(1, np.int32)
     _mark(
-        image.depth, image.camera.width, image.intrinsics, centre, to_voxels,
+        image.depth, image.camera.width, stride_metres(image.camera, voxel_size, inference),
+        image.intrinsics, centre, to_voxels,
         image.noise, image.noise_table.patch, image.noise_table.columns,
         sensor.max_depth, inference.end_sigmas,
         window.shape_vector, box_lower, box_upper, marks, longest,
@@ -122,15 +124,15 @@ def _mark_brick(mark: Template, context: Template, ray: Template, brick: IVec3, 
 
 @ti.kernel
 def _mark(
-    depth: F32Array, width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
+    depth: F32Array, width: I32, stride_metres: F32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
     noise: F32Array3, patch: I32, columns: I32,
     max_depth: F32, end_sigmas: F32,
     shape: IVec3, box_lower: Vec3, box_upper: Vec3, marks: I32Array, longest: I32Array,
 ):  # fmt: skip
     for pixel in range(depth.shape[0]):
         measured = depth[pixel]
-        if measured > 0.0:
-            u, v = pixel % width, pixel // width
+        u, v = pixel % width, pixel // width
+        if is_cast(u, v, measured, stride_metres):
             direction = to_voxels @ Vec3(
                 (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0
             )

@@ -67,7 +67,8 @@ class Keyframe:
     """One keyframe of a map.
 
     ``messages`` is (bricks * 512) log-odds, in the order of ``visible``; ``begins`` is, for each
-    block of pixels, the depth up to which its rays cross none of these bricks, once it is known.
+    block of pixels, the depth up to which its rays cross none of these bricks, once it is known;
+    ``revision`` is that of the beliefs right after its last sweep.
     """
 
     id: int
@@ -78,6 +79,7 @@ class Keyframe:
     visible: VisibleBricks
     begins: ti.Ndarray
     begins_known: bool = False
+    revision: int = -1
     messages: ti.Ndarray | None = None
 
     @property

@@ -66,11 +66,12 @@ def run_sweeps(
     keyframes, when ``progress`` returns False.
     """
     begin = time.perf_counter()
+    damping = sweeper.inference.damping
     residual, rays, done, complete = 0.0, 0, 0, True
     for sweep in range(1, sweeps + 1):
         moved = seen = 0
         for number, keyframe in enumerate(keyframes, start=1):
-            changed = sweeper.sweep(keyframe, pool)
+            changed = None if _has_converged(keyframe, pool, damping) else sweeper.sweep(keyframe, pool)
             if changed is not None:
                 moved += int(changed.sum())
                 seen += len(changed) * VOXELS
@@ -85,3 +86,12 @@ def run_sweeps(
             break
     runtime.settle()
     return InferReport(time.perf_counter() - begin, residual, done, rays, complete)
+
+
+def _has_converged(keyframe: Keyframe, pool: BrickPool, damping: float) -> bool:
+    """Whether a sweep over this keyframe would send the very messages that it has sent.
+
+    They follow from the cavity, which is what all *others* believe: if no belief has changed since this
+    keyframe's own last sweep, the cavity has not.
+    """
+    return damping == 0 and keyframe.messages is not None and keyframe.revision == pool.revision

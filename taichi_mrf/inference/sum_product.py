@@ -22,6 +22,7 @@ it: it lets the ray pass with probability (1 - m)^l where m is its probability o
 import taichi as ti
 
 from taichi_mrf.inference.accumulators import add_message, length_sum, mean_message
+from taichi_mrf.inference.rays import is_cast
 from taichi_mrf.sensor.forward import (
     SUPPORT,
     PixelNoise,
@@ -91,7 +92,7 @@ def cavity(
 @ti.kernel
 def send_messages(
     depth: F32Array, begins: F32Array, begins_known: I32,
-    width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
+    width: I32, stride_metres: F32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
     noise: F32Array3, patch: I32, columns: I32,
     voxel_size: F32, max_depth: F32, end_sigmas: F32, floor: F32,
     shape: IVec3, box_lower: Vec3, box_upper: Vec3, chunks: I32Array, bricks: I32Array,
@@ -100,7 +101,7 @@ def send_messages(
     workers: I32, tile: I32, spread: I32,
     likelihood: Template, segment_lengths: Template, log_average: Template, block_dim: Template,
 ):  # fmt: skip
-    """Follow all rays of a keyframe there and back, and sum up what they tell each voxel.
+    """Follow the rays of a keyframe there and back, and sum up what they tell each voxel.
 
     A worker follows one ray after the other and writes each ray's steps into its own part of the trace,
     so that the way back need not be walked again. ``longest`` is never less than a ray has voxels.
@@ -130,7 +131,7 @@ def send_messages(
             measured = 0.0
             if u < width and v < height:
                 measured = depth[v * width + u]
-            if measured > 0.0:
+            if is_cast(u, v, measured, stride_metres):
                 direction = to_voxels @ Vec3(
                     (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0
                 )

@@ -11,6 +11,7 @@ from taichi_mrf.config import InferenceConfig, SensorConfig, VolumeConfig
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.accumulators import finest_scale
 from taichi_mrf.inference.keyframe import DepthImage, Keyframe
+from taichi_mrf.inference.rays import stride_metres
 from taichi_mrf.sensor.forward import AUTO, CENTRE, SEGMENT
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
@@ -116,7 +117,8 @@ class Sweeper:
         self.index.fill(window, visible.cells, np.arange(n, dtype=np.int32))
         sum_product.send_messages(
             image.depth, keyframe.begins, int(keyframe.begins_known),
-            image.camera.width, image.intrinsics, centre, to_voxels,
+            image.camera.width, stride_metres(image.camera, self.voxel_size, config),
+            image.intrinsics, centre, to_voxels,
             image.noise, image.noise_table.patch, image.noise_table.columns,
             self.voxel_size, self.sensor.max_depth, config.end_sigmas, config.outlier_floor,
             window.shape_vector, box_lower, box_upper, self.index.chunks, self.index.bricks,
@@ -132,6 +134,8 @@ class Sweeper:
             visible.slots, pool.belief, messages, self.sums, scale,
             config.message_clamp, config.damping, config.min_length, self.moved, log_average,
         )  # fmt: skip
+        pool.revision += 1
+        keyframe.revision = pool.revision
         return self.moved.to_numpy()[:n]
 
     def _reserve(self, bricks: int, steps: int, workers: int) -> None:

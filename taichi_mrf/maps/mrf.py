@@ -357,6 +357,7 @@ class MRFMap:
             messages = self._refresh(keyframe)
             if len(keyframe.visible.slots):
                 sum_product.withdraw(keyframe.visible.slots, self._pool.belief, messages)
+                self._pool.revision += 1
         self._book.disclaim(keyframe.footprint)
         runtime.settle()  # before its arrays are dropped
 
@@ -369,6 +370,7 @@ class MRFMap:
             keyframe.begins_known = False
         if old_messages is None or keyframe.visible is not old:
             keyframe.messages = new_messages(keyframe.visible, self.config.inference.message_precision)
+            keyframe.revision = -1
             if old_messages is not None:
                 carry_over(old, old_messages, keyframe.visible, keyframe.messages)
         return keyframe.messages

@@ -40,6 +40,7 @@ class BrickPool:
         self.bricks = np.zeros((0, 3), np.int32)
         self.owners = np.zeros(0, np.int32)
         self.identity = np.zeros(0, np.int64)
+        self.revision = 0  # changes whenever the beliefs do
         self._free: list[int] = []
         self._born = 0
 
@@ -81,6 +82,7 @@ class BrickPool:
 
     def restart(self) -> None:
         """Set all beliefs to what inference starts from."""
+        self.revision += 1
         if self.evidence is not None:
             self.belief.copy_from(self.evidence)
         else:
@@ -102,6 +104,7 @@ class BrickPool:
 
     def write(self, channel: str, slots: NDArray[np.int32], values: NDArray[np.float32]) -> None:
         """Set the voxels of some bricks, (n, 512)."""
+        self.revision += 1
         if channel == "evidence":
             self.keep_evidence()
         _write_bricks(getattr(self, channel), slots, np.ascontiguousarray(values, np.float32).reshape(-1))

@@ -73,12 +73,12 @@ def leave_at(walk: Walk) -> F32:
 
 
 @ti.func
-def advance(ray: Ray, walk: Template, size: Template):
+def advance(ray: Ray, walk: Template, nearest: F32, size: Template):
     """Step to the next cell, through the nearest face."""
-    if walk.leave[0] <= walk.leave[1] and walk.leave[0] <= walk.leave[2]:
+    if walk.leave[0] <= nearest:
         walk.cell[0] += ray.step[0]
         walk.leave[0] += size * ti.abs(ray.inverse[0])
-    elif walk.leave[1] <= walk.leave[2]:
+    elif walk.leave[1] <= nearest:
         walk.cell[1] += ray.step[1]
         walk.leave[1] += size * ti.abs(ray.inverse[1])
     else:
@@ -131,7 +131,8 @@ def walk_bricks(
     go = 1
     chunk = enter(ray, t, CHUNK_VOXELS, IVec3(0), chunk_shape)
     while go == 1 and t < t_end and within(chunk.cell, chunk_shape):
-        t_chunk = ti.min(leave_at(chunk), t_end)
+        next_chunk = leave_at(chunk)
+        t_chunk = ti.min(next_chunk, t_end)
         wanted = 1
         if ti.static(skip_empty):
             wanted = chunks[flat(chunk.cell, chunk_shape)]
@@ -139,13 +140,14 @@ def walk_bricks(
             first = chunk.cell * CHUNK
             brick = enter(ray, t, BRICK, first, IVec3(CHUNK))
             while go == 1 and t < t_chunk and inside_eight(brick.cell):
-                t_brick = ti.min(leave_at(brick), t_chunk)
+                next_brick = leave_at(brick)
+                t_brick = ti.min(next_brick, t_chunk)
                 if t_brick > t:  # a ray through an edge touches cells for no length at all
                     go = visit(state, context, ray, first + brick.cell, t, t_brick)
                     t = t_brick
-                advance(ray, brick, BRICK)
+                advance(ray, brick, next_brick, BRICK)
         t = ti.max(t, t_chunk)
-        advance(ray, chunk, CHUNK_VOXELS)
+        advance(ray, chunk, next_chunk, CHUNK_VOXELS)
 
 
 @ti.func
@@ -179,10 +181,11 @@ def _cross_brick(state: Template, context: Template, ray: Ray, brick: IVec3, t_e
         t = t_enter
         voxel = enter(ray, t, 1, brick * BRICK, IVec3(BRICK))
         while go == 1 and t < t_leave and inside_eight(voxel.cell):
-            t_voxel = ti.min(leave_at(voxel), t_leave)
+            next_voxel = leave_at(voxel)
+            t_voxel = ti.min(next_voxel, t_leave)
             if t_voxel > t:
                 index = slot * VOXELS + voxel_number(voxel.cell)
                 go = context[2](state, context[3], index, t, t_voxel)
                 t = t_voxel
-            advance(ray, voxel, 1)
+            advance(ray, voxel, next_voxel, 1)
     return go
