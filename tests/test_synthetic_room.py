@@ -15,7 +15,7 @@ from taichi_mrf.datasets.synthetic_room import SyntheticRoom
 from taichi_mrf.errors import BackendError, DatasetError
 from taichi_mrf.poses import as_pose, look_at, tangent_norms
 
-SMALL = "synthetic:room?width=160&height=120"
+SMALL = "synthetic:room?width=160&height=120&frames=60"
 CAMERA = PinholeCamera(width=160, height=120, fx=131.25, fy=131.25, cx=79.5, cy=59.5)
 
 number = st.floats(-2, 2)
@@ -200,7 +200,7 @@ def test_frames_are_deterministic_whatever_the_order(backend: str) -> None:
 
 
 def test_noise_is_that_of_a_kinect(backend: str) -> None:
-    room = opened("synthetic:room")
+    room = opened("synthetic:room?width=640&height=480&frames=60")
     clean, noisy = room.clean_depth(50).astype(np.float64), room.read(50).depth_m.astype(np.float64)
     seen = noisy > 0
     assert 0.8 < seen.mean() < 0.999
@@ -227,12 +227,12 @@ def test_without_noise_a_frame_holds_the_clean_depth(backend: str) -> None:
 
 def test_options_and_defaults() -> None:
     room = opened("synthetic:room")
-    assert len(room) == len(room.frame_names) == 60
-    assert room.camera == PinholeCamera(640, 480, 525, 525, 319.5, 239.5)
+    assert len(room) == len(room.frame_names) == 40
+    assert room.camera == PinholeCamera(320, 240, 262.5, 262.5, 159.5, 119.5)
     assert len(opened("synthetic:room?frames=7&seed=3&noise=none")) == 7
     assert open_dataset("synthetic:room", camera=CAMERA).camera == CAMERA
     with pytest.raises(IndexError):
-        room.read(60)
+        room.read(40)
     with pytest.raises(IndexError):
         room.read(-1)
 
