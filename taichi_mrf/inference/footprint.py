@@ -15,7 +15,8 @@ from taichi_mrf.inference.rays import is_cast, stride_metres
 from taichi_mrf.poses import Pose
 from taichi_mrf.sensor.forward import depth_of_deviation, pixel_noise
 from taichi_mrf.sensor.noise import LEAST_SIGMA_M, evaluate
-from taichi_mrf.voxels.layout import flat
+from taichi_mrf.voxels.layout import VOXELS, flat
+from taichi_mrf.voxels.memory import check_memory
 from taichi_mrf.voxels.traversal import clip, make_ray, walk_bricks
 from taichi_mrf.voxels.types import (
     F32,
@@ -72,7 +73,18 @@ def find_footprint(
     )  # fmt: skip
     crossed = np.flatnonzero(marks).astype(np.int32)
     surface = crossed[marks[crossed] & SURFACE != 0]
+    _check_size(len(crossed), len(surface), voxel_size, volume.memory_limit_gb)
     return Footprint(window, crossed, surface, int(longest[0]))
+
+
+def _check_size(crossed: int, surface: int, voxel_size: float, limit_gb: float) -> None:
+    """Refuse a view before anything is allocated for it: 60 bytes for each brick crossed while lists of
+    them are made, and for each voxel near a surface belief, message and a sweep's scratch."""
+    check_memory(
+        60.0 * crossed + VOXELS * surface * (4.0 + 2.0 + 12.0),
+        f"a view of {surface * VOXELS / 1e6:.3g} million voxels of {voxel_size:g} m",
+        limit_gb,
+    )
 
 
 def visible_box(
