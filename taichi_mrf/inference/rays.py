@@ -1,4 +1,4 @@
-"""Which pixels become rays: no more than the voxels need.
+"""Which pixels become rays, and who follows them.
 
 Near the camera a voxel covers hundreds of pixels, whose rays all tell it the same. They are thinned on a
 regular pixel grid until a voxel that faces the camera is still met by the wanted number.
@@ -29,3 +29,19 @@ def is_cast(u: I32, v: I32, measured: F32, stride_metres: F32) -> I32:
         stride = ti.max(1, ti.cast(stride_metres / measured, ti.i32))
         cast = u % stride == 0 and v % stride == 0
     return cast
+
+
+@ti.func
+def deals(workers: I32, tile: I32, width: I32, height: I32) -> I32:
+    """How many pixels each worker is dealt, those outside the image included."""
+    tiles = ((width + tile - 1) // tile) * ((height + tile - 1) // tile)
+    return (tiles + workers - 1) // workers * tile * tile
+
+
+@ti.func
+def dealt_pixel(worker: I32, turn: I32, workers: I32, tile: I32, width: I32):
+    """The pixel (u, v) of a worker's turn: whole square tiles go to one worker, because the rays of a tile
+    cross the same bricks. It may lie outside the image."""
+    across = (width + tile - 1) // tile
+    number = turn // (tile * tile) * workers + worker
+    return number % across * tile + turn % tile, number // across * tile + turn // tile % tile

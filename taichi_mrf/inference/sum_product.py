@@ -22,7 +22,8 @@ it: it lets the ray pass with probability (1 - m)^l where m is its probability o
 import taichi as ti
 
 from taichi_mrf.inference.accumulators import add_message, length_sum, mean_message
-from taichi_mrf.inference.rays import is_cast
+from taichi_mrf.inference.log_odds import clamped_log_odds, exp_of_negative, logistic, softplus
+from taichi_mrf.inference.rays import deals, dealt_pixel, is_cast
 from taichi_mrf.sensor.forward import (
     SUPPORT,
     PixelNoise,
@@ -115,19 +116,13 @@ def send_messages(
     for iteration in range(workers * spread):
         worker = iteration // spread
         height = depth.shape[0] // width
-        blocks_across = (width + BLOCK - 1) // BLOCK
-        tiles_across = (width + tile - 1) // tile
-        tiles = tiles_across * ((height + tile - 1) // tile)
-        turns = (tiles + workers - 1) // workers * tile * tile
-        if iteration % spread != 0:
-            turns = 0
-        else:
-            steps[worker] = 0
         largest = ti.exp(clamp)
+        turns = 0
+        if iteration % spread == 0:
+            turns = deals(workers, tile, width, height)
+            steps[worker] = 0
         for turn in range(turns):
-            number = turn // (tile * tile) * workers + worker
-            u = number % tiles_across * tile + turn % tile
-            v = number // tiles_across * tile + turn // tile % tile
+            u, v = dealt_pixel(worker, turn, workers, tile, width)
             measured = 0.0
             if u < width and v < height:
                 measured = depth[v * width + u]
@@ -140,7 +135,7 @@ def send_messages(
 
                 # The ray ends where its measurement has nothing more to say, or where the map does.
                 last = depth_of_deviation(measured, -end_sigmas, here)
-                block = (v // BLOCK) * blocks_across + u // BLOCK
+                block = (v // BLOCK) * ((width + BLOCK - 1) // BLOCK) + u // BLOCK
                 begin, end = 0.0, ti.min(last, max_depth)
                 if begins_known == 1:
                     begin = begins[block]
@@ -220,20 +215,6 @@ def empty_message(before: F32, behind: F32, free: F32, floor: F32) -> F32:
     return before + behind / ti.max(free, TINY) + (floor + TINY)
 
 
-@ti.func
-def clamped_log_odds(occupied: F32, empty: F32, clamp: F32, largest: F32) -> F32:
-    """log(occupied / empty), clamped, and moved from [-clamp, clamp] to [0, 1] for the accumulators.
-
-    ``largest`` is e^clamp: most messages lie beyond the clamp, where no logarithm need be taken.
-    """
-    message = 1.0
-    if occupied * largest <= empty:
-        message = 0.0
-    elif occupied < empty * largest:
-        message = 0.5 + 0.5 * ti.log(occupied / empty) / clamp
-    return message
-
-
 @ti.kernel
 def finish(
     slots: I32Array, belief: F32Array, messages: AnyArray, sums: I64Array, scale: F32,
@@ -274,28 +255,3 @@ def fold(slots: I32Array, evidence: F32Array, messages: AnyArray):
     """Add a keyframe's messages to what inference starts from (freezing)."""
     for i in range(slots.shape[0] * VOXELS):
         evidence[slots[i // VOXELS] * VOXELS + i % VOXELS] += ti.cast(messages[i], ti.f32)
-
-
-@ti.func
-def logistic(x: F32) -> F32:
-    """Log-odds to probability."""
-    return 1.0 / (1.0 + ti.exp(-x))
-
-
-@ti.func
-def softplus(x: F32) -> F32:
-    """log(1 + e^x) without losing the digits of a small e^x: minus the log of being free."""
-    grown = ti.exp(-ti.abs(x))
-    tail = grown * (1.0 - grown * (0.5 - grown * (1.0 / 3.0)))
-    if grown >= 1e-2:
-        tail = ti.log(1.0 + grown)
-    return ti.max(x, 0.0) + tail
-
-
-@ti.func
-def exp_of_negative(x: F32) -> F32:
-    """e^x for x <= 0, by its series near 0: most voxels on a ray's way are nearly free."""
-    value = 1.0 + x * (1.0 + x * (0.5 + x * (1.0 / 6.0)))
-    if x <= -0.05:
-        value = ti.exp(x)
-    return value

@@ -14,7 +14,7 @@ from taichi_mrf import runtime
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import VolumeConfig
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.inference.sum_product import softplus
+from taichi_mrf.inference.log_odds import softplus
 from taichi_mrf.poses import Pose
 from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.pool import BrickPool
