@@ -7,6 +7,7 @@ import contextlib
 import importlib
 import importlib.metadata
 import io
+import logging
 import os
 import platform
 import sys
@@ -55,10 +56,11 @@ class BackendStatus:
 
 
 _chosen: Backend | None = None
+_log = logging.getLogger(__name__)
 
 
 def init(arch: str = "auto", threads: int = 0, debug: bool = False) -> str:
-    """Start Taichi and return the backend's name; :func:`choice` tells the rest.
+    """Start Taichi and return the backend's name; :func:`choice` and the log tell the rest.
 
     ``arch`` is "cuda", "vulkan", "cpu", or "auto" for the first of these that there is. A software
     Vulkan device is taken only for arch="vulkan". ``threads`` limits the CPU backend (0 = all cores),
@@ -73,6 +75,9 @@ def init(arch: str = "auto", threads: int = 0, debug: bool = False) -> str:
     _chosen = _chosen or _already_running()
     if _chosen is None:
         _chosen = _started(arch, threads, debug)
+        _log.info("Taichi runs on %s (%s), %s", _chosen.name, _chosen.device, _chosen.reason)
+        for name, why in _chosen.rejected.items():
+            _log.info("Taichi does not run on %s: %s", name, why)
     elif arch not in ("auto", _chosen.name):
         raise BackendError(
             f"Taichi already runs on {_chosen.name}: a process has one backend, {arch} needs another process"
