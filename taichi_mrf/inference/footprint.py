@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from taichi_mrf.config import InferenceConfig, SensorConfig, VolumeConfig
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.inference.keyframe import DepthImage, Footprint
-from taichi_mrf.inference.rays import is_cast, stride_metres
+from taichi_mrf.inference.rays import is_cast, pixel_direction, stride_metres
 from taichi_mrf.poses import Pose
 from taichi_mrf.sensor.forward import depth_of_deviation, pixel_noise
 from taichi_mrf.sensor.noise import LEAST_SIGMA_M, evaluate
@@ -145,9 +145,7 @@ def _mark(
         measured = depth[pixel]
         u, v = pixel % width, pixel // width
         if is_cast(u, v, measured, stride_metres):
-            direction = to_voxels @ Vec3(
-                (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0
-            )
+            direction = to_voxels @ pixel_direction(u, v, intrinsics)
             ray = make_ray(centre, direction)
             noise_here = pixel_noise(noise, patch, columns, u, v)
             begin, end = 0.0, ti.min(depth_of_deviation(measured, -end_sigmas, noise_here), max_depth)

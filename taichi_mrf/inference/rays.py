@@ -10,7 +10,7 @@ import taichi as ti
 
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import InferenceConfig
-from taichi_mrf.voxels.types import F32, I32
+from taichi_mrf.voxels.types import F32, I32, Vec3, Vec4
 
 
 def stride_metres(camera: PinholeCamera, voxel_size: float, config: InferenceConfig) -> float:
@@ -19,6 +19,13 @@ def stride_metres(camera: PinholeCamera, voxel_size: float, config: InferenceCon
     if config.rays_per_voxel == 0:
         return 0.0
     return voxel_size * min(camera.fx, camera.fy) / math.sqrt(config.rays_per_voxel)
+
+
+@ti.func
+def pixel_direction(u: I32, v: I32, intrinsics: Vec4):
+    """The ray through the centre of pixel (u, v) in the camera frame, for one metre of axial depth;
+    ``intrinsics`` are fx, fy, cx, cy in pixels."""
+    return Vec3((u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0)
 
 
 @ti.func

@@ -23,7 +23,7 @@ import taichi as ti
 
 from taichi_mrf.inference.accumulators import add_message, length_sum, mean_message
 from taichi_mrf.inference.log_odds import clamped_log_odds, exp_of_negative, logistic, softplus
-from taichi_mrf.inference.rays import deals, dealt_pixel, is_cast
+from taichi_mrf.inference.rays import dealt_pixel, deals, is_cast, pixel_direction
 from taichi_mrf.sensor.forward import (
     SUPPORT,
     PixelNoise,
@@ -127,9 +127,7 @@ def send_messages(
             if u < width and v < height:
                 measured = depth[v * width + u]
             if is_cast(u, v, measured, stride_metres):
-                direction = to_voxels @ Vec3(
-                    (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1], 1.0
-                )
+                direction = to_voxels @ pixel_direction(u, v, intrinsics)
                 ray = make_ray(centre, direction)
                 here = pixel_noise(noise, patch, columns, u, v)
 

@@ -15,6 +15,7 @@ from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import VolumeConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.inference.log_odds import softplus
+from taichi_mrf.inference.rays import pixel_direction
 from taichi_mrf.poses import Pose
 from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.pool import BrickPool
@@ -155,11 +156,7 @@ def _render(
 ):  # fmt: skip
     """The segment's middle at the argmax of omega (eq. 18, section III-D), for every pixel."""
     for pixel in range(depth.shape[0]):
-        direction = to_voxels @ Vec3(
-            (pixel % width - intrinsics[2]) / intrinsics[0],
-            (pixel // width - intrinsics[3]) / intrinsics[1],
-            1.0,
-        )
+        direction = to_voxels @ pixel_direction(pixel % width, pixel // width, intrinsics)
         ray = make_ray(centre, direction)
         begin, end = 0.0, max_depth
         clip(ray, begin, end, lower, upper)
