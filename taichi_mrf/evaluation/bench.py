@@ -117,6 +117,7 @@ def bench_mapping(
         m.infer(sweeps=0, keyframes=[k])
         sweeps.append(_timed(lambda: m.infer(sweeps=1, keyframes=[k])))  # noqa: B023
         steps.append(m.last_voxel_steps)
+    peak_mb = None if begin_mb is None else (peak_memory_mb() or 0.0) - begin_mb
     size = m.statistics()
     points = np.random.default_rng(0).choice(m.voxels(0.0)[0], QUERY_POINTS)
     view = frames[len(frames) // 2]
@@ -143,7 +144,7 @@ def bench_mapping(
         bricks=size.bricks,
         voxels=size.bricks * VOXELS,
         bytes_per_voxel=size.bytes_per_voxel,
-        peak_memory_mb=None if begin_mb is None else (peak_memory_mb() or 0.0) - begin_mb,
+        peak_memory_mb=peak_mb,
     )
 
 

@@ -23,7 +23,7 @@ import taichi as ti
 
 from taichi_mrf.inference.accumulators import add_message, length_sum, mean_message
 from taichi_mrf.inference.log_odds import clamped_log_odds, exp_of_negative, logistic, softplus
-from taichi_mrf.inference.rays import dealt_pixel, deals, is_cast, pixel_direction
+from taichi_mrf.inference.rays import deals, dealt_pixel, is_cast, pixel_direction
 from taichi_mrf.sensor.forward import (
     SUPPORT,
     PixelNoise,
