@@ -227,12 +227,12 @@ def test_without_noise_a_frame_holds_the_clean_depth(backend: str) -> None:
 
 def test_options_and_defaults() -> None:
     room = opened("synthetic:room")
-    assert len(room) == len(room.frame_names) == 40
+    assert len(room) == len(room.frame_names) == 32
     assert room.camera == PinholeCamera(320, 240, 262.5, 262.5, 159.5, 119.5)
     assert len(opened("synthetic:room?frames=7&seed=3&noise=none")) == 7
     assert open_dataset("synthetic:room", camera=CAMERA).camera == CAMERA
     with pytest.raises(IndexError):
-        room.read(40)
+        room.read(32)
     with pytest.raises(IndexError):
         room.read(-1)
 

@@ -34,7 +34,8 @@ def write_pictures(out_dir: Path, m: OccupancyMap, held_out: Sequence[Frame]) ->
     figures = {"depth.png": depth_comparison(m, held_out), **_room_figures(m)}
     for name, figure in figures.items():
         with atomic_path(out_dir / name) as temporary:
-            figure.savefig(temporary, dpi=_DPI)
+            # Level 2 of 9 takes half of the default's time, and the files are a fifth larger.
+            figure.savefig(temporary, dpi=_DPI, pil_kwargs={"compress_level": 2})
     return [out_dir / name for name in figures]
 
 
