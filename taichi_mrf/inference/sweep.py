@@ -91,12 +91,8 @@ class Sweeper:
 
         Returns how many voxels of each visible brick moved, or None if it sees no brick.
         """
-        config, visible, footprint, image = (
-            self.inference,
-            keyframe.visible,
-            keyframe.footprint,
-            keyframe.image,
-        )
+        config, image = self.inference, keyframe.image
+        visible, footprint = keyframe.visible, keyframe.footprint
         n = len(visible.slots)
         if n == 0:
             return None
@@ -111,9 +107,12 @@ class Sweeper:
         )
         log_average = config.average == "log_odds"
 
+        # Eq. 6: what all others believe of each voxel.
         sum_product.cavity(
             visible.slots, pool.belief, messages, config.cavity_clamp, self.log_free, self.sums
         )
+
+        # Eqs. 4, 11, 13 and 14: what the rays make of that and of their measurements.
         self.index.fill(window, visible.cells, np.arange(n, dtype=np.int32))
         sum_product.send_messages(
             image.depth, keyframe.begins, int(keyframe.begins_known),
@@ -129,6 +128,8 @@ class Sweeper:
         )  # fmt: skip
         keyframe.begins_known = True
         self.index.clear(window, visible.cells)
+
+        # Eqs. 7 and 8: the average over rays is the keyframe's new message, and changes the beliefs.
         self.moved.fill(0)
         sum_product.finish(
             visible.slots, pool.belief, messages, self.sums, scale,
