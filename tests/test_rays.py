@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("backend")
 
 
 @ti.kernel
-def deal(workers: I32, tile: I32, width: I32, height: I32, times: I32Array) -> None:
+def _deal(workers: I32, tile: I32, width: I32, height: I32, times: I32Array):  # noqa: ANN202 (Taichi allows no None)
     for worker in range(workers):
         for turn in range(deals(workers, tile, width, height)):
             u, v = dealt_pixel(worker, turn, workers, tile, width)
@@ -30,12 +30,12 @@ def deal(workers: I32, tile: I32, width: I32, height: I32, times: I32Array) -> N
 def test_every_pixel_is_dealt_once(width: int, height: int, workers: int, tile: int) -> None:
     times = ti.ndarray(ti.i32, width * height)
     times.fill(0)
-    deal(workers, tile, width, height, times)
+    _deal(workers, tile, width, height, times)
     np.testing.assert_array_equal(times.to_numpy(), 1)
 
 
 @ti.kernel
-def select(depth: F32Array, width: I32, stride: F32, chosen: I32Array) -> None:
+def _select(depth: F32Array, width: I32, stride: F32, chosen: I32Array):  # noqa: ANN202 (Taichi allows no None)
     for pixel in range(depth.shape[0]):
         chosen[pixel] = is_cast(pixel % width, pixel // width, depth[pixel], stride)
 
@@ -47,7 +47,7 @@ def test_rays_are_thinned_by_what_a_voxel_covers(wanted: float) -> None:
     depth[::5, ::7] = 0
     config = InferenceConfig(rays_per_voxel=wanted)
     chosen = np.zeros(depth.size, np.int32)
-    select(depth.reshape(-1), camera.width, stride_metres(camera, 0.1, config), chosen)
+    _select(depth.reshape(-1), camera.width, stride_metres(camera, 0.1, config), chosen)
     v, u = np.mgrid[: camera.height, : camera.width]
     with np.errstate(divide="ignore"):
         covered = 0.1 * 50.0 / depth.astype(np.float64)  # pixels along a voxel's side
@@ -60,7 +60,7 @@ def test_rays_are_thinned_by_what_a_voxel_covers(wanted: float) -> None:
 
 
 @ti.kernel
-def directions(width: I32, intrinsics: Vec4, out: F32Array3) -> None:
+def _directions(width: I32, intrinsics: Vec4, out: F32Array3):  # noqa: ANN202 (Taichi allows no None)
     for v, u in ti.ndrange(out.shape[0], width):
         d = pixel_direction(u, v, intrinsics)
         for axis in ti.static(range(3)):
@@ -70,5 +70,5 @@ def directions(width: I32, intrinsics: Vec4, out: F32Array3) -> None:
 def test_directions_are_the_cameras() -> None:
     camera = PinholeCamera(13, 9, 20.0, 17.0, 5.3, 4.9)
     out = np.zeros((9, 13, 3), np.float32)
-    directions(13, ti.Vector([20.0, 17.0, 5.3, 4.9], ti.f32), out)
+    _directions(13, ti.Vector([20.0, 17.0, 5.3, 4.9], ti.f32), out)
     np.testing.assert_allclose(out, camera.rays(), atol=1e-6)
