@@ -33,10 +33,9 @@ MAP_FILE, VOXEL_FILE, REPORT_FILE = "map.npz", "voxels.ply", "report.json"
 MAY_CHANGE = ("inference.sweeps", "inference.tolerance", "runtime.")
 """Parameters (or groups) that may differ from those of the run that --resume goes on with."""
 
-NEXT_STEP = (
-    "Look at the .png files, or open voxels.ply in MeshLab, CloudCompare or Blender. "
-    "The live view, taichi-mrf live, comes with the next version."
-)
+LOOK_AT_PICTURES = "Look at the .png files, or open"
+OPEN_VOXELS = "voxels.ply in MeshLab, CloudCompare or Blender."
+LIVE_VIEW = "The live view, taichi-mrf live, comes with the next version."
 
 _PICTURED_FRAMES = 3
 
@@ -76,7 +75,8 @@ def run_map(options: Map) -> int:
             report["skipped_frames"] = _skipped_before(options.out) | report["skipped_frames"]
         write_text(options.out / REPORT_FILE, report_json(report))
         print_report(console, report, [*written, options.out / REPORT_FILE])
-        console.print(NEXT_STEP, highlight=False)
+        look = LOOK_AT_PICTURES if options.pictures else "Open"
+        console.print(f"{look} {OPEN_VOXELS} {LIVE_VIEW}", highlight=False)
     return _exit_status(request)
 
 
