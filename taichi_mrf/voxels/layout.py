@@ -39,8 +39,3 @@ def flat(cell: IVec3, shape: IVec3) -> I32:
 def offsets_in_brick() -> NDArray[np.int32]:
     """(512, 3): the voxel of each number within a brick, the inverse of :func:`voxel_number`."""
     return np.stack(np.unravel_index(np.arange(VOXELS), (BRICK,) * 3), axis=1).astype(np.int32)
-
-
-def voxel_size_text(voxel_size: float) -> str:
-    """A voxel size for messages: '2 cm', '5 mm'."""
-    return f"{voxel_size * 100:g} cm" if voxel_size >= 0.01 else f"{voxel_size * 1000:g} mm"
