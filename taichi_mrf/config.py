@@ -6,20 +6,18 @@ this file needs Taichi, so that ``taichi-mrf --help`` answers at once.
 """
 
 import dataclasses
-import difflib
 import math
-import types
-import typing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import yaml
 
+from taichi_mrf.config_values import from_dict
 from taichi_mrf.errors import ConfigError
 
 Arch = Literal["auto", "cuda", "vulkan", "cpu"]
-T = TypeVar("T")
+Method = Literal["mrf", "log_odds", "visibility"]
 
 
 @dataclass(frozen=True)
@@ -129,6 +127,87 @@ class InferenceConfig:
 
 
 @dataclass(frozen=True)
+class LogOddsConfig:
+    """Occupancy mapping by independent log-odds, as OctoMap does it (Hornung et al. 2013)."""
+
+    hit: float = 0.7
+    """Probability of occupied that a ray's end gives a voxel."""
+
+    miss: float = 0.4
+    """Probability of occupied that a ray gives a voxel by passing through it."""
+
+    lowest: float = 0.1192
+    """A voxel's probability never falls below this, so that it can change again."""
+
+    highest: float = 0.971
+    """A voxel's probability never rises above this."""
+
+    update: Literal["scan", "ray"] = "scan"
+    """One update for each voxel and scan, in which a hit wins over misses (OctoMap), or one for each ray."""
+
+    max_range: float = 0.0
+    """A ray is cut off at this range (metres) and its end then counts as free; 0 means no limit."""
+
+    discretise: bool = False
+    """Cast one ray to the centre of each voxel that holds a measurement, instead of one for each pixel."""
+
+    correct_bias: bool = False
+    """Take the sensor's known bias out of the measurements first."""
+
+    def __post_init__(self) -> None:
+        _check(0.5 < self.hit < 1, "log_odds.hit", "must lie between 0.5 and 1")
+        _check(0 < self.miss < 0.5, "log_odds.miss", "must lie between 0 and 0.5")
+        _check(0 < self.lowest < 0.5, "log_odds.lowest", "must lie between 0 and 0.5")
+        _check(0.5 < self.highest < 1, "log_odds.highest", "must lie between 0.5 and 1")
+        _check(self.max_range >= 0, "log_odds.max_range", "must not be negative")
+
+
+@dataclass(frozen=True)
+class VisibilityConfig:
+    """Visibility-aware occupancy mapping (Schauwecker & Zell, IROS 2014); defaults are their Table I."""
+
+    hit_if_free: float = 0.43
+    """P(H | V, not O): probability of a hit for a visible voxel that is free."""
+
+    hit_if_occupied: float = 0.55
+    """P(H | V, O): probability of a hit for a visible voxel that is occupied."""
+
+    hit_if_hidden: float = 0.05
+    """P(H | not V): probability of a hit for a voxel that cannot be seen."""
+
+    visible_if_occluded: float = 0.2
+    """P(V_i | C_i, V_i-1): probability that a locally occluded voxel behind a visible one is visible."""
+
+    visible_if_clear: float = 1.0
+    """P(V_i | not C_i, V_i-1): the same for one that is not locally occluded."""
+
+    q_min: float = 0.1
+    """A ray ends where the probability of being visible falls below this."""
+
+    q_max: float = 0.7
+    """A probability of being visible from here on counts as 1."""
+
+    lowest: float = 0.1192
+    """A voxel's probability never falls below this (OctoMap's default)."""
+
+    highest: float = 0.971
+    """A voxel's probability never rises above this (OctoMap's default)."""
+
+    max_range: float = 0.0
+    """A ray is cut off at this range (metres) and its end then counts as free; 0 means no limit."""
+
+    def __post_init__(self) -> None:
+        for name in ("hit_if_free", "hit_if_occupied", "hit_if_hidden"):
+            _check(0 < getattr(self, name) < 1, f"visibility.{name}", "must lie between 0 and 1")
+        for name in ("visible_if_occluded", "visible_if_clear", "q_min", "q_max"):
+            _check(0 <= getattr(self, name) <= 1, f"visibility.{name}", "must lie from 0 to 1")
+        _check(self.q_min < self.q_max, "visibility.q_max", "must be more than visibility.q_min")
+        _check(0 < self.lowest < 0.5, "visibility.lowest", "must lie between 0 and 0.5")
+        _check(0.5 < self.highest < 1, "visibility.highest", "must lie between 0.5 and 1")
+        _check(self.max_range >= 0, "visibility.max_range", "must not be negative")
+
+
+@dataclass(frozen=True)
 class KeyframeConfig:
     """Which frames become keyframes (section V): those that have moved enough."""
 
@@ -216,11 +295,20 @@ class Config:
     voxel_size: float = 0.05
     """Side of a voxel in metres."""
 
+    method: Method = "mrf"
+    """How a map is made: mrf is MRFMap, log_odds OctoMap's way, visibility Schauwecker & Zell's."""
+
     sensor: SensorConfig = field(default_factory=SensorConfig)
     """What is known of the sensor."""
 
     inference: InferenceConfig = field(default_factory=InferenceConfig)
     """How the marginals are computed."""
+
+    log_odds: LogOddsConfig = field(default_factory=LogOddsConfig)
+    """Occupancy mapping by independent log-odds (method log_odds)."""
+
+    visibility: VisibilityConfig = field(default_factory=VisibilityConfig)
+    """Visibility-aware occupancy mapping (method visibility)."""
 
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     """Which frames become keyframes."""
@@ -242,75 +330,6 @@ class Config:
 def _check(ok: bool, name: str, problem: str) -> None:
     if not ok:
         raise ConfigError(f"{name} {problem}")
-
-
-def unknown_key(key: object, known: typing.Iterable[str], where: str) -> ConfigError:
-    """The error for a parameter that does not exist: it names the nearest one that does."""
-    known = list(known)
-    near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
-    hint = f"did you mean '{near[0]}'?" if near else f"known are: {', '.join(known)}"
-    return ConfigError(f"{where}: unknown parameter '{key}'; {hint}")
-
-
-def overridden(config: T, overrides: dict[str, Any], where: str) -> T:
-    """A dataclass instance with some fields replaced; an unknown name is a ConfigError."""
-    names = [f.name for f in dataclasses.fields(config)]  # type: ignore[arg-type]
-    for key in overrides:
-        if key not in names:
-            raise unknown_key(key, names, where)
-    return dataclasses.replace(config, **overrides)  # type: ignore[type-var]
-
-
-def from_dict(cls: type[T], values: Any, where: str) -> T:
-    """Build a configuration dataclass from parsed YAML.
-
-    ``where`` is the file, for error messages. Raises ConfigError for an unknown key (naming the
-    nearest), a value of the wrong type, or one outside its range.
-    """
-    if values is None:
-        values = {}
-    if not isinstance(values, dict):
-        raise ConfigError(f"{where}: expected a mapping of parameters, not {values!r}")
-    hints = typing.get_type_hints(cls)
-    arguments = {}
-    for key, value in values.items():
-        if key not in hints:
-            raise unknown_key(key, hints, where)
-        arguments[key] = _convert(value, hints[key], f"{where}: {key}")
-    try:
-        return cls(**arguments)
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from error
-
-
-def _convert(value: Any, hint: Any, where: str) -> Any:
-    """Check one YAML value against a field's type; whole numbers are accepted where numbers are."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if dataclasses.is_dataclass(hint):
-        return from_dict(typing.cast(type, hint), value, where)
-    if origin in (typing.Union, types.UnionType):
-        if value is None and type(None) in arguments:
-            return None
-        return _convert(value, next(a for a in arguments if a is not type(None)), where)
-    if origin is Literal:
-        if value not in arguments:
-            raise ConfigError(f"{where} must be one of {', '.join(map(str, arguments))}, not {value!r}")
-        return value
-    if origin is tuple:
-        if not isinstance(value, list | tuple):
-            raise ConfigError(f"{where} must be a list, not {value!r}")
-        if arguments[-1] is not Ellipsis and len(value) != len(arguments):
-            raise ConfigError(f"{where} must have {len(arguments)} entries, not {len(value)}")
-        return tuple(_convert(v, arguments[0], where) for v in value)
-    if hint is float and isinstance(value, str):  # YAML 1.1 reads 1e-6 (without a point) as a string
-        try:
-            value = float(value)
-        except ValueError:
-            raise ConfigError(f"{where} must be a number, not {value!r}") from None
-    accepted = (int, float) if hint is float else hint
-    if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
-        raise ConfigError(f"{where} must be of type {hint.__name__}, not {value!r}")
-    return float(value) if hint is float else value
 
 
 def load(path: str | Path) -> Config:

@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 
 from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.config import from_dict
+from taichi_mrf.config_values import from_dict
 from taichi_mrf.datasets.base import ReadOptions
 from taichi_mrf.datasets.images import image_size
 from taichi_mrf.errors import ConfigError, DatasetError

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf import runtime
 from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.config import from_dict
+from taichi_mrf.config_values import from_dict
 from taichi_mrf.datasets.analytic_scene import Scene
 from taichi_mrf.datasets.base import Dataset, ReadOptions
 from taichi_mrf.datasets.intrinsics import PRIMESENSE

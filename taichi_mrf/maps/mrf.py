@@ -18,7 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf import runtime
 from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.config import Config, InferenceConfig, SensorConfig, VolumeConfig, overridden
+from taichi_mrf.config import Config, InferenceConfig, SensorConfig, VolumeConfig
+from taichi_mrf.config_values import overridden
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.footprint import find_footprint
@@ -31,7 +32,8 @@ from taichi_mrf.maps.storage import MapContents, StoredKeyframe, read_contents, 
 from taichi_mrf.poses import as_pose
 from taichi_mrf.queries.extract import extract_voxels
 from taichi_mrf.queries.points import classify, point_log_odds, probability
-from taichi_mrf.queries.view import RayProfile, View
+from taichi_mrf.queries.profile import RayProfile
+from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config, warn_of_bad_sigma
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.pool import BrickPool
@@ -78,7 +80,9 @@ class MRFMap:
         runtime.init()
         self.sensor = SensorConfig(min_depth=min_depth, max_depth=max_depth)
         inference = overridden(inference or InferenceConfig(), parameters, "MRFMap")
-        self.config = Config(voxel_size, self.sensor, inference, volume=volume or VolumeConfig())
+        self.config = Config(
+            voxel_size, sensor=self.sensor, inference=inference, volume=volume or VolumeConfig()
+        )
         self.noise = noise if noise is not None else PolynomialNoise(self.sensor.sigma, self.sensor.bias)
         self.voxel_size = self.config.voxel_size
         self.prior = prior_probability(inference, self.voxel_size)
@@ -88,7 +92,7 @@ class MRFMap:
         weakref.finalize(self, recycle, topology)
         self._book = BrickBook(topology, self._pool, self.voxel_size)
         self._sweeper = Sweeper(self.voxel_size, self.sensor, inference, self.config.volume)
-        self._view = View(self._pool, self.voxel_size, self.config.volume)
+        self.view = View(self._pool, self.voxel_size, self.config.volume)
         self._keyframes: dict[int, Keyframe] = {}
         self._frozen: dict[int, str] = {}
         self._next_id = 0
@@ -217,13 +221,13 @@ class MRFMap:
 
     def render_depth(self, camera: PinholeCamera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
         """Axial depth of the likeliest surface seen by each pixel, (H, W) float32, NaN where none is."""
-        return self._view.render_depth(camera, as_pose(T_world_camera), self.sensor.max_depth)
+        return self.view.render_depth(camera, as_pose(T_world_camera), self.sensor.max_depth)
 
     def ray_profile(
         self, origin: ArrayLike, direction: ArrayLike, max_range: float | None = None
     ) -> RayProfile:
         """Occupancy, visibility and omega (eqs. 15 to 18) along a ray, by range in metres."""
-        return self._view.ray_profile(origin, direction, max_range or self.sensor.max_depth)
+        return self.view.ray_profile(origin, direction, max_range or self.sensor.max_depth)
 
     @property
     def last_voxel_steps(self) -> int:

@@ -14,7 +14,8 @@ import yaml
 from numpy.typing import NDArray
 
 from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.config import Config, from_dict, to_yaml
+from taichi_mrf.config import Config, to_yaml
+from taichi_mrf.config_values import from_dict
 from taichi_mrf.errors import MapFileError, TaichiMRFError
 from taichi_mrf.export.atomic import write_npz
 from taichi_mrf.poses import Pose

@@ -38,6 +38,13 @@ class NoiseTable:
     patch: int
     columns: int
 
+    def at_pixels(self, depth_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """sigma (at least LEAST_SIGMA_M) and bias, (H, W) each, for surfaces at (H, W) axial depths."""
+        v, u = np.indices(depth_m.shape)
+        row = (v // self.patch) * self.columns + u // self.patch
+        sigma, bias = (evaluate(self.coefficients[row, which], depth_m) for which in (0, 1))
+        return np.maximum(sigma, LEAST_SIGMA_M), bias
+
 
 class NoiseModel(Protocol):
     """What MRFMap asks of a noise model."""

@@ -1,0 +1,84 @@
+"""Plain values, as YAML or a caller gives them, made into typed dataclasses.
+
+A dataclass is the only definition of its parameters: what they are called, what type they have. Whatever
+does not fit is a ConfigError that says where it stands and, for a name, which one is nearest.
+"""
+
+import dataclasses
+import difflib
+import types
+import typing
+from typing import Any, Literal, TypeVar
+
+from taichi_mrf.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def unknown_key(key: object, known: typing.Iterable[str], where: str) -> ConfigError:
+    """The error for a parameter that does not exist: it names the nearest one that does."""
+    known = list(known)
+    near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
+    hint = f"did you mean '{near[0]}'?" if near else f"known are: {', '.join(known)}"
+    return ConfigError(f"{where}: unknown parameter '{key}'; {hint}")
+
+
+def overridden(config: T, overrides: dict[str, Any], where: str) -> T:
+    """A dataclass instance with some fields replaced; an unknown name is a ConfigError."""
+    names = [f.name for f in dataclasses.fields(config)]  # type: ignore[arg-type]
+    for key in overrides:
+        if key not in names:
+            raise unknown_key(key, names, where)
+    return dataclasses.replace(config, **overrides)  # type: ignore[type-var]
+
+
+def from_dict(cls: type[T], values: Any, where: str) -> T:
+    """Build a configuration dataclass from parsed YAML.
+
+    ``where`` is the file, for error messages. Raises ConfigError for an unknown key (naming the
+    nearest), a value of the wrong type, or one outside its range.
+    """
+    if values is None:
+        values = {}
+    if not isinstance(values, dict):
+        raise ConfigError(f"{where}: expected a mapping of parameters, not {values!r}")
+    hints = typing.get_type_hints(cls)
+    arguments = {}
+    for key, value in values.items():
+        if key not in hints:
+            raise unknown_key(key, hints, where)
+        arguments[key] = _convert(value, hints[key], f"{where}: {key}")
+    try:
+        return cls(**arguments)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error
+
+
+def _convert(value: Any, hint: Any, where: str) -> Any:
+    """Check one YAML value against a field's type; whole numbers are accepted where numbers are."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if dataclasses.is_dataclass(hint):
+        return from_dict(typing.cast(type, hint), value, where)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        return _convert(value, next(a for a in arguments if a is not type(None)), where)
+    if origin is Literal:
+        if value not in arguments:
+            raise ConfigError(f"{where} must be one of {', '.join(map(str, arguments))}, not {value!r}")
+        return value
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise ConfigError(f"{where} must be a list, not {value!r}")
+        if arguments[-1] is not Ellipsis and len(value) != len(arguments):
+            raise ConfigError(f"{where} must have {len(arguments)} entries, not {len(value)}")
+        return tuple(_convert(v, arguments[0], where) for v in value)
+    if hint is float and isinstance(value, str):  # YAML 1.1 reads 1e-6 (without a point) as a string
+        try:
+            value = float(value)
+        except ValueError:
+            raise ConfigError(f"{where} must be a number, not {value!r}") from None
+    accepted = (int, float) if hint is float else hint
+    if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
+        raise ConfigError(f"{where} must be of type {hint.__name__}, not {value!r}")
+    return float(value) if hint is float else value

@@ -1,0 +1,191 @@
+"""How well a map explains a depth image that it has not seen (MRFMap, sections III-D and V).
+
+The map is asked, for each pixel, at which depth its ray most likely meets the first surface: where
+omega (eq. 18) is largest. The pixel is right if that depth is within a tolerance of the depth to judge
+by. One function for every kind of map: all that it needs is the map's ``view``.
+
+The paper and its published code disagree on the tolerance and on rays that meet nothing, so all readings
+are here, and rays without an answer are counted as wrong and reported.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.config import SensorConfig
+from taichi_mrf.errors import ConfigError, FrameError
+from taichi_mrf.evaluation.depth_error import DepthError, depth_error
+from taichi_mrf.poses import as_pose
+from taichi_mrf.queries.survey import SurfaceSurvey
+from taichi_mrf.queries.view import View
+from taichi_mrf.sensor.noise import NoiseModel, NoiseTable, PolynomialNoise
+
+Tolerance = Literal["voxel", "1.5sigma", "5cm", "sensor"]
+TOLERANCES: tuple[Tolerance, ...] = ("voxel", "1.5sigma", "5cm", "sensor")
+"""voxel: the depth lies in the answer's voxel (section III-D). 1.5sigma: within 1.5 sigma of its middle, with
+a constant sigma of one voxel (section V). 5cm: within 5 cm of its middle (the published code). sensor:
+within 1.5 sigma of what the sensor would measure there, bias and sigma being the sensor's own."""
+
+NOT_JUDGED, NO_ANSWER, WRONG, RIGHT = 0, 1, 2, 3
+"""What a pixel of an accuracy image can be."""
+
+FACE = 0.01
+"""A depth this share of a voxel outside the answer's voxel still counts as in it: surfaces like to lie
+exactly in the grid's planes, where rounding decides."""
+
+OUTLIERS = 0.01
+"""Share of measurements that the log-likelihood takes for outliers, spread evenly over the sensor's range."""
+
+
+class JudgedMap(Protocol):
+    """What the judge asks of a map, whatever the method."""
+
+    @property
+    def voxel_size(self) -> float: ...
+    @property
+    def view(self) -> View: ...
+    @property
+    def sensor(self) -> SensorConfig: ...
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """``score`` and ``unanswered`` are shares of the judged pixels, ``image`` (H, W) int8 says of each pixel
+    whether it is NOT_JUDGED, NO_ANSWER, WRONG or RIGHT."""
+
+    score: float
+    unanswered: float
+    image: NDArray[np.int8]
+
+
+@dataclass(frozen=True)
+class JudgedView:
+    """A view followed through a map once, to be scored in any way.
+
+    ``depth_m`` (H, W) is the axial depth to judge by, 0 where nothing is judged, ``noise`` that of its
+    sensor.
+    """
+
+    depth_m: NDArray[np.float32]
+    survey: SurfaceSurvey
+    voxel_size: float
+    max_depth: float
+    noise: NoiseTable
+
+    @property
+    def judged(self) -> NDArray[np.bool_]:
+        """Pixels that count, (H, W)."""
+        return self.depth_m > 0
+
+    @property
+    def answered(self) -> NDArray[np.bool_]:
+        """Judged pixels whose ray meets anything at all, (H, W)."""
+        return self.judged & (self.survey.far > 0)
+
+    @cached_property
+    def answer_m(self) -> NDArray[np.float32]:
+        """Axial depth of the likeliest surface, (H, W), NaN where there is no answer."""
+        return np.where(self.answered, self.survey.middle, np.float32(np.nan))
+
+    def accuracy(self, tolerance: Tolerance) -> Accuracy:
+        """Share of right pixels. Raises ConfigError for a tolerance that does not exist."""
+        right = self.answered & self._within(tolerance)
+        image = np.where(self.judged, NO_ANSWER, NOT_JUDGED).astype(np.int8)
+        image[self.answered] = WRONG
+        image[right] = RIGHT
+        judged = int(self.judged.sum())
+        return Accuracy(int(right.sum()) / judged, 1.0 - int(self.answered.sum()) / judged, image)
+
+    def depth_error(self) -> DepthError:
+        """Answer minus depth."""
+        return depth_error(self.answer_m, self.depth_m)
+
+    def expected_depth_error(self) -> DepthError:
+        """The mean depth of the surface, by eq. 16's Omega, minus the depth."""
+        expected = np.where(self.answered, self.survey.expected, np.float32(np.nan))
+        return depth_error(expected, self.depth_m)
+
+    def log_likelihood(self) -> float:
+        """Mean log density (per metre) of the depths under the map and the sensor's noise.
+
+        A share OUTLIERS of the measurements, and what is left of a ray that leaves the map, may come from
+        anywhere in the sensor's range, so one pixel cannot cost more than log(OUTLIERS / range).
+        """
+        survey, anywhere = self.survey, 1.0 / self.max_depth
+        through = survey.visibility[self.judged].astype(np.float64)
+        explained = survey.likelihood[self.judged] + through * anywhere
+        return float(np.mean(np.log((1.0 - OUTLIERS) * explained + OUTLIERS * anywhere)))
+
+    def _within(self, tolerance: Tolerance) -> NDArray[np.bool_]:
+        depth, answer = self.depth_m.astype(np.float64), self.survey.middle.astype(np.float64)
+        if tolerance == "voxel":
+            slack = FACE * self.voxel_size
+            return (depth >= self.survey.near - slack) & (depth <= self.survey.far + slack)
+        if tolerance == "1.5sigma":
+            return np.abs(depth - answer) <= 1.5 * self.voxel_size
+        if tolerance == "5cm":
+            return np.abs(depth - answer) <= 0.05
+        if tolerance == "sensor":
+            sigma, bias = self.noise.at_pixels(answer)
+            return np.abs(depth - answer - bias) <= 1.5 * sigma
+        raise ConfigError(f"there is no tolerance '{tolerance}'; known are: {', '.join(TOLERANCES)}")
+
+
+def judge_view(
+    m: JudgedMap,
+    depth_m: ArrayLike,
+    T_world_camera: ArrayLike,
+    camera: PinholeCamera,
+    *,
+    noise: NoiseModel | None = None,
+    mask: ArrayLike | None = None,
+    view: View | None = None,
+) -> JudgedView:
+    """Follow the rays of a view's pixels through a map.
+
+    ``depth_m`` is (H, W) axial depth in metres, 0 or NaN where there is none; ``noise`` that of its
+    sensor, a constant sigma of one voxel if not given; ``mask`` (H, W) says which pixels count, all with
+    a depth if not given. ``view`` takes the place of ``m.view``.
+    Raises FrameError if shapes do not fit or no pixel is left to judge.
+    """
+    depth = np.asarray(depth_m, np.float32)
+    if depth.shape != camera.shape:
+        raise FrameError(
+            f"a depth image has the shape {depth.shape}, but the camera has {camera.height} rows and "
+            f"{camera.width} columns"
+        )
+    judged = np.isfinite(depth) & (depth > 0) & (depth <= m.sensor.max_depth)
+    if mask is not None:
+        wanted = np.asarray(mask, bool)
+        if wanted.shape != camera.shape:
+            raise FrameError(f"a mask has the shape {wanted.shape}, its depth image {depth.shape}")
+        judged &= wanted
+    if not judged.any():
+        raise FrameError(
+            f"no pixel of {depth.size} can be judged: none holds a depth up to {m.sensor.max_depth:g} m"
+            + ("" if mask is None else " inside the mask")
+        )
+    depth = np.where(judged, depth, np.float32(0))
+    table = (noise or PolynomialNoise((m.voxel_size,))).table(camera)
+    survey = (view or m.view).survey(camera, as_pose(T_world_camera), m.sensor.max_depth, depth, table)
+    return JudgedView(depth, survey, m.voxel_size, m.sensor.max_depth, table)
+
+
+def accuracy(
+    m: JudgedMap,
+    depth_m: ArrayLike,
+    T_world_camera: ArrayLike,
+    camera: PinholeCamera,
+    tolerance: Tolerance = "voxel",
+    *,
+    noise: NoiseModel | None = None,
+    mask: ArrayLike | None = None,
+) -> Accuracy:
+    """Score a map on one depth image: :func:`judge_view`, then :meth:`JudgedView.accuracy`."""
+    if tolerance not in TOLERANCES:
+        raise ConfigError(f"there is no tolerance '{tolerance}'; known are: {', '.join(TOLERANCES)}")
+    return judge_view(m, depth_m, T_world_camera, camera, noise=noise, mask=mask).accuracy(tolerance)

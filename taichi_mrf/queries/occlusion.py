@@ -1,0 +1,33 @@
+"""How much a voxel dims a ray that passes through it.
+
+Occupancy is read as a medium: a voxel of probability p has the occlusion density
+alpha = -ln(1 - p) / voxel size (MRFMap, section III-D).
+"""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from taichi_mrf.inference.log_odds import softplus
+from taichi_mrf.voxels.traversal import FAR
+from taichi_mrf.voxels.types import F32
+
+
+@dataclass(frozen=True)
+class Occlusion:
+    """Which voxels let every ray through, by their log-odds of being occupied."""
+
+    unknown: float = FAR
+    """Log-odds that stand for "never seen" in maps that mark it so."""
+
+    empty_below: float = -FAR
+    """Voxels with less than this are taken for empty, as in a map that keeps occupied voxels only."""
+
+
+@ti.func
+def occlusion(log_odds: F32, unknown: F32, empty_below: F32) -> F32:
+    """alpha times the voxel size: -ln(1 - p), or 0 for a voxel that lets every ray through."""
+    alpha = softplus(log_odds)
+    if log_odds == unknown or log_odds < empty_below:
+        alpha = 0.0
+    return alpha
