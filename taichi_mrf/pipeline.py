@@ -15,7 +15,8 @@ from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.frame import Frame
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.keyframes import KeyframeSelector
-from taichi_mrf.maps.mrf import MRFMap
+from taichi_mrf.maps.create import create_map
+from taichi_mrf.maps.protocol import OccupancyMap
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class MappingResult:
     if the run was told to stop before its end; the map holds everything up to there.
     """
 
-    map: MRFMap
+    map: OccupancyMap
     frames: int = 0
     held_out: list[int] = field(default_factory=list)
     skipped: dict[str, str] = field(default_factory=dict)
@@ -101,7 +102,7 @@ def map_sequence(
     limit: int | None = None,
     skip_bad_frames: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
-    resume_from: MRFMap | None = None,
+    resume_from: OccupancyMap | None = None,
 ) -> MappingResult:
     """Map the frames 0, ``every``, 2 ``every``, ... of a dataset, ``limit`` of them at most.
 
@@ -113,7 +114,7 @@ def map_sequence(
     Raises FrameError for a broken frame unless ``skip_bad_frames``, DatasetError if no frame became a
     keyframe or the map to resume is of another recording, and what the map raises.
     """
-    start = MRFMap.from_config(config, dataset.camera) if resume_from is None else resume_from
+    start = create_map(config, dataset.camera) if resume_from is None else resume_from
     result = MappingResult(start)
     indices = range(0, len(dataset), every)[:limit]
     _add_keyframes(result, dataset, indices, config, listener, skip_bad_frames, should_stop)

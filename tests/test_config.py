@@ -115,7 +115,7 @@ def test_the_sections_above_are_all_there_are() -> None:
         ("kinect1", lambda z: 0.0012 + 0.0019 * (z - 0.4) ** 2),
         ("kinect_one", lambda z: 1e-3 * (1.5 - 0.5 * z + 0.3 * z**2)),
         ("realsense_d435", lambda z: 0.08 * z**2 / (848 / 2 * 0.05)),
-        ("stereo", lambda z: 0.5 * z**2 / (0.5372 * 707.1)),
+        ("stereo", lambda z: 0.286 * z**2 / (0.5372 * 707.1)),
     ],
 )
 def test_each_sensor_file_holds_the_formula_that_it_cites(

@@ -11,7 +11,7 @@ PACKAGE = Path(taichi_mrf.__file__).parent
 
 FLOORS = [
     {"errors", "poses", "config", "config_text", "config_values", "camera", "frame", "devices", "runtime", "voxels", ""},
-    {"sensor", "keyframes"},
+    {"sensor", "keyframes", "calibration"},
     {"inference", "queries", "datasets", "export"},
     {"maps"},
     {"pipeline"},

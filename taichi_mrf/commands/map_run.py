@@ -25,7 +25,8 @@ from taichi_mrf.evaluation.pictures import write_pictures
 from taichi_mrf.export.atomic import write_text
 from taichi_mrf.export.ply import write_voxels
 from taichi_mrf.frame import Frame
-from taichi_mrf.maps.mrf import MRFMap
+from taichi_mrf.maps.create import load_map
+from taichi_mrf.maps.protocol import OccupancyMap
 from taichi_mrf.pipeline import MappingResult, map_sequence
 
 MAP_FILE, VOXEL_FILE, REPORT_FILE = "map.npz", "voxels.ply", "report.json"
@@ -80,7 +81,7 @@ def run_map(options: Map) -> int:
     return _exit_status(request)
 
 
-def _resumed_map(folder: Path, settings: Config) -> MRFMap | None:
+def _resumed_map(folder: Path, settings: Config) -> OccupancyMap | None:
     """The map of the run to go on with; None if that run was stopped before it wrote one."""
     if not (folder / MAP_FILE).exists():
         return None
@@ -95,7 +96,7 @@ def _resumed_map(folder: Path, settings: Config) -> MRFMap | None:
                 f"{folder / CONFIG_FILE}: made with another {', '.join(changed)}; "
                 "--resume goes on with the same parameters"
             )
-    return MRFMap.load(folder / MAP_FILE)
+    return load_map(folder / MAP_FILE)
 
 
 @contextmanager

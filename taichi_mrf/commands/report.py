@@ -25,6 +25,7 @@ def run_report(
     choice = runtime.choice()
     return {
         "source": source,
+        "method": result.map.config.method,
         "version": taichi_mrf.__version__,
         "backend": choice.name if choice else None,
         "device": choice.device if choice else None,
@@ -75,6 +76,7 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     peak = report["peak_memory_mb"]
     return [
         ("backend", f"{report['backend']} ({report['device']})"),
+        ("method", report["method"]),
         ("frames", f"{report['frames']}, {report['keyframes']} of them keyframes"),
         ("rays", f"{report['rays']:,}"),
         ("voxels", f"{report['voxels']:,} of {report['voxel_size']} m in {report['bricks']:,} bricks"),

@@ -11,7 +11,14 @@ from pathlib import Path
 from typing import Protocol
 
 from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.datasets import numbered_depth, seven_scenes, synthetic_room, tum_rgbd
+from taichi_mrf.datasets import (
+    mesh_sequence,
+    numbered_depth,
+    seven_scenes,
+    stereo_pairs,
+    synthetic_room,
+    tum_rgbd,
+)
 from taichi_mrf.datasets.base import Dataset, ReadOptions
 from taichi_mrf.errors import DatasetError
 
@@ -29,12 +36,13 @@ class FolderFormat(Protocol):
         """List the recording's frames. Raises DatasetError."""
 
 
-FOLDER_FORMATS: tuple[FolderFormat, ...] = (seven_scenes, tum_rgbd, numbered_depth)
+FOLDER_FORMATS: tuple[FolderFormat, ...] = (seven_scenes, tum_rgbd, numbered_depth, stereo_pairs)
 
 _BUILT_IN: dict[str, Callable[[str, ReadOptions], Dataset]] = {
-    synthetic_room.NAME: synthetic_room.open_synthetic_room
+    synthetic_room.NAME: synthetic_room.open_synthetic_room,
+    mesh_sequence.NAME: mesh_sequence.open_mesh,
 }
-"""Name -> what opens it, given the text after the name's question mark."""
+"""Name -> what opens it, given the text after the name's question mark, or after a name that ends in ':'."""
 
 
 def open_dataset(
@@ -94,6 +102,9 @@ def _looked_for() -> str:
 
 def _open_built_in(source: str, options: ReadOptions) -> Dataset:
     name, _, query = source.partition("?")
+    kind, _, rest = source.partition(":")
+    if f"{kind}:" in _BUILT_IN:
+        name, query = f"{kind}:", rest
     if name not in _BUILT_IN:
         near = difflib.get_close_matches(name, _BUILT_IN, n=1, cutoff=0.5)
         hint = f"did you mean '{near[0]}'?" if near else f"built in are: {', '.join(_BUILT_IN)}"

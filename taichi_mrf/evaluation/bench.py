@@ -88,7 +88,7 @@ def bench_mapping(
     m = MRFMap.from_config(config, frames[0].camera)
     times: dict[str, list[float]] = {name: [] for name in ("allocate", "visible", "sweeps", "add")}
     octomap_times, rays = [], 0
-    octomap = _octomap_inserter(config.voxel_size) if with_octomap else None
+    octomap = octomap_inserter(config.voxel_size) if with_octomap else None
     for number, frame in enumerate(frames, start=1):
         start = time.perf_counter()
         k = m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera)
@@ -156,7 +156,7 @@ def _warm_up(frame: Frame, config: Config) -> None:
     ti.sync()
 
 
-def _octomap_inserter(voxel_size: float) -> Callable[[Frame], float]:
+def octomap_inserter(voxel_size: float) -> Callable[[Frame], float]:
     """A function that inserts a frame, a ray for each pixel, and returns the seconds that took."""
     import pyoctomap
 

@@ -45,20 +45,18 @@ def find_footprint(
     sensor: SensorConfig,
     inference: InferenceConfig,
     volume: VolumeConfig,
+    beyond_m: float = 0.0,
 ) -> Footprint:
-    """Follow every ray of an image from the camera to ``end_sigmas`` beyond its measurement.
+    """Follow every ray of an image from the camera to ``end_sigmas`` beyond its measurement, and
+    ``beyond_m`` metres of axial depth more.
 
     Raises CapacityError if the space that the image sees has too many bricks at this voxel size.
     """
-    lower_m, upper_m = visible_box(image, T_world_camera, sensor.max_depth, inference.end_sigmas)
-    if volume.lower is not None and volume.upper is not None:
-        lower_m, upper_m = np.maximum(lower_m, volume.lower), np.minimum(upper_m, volume.upper)
-    if image.rays == 0 or (lower_m >= upper_m).any():
+    lower_m, upper_m = visible_box(image, T_world_camera, sensor.max_depth, inference.end_sigmas, beyond_m)
+    window = window_around(lower_m, upper_m, voxel_size, volume)
+    if image.rays == 0 or window is None:
         nowhere = Window.covering(T_world_camera[:3, 3], T_world_camera[:3, 3], voxel_size)
         return Footprint(nowhere, np.zeros(0, np.int32), np.zeros(0, np.int32), 1)
-    window = Window.covering(lower_m, upper_m, voxel_size)
-    if window.cells >= 2**31:
-        raise CapacityError(f"a view at a voxel size of {voxel_size:g} m has {window.cells:.3g} bricks")
     centre, to_voxels = window.rays_of(T_world_camera)
     box_lower, box_upper = window.clip_box(volume.lower, volume.upper)
     # NumPy arrays, which a kernel on the CPU writes in place: small voxels make the window large.
@@ -68,13 +66,30 @@ def find_footprint(
         image.depth, image.camera.width, stride_metres(image.camera, voxel_size, inference),
         image.intrinsics, centre, to_voxels,
         image.noise, image.noise_table.patch, image.noise_table.columns,
-        sensor.max_depth, inference.end_sigmas,
+        sensor.max_depth, inference.end_sigmas, beyond_m,
         window.shape_vector, box_lower, box_upper, marks, longest,
     )  # fmt: skip
     crossed = np.flatnonzero(marks).astype(np.int32)
     surface = crossed[marks[crossed] & SURFACE != 0]
     _check_size(len(crossed), len(surface), voxel_size, volume.memory_limit_gb)
     return Footprint(window, crossed, surface, int(longest[0]))
+
+
+def window_around(
+    lower_m: NDArray[np.float64], upper_m: NDArray[np.float64], voxel_size: float, volume: VolumeConfig
+) -> Window | None:
+    """The window around what lies in the mapped volume of a box in metres; None if nothing does.
+
+    Raises CapacityError if it has too many bricks.
+    """
+    if volume.lower is not None and volume.upper is not None:
+        lower_m, upper_m = np.maximum(lower_m, volume.lower), np.minimum(upper_m, volume.upper)
+    if (lower_m >= upper_m).any():
+        return None
+    window = Window.covering(lower_m, upper_m, voxel_size)
+    if window.cells >= 2**31:
+        raise CapacityError(f"a view at a voxel size of {voxel_size:g} m has {window.cells:.3g} bricks")
+    return window
 
 
 def _check_size(crossed: int, surface: int, voxel_size: float, limit_gb: float) -> None:
@@ -88,7 +103,7 @@ def _check_size(crossed: int, surface: int, voxel_size: float, limit_gb: float) 
 
 
 def visible_box(
-    image: DepthImage, T_world_camera: Pose, max_depth: float, end_sigmas: float
+    image: DepthImage, T_world_camera: Pose, max_depth: float, end_sigmas: float, beyond_m: float = 0.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Two corners, in metres, of an upright box around the camera and the ends of all its rays."""
     camera = image.camera
@@ -101,7 +116,8 @@ def visible_box(
     # the table is worse than the worst.
     values = np.abs(evaluate(image.noise_table.coefficients[:, :, None], farthest.reshape(1, 1, -1)))
     sigma, bias = np.maximum(values[:, 0], LEAST_SIGMA_M).max(axis=0), values[:, 1].max(axis=0)
-    ends = np.minimum(farthest + (3 * (end_sigmas * sigma + bias)).reshape(farthest.shape), max_depth)
+    reach = (3 * (end_sigmas * sigma + bias)).reshape(farthest.shape) + beyond_m
+    ends = np.minimum(farthest + reach, max_depth)
     ends[farthest <= 0] = 0.0
     u = np.minimum(np.arange(columns + 1) * TILE, camera.width) - 0.5
     v = np.minimum(np.arange(rows + 1) * TILE, camera.height) - 0.5
@@ -138,7 +154,7 @@ def _mark_brick(mark: Template, context: Template, ray: Template, brick: IVec3, 
 def _mark(
     depth: F32Array, width: I32, stride_metres: F32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
     noise: F32Array3, patch: I32, columns: I32,
-    max_depth: F32, end_sigmas: F32,
+    max_depth: F32, end_sigmas: F32, beyond_m: F32,
     shape: IVec3, box_lower: Vec3, box_upper: Vec3, marks: I32Array, longest: I32Array,
 ):  # fmt: skip
     for pixel in range(depth.shape[0]):
@@ -148,7 +164,8 @@ def _mark(
             direction = to_voxels @ pixel_direction(u, v, intrinsics)
             ray = make_ray(centre, direction)
             noise_here = pixel_noise(noise, patch, columns, u, v)
-            begin, end = 0.0, ti.min(depth_of_deviation(measured, -end_sigmas, noise_here), max_depth)
+            last = depth_of_deviation(measured, -end_sigmas, noise_here) + beyond_m
+            begin, end = 0.0, ti.min(last, max_depth)
             clip(ray, begin, end, box_lower, box_upper)
             mark = _Mark(depth_of_deviation(measured, end_sigmas, noise_here), 0)
             walk_bricks(ray, begin, end, shape, marks, False, _mark_brick, mark, (shape, marks))

@@ -4,14 +4,33 @@ from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.errors import KeyframeError
 from taichi_mrf.poses import Pose
-from taichi_mrf.sensor.noise import NoiseTable
+from taichi_mrf.sensor.noise import NoiseModel, NoiseTable
 from taichi_mrf.voxels.window import Window
 
 Cells = NDArray[np.int32]
+
+
+def checked_depth(depth_m: ArrayLike, camera: PinholeCamera, min_depth: float) -> NDArray[np.float32]:
+    """A copy of (H, W) axial depth in metres, in which what is no measurement is 0: NaN, infinite, not
+    positive, or nearer than ``min_depth``.
+
+    Raises KeyframeError if it does not have the camera's shape, or holds no floating-point metres.
+    """
+    depth = np.asarray(depth_m)
+    if depth.shape != camera.shape:
+        raise KeyframeError(
+            f"a depth image has the shape {depth.shape}, but the camera has {camera.height} rows and "
+            f"{camera.width} columns"
+        )
+    if not np.issubdtype(depth.dtype, np.floating):
+        raise KeyframeError(f"a depth image must be floating-point metres, not {depth.dtype}")
+    valid = np.isfinite(depth) & (depth >= min_depth) & (depth > 0)
+    return np.where(valid, depth, 0.0).astype(np.float32)
 
 
 @dataclass
@@ -26,6 +45,21 @@ class DepthImage:
     noise: ti.Ndarray
     noise_table: NoiseTable
     rays: int
+
+    @staticmethod
+    def upload(depth_m: NDArray[np.float32], camera: PinholeCamera, noise: NoiseModel) -> "DepthImage":
+        """Put :func:`checked_depth` (H, W) on the device. Raises ConfigError if the noise model does not
+        fit the camera."""
+        table = noise.table(camera)
+        depth = ti.ndarray(ti.f32, depth_m.size)
+        depth.from_numpy(depth_m.reshape(-1))
+        coefficients = ti.ndarray(ti.f32, table.coefficients.shape)
+        coefficients.from_numpy(table.coefficients)
+        return DepthImage(depth, camera, coefficients, table, int((depth_m > 0).sum()))
+
+    def to_numpy(self) -> NDArray[np.float32]:
+        """(H, W) axial depth in metres, 0 where there is no measurement."""
+        return self.depth.to_numpy().reshape(self.camera.shape)
 
     @property
     def intrinsics(self) -> ti.Vector:
@@ -94,7 +128,7 @@ class Keyframe:
     @property
     def depth_m(self) -> NDArray[np.float32]:
         """(H, W) axial depth in metres, 0 where there is no measurement."""
-        return self.image.depth.to_numpy().reshape(self.camera.shape)
+        return self.image.to_numpy()
 
     @property
     def image_bytes(self) -> int:

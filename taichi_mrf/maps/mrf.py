@@ -7,7 +7,6 @@ them, which keyframes see them. The computation itself is inference/sum_product.
 import math
 import weakref
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -23,36 +22,23 @@ from taichi_mrf.config_values import overridden
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.footprint import find_footprint
-from taichi_mrf.inference.keyframe import DepthImage, Keyframe
+from taichi_mrf.inference.keyframe import DepthImage, Keyframe, checked_depth
 from taichi_mrf.inference.messages import carry_over, new_messages
 from taichi_mrf.inference.schedule import InferReport, Progress, content_key, run_sweeps
 from taichi_mrf.inference.sweep import Sweeper, unknown_begins
 from taichi_mrf.maps.brick_book import BrickBook
-from taichi_mrf.maps.storage import MapContents, StoredKeyframe, read_contents, write_contents
+from taichi_mrf.maps.map_file import MapHeader, StoredKeyframe
+from taichi_mrf.maps.statistics import MapStatistics, measure
+from taichi_mrf.maps.storage import MapContents, read_contents, write_contents
 from taichi_mrf.poses import as_pose
 from taichi_mrf.queries.extract import extract_voxels
 from taichi_mrf.queries.points import classify, point_log_odds, probability
 from taichi_mrf.queries.profile import RayProfile
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config, warn_of_bad_sigma
-from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import create_topology, recycle
-
-
-@dataclass(frozen=True)
-class MapStatistics:
-    """How large a map is. ``memory_mb`` counts its voxels, messages, images and scratch;
-    ``bytes_per_voxel`` what grows with the voxels: their channels, and all keyframes' messages."""
-
-    keyframes: int
-    frozen: int
-    rays: int
-    bricks: int
-    voxels: int
-    chunks: int
-    memory_mb: float
-    bytes_per_voxel: float
 
 
 class MRFMap:
@@ -236,20 +222,14 @@ class MRFMap:
 
     def statistics(self) -> MapStatistics:
         """How large the map is."""
-        in_use = self._pool.in_use
-        voxels = len(in_use) * VOXELS
-        of_voxels = self._pool.capacity * VOXELS * self._pool.bytes_per_voxel
-        of_voxels += sum(k.voxel_bytes for k in self._keyframes.values())
-        images = sum(k.image_bytes for k in self._keyframes.values())
-        return MapStatistics(
-            keyframes=len(self._keyframes),
+        keyframes = self._keyframes.values()
+        return measure(
+            self._pool,
+            keyframes=len(keyframes),
             frozen=len(self._frozen),
-            rays=sum(k.rays for k in self._keyframes.values()),
-            bricks=len(in_use),
-            voxels=voxels,
-            chunks=len(np.unique(self._pool.bricks[in_use] // BRICK, axis=0)),
-            memory_mb=(of_voxels + images + self._sweeper.nbytes) / 1e6,
-            bytes_per_voxel=of_voxels / max(voxels, 1),
+            rays=sum(k.rays for k in keyframes),
+            message_bytes=sum(k.voxel_bytes for k in keyframes),
+            other_bytes=sum(k.image_bytes for k in keyframes) + self._sweeper.nbytes,
         )
 
     def save(self, path: str | Path) -> None:
@@ -266,16 +246,13 @@ class MRFMap:
         write_contents(
             Path(path),
             MapContents(
-                self.config,
-                self.noise,
+                MapHeader(self.config, self.noise, keyframes, self._next_id),
                 self._pool.bricks[slots],
                 self._pool.read("belief", slots),
                 None if self._pool.evidence is None else self._pool.read("evidence", slots),
                 self._pool.owners[slots] - live[slots],
                 self._book.frozen_crossed,
                 self._frozen,
-                keyframes,
-                self._next_id,
             ),
         )
 
@@ -283,10 +260,10 @@ class MRFMap:
     def load(cls, path: str | Path) -> "MRFMap":
         """Read a map that can be queried at once and extended. Raises MapFileError."""
         contents = read_contents(Path(path))
-        config = contents.config
+        header, config = contents.header, contents.header.config
         m = cls(
             config.voxel_size,
-            contents.noise,
+            header.noise,
             inference=config.inference,
             volume=config.volume,
             min_depth=config.sensor.min_depth,
@@ -299,7 +276,7 @@ class MRFMap:
             m._pool.owners[slots] = contents.frozen_owners
         m._book.see_for_good(contents.frozen_crossed)
         m._frozen = dict(contents.frozen)
-        for stored in contents.keyframes:
+        for stored in header.keyframes:
             image = m._upload(stored.depth_m, stored.camera)
             T_world_camera = as_pose(stored.T_world_camera)
             m._keyframes[stored.id] = m._place(stored.id, stored.name, image, T_world_camera)
@@ -307,7 +284,7 @@ class MRFMap:
             m._pool.write("belief", slots, contents.belief)
             if contents.evidence is not None:
                 m._pool.write("evidence", slots, contents.evidence)
-        m._next_id = contents.next_id
+        m._next_id = header.next_id
         m._messages_lost = bool(m._keyframes)
         return m
 
@@ -323,25 +300,10 @@ class MRFMap:
         return self._keyframes[id]
 
     def _upload(self, depth_m: ArrayLike, camera: PinholeCamera) -> DepthImage:
-        """Check a depth image and put it where kernels reach it; what is no measurement becomes 0."""
-        depth = np.asarray(depth_m)
-        if depth.shape != camera.shape:
-            raise KeyframeError(
-                f"a depth image has the shape {depth.shape}, but the camera has {camera.height} rows and "
-                f"{camera.width} columns"
-            )
-        if not np.issubdtype(depth.dtype, np.floating):
-            raise KeyframeError(f"a depth image must be floating-point metres, not {depth.dtype}")
-        valid = np.isfinite(depth) & (depth >= self.sensor.min_depth) & (depth > 0)
-        clean = np.where(valid, depth, 0.0).astype(np.float32)
-        table = self.noise.table(camera)
+        image = DepthImage.upload(checked_depth(depth_m, camera, self.sensor.min_depth), camera, self.noise)
         if not self._keyframes:
-            warn_of_bad_sigma(table, self.sensor.min_depth, self.sensor.max_depth)
-        device_depth = ti.ndarray(ti.f32, depth.size)
-        device_depth.from_numpy(clean.reshape(-1))
-        noise = ti.ndarray(ti.f32, table.coefficients.shape)
-        noise.from_numpy(table.coefficients)
-        return DepthImage(device_depth, camera, noise, table, int(valid.sum()))
+            warn_of_bad_sigma(image.noise_table, self.sensor.min_depth, self.sensor.max_depth)
+        return image
 
     def _place(self, id: int, name: str, image: DepthImage, T_world_camera: NDArray[np.float64]) -> Keyframe:
         """Find out which bricks a keyframe needs and sees, and claim them."""

@@ -10,7 +10,7 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -89,6 +89,27 @@ class PatchNoise:
                     f"the {name} table has {rows} patches, but {camera.width} x {camera.height} pixels in "
                     f"patches of {patch} make {patches}"
                 )
+
+    @classmethod
+    def load(cls, path: str | Path) -> "PatchNoise":
+        """Read the ``noise.npz`` that ``taichi-mrf calibrate`` writes: ``sigma``, ``bias``, ``patch``, and
+        ``camera`` (width, height, fx, fy, cx, cy). Raises ConfigError, which names the file.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                width, height, *intrinsics = file["camera"].tolist()
+                camera = PinholeCamera(round(width), round(height), *intrinsics)
+                return cls(file["sigma"], file["bias"], int(file["patch"]), camera)
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from error
+        except (OSError, ValueError, EOFError, TypeError, KeyError, zipfile.BadZipFile) as error:
+            raise ConfigError(f"{path}: cannot be read as a noise table: {error}") from error
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What :meth:`load` reads, by name."""
+        k = self.camera
+        camera = np.array([k.width, k.height, k.fx, k.fy, k.cx, k.cy], np.float64)
+        return {"sigma": self.sigma, "bias": self.bias, "patch": np.array(self.patch), "camera": camera}
 
     def table(self, camera: PinholeCamera) -> NoiseTable:
         if camera.shape != self.camera.shape:

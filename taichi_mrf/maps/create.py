@@ -1,0 +1,36 @@
+"""Which class makes a map: chosen by the configuration's method, or by what a saved map says."""
+
+from pathlib import Path
+
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.config import Config, Method
+from taichi_mrf.maps.log_odds import LogOddsMap
+from taichi_mrf.maps.map_file import method_of, open_map_file
+from taichi_mrf.maps.mrf import MRFMap
+from taichi_mrf.maps.protocol import OccupancyMap
+from taichi_mrf.maps.recursive import RecursiveMap
+
+MapClass = type[MRFMap] | type[RecursiveMap]
+
+
+def create_map(config: Config, camera: PinholeCamera) -> OccupancyMap:
+    """An empty map of the method ``config.method``; ``camera`` is what its noise tables must fit."""
+    return _map_class(config.method).from_config(config, camera)
+
+
+def load_map(path: str | Path) -> OccupancyMap:
+    """A saved map, whatever its method. Raises MapFileError."""
+    with open_map_file(Path(path)) as file:
+        method = method_of(file)
+    return _map_class(method).load(path)
+
+
+def _map_class(method: Method) -> MapClass:
+    if method == "mrf":
+        return MRFMap
+    if method == "log_odds":
+        return LogOddsMap
+    # Imported late: whoever makes another map need not wait for its kernels.
+    from taichi_mrf.maps.visibility import VisibilityMap
+
+    return VisibilityMap

@@ -1,0 +1,43 @@
+"""How large a map is, in numbers that compare from one mapping method to another."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.pool import BrickPool
+
+
+@dataclass(frozen=True)
+class MapStatistics:
+    """How large a map is. ``memory_mb`` counts its voxels, messages, images and scratch;
+    ``bytes_per_voxel`` what grows with the voxels: their channels, and all keyframes' messages."""
+
+    keyframes: int
+    frozen: int
+    rays: int
+    bricks: int
+    voxels: int
+    chunks: int
+    memory_mb: float
+    bytes_per_voxel: float
+
+
+def measure(
+    pool: BrickPool, *, keyframes: int, frozen: int, rays: int, message_bytes: int, other_bytes: int
+) -> MapStatistics:
+    """Take a map's measure: ``message_bytes`` is what keyframes hold for each voxel, ``other_bytes`` what
+    does not grow with the voxels."""
+    in_use = pool.in_use
+    voxels = len(in_use) * VOXELS
+    of_voxels = pool.capacity * VOXELS * pool.bytes_per_voxel + message_bytes
+    return MapStatistics(
+        keyframes=keyframes,
+        frozen=frozen,
+        rays=rays,
+        bricks=len(in_use),
+        voxels=voxels,
+        chunks=len(np.unique(pool.bricks[in_use] // BRICK, axis=0)),
+        memory_mb=(of_voxels + other_bytes) / 1e6,
+        bytes_per_voxel=of_voxels / max(voxels, 1),
+    )
