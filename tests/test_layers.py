@@ -11,11 +11,11 @@ PACKAGE = Path(taichi_mrf.__file__).parent
 
 FLOORS = [
     {"errors", "poses", "config", "config_text", "config_values", "camera", "frame", "devices", "runtime", "voxels", ""},
-    {"sensor", "keyframes", "calibration"},
+    {"sensor", "keyframes"},
     {"inference", "queries", "datasets", "export"},
     {"maps"},
     {"pipeline"},
-    {"evaluation"},
+    {"evaluation", "calibration"},
     {"commands", "cli", "__main__"},
 ]
 """From the ground up; the empty name is the package itself, which loads its public names when asked."""

@@ -6,7 +6,11 @@ import typing
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
 from taichi_mrf import config
+from taichi_mrf.calibration import options as calibration_options
 from taichi_mrf.config_text import field_help
+
+DEFINITIONS = (config.__name__, calibration_options.__name__)
+"""The modules whose dataclasses are parameters."""
 
 registry = ConstructorRegistry()
 """For :func:`tyro.cli`, which by itself keeps the line breaks that the source code has in a help text."""
@@ -14,8 +18,8 @@ registry = ConstructorRegistry()
 
 @registry.struct_rule
 def configuration_flags(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """One flag a field for the dataclasses of config.py; nothing for any other type."""
-    if not (dataclasses.is_dataclass(info.type) and info.type.__module__ == config.__name__):
+    """One flag a field for the dataclasses of DEFINITIONS; nothing for any other type."""
+    if not (dataclasses.is_dataclass(info.type) and info.type.__module__ in DEFINITIONS):
         return None
     hints, texts = typing.get_type_hints(info.type), field_help(info.type)
     defaults = info.default if isinstance(info.default, info.type) else info.type()

@@ -1,0 +1,122 @@
+"""Depth images of a folder or of one file, by name: what is calibrated, and what it is compared with.
+
+A folder holds 16-bit PNGs, ``.npy`` images and ``.npz`` stacks; a single ``.npy`` or ``.npz`` is a stack. The
+images of a stack are called by their number, 0000, 0001, ...; those of a stack in a folder get the
+file's name in front. Whole numbers are steps of a metre, floating-point numbers are metres.
+"""
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.datasets.images import read_depth
+from taichi_mrf.errors import DatasetError
+
+FORMATS = (".png", ".npy", ".npz")
+STACK_NAME = "depth_m"
+"""The array of a .npz file that is taken where there are several."""
+
+
+@dataclass(frozen=True)
+class _Place:
+    path: Path
+    number: int | None
+    """Position in the stack; None where the file is one image."""
+
+
+class DepthFiles:
+    """The depth images under ``path``, listed at once and read one at a time."""
+
+    def __init__(self, path: Path, steps_per_metre: float) -> None:
+        """Raises DatasetError, which names the file, if there is nothing or a stack cannot be read."""
+        if not (np.isfinite(steps_per_metre) and steps_per_metre > 0):
+            raise DatasetError(f"the depth scale must be a positive number of steps, not {steps_per_metre}")
+        self.path = path
+        self._steps_per_metre = steps_per_metre
+        self._stack: tuple[Path, NDArray] | None = None
+        if path.is_dir():
+            self._places = self._of_folder(path)
+        elif path.suffix in (".npy", ".npz") and path.is_file():
+            self._places = self._of_stack(path, "")
+        else:
+            raise DatasetError(f"{path}: is neither a folder nor a .npy or .npz file of depth images")
+        if not self._places:
+            raise DatasetError(f"{path}: holds no depth images ({', '.join(FORMATS)})")
+
+    @property
+    def names(self) -> list[str]:
+        return list(self._places)
+
+    def file(self, name: str) -> Path:
+        """The file that an image lies in."""
+        return self._places[name].path
+
+    def read(self, name: str) -> NDArray[np.float32]:
+        """Axial depth in metres, (H, W); 0 where there is none. Raises DatasetError naming the file."""
+        place = self._places[name]
+        if place.path.suffix == ".png":
+            depth_m = read_depth(place.path, self._steps_per_metre)
+        else:
+            array = self._array(place.path)
+            depth_m = self._metres(array if place.number is None else array[place.number])
+        return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.float32(0))
+
+    def _of_folder(self, folder: Path) -> dict[str, _Place]:
+        places: dict[str, _Place] = {}
+        for path in sorted(p for p in folder.iterdir() if p.suffix in FORMATS):
+            found = (
+                self._of_stack(path, path.stem) if path.suffix == ".npz" else {path.stem: _Place(path, None)}
+            )
+            for name, place in found.items():
+                if name in places:
+                    raise DatasetError(f"{path}: {places[name].path.name} has the same name")
+                places[name] = place
+        return places
+
+    def _of_stack(self, path: Path, prefix: str) -> dict[str, _Place]:
+        array = self._array(path)
+        if array.ndim == 2:
+            return {prefix or path.stem: _Place(path, None)}
+        if array.ndim != 3:
+            raise DatasetError(
+                f"{path}: holds an array of shape {array.shape}, not a stack (N, H, W) of depth"
+            )
+        start = f"{prefix}-" if prefix else ""
+        return {f"{start}{number:04d}": _Place(path, number) for number in range(len(array))}
+
+    def _array(self, path: Path) -> NDArray:
+        """The array of a file; that of the last file is kept, since stacks are read image by image."""
+        if self._stack is None or self._stack[0] != path:
+            self._stack = (path, _load(path))
+        return self._stack[1]
+
+    def _metres(self, image: NDArray) -> NDArray[np.float32]:
+        if np.issubdtype(image.dtype, np.integer):
+            return image.astype(np.float32) / np.float32(self._steps_per_metre)
+        return image.astype(np.float32)
+
+
+def _load(path: Path) -> NDArray:
+    try:
+        content = np.load(path, allow_pickle=False)
+        if isinstance(content, np.ndarray):
+            array = content
+        else:
+            with content:
+                names = content.files
+                name = STACK_NAME if STACK_NAME in names else names[0] if len(names) == 1 else None
+                if name is None:
+                    raise DatasetError(
+                        f"{path}: holds no array '{STACK_NAME}' but {', '.join(names) or 'nothing'}"
+                    )
+                array = content[name]
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise DatasetError(f"{path}: cannot be read as an array: {error}") from error
+    if not np.issubdtype(array.dtype, np.integer) and not np.issubdtype(array.dtype, np.floating):
+        raise DatasetError(f"{path}: holds no numbers")
+    if array.ndim == 2 or array.ndim == 3:
+        return array
+    raise DatasetError(f"{path}: holds an array of shape {array.shape}, not depth images")

@@ -1,0 +1,145 @@
+"""Weighted least squares for bias and sigma of many patches, from the sums of their cells.
+
+Bias: the errors regressed on powers of the true depth, each cell weighted with 1 / sigma^2.
+Sigma: the standard deviation of each cell's residuals, regressed likewise, with the weight 2 n / sigma^2 that
+the standard deviation of n normal samples has. Bias and sigma need one another and take turns.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.calibration.curves import Curves, Prior
+
+ROUNDS = 4
+"""Turns of bias and sigma. The weights then move the result by far less than its standard error."""
+
+_SIGMA_ROUNDS = 5
+_LEAST_SHARE = 0.1
+"""A cell's weight is never taken from a sigma below this share of the one it shows itself: a polynomial on
+its way to the solution may pass near zero."""
+
+_TINY_M = 1e-7
+
+
+@dataclass(frozen=True)
+class Sums:
+    """The sums of samples.Moments for the cells that count; all others are zero.
+
+    (patches, bins, 2 degree + 1), (patches, bins, degree + 1) and (patches, bins).
+    """
+
+    powers: NDArray[np.float64]
+    products: NDArray[np.float64]
+    squares: NDArray[np.float64]
+
+    @property
+    def counts(self) -> NDArray[np.float64]:
+        return self.powers[..., 0]
+
+    @property
+    def terms(self) -> int:
+        return self.products.shape[-1]
+
+    def of(self, patches: NDArray[np.bool_]) -> "Sums":
+        """The sums of some patches only."""
+        return Sums(self.powers[patches], self.products[patches], self.squares[patches])
+
+    def merged(self) -> "Sums":
+        """All patches taken for one."""
+        return Sums(*(each.sum(axis=0, keepdims=True) for each in (self.powers, self.products, self.squares)))
+
+    def outer(self) -> NDArray[np.float64]:
+        """The sums of t^(j + k), (patches, bins, terms, terms)."""
+        j, k = np.indices((self.terms, self.terms))
+        return self.powers[..., j + k]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Bias and sigma over the scaled depth, and how well the bias polynomial fits.
+
+    ``misfit`` is, for each patch, the mean square of the distance of its bins' mean errors from the curve,
+    in their own standard errors and corrected for the fitted terms: about 1 if errors are independent and
+    the polynomial has the right shape; NaN for patches without bins to spare.
+    """
+
+    bias: Curves
+    sigma: Curves
+    misfit: NDArray[np.float64]
+
+
+def fit_curves(sums: Sums, bias_prior: Prior, sigma_prior: Prior) -> Fit:
+    """Fit all patches. Each must have enough bins, or a prior, to determine its curves."""
+    n, outer = np.maximum(sums.counts, 1.0), sums.outer()
+    mean = sums.products[..., 0] / n
+    variance = np.maximum((sums.squares - n * mean**2) / np.maximum(n - 1, 1.0), _TINY_M**2)
+    for _ in range(ROUNDS):
+        weight = np.where(sums.counts > 0, 1.0 / variance, 0.0)
+        bias = _solve(
+            np.einsum("pb,pbij->pij", weight, outer),
+            np.einsum("pb,pbi->pi", weight, sums.products),
+            bias_prior,
+        )
+        squares, freedom = _residuals(sums, outer, weight, bias)
+        sigma, variance = _fit_sigma(sums, outer, squares, freedom, sigma_prior)
+    return Fit(bias, sigma, _misfit(sums, bias, variance))
+
+
+def _residuals(
+    sums: Sums, outer: NDArray[np.float64], weight: NDArray[np.float64], bias: Curves
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Each cell's sum of squared residuals, and its samples less what the fit has used up of them."""
+    beta = bias.coefficients
+    squares = (
+        sums.squares
+        - 2 * np.einsum("pi,pbi->pb", beta, sums.products)
+        + np.einsum("pi,pbij,pj->pb", beta, outer, beta)
+    )
+    leverage = weight * np.einsum("pbij,pij->pb", outer, bias.covariance)
+    return np.maximum(squares, 0.0), np.maximum(sums.counts - leverage, 1.0)
+
+
+def _fit_sigma(
+    sums: Sums,
+    outer: NDArray[np.float64],
+    squares: NDArray[np.float64],
+    freedom: NDArray[np.float64],
+    prior: Prior,
+) -> tuple[Curves, NDArray[np.float64]]:
+    """The sigma polynomials, and the variance that they predict for each cell."""
+    n = np.maximum(sums.counts, 1.0)
+    x = sums.powers[..., : sums.terms] / n[..., None]
+    # The root of an unbiased variance is too small by 1 / (4 n).
+    shown = np.maximum(np.sqrt(squares / freedom) * (1 + 0.25 / freedom), _TINY_M)
+    value, excess = shown, np.zeros_like(shown)
+    for _ in range(_SIGMA_ROUNDS):
+        weight = np.where(sums.counts > 0, 2 * freedom / value**2, 0.0)
+        sigma = _solve(
+            np.einsum("pb,pbi,pbj->pij", weight, x, x),
+            np.einsum("pb,pbi,pb->pi", weight, x, shown - excess),
+            prior,
+        )
+        beta = sigma.coefficients
+        mean = np.einsum("pi,pbi->pb", beta, x)
+        root = np.sqrt(np.maximum(np.einsum("pi,pbij,pj->pb", beta, outer, beta) / n, 0.0))
+        # A cell shows the root of its mean variance, a little more than its mean sigma where sigma is steep.
+        excess = root - np.abs(mean)
+        value = np.maximum(root, _LEAST_SHARE * shown)
+    return sigma, value**2
+
+
+def _solve(information: NDArray[np.float64], vector: NDArray[np.float64], prior: Prior) -> Curves:
+    total = information + prior.information
+    covariance = np.asarray(np.linalg.inv(total), np.float64)
+    vector = vector + np.einsum("pij,pj->pi", prior.information, prior.mean)
+    return Curves(np.einsum("pij,pj->pi", covariance, vector), covariance)
+
+
+def _misfit(sums: Sums, bias: Curves, variance: NDArray[np.float64]) -> NDArray[np.float64]:
+    predicted = np.einsum("pi,pbi->pb", bias.coefficients, sums.powers[..., : sums.terms])
+    n = np.maximum(sums.counts, 1.0)
+    square = np.where(sums.counts > 0, (sums.products[..., 0] - predicted) ** 2 / (n * variance), 0.0)
+    spare = (sums.counts > 0).sum(axis=1) - sums.terms
+    return np.where(spare > 0, square.sum(axis=1) / np.maximum(spare, 1), np.nan)

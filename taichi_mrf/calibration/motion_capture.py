@@ -1,0 +1,188 @@
+"""From poses of marker bodies to the pose of the chessboard in the camera, at the time of any depth image.
+
+Markers sit neither in the camera's optical centre nor in the board's first corner. Where they sit, and the
+time lag to a fraction of a millisecond, are the values that put the corners found in the images where
+they were found: T_camera_board(t) = T_camera_body  M(t + lag)  T_body_board, with M the board's body in
+the camera's. A linear hand-eye solution starts it, Gauss-Newton on the reprojection error ends it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.calibration.chessboard import BoardView, corner_points
+from taichi_mrf.calibration.hand_eye import hand_eye
+from taichi_mrf.calibration.options import BoardConfig, MotionCaptureConfig
+from taichi_mrf.calibration.pose_stream import rotations
+from taichi_mrf.calibration.time_lag import BodyPair, estimate_lag
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.poses import Pose
+
+_PARAMETERS = 13
+"""Six for where each body's markers sit, one for the lag."""
+
+_ITERATIONS = 30
+_DIFFERENCE = 1e-5
+_CONVERGED = 1e-8
+_LARGEST_RESIDUAL = 5.0
+"""In largest_reprojection of the board: what the alignment may leave, RMS."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """What links motion capture to the images; ``lag`` and ``lag_error`` (one sigma) in seconds, to be
+    added to an image's stamp; ``reprojection`` in pixels, RMS."""
+
+    T_camera_body: Pose
+    T_body_board: Pose
+    lag: float
+    lag_error: float
+    reprojection: float
+    correlation: float
+
+    def T_camera_board(
+        self, stamps: NDArray[np.float64], bodies: BodyPair, largest_gap: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """The board's pose at image stamps (N,), (N, 4, 4), and where motion capture knows it."""
+        M, known = bodies.relative(np.asarray(stamps) + self.lag, largest_gap)
+        return self.T_camera_body @ M @ self.T_body_board, known
+
+
+def align(
+    stamps: NDArray[np.float64],
+    views: list[BoardView],
+    bodies: BodyPair,
+    board: BoardConfig,
+    camera: PinholeCamera,
+    options: MotionCaptureConfig,
+) -> Alignment:
+    """Find the lag and where the markers sit, from views of the board at ascending ``stamps``.
+
+    Raises ConfigError for a board that looks the same upside down, DatasetError if the streams do not
+    belong together or the views do not tell enough.
+    """
+    if (board.columns + board.rows) % 2 == 0:
+        raise ConfigError(
+            f"board.columns: with motion capture the board must not look the same upside down: one of "
+            f"{board.columns} and {board.rows} must be even and the other odd"
+        )
+    T_camera_board = np.stack([view.T_camera_board for view in views])
+    lag = estimate_lag(stamps, T_camera_board, bodies, options)
+    M, known = bodies.relative(stamps + lag.seconds, options.largest_gap)
+    start = hand_eye(T_camera_board[known], M[known])
+    problem = _Reprojection(
+        stamps[known],
+        np.stack([view.corners for view, has in zip(views, known, strict=True) if has]),
+        bodies,
+        corner_points(board),
+        camera,
+        options.largest_gap,
+    )
+    (T_camera_body, T_body_board, seconds), covariance, error = _gauss_newton(problem, (*start, lag.seconds))
+    if not error <= _LARGEST_RESIDUAL * board.largest_reprojection:
+        raise DatasetError(
+            f"motion capture puts the board's corners {error:.1f} pixels (RMS) from where the images show "
+            "them: check that both are of the same recording and that the markers did not slip"
+        )
+    return Alignment(
+        T_camera_body, T_body_board, seconds, float(np.sqrt(covariance[-1, -1])), error, lag.correlation
+    )
+
+
+_State = tuple[Pose, Pose, float]
+
+
+@dataclass(frozen=True)
+class _Reprojection:
+    """Where corners (N, corners, 2) were seen at ``stamps`` (N,), and where a state says they are."""
+
+    stamps: NDArray[np.float64]
+    corners: NDArray[np.float64]
+    bodies: BodyPair
+    points: NDArray[np.float64]
+    camera: PinholeCamera
+    largest_gap: float
+
+    def residuals(self, state: _State) -> NDArray[np.float64]:
+        """Projected minus seen, (N, corners * 2), in pixels."""
+        T_camera_body, T_body_board, lag = state
+        M, _ = self.bodies.relative(self.stamps + lag, self.largest_gap)
+        T = T_camera_body @ M @ T_body_board
+        seen = np.einsum("nij,cj->nci", T[:, :3, :3], self.points) + T[:, None, :3, 3]
+        x, y, z = np.moveaxis(seen, -1, 0)
+        z = np.maximum(z, 1e-3)
+        u = self.camera.fx * x / z + self.camera.cx
+        v = self.camera.fy * y / z + self.camera.cy
+        return (np.stack([u, v], axis=-1) - self.corners).reshape(len(self.stamps), -1)
+
+
+def _gauss_newton(problem: _Reprojection, state: _State) -> tuple[_State, NDArray[np.float64], float]:
+    """Levenberg-damped Gauss-Newton; returns state, covariance of its parameters, and RMS error in pixels.
+
+    Views whose corners lie far off (more than three times the median) count less, as in Huber's norm.
+    """
+    residuals = problem.residuals(state)
+    damping = 1e-3
+    for _ in range(_ITERATIONS):
+        weight = _view_weights(residuals)
+        J = _jacobian(problem, state, residuals)
+        H = np.einsum("nki,n,nkj->ij", J, weight, J)
+        g = np.einsum("nki,n,nk->i", J, weight, residuals)
+        step = -np.linalg.solve(H + damping * np.diag(np.diag(H) + 1e-12), g)
+        moved = _moved(state, step)
+        new = problem.residuals(moved)
+        if _cost(new, weight) < _cost(residuals, weight):
+            state, residuals, damping = moved, new, max(damping / 10, 1e-9)
+            if np.abs(step).max() < _CONVERGED:
+                break
+        elif damping > 1e6:
+            break
+        else:
+            damping *= 10
+    weight = _view_weights(residuals)
+    per_corner = 2 * _cost(residuals, weight) / (float(weight.sum()) * residuals.shape[1])
+    return state, _covariance(problem, state, residuals, weight), float(np.sqrt(per_corner))
+
+
+def _covariance(
+    problem: _Reprojection, state: _State, residuals: NDArray[np.float64], weight: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Of the parameters, if views are independent and the corners of one view need not be: an error of
+    motion capture moves them all together (the sandwich estimator, clustered by view)."""
+    J = _jacobian(problem, state, residuals)
+    bread = np.linalg.pinv(np.einsum("nki,n,nkj->ij", J, weight, J))
+    scores = np.einsum("nki,n,nk->ni", J, weight, residuals)
+    views = len(residuals)
+    return bread @ (scores.T @ scores) @ bread * views / max(1, views - _PARAMETERS)
+
+
+def _cost(residuals: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
+    return float(np.einsum("nk,n->", residuals**2, weight))
+
+
+def _view_weights(residuals: NDArray[np.float64]) -> NDArray[np.float64]:
+    size = np.sqrt(np.mean(residuals**2, axis=1))
+    return np.minimum(1.0, 3 * np.median(size) / np.maximum(size, 1e-12))
+
+
+def _jacobian(problem: _Reprojection, state: _State, residuals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Derivatives of the residuals by the parameters, (N, corners * 2, _PARAMETERS), by differences."""
+    columns = [
+        (problem.residuals(_moved(state, _DIFFERENCE * direction)) - residuals) / _DIFFERENCE
+        for direction in np.eye(_PARAMETERS)
+    ]
+    return np.stack(columns, axis=-1)
+
+
+def _moved(state: _State, step: NDArray[np.float64]) -> _State:
+    T_camera_body, T_body_board, lag = state
+    return _transform(step[:6]) @ T_camera_body, T_body_board @ _transform(step[6:12]), lag + float(step[12])
+
+
+def _transform(step: NDArray[np.float64]) -> Pose:
+    T = np.eye(4)
+    T[:3, :3] = rotations(step[None, :3])[0]
+    T[:3, 3] = step[3:]
+    return T

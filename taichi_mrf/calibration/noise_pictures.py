@@ -1,0 +1,112 @@
+"""What was learnt, as pictures: bias and sigma against depth, and over the image."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.calibration.coverage import Coverage
+from taichi_mrf.calibration.fit import LearntNoise
+from taichi_mrf.calibration.frustum_picture import image_extent, within_image
+from taichi_mrf.evaluation.figures import new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_LINE, _CENTRE, _POINTS = "#1f4e9c", "#c8102e", "0.35"
+_MAP_DEPTHS = 3
+_MM = 1e3
+
+
+def central_third(noise: LearntNoise) -> NDArray[np.bool_]:
+    """The patches in the middle third of rows and columns, (patches,): those of the paper's Fig. 5."""
+    rows, columns = noise.cells.rows, noise.cells.columns
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    inner_row = np.abs(row - (rows - 1) / 2) <= rows / 6
+    return inner_row & (np.abs(column - (columns - 1) / 2) <= columns / 6)
+
+
+def curves_picture(noise: LearntNoise, coverage: Coverage) -> "Figure":
+    """Bias and sigma against depth: patches' median and spread, the centre of the image, and the bins."""
+    figure = new_figure(12.0, 5.0)
+    left, right = figure.subplots(1, 2)
+    _draw_curves(left, noise, coverage, noise.bias.at, noise.mean_error)
+    left.axhline(0.0, color="0.6", linewidth=0.8)
+    left.set(title="Bias: measured minus true", xlabel="true depth, m", ylabel="bias, mm")
+    _draw_curves(right, noise, coverage, noise.sigma.at, noise.spread)
+    right.set_ylim(bottom=0.0)
+    right.set(title="Sigma: standard deviation", xlabel="true depth, m", ylabel="sigma, mm")
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    return figure
+
+
+def maps_picture(noise: LearntNoise, coverage: Coverage) -> "Figure":
+    """Bias and sigma of each patch over the image at three depths of the covered range; dots mark patches
+    that borrowed from their neighbours."""
+    near, far = coverage.depth_range()
+    depths = near + (far - near) * (np.arange(_MAP_DEPTHS) + 0.5) / _MAP_DEPTHS
+    figure = new_figure(13.0, 6.5)
+    all_axes = figure.subplots(2, _MAP_DEPTHS)
+    for axes_row, curves, name in ((all_axes[0], noise.bias, "bias"), (all_axes[1], noise.sigma, "sigma")):
+        values = curves.at(depths) * _MM
+        for axes, depth, value in zip(axes_row, depths, values.T, strict=True):
+            low, high = np.quantile(value, [0.02, 0.98])
+            colors = "viridis"
+            if low < 0 < high:  # white is no bias
+                colors, high = "RdBu_r", max(-low, high)
+                low = -high
+            grid = value.reshape(noise.cells.rows, noise.cells.columns)
+            image = axes.imshow(grid, cmap=colors, vmin=low, vmax=high, extent=image_extent(coverage))
+            _mark_borrowed(axes, noise)
+            within_image(axes, coverage)
+            axes.set(title=f"{name} at {depth:.2f} m", xticks=[], yticks=[])
+            figure.colorbar(image, ax=axes, label="mm", shrink=0.9)
+    if not noise.own.all():
+        figure.supxlabel(f"Dots: {int((~noise.own).sum())} patches that borrowed from others", fontsize=10)
+    return figure
+
+
+def _draw_curves(
+    axes: "Axes",
+    noise: LearntNoise,
+    coverage: Coverage,
+    at: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    cells: NDArray[np.float64],
+) -> None:
+    options, edges = noise.cells.options, noise.cells.edges
+    depth = np.linspace(options.min_depth, options.max_depth, 200)
+    values = at(depth) * _MM
+    low, median, high = np.quantile(values, [0.1, 0.5, 0.9], axis=0)
+    axes.fill_between(depth, low, high, color=_LINE, alpha=0.18, label="8 of 10 patches", linewidth=0)
+    axes.plot(depth, median, color=_LINE, label="median patch")
+    centre = values[central_third(noise)].mean(axis=0)
+    axes.plot(depth, centre, color=_CENTRE, linestyle="--", label="mean of the image's centre")
+    filled = np.flatnonzero(noise.covered.any(axis=0))
+    middle = 0.5 * (edges[:-1] + edges[1:])[filled]
+    points = np.nanmedian(cells[:, filled], axis=0) * _MM
+    axes.plot(middle, points, "o", color=_POINTS, markersize=3.5, label="bins, median of the patches")
+    near, far = coverage.depth_range()
+    label = "too few samples"
+    for first, last in ((options.min_depth, near), (far, options.max_depth)):
+        if last > first:
+            axes.axvspan(first, last, color="0.88", zorder=0, linewidth=0, label=label)
+            label = ""
+    _limit(axes, np.concatenate([low, high, centre]), np.tile((depth >= near) & (depth <= far), 3), points)
+    axes.set_xlim(options.min_depth, options.max_depth)
+
+
+def _limit(
+    axes: "Axes", values: NDArray[np.float64], inside: NDArray[np.bool_], points: NDArray[np.float64]
+) -> None:
+    """Scale the axis by what is covered; extrapolated curves may leave the picture."""
+    shown = np.concatenate([values[inside], points, [0.0]])
+    margin = 0.25 * max(float(np.ptp(shown)), 1.0)
+    axes.set_ylim(shown.min() - margin, shown.max() + margin)
+
+
+def _mark_borrowed(axes: "Axes", noise: LearntNoise) -> None:
+    patch = noise.cells.options.patch
+    row, column = np.divmod(np.flatnonzero(~noise.own), noise.cells.columns)
+    axes.plot((column + 0.5) * patch - 0.5, (row + 0.5) * patch - 0.5, ".", color="black", markersize=2.0)

@@ -1,0 +1,132 @@
+"""The parameters of learning a sensor's noise. As in config.py, the string under a field is its help, and
+nothing in this file needs NumPy, so that ``taichi-mrf --help`` answers at once.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+from taichi_mrf.errors import ConfigError
+
+HIGHEST_DEGREE = 4
+"""What the map's kernels have room for: sensor.noise.TERMS coefficients."""
+
+LEAST_CORNERS = 3
+"""Inner corners along each side of a chessboard that OpenCV can find."""
+
+
+@dataclass(frozen=True)
+class BoardConfig:
+    """The chessboard that stands in for ground truth. It must be flat."""
+
+    columns: int = 0
+    """Inner corners along a row of the chessboard: one less than the squares."""
+
+    rows: int = 0
+    """Inner corners along a column."""
+
+    square: float = 0.0
+    """Side of a square in metres, as measured on the print."""
+
+    border: float = 0.5
+    """How far the pixels that are used reach beyond the outermost inner corners, in squares. 1 is the edge of
+    the outer squares, where many sensors mix board and background."""
+
+    largest_reprojection: float = 1.0
+    """Images whose corners lie further than this (pixels, RMS) from where the board's pose puts them are
+    left out."""
+
+    def __post_init__(self) -> None:
+        for name in ("columns", "rows"):
+            corners = getattr(self, name)
+            _check(corners == 0 or corners >= LEAST_CORNERS, f"board.{name}", "must be at least 3 corners")
+        _check(math.isfinite(self.square) and self.square >= 0, "board.square", "must be positive")
+        _check(0 <= self.border <= 1, "board.border", "must lie between 0 and 1 squares")
+        _check(self.largest_reprojection > 0, "board.largest_reprojection", "must be positive")
+
+    def require(self) -> None:
+        """Raise ConfigError, naming the field, unless the board is fully described."""
+        for name in ("columns", "rows", "square"):
+            _check(getattr(self, name) > 0, f"board.{name}", "must be given to find the chessboard")
+
+
+@dataclass(frozen=True)
+class MotionCaptureConfig:
+    """How poses of motion capture are put into the time of the images."""
+
+    largest_lag: float = 1.0
+    """The time lag between the two streams is sought up to this many seconds either way."""
+
+    largest_gap: float = 0.05
+    """Where poses of motion capture lie further apart than this (seconds), nothing is interpolated."""
+
+    least_correlation: float = 0.6
+    """Least correlation of the board's speeds in the images with those in motion capture; below it the
+    streams do not belong together."""
+
+    def __post_init__(self) -> None:
+        _check(self.largest_lag >= 0, "motion_capture.largest_lag", "must not be negative")
+        _check(self.largest_gap > 0, "motion_capture.largest_gap", "must be positive")
+        ok = 0 < self.least_correlation < 1
+        _check(ok, "motion_capture.least_correlation", "must lie between 0 and 1")
+
+
+@dataclass(frozen=True)
+class CalibrationConfig:
+    """How bias and sigma are learnt (MRFMap, section IV-C). Depths are axial depth in metres."""
+
+    patch: int = 20
+    """Side in pixels of the square patches, each of which gets its own polynomials."""
+
+    degree: int = 2
+    """Degree of the polynomials in depth."""
+
+    min_depth: float = 0.3
+    """Nearest depth that the sensor is used at; nearer samples are not looked at."""
+
+    max_depth: float = 5.0
+    """Furthest depth that the sensor is used at. From the nearest to the furthest sigma is kept positive."""
+
+    bin_width: float = 0.1
+    """Width of a depth bin in metres."""
+
+    least_count: int = 50
+    """A patch's depth bin with fewer samples than this does not count."""
+
+    least_span: float = 0.5
+    """A patch whose bins span less than this share of what the best covered patches span borrows from its
+    neighbours."""
+
+    outlier_sigmas: float = 5.0
+    """Samples further than this many robust standard deviations from the median of their patch and bin are
+    left out; the map's inference.outlier_floor is there for these."""
+
+    least_sigma: float = 1e-4
+    """Sigma is kept at this many metres or more from min_depth to max_depth. The map itself takes nothing
+    below 1 mm for true."""
+
+    board: BoardConfig = field(default_factory=BoardConfig)
+    """The chessboard, where one is used."""
+
+    motion_capture: MotionCaptureConfig = field(default_factory=MotionCaptureConfig)
+    """How motion capture is used, where it is."""
+
+    def __post_init__(self) -> None:
+        _check(self.patch >= 1, "patch", "must be at least 1 pixel")
+        _check(0 <= self.degree <= HIGHEST_DEGREE, "degree", f"must lie between 0 and {HIGHEST_DEGREE}")
+        _check(self.min_depth >= 0, "min_depth", "must not be negative")
+        _check(math.isfinite(self.max_depth), "max_depth", "must be finite")
+        _check(self.max_depth > self.min_depth, "max_depth", "must be more than min_depth")
+        _check(self.bin_width > 0, "bin_width", "must be positive")
+        ok = (self.max_depth - self.min_depth) / self.bin_width <= 1000
+        _check(ok, "bin_width", "makes more than 1000 bins of the range from min_depth to max_depth")
+        _check(self.least_count >= 10, "least_count", "must be at least 10")
+        _check(0 < self.least_span <= 1, "least_span", "must lie between 0 and 1")
+        _check(
+            self.outlier_sigmas >= 3, "outlier_sigmas", "must be at least 3: nearer samples are no outliers"
+        )
+        _check(self.least_sigma > 0, "least_sigma", "must be positive")
+
+
+def _check(ok: bool, name: str, problem: str) -> None:
+    if not ok:
+        raise ConfigError(f"{name} {problem}")
