@@ -10,6 +10,7 @@ import tyro
 import taichi_mrf
 from taichi_mrf.commands.bench import Bench
 from taichi_mrf.commands.calibrate import Calibrate
+from taichi_mrf.commands.eval import Eval
 from taichi_mrf.commands.flags import registry
 from taichi_mrf.commands.info import Info
 from taichi_mrf.commands.map import Map, file_settings
@@ -48,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return ABORTED
 
 
-def parse(arguments: Sequence[str]) -> Map | Info | Bench | Calibrate:
+def parse(arguments: Sequence[str]) -> Map | Info | Bench | Calibrate | Eval:
     """The command that the arguments ask for. Exits with status 2 where they cannot be parsed."""
     settings = file_settings(arguments[1:]) if arguments[:1] == ["map"] else file_settings([])
     commands = (
@@ -61,6 +62,7 @@ def parse(arguments: Sequence[str]) -> Map | Info | Bench | Calibrate:
         | Annotated[Info, tyro.conf.subcommand("info", prefix_name=False)]
         | Annotated[Bench, tyro.conf.subcommand("bench", default=Bench(), prefix_name=False)]
         | Annotated[Calibrate, tyro.conf.subcommand("calibrate", prefix_name=False)]
+        | Annotated[Eval, tyro.conf.subcommand("eval", prefix_name=False)]
     )
     return tyro.cli(
         commands,

@@ -146,7 +146,8 @@ class LogOddsConfig:
     """One update for each voxel and scan, in which a hit wins over misses (OctoMap), or one for each ray."""
 
     max_range: float = 0.0
-    """A ray is cut off at this range (metres) and its end then counts as free; 0 means no limit."""
+    """A ray is cut off at this range (metres) and then hits nothing: the voxel in which it ends is not
+    updated. 0 means no limit."""
 
     discretise: bool = False
     """Cast one ray to the centre of each voxel that holds a measurement, instead of one for each pixel."""

@@ -1,9 +1,19 @@
 """Queries of maps made by hand, against NumPy: points, voxels, rendered depth, and the profile of a ray."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
+from hand_made import (
+    BRICK_M,
+    CAMERA,
+    PRIOR,
+    VIEWS,
+    VOXEL,
+    HandMade,
+    made,
+    made_at_random,
+    profile_of,
+    rays_into,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -16,62 +26,17 @@ from taichi_mrf.poses import Pose, look_at
 from taichi_mrf.queries.extract import extract_voxels
 from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN, classify, point_log_odds, probability
 from taichi_mrf.queries.view import View
-from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.pool import BrickPool
-from taichi_mrf.voxels.topology import Topology, create_topology
 
 pytestmark = pytest.mark.usefixtures("backend")
 
-VOXEL = 0.05
-BRICK_M = VOXEL * BRICK
-PRIOR = -2.2
 SEEN_FREE = PRIOR - 6.9
-
-CAMERA = PinholeCamera(width=48, height=36, fx=40, fy=42, cx=23.2, cy=17.9)
-
-
-@dataclass(frozen=True)
-class HandMade:
-    """Bricks (n, 3) with their log-odds (n, 8, 8, 8), in a pool and a topology."""
-
-    bricks: NDArray[np.int32]
-    log_odds: NDArray[np.float32]
-    pool: BrickPool
-    topology: Topology
-
-    def at(self, voxels: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Log-odds of voxels (n, 3), NaN where no brick is."""
-        place = {tuple(brick): i for i, brick in enumerate(self.bricks.tolist())}
-        rows = np.array([place.get(tuple(b), -1) for b in (voxels // BRICK).tolist()], np.int64)
-        values = self.log_odds[(rows, *(voxels % BRICK).T)].astype(np.float64)
-        return np.where(rows >= 0, values, np.nan)
-
-
-def made(backend: str, bricks: NDArray[np.int32], log_odds: NDArray[np.float32], dead: int = 0) -> HandMade:
-    """``dead`` bricks before them have been released again and keep their old values in the pool."""
-    pool, topology = BrickPool(PRIOR), create_topology(backend, 64)
-    topology.anchor(bricks[0])
-    ghosts = pool.allocate(np.zeros((dead, 3), np.int32) + np.arange(dead)[:, None].astype(np.int32))
-    slots = pool.allocate(bricks)
-    values = pool.belief.to_numpy().reshape(-1, VOXELS)
-    values[ghosts] = 8.0
-    values[slots] = log_odds.reshape(-1, VOXELS)
-    pool.belief.from_numpy(values.reshape(-1))
-    pool.owners[slots] = 1
-    pool.release(ghosts)
-    topology.insert(bricks, slots)
-    return HandMade(bricks, log_odds, pool, topology)
 
 
 @pytest.fixture(scope="module")
 def random_map(backend: str) -> HandMade:
-    """Sixty bricks around (-1, 2, 0) m, mostly thin, with some dense voxels."""
-    random = np.random.default_rng(0)
-    corner = np.array([-6, 2, -4])
-    cells = np.stack(np.unravel_index(random.choice(216, 60, replace=False), (6, 6, 6)), axis=1)
-    log_odds = random.normal(-4, 1.5, (60, BRICK, BRICK, BRICK))
-    log_odds[random.random(log_odds.shape) < 0.03] = 2.0
-    return made(backend, (corner + cells).astype(np.int32), log_odds.astype(np.float32), dead=7)
+    return made_at_random(backend)
 
 
 def points_in(bricks: NDArray[np.int32], count: int, seed: int) -> NDArray[np.float64]:
@@ -177,40 +142,6 @@ def test_a_probability_outside_its_range_is_refused(random_map: HandMade, least:
         extract_voxels(random_map.pool, VOXEL, least)
 
 
-@dataclass(frozen=True)
-class Profile:
-    """Eqs. 15 to 18 along a ray, over the voxels that exist."""
-
-    near: NDArray[np.float64]
-    far: NDArray[np.float64]
-    occupancy: NDArray[np.float64]
-    visibility: NDArray[np.float64]
-    omega: NDArray[np.float64]
-
-
-def profile_of(
-    hand: HandMade, origin: NDArray, direction: NDArray, end: float, speed: float = 1.0
-) -> Profile:
-    """``speed`` is metres for one unit of t; the direction is metres for one unit of t, too."""
-    cells, near, far = segments(origin / VOXEL, direction / VOXEL, 0.0, end)
-    log_odds = hand.at(cells)
-    exists = np.isfinite(log_odds)
-    near, far, log_odds = near[exists], far[exists], log_odds[exists]
-    alpha = np.log1p(np.exp(log_odds)) / VOXEL  # -ln(1 - p) / voxel size
-    passed = np.exp(-np.cumsum(alpha * (far - near) * speed))
-    visibility = np.concatenate([[1.0], passed[:-1]])[: len(near)]
-    return Profile(near, far, 1 / (1 + np.exp(-log_odds)), visibility, alpha * visibility)
-
-
-def rays_into(hand: HandMade, count: int, seed: int) -> list[tuple[NDArray, NDArray]]:
-    """Origins and unit directions, of rays from around the map through it and from inside it."""
-    random = np.random.default_rng(seed)
-    low, high = hand.bricks.min(axis=0) * BRICK_M, (hand.bricks.max(axis=0) + 1) * BRICK_M
-    origins = random.uniform(low - 1.5, high + 1.5, (count, 3))
-    directions = random.uniform(low, high, (count, 3)) - origins
-    return list(zip(origins, directions / np.linalg.norm(directions, axis=1)[:, None], strict=True))
-
-
 def test_ray_profiles_follow_eqs_15_to_18(random_map: HandMade) -> None:
     view = View(random_map.pool, VOXEL, VolumeConfig())
     met = 0
@@ -267,13 +198,6 @@ def test_what_is_no_ray_is_refused(random_map: HandMade, origin: tuple, directio
         View(random_map.pool, VOXEL, VolumeConfig()).ray_profile(origin, direction, 5.0)
 
 
-VIEWS = [
-    look_at((0.9, 0.3, -0.1), (-1.2, 2.0, -0.4)),
-    look_at((-1.21, 1.93, 3.1), (-1.2, 2.0, 0.0)),
-    look_at((-1.3, 2.1, -0.45), (-3.0, 2.5, -0.5)),
-]
-
-
 LEARNT = np.log1p(np.exp(PRIOR + VolumeConfig.min_evidence))
 """What -ln(1 - p) is where the log-odds are as far above the prior as they are in unknown space."""
 
@@ -287,8 +211,6 @@ def rendered_by_oracle(hand: HandMade, camera: PinholeCamera, T: Pose, max_depth
         profile = profile_of(hand, T[:3, 3], T[:3, :3] @ local, max_depth, float(np.linalg.norm(local)))
         row[:] = (0, 1, 1)
         if len(profile.omega):
-            alpha = profile.omega[-1] / profile.visibility[-1]
-            span = (profile.far[-1] - profile.near[-1]) * np.linalg.norm(local)
             learnt = profile.omega / profile.visibility * VOXEL > LEARNT
             omega = np.where(learnt, profile.omega, 0.0)
             best = omega.argmax()
@@ -296,7 +218,7 @@ def rendered_by_oracle(hand: HandMade, camera: PinholeCamera, T: Pose, max_depth
             if learnt.any():
                 row[0] = 0.5 * (profile.near[best] + profile.far[best])
                 row[1] = 1 - others / omega[best]
-            row[2] = profile.visibility[-1] * np.exp(-alpha * span)
+            row[2] = profile.through
     return out
 
 

@@ -50,5 +50,7 @@ def _lathed(solid: Solid, sag_m: float) -> tuple[NDArray[np.float64], NDArray[np
     points[..., 2] = heights[:, None]
     ring, spoke = np.indices((rings - 1, count))
     here, beside = ring * count + spoke, ring * count + (spoke + 1) % count
-    quads = np.stack([here, beside, beside + count, here, beside + count, here + count], axis=-1)
-    return points.reshape(-1, 3), quads.reshape(-1, 3)
+    # The first and the last ring are points, where one triangle of each pair would have no area.
+    lower = np.stack([here, beside, beside + count], axis=-1)[1:]
+    upper = np.stack([here, beside + count, here + count], axis=-1)[:-1]
+    return points.reshape(-1, 3), np.concatenate([lower, upper]).reshape(-1, 3)

@@ -101,7 +101,9 @@ class RecursiveMap(ABC, Generic[FootprintT]):
     the sign of its log-odds. Removing or moving a keyframe leaves the map stale: queries still answer
     with what is known, and the next :meth:`infer` integrates all scans that are left anew.
 
-    ``view`` follows rays through the map, which pass unknown voxels as if they were empty.
+    ``view`` follows rays through the map. They pass voxels that are unknown or more likely free than
+    occupied as if these were empty: such a map says of free space "0.12 at the least", which read as a
+    medium (eq. 15 of MRFMap) would stop every ray within a metre or two.
     """
 
     METHOD: ClassVar[Method]
@@ -119,7 +121,7 @@ class RecursiveMap(ABC, Generic[FootprintT]):
         weakref.finalize(self, recycle, topology)
         self._book = BrickBook(topology, self._pool, self.voxel_size)
         any_evidence_counts = dataclasses.replace(config.volume, min_evidence=0.0)
-        occlusion = Occlusion(unknown=UNKNOWN_LOG_ODDS)
+        occlusion = Occlusion(unknown=UNKNOWN_LOG_ODDS, empty_below=0.0)
         self.view = View(self._pool, self.voxel_size, any_evidence_counts, occlusion)
         self._keyframes: dict[int, ScanRecord] = {}
         self._next_id = 0

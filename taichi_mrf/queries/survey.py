@@ -11,8 +11,9 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from taichi_mrf.inference.log_odds import exp_of_negative
 from taichi_mrf.inference.rays import pixel_direction
-from taichi_mrf.queries.occlusion import occlusion
+from taichi_mrf.queries.occlusion import occlusion, stopped_share
 from taichi_mrf.sensor.forward import SEGMENT, PixelNoise, pixel_noise, surface_likelihood
 from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
 from taichi_mrf.voxels.types import (
@@ -88,9 +89,9 @@ def survey_voxel(ray: Template, context: Template, voxel: I32, near: F32, far: F
         ray.near = near
         ray.far = far
     # Eqs. 15 and 16.
-    passing = ti.exp(-alpha * (far - near) * ray.voxels_per_depth)
-    here = ray.visibility * (1.0 - passing)
-    ray.visibility *= passing
+    thickness = alpha * (far - near) * ray.voxels_per_depth
+    here = ray.visibility * stopped_share(thickness)
+    ray.visibility *= exp_of_negative(-thickness)
     ray.stopped += here
     ray.moment += here * 0.5 * (near + far)
     if ti.static(context[1]):

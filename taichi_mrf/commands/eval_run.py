@@ -1,0 +1,124 @@
+"""Carrying out ``taichi-mrf eval``: the ledger, the progress bar, tables on the terminal."""
+
+import dataclasses
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table as RichTable
+
+import taichi_mrf
+from taichi_mrf import runtime
+from taichi_mrf.commands.eval import Eval
+from taichi_mrf.commands.output import output_folder
+from taichi_mrf.config import Config, to_yaml
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.evaluation.experiments.fig7 import run_fig7
+from taichi_mrf.evaluation.experiments.fig10 import run_fig10
+from taichi_mrf.evaluation.experiments.folds import Experiment
+from taichi_mrf.evaluation.experiments.ledger import Ledger
+from taichi_mrf.evaluation.experiments.stereo import run_stereo
+from taichi_mrf.evaluation.experiments.table1 import run_table1
+from taichi_mrf.evaluation.experiments.table2 import run_table2
+from taichi_mrf.evaluation.experiments.table3 import run_table3
+from taichi_mrf.evaluation.experiments.tables import Table, entry_text
+from taichi_mrf.export.atomic import write_text
+
+Run = Callable[[Experiment], tuple[list[Table], list[Path]]]
+
+EXPERIMENTS: dict[str, tuple[Run, tuple[float, ...]]] = {
+    "table1": (run_table1, (0.05, 0.02, 0.01)),
+    "table2": (run_table2, (0.05, 0.02)),
+    "table3": (run_table3, (0.05, 0.02, 0.01)),
+    "fig7": (run_fig7, (0.05, 0.02)),
+    "fig10": (run_fig10, (0.05, 0.02, 0.01)),
+    "stereo": (run_stereo, (0.2,)),
+}
+"""Name -> what runs it, and its own voxel sizes."""
+
+
+def run_eval(options: Eval) -> int:
+    """Carry out the command; returns the exit status. Raises TaichiMRFError."""
+    console = Console()
+    if not options.data.is_dir():
+        raise DatasetError(f"{options.data}: there is no such folder; --data names the one with the scenes")
+    names = list(EXPERIMENTS) if options.experiment == "all" else [options.experiment]
+    with output_folder(options.out):
+        runtime.init(options.runtime.arch, options.runtime.threads, options.runtime.debug)
+        for name in names:
+            tables, paths = _run(name, options, console)
+            for table in tables:
+                _print(console, table)
+            for path in paths:
+                console.print(str(path), markup=False, highlight=False, soft_wrap=True)
+    return 0
+
+
+def _run(name: str, options: Eval, console: Console) -> tuple[list[Table], list[Path]]:
+    run, own_sizes = EXPERIMENTS[name]
+    sizes = options.voxel_sizes or own_sizes
+    configuration = options.out / f"{name}_config.yaml"
+    write_text(configuration, _configuration(name, options, sizes))
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task(name, total=None)
+
+        def report(what: str, done: int, total: int) -> None:
+            progress.update(task, description=f"{name}: {what}", completed=done, total=total)
+
+        experiment = Experiment(
+            options.data,
+            options.out,
+            Ledger(options.out / f"{name}.jsonl", _made_with()),
+            sizes,
+            options.seeds,
+            options.limit,
+            report,
+        )
+        with warnings.catch_warnings():
+            # Learnt tables have patches whose sigma falls below zero far away; the tables' notes say so.
+            warnings.filterwarnings("ignore", message="sigma of patch")
+            tables, paths = run(experiment)
+    return tables, [*paths, configuration]
+
+
+def _made_with() -> dict[str, Any]:
+    """What results depend on beside their keys. The backend is part of it: times depend on it."""
+    choice = runtime.choice()
+    return {
+        "version": taichi_mrf.__version__,
+        "backend": choice.name if choice else None,
+        "parameters": dataclasses.asdict(Config()),
+    }
+
+
+def _configuration(name: str, options: Eval, sizes: tuple[float, ...]) -> str:
+    """The exact parameters: those of the experiment, and those that every map has but for its method's."""
+    head = {
+        "experiment": name,
+        "voxel_sizes": list(sizes),
+        "seeds": list(options.seeds),
+        "limit": options.limit,
+        "version": taichi_mrf.__version__,
+    }
+    return (
+        "# How this evaluation was run, and the parameters of its maps where the experiment sets none.\n"
+        + yaml.safe_dump({"evaluation": head}, sort_keys=False)
+        + "maps:\n"
+        + "".join(f"  {line}\n" for line in to_yaml(Config()).splitlines())
+    )
+
+
+def _print(console: Console, table: Table) -> None:
+    shown = RichTable(title=table.title, title_justify="left")
+    for number, name in enumerate(table.columns):
+        shown.add_column(name, justify="right" if number else "left", overflow="fold")
+    for row in table.rows:
+        shown.add_row(*(entry_text(entry, table.digits) for entry in row))
+    console.print(shown)
+    for note in table.notes:
+        console.print(note, markup=False, highlight=False)

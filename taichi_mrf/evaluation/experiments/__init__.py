@@ -1,0 +1,1 @@
+"""The papers' evaluations, each from one call: scenes, contenders, scores, tables and pictures."""

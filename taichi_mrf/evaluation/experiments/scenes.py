@@ -1,0 +1,143 @@
+"""The scenes that maps are judged on: what a sensor measured, and what is known of the truth.
+
+Where depth is clean it is what a perfect sensor would measure, and the noise is simulated here, so that
+the truth stays known. Folders are laid out as data/README.md says.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.config import KeyframeConfig, VolumeConfig
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.keyframes import KeyframeSelector
+from taichi_mrf.poses import Pose, as_pose
+from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
+from taichi_mrf.sensor.simulate import KINECT_1_LATERAL, simulate, simulate_model
+
+COFFIN_VOLUME = ((-2.0, -2.0, 0.0), (2.0, 2.0, 3.0))
+"""The walls, floor and boxes of MRFMap's Table I lie in this box; a view sees floor beyond it."""
+
+COFFIN_MARGIN = 0.4
+"""The map may reach this far out of the volume, so that noise in front of a wall and behind it is mapped."""
+
+EDGE = 0.01
+"""A surface counts as in the volume up to this far outside (metres): walls stand on its faces."""
+
+COFFIN_SEED = 100
+"""View i of noise seed s is drawn with COFFIN_SEED + 1000 s + i."""
+
+
+@dataclass(frozen=True)
+class SceneView:
+    """One view. ``measured_m`` and ``true_m`` are (H, W) axial depth in metres, 0 for none; in a recording
+    what was measured is all that is known of the truth. ``judged`` (H, W): pixels that count."""
+
+    name: str
+    T_world_camera: Pose
+    measured_m: NDArray[np.float32]
+    true_m: NDArray[np.float32]
+    judged: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Views of one place by one camera, the noise of its sensor, and where the map may be."""
+
+    name: str
+    camera: PinholeCamera
+    noise: NoiseModel
+    volume: VolumeConfig
+    max_depth: float
+    views: Sequence[SceneView]
+
+
+def coffin_scene(data: Path, seed: int = 0) -> Scene:
+    """MRFMap's Table I: 12 views of a room with a box, measured with the learnt noise of a RealSense D435.
+
+    Raises DatasetError if a file of ``data``/coffin_world is missing or does not hold what it should.
+    """
+    folder = data / "coffin_world"
+    try:
+        with np.load(folder / "clean_depth.npz") as file:
+            clean, poses, K = file["depth_m"], file["T_world_camera"], file["K"]
+        sigma = np.load(folder / "realsense_stddev_poly5x.npy")
+        bias = np.load(folder / "realsense_bias_poly5x.npy")
+    except (OSError, ValueError, KeyError) as error:
+        raise DatasetError(f"{folder}: not the scene of Table I: {error}") from error
+    height, width = clean.shape[1:]
+    camera = PinholeCamera(width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+    patch = _patch_size(len(sigma), camera)
+    noise = PatchNoise(sigma, bias, patch, camera)
+    lower, upper = (np.asarray(corner) for corner in COFFIN_VOLUME)
+    views = []
+    for index, (depth, pose) in enumerate(zip(clean, poses, strict=True)):
+        true = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
+        T_world_camera = as_pose(pose)
+        measured = simulate_model(true, camera, noise, seed=COFFIN_SEED + 1000 * seed + index)
+        inside = _inside(true, camera, T_world_camera, lower - EDGE, upper + EDGE)
+        views.append(SceneView(f"view {index:02d}", T_world_camera, measured, true, inside))
+    box = (tuple((lower - COFFIN_MARGIN).tolist()), tuple((upper + COFFIN_MARGIN).tolist()))
+    volume = VolumeConfig(lower=box[0], upper=box[1])
+    return Scene("coffin_world", camera, noise, volume, 20.0, views)
+
+
+def house_scene(data: Path, seed: int = 0, limit: int | None = None) -> Scene:
+    """In the manner of MRFMap's Table II: clean views of a living room, with the noise of a Kinect 1."""
+    dataset = open_dataset(data / "house_livingroom", color=False)
+    views = []
+    for index in range(len(dataset))[:limit]:
+        frame = dataset.read(index)
+        measured = simulate(frame.depth_m, frame.camera, KINECT_1_LATERAL, seed=(seed, index))
+        views.append(SceneView(frame.name, frame.T_world_camera, measured, frame.depth_m, frame.depth_m > 0))
+    noise = PolynomialNoise(KINECT_1_LATERAL.sigma, KINECT_1_LATERAL.bias)
+    return Scene("house_livingroom", dataset.camera, noise, VolumeConfig(), 10.0, views)
+
+
+def kitchen_scene(data: Path, limit: int | None = None) -> Scene:
+    """In the manner of MRFMap's Table III: a real recording, for which the measured depth must do."""
+    dataset = open_dataset(data / "seven_scenes_redkitchen", color=False)
+    views = []
+    for index in range(len(dataset))[:limit]:
+        frame = dataset.read(index)
+        depth = frame.depth_m
+        views.append(SceneView(frame.name, frame.T_world_camera, depth, depth, depth > 0))
+    noise = PolynomialNoise(KINECT_1_LATERAL.sigma, KINECT_1_LATERAL.bias)
+    return Scene("seven_scenes_redkitchen", dataset.camera, noise, VolumeConfig(), 10.0, views)
+
+
+def keyframes_of(scene: Scene, rotation: float, translation: float) -> list[int]:
+    """Indices of the views that the geometric heuristic of section V makes keyframes."""
+    selector = KeyframeSelector(KeyframeConfig(rotation=rotation, translation=translation))
+    chosen = []
+    for index, view in enumerate(scene.views):
+        if selector.wants(view.T_world_camera):
+            selector.accept(view.T_world_camera)
+            chosen.append(index)
+    return chosen
+
+
+def _patch_size(rows: int, camera: PinholeCamera) -> int:
+    """The side in pixels of the square patches of which ``rows`` cover the image."""
+    for patch in range(1, max(camera.width, camera.height) + 1):
+        if -(-camera.width // patch) * -(-camera.height // patch) == rows:
+            return patch
+    raise DatasetError(f"no square patch divides {camera.width} x {camera.height} pixels into {rows}")
+
+
+def _inside(
+    depth_m: NDArray[np.float32],
+    camera: PinholeCamera,
+    T_world_camera: Pose,
+    lower: NDArray[np.float64],
+    upper: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Pixels with a depth whose surface lies in a box, (H, W)."""
+    points = camera.rays() * depth_m[..., None].astype(np.float64)
+    points = points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    return (depth_m > 0) & ((points >= lower) & (points <= upper)).all(axis=-1)

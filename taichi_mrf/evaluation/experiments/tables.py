@@ -1,0 +1,140 @@
+"""A table of results in every form that it is asked for: CSV, LaTeX, and a picture."""
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from taichi_mrf.evaluation.figures import new_figure
+from taichi_mrf.export.atomic import atomic_path, write_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A mean and, if there were several values, their standard deviation."""
+
+    mean: float
+    deviation: float | None = None
+
+    @staticmethod
+    def of(values: Sequence[float | None]) -> "Spread":
+        """Of the values that exist; NaN if none does."""
+        known = [v for v in values if v is not None and math.isfinite(v)]
+        if not known:
+            return Spread(math.nan)
+        mean = sum(known) / len(known)
+        if len(known) == 1:
+            return Spread(mean)
+        return Spread(mean, math.sqrt(sum((v - mean) ** 2 for v in known) / (len(known) - 1)))
+
+
+Entry = Spread | float | int | str | None
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows under named columns; a row's first entry is its name. ``notes`` say how to read it."""
+
+    name: str
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Entry]]
+    notes: Sequence[str] = field(default_factory=list)
+    digits: int = 3
+
+
+def entry_text(entry: Entry, digits: int, plus_minus: str = "±") -> str:
+    """How an entry is printed; a dash for what does not exist."""
+    if entry is None:
+        return "-"
+    if isinstance(entry, Spread):
+        if not math.isfinite(entry.mean):
+            return "-"
+        text = f"{entry.mean:.{digits}f}"
+        return text if entry.deviation is None else f"{text} {plus_minus} {entry.deviation:.{digits}f}"
+    if isinstance(entry, float):
+        return f"{entry:.{digits}f}" if math.isfinite(entry) else "-"
+    return str(entry)
+
+
+def as_csv(table: Table) -> str:
+    """Comma-separated values with full digits; a spread takes two columns."""
+    spread = [any(_has_deviation(row[i]) for row in table.rows) for i in range(len(table.columns))]
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(
+        [
+            text
+            for name, wide in zip(table.columns, spread, strict=True)
+            for text in ([name, f"{name} (std)"] if wide else [name])
+        ]
+    )
+    for row in table.rows:
+        values: list[str | float | int | None] = []
+        for entry, wide in zip(row, spread, strict=True):
+            mean, deviation = (entry.mean, entry.deviation) if isinstance(entry, Spread) else (entry, None)
+            values += [mean, deviation] if wide else [mean]
+        writer.writerow(["" if v is None else v for v in values])
+    return out.getvalue()
+
+
+def as_latex(table: Table) -> str:
+    """A tabular with booktabs' rules."""
+
+    def escaped(text: str) -> str:
+        return text.replace("&", r"\&").replace("%", r"\%").replace("_", r"\_")
+
+    lines = [rf"\begin{{tabular}}{{l{'r' * (len(table.columns) - 1)}}}", r"\toprule"]
+    lines += [" & ".join(map(escaped, table.columns)) + r" \\", r"\midrule"]
+    for row in table.rows:
+        lines.append(" & ".join(escaped(entry_text(e, table.digits, r"$\pm$")) for e in row) + r" \\")
+    lines += [r"\bottomrule", r"\end{tabular}", *(f"% {note}" for note in table.notes)]
+    return "\n".join(lines) + "\n"
+
+
+def as_figure(table: Table) -> "Figure":
+    """The table as a picture."""
+    cells = [[entry_text(entry, table.digits) for entry in row] for row in table.rows]
+    widths = [max(len(str(c)) for c in column) for column in zip(table.columns, *cells, strict=True)]
+    figure = new_figure(
+        max(6.0, 0.085 * sum(widths) + 0.25 * len(widths)),
+        0.26 * (len(cells) + 2) + 0.2 * len(table.notes) + 0.5,
+    )
+    axes = figure.add_subplot()
+    axes.axis("off")
+    axes.set_title(table.title, loc="left", fontsize=11)
+    drawn = axes.table(
+        cellText=cells,
+        colLabels=list(table.columns),
+        colWidths=[w / sum(widths) for w in widths],
+        cellLoc="right",
+        loc="upper left",
+        edges="horizontal",
+    )
+    drawn.auto_set_font_size(False)
+    drawn.set_fontsize(9)
+    for (row, column), cell in drawn.get_celld().items():
+        cell.set_text_props(weight="bold" if row == 0 else "normal", ha="left" if column == 0 else "right")
+    if table.notes:
+        figure.supxlabel("\n".join(table.notes), fontsize=8, x=0.02, ha="left")
+    return figure
+
+
+def write_table(folder: Path, table: Table) -> list[Path]:
+    """Write a table as .csv, .tex and .png. Raises MapFileError."""
+    paths = [folder / f"{table.name}{suffix}" for suffix in (".csv", ".tex", ".png")]
+    write_text(paths[0], as_csv(table))
+    write_text(paths[1], as_latex(table))
+    with atomic_path(paths[2]) as temporary:
+        as_figure(table).savefig(temporary, dpi=130)
+    return paths
+
+
+def _has_deviation(entry: Entry) -> bool:
+    return isinstance(entry, Spread) and entry.deviation is not None
