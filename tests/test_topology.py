@@ -204,6 +204,26 @@ def test_a_recycled_index_comes_back_empty(backend: str) -> None:
     assert (again.crossings(bricks) == 0).all()
 
 
+def test_as_many_maps_as_there_are_layers_stay_apart(backend: str) -> None:
+    """Ten trees of pointers in one process used to crash it; now all maps share one tree."""
+    if backend == "vulkan":
+        pytest.skip("Vulkan has no sparse SNodes")
+    bricks = block((0, 0, 0))
+    kept = []
+    with pytest.raises(CapacityError, match="64 maps already"):
+        for number in range(65):
+            topology = SparseTopology()
+            topology.insert(bricks, np.full(len(bricks), number, np.int32))
+            kept.append(topology)
+    assert len(kept) > 20
+    for number, topology in enumerate(kept):
+        assert (topology.slots(bricks) == number).all()
+    layer = kept.pop().layer
+    again = SparseTopology()
+    assert again.layer == layer
+    assert (again.slots(bricks) == -1).all()
+
+
 def test_each_backend_gets_its_kind(backend: str) -> None:
     kind = DenseTopology if backend == "vulkan" else SparseTopology
     assert isinstance(create_topology(backend, SIDE), kind)

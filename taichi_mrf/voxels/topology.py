@@ -1,16 +1,17 @@
 """Which bricks exist: the map's index from brick coordinates to slots in the pool.
 
-On CPU and CUDA it is a Taichi SNode tree, pointer -> pointer -> bitmasked: a bitmasked cell is a brick,
-the pointer cell above it a chunk of 8^3 bricks, and the pointer above that a region of 16^3 chunks,
-which together span 8192 bricks along each axis. Vulkan has no sparse SNodes, so there the same
-interface is served by dense arrays over a bounded volume. Nothing outside this file knows which of the
-two it is.
+On CPU and CUDA it is a layer of a Taichi SNode tree, pointer -> pointer -> pointer -> bitmasked: a bitmasked
+cell is a brick, the pointer cell above it a chunk of 8^3 bricks, the one above that a region of 16^3 chunks,
+which together span 8192 bricks along each axis, and the uppermost a map. Vulkan has no sparse SNodes, so
+there the same interface is served by dense arrays over a bounded volume. Nothing outside this file knows
+which of the two it is.
 
 Beside its slot each brick has a number of crossings: how many keyframes' rays pass through it. A brick
 without a slot that has been crossed is seen-free space, one that has not is unknown.
 """
 
-from typing import Protocol
+import weakref
+from typing import ClassVar, Protocol
 
 import numpy as np
 import taichi as ti
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.voxels.layout import BRICK, CHUNK, flat
-from taichi_mrf.voxels.types import I32, AnyArray, I32Array, IVec3, Template
+from taichi_mrf.voxels.types import I32, AnyArray, I32Array, IVec3, IVec4, Template
 
 Bricks = NDArray[np.int32]
 """(n, 3) brick coordinates in the world."""
@@ -65,51 +66,117 @@ def create_topology(arch: str, dense_bricks: int) -> Topology:
 def recycle(topology: Topology) -> None:
     """Keep the index of a map that is gone for the next map.
 
-    Taichi compiles a kernel anew for each SNode tree, so an old tree costs less than a new one, and a dense
-    index is large. It is
-    cleared when it is taken again and not here: this runs when Python collects the map, where no
-    kernel may be launched.
+    A layer of the tree can be given away once only, and a dense index is large. It is cleared when it is
+    taken again and not here: this runs when Python collects the map, where no kernel may be launched.
     """
     key = topology.side if isinstance(topology, DenseTopology) else 0
     _spare.setdefault(key, []).append(topology)
 
 
 @ti.data_oriented
-class SparseTopology:
-    """Pointer -> pointer -> bitmasked SNodes that hold a slot and a number of crossings a brick."""
+class _Tree:
+    """The SNode tree: a layer for each map -> regions -> chunks -> bricks, which hold a slot and crossings.
 
-    REGIONS, REGION = 64, 16
+    One tree for all maps of the process. Taichi compiles a kernel anew for each tree that it is used with,
+    and a process with some ten trees of pointers crashes (Taichi 1.7.4).
+    """
+
+    LAYERS, REGIONS, REGION = 64, 64, 16
     HALF_SPAN = REGIONS * REGION * CHUNK // 2
 
     def __init__(self) -> None:
         self.slot = ti.field(ti.i32)  # slot + 1, because an inactive cell reads as 0
         self.crossing = ti.field(ti.i32)
         builder = ti.FieldsBuilder()
-        self.regions = builder.pointer(ti.ijk, self.REGIONS)
-        self.bricks = self.regions.pointer(ti.ijk, self.REGION).bitmasked(ti.ijk, CHUNK)
+        self.layers = builder.pointer(ti.l, self.LAYERS)
+        regions = self.layers.pointer(ti.ijk, self.REGIONS)
+        self.bricks = regions.pointer(ti.ijk, self.REGION).bitmasked(ti.ijk, CHUNK)
         self.bricks.place(self.slot, self.crossing)
         builder.finalize()
+        self.unused = list(range(self.LAYERS))
+
+    @ti.func
+    def cell(self, bricks: Template, i: I32, layer: I32):
+        return IVec4(
+            bricks[i, 0] + self.HALF_SPAN, bricks[i, 1] + self.HALF_SPAN, bricks[i, 2] + self.HALF_SPAN, layer
+        )
+
+    @ti.func
+    def in_span(self, cell: IVec4) -> I32:
+        return ti.min(cell[0], cell[1], cell[2]) >= 0 and (
+            ti.max(cell[0], cell[1], cell[2]) < 2 * self.HALF_SPAN
+        )
+
+    @ti.kernel
+    def write(self, bricks: AnyArray, values: I32Array, layer: I32):
+        for i in range(values.shape[0]):
+            cell = self.cell(bricks, i, layer)
+            # Writing a leaf activates its parents; ti.activate would not.
+            self.slot[cell] = values[i]
+            if values[i] == 0 and self.crossing[cell] == 0:
+                ti.deactivate(self.bricks, cell)
+
+    @ti.kernel
+    def count(self, bricks: AnyArray, number: I32, layer: I32):
+        for i in range(bricks.shape[0]):
+            cell = self.cell(bricks, i, layer)
+            self.crossing[cell] += number
+            if self.crossing[cell] == 0 and self.slot[cell] == 0:
+                ti.deactivate(self.bricks, cell)
+
+    @ti.kernel
+    def read(self, bricks: AnyArray, out: I32Array, channel: I32, layer: I32):
+        for i in range(out.shape[0]):
+            cell = self.cell(bricks, i, layer)
+            if self.in_span(cell):  # a query may ask for any point
+                if channel == 0:
+                    out[i] = self.slot[cell]
+                else:
+                    out[i] = self.crossing[cell]
+
+    @ti.kernel
+    def clear(self, layer: I32):
+        for _ in range(1):
+            ti.deactivate(self.layers, [layer])
+
+
+class SparseTopology:
+    """A layer of the SNode tree."""
+
+    HALF_SPAN = _Tree.HALF_SPAN
+    tree: ClassVar["_Tree | None"] = None
+
+    def __init__(self) -> None:
+        """Raises CapacityError if the process has too many maps."""
+        if SparseTopology.tree is None:
+            SparseTopology.tree = _Tree()
+        if not SparseTopology.tree.unused:
+            raise CapacityError(f"there are {_Tree.LAYERS} maps already, the most that a process can have")
+        self._tree = SparseTopology.tree
+        self.layer = self._tree.unused.pop(0)
+        weakref.finalize(self, self._tree.unused.append, self.layer)
+        self.clear()  # whoever had the layer before has left it as it was
 
     def anchor(self, brick: Bricks) -> None:
         """A sparse index spans the same space wherever the map begins."""
 
     def insert(self, bricks: Bricks, slots: NDArray[np.int32]) -> None:
-        self._write(bricks, slots + 1)
+        self._tree.write(bricks, slots + 1, self.layer)
 
     def erase(self, bricks: Bricks) -> None:
-        self._write(bricks, np.zeros(len(bricks), np.int32))
+        self._tree.write(bricks, np.zeros(len(bricks), np.int32), self.layer)
 
     def slots(self, bricks: Bricks) -> NDArray[np.int32]:
         out = np.zeros(len(bricks), np.int32)
-        self._read(bricks, out, 0)
+        self._tree.read(bricks, out, 0, self.layer)
         return out - 1
 
     def add_crossings(self, bricks: Bricks, number: int) -> None:
-        self._count(bricks, number)
+        self._tree.count(bricks, number, self.layer)
 
     def crossings(self, bricks: Bricks) -> NDArray[np.int32]:
         out = np.zeros(len(bricks), np.int32)
-        self._read(bricks, out, 1)
+        self._tree.read(bricks, out, 1, self.layer)
         return out
 
     def check(self, bricks: Bricks, voxel_size: float) -> None:
@@ -121,42 +188,7 @@ class SparseTopology:
             )
 
     def clear(self) -> None:
-        self.regions.deactivate_all()
-
-    @ti.func
-    def _cell(self, bricks: Template, i: I32) -> IVec3:
-        return IVec3(bricks[i, 0], bricks[i, 1], bricks[i, 2]) + self.HALF_SPAN
-
-    @ti.func
-    def _in_span(self, cell: IVec3) -> I32:
-        return cell.min() >= 0 and cell.max() < 2 * self.HALF_SPAN
-
-    @ti.kernel
-    def _write(self, bricks: AnyArray, values: I32Array):
-        for i in range(values.shape[0]):
-            cell = self._cell(bricks, i)
-            # Writing a leaf activates its parents; ti.activate would not.
-            self.slot[cell] = values[i]
-            if values[i] == 0 and self.crossing[cell] == 0:
-                ti.deactivate(self.bricks, cell)
-
-    @ti.kernel
-    def _count(self, bricks: AnyArray, number: I32):
-        for i in range(bricks.shape[0]):
-            cell = self._cell(bricks, i)
-            self.crossing[cell] += number
-            if self.crossing[cell] == 0 and self.slot[cell] == 0:
-                ti.deactivate(self.bricks, cell)
-
-    @ti.kernel
-    def _read(self, bricks: AnyArray, out: I32Array, channel: I32):
-        for i in range(out.shape[0]):
-            cell = self._cell(bricks, i)
-            if self._in_span(cell):  # a query may ask for any point
-                if channel == 0:
-                    out[i] = self.slot[cell]
-                else:
-                    out[i] = self.crossing[cell]
+        self._tree.clear(self.layer)
 
 
 _spare: dict[int, list[Topology]] = {}

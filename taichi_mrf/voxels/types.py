@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
     class IVec3(Any): ...
 
+    class IVec4(Any): ...
+
     class Mat3(Any): ...
 
     class AnyArray(Any): ...
@@ -49,6 +51,7 @@ else:
     Vec4 = ti.types.vector(4, ti.f32)
     Vec5 = ti.types.vector(5, ti.f32)
     IVec3 = ti.types.vector(3, ti.i32)
+    IVec4 = ti.types.vector(4, ti.i32)
     Mat3 = ti.types.matrix(3, 3, ti.f32)
     AnyArray = ti.types.ndarray()
     I32Array = ti.types.ndarray(dtype=ti.i32, ndim=1)
