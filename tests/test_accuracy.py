@@ -366,3 +366,31 @@ def test_nothing_behind_an_opaque_wall_matters(before: NDArray, behind: NDArray,
         )
     for tolerance in TOLERANCES:
         np.testing.assert_array_equal(one.accuracy(tolerance).image, two.accuracy(tolerance).image)
+
+
+def test_a_true_depth_and_what_was_measured_of_it_are_judged_apart(random_map: HandMade) -> None:
+    """Tolerances but "sensor" go by the truth, the sensor's by the measurement, pixel by pixel."""
+    m = PoolMap(random_map.pool)
+    T = VIEWS[0]
+    random = np.random.default_rng(5)
+    true = random.uniform(0.5, 3.0, CAMERA.shape).astype(np.float32)
+    measured = (true + random.normal(0, 0.05, CAMERA.shape)).astype(np.float32)
+    measured[random.random(CAMERA.shape) < 0.3] = 0
+    both = judge_view(m, true, T, CAMERA, measured_m=measured, noise=NOISE)
+    by_truth = judge_view(m, true, T, CAMERA, noise=NOISE)
+    by_sensor = judge_view(m, measured, T, CAMERA, noise=NOISE)
+    for tolerance in ("voxel", "1.5sigma", "5cm"):
+        assert both.accuracy(tolerance).score == by_truth.accuracy(tolerance).score
+    assert both.accuracy("sensor").score == by_sensor.accuracy("sensor").score
+    assert both.log_likelihood() == pytest.approx(by_sensor.log_likelihood(), rel=1e-6)
+    np.testing.assert_array_equal(both.accuracy("sensor").image == NOT_JUDGED, measured == 0)
+
+
+def test_a_view_without_measurements_still_has_a_truth(random_map: HandMade) -> None:
+    depth = np.full(CAMERA.shape, 1.5, np.float32)
+    judged = judge_view(
+        PoolMap(random_map.pool), depth, VIEWS[0], CAMERA, measured_m=np.zeros(CAMERA.shape), noise=NOISE
+    )
+    assert 0 <= judged.accuracy("1.5sigma").score <= 1
+    assert np.isnan(judged.accuracy("sensor").score)
+    assert np.isnan(judged.log_likelihood())

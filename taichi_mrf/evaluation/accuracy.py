@@ -66,11 +66,12 @@ class Accuracy:
 class JudgedView:
     """A view followed through a map once, to be scored in any way.
 
-    ``depth_m`` (H, W) is the axial depth to judge by, 0 where nothing is judged, ``noise`` that of its
-    sensor.
+    ``depth_m`` (H, W) is the axial depth to judge by, 0 where nothing is judged; ``measured_m`` (H, W) what a
+    sensor with the noise ``noise`` measured of it, 0 where nothing.
     """
 
     depth_m: NDArray[np.float32]
+    measured_m: NDArray[np.float32]
     survey: SurfaceSurvey
     voxel_size: float
     max_depth: float
@@ -86,19 +87,31 @@ class JudgedView:
         """Judged pixels whose ray meets anything at all, (H, W)."""
         return self.judged & (self.survey.far > 0)
 
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Judged pixels of which the sensor has measured something, (H, W)."""
+        return self.judged & (self.measured_m > 0)
+
     @cached_property
     def answer_m(self) -> NDArray[np.float32]:
         """Axial depth of the likeliest surface, (H, W), NaN where there is no answer."""
         return np.where(self.answered, self.survey.middle, np.float32(np.nan))
 
     def accuracy(self, tolerance: Tolerance) -> Accuracy:
-        """Share of right pixels. Raises ConfigError for a tolerance that does not exist."""
-        right = self.answered & self._within(tolerance)
-        image = np.where(self.judged, NO_ANSWER, NOT_JUDGED).astype(np.int8)
-        image[self.answered] = WRONG
-        image[right] = RIGHT
-        judged = int(self.judged.sum())
-        return Accuracy(int(right.sum()) / judged, 1.0 - int(self.answered.sum()) / judged, image)
+        """Share of right pixels; with the tolerance "sensor" of those measured, NaN if there are none.
+
+        Raises ConfigError for a tolerance that does not exist.
+        """
+        within = self._within(tolerance)
+        judged = self.measured if tolerance == "sensor" else self.judged
+        answered = judged & self.answered
+        image = np.where(judged, NO_ANSWER, NOT_JUDGED).astype(np.int8)
+        image[answered] = np.where(within[answered], RIGHT, WRONG)
+        count = int(judged.sum())
+        if count == 0:
+            return Accuracy(float("nan"), float("nan"), image)
+        right = int((image == RIGHT).sum())
+        return Accuracy(right / count, 1.0 - int(answered.sum()) / count, image)
 
     def depth_error(self) -> DepthError:
         """Answer minus depth."""
@@ -110,14 +123,17 @@ class JudgedView:
         return depth_error(expected, self.depth_m)
 
     def log_likelihood(self) -> float:
-        """Mean log density (per metre) of the depths under the map and the sensor's noise.
+        """Mean log density (per metre) of the measurements under the map and the sensor's noise; NaN if there
+        are none.
 
         A share OUTLIERS of the measurements, and what is left of a ray that leaves the map, may come from
         anywhere in the sensor's range, so one pixel cannot cost more than log(OUTLIERS / range).
         """
+        if not self.measured.any():
+            return float("nan")
         survey, anywhere = self.survey, 1.0 / self.max_depth
-        through = survey.visibility[self.judged].astype(np.float64)
-        explained = survey.likelihood[self.judged] + through * anywhere
+        through = survey.visibility[self.measured].astype(np.float64)
+        explained = survey.likelihood[self.measured] + through * anywhere
         return float(np.mean(np.log((1.0 - OUTLIERS) * explained + OUTLIERS * anywhere)))
 
     def _within(self, tolerance: Tolerance) -> NDArray[np.bool_]:
@@ -131,7 +147,7 @@ class JudgedView:
             return np.abs(depth - answer) <= 0.05
         if tolerance == "sensor":
             sigma, bias = self.noise.at_pixels(answer)
-            return np.abs(depth - answer - bias) <= 1.5 * sigma
+            return np.abs(self.measured_m - answer - bias) <= 1.5 * sigma
         raise ConfigError(f"there is no tolerance '{tolerance}'; known are: {', '.join(TOLERANCES)}")
 
 
@@ -141,13 +157,15 @@ def judge_view(
     T_world_camera: ArrayLike,
     camera: PinholeCamera,
     *,
+    measured_m: ArrayLike | None = None,
     noise: NoiseModel | None = None,
     mask: ArrayLike | None = None,
     view: View | None = None,
 ) -> JudgedView:
     """Follow the rays of a view's pixels through a map.
 
-    ``depth_m`` is (H, W) axial depth in metres, 0 or NaN where there is none; ``noise`` that of its
+    ``depth_m`` is (H, W) axial depth in metres, 0 or NaN where there is none. Where it is the truth,
+    ``measured_m`` (H, W) is what the sensor made of it; else it was measured itself. ``noise`` is that of the
     sensor, a constant sigma of one voxel if not given; ``mask`` (H, W) says which pixels count, all with
     a depth if not given. ``view`` takes the place of ``m.view``.
     Raises FrameError if shapes do not fit or no pixel is left to judge.
@@ -170,9 +188,14 @@ def judge_view(
             + ("" if mask is None else " inside the mask")
         )
     depth = np.where(judged, depth, np.float32(0))
+    measured = depth if measured_m is None else np.asarray(measured_m, np.float32)
+    if measured.shape != depth.shape:
+        raise FrameError(f"a measured depth image has the shape {measured.shape}, the true one {depth.shape}")
+    measured = np.where(judged & (measured > 0), measured, np.float32(0))
+    rays = np.where(judged & (measured == 0), np.float32(-1), measured)
     table = (noise or PolynomialNoise((m.voxel_size,))).table(camera)
-    survey = (view or m.view).survey(camera, as_pose(T_world_camera), m.sensor.max_depth, depth, table)
-    return JudgedView(depth, survey, m.voxel_size, m.sensor.max_depth, table)
+    survey = (view or m.view).survey(camera, as_pose(T_world_camera), m.sensor.max_depth, rays, table)
+    return JudgedView(depth, measured, survey, m.voxel_size, m.sensor.max_depth, table)
 
 
 def accuracy(

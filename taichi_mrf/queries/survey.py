@@ -110,7 +110,8 @@ def survey_rays(
     near: F32Array, far: F32Array, visibility: F32Array, expected: F32Array, likelihood: F32Array,
     judged: Template,
 ):  # fmt: skip
-    """Follow the ray of each pixel; with ``judged`` only where there is a measurement to judge."""
+    """Follow the ray of each pixel; with ``judged`` only where ``measured`` is not 0. A negative value stands
+    for a ray that is to be followed and has no measurement."""
     for pixel in range(near.shape[0]):
         u, v = pixel % width, pixel // width
         ray = RaySurvey(
@@ -121,7 +122,7 @@ def survey_rays(
         if ti.static(judged):
             ray.measured = measured[pixel]
             ray.noise = pixel_noise(noise, patch, columns, u, v)
-            wanted = ti.cast(ray.measured > 0.0, ti.i32)
+            wanted = ti.cast(ray.measured != 0.0, ti.i32)
         if wanted == 1:
             direction = to_voxels @ pixel_direction(u, v, intrinsics)
             ray.voxels_per_depth = direction.norm()

@@ -57,9 +57,10 @@ class View:
         measured_m: NDArray[np.float32],
         noise: NoiseTable,
     ) -> SurfaceSurvey:
-        """Follow the rays of those pixels of (H, W) ``measured_m`` that are positive, up to ``max_depth``.
+        """Follow the rays of those pixels of (H, W) ``measured_m`` that are not 0, up to ``max_depth``.
 
-        ``noise`` is that of the measurements. Every voxel can be the surface, seen or not.
+        ``noise`` is that of the measurements; a negative one stands for a pixel without. Every voxel can be
+        the surface, seen or not.
         """
         return self._survey(camera, T_world_camera, max_depth, -FAR, measured_m, noise)
 
