@@ -109,6 +109,10 @@ class InferenceConfig:
     cavity_clamp: float = 9.2
     """Largest log-odds of a voxel as a keyframe's rays see it, without that keyframe's own message."""
 
+    free_share: float = 0.25
+    """A voxel is never more surely free, as a keyframe's rays see it, than this share of its prior: what
+    others hold to be free may still stop a ray now and then. 0 leaves only the clamp."""
+
     message_precision: Literal["float16", "float32"] = "float16"
     """How messages are stored. float16 halves the memory and moves beliefs by at most 0.006."""
 
@@ -124,6 +128,7 @@ class InferenceConfig:
         _check(self.min_length >= 0, "inference.min_length", "must not be negative")
         _check(0 < self.message_clamp <= 30, "inference.message_clamp", "must lie between 0 and 30")
         _check(0 < self.cavity_clamp <= 60, "inference.cavity_clamp", "must lie between 0 and 60")
+        _check(0 <= self.free_share <= 1, "inference.free_share", "must lie between 0 and 1")
 
 
 @dataclass(frozen=True)

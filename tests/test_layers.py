@@ -10,7 +10,19 @@ import taichi_mrf
 PACKAGE = Path(taichi_mrf.__file__).parent
 
 FLOORS = [
-    {"errors", "poses", "config", "config_text", "config_values", "camera", "frame", "devices", "runtime", "voxels", ""},
+    {
+        "errors",
+        "poses",
+        "config",
+        "config_text",
+        "config_values",
+        "camera",
+        "frame",
+        "devices",
+        "runtime",
+        "voxels",
+        "",
+    },
     {"sensor", "keyframes"},
     {"inference", "queries", "datasets", "export"},
     {"maps"},

@@ -22,6 +22,7 @@ EXACT = {
     "message_precision": "float32",
     "message_clamp": 25.0,
     "cavity_clamp": 25.0,
+    "free_share": 0.0,
     "min_length": 0.0,
 }
 
@@ -125,6 +126,7 @@ def test_two_rays_that_share_one_voxel_equal_enumeration(
     lengths=st.booleans(),
     damping=st.sampled_from([0.0, 0.3]),
     sweeps=st.integers(1, 5),
+    free_share=st.sampled_from([0.0, 0.25, 1.0]),
 )
 def test_loops_equal_the_numpy_schedule(
     seed: int,
@@ -136,6 +138,7 @@ def test_loops_equal_the_numpy_schedule(
     lengths: bool,
     damping: float,
     sweeps: int,
+    free_share: float,
 ) -> None:
     rng = np.random.default_rng(seed)
     camera = PinholeCamera(pixels[0], pixels[1], 8.0, 8.0, (pixels[0] - 1) / 2, (pixels[1] - 1) / 2)
@@ -148,6 +151,7 @@ def test_loops_equal_the_numpy_schedule(
         message_precision="float32",
         min_length=0.0,
         outlier_floor=1e-3,
+        free_share=free_share,
     )
     sensor = Noise((sigma,), (0.01,))
     m = MRFMap(VOXEL, PolynomialNoise((sigma,), (0.01,)), inference=config, max_depth=1.5)

@@ -47,6 +47,11 @@ class Eval:
             raise ConfigError(f"--limit must be at least 1, not {self.limit}")
         if not self.seeds:
             raise ConfigError("--seeds needs at least one number")
+        if min(self.seeds) < 0:
+            raise ConfigError(f"--seeds must not be negative, not {min(self.seeds)}")
+        for name, values in (("seeds", self.seeds), ("voxel-sizes", self.voxel_sizes)):
+            if len(set(values)) < len(values):
+                raise ConfigError(f"--{name} must differ from each other, not {values}")
         for size in self.voxel_sizes:
             if not 0 < size < float("inf"):
                 raise ConfigError(f"--voxel-sizes must be positive numbers of metres, not {size}")

@@ -1,6 +1,5 @@
 """Carrying out ``taichi-mrf eval``: the ledger, the progress bar, tables on the terminal."""
 
-import dataclasses
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import Any
 
 import yaml
 from rich.console import Console
+from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
 
@@ -39,6 +39,10 @@ EXPERIMENTS: dict[str, tuple[Run, tuple[float, ...]]] = {
     "stereo": (run_stereo, (0.2,)),
 }
 """Name -> what runs it, and its own voxel sizes."""
+
+
+_WIDEST = 1000
+"""Columns of text that no table needs."""
 
 
 def run_eval(options: Eval) -> int:
@@ -87,12 +91,12 @@ def _run(name: str, options: Eval, console: Console) -> tuple[list[Table], list[
 
 
 def _made_with() -> dict[str, Any]:
-    """What results depend on beside their keys. The backend is part of it: times depend on it."""
+    """What results depend on beside their keys. The device is part of it: times depend on it."""
     choice = runtime.choice()
     return {
         "version": taichi_mrf.__version__,
         "backend": choice.name if choice else None,
-        "parameters": dataclasses.asdict(Config()),
+        "device": choice.device if choice else None,
     }
 
 
@@ -115,10 +119,15 @@ def _configuration(name: str, options: Eval, sizes: tuple[float, ...]) -> str:
 
 def _print(console: Console, table: Table) -> None:
     shown = RichTable(title=table.title, title_justify="left")
-    for number, name in enumerate(table.columns):
-        shown.add_column(name, justify="right" if number else "left", overflow="fold")
-    for row in table.rows:
-        shown.add_row(*(entry_text(entry, table.digits) for entry in row))
-    console.print(shown)
+    cells = [[entry_text(entry, table.digits) for entry in row] for row in table.rows]
+    for number, column in enumerate(zip(table.columns, *cells, strict=True)):
+        longest_word = max(len(word) for cell in column for word in cell.split())
+        shown.add_column(column[0], justify="right" if number else "left", min_width=longest_word)
+    for row in cells:
+        shown.add_row(*row)
+    # Chopped words and numbers cannot be read: rather let a narrow terminal wrap the lines of a wide table.
+    needed = Measurement.get(console, console.options.update(max_width=_WIDEST), shown)
+    width = needed.minimum if console.is_terminal else needed.maximum
+    Console(width=max(console.width, width)).print(shown)
     for note in table.notes:
         console.print(note, markup=False, highlight=False)

@@ -78,15 +78,17 @@ class ForwardPass(Struct):
 
 @ti.kernel
 def cavity(
-    slots: I32Array, belief: F32Array, messages: AnyArray, clamp: F32, log_free: F32Array, sums: I64Array
-):
+    slots: I32Array, belief: F32Array, messages: AnyArray, lowest: F32, highest: F32,
+    log_free: F32Array, sums: I64Array,
+):  # fmt: skip
     """Eq. 6: what a voxel tells this keyframe's rays is all that it knows but from them.
 
-    Writes log(1 - m) for each voxel, and empties the sums.
+    Writes log(1 - m) for each voxel, its log-odds bounded by ``lowest`` and ``highest``, and empties the
+    sums.
     """
     for i in range(slots.shape[0] * VOXELS):
         log_odds = belief[slots[i // VOXELS] * VOXELS + i % VOXELS] - ti.cast(messages[i], ti.f32)
-        log_free[i] = -softplus(ti.max(-clamp, ti.min(clamp, log_odds)))
+        log_free[i] = -softplus(ti.max(lowest, ti.min(highest, log_odds)))
         sums[i] = 0
 
 

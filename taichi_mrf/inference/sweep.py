@@ -1,5 +1,6 @@
 """One sweep over one keyframe: the host's side of sum_product.py, with the scratch that it needs."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,6 +47,15 @@ def workers_for(arch: str, software: bool, longest: int) -> Workers:
         return Workers(1024, 1, 1, runtime.SOFTWARE_BLOCK)
     most = (512 << 20) // (TRACE_BYTES * longest)
     return Workers(max(256, min(65536, most)), 1, 1, 128)
+
+
+def least_log_odds(inference: InferenceConfig, prior_log_odds: float) -> float:
+    """How surely free a voxel can be for a keyframe's rays, as log-odds: by ``free_share``, and never beyond
+    the clamp."""
+    chance = inference.free_share / (1.0 + math.exp(-prior_log_odds))
+    if chance == 0:
+        return -inference.cavity_clamp
+    return max(-inference.cavity_clamp, math.log(chance / (1.0 - chance)))
 
 
 def unknown_begins(image: DepthImage) -> "ti.Ndarray":
@@ -109,8 +119,10 @@ class Sweeper:
 
         # Eq. 6: what all others believe of each voxel.
         sum_product.cavity(
-            visible.slots, pool.belief, messages, config.cavity_clamp, self.log_free, self.sums
-        )
+            visible.slots, pool.belief, messages,
+            least_log_odds(config, pool.prior_log_odds), config.cavity_clamp,
+            self.log_free, self.sums,
+        )  # fmt: skip
 
         # Eqs. 4, 11, 13 and 14: what the rays make of that and of their measurements.
         self.index.fill(window, visible.cells, np.arange(n, dtype=np.int32))

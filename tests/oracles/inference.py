@@ -116,16 +116,20 @@ def ray_messages(
 
 
 def infer(
-    keyframes: list[list[Ray]], voxels: set[Voxel], prior: float, config: InferenceConfig
+    keyframes: list[list[Ray]],
+    voxels: set[Voxel],
+    prior: float,
+    config: InferenceConfig,
 ) -> dict[Voxel, float]:
     """Gauss-Seidel sweeps over keyframes with average messages; returns each voxel's log-odds."""
     belief = dict.fromkeys(voxels, logit(prior))
+    clamp = config.cavity_clamp
+    lowest = max(-clamp, logit(config.free_share * prior)) if config.free_share > 0 else -clamp
     sent: list[dict[Voxel, float]] = [{} for _ in keyframes]
     for _ in range(config.sweeps):
         for rays, messages in zip(keyframes, sent, strict=True):
             seen = {s.voxel for ray in rays for s in ray.segments if s.voxel in belief}
-            clamp = config.cavity_clamp
-            incoming = {v: min(clamp, max(-clamp, belief[v] - messages.get(v, 0.0))) for v in seen}
+            incoming = {v: min(clamp, max(lowest, belief[v] - messages.get(v, 0.0))) for v in seen}
             weights: dict[Voxel, float] = dict.fromkeys(seen, 0.0)
             sums: dict[Voxel, float] = dict.fromkeys(seen, 0.0)
             for ray in rays:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAJORITIES = (0.5, MAJORITY, 0.9)
-"""Shares of rays from which on a voxel counts as seen through: the measure's own, one milder, one stricter."""
+"""Shares of rays from which on a voxel is seen through: the measure's own, one milder and one stricter."""
 
 LOG_ODDS = np.arange(-3.5, 7.0, 0.05)
 """Thresholds of the sweep: finer than any update."""

@@ -1,9 +1,11 @@
 """Who is judged: each mapping method, and every reading of its maps that gives it a fair chance."""
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from taichi_mrf.config import to_yaml
 from taichi_mrf.evaluation.experiments.scenes import Scene
 from taichi_mrf.maps.log_odds import LogOddsMap
 from taichi_mrf.maps.mrf import MRFMap
@@ -25,9 +27,10 @@ class Contender:
     make: Callable[[Scene, float], OccupancyMap]
     readings: dict[str, dict[str, float]] = field(default_factory=lambda: {"": {}})
 
-    def rows(self) -> list[str]:
-        """The names of its rows in a table, one for each reading."""
-        return [row_name(self.name, reading) for reading in self.readings]
+    def signature(self, scene: Scene, voxel_size: float) -> str:
+        """A short text that changes with any parameter of its maps."""
+        parameters = to_yaml(self.make(scene, voxel_size).config)
+        return hashlib.sha256(parameters.encode()).hexdigest()[:12]
 
 
 def row_name(contender: str, reading: str) -> str:

@@ -41,7 +41,7 @@ def run_fig10(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     for number, voxel_size in enumerate(experiment.voxel_sizes):
         experiment.report(f"timing {voxel_size * 100:g} cm", number, len(experiment.voxel_sizes))
         timings[voxel_size] = experiment.ledger.result(
-            fold_key(scene, 0, "time for each image", voxel_size, f"{count} images"),
+            fold_key(scene, 0, mrf(), voxel_size, f"time for each of {count} images"),
             lambda v=voxel_size: _time_images(scene, v, count),  # type: ignore[misc]
         )
     rows = [

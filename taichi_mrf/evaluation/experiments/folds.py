@@ -1,6 +1,5 @@
 """Leave one out: maps of all views but one, judged on that one, for every contender and voxel size."""
 
-import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -53,9 +52,10 @@ class Scored:
     build_seconds: float
 
 
-def fold_key(scene: Scene, seed: int, contender: str, voxel_size: float, fold: object) -> str:
-    """Under which a fold's result is kept."""
-    return f"{scene.name} | noise {seed} | {contender} | {voxel_size:g} m | {fold}"
+def fold_key(scene: Scene, seed: int, contender: Contender, voxel_size: float, fold: object) -> str:
+    """Under which a fold's result is kept: it changes with whatever the result depends on."""
+    signature = contender.signature(scene, voxel_size)
+    return f"{scene.name} | noise {seed} | {contender.name} ({signature}) | {voxel_size:g} m | {fold}"
 
 
 def flatten(result: dict[str, Any], contender: str, voxel_size: float, seed: int) -> Iterable[Scored]:
@@ -83,7 +83,7 @@ def leave_one_out(
             others = [i for i in range(count) if i != fold]
             experiment.report(f"{contender.name}, {voxel_size * 100:g} cm, noise {seed}", fold, len(folds))
             result = experiment.ledger.result(
-                fold_key(scene, seed, contender.name, voxel_size, scene.views[fold].name),
+                fold_key(scene, seed, contender, voxel_size, scene.views[fold].name),
                 lambda c=contender, o=others, f=fold: build_and_judge(c, scene, voxel_size, o, [f]),  # type: ignore[misc]
             )
             scored += flatten(result, contender.name, voxel_size, seed)
@@ -94,8 +94,3 @@ def require_views(scene: Scene, least: int) -> None:
     """Raise ConfigError for a scene with fewer views than an experiment needs."""
     if len(scene.views) < least:
         raise ConfigError(f"{scene.name}: {len(scene.views)} views; the experiment needs at least {least}")
-
-
-def replaced(scored: Iterable[Scored], row: str) -> list[Scored]:
-    """The same figures under another row's name."""
-    return [dataclasses.replace(each, row=row) for each in scored]

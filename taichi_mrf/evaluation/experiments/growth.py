@@ -75,9 +75,13 @@ def growth_figure(panels: Mapping[str, Mapping[str, Result]]) -> "Figure":
     for axes, (title, lines) in zip(
         figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True
     ):
+        at_once = [result["farthest_m"][0] for result in lines.values() if len(result["updates"]) == 1]
+        for number, farthest in enumerate(at_once):
+            label = "_" if number else "OctoMap-style, after 1 update"
+            axes.axhline(farthest, color="0.5", linestyle="--", label=label)
         for name, result in lines.items():
-            style = "--" if "OctoMap" in name else "-"
-            axes.plot(result["updates"], result["farthest_m"], style, label=name)
+            if len(result["updates"]) > 1:
+                axes.plot(result["updates"], result["farthest_m"], label=name)
         axes.plot(PAPER_UPDATES, PAPER_M, "k*", markersize=12, label="paper, 0.2 m")
         axes.set(xlabel="updates with one image", title=title, ylim=(0, None))
         axes.grid(alpha=0.3)

@@ -6,13 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from taichi_mrf.errors import FrameError
-from taichi_mrf.evaluation.accuracy import JudgedView, judge_view
+from taichi_mrf.evaluation.accuracy import TOLERANCES, judge_view
 from taichi_mrf.evaluation.experiments.contenders import Contender
 from taichi_mrf.evaluation.experiments.ledger import Result
 from taichi_mrf.evaluation.experiments.scenes import Scene, SceneView
 from taichi_mrf.maps.protocol import OccupancyMap
-from taichi_mrf.queries.view import View
 
 Figures = dict[str, Any]
 
@@ -58,32 +56,20 @@ def build_and_judge(
 
 
 def _figures(m: OccupancyMap, scene: Scene, view: SceneView, changes: dict[str, float]) -> Figures:
-    seen = m.view.with_occlusion(**changes) if changes else m.view
-    truth = judge_view(m, view.true_m, view.T_world_camera, scene.camera, mask=view.judged, view=seen)
-    scores = {name: truth.accuracy(name) for name in ("voxel", "1.5sigma", "5cm")}
-    error, expected = truth.depth_error(), truth.expected_depth_error()
-    figures: Figures = {name: each.score for name, each in scores.items()}
-    figures |= {
+    judged = judge_view(
+        m, view.true_m, view.T_world_camera, scene.camera,
+        measured_m=view.measured_m, noise=scene.noise, mask=view.judged,
+        view=m.view.with_occlusion(**changes) if changes else m.view,
+    )  # fmt: skip
+    scores = {name: judged.accuracy(name) for name in TOLERANCES}
+    error = judged.depth_error()
+    return {name: score.score for name, score in scores.items()} | {
         "unanswered": scores["5cm"].unanswered,
-        "see_through": float(np.mean(truth.survey.visibility[truth.judged] > 0.5)),
+        "see_through": float(np.mean(judged.survey.visibility[judged.judged] > 0.5)),
         "median_abs": error.median_abs,
         "median": error.median,
         "rms": error.rms,
-        "expected_median_abs": expected.median_abs,
-        "pixels": int(truth.judged.sum()),
+        "expected_median_abs": judged.expected_depth_error().median_abs,
+        "log_likelihood": judged.log_likelihood(),
+        "pixels": int(judged.judged.sum()),
     }
-    measured = _of_the_measurement(m, scene, view, seen)
-    figures["sensor"] = None if measured is None else measured.accuracy("sensor").score
-    figures["log_likelihood"] = None if measured is None else measured.log_likelihood()
-    return figures
-
-
-def _of_the_measurement(m: OccupancyMap, scene: Scene, view: SceneView, seen: View) -> JudgedView | None:
-    """The view judged by what the sensor measured; None for one that measured nothing at all."""
-    try:
-        return judge_view(
-            m, view.measured_m, view.T_world_camera, scene.camera,
-            noise=scene.noise, mask=view.judged, view=seen,
-        )  # fmt: skip
-    except FrameError:
-        return None

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from taichi_mrf.errors import ConfigError, MapFileError
+from taichi_mrf.export.atomic import write_text
 
 Result = dict[str, Any]
 
@@ -27,28 +28,35 @@ class Ledger:
         self.computed = 0
         head = json.dumps({"made_with": made_with}, sort_keys=True)
         try:
-            lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-            # A run that was killed may have left half of its last line.
-            whole = [line for line in lines if _is_whole(line)]
-            if whole and whole[0] != head:
-                raise ConfigError(
-                    f"{path}: holds results made with other parameters or another version; "
-                    "choose another folder, or delete the file"
-                )
-            for line in whole[1:]:
-                entry = json.loads(line)
-                self.done[entry["key"]] = entry["result"]
-            if whole != lines or not whole:
-                path.write_text("".join(f"{line}\n" for line in whole or [head]), encoding="utf-8")
-        except OSError as error:
-            raise MapFileError(f"{path}: {error.strerror or error}") from error
+            text = path.read_text(encoding="utf-8") if path.exists() else ""
+        except (OSError, UnicodeDecodeError) as error:
+            raise MapFileError(
+                f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}"
+            ) from error
+        # A run that was killed may have left half of its last line.
+        whole = [line for line in text.splitlines() if _is_whole(line)]
+        if not (whole[0] == head if whole else head.startswith(text)):
+            raise ConfigError(
+                f"{path}: holds no results, or such made with other parameters or another version; "
+                "choose another folder, or delete the file"
+            )
+        for line in whole[1:]:
+            entry = json.loads(line)
+            self.done[entry["key"]] = entry["result"]
+        kept = "".join(f"{line}\n" for line in whole or [head])
+        if kept != text:
+            write_text(path, kept)
 
     def result(self, key: str, compute: Callable[[], Result]) -> Result:
-        """What is known under a key; computed and written down if nothing is yet."""
+        """What is known under a key; computed and written down if nothing is yet. Raises MapFileError."""
         if key not in self.done:
             found = compute()
-            with open(self.path, "a", encoding="utf-8") as file:
-                file.write(json.dumps({"key": key, "result": found}) + "\n")
+            line = json.dumps({"key": key, "result": found}) + "\n"
+            try:
+                with open(self.path, "a", encoding="utf-8") as file:
+                    file.write(line)
+            except OSError as error:
+                raise MapFileError(f"{self.path}: cannot be written: {error.strerror or error}") from error
             # As a later run will read it, so that both give the same tables.
             self.done[key] = json.loads(json.dumps(found))
             self.computed += 1

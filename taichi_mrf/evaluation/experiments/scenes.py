@@ -4,6 +4,7 @@ Where depth is clean it is what a perfect sensor would measure, and the noise is
 the truth stays known. Folders are laid out as data/README.md says.
 """
 
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import KeyframeConfig, VolumeConfig
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, TaichiMRFError
 from taichi_mrf.keyframes import KeyframeSelector
 from taichi_mrf.poses import Pose, as_pose
 from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
@@ -28,6 +29,9 @@ COFFIN_MARGIN = 0.4
 
 EDGE = 0.01
 """A surface counts as in the volume up to this far outside (metres): walls stand on its faces."""
+
+_UNREADABLE = (OSError, ValueError, EOFError, zipfile.BadZipFile)
+"""What NumPy raises for a file that is missing or damaged."""
 
 COFFIN_SEED = 100
 """View i of noise seed s is drawn with COFFIN_SEED + 1000 s + i."""
@@ -63,22 +67,12 @@ def coffin_scene(data: Path, seed: int = 0) -> Scene:
     Raises DatasetError if a file of ``data``/coffin_world is missing or does not hold what it should.
     """
     folder = data / "coffin_world"
-    try:
-        with np.load(folder / "clean_depth.npz") as file:
-            clean, poses, K = file["depth_m"], file["T_world_camera"], file["K"]
-        sigma = np.load(folder / "realsense_stddev_poly5x.npy")
-        bias = np.load(folder / "realsense_bias_poly5x.npy")
-    except (OSError, ValueError, KeyError) as error:
-        raise DatasetError(f"{folder}: not the scene of Table I: {error}") from error
-    height, width = clean.shape[1:]
-    camera = PinholeCamera(width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-    patch = _patch_size(len(sigma), camera)
-    noise = PatchNoise(sigma, bias, patch, camera)
+    camera, clean, poses = _clean_views(folder / "clean_depth.npz")
+    noise = _learnt_noise(folder, camera)
     lower, upper = (np.asarray(corner) for corner in COFFIN_VOLUME)
     views = []
-    for index, (depth, pose) in enumerate(zip(clean, poses, strict=True)):
+    for index, (depth, T_world_camera) in enumerate(zip(clean, poses, strict=True)):
         true = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
-        T_world_camera = as_pose(pose)
         measured = simulate_model(true, camera, noise, seed=COFFIN_SEED + 1000 * seed + index)
         inside = _inside(true, camera, T_world_camera, lower - EDGE, upper + EDGE)
         views.append(SceneView(f"view {index:02d}", T_world_camera, measured, true, inside))
@@ -122,12 +116,51 @@ def keyframes_of(scene: Scene, rotation: float, translation: float) -> list[int]
     return chosen
 
 
-def _patch_size(rows: int, camera: PinholeCamera) -> int:
-    """The side in pixels of the square patches of which ``rows`` cover the image."""
+def _clean_views(path: Path) -> tuple[PinholeCamera, NDArray[np.floating], list[Pose]]:
+    """Camera, axial depth (n, H, W) in metres and T_world_camera of Table I's views."""
+    try:
+        with np.load(path) as file:
+            clean, matrices, K = file["depth_m"], file["T_world_camera"], file["K"]
+    except KeyError as error:
+        raise DatasetError(f"{path}: {error.args[0]}") from error
+    except _UNREADABLE as error:
+        raise DatasetError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+    if clean.ndim != 3 or matrices.shape != (len(clean), 4, 4) or K.shape != (3, 3):
+        raise DatasetError(
+            f"{path}: depth_m {clean.shape}, T_world_camera {matrices.shape} and K {K.shape} do not go "
+            "together: (n, H, W), (n, 4, 4) and (3, 3) are expected"
+        )
+    height, width = clean.shape[1:]
+    try:
+        camera = PinholeCamera(width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+        return camera, clean, [as_pose(matrix) for matrix in matrices]
+    except TaichiMRFError as error:
+        raise DatasetError(f"{path}: {error}") from error
+
+
+def _learnt_noise(folder: Path, camera: PinholeCamera) -> PatchNoise:
+    """The noise of Table I's sensor, in whatever square patches its tables divide the image."""
+    tables = []
+    for name in ("stddev", "bias"):
+        path = folder / f"realsense_{name}_poly5x.npy"
+        try:
+            tables.append(np.load(path))
+        except _UNREADABLE as error:
+            raise DatasetError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+    sigma, bias = tables
+    rows = sigma.shape[0] if sigma.ndim else 0
     for patch in range(1, max(camera.width, camera.height) + 1):
         if -(-camera.width // patch) * -(-camera.height // patch) == rows:
-            return patch
-    raise DatasetError(f"no square patch divides {camera.width} x {camera.height} pixels into {rows}")
+            break
+    else:
+        raise DatasetError(
+            f"{folder / 'realsense_stddev_poly5x.npy'}: no square patch divides {camera.width} x "
+            f"{camera.height} pixels into {rows}"
+        )
+    try:
+        return PatchNoise(sigma, bias, patch, camera)
+    except TaichiMRFError as error:
+        raise DatasetError(f"{folder}/realsense_*_poly5x.npy: {error}") from error
 
 
 def _inside(

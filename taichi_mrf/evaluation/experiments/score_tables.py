@@ -58,8 +58,3 @@ def score_table(
         rows,
         [*HOW_TO_READ, *notes],
     )
-
-
-def mean_of(scored: Sequence[Scored], row: str, voxel_size: float, figure: str) -> float:
-    """The mean of one figure over the views of a row; NaN if there are none."""
-    return Spread.of([e.figures[figure] for e in scored if e.row == row and e.voxel_size == voxel_size]).mean

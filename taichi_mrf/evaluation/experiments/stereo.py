@@ -1,4 +1,4 @@
-"""Maps of stereo depth: artefacts, growth, time and memory, in the manner of Schauwecker & Zell's section IV."""
+"""Maps of stereo depth in the manner of Schauwecker & Zell's section IV: artefacts, growth, time, memory."""
 
 import time
 from collections.abc import Mapping
@@ -6,14 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from taichi_mrf.evaluation.bench import octomap_available
-from taichi_mrf.evaluation.experiments.artefact_curve import (
-    MAJORITIES,
-    artefacts_at,
-    curve,
-    curve_figure,
-    threshold_for,
-)
-from taichi_mrf.evaluation.experiments.artefacts import LEAST_RAYS, MAJORITY, SIGMAS, sightings
+from taichi_mrf.evaluation.experiments.artefact_curve import curve, curve_figure, threshold_for
+from taichi_mrf.evaluation.experiments.artefact_tables import COVERAGES, artefact_table, majority_table
+from taichi_mrf.evaluation.experiments.artefacts import sightings
 from taichi_mrf.evaluation.experiments.folds import Experiment
 from taichi_mrf.evaluation.experiments.growth import corridor_scene, grow, growth_figure, growth_rows
 from taichi_mrf.evaluation.experiments.ledger import Result
@@ -27,8 +22,6 @@ from taichi_mrf.evaluation.experiments.scaling import (
 )
 from taichi_mrf.evaluation.experiments.scenes import Scene
 from taichi_mrf.evaluation.experiments.street import (
-    MAX_DEPTH_M,
-    REPEATS,
     Row,
     mrf_of_street,
     octomap_style,
@@ -44,9 +37,6 @@ from taichi_mrf.export.atomic import atomic_path
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-COVERAGES = (0.95, 0.9, 0.8, 0.6)
-"""Coverages at which maps are compared."""
 
 PICTURE_COVERAGE = 0.8
 """What the maps in the picture cover at least, if they can."""
@@ -101,8 +91,8 @@ def _artefacts(
         )
     suffix = "" if len(experiment.voxel_sizes) == 1 else f"_{voxel_size * 1000:g}mm"
     tables = [
-        _artefact_table(f"stereo{suffix}", results, scene, voxel_size),
-        _majority_table(f"stereo_majority{suffix}", results),
+        artefact_table(f"stereo{suffix}", results, scene, voxel_size),
+        majority_table(f"stereo_majority{suffix}", results),
     ]
     curves = {name: result["curve"] for name, result in results.items()}
     plans = {name: results[name]["plan"] for name in DRAWN}
@@ -127,55 +117,6 @@ def _map_and_judge(row: Row, scene: Scene, voxel_size: float) -> Result:
     }
 
 
-def _artefact_table(name: str, results: Mapping[str, Result], scene: Scene, voxel_size: float) -> Table:
-    baseline = next(iter(results.values()))["curve"]
-    lines: list[list[Entry]] = []
-    for row, result in results.items():
-        swept = result["curve"]
-        half = next(i for i, threshold in enumerate(swept["threshold"]) if threshold >= 0.5)
-        line: list[Entry] = [row, swept["coverage"][half], swept["occupied"][half]]
-        line.append(swept["artefacts"][f"{MAJORITY:g}"][half])
-        for coverage in COVERAGES:
-            found, theirs = artefacts_at(swept, coverage), artefacts_at(baseline, coverage)
-            line += [
-                None if found is None else round(found),
-                found / theirs if found is not None and theirs else None,
-            ]
-        lines.append([*line, result["build_seconds"]])
-    columns = ["map", "coverage", "occupied", "artefacts"]
-    for coverage in COVERAGES:
-        columns += [f"at {coverage:g}", "ratio"]
-    mapped, held_out = len(scene.views[::2]), len(scene.views[1::2])
-    notes = [
-        f"{scene.name}: {mapped} stereo pairs mapped at half resolution up to {MAX_DEPTH_M:g} m, {held_out} held "
-        "out. The first three figures are at P(O) >= 0.5, the others at equal coverage, with the ratio to the "
-        "first row; a dash: the map has no threshold with that coverage.",
-        f"Artefact: of at least {LEAST_RAYS} held-out rays that say something of an occupied voxel, at least "
-        f"{MAJORITY:.0%} measure a surface more than {SIGMAS:g} sigma behind it. Coverage: held-out measurements "
-        f"with an occupied voxel on their ray within {SIGMAS:g} sigma and a voxel size.",
-        f"'{REPEATS} times': each pair is integrated so often before the next. 'At once': P(V | C, V) = 0.4 in "
-        "place of 0.2, so that unknown voxels do not stop a ray and every pair needs integrating only once.",
-    ]
-    return Table(name, f"Artefacts of stereo maps, {voxel_size:g} m", [*columns, "seconds"], lines, notes, 2)
-
-
-def _majority_table(name: str, results: Mapping[str, Result]) -> Table:
-    """The ratio to the first row under milder and stricter majorities."""
-    baseline = next(iter(results.values()))["curve"]
-    lines: list[list[Entry]] = []
-    for row, result in results.items():
-        line: list[Entry] = [row]
-        for majority in MAJORITIES:
-            for coverage in (0.9, 0.8):
-                found = artefacts_at(result["curve"], coverage, majority)
-                theirs = artefacts_at(baseline, coverage, majority)
-                line.append(found / theirs if found is not None and theirs else None)
-        lines.append(line)
-    columns = ["map", *(f"{m:.0%}, at {c:g}" for m in MAJORITIES for c in (0.9, 0.8))]
-    notes = ["Artefacts in relation to those of the first row, by the share of rays that makes one."]
-    return Table(name, "What counts as seen through", columns, lines, notes, 2)
-
-
 def _growth(experiment: Experiment, street: Scene) -> "tuple[Table, Figure]":
     """Fig. 5a."""
     corridor = corridor_scene(street.noise)
@@ -186,7 +127,7 @@ def _growth(experiment: Experiment, street: Scene) -> "tuple[Table, Figure]":
     ):
         panels[title] = {}
         for size in sizes:
-            for contender, updates in ((visibility(), GROWTH_UPDATES[size]), (octomap_style(), 2)):
+            for contender, updates in ((visibility(), GROWTH_UPDATES[size]), (octomap_style(), 1)):
                 experiment.report(f"growth, {title}, {size:g} m", len(panels[title]), 2 * len(sizes))
                 panels[title][f"{contender.name}, {size:g} m"] = experiment.ledger.result(
                     f"{scene.name} | growth of {title} | {contender.name} | {size:g} m | {updates} updates",
@@ -202,8 +143,8 @@ def _growth(experiment: Experiment, street: Scene) -> "tuple[Table, Figure]":
         "m after all",
     ]
     notes = [
-        "Distance of the farthest voxel with P(O) > 0.5 when one image is integrated again and again; the paper: "
-        f"about 65 updates to 10 m at 0.2 m. Looked at after every {GROWTH_EVERY} updates.",
+        "Distance of the farthest voxel with P(O) > 0.5 when one image is integrated again and again,",
+        f"looked at after every {GROWTH_EVERY} updates. The paper: about 65 updates to 10 m at 0.2 m.",
     ]
     table = Table("stereo_fig5a", "Fig. 5a: growth", columns, growth_rows(panels, distances), notes, 1)
     return table, growth_figure(panels)
@@ -230,15 +171,16 @@ def _scaling(experiment: Experiment, whole: Scene) -> "tuple[Table, Figure]":
                     ),
                 )
     lines: list[list[Entry]] = [
-        [f"{size:g} m, {STRIDES[stride]}", method, r["seconds"], r["mb"], r["voxels"]]
+        [f"{size:g} m, {STRIDES[stride]}", method, r["seconds"], r["mb"], round(r["voxels"] / 1000)]
         for (size, stride, method), r in results.items()
     ]
     pairs = len(whole.views[: 2 * SCALING_VIEWS : 2])
     notes = [
-        f"Medians over {pairs} pairs; MB of voxels and messages and known voxels after them. OctoMap's are nodes, "
-        "which stand for many equal voxels; it runs on one thread."
-        + ("" if octomap_available() else " It is not installed: pip install 'taichi-mrf[bench]' brings it.")
+        f"Medians over {pairs} pairs; after them, MB of voxels and messages, and thousands of known voxels.",
+        "OctoMap's are nodes, which stand for many equal voxels; it runs on one thread.",
     ]
-    columns = ["voxels, resolution", "map", "seconds", "MB", "known"]
+    if not octomap_available():
+        notes.append("OctoMap is not installed: pip install 'taichi-mrf[bench]' brings it.")
+    columns = ["voxels, resolution", "map", "seconds", "MB", "1000 known"]
     table = Table("stereo_fig5bc", "Figs. 5b, 5c: time and memory", columns, lines, notes, 3)
     return table, scaling_figure(results, methods)

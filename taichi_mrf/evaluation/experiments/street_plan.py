@@ -85,5 +85,8 @@ def plan_figure(plans: Mapping[str, Result], scene: Scene, voxel_size: float) ->
             xlim=extent[:2], ylim=extent[2:],
         )  # fmt: skip
     axes_of_all[-1].set_xlabel("metres ahead; black: way of the camera")
-    figure.colorbar(shown, ax=axes_of_all, label="highest voxel (m above the camera)", shrink=0.7, pad=0.01)
+    figure.colorbar(
+        shown, ax=list(axes_of_all), location="bottom", shrink=0.5, aspect=40, pad=0.01,
+        label="highest voxel (m above the camera)",
+    )  # fmt: skip
     return figure

@@ -15,7 +15,7 @@ from taichi_mrf.evaluation.experiments.judging import build, judge_all
 from taichi_mrf.evaluation.experiments.ledger import Result
 from taichi_mrf.evaluation.experiments.scenes import Scene, house_scene, keyframes_of
 from taichi_mrf.evaluation.experiments.score_tables import score_table
-from taichi_mrf.evaluation.experiments.tables import Spread, Table, write_table
+from taichi_mrf.evaluation.experiments.tables import Entry, Spread, Table, write_table
 from taichi_mrf.evaluation.ground_truth import OccupancyTruth, occupancy_truth
 from taichi_mrf.evaluation.occupancy_scores import OccupancyScores, score_occupancy
 from taichi_mrf.evaluation.reliability import reliability_figure, roc_figure
@@ -55,15 +55,13 @@ def run_table2(experiment: Experiment) -> tuple[list[Table], list[Path]]:
         f"(moved or turned by more than {THRESHOLD:g}); judged by clean depth. "
         "The paper's figures are of another room.",
     ]
+    tables = [score_table("table2", "Table II: a living room with Kinect noise", scored, PAPER, notes)]
     held_out = {view.name for i, view in enumerate(scene.views) if i not in keyframes}
-    tables = [
-        score_table("table2", "Table II: a living room with Kinect noise", scored, PAPER, notes),
-        score_table(
-            "table2_held_out", "Table II, only views that are no keyframes",
-            [each for each in scored if each.view in held_out], {}, notes[:1],
-        ),
-        _occupancy_table(occupancy),
-    ]  # fmt: skip
+    if held_out:
+        of_held_out = [each for each in scored if each.view in held_out]
+        title = "Table II, only views that are no keyframes"
+        tables.append(score_table("table2_held_out", title, of_held_out, {}, notes))
+    tables.append(_occupancy_table(occupancy))
     paths = [path for table in tables for path in write_table(experiment.out, table)]
     for voxel_size in experiment.voxel_sizes:
         of_methods = {name: scores for size, name, scores in occupancy if size == voxel_size}
@@ -94,7 +92,7 @@ def _results(
         experiment.report(f"{contender.name}, {voxel_size * 100:g} cm", number, len(contenders))
         results[contender.name] = experiment.ledger.result(
             fold_key(
-                scene, experiment.seeds[0], contender.name, voxel_size,
+                scene, experiment.seeds[0], contender, voxel_size,
                 f"{len(keyframes)} keyframes, {len(scene.views)} views",
             ),
             lambda c=contender: compute(c),  # type: ignore[misc]
@@ -122,7 +120,7 @@ def _score(m: OccupancyMap, truth: OccupancyTruth) -> OccupancyScores:
 
 
 def _occupancy_table(occupancy: Sequence[tuple[float, str, OccupancyScores]]) -> Table:
-    rows = [
+    rows: list[list[Entry]] = [
         [f"{size * 100:g} cm", name, s.precision, s.recall, s.roc_area, s.brier, s.calibration_error,
          s.occupied, s.count]
         for size, name, s in occupancy

@@ -32,7 +32,7 @@ def run_table3(experiment: Experiment) -> tuple[list[Table], list[Path]]:
         for number, contender in enumerate(standard_contenders()):
             experiment.report(f"{contender.name}, {voxel_size * 100:g} cm", number, 4)
             result = experiment.ledger.result(
-                fold_key(scene, 0, contender.name, voxel_size, f"{len(keyframes)} keyframes"),
+                fold_key(scene, 0, contender, voxel_size, f"{len(keyframes)} keyframes"),
                 lambda c=contender, v=voxel_size: build_and_judge(c, scene, v, keyframes, judged),  # type: ignore[misc]
             )
             scored += flatten(result, contender.name, voxel_size, 0)

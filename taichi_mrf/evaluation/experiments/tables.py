@@ -36,6 +36,12 @@ class Spread:
 
 Entry = Spread | float | int | str | None
 
+_LATEX = str.maketrans(
+    {mark: rf"\{mark}" for mark in "&%_#${}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+)
+"""What means something to LaTeX, as it is printed."""
+
 
 @dataclass(frozen=True)
 class Table:
@@ -87,13 +93,13 @@ def as_csv(table: Table) -> str:
 def as_latex(table: Table) -> str:
     """A tabular with booktabs' rules."""
 
-    def escaped(text: str) -> str:
-        return text.replace("&", r"\&").replace("%", r"\%").replace("_", r"\_")
+    def cell(entry: Entry) -> str:
+        return _escaped(entry) if isinstance(entry, str) else entry_text(entry, table.digits, r"$\pm$")
 
     lines = [rf"\begin{{tabular}}{{l{'r' * (len(table.columns) - 1)}}}", r"\toprule"]
-    lines += [" & ".join(map(escaped, table.columns)) + r" \\", r"\midrule"]
+    lines += [" & ".join(map(_escaped, table.columns)) + r" \\", r"\midrule"]
     for row in table.rows:
-        lines.append(" & ".join(escaped(entry_text(e, table.digits, r"$\pm$")) for e in row) + r" \\")
+        lines.append(" & ".join(map(cell, row)) + r" \\")
     lines += [r"\bottomrule", r"\end{tabular}", *(f"% {note}" for note in table.notes)]
     return "\n".join(lines) + "\n"
 
@@ -134,6 +140,10 @@ def write_table(folder: Path, table: Table) -> list[Path]:
     with atomic_path(paths[2]) as temporary:
         as_figure(table).savefig(temporary, dpi=130)
     return paths
+
+
+def _escaped(text: str) -> str:
+    return text.translate(_LATEX)
 
 
 def _has_deviation(entry: Entry) -> bool:

@@ -42,8 +42,13 @@ class Weights:
         )
 
 
-GRID: Sequence[Weights] = tuple(Weights(hit, miss) for hit in (0.2, 1.0, 4.0) for miss in (-0.02, -0.1, -0.4))
+GRID: Sequence[Weights] = tuple(
+    Weights(hit, round(-share * hit, 3)) for hit in (0.3, 1.0, 3.0) for share in (0.2, 0.4, 0.8)
+)
 """From cautious to bold; OctoMap's own weights are 0.85 and -0.41."""
+
+FINE, FINE_FOLDS = 0.015, 4
+"""With voxels below this size (metres) only every so many folds are tuned, which still takes the longest."""
 
 
 def tuned_leave_one_out(
@@ -52,32 +57,34 @@ def tuned_leave_one_out(
     """(tuned, mistuned): the fold's test view under the weights chosen for it, with a map of all training
     views; and under every weight of the grid, with a map that lacks the view that they are tuned on."""
     count = len(scene.views)
-    folds = range(count)[: experiment.limit]
+    folds = range(0, count, FINE_FOLDS if voxel_size < FINE else 1)[: experiment.limit]
     tuned: list[Scored] = []
     every: list[Scored] = []
-    for fold in folds:
+    for position, fold in enumerate(folds):
         best, best_score = GRID[0], -math.inf
         check = (fold + 1) % count
         for number, weights in enumerate(GRID):
             experiment.report(
-                f"tuning log-odds, {voxel_size * 100:g} cm", fold * len(GRID) + number, len(folds) * len(GRID)
+                f"tuning log-odds, {voxel_size * 100:g} cm",
+                position * len(GRID) + number,
+                len(folds) * len(GRID),
             )
             training = [i for i in range(count) if i not in (fold, check)]
             contender = weights.contender()
             result = experiment.ledger.result(
-                fold_key(scene, seed, contender.name, voxel_size, f"{fold} and {check} left out"),
+                fold_key(scene, seed, contender, voxel_size, f"{fold} and {check} left out"),
                 lambda c=contender, t=training, j=(check, fold): build_and_judge(c, scene, voxel_size, t, j),  # type: ignore[misc]
             )
             views = list(flatten(result, contender.name, voxel_size, seed))
             every += [each for each in views if each.view == scene.views[fold].name]
             scores = [each.figures["sensor"] for each in views if each.view == scene.views[check].name]
-            score = max(s for s in scores if s is not None)
+            score = max(scores)
             if score > best_score:
                 best, best_score = weights, score
         contender = best.contender()
         others = [i for i in range(count) if i != fold]
         result = experiment.ledger.result(
-            fold_key(scene, seed, contender.name, voxel_size, f"{fold} left out"),
+            fold_key(scene, seed, contender, voxel_size, f"{fold} left out"),
             lambda c=contender, o=others, f=fold: build_and_judge(c, scene, voxel_size, o, [f]),  # type: ignore[misc]
         )
         tuned += flatten(result, NAME, voxel_size, seed)
