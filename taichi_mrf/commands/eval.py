@@ -34,7 +34,7 @@ class Eval:
     """Voxel sizes in metres, instead of the experiment's own."""
 
     seeds: tuple[int, ...] = (0, 1, 2, 3)
-    """Draws of the simulated noise: the first for every method, the others for the spread."""
+    """Draws of the simulated noise: the first for every method, the others for the spread of MRFMap."""
 
     limit: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Use no more than N views or folds, for a quick look."""

@@ -32,7 +32,7 @@ class Experiment:
     """Voxel sizes in metres."""
 
     seeds: Sequence[int] = (0, 1, 2, 3)
-    """Draws of the noise: the first for all contenders, the others for MRFMap and OctoMap-style only."""
+    """Draws of the noise: the first for all contenders, the others for MRFMap only."""
 
     limit: int | None = None
     """Use no more than this many views or folds of a scene."""

@@ -47,8 +47,8 @@ GRID: Sequence[Weights] = tuple(
 )
 """From cautious to bold; OctoMap's own weights are 0.85 and -0.41."""
 
-FINE, FINE_FOLDS = 0.015, 4
-"""With voxels below this size (metres) only every so many folds are tuned, which still takes the longest."""
+EVERY = 4
+"""One fold in so many is tuned: each takes as many maps as the grid has weights."""
 
 
 def tuned_leave_one_out(
@@ -57,7 +57,7 @@ def tuned_leave_one_out(
     """(tuned, mistuned): the fold's test view under the weights chosen for it, with a map of all training
     views; and under every weight of the grid, with a map that lacks the view that they are tuned on."""
     count = len(scene.views)
-    folds = range(0, count, FINE_FOLDS if voxel_size < FINE else 1)[: experiment.limit]
+    folds = range(0, count, EVERY)[: experiment.limit]
     tuned: list[Scored] = []
     every: list[Scored] = []
     for position, fold in enumerate(folds):
