@@ -16,6 +16,7 @@ from taichi_mrf.evaluation.experiments.ledger import Result
 from taichi_mrf.evaluation.experiments.scenes import Scene, house_scene, keyframes_of
 from taichi_mrf.evaluation.experiments.score_tables import score_table
 from taichi_mrf.evaluation.experiments.tables import Entry, Spread, Table, write_table
+from taichi_mrf.evaluation.experiments.tuning import tuned_contender
 from taichi_mrf.evaluation.ground_truth import OccupancyTruth, occupancy_truth
 from taichi_mrf.evaluation.occupancy_scores import OccupancyScores, score_occupancy
 from taichi_mrf.evaluation.reliability import reliability_figure, roc_figure
@@ -86,7 +87,10 @@ def _results(
         result = judge_all(m, seconds, contender, scene, range(len(scene.views)))
         return result | {"occupancy": _score(m, truths[0]).to_json()}
 
-    contenders = standard_contenders()
+    contenders = [
+        *standard_contenders(),
+        tuned_contender(experiment, scene, experiment.seeds[0], voxel_size, keyframes),
+    ]
     results = {}
     for number, contender in enumerate(contenders):
         experiment.report(f"{contender.name}, {voxel_size * 100:g} cm", number, len(contenders))

@@ -10,6 +10,7 @@ from taichi_mrf.evaluation.experiments.judging import build_and_judge
 from taichi_mrf.evaluation.experiments.scenes import Scene, kitchen_scene
 from taichi_mrf.evaluation.experiments.score_tables import score_table
 from taichi_mrf.evaluation.experiments.tables import Spread, Table, write_table
+from taichi_mrf.evaluation.experiments.tuning import tuned_contender
 
 PAPER = {
     ("MRFMap", 0.01): Spread(0.305, 0.185),
@@ -29,8 +30,12 @@ def run_table3(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     keyframes, judged = range(0, len(scene.views), 2), range(1, len(scene.views), 2)
     scored: list[Scored] = []
     for voxel_size in experiment.voxel_sizes:
-        for number, contender in enumerate(standard_contenders()):
-            experiment.report(f"{contender.name}, {voxel_size * 100:g} cm", number, 4)
+        contenders = [
+            *standard_contenders(),
+            tuned_contender(experiment, scene, 0, voxel_size, keyframes),
+        ]
+        for number, contender in enumerate(contenders):
+            experiment.report(f"{contender.name}, {voxel_size * 100:g} cm", number, len(contenders))
             result = experiment.ledger.result(
                 fold_key(scene, 0, contender, voxel_size, f"{len(keyframes)} keyframes"),
                 lambda c=contender, v=voxel_size: build_and_judge(c, scene, v, keyframes, judged),  # type: ignore[misc]
