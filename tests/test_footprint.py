@@ -169,6 +169,17 @@ def test_surfaces_are_where_the_measurement_may_have_come_from() -> None:
     assert footprint.window.bricks_of(footprint.crossed)[:, 0].min() == 0
 
 
+@pytest.mark.parametrize("beyond", [0.35, 1.2])
+def test_rays_can_go_on_beyond_their_end(beyond: float) -> None:
+    """As if every ray ended so many metres of axial depth further away; surfaces begin where they did."""
+    image, T = uploaded(scene(5)), POSES["oblique"]
+    footprint = find_footprint(image, T, VOXEL, SENSOR, INFERENCE, VolumeConfig(), beyond_m=beyond)
+    rays = rays_of(image, T, footprint.window, 1e9)
+    further = replace(rays, end=np.minimum(rays.end + beyond, SENSOR.max_depth))
+    assert_between(footprint, further, whole(footprint.window))
+    assert len(footprint.crossed) > len(footprint_of(image, T).crossed)
+
+
 @pytest.mark.parametrize("value", [0.0, 2.5])
 def test_an_image_of_nothing_and_one_of_a_single_pixel(value: float) -> None:
     depth = np.zeros(CAMERA.shape)
