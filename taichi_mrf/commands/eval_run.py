@@ -16,7 +16,7 @@ from taichi_mrf import runtime
 from taichi_mrf.commands.eval import Eval
 from taichi_mrf.commands.output import output_folder
 from taichi_mrf.config import Config, to_yaml
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, TaichiMRFError
 from taichi_mrf.evaluation.experiments.fig7 import run_fig7
 from taichi_mrf.evaluation.experiments.fig10 import run_fig10
 from taichi_mrf.evaluation.experiments.folds import Experiment
@@ -53,12 +53,23 @@ def run_eval(options: Eval) -> int:
     names = list(EXPERIMENTS) if options.experiment == "all" else [options.experiment]
     with output_folder(options.out):
         runtime.init(options.runtime.arch, options.runtime.threads, options.runtime.debug)
+        failed = 0
         for name in names:
-            tables, paths = _run(name, options, console)
+            try:
+                tables, paths = _run(name, options, console)
+            except TaichiMRFError as error:
+                if len(names) == 1:
+                    raise
+                # One experiment that lacks its data or an extra does not keep the others from running.
+                console.print(f"{name}: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
+                failed += 1
+                continue
             for table in tables:
                 _print(console, table)
             for path in paths:
                 console.print(str(path), markup=False, highlight=False, soft_wrap=True)
+    if failed:
+        raise TaichiMRFError(f"{failed} of {len(names)} experiments could not be run")
     return 0
 
 
@@ -77,7 +88,7 @@ def _run(name: str, options: Eval, console: Console) -> tuple[list[Table], list[
         experiment = Experiment(
             options.data,
             options.out,
-            Ledger(options.out / f"{name}.jsonl", _made_with()),
+            Ledger(options.out / f"{name}.jsonl", _made_with(options.data)),
             sizes,
             options.seeds,
             options.limit,
@@ -90,13 +101,14 @@ def _run(name: str, options: Eval, console: Console) -> tuple[list[Table], list[
     return tables, [*paths, configuration]
 
 
-def _made_with() -> dict[str, Any]:
-    """What results depend on beside their keys. The device is part of it: times depend on it."""
+def _made_with(data: Path) -> dict[str, Any]:
+    """What results depend on beside their keys: the scenes, and the device, on which times depend."""
     choice = runtime.choice()
     return {
         "version": taichi_mrf.__version__,
         "backend": choice.name if choice else None,
         "device": choice.device if choice else None,
+        "data": str(data.resolve()),
     }
 
 

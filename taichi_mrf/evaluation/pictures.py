@@ -9,10 +9,11 @@ import numpy as np
 from taichi_mrf.evaluation.depth_error import depth_error
 from taichi_mrf.evaluation.figures import new_figure, notice
 from taichi_mrf.evaluation.room_views import Room, perspective, top_view
-from taichi_mrf.evaluation.surfaces import KeyframeLike, OccupancyMap, seen_surfaces, up_direction
+from taichi_mrf.evaluation.surfaces import KeyframeLike, seen_surfaces, up_direction
 from taichi_mrf.export.atomic import atomic_path
 from taichi_mrf.export.colors import LOWEST
 from taichi_mrf.frame import Frame
+from taichi_mrf.maps.protocol import OccupancyMap
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -4,7 +4,7 @@ A map knows neither gravity nor the inside of a room. Both follow from what the 
 faces the camera that saw it, and most of a room is level or upright.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.maps.protocol import OccupancyMap
 from taichi_mrf.poses import Pose
 
 _VIEWS = 60
@@ -41,17 +42,6 @@ class KeyframeLike(Protocol):
     def depth_m(self) -> NDArray[np.float32]: ...
     @property
     def name(self) -> str: ...
-
-
-class OccupancyMap(Protocol):
-    """What the pictures read of a map, whatever the mapping method."""
-
-    @property
-    def voxel_size(self) -> float: ...
-    @property
-    def keyframes(self) -> Mapping[int, KeyframeLike]: ...
-    def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.floating], NDArray[np.floating]]: ...
-    def render_depth(self, camera: PinholeCamera, T_world_camera: Pose) -> NDArray[np.float32]: ...
 
 
 @dataclass(frozen=True)

@@ -142,11 +142,13 @@ def _draw_profile(
         axes.step(begins, values, where="post", color=color, label=label)
     axes.axvspan(true - voxel_size, true + voxel_size, color="purple", alpha=0.15)
     axes.axvline(true, color="purple", label="true range and one sigma")
-    axes.axvline(measured, color="black", linestyle="--", label="measured range")
+    if measured > 0:
+        axes.axvline(measured, color="black", linestyle="--", label="measured range")
     if len(profile.omega):
         likeliest = float(profile.distance[profile.omega.argmax()])
         axes.axvline(likeliest, color="tab:blue", label="argmax omega")
-    near = min(true, measured, *(begins[profile.omega > 0.02 * peak].tolist() or [FAR])) - 0.3
-    axes.set(xlim=(near, max(true, measured) + 0.4), ylim=(-0.02, 1.05), xlabel="range (m)")
+    depths = [true, measured] if measured > 0 else [true]
+    near = min(*depths, *(begins[profile.omega > 0.02 * peak].tolist() or [FAR])) - 0.3
+    axes.set(xlim=(near, max(depths) + 0.4), ylim=(-0.02, 1.05), xlabel="range (m)")
     axes.legend(fontsize=8, loc="upper left")
     axes.grid(alpha=0.3)

@@ -28,6 +28,7 @@ def run_table3(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     scene = kitchen_scene(experiment.data, experiment.limit)
     require_views(scene, 2)
     keyframes, judged = range(0, len(scene.views), 2), range(1, len(scene.views), 2)
+    mapped = f"{len(keyframes)} keyframes" + (f" of {experiment.limit} views" if experiment.limit else "")
     scored: list[Scored] = []
     for voxel_size in experiment.voxel_sizes:
         contenders = [
@@ -37,7 +38,7 @@ def run_table3(experiment: Experiment) -> tuple[list[Table], list[Path]]:
         for number, contender in enumerate(contenders):
             experiment.report(f"{contender.name}, {voxel_size * 100:g} cm", number, len(contenders))
             result = experiment.ledger.result(
-                fold_key(scene, 0, contender, voxel_size, f"{len(keyframes)} keyframes"),
+                fold_key(scene, 0, contender, voxel_size, mapped),
                 lambda c=contender, v=voxel_size: build_and_judge(c, scene, v, keyframes, judged),  # type: ignore[misc]
             )
             scored += flatten(result, contender.name, voxel_size, 0)
