@@ -38,6 +38,7 @@ from taichi_mrf.voxels.types import (
     Vec4,
     Vec4Array,
 )
+from taichi_mrf.voxels.vectors import vec4_array
 from taichi_mrf.voxels.window import Window, WindowIndex
 
 
@@ -76,7 +77,7 @@ class ScanIntegrator:
         window = window_around(lower_m, upper_m, self.voxel_size, self.volume)
         if window is None or image.rays == 0:
             window, nothing = Window.covering(centre_m, centre_m, self.voxel_size), np.zeros(0, np.int32)
-            return RayFootprint(window, nothing, nothing, 1, ti.ndarray(Vec4, 1))
+            return RayFootprint(window, nothing, nothing, 1, vec4_array(1))
         ends = ray_ends(
             image, T_world_camera, window, max_depth=self.max_depth, max_range=config.max_range,
             discretise=config.discretise, correct_bias=config.correct_bias,

@@ -18,6 +18,7 @@ from taichi_mrf.voxels.types import (
     Vec4,
     Vec4Array,
 )
+from taichi_mrf.voxels.vectors import vec4_array
 from taichi_mrf.voxels.window import Window
 
 NO_RAY, FREE_END, HIT = -1.0, 0.0, 1.0
@@ -44,7 +45,7 @@ def ray_ends(
     """
     table = image.noise_table
     centre, to_voxels = window.rays_of(T_world_camera)
-    ends = ti.ndarray(Vec4, image.camera.width * image.camera.height)
+    ends = vec4_array(image.camera.width * image.camera.height)
     _find_ends(
         image.depth, image.camera.width, image.intrinsics, centre, to_voxels,
         image.noise, table.patch, table.columns, max_depth, ends, correct_bias,
@@ -68,7 +69,7 @@ def _once_a_voxel(ends: "ti.Ndarray") -> "ti.Ndarray":
         keys = np.unique(np.ravel_multi_index(tuple((voxels - lowest).T), shape))
         once = (np.stack(np.unravel_index(keys, shape), axis=1) + lowest).astype(np.float32)
         once[:, :3] += 0.5
-    result = ti.ndarray(Vec4, len(once))
+    result = vec4_array(len(once))
     result.from_numpy(once)
     return result
 

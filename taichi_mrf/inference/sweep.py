@@ -17,7 +17,7 @@ from taichi_mrf.sensor.forward import AUTO, CENTRE, SEGMENT
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.traversal import FAR
-from taichi_mrf.voxels.types import Vec4
+from taichi_mrf.voxels.vectors import vec4_array
 from taichi_mrf.voxels.window import WindowIndex
 
 LIKELIHOODS = {"auto": AUTO, "segment": SEGMENT, "centre": CENTRE}
@@ -78,7 +78,7 @@ class Sweeper:
         self.sums = ti.ndarray(ti.i64, VOXELS)
         self.moved = ti.ndarray(ti.i32, 1)
         self.trace_voxel = ti.ndarray(ti.i32, 1)
-        self.trace = ti.ndarray(Vec4, 1)
+        self.trace = vec4_array(1)
         self.steps = ti.ndarray(ti.i32, 1)
 
     @property
@@ -159,6 +159,6 @@ class Sweeper:
             self.moved = ti.ndarray(ti.i32, bricks)
         if steps > self.trace_voxel.shape[0]:
             self.trace_voxel = ti.ndarray(ti.i32, steps)
-            self.trace = ti.ndarray(Vec4, steps)
+            self.trace = vec4_array(steps)
         if workers != self.steps.shape[0]:
             self.steps = ti.ndarray(ti.i32, workers)

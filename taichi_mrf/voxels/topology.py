@@ -89,8 +89,9 @@ class _Tree:
         self.crossing = ti.field(ti.i32)
         builder = ti.FieldsBuilder()
         self.layers = builder.pointer(ti.l, self.LAYERS)
-        regions = self.layers.pointer(ti.ijk, self.REGIONS)
-        self.bricks = regions.pointer(ti.ijk, self.REGION).bitmasked(ti.ijk, CHUNK)
+        self.regions = self.layers.pointer(ti.ijk, self.REGIONS)
+        self.chunks = self.regions.pointer(ti.ijk, self.REGION)
+        self.bricks = self.chunks.bitmasked(ti.ijk, CHUNK)
         self.bricks.place(self.slot, self.crossing)
         builder.finalize()
         self.unused = list(range(self.LAYERS))
@@ -134,10 +135,26 @@ class _Tree:
                 else:
                     out[i] = self.crossing[cell]
 
+    def clear(self, layer: int) -> None:
+        """Empty a layer. Taichi does not give back what lies below a cell that is deactivated, so it is done
+        from the bottom up."""
+        self.clear_chunks(layer)
+        self.clear_regions(layer)
+
     @ti.kernel
-    def clear(self, layer: I32):
-        for _ in range(1):
-            ti.deactivate(self.layers, [layer])
+    def clear_chunks(self, layer: I32):
+        for i, j, k in ti.ndrange(self.REGIONS, self.REGIONS, self.REGIONS):
+            if ti.is_active(self.regions, [i, j, k, layer]):
+                for di, dj, dk in ti.ndrange(self.REGION, self.REGION, self.REGION):
+                    chunk = IVec4(i * self.REGION + di, j * self.REGION + dj, k * self.REGION + dk, layer)
+                    if ti.is_active(self.chunks, chunk):
+                        ti.deactivate(self.chunks, chunk)
+
+    @ti.kernel
+    def clear_regions(self, layer: I32):
+        for i, j, k in ti.ndrange(self.REGIONS, self.REGIONS, self.REGIONS):
+            if ti.is_active(self.regions, [i, j, k, layer]):
+                ti.deactivate(self.regions, [i, j, k, layer])
 
 
 class SparseTopology:
