@@ -18,7 +18,7 @@ from taichi_mrf.config import LogOddsConfig, VolumeConfig
 from taichi_mrf.inference.accumulators import low_half
 from taichi_mrf.inference.footprint import visible_box, window_around
 from taichi_mrf.inference.keyframe import DepthImage, Footprint
-from taichi_mrf.inference.ray_ends import HIT, ray_ends
+from taichi_mrf.inference.ray_ends import HIT, end_of, ray_ends
 from taichi_mrf.inference.recursive_update import updated
 from taichi_mrf.poses import Pose
 from taichi_mrf.voxels.layout import BRICK, VOXELS, flat, voxel_number
@@ -29,6 +29,7 @@ from taichi_mrf.voxels.types import (
     F32,
     I32,
     F32Array,
+    F32Array2,
     I32Array,
     I64Array,
     IVec3,
@@ -36,9 +37,7 @@ from taichi_mrf.voxels.types import (
     Template,
     Vec3,
     Vec4,
-    Vec4Array,
 )
-from taichi_mrf.voxels.vectors import vec4_array
 from taichi_mrf.voxels.window import Window, WindowIndex
 
 
@@ -77,7 +76,7 @@ class ScanIntegrator:
         window = window_around(lower_m, upper_m, self.voxel_size, self.volume)
         if window is None or image.rays == 0:
             window, nothing = Window.covering(centre_m, centre_m, self.voxel_size), np.zeros(0, np.int32)
-            return RayFootprint(window, nothing, nothing, 1, vec4_array(1))
+            return RayFootprint(window, nothing, nothing, 1, ti.ndarray(ti.f32, (1, 4)))
         ends = ray_ends(
             image, T_world_camera, window, max_depth=self.max_depth, max_range=config.max_range,
             discretise=config.discretise, correct_bias=config.correct_bias,
@@ -141,9 +140,9 @@ def _mark_brick(state: Template, context: Template, ray: Template, brick: IVec3,
 
 
 @ti.kernel
-def _mark(ends: Vec4Array, centre: Vec3, shape: IVec3, lower: Vec3, upper: Vec3, marks: I32Array):
+def _mark(ends: F32Array2, centre: Vec3, shape: IVec3, lower: Vec3, upper: Vec3, marks: I32Array):
     for i in range(ends.shape[0]):
-        end = ends[i]
+        end = end_of(ends, i)
         if end[3] >= 0.0:
             ray = make_ray(centre, Vec3(end[0], end[1], end[2]) - centre)
             t_begin, t_end = 0.0, 1.0
@@ -178,7 +177,7 @@ def _count(tally: Template, voxel: I32, one: ti.i64, every_ray: Template):
 
 @ti.kernel
 def count_rays(
-    ends: Vec4Array, centre: Vec3, shape: IVec3, lower: Vec3, upper: Vec3,
+    ends: F32Array2, centre: Vec3, shape: IVec3, lower: Vec3, upper: Vec3,
     chunks: I32Array, bricks: I32Array, tally: I64Array, every_ray: Template,
 ):  # fmt: skip
     """Count hits (upper half of the tally) and misses (lower half) of each voxel, or with ``every_ray``
@@ -187,7 +186,7 @@ def count_rays(
     A ray goes from ``centre`` to its end, both in voxels.
     """
     for i in range(ends.shape[0]):
-        end = ends[i]
+        end = end_of(ends, i)
         if end[3] >= 0.0:
             ray = make_ray(centre, Vec3(end[0], end[1], end[2]) - centre)
             t_begin, t_end = 0.0, 1.0

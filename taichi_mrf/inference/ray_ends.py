@@ -11,14 +11,13 @@ from taichi_mrf.voxels.types import (
     F32,
     I32,
     F32Array,
+    F32Array2,
     F32Array3,
     Mat3,
     Template,
     Vec3,
     Vec4,
-    Vec4Array,
 )
-from taichi_mrf.voxels.vectors import vec4_array
 from taichi_mrf.voxels.window import Window
 
 NO_RAY, FREE_END, HIT = -1.0, 0.0, 1.0
@@ -36,7 +35,7 @@ def ray_ends(
     discretise: bool = False,
     correct_bias: bool = False,
 ) -> "ti.Ndarray":
-    """The ends of an image's rays as (n) 4-vectors: voxels from the window's corner, and what kind of end.
+    """The ends of an image's rays as (n, 4): voxels from the window's corner, and what kind of end.
 
     ``correct_bias`` puts an end where a surface gives the measurement on average. Measurements beyond the
     axial ``max_depth`` are cut off there. ``discretise`` leaves one ray to the centre of each voxel that
@@ -45,7 +44,7 @@ def ray_ends(
     """
     table = image.noise_table
     centre, to_voxels = window.rays_of(T_world_camera)
-    ends = vec4_array(image.camera.width * image.camera.height)
+    ends = ti.ndarray(ti.f32, (image.camera.width * image.camera.height, 4))
     _find_ends(
         image.depth, image.camera.width, image.intrinsics, centre, to_voxels,
         image.noise, table.patch, table.columns, max_depth, ends, correct_bias,
@@ -69,15 +68,29 @@ def _once_a_voxel(ends: "ti.Ndarray") -> "ti.Ndarray":
         keys = np.unique(np.ravel_multi_index(tuple((voxels - lowest).T), shape))
         once = (np.stack(np.unravel_index(keys, shape), axis=1) + lowest).astype(np.float32)
         once[:, :3] += 0.5
-    result = vec4_array(len(once))
+    result = ti.ndarray(ti.f32, once.shape)
     result.from_numpy(once)
     return result
+
+
+@ti.func
+def end_of(ends: Template, ray: I32) -> Vec4:
+    """Where a ray ends, and how."""
+    return Vec4(ends[ray, 0], ends[ray, 1], ends[ray, 2], ends[ray, 3])
+
+
+@ti.func
+def put_end(ends: Template, ray: I32, place: Vec3, kind: F32):
+    """Write down where a ray ends, and how."""
+    for axis in ti.static(range(3)):
+        ends[ray, axis] = place[axis]
+    ends[ray, 3] = kind
 
 
 @ti.kernel
 def _find_ends(
     depth: F32Array, width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
-    noise: F32Array3, patch: I32, columns: I32, max_depth: F32, ends: Vec4Array, correct_bias: Template,
+    noise: F32Array3, patch: I32, columns: I32, max_depth: F32, ends: F32Array2, correct_bias: Template,
 ):  # fmt: skip
     for pixel in range(depth.shape[0]):
         u, v = pixel % width, pixel // width
@@ -88,14 +101,14 @@ def _find_ends(
                 surface = depth_of_deviation(surface, 0.0, pixel_noise(noise, patch, columns, u, v))
             kind = HIT if surface <= max_depth else FREE_END
         end = centre + to_voxels @ pixel_direction(u, v, intrinsics) * ti.min(surface, max_depth)
-        ends[pixel] = Vec4(end[0], end[1], end[2], kind)
+        put_end(ends, pixel, end, kind)
 
 
 @ti.kernel
-def _cut_off(ends: Vec4Array, centre: Vec3, longest: F32):
+def _cut_off(ends: F32Array2, centre: Vec3, longest: F32):
     for i in range(ends.shape[0]):
-        end = ends[i]
+        end = end_of(ends, i)
         way = Vec3(end[0], end[1], end[2]) - centre
         if end[3] >= 0.0 and way.norm() > longest:
             near = centre + way * (longest / way.norm())
-            ends[i] = Vec4(near[0], near[1], near[2], FREE_END)
+            put_end(ends, i, near, FREE_END)

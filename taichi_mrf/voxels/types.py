@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
     class F32Array(Any): ...
 
+    class F32Array2(Any): ...
+
     class F32Array3(Any): ...
 
     class Vec4Array(Any): ...
@@ -57,5 +59,6 @@ else:
     I32Array = ti.types.ndarray(dtype=ti.i32, ndim=1)
     I64Array = ti.types.ndarray(dtype=ti.i64, ndim=1)
     F32Array = ti.types.ndarray(dtype=ti.f32, ndim=1)
+    F32Array2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
     F32Array3 = ti.types.ndarray(dtype=ti.f32, ndim=3)
     Vec4Array = ti.types.ndarray(dtype=Vec4, ndim=1)

@@ -12,7 +12,8 @@ from taichi_mrf.voxels.types import Vec4
 def vec4_array(length: int) -> "ti.Ndarray":
     """An array of 4-vectors of float32, all zero.
 
-    Taichi 1.7.4 itself never gives the memory of such an array back.
+    Taichi 1.7.4 itself never gives the memory of such an array back, and on Vulkan not always when asked to:
+    for what is made again and again, such as for each scan, take an array of scalars.
     """
     array = ti.ndarray(Vec4, length)
     weakref.finalize(array, _free, array.arr).atexit = False
