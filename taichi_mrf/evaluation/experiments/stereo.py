@@ -86,7 +86,8 @@ def _artefacts(
     for number, row in enumerate(everyone):
         experiment.report(f"{row.name}, {voxel_size:g} m", number, len(everyone))
         results[row.name] = experiment.ledger.result(
-            f"{scene.name} | {len(scene.views)} pairs | {row.name} | {voxel_size:g} m",
+            f"{scene.name} | {len(scene.views)} pairs | {row.name} "
+            f"({row.contender.signature(scene, voxel_size)}) | {voxel_size:g} m",
             lambda r=row: _map_and_judge(r, scene, voxel_size),  # type: ignore[misc]
         )
     suffix = "" if len(experiment.voxel_sizes) == 1 else f"_{voxel_size * 1000:g}mm"
@@ -130,7 +131,8 @@ def _growth(experiment: Experiment, street: Scene) -> "tuple[Table, Figure]":
             for contender, updates in ((visibility(), GROWTH_UPDATES[size]), (octomap_style(), 1)):
                 experiment.report(f"growth, {title}, {size:g} m", len(panels[title]), 2 * len(sizes))
                 panels[title][f"{contender.name}, {size:g} m"] = experiment.ledger.result(
-                    f"{scene.name} | growth of {title} | {contender.name} | {size:g} m | {updates} updates",
+                    f"{scene.name} | growth of {title} | {contender.name} "
+                    f"({contender.signature(scene, size)}) | {size:g} m | {updates} updates",
                     lambda c=contender, s=scene, v=size, u=updates: grow(c, s, v, u, GROWTH_EVERY),  # type: ignore[misc]
                 )
     distances = (5.0, 10.0, 15.0)
