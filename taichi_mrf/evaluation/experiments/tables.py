@@ -105,30 +105,33 @@ def as_latex(table: Table) -> str:
 
 
 def as_figure(table: Table) -> "Figure":
-    """The table as a picture."""
+    """The table as a picture; columns of words are on the left of their column, numbers on the right."""
+    from matplotlib.table import Table as Drawing
+    from matplotlib.transforms import Bbox
+
     cells = [[entry_text(entry, table.digits) for entry in row] for row in table.rows]
-    widths = [max(len(str(c)) for c in column) for column in zip(table.columns, *cells, strict=True)]
+    widths = [max(len(str(c)) for c in column) + 2 for column in zip(table.columns, *cells, strict=True)]
+    words = [any(isinstance(row[i], str) for row in table.rows) for i in range(len(table.columns))]
     figure = new_figure(
-        max(6.0, 0.085 * sum(widths) + 0.25 * len(widths)),
-        0.26 * (len(cells) + 2) + 0.2 * len(table.notes) + 0.5,
+        max(6.0, 0.085 * sum(widths)), 0.24 * (len(cells) + 1) + 0.17 * len(table.notes) + 0.7
     )
     axes = figure.add_subplot()
     axes.axis("off")
     axes.set_title(table.title, loc="left", fontsize=11)
-    drawn = axes.table(
-        cellText=cells,
-        colLabels=list(table.columns),
-        colWidths=[w / sum(widths) for w in widths],
-        cellLoc="right",
-        loc="upper left",
-        edges="horizontal",
-    )
+    drawn = Drawing(axes, bbox=Bbox.unit())
     drawn.auto_set_font_size(False)
-    drawn.set_fontsize(9)
-    for (row, column), cell in drawn.get_celld().items():
-        cell.set_text_props(weight="bold" if row == 0 else "normal", ha="left" if column == 0 else "right")
+    for number, texts in enumerate([table.columns, *cells]):
+        for column, text in enumerate(texts):
+            cell = drawn.add_cell(
+                number, column, widths[column] / sum(widths), 1.0, text=text,
+                loc="left" if words[column] else "right",
+            )  # fmt: skip
+            cell.visible_edges = "horizontal"
+            cell.set(linewidth=0.4, fontsize=9)
+            cell.set_text_props(weight="bold" if number == 0 else "normal")
+    axes.add_table(drawn)
     if table.notes:
-        figure.supxlabel("\n".join(table.notes), fontsize=8, x=0.02, ha="left")
+        figure.supxlabel("\n".join(table.notes), fontsize=8, x=0.01, ha="left")
     return figure
 
 
