@@ -109,6 +109,9 @@ def _figure(
         picture.plot(*pixel, "o", markersize=11, markerfacecolor="none", markeredgecolor="red", mew=2)
         picture.set(xticks=[], yticks=[], title=f"{contender.name}: {100 * score.score:.1f} % right")
         _draw_profile(axes[1, column], scene, view, pixel, profile, seen.voxel_size)
+    limits = [ax.get_xlim() for ax in axes[1]]
+    for ax in axes[1]:
+        ax.set_xlim(min(low for low, _ in limits), max(high for _, high in limits))
     figure.legend(
         handles=[Patch(color=COLORS[k], label=NAMES[k]) for k in (RIGHT, WRONG, NO_ANSWER, NOT_JUDGED)],
         loc="outside lower center", ncols=4, frameon=False,
@@ -150,5 +153,5 @@ def _draw_profile(
     depths = [true, measured] if measured > 0 else [true]
     near = min(*depths, *(begins[profile.omega > 0.02 * peak].tolist() or [FAR])) - 0.3
     axes.set(xlim=(near, max(depths) + 0.4), ylim=(-0.02, 1.05), xlabel="range (m)")
-    axes.legend(fontsize=8, loc="upper left")
+    axes.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False)
     axes.grid(alpha=0.3)
