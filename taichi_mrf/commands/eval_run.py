@@ -14,6 +14,7 @@ from rich.table import Table as RichTable
 import taichi_mrf
 from taichi_mrf import runtime
 from taichi_mrf.commands.eval import Eval
+from taichi_mrf.commands.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.commands.output import output_folder
 from taichi_mrf.config import Config, to_yaml
 from taichi_mrf.errors import DatasetError, TaichiMRFError
@@ -51,12 +52,18 @@ def run_eval(options: Eval) -> int:
     if not options.data.is_dir():
         raise DatasetError(f"{options.data}: there is no such folder; --data names the one with the scenes")
     names = list(EXPERIMENTS) if options.experiment == "all" else [options.experiment]
-    with output_folder(options.out):
+    with (
+        output_folder(options.out),
+        stop_on_signals(lambda text: console.print(text, style="yellow")) as request,
+    ):
         runtime.init(options.runtime.arch, options.runtime.threads, options.runtime.debug)
         failed = 0
         for name in names:
             try:
-                tables, paths = _run(name, options, console)
+                tables, paths = _run(name, options, console, request)
+            except _StoppedError:
+                console.print("Stopped before the end; the same command goes on from here.", style="yellow")
+                return 128 + (request.signal or 0)
             except TaichiMRFError as error:
                 if len(names) == 1:
                     raise
@@ -73,7 +80,13 @@ def run_eval(options: Eval) -> int:
     return 0
 
 
-def _run(name: str, options: Eval, console: Console) -> tuple[list[Table], list[Path]]:
+class _StoppedError(Exception):
+    """The user wants the run to end; what was found is kept."""
+
+
+def _run(
+    name: str, options: Eval, console: Console, should_stop: StopRequest
+) -> tuple[list[Table], list[Path]]:
     run, own_sizes = EXPERIMENTS[name]
     sizes = options.voxel_sizes or own_sizes
     configuration = options.out / f"{name}_config.yaml"
@@ -83,6 +96,9 @@ def _run(name: str, options: Eval, console: Console) -> tuple[list[Table], list[
         task = progress.add_task(name, total=None)
 
         def report(what: str, done: int, total: int) -> None:
+            # Between two maps. An exception raised by the signal itself could be lost in a finaliser.
+            if should_stop():
+                raise _StoppedError
             progress.update(task, description=f"{name}: {what}", completed=done, total=total)
 
         experiment = Experiment(

@@ -26,7 +26,7 @@ def stop_on_signals(tell: Callable[[str], None]) -> Iterator[StopRequest]:
         if request():
             raise KeyboardInterrupt
         request.signal = number
-        tell("Stopping: what is mapped so far will be kept. Once more to abort.")
+        tell("Stopping: what is done so far will be kept. Once more to abort.")
 
     saved = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
