@@ -9,11 +9,11 @@ import numpy as np
 from taichi_mrf.evaluation.depth_error import depth_error
 from taichi_mrf.evaluation.figures import new_figure, notice
 from taichi_mrf.evaluation.room_views import Room, perspective, top_view
-from taichi_mrf.evaluation.surfaces import KeyframeLike, seen_surfaces, up_direction
+from taichi_mrf.evaluation.surfaces import seen_surfaces, up_direction
 from taichi_mrf.export.atomic import atomic_path
 from taichi_mrf.export.colors import LOWEST
 from taichi_mrf.frame import Frame
-from taichi_mrf.maps.protocol import OccupancyMap
+from taichi_mrf.maps.protocol import OccupancyMap, PosedDepth
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,7 +67,7 @@ def depth_comparison(m: OccupancyMap, held_out: Sequence[Frame]) -> "Figure":
     from matplotlib import colormaps
     from matplotlib.colors import Normalize
 
-    frames: list[KeyframeLike] = list(held_out) or list(m.keyframes.values())
+    frames: list[PosedDepth] = list(held_out) or list(m.keyframes.values())
     if not frames:
         return notice("There is no frame to compare the map with.")
     kind, rows = ("held-out frame", min(_DEPTH_ROWS, len(frames))) if held_out else ("keyframe", 1)

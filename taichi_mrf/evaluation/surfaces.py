@@ -6,7 +6,6 @@ faces the camera that saw it, and most of a room is level or upright.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,19 +28,6 @@ _NEIGHBOURS = np.array([(i << 42) + (j << 21) + k for i, j, k in np.ndindex(3, 3
     (1 << 42) + (1 << 21) + 1
 )
 """What to add to a cell's key for itself and the 26 cells around it."""
-
-
-class KeyframeLike(Protocol):
-    """What the pictures read of a keyframe (or a frame)."""
-
-    @property
-    def T_world_camera(self) -> Pose: ...
-    @property
-    def camera(self) -> PinholeCamera: ...
-    @property
-    def depth_m(self) -> NDArray[np.float32]: ...
-    @property
-    def name(self) -> str: ...
 
 
 @dataclass(frozen=True)

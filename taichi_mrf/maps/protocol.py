@@ -17,8 +17,9 @@ from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.noise import NoiseModel
 
 
-class MappedKeyframe(Protocol):
-    """What a map remembers of a keyframe. Depth is (H, W) axial depth in metres, 0 for no measurement."""
+class PosedDepth(Protocol):
+    """A depth image with its place: a keyframe of a map, or a frame. Depth is (H, W) axial depth in metres, 0
+    for no measurement."""
 
     @property
     def name(self) -> str: ...
@@ -28,8 +29,15 @@ class MappedKeyframe(Protocol):
     def camera(self) -> PinholeCamera: ...
     @property
     def depth_m(self) -> NDArray[np.float32]: ...
+
+
+class MappedKeyframe(PosedDepth, Protocol):
+    """What a map remembers of a keyframe."""
+
     @property
-    def rays(self) -> int: ...
+    def rays(self) -> int:
+        """Number of pixels that hold a measurement."""
+        ...
 
 
 class OccupancyMap(Protocol):
