@@ -1,4 +1,4 @@
-"""Arrays of vectors that are freed with their Python object, as Taichi's arrays of scalars are."""
+"""Arrays of vectors that are freed when Python collects them, as Taichi's arrays of scalars are."""
 
 import weakref
 from typing import Any
