@@ -8,18 +8,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
-from urllib.parse import parse_qsl
 
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf import runtime
 from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.config_values import from_dict
 from taichi_mrf.datasets.analytic_scene import Scene
 from taichi_mrf.datasets.base import Dataset, ReadOptions
 from taichi_mrf.datasets.intrinsics import PRIMESENSE
+from taichi_mrf.datasets.query_options import parse_options
 from taichi_mrf.datasets.room_furniture import camera_pose, room_scene
 from taichi_mrf.errors import BackendError, ConfigError, DatasetError
 from taichi_mrf.frame import Frame
@@ -125,13 +123,5 @@ def open_synthetic_room(query: str, options: ReadOptions) -> SyntheticRoom:
     """
     if options.depth_scale is not None:
         raise DatasetError(f"{NAME}: has no depth_scale, its depth is in metres")
-    try:
-        pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
-        values = {key: yaml.safe_load(value) for key, value in pairs}
-        room = from_dict(RoomOptions, values, NAME)
-    except (ValueError, yaml.YAMLError):
-        raise DatasetError(f"{NAME}?{query}: options are written name=value, with & between them") from None
-    except ConfigError as error:
-        text = str(error)
-        raise DatasetError(text if text.startswith(NAME) else f"{NAME}: {text}") from error
+    room = parse_options(RoomOptions, query, NAME)
     return SyntheticRoom(NAME, options.camera or room.camera(), options=room, color=options.color)
