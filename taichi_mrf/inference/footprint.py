@@ -15,8 +15,9 @@ from taichi_mrf.inference.rays import is_cast, pixel_direction, stride_metres
 from taichi_mrf.poses import Pose
 from taichi_mrf.sensor.forward import depth_of_deviation, pixel_noise
 from taichi_mrf.sensor.noise import LEAST_SIGMA_M, evaluate
-from taichi_mrf.voxels.layout import VOXELS, flat
+from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.memory import check_memory
+from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.traversal import clip, make_ray, walk_bricks
 from taichi_mrf.voxels.types import (
     F32,

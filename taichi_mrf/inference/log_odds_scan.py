@@ -21,8 +21,9 @@ from taichi_mrf.inference.keyframe import DepthImage, Footprint
 from taichi_mrf.inference.ray_ends import HIT, end_of, ray_ends
 from taichi_mrf.inference.recursive_update import updated
 from taichi_mrf.poses import Pose
-from taichi_mrf.voxels.layout import BRICK, VOXELS, flat, voxel_number
+from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.memory import check_memory
+from taichi_mrf.voxels.numbering import flat, voxel_number
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.traversal import clip, make_ray, walk_bricks, walk_voxels
 from taichi_mrf.voxels.types import (

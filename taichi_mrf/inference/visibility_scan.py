@@ -22,7 +22,8 @@ from taichi_mrf.inference.log_odds import logistic
 from taichi_mrf.inference.rays import pixel_direction
 from taichi_mrf.inference.recursive_update import updated
 from taichi_mrf.sensor.forward import SUPPORT, depth_of_deviation, normal_tail, pixel_noise, sigma_at
-from taichi_mrf.voxels.layout import BRICK, VOXELS, flat
+from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
 from taichi_mrf.voxels.types import (
     F32,

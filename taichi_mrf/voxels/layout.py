@@ -6,10 +6,7 @@ is integer arithmetic with floor division, so negative coordinates need no speci
 """
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
-
-from taichi_mrf.voxels.types import I32, IVec3
 
 BRICK = 8
 """Voxels along each side of a brick."""
@@ -24,18 +21,6 @@ VOXELS = BRICK**3
 """Voxels in a brick."""
 
 
-@ti.func
-def voxel_number(cell: IVec3) -> I32:
-    """Number (0..511) of a voxel in its brick, from its coordinates there (0..7)."""
-    return (cell[0] * BRICK + cell[1]) * BRICK + cell[2]
-
-
-@ti.func
-def flat(cell: IVec3, shape: IVec3) -> I32:
-    """Row-major number of a cell in a box of cells."""
-    return (cell[0] * shape[1] + cell[1]) * shape[2] + cell[2]
-
-
 def offsets_in_brick() -> NDArray[np.int32]:
-    """(512, 3): the voxel of each number within a brick, the inverse of :func:`voxel_number`."""
+    """(512, 3): the voxel of each number within a brick, the inverse of ``voxel_number``."""
     return np.stack(np.unravel_index(np.arange(VOXELS), (BRICK,) * 3), axis=1).astype(np.int32)

@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf import runtime
 from taichi_mrf.poses import Pose
-from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, flat
+from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS
 from taichi_mrf.voxels.memory import check_memory
+from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.types import I32, I32Array, IVec3
 
 Vector = NDArray[np.float64]
