@@ -1,0 +1,97 @@
+"""Colours of voxels: what is shown, and the scale beside it. All scales are perceptually uniform."""
+
+import base64
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.export.colors import LOWEST
+from taichi_mrf.viewer.messages import LOG_ODDS_STEP
+from taichi_mrf.viewer.options import ColorBy
+from taichi_mrf.viewer.voxel_store import Shown
+
+_MAPS = {
+    "marginal": cv2.COLORMAP_VIRIDIS,
+    "height": cv2.COLORMAP_CIVIDIS,
+    "uncertainty": cv2.COLORMAP_MAGMA,
+    "keyframes": cv2.COLORMAP_PLASMA,
+}
+MOST_KEYFRAMES = 64
+"""The bright end of the scale of keyframes, which is logarithmic."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A colour scale: 256 colours (256, 3), the values at both ends, and what they are.
+
+    ``table`` gives the colour's number for what the scale is of: for each int16 of log-odds, seen as
+    uint16, or for each number of keyframes; a height has none.
+    """
+
+    color_by: ColorBy
+    colors: NDArray[np.uint8]
+    low: float
+    high: float
+    label: str
+    table: NDArray[np.uint8] | None = None
+
+    def legend(self) -> tuple[str, float, float]:
+        """What tells one scale from another."""
+        return self.label, self.low, self.high
+
+
+def scale_of(color_by: ColorBy, threshold: float, heights_m: tuple[float, float]) -> Scale:
+    """The scale of a mode; ``heights_m`` are the lowest and the highest voxel's. That of the marginals
+    begins at one half, or at 0 if voxels less probable than that are shown."""
+    ramp = np.arange(256, dtype=np.uint8)[:, None]
+    colors = np.ascontiguousarray(cv2.applyColorMap(ramp, _MAPS[color_by])[:, 0, ::-1])
+    if color_by == "height":
+        return Scale(color_by, colors, *heights_m, "height (m)")
+    if color_by == "keyframes":
+        share = np.log(np.maximum(np.arange(256), 1)) / np.log(MOST_KEYFRAMES)
+        label = "keyframes that see the voxel"
+        return Scale(color_by, colors, 1.0, float(MOST_KEYFRAMES), label, _numbers(share))
+    p = _probabilities()
+    if color_by == "uncertainty":
+        return Scale(color_by, colors, 0.0, 1.0, "uncertainty: entropy (bits)", _numbers(_entropy(p)))
+    low = LOWEST if threshold >= LOWEST else 0.0
+    return Scale(color_by, colors, low, 1.0, "marginal probability", _numbers((p - low) / (1.0 - low)))
+
+
+def voxel_colors(scale: Scale, shown: Shown, heights_m: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Colours (n, 3) of a chunk's voxels, whose centres are at these heights (n,)."""
+    if scale.table is None:
+        span = max(scale.high - scale.low, 1e-6)
+        return scale.colors[_numbers((heights_m - scale.low) / span)]
+    of = shown.seen if scale.color_by == "keyframes" else shown.log_odds.view(np.uint16)
+    return scale.colors[scale.table[of]]
+
+
+def legend_html(scale: Scale) -> str:
+    """The scale as a strip with numbers, for the page."""
+    strip = np.ascontiguousarray(scale.colors[None, :, ::-1])
+    png = base64.b64encode(cv2.imencode(".png", strip)[1].tobytes()).decode("ascii")
+    return (
+        '<div style="padding:0 0.75em;font-size:0.85em">'
+        f'<img alt="{scale.label}" style="width:100%;height:0.9em;image-rendering:pixelated" '
+        f'src="data:image/png;base64,{png}">'
+        '<div style="display:flex;justify-content:space-between">'
+        f"<span>{scale.low:.3g}</span><span>{scale.label}</span><span>{scale.high:.3g}</span></div></div>"
+    )
+
+
+def _numbers(share: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Shares of the way from the low to the high end, as numbers of colours."""
+    return np.rint(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
+
+
+def _probabilities() -> NDArray[np.float64]:
+    """The probability that belongs to each int16 of log-odds, seen as uint16."""
+    return 0.5 * (1.0 + np.tanh(0.5 * np.arange(65536, dtype=np.uint16).view(np.int16) * LOG_ODDS_STEP))
+
+
+def _entropy(p: NDArray[np.float64]) -> NDArray[np.float64]:
+    p = np.clip(p, 1e-12, 1 - 1e-12)
+    return -(p * np.log2(p) + (1 - p) * np.log2(1 - p))

@@ -1,0 +1,81 @@
+"""From where browsers look at the map: a sensible first view, and the view that follows the camera."""
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from taichi_mrf.poses import Pose
+from taichi_mrf.viewer.look import Up, up_vector
+from taichi_mrf.viewer.voxel_store import VoxelStore
+from taichi_mrf.voxels.layout import BRICK
+
+_BEHIND_M, _ABOVE_M, _AHEAD_M = 1.5, 0.7, 2.0
+
+
+class Eye:
+    """Owns the cameras of the browsers, as far as the page moves them."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self.up: Up = (2, 1)
+        self._camera: Pose | None = None
+        self._seen_size = 0.0
+        self._waiting: set[int] = set()
+
+    def set_up(self, up: Up) -> None:
+        """Which way is up, from the first keyframe on."""
+        self.up = up
+        self._seen_size = 0.0
+        self._waiting = set(self._server.get_clients())
+        self._server.scene.set_up_direction(up_vector(up))
+
+    def joined(self, client: int) -> None:
+        """A browser that comes before there is a map gets its first view when there is one."""
+        if self._seen_size == 0.0:
+            self._waiting.add(client)
+
+    def camera_moved(self, T_world_camera: Pose, follow: bool) -> None:
+        """Remember the mapping camera, and look over its shoulder if ``follow``."""
+        self._camera = T_world_camera
+        if not follow:
+            return
+        position, forward = T_world_camera[:3, 3], T_world_camera[:3, 2]
+        up = up_vector(self.up)
+        eye, target = position - _BEHIND_M * forward + _ABOVE_M * up, position + _AHEAD_M * forward
+        for client in self._server.get_clients().values():
+            self._point(client, eye, target)
+
+    def map_grew(self, store: VoxelStore, voxel_size: float) -> None:
+        """Set the view of those who come later to one that has the whole map in it, and give it at once to
+        those who came before there was a map."""
+        bounds = store.bounds()
+        if bounds is None or self._camera is None:
+            return
+        low, high = bounds[0] * BRICK * voxel_size, (bounds[1] + 1) * BRICK * voxel_size
+        size = float(np.linalg.norm(high - low))
+        if size < 1.2 * self._seen_size:
+            return
+        self._seen_size = size
+        centre = (low + high) / 2
+        backwards = self._camera[:3, 3] - centre
+        up = up_vector(self.up)
+        backwards = backwards - up * (backwards @ up)
+        length = float(np.linalg.norm(backwards))
+        if length < 0.05 * size:  # a camera in the middle: from any side
+            backwards, length = np.roll(up, 1), 1.0
+        eye = centre + 0.55 * size * backwards / length + 0.5 * size * up
+        start = self._server.initial_camera
+        start.position, start.look_at = eye, centre
+        for client in self._server.get_clients().values():
+            if client.client_id in self._waiting:
+                self._point(client, eye, centre)
+        if len(store.chunks) > 1:
+            self._waiting.clear()
+
+    def _point(
+        self, client: viser.ClientHandle, eye: NDArray[np.float64], target: NDArray[np.float64]
+    ) -> None:
+        with client.atomic():
+            client.camera.up_direction = up_vector(self.up)
+            client.camera.position = eye
+            client.camera.look_at = target

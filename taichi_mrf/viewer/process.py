@@ -1,0 +1,59 @@
+"""The viewer's process: the page on its main thread, and a thread that listens to the mapper.
+
+It is spawned by whoever maps, and ends when told to or when that process is gone.
+"""
+
+import signal
+import threading
+from multiprocessing.connection import Connection
+from typing import Any
+
+from taichi_mrf.errors import TaichiMRFError
+from taichi_mrf.viewer.messages import Listening, Notice, Quit, Request
+from taichi_mrf.viewer.page import Page
+from taichi_mrf.viewer.server import start_server
+
+TITLE = "taichi_mrf"
+
+
+def run_viewer(connection: "Connection[Any, Any]", host: str, port: int) -> None:
+    """Serve the page until the mapper says Quit or is gone.
+
+    The first message back is Listening, or a Notice that says why there is no page.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the mapper hears it too, and says when to end
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    try:
+        server = start_server(host, port, TITLE)
+    except TaichiMRFError as error:
+        connection.send(Notice(str(error), "error"))
+        return
+    lock = threading.Lock()
+
+    def ask(request: Request) -> None:
+        with lock:
+            try:
+                connection.send(request)
+            except OSError:
+                page.inbox.put(None)
+
+    page = Page(server, ask)
+    ask(Listening(server.get_host(), server.get_port()))
+    threading.Thread(target=_listen, args=(connection, page), daemon=True, name="listener").start()
+    try:
+        page.run()
+    finally:
+        server.stop()
+
+
+def _listen(connection: "Connection[Any, Any]", page: Page) -> None:
+    """Put what the mapper says into the page's inbox, to the end."""
+    try:
+        while True:
+            update = connection.recv()
+            if isinstance(update, Quit):
+                break
+            page.inbox.put(update)
+    except (EOFError, OSError):
+        pass
+    page.inbox.put(None)

@@ -1,0 +1,111 @@
+"""The curves along a ray (MRFMap, Fig. 7): p_occ, visibility and omega, with the measurement's band."""
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from viser import uplot
+
+from taichi_mrf.viewer.messages import RayAnswer
+
+Curves = tuple[NDArray[np.float64], ...]
+
+_STEP_M = 1e-6
+"""Width of a step's edge on the plot's axis."""
+
+_SERIES = (
+    uplot.Series(label="range (m)"),
+    uplot.Series(label="p occupied", stroke="#1f968b", width=2),
+    uplot.Series(label="visibility", stroke="#404788", width=2),
+    uplot.Series(label="omega / largest", stroke="#e6007e", width=2),
+    uplot.Series(label="measured ± sigma", stroke="#e69f00", fill="#e69f0055", width=1),
+    uplot.Series(label="measured", stroke="#d55e00", width=2),
+)
+
+
+class RayPlot:
+    """Owns the plot and the line of the ray in the scene."""
+
+    def __init__(self, gui: viser.GuiApi, scene: viser.SceneApi) -> None:
+        self._scene = scene
+        self._text = gui.add_markdown("Click a voxel, or the picture of a keyframe.")
+        nothing = tuple(np.zeros(2) for _ in _SERIES)
+        self._plot = gui.add_uplot(
+            nothing,
+            _SERIES,
+            scales={"x": uplot.Scale(time=False), "y": uplot.Scale(range=(0.0, 1.05))},
+            aspect=1.5,
+            visible=False,
+        )
+
+    def show(self, answer: RayAnswer) -> None:
+        """Draw an answer, and the ray in the scene."""
+        self._plot.data = curves(answer)
+        self._plot.visible = True
+        self._text.content = f"**{answer.title}**\n\n{_sentence(answer)}"
+        start = np.array(answer.origin)
+        end = start + np.array(answer.direction) * _end_m(answer)
+        self._scene.add_line_segments(
+            "/ray",
+            np.array([[start, end]], np.float32),
+            (230, 0, 126),
+            thickness=3.0,
+            thickness_units="screen",
+        )
+
+    def clear(self) -> None:
+        """Back to nothing."""
+        self._plot.visible = False
+        self._text.content = "Click a voxel, or the picture of a keyframe."
+        self._scene.remove_by_name("/ray")
+
+
+def curves(answer: RayAnswer) -> Curves:
+    """Range in metres and the five curves over it, all (n,); each voxel is a step."""
+    begins = (answer.distance - answer.length / 2).astype(np.float64)
+    ends = (answer.distance + answer.length / 2).astype(np.float64)
+    band = _band_m(answer)
+    edges = np.concatenate([begins, ends, [] if band is None else [*band, answer.measured_m or 0.0]])
+    last = _end_m(answer)
+    x = np.unique(np.concatenate([[0.0, last], edges - _STEP_M, edges + _STEP_M]))
+    x = x[(x >= 0) & (x <= last)]
+    voxel = np.searchsorted(begins, x, side="right") - 1
+    inside = (voxel >= 0) & (x < ends[voxel] if len(ends) else np.zeros(len(x), bool))
+    omega = answer.omega / max(float(answer.omega.max(initial=0.0)), 1e-12)
+    steps = [
+        np.where(inside, values[voxel] if len(values) else 0.0, 0.0) for values in (answer.occupancy, omega)
+    ]
+    left = answer.visibility[np.maximum(voxel, 0)] if len(ends) else np.ones(len(x))
+    visibility = np.where(voxel >= 0, left, 1.0)
+    in_band = np.zeros(len(x)) if band is None else ((x >= band[0]) & (x <= band[1])).astype(float)
+    measured = np.zeros(len(x))
+    if answer.measured_m is not None:
+        measured = (np.abs(x - answer.measured_m) <= 1.5 * _STEP_M).astype(float)
+    return x, steps[0], visibility.astype(np.float64), steps[1], in_band, measured
+
+
+def _band_m(answer: RayAnswer) -> tuple[float, float] | None:
+    """Where the surface is, within one sigma, by the measurement alone."""
+    if answer.measured_m is None:
+        return None
+    middle = answer.measured_m - answer.bias_m
+    return middle - answer.sigma_m, middle + answer.sigma_m
+
+
+def _end_m(answer: RayAnswer) -> float:
+    """How far the plot goes: past the measurement, or to where next to nothing of the ray is left."""
+    seen = answer.distance[answer.visibility > 0.01]
+    end = float(seen.max(initial=0.5)) + 2 * float(answer.length.max(initial=0.05))
+    band = _band_m(answer)
+    return end if band is None else max(end, band[1] + 2 * answer.sigma_m + 0.1)
+
+
+def _sentence(answer: RayAnswer) -> str:
+    if not len(answer.omega):
+        return "The ray meets no voxel of the map."
+    best = int(np.argmax(answer.omega))
+    text = f"Likeliest surface at {answer.distance[best]:.3f} m (p = {answer.occupancy[best]:.2f})"
+    if answer.measured_m is None:
+        return text + ", nothing measured."
+    sigma = f"{1000 * answer.sigma_m:.1f} mm"
+    bias = f", bias {1000 * answer.bias_m:+.1f} mm" if answer.bias_m else ""
+    return f"{text}, measured {answer.measured_m:.3f} m (sigma {sigma}{bias})."

@@ -1,0 +1,162 @@
+"""The viewer's copy of the map: what it was told of each voxel, by chunk.
+
+A chunk of 64^3 voxels is the unit that is drawn anew. It keeps the bricks that exist in it and answers,
+without asking the mapper, which of their voxels are to be seen.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.viewer.messages import LOG_ODDS_STEP
+from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS, offsets_in_brick
+
+ChunkKey = tuple[int, int, int]
+
+_IN_BRICK = offsets_in_brick().astype(np.uint8)
+_NOWHERE = -1
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Voxels of one chunk: ``cells`` (n, 3) uint8 in 0..63, ``log_odds`` (n,) int16 in LOG_ODDS_STEP,
+    ``seen`` (n,) uint8 keyframes."""
+
+    cells: NDArray[np.uint8]
+    log_odds: NDArray[np.int16]
+    seen: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A plane across ``axis``: the voxels whose coordinate there is more than ``voxel`` are hidden."""
+
+    axis: int
+    voxel: int
+
+
+class Chunk:
+    """The bricks of one chunk, in no particular order."""
+
+    def __init__(self) -> None:
+        self._row = np.full(CHUNK**3, _NOWHERE, np.int16)
+        self._codes = np.zeros(0, np.int16)
+        self.log_odds = np.zeros((0, VOXELS), np.int16)
+        self.seen = np.zeros((0, VOXELS), np.uint8)
+
+    def __len__(self) -> int:
+        return len(self._codes)
+
+    @property
+    def bricks(self) -> NDArray[np.int32]:
+        """Coordinates (n, 3) of the bricks in this chunk, 0..7."""
+        return np.stack(np.unravel_index(self._codes, (CHUNK,) * 3), axis=1).astype(np.int32)
+
+    def put(self, codes: NDArray[np.int16], log_odds: NDArray[np.int16], seen: NDArray[np.uint8]) -> None:
+        """Set the voxels of some bricks, known by their numbers in the chunk."""
+        new = codes[self._row[codes] == _NOWHERE]
+        if len(new):
+            self._row[new] = np.arange(len(self), len(self) + len(new))
+            self._codes = np.concatenate([self._codes, new])
+            more = len(new), VOXELS
+            self.log_odds = np.concatenate([self.log_odds, np.zeros(more, np.int16)])
+            self.seen = np.concatenate([self.seen, np.zeros(more, np.uint8)])
+        rows = self._row[codes]
+        self.log_odds[rows], self.seen[rows] = log_odds, seen
+
+    def remove(self, codes: NDArray[np.int16]) -> None:
+        """Forget some bricks; those that are not there are no error."""
+        keep = ~np.isin(self._codes, codes)
+        self._codes = self._codes[keep]
+        self.log_odds, self.seen = self.log_odds[keep], self.seen[keep]
+        self._row[:] = _NOWHERE
+        self._row[self._codes] = np.arange(len(self))
+
+    def at_least(self, log_odds: float, hidden_above: tuple[int, int] | None = None) -> Shown:
+        """The voxels of at least these log-odds; with ``hidden_above`` = (axis, cell), only those whose
+        cell along that axis is at most that."""
+        chosen = self.log_odds >= np.ceil(log_odds / LOG_ODDS_STEP)
+        rows, voxels = np.nonzero(chosen)
+        cells = (self.bricks.astype(np.uint8) * BRICK)[rows] + _IN_BRICK[voxels]
+        if hidden_above is not None:
+            kept = cells[:, hidden_above[0]] <= hidden_above[1]
+            rows, voxels, cells = rows[kept], voxels[kept], cells[kept]
+        return Shown(cells, self.log_odds[rows, voxels], self.seen[rows, voxels])
+
+    def slab(self, axis: int, cell: int) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
+        """The voxels of one layer of the chunk: cells (n, 2) along the other two axes, log-odds (n,)."""
+        rows = np.flatnonzero(self.bricks[:, axis] == cell // BRICK)
+        voxels = np.flatnonzero(_IN_BRICK[:, axis] == cell % BRICK)
+        cells = (self.bricks * BRICK)[rows][:, None] + _IN_BRICK[voxels]
+        others = [other for other in range(3) if other != axis]
+        return cells[..., others].reshape(-1, 2), self.log_odds[np.ix_(rows, voxels)].reshape(-1)
+
+
+class VoxelStore:
+    """All chunks of a map that is shown."""
+
+    def __init__(self) -> None:
+        self.chunks: dict[ChunkKey, Chunk] = {}
+
+    def put(
+        self, bricks: NDArray[np.int32], log_odds: NDArray[np.int16], seen: NDArray[np.uint8]
+    ) -> set[ChunkKey]:
+        """Take in bricks as :class:`messages.Bricks` brings them; returns the chunks that have changed."""
+        changed = set()
+        for key, codes, rows in _by_chunk(bricks):
+            self.chunks.setdefault(key, Chunk()).put(codes, log_odds[rows], seen[rows])
+            changed.add(key)
+        return changed
+
+    def remove(self, bricks: NDArray[np.int32]) -> set[ChunkKey]:
+        """Forget bricks (n, 3); returns the chunks that have changed. A chunk without bricks is gone."""
+        changed = set()
+        for key, codes, _ in _by_chunk(bricks):
+            if key in self.chunks:
+                self.chunks[key].remove(codes)
+                changed.add(key)
+                if not len(self.chunks[key]):
+                    del self.chunks[key]
+        return changed
+
+    def bounds(self) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
+        """Lowest and highest brick coordinates, (3,) each; None for an empty map."""
+        if not self.chunks:
+            return None
+        all_bricks = self.bricks()
+        return all_bricks.min(axis=0), all_bricks.max(axis=0)
+
+    def bricks(self) -> NDArray[np.int64]:
+        """World coordinates (n, 3) of all bricks."""
+        return np.concatenate(
+            [np.zeros((0, 3), np.int64)]
+            + [chunk.bricks + np.array(key, np.int64) * CHUNK for key, chunk in self.chunks.items()]
+        )
+
+    def shown(self, key: ChunkKey, log_odds: float, cut: Cut | None) -> Shown:
+        """The voxels of a chunk that are at least so probable and not cut away; none if there is no chunk."""
+        chunk = self.chunks.get(key)
+        if chunk is None:
+            return Chunk().at_least(log_odds)
+        hidden_above = None
+        if cut is not None:
+            hidden_above = cut.axis, cut.voxel - key[cut.axis] * CHUNK_VOXELS
+        return chunk.at_least(log_odds, hidden_above)
+
+
+def _by_chunk(
+    bricks: NDArray[np.int32],
+) -> list[tuple[ChunkKey, NDArray[np.int16], NDArray[np.intp]]]:
+    """Bricks (n, 3) by chunk: its key, the bricks' numbers in it, and their rows."""
+    if not len(bricks):
+        return []
+    keys, inverse = np.unique(bricks // CHUNK, axis=0, return_inverse=True)
+    order = np.argsort(inverse.reshape(-1), kind="stable")
+    ends = np.cumsum(np.bincount(inverse.reshape(-1), minlength=len(keys)))
+    local = bricks % CHUNK
+    codes = ((local[:, 0] * CHUNK + local[:, 1]) * CHUNK + local[:, 2]).astype(np.int16)
+    return [
+        ((int(key[0]), int(key[1]), int(key[2])), codes[rows], rows)
+        for key, rows in zip(keys, np.split(order, ends[:-1]), strict=True)
+    ]

@@ -1,0 +1,67 @@
+"""Widgets made from a typed dataclass, so that a name, a range or a help text is written once."""
+
+import dataclasses
+import typing
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any, Generic, Literal, TypeVar
+
+import viser
+
+from taichi_mrf.config_text import field_help
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Range:
+    """The smallest and largest value of a slider, and its step."""
+
+    least: float
+    most: float
+    step: float
+
+
+class OptionWidgets(Generic[T]):
+    """One widget for each field of a dataclass: a slider for a number with a Range, a dropdown for a Literal,
+    a checkbox for a bool."""
+
+    def __init__(
+        self, gui: viser.GuiApi, options: T, changed: Callable[[], None], only: tuple[str, ...] = ()
+    ) -> None:
+        """Add the widgets for all fields, or ``only`` for these, at the place where the GUI stands.
+        ``changed`` is called, on some thread, after any of them was moved."""
+        cls: type[Any] = type(options)
+        hints = typing.get_type_hints(cls, include_extras=True)
+        texts = field_help(cls)
+        self._options: Any = options
+        self.handles: dict[str, Any] = {}
+        for field in dataclasses.fields(cls):
+            if only and field.name not in only:
+                continue
+            value = getattr(options, field.name)
+            handle = _widget(gui, label_of(field.name), hints[field.name], value, texts[field.name])
+            handle.on_update(lambda event: changed())
+            self.handles[field.name] = handle
+
+    def value(self) -> T:
+        """The options as the widgets stand."""
+        values = {name: handle.value for name, handle in self.handles.items()}
+        result: T = dataclasses.replace(self._options, **values)
+        return result
+
+
+def label_of(name: str) -> str:
+    """How a field is called on the page."""
+    return name.replace("_", " ").capitalize()
+
+
+def _widget(gui: viser.GuiApi, label: str, hint: Any, value: Any, text: str) -> Any:
+    if typing.get_origin(hint) is Annotated:
+        limits = next(each for each in typing.get_args(hint) if isinstance(each, Range))
+        return gui.add_slider(label, limits.least, limits.most, limits.step, value, hint=text)
+    if typing.get_origin(hint) is Literal:
+        return gui.add_dropdown(label, list(typing.get_args(hint)), initial_value=value, hint=text)
+    if hint is bool:
+        return gui.add_checkbox(label, value, hint=text)
+    raise TypeError(f"no widget for {label}: {hint}")
