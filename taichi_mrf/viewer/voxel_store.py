@@ -42,6 +42,8 @@ class Chunk:
     def __init__(self) -> None:
         self._row = np.full(CHUNK**3, _NOWHERE, np.int16)
         self._codes = np.zeros(0, np.int16)
+        # Where each voxel is in the chunk: kept, because finding it took half the time of drawing.
+        self._cells = np.zeros((0, VOXELS, 3), np.uint8)
         self.log_odds = np.zeros((0, VOXELS), np.int16)
         self.seen = np.zeros((0, VOXELS), np.uint8)
 
@@ -51,7 +53,7 @@ class Chunk:
     @property
     def bricks(self) -> NDArray[np.int32]:
         """Coordinates (n, 3) of the bricks in this chunk, 0..7."""
-        return np.stack(np.unravel_index(self._codes, (CHUNK,) * 3), axis=1).astype(np.int32)
+        return _bricks_of(self._codes)
 
     def put(self, codes: NDArray[np.int16], log_odds: NDArray[np.int16], seen: NDArray[np.uint8]) -> None:
         """Set the voxels of some bricks, known by their numbers in the chunk."""
@@ -59,6 +61,7 @@ class Chunk:
         if len(new):
             self._row[new] = np.arange(len(self), len(self) + len(new))
             self._codes = np.concatenate([self._codes, new])
+            self._cells = np.concatenate([self._cells, _cells_of(new)])
             more = len(new), VOXELS
             self.log_odds = np.concatenate([self.log_odds, np.zeros(more, np.int16)])
             self.seen = np.concatenate([self.seen, np.zeros(more, np.uint8)])
@@ -68,7 +71,7 @@ class Chunk:
     def remove(self, codes: NDArray[np.int16]) -> None:
         """Forget some bricks; those that are not there are no error."""
         keep = ~np.isin(self._codes, codes)
-        self._codes = self._codes[keep]
+        self._codes, self._cells = self._codes[keep], self._cells[keep]
         self.log_odds, self.seen = self.log_odds[keep], self.seen[keep]
         self._row[:] = _NOWHERE
         self._row[self._codes] = np.arange(len(self))
@@ -76,21 +79,32 @@ class Chunk:
     def at_least(self, log_odds: float, hidden_above: tuple[int, int] | None = None) -> Shown:
         """The voxels of at least these log-odds; with ``hidden_above`` = (axis, cell), only those whose
         cell along that axis is at most that."""
-        chosen = self.log_odds >= np.ceil(log_odds / LOG_ODDS_STEP)
-        rows, voxels = np.nonzero(chosen)
-        cells = (self.bricks.astype(np.uint8) * BRICK)[rows] + _IN_BRICK[voxels]
+        voxels = np.flatnonzero(self.log_odds.reshape(-1) >= np.ceil(log_odds / LOG_ODDS_STEP))
+        cells = self._cells.reshape(-1, 3)[voxels]
         if hidden_above is not None:
             kept = cells[:, hidden_above[0]] <= hidden_above[1]
-            rows, voxels, cells = rows[kept], voxels[kept], cells[kept]
-        return Shown(cells, self.log_odds[rows, voxels], self.seen[rows, voxels])
+            voxels, cells = voxels[kept], cells[kept]
+        return Shown(cells, self.log_odds.reshape(-1)[voxels], self.seen.reshape(-1)[voxels])
 
     def slab(self, axis: int, cell: int) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
         """The voxels of one layer of the chunk: cells (n, 2) along the other two axes, log-odds (n,)."""
         rows = np.flatnonzero(self.bricks[:, axis] == cell // BRICK)
         voxels = np.flatnonzero(_IN_BRICK[:, axis] == cell % BRICK)
-        cells = (self.bricks * BRICK)[rows][:, None] + _IN_BRICK[voxels]
         others = [other for other in range(3) if other != axis]
-        return cells[..., others].reshape(-1, 2), self.log_odds[np.ix_(rows, voxels)].reshape(-1)
+        layer = np.ix_(rows, voxels)
+        return self._cells[layer][..., others].reshape(-1, 2).astype(np.int32), self.log_odds[layer].reshape(
+            -1
+        )
+
+
+def _bricks_of(codes: NDArray[np.int16]) -> NDArray[np.int32]:
+    """Numbers of bricks in a chunk as coordinates (n, 3), 0..7."""
+    return np.stack(np.unravel_index(codes, (CHUNK,) * 3), axis=1).astype(np.int32)
+
+
+def _cells_of(codes: NDArray[np.int16]) -> NDArray[np.uint8]:
+    """The cells (n, 512, 3) in the chunk, 0..63, of the voxels of some bricks."""
+    return (_bricks_of(codes) * BRICK).astype(np.uint8)[:, None] + _IN_BRICK
 
 
 class VoxelStore:
