@@ -17,7 +17,7 @@ from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Keyframe, RayAnswer, pack_
 from taichi_mrf.viewer.options import ColorBy, ViewOptions
 from taichi_mrf.viewer.picking import first_pixel, first_voxel
 from taichi_mrf.viewer.ray_plot import curves
-from taichi_mrf.viewer.voxel_store import Shown, VoxelStore
+from taichi_mrf.viewer.voxel_store import Shown, VoxelStore, facing
 
 HEIGHTS = (0.0, 2.0)
 
@@ -177,3 +177,27 @@ def test_packed_steps_are_what_the_store_compares_with() -> None:
     p = 1 / (1 + math.exp(-0.39))
     assert len(store.shown((0, 0, 0), math.log(p / (1 - p)), None).cells) == 512
     assert len(store.shown((0, 0, 0), 0.41, None).cells) == 0
+
+
+def test_surfaces_are_darkened_by_the_way_they_face() -> None:
+    grid = np.zeros((64, 64, 64), bool)
+    grid[10, 5:15, 5:15] = True  # a wall across x
+    grid[40, 40, 40] = True
+    grid[63, 20:23, 20:23] = True  # at the chunk's end: the next chunk may go on
+    cells = np.argwhere(grid).astype(np.uint8)
+    numbers = facing(cells)
+    for cell, number in zip(cells.tolist(), numbers.tolist(), strict=True):
+        missing = [sum(not grid[tuple(c)] for c in neighbours(cell, axis)) for axis in range(3)]
+        assert number == (missing[0] * 3 + missing[1]) * 3 + missing[2]
+    scale = scale_of("marginal", 0.5, HEIGHTS)
+    bright = shown(np.full(3, 9.0))
+    plain = voxel_colors(scale, bright, np.zeros(3)).astype(float)
+    dark = voxel_colors(scale, bright, np.zeros(3), np.array([18, 2, 0], np.uint8)).astype(float)
+    assert np.all(dark[0] < 0.8 * plain[0] + 1)
+    np.testing.assert_array_equal(dark[1], plain[1])  # level surfaces stay as bright as the scale says
+
+
+def neighbours(cell: list[int], axis: int) -> list[list[int]]:
+    """The two next to a cell along an axis that are in the chunk."""
+    both = [[c + step * (a == axis) for a, c in enumerate(cell)] for step in (-1, 1)]
+    return [each for each in both if 0 <= each[axis] < 64]

@@ -2,6 +2,7 @@
 
 import base64
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -22,6 +23,15 @@ MOST_KEYFRAMES = 64
 """The bright end of the scale of keyframes, which is logarithmic."""
 
 
+_DARKENED = (0.75, 0.62, 1.0)
+"""The brightness of surfaces across x, y and z."""
+
+_ACROSS = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1)
+_SHADES = np.where(
+    _ACROSS.any(axis=1), _ACROSS @ _DARKENED / np.maximum(_ACROSS.sum(axis=1), 1), sum(_DARKENED) / 3
+)
+
+
 @dataclass(frozen=True)
 class Scale:
     """A colour scale: 256 colours (256, 3), the values at both ends, and what they are.
@@ -36,6 +46,11 @@ class Scale:
     high: float
     label: str
     table: NDArray[np.uint8] | None = None
+
+    @cached_property
+    def shaded(self) -> NDArray[np.uint8]:
+        """The colours, darkened for each way to face, (27 * 256, 3)."""
+        return (self.colors * _SHADES[:, None, None] + 0.5).astype(np.uint8).reshape(-1, 3)
 
     def legend(self) -> tuple[str, float, float]:
         """What tells one scale from another."""
@@ -60,13 +75,20 @@ def scale_of(color_by: ColorBy, threshold: float, heights_m: tuple[float, float]
     return Scale(color_by, colors, low, 1.0, "marginal probability", _numbers((p - low) / (1.0 - low)))
 
 
-def voxel_colors(scale: Scale, shown: Shown, heights_m: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Colours (n, 3) of a chunk's voxels, whose centres are at these heights (n,)."""
+def voxel_colors(
+    scale: Scale, shown: Shown, heights_m: NDArray[np.floating], facing: NDArray[np.uint8] | None = None
+) -> NDArray[np.uint8]:
+    """Colours (n, 3) of a chunk's voxels, whose centres are at these heights (n,); darkened by the way they
+    face, if that is given."""
     if scale.table is None:
         span = max(scale.high - scale.low, 1e-6)
-        return scale.colors[_numbers((heights_m - scale.low) / span)]
-    of = shown.seen if scale.color_by == "keyframes" else shown.log_odds.view(np.uint16)
-    return scale.colors[scale.table[of]]
+        numbers = _numbers((heights_m - scale.low) / span)
+    else:
+        of = shown.seen if scale.color_by == "keyframes" else shown.log_odds.view(np.uint16)
+        numbers = scale.table[of]
+    if facing is None:
+        return scale.colors[numbers]
+    return scale.shaded[facing.astype(np.int32) * 256 + numbers]
 
 
 def legend_html(scale: Scale) -> str:

@@ -9,6 +9,9 @@ from taichi_mrf.viewer.look import Up, up_vector
 from taichi_mrf.viewer.voxel_store import VoxelStore
 from taichi_mrf.voxels.layout import BRICK
 
+_GROWTH = 1.2
+"""The first view is chosen anew when the map has grown by this factor."""
+
 _BEHIND_M, _ABOVE_M, _AHEAD_M = 1.5, 0.7, 2.0
 
 
@@ -20,19 +23,22 @@ class Eye:
         self.up: Up = (2, 1)
         self._camera: Pose | None = None
         self._seen_size = 0.0
-        self._waiting: set[int] = set()
+        self._view: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        self._placed: dict[int, NDArray[np.float64]] = {}
 
     def set_up(self, up: Up) -> None:
         """Which way is up, from the first keyframe on."""
         self.up = up
-        self._seen_size = 0.0
-        self._waiting = set(self._server.get_clients())
+        self._seen_size, self._view = 0.0, None
         self._server.scene.set_up_direction(up_vector(up))
 
     def joined(self, client: int) -> None:
-        """A browser that comes before there is a map gets its first view when there is one."""
-        if self._seen_size == 0.0:
-            self._waiting.add(client)
+        """Give a new browser the view that the others began with, once there is one."""
+        handle = self._server.get_clients().get(client)
+        if handle is not None:
+            self._placed[client] = handle.camera.position
+            if self._view is not None:
+                self._point(handle, *self._view)
 
     def camera_moved(self, T_world_camera: Pose, follow: bool) -> None:
         """Remember the mapping camera, and look over its shoulder if ``follow``."""
@@ -46,31 +52,29 @@ class Eye:
             self._point(client, eye, target)
 
     def map_grew(self, store: VoxelStore, voxel_size: float) -> None:
-        """Set the view of those who come later to one that has the whole map in it, and give it at once to
-        those who came before there was a map."""
+        """Look at the whole map: those who come later, and those who have not moved their view yet."""
         bounds = store.bounds()
         if bounds is None or self._camera is None:
             return
         low, high = bounds[0] * BRICK * voxel_size, (bounds[1] + 1) * BRICK * voxel_size
         size = float(np.linalg.norm(high - low))
-        if size < 1.2 * self._seen_size:
+        if size < _GROWTH * self._seen_size:
             return
         self._seen_size = size
         centre = (low + high) / 2
-        backwards = self._camera[:3, 3] - centre
         up = up_vector(self.up)
-        backwards = backwards - up * (backwards @ up)
+        backwards = self._camera[:3, 3] - centre
+        backwards -= up * (backwards @ up)
         length = float(np.linalg.norm(backwards))
         if length < 0.05 * size:  # a camera in the middle: from any side
             backwards, length = np.roll(up, 1), 1.0
-        eye = centre + 0.55 * size * backwards / length + 0.5 * size * up
+        eye = centre + 0.6 * size * backwards / length + 0.55 * size * up
+        self._view = eye, centre
         start = self._server.initial_camera
         start.position, start.look_at = eye, centre
-        for client in self._server.get_clients().values():
-            if client.client_id in self._waiting:
+        for id, client in self._server.get_clients().items():
+            if np.allclose(client.camera.position, self._placed.get(id, np.inf), atol=1e-3):
                 self._point(client, eye, centre)
-        if len(store.chunks) > 1:
-            self._waiting.clear()
 
     def _point(
         self, client: viser.ClientHandle, eye: NDArray[np.float64], target: NDArray[np.float64]
@@ -79,3 +83,4 @@ class Eye:
             client.camera.up_direction = up_vector(self.up)
             client.camera.position = eye
             client.camera.look_at = target
+        self._placed[client.client_id] = eye

@@ -37,6 +37,7 @@ def look_of(options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float) 
         cut=cut,
         scale=scale_of(options.color_by, options.threshold, _heights_m(store, up, voxel_size)),
         point_size=options.size,
+        shade=options.shade,
         up=up,
     )
 

@@ -24,6 +24,9 @@ class ViewOptions:
     size: Annotated[float, Range(0.2, 2.0, 0.05)] = 1.0
     """Size of the points, in voxels."""
 
+    shade: bool = True
+    """Darken voxels a little by the way their surface faces, so that shapes are easier to see."""
+
     cut_axis: CutAxis = "none"
     """Cut the map open across this axis; the cut shows what is free (blue), occupied (yellow) and unknown
     (nothing)."""

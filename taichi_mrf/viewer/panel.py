@@ -26,7 +26,7 @@ SPEEDS = {"as fast as it goes": 0.0, "0.25x": 0.25, "0.5x": 0.5, "1x": 1.0, "2x"
 CURRENT_CAMERA, CHOSEN_KEYFRAME = "current camera", "chosen keyframe"
 NO_KEYFRAME = "none yet"
 
-_MAP_OPTIONS = ("color_by", "threshold", "size", "cut_axis", "cut_at", "bricks", "beside")
+_MAP_OPTIONS = ("color_by", "threshold", "size", "shade", "cut_axis", "cut_at", "bricks", "beside")
 _PAGE_OPTIONS = ("follow", "pictures", "dark")
 _MOST_NOTICES = 6
 _LISTED_KEYFRAMES = 500

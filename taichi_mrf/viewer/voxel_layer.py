@@ -7,7 +7,7 @@ import viser
 from numpy.typing import NDArray
 
 from taichi_mrf.viewer.coloring import Scale, voxel_colors
-from taichi_mrf.viewer.voxel_store import ChunkKey, Cut, VoxelStore
+from taichi_mrf.viewer.voxel_store import ChunkKey, Cut, VoxelStore, facing
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
 NOTICEABLE = 12
@@ -23,13 +23,15 @@ class Look:
     scale: Scale
     point_size: float
     """In voxels."""
+    shade: bool
     up: tuple[int, int]
     """The axis that points up, and 1 or -1 for its direction."""
 
     def same_everywhere(self, other: "Look") -> bool:
         """Whether a voxel that has not changed looks the same."""
         mine, others = (
-            (look.log_odds, look.cut, look.point_size, look.up, look.scale.legend()) for look in (self, other)
+            (look.log_odds, look.cut, look.point_size, look.shade, look.up, look.scale.legend())
+            for look in (self, other)
         )
         return mine == others
 
@@ -106,7 +108,8 @@ class VoxelLayer:
             return
         axis, sign = look.up
         heights = sign * (key[axis] * CHUNK_VOXELS + 0.5 + shown.cells[:, axis]) * self._voxel_size
-        now = _Sent(shown.cells, voxel_colors(look.scale, shown, heights), look.point_size)
+        faces = facing(shown.cells) if look.shade else None
+        now = _Sent(shown.cells, voxel_colors(look.scale, shown, heights, faces), look.point_size)
         if before is not None and np.array_equal(before.cells, now.cells):
             moved = np.abs(before.colors.astype(np.int16) - now.colors).max()
             if before.point_size != now.point_size:
@@ -126,7 +129,7 @@ class VoxelLayer:
             points=now.cells.astype(np.float16),
             colors=now.colors,
             point_size=now.point_size,
-            point_shape="rounded",
+            point_shape="square",
             precision="float16",
             scale=self._voxel_size,
             position=self._position(key),

@@ -36,6 +36,23 @@ class Cut:
     voxel: int
 
 
+def facing(cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Which way the surface faces that each shown voxel (n, 3) of a chunk is part of, by the neighbours that
+    it lacks: (a * 3 + b) * 3 + c, (n,), where a, b, c = 0..2 are those missing along x, y, z. Neighbours in
+    other chunks count as there."""
+    side = CHUNK_VOXELS + 2
+    grid = np.ones((side,) * 3, np.uint8)
+    grid[1:-1, 1:-1, 1:-1] = 0
+    here = (cells + 1).astype(np.int32) @ np.array([side * side, side, 1], np.int32)
+    there = grid.reshape(-1)
+    there[here] = 1
+    number = np.zeros(len(cells), np.uint8)
+    for step in (side * side, side, 1):
+        number *= 3
+        number += 2 - there[here - step] - there[here + step]
+    return number
+
+
 class Chunk:
     """The bricks of one chunk, in no particular order."""
 
