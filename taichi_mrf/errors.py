@@ -34,3 +34,7 @@ class KeyframeError(TaichiMRFError):
 
 class MapFileError(TaichiMRFError):
     """A saved map cannot be read or written; the text names the file."""
+
+
+class ViewerError(TaichiMRFError):
+    """The page cannot be served, or viser is not the version that it is guarded against."""

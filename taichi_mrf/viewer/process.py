@@ -8,7 +8,7 @@ import threading
 from multiprocessing.connection import Connection
 from typing import Any
 
-from taichi_mrf.errors import TaichiMRFError
+from taichi_mrf.errors import ViewerError
 from taichi_mrf.viewer.messages import Listening, Notice, Quit, Request
 from taichi_mrf.viewer.page import Page
 from taichi_mrf.viewer.server import start_server
@@ -25,7 +25,7 @@ def run_viewer(connection: "Connection[Any, Any]", host: str, port: int) -> None
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     try:
         server = start_server(host, port, TITLE)
-    except TaichiMRFError as error:
+    except ViewerError as error:
         connection.send(Notice(str(error), "error"))
         return
     lock = threading.Lock()

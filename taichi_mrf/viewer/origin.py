@@ -1,0 +1,101 @@
+"""Who may talk to the viewer: which requests may become websockets, and what pages may be asked for.
+
+A browser lets any page open a websocket to any address, and a name can be made to point at this machine
+after the page was loaded (DNS rebinding). So the page that asks must come from the very address it talks
+to, and that address must be one that nobody else can hand out.
+"""
+
+import http
+import ipaddress
+import re
+import socket
+from collections.abc import Callable
+from urllib.parse import urlsplit
+
+from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+PAGE_HEADERS = {"X-Frame-Options": "DENY", "X-Content-Type-Options": "nosniff"}
+"""No foreign page may hold ours in a frame, and no browser may guess what kind of file it got."""
+
+Pages = Callable[[ServerConnection, Request], Response | None]
+"""What serves the client's files; None where a request is for a websocket."""
+
+DEFAULT_PORTS = {"http": 80, "https": 443}
+
+_PLAIN_PATH = re.compile(r"(/[A-Za-z0-9_-][A-Za-z0-9._-]*)*/?", re.ASCII)
+"""All that the client build needs: no parent folder, percent, backslash or NUL can be spelled in this."""
+
+
+def refusal(headers: Headers, host: str) -> str | None:
+    """Why a request with these headers may not become a websocket; None if it may.
+
+    ``host`` is the name or address that the server was asked to listen on. Works through an ssh tunnel:
+    the browser puts the tunnel's port both into Host and into Origin.
+    """
+    origins, hosts = headers.get_all("Origin"), headers.get_all("Host")
+    if len(origins) != 1:
+        return "exactly one Origin is needed"
+    unknown = unknown_name(headers, host)
+    if unknown is not None:
+        return unknown
+    try:
+        origin, addressed = urlsplit(origins[0]), urlsplit(f"//{hosts[0]}")
+        default_port = DEFAULT_PORTS[origin.scheme]
+        from_page = (origin.hostname, origin.port or default_port)
+        to_server = (addressed.hostname, addressed.port or default_port)
+    except (KeyError, ValueError):
+        return "the Origin cannot be read"
+    if origins[0] != f"{origin.scheme}://{origin.netloc}" or "@" in origin.netloc:
+        return "the Origin cannot be read"
+    return None if from_page == to_server else "the page comes from another address"
+
+
+def unknown_name(headers: Headers, host: str) -> str | None:
+    """Why the name in the Host header is none of ours; None if it is.
+
+    A stranger's name server can point any name at this machine, but no address, not localhost, and not
+    what this machine calls itself.
+    """
+    hosts = headers.get_all("Host")
+    try:
+        (addressed,) = (urlsplit(f"//{each}") for each in hosts)
+        name, _ = addressed.hostname, addressed.port
+    except ValueError:
+        return "exactly one Host is needed, as name or name:port"
+    if name is None or hosts[0] != addressed.netloc or "@" in addressed.netloc:
+        return "the Host cannot be read"
+    if _is_address(name) or name == "localhost" or name.endswith(".localhost"):
+        return None
+    if name in {socket.gethostname().lower(), host.lower()}:
+        return None
+    return "the viewer is not known by this name; use the machine's IP address, or start it with --host NAME"
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def answer_page(connection: ServerConnection, request: Request, pages: Pages) -> Response | None:
+    """What ``pages`` answers to a request for a file, made safe; None where it sees a websocket's request.
+
+    Paths that are not plain never reach ``pages``, and whatever it makes of the others comes with
+    :data:`PAGE_HEADERS`.
+    """
+    if _PLAIN_PATH.fullmatch(request.path.partition("?")[0]):
+        try:
+            response = pages(connection, request)
+        except (LookupError, OSError, ValueError):
+            response = connection.respond(http.HTTPStatus.NOT_FOUND, "Not found.\n")
+        if response is None:
+            return None
+    else:
+        response = connection.respond(http.HTTPStatus.NOT_FOUND, "Not found.\n")
+    for name, value in PAGE_HEADERS.items():
+        response.headers[name] = value
+    return response
