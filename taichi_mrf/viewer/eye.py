@@ -6,8 +6,6 @@ from numpy.typing import NDArray
 
 from taichi_mrf.poses import Pose
 from taichi_mrf.viewer.look import Up, up_vector
-from taichi_mrf.viewer.voxel_store import VoxelStore
-from taichi_mrf.voxels.layout import BRICK
 
 _GROWTH = 1.2
 """The first view is chosen anew when the map has grown by this factor."""
@@ -51,24 +49,27 @@ class Eye:
         for client in self._server.get_clients().values():
             self._point(client, eye, target)
 
-    def map_grew(self, store: VoxelStore, voxel_size: float) -> None:
-        """Look at the whole map: those who come later, and those who have not moved their view yet."""
-        bounds = store.bounds()
-        if bounds is None or self._camera is None:
-            return
-        low, high = bounds[0] * BRICK * voxel_size, (bounds[1] + 1) * BRICK * voxel_size
+    def look_at_everything(self) -> None:
+        """Choose the view anew, for everybody: what there is to see has changed."""
+        self._seen_size = 0.0
+        for id, client in self._server.get_clients().items():
+            self._placed[id] = client.camera.position
+
+    def map_grew(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+        """Look at the whole box from ``low`` to ``high`` (metres): those who come later, and those who have
+        not moved their view yet."""
         size = float(np.linalg.norm(high - low))
-        if size < _GROWTH * self._seen_size:
+        if self._camera is None or size < _GROWTH * self._seen_size:
             return
         self._seen_size = size
         centre = (low + high) / 2
         up = up_vector(self.up)
-        backwards = self._camera[:3, 3] - centre
-        backwards -= up * (backwards @ up)
-        length = float(np.linalg.norm(backwards))
-        if length < 0.05 * size:  # a camera in the middle: from any side
-            backwards, length = np.roll(up, 1), 1.0
-        eye = centre + 0.6 * size * backwards / length + 0.55 * size * up
+        # Across the shorter level side, so that the longer one lies across the screen, and a little aslant.
+        level = [axis for axis in range(3) if axis != self.up[0]]
+        short, long = sorted(level, key=lambda axis: high[axis] - low[axis])
+        aside = np.zeros(3)
+        aside[short], aside[long] = np.sign(self._camera[short, 3] - centre[short]) or 1.0, 0.35
+        eye = centre + 0.5 * size * aside / np.linalg.norm(aside) + 0.7 * size * up
         self._view = eye, centre
         start = self._server.initial_camera
         start.position, start.look_at = eye, centre

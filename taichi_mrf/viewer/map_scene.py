@@ -28,8 +28,11 @@ _GAP_M = 0.5
 """Between the map and the one beside it."""
 
 
+_NAMES: dict[Layer, str] = {"map": "this map", "beside": "OctoMap's way"}
+
+
 class MapScene:
-    """Owns the scene nodes /voxels, /beside, /cut and /bricks."""
+    """Owns the scene nodes /voxels, /beside, /cut, /bricks and /names."""
 
     def __init__(self, server: viser.ViserServer, hello: Hello) -> None:
         self._server, self._hello = server, hello
@@ -54,6 +57,19 @@ class MapScene:
         """The colours in use; None before anything was drawn."""
         return None if self._look is None else self._look.scale
 
+    def box_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Lowest and highest corner of all that is shown, in metres; None if that is nothing."""
+        corners = []
+        for layer in self.layers.values():
+            bounds = layer.store.bounds()
+            if bounds is not None:
+                ends = np.stack([bounds[0], bounds[1] + 1]) * BRICK * self._hello.voxel_size
+                corners.append(ends + layer.origin_m)
+        if not corners:
+            return None
+        every = np.concatenate(corners)
+        return every.min(axis=0), every.max(axis=0)
+
     def take(self, bricks: Bricks) -> None:
         """Remember what the mapper says; it is drawn by :meth:`flush`."""
         store = self.layers[bricks.layer].store
@@ -72,6 +88,8 @@ class MapScene:
             layer.clear()
         self._cut_plane.hide()
         self._brick_lines.hide()
+        for name in _NAMES:
+            self._server.scene.remove_by_name(f"/names/{name}")
 
     def patience(self) -> float | None:
         """Seconds until :meth:`flush` has something to do if nothing happens; None: there is nothing."""
@@ -94,16 +112,19 @@ class MapScene:
         look = look_of(options, self.store, up, self._hello.voxel_size)
         # A scale of heights or a cut that moves with the map's size changes every chunk.
         everything = self._all_dirty or (self._look is not None and not look.same_everywhere(self._look))
-        voxels_changed = everything or bool(self._dirty["map"])
+        map_changed = everything or bool(self._dirty["map"])
+        any_changed = map_changed or bool(self._dirty["beside"])
         with self._server.atomic():
             for name, layer in self.layers.items():
                 chunks = layer.all_chunks() if everything else self._dirty[name]
                 layer.refresh(chunks | (layer.inexact() if rested else set()), look, exactly=rested)
                 self._dirty[name] = set()
-            if voxels_changed:
+            if map_changed:
                 self._draw_cut(look, crossed)
                 self._brick_lines.show(self.store.bricks() if options.bricks else None)
+            if any_changed:
                 self.layers["beside"].place(self._beside_m(up))
+                self._draw_names(up)
         self._look, self._all_dirty, self._sent_at = look, False, time.monotonic()
         return True
 
@@ -115,6 +136,22 @@ class MapScene:
             self.store, look.cut, self._hello.prior_log_odds, self._hello.min_evidence, crossed
         )
         self._cut_plane.show(self.store, look.cut, picture)
+
+    def _draw_names(self, up: Up) -> None:
+        """Say which map is which, above them, if there are two."""
+        two = bool(self.layers["beside"].store.chunks)
+        for layer, text in _NAMES.items():
+            if not two:
+                self._server.scene.remove_by_name(f"/names/{layer}")
+                continue
+            bounds = self.layers[layer].store.bounds()
+            if bounds is None:
+                continue
+            ends = np.stack([bounds[0], bounds[1] + 1]) * BRICK * self._hello.voxel_size
+            above = ends.mean(axis=0) + self.layers[layer].origin_m
+            axis, sign = up
+            above[axis] = ends[:, axis].max() if sign > 0 else ends[:, axis].min()
+            self._server.scene.add_label(f"/names/{layer}", text, position=above)
 
     def _beside_m(self, up: Up) -> NDArray[np.float64]:
         """How far the other map is shifted: past this one, along a level axis."""

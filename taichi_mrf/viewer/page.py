@@ -127,7 +127,9 @@ class Page:
         crossed = [k.crossed for k in self._keyframes.keyframes.values() if k.state != "off"]
         if not self._map.flush(self._options, self._eye.up, crossed):
             return
-        self._eye.map_grew(self._map.store, self._voxel_size)
+        box = self._map.box_m()
+        if box is not None:
+            self._eye.map_grew(*box)
         shown = {name: layer.voxels_shown for name, layer in self._map.layers.items()}
         self._panel.show_counts(shown["map"], shown["beside"], self._downloads.is_recording)
         scale = self._map.scale
@@ -149,6 +151,7 @@ class Page:
             )
         if self._options.beside != before.beside:
             self._watch()
+            self._eye.look_at_everything()
         self._keyframes.show_pictures(self._options.pictures)
         if self._map is not None:
             self._map.look_changed()
