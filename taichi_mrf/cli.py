@@ -13,11 +13,12 @@ from taichi_mrf.commands.calibrate import Calibrate
 from taichi_mrf.commands.eval import Eval
 from taichi_mrf.commands.flags import registry
 from taichi_mrf.commands.info import Info
+from taichi_mrf.commands.live import Live
 from taichi_mrf.commands.map import Map, file_settings
 from taichi_mrf.errors import TaichiMRFError
 
 PROGRAM = "taichi-mrf"
-COMING = ("live", "tune")
+COMING = ("tune",)
 """Applications whose place is taken, but which a later version brings."""
 
 BAD_INPUT = 2
@@ -49,9 +50,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return ABORTED
 
 
-def parse(arguments: Sequence[str]) -> Map | Info | Bench | Calibrate | Eval:
+def parse(arguments: Sequence[str]) -> Map | Live | Info | Bench | Calibrate | Eval:
     """The command that the arguments ask for. Exits with status 2 where they cannot be parsed."""
-    settings = file_settings(arguments[1:]) if arguments[:1] == ["map"] else file_settings([])
+    settings = file_settings(arguments[1:]) if arguments[:1] in (["map"], ["live"]) else file_settings([])
     commands = (
         Annotated[
             Map,
@@ -59,6 +60,7 @@ def parse(arguments: Sequence[str]) -> Map | Info | Bench | Calibrate | Eval:
                 "map", default=Map(tyro.MISSING, tyro.MISSING, settings=settings), prefix_name=False
             ),
         ]
+        | Annotated[Live, tyro.conf.subcommand("live", default=Live(settings=settings), prefix_name=False)]
         | Annotated[Info, tyro.conf.subcommand("info", prefix_name=False)]
         | Annotated[Bench, tyro.conf.subcommand("bench", default=Bench(), prefix_name=False)]
         | Annotated[Calibrate, tyro.conf.subcommand("calibrate", prefix_name=False)]

@@ -155,7 +155,7 @@ def _add_keyframes(
         if names[index] in mapped:
             listener(FramePassed(*place, reason="in the map already"))
             continue
-        if _is_held_out(number, config.evaluation.hold_out):
+        if is_held_out(number, config.evaluation.hold_out):
             result.held_out.append(index)
             listener(FramePassed(*place, reason="kept out to check the map"))
             continue
@@ -193,7 +193,7 @@ def _infer(result: MappingResult, listener: Listener, should_stop: Callable[[], 
     result.sweeps, result.residual = report.sweeps, report.residual
 
 
-def _is_held_out(number: int, hold_out: int) -> bool:
+def is_held_out(number: int, hold_out: int) -> bool:
     """Whether the ``number``-th frame (from 1) is kept out: the middle one of each ``hold_out``."""
     return hold_out > 0 and (number - 1) % hold_out == hold_out // 2
 

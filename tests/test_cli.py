@@ -113,7 +113,7 @@ def test_version_and_info() -> None:
         assert word in done.stdout
 
 
-@pytest.mark.parametrize("name", ["live", "tune"])
+@pytest.mark.parametrize("name", ["tune"])
 def test_what_comes_later_says_so(name: str, repository: Path) -> None:
     assert_refused(taichi_mrf(name), f"{name} is not in this version yet")
     environment = {**os.environ, "PYTHONPATH": str(repository)}

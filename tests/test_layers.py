@@ -24,10 +24,11 @@ FLOORS = [
         "",
     },
     {"sensor", "keyframes"},
-    {"inference", "queries", "datasets", "export"},
+    {"inference", "queries", "datasets", "export", "viewer"},
     {"maps"},
     {"pipeline"},
     {"evaluation", "calibration"},
+    {"live"},
     {"commands", "cli", "__main__"},
 ]
 """From the ground up; the empty name is the package itself, which loads its public names when asked."""

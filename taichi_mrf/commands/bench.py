@@ -2,9 +2,12 @@
 
 import dataclasses
 import json
+import statistics
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -12,9 +15,11 @@ from taichi_mrf.config import Config
 from taichi_mrf.errors import ConfigError
 
 if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
     from rich.table import Table
 
     from taichi_mrf.evaluation.bench import BenchRow
+    from taichi_mrf.live.bench import ViewerRow
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,9 @@ class Bench:
 
     octomap: bool = True
     """Insert the same frames into OctoMap, where the extra 'bench' is installed."""
+
+    viewer: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Measure instead what each keyframe costs the live view: time on the server and bytes to a browser."""
 
     json: Path | None = None
     """Write the figures to this file as well."""
@@ -52,16 +60,17 @@ class Bench:
         from taichi_mrf.datasets import open_dataset
         from taichi_mrf.evaluation.bench import bench_mapping, octomap_available
         from taichi_mrf.export.atomic import write_text
+        from taichi_mrf.live.bench import bench_viewer
 
         console = Console()
         configs = [dataclasses.replace(self.settings, voxel_size=size) for size in self.voxel_sizes]
-        with_octomap = self.octomap and octomap_available()
-        if self.octomap and not with_octomap:
+        with_octomap = self.octomap and not self.viewer and octomap_available()
+        if self.octomap and not self.viewer and not with_octomap:
             console.print("OctoMap is left out: pip install 'taichi-mrf[bench]' brings it.", markup=False)
         runtime.init(self.settings.runtime.arch, self.settings.runtime.threads, self.settings.runtime.debug)
         dataset = open_dataset(self.source, color=False)
         count = min(self.frames, len(dataset))
-        rows = []
+        rows, viewer_rows = [], []
         with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
             reading = progress.add_task("reading", total=count)
             frames = []
@@ -70,24 +79,56 @@ class Bench:
                 progress.advance(reading)
             for config in configs:
                 task = progress.add_task(f"{config.voxel_size:g} m", total=count)
-                rows.append(
-                    bench_mapping(
-                        frames,
-                        config,
-                        with_octomap,
-                        lambda done, task=task: progress.update(task, completed=done),  # type: ignore[misc]
-                    )
-                )
+                advance = partial(_advance, progress, task)
+                if self.viewer:
+                    viewer_rows.append(bench_viewer(frames, config, advance))
+                else:
+                    rows.append(bench_mapping(frames, config, with_octomap, advance))
         choice = runtime.choice()
         where = f"{choice.name}, {choice.device}" if choice else ""
-        console.print(bench_table(rows, f"{self.source}, {count} keyframes, on {where}"))
+        title = f"{self.source}, {count} keyframes, on {where}"
+        console.print(
+            viewer_table(self.voxel_sizes, viewer_rows, title) if self.viewer else bench_table(rows, title)
+        )
         if self.json is not None:
-            figures = [
+            figures: list[Any] = [
                 dataclasses.asdict(row) | {"ratio": row.ratio, "ratio_in_full": row.ratio_in_full}
                 for row in rows
             ]
+            for size, keyframes in zip(self.voxel_sizes, viewer_rows, strict=bool(viewer_rows)):
+                figures.append(
+                    {"voxel_size": size, "keyframes": [dataclasses.asdict(row) for row in keyframes]}
+                )
             write_text(self.json, json.dumps({"device": where, "rows": figures}, indent=2) + "\n")
         return 0
+
+
+def _advance(progress: "Progress", task: "TaskID", done: int) -> None:
+    progress.update(task, completed=done)
+
+
+def viewer_table(voxel_sizes: Sequence[float], benches: "list[list[ViewerRow]]", title: str) -> "Table":
+    """One column for each voxel size: medians over keyframes, and the largest."""
+    from rich.table import Table
+
+    table = Table(title=f"Live view: {title}", title_justify="left")
+    table.add_column("a keyframe: median (largest)")
+    for size in voxel_sizes:
+        table.add_column(f"{size * 100:g} cm", justify="right")
+
+    def line(name: str, figure: str, scale: float, digits: int) -> None:
+        texts = []
+        for rows in benches:
+            values = [getattr(row, figure) * scale for row in rows]
+            texts.append(f"{statistics.median(values):,.{digits}f} ({max(values):,.{digits}f})")
+        table.add_row(name, *texts)
+
+    line("find the changes, ms", "publish", 1e3, 1)
+    line("draw them, ms", "draw", 1e3, 1)
+    line("changed bricks", "changed", 1, 0)
+    line("sent to a browser, MB", "sent", 1e-6, 2)
+    table.add_row("voxels shown in the end", *[f"{rows[-1].shown:,}" for rows in benches])
+    return table
 
 
 def bench_table(rows: "list[BenchRow]", title: str) -> "Table":

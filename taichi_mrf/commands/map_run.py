@@ -36,7 +36,7 @@ MAY_CHANGE = ("inference.sweeps", "inference.tolerance", "runtime.")
 
 LOOK_AT_PICTURES = "Look at the .png files, or open"
 OPEN_VOXELS = "voxels.ply in MeshLab, CloudCompare or Blender."
-LIVE_VIEW = "The live view, taichi-mrf live, comes with the next version."
+LIVE_VIEW = "shows the map in the browser."
 
 _PICTURED_FRAMES = 3
 
@@ -77,7 +77,8 @@ def run_map(options: Map) -> int:
         write_text(options.out / REPORT_FILE, report_json(report))
         print_report(console, report, [*written, options.out / REPORT_FILE])
         look = LOOK_AT_PICTURES if options.pictures else "Open"
-        console.print(f"{look} {OPEN_VOXELS} {LIVE_VIEW}", highlight=False)
+        live = f"taichi-mrf live {options.out / MAP_FILE} {LIVE_VIEW}"
+        console.print(f"{look} {OPEN_VOXELS} {live}", highlight=False, markup=False)
     return _exit_status(request)
 
 

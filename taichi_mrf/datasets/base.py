@@ -4,6 +4,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.errors import DatasetError
@@ -47,6 +48,10 @@ class Dataset(ABC):
     camera: PinholeCamera
     notes: list[str] = field(default_factory=list)
     dropped: int = 0
+
+    endless: ClassVar[bool] = False
+    """Whether frames come as long as they are asked for, as from a camera: then len says nothing, frames
+    cannot be read again, and an error other than FrameError is the end."""
 
     @property
     @abstractmethod

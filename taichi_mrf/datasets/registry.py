@@ -14,6 +14,7 @@ from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.datasets import (
     mesh_sequence,
     numbered_depth,
+    realsense,
     seven_scenes,
     stereo_pairs,
     synthetic_room,
@@ -41,6 +42,7 @@ FOLDER_FORMATS: tuple[FolderFormat, ...] = (seven_scenes, tum_rgbd, numbered_dep
 _BUILT_IN: dict[str, Callable[[str, ReadOptions], Dataset]] = {
     synthetic_room.NAME: synthetic_room.open_synthetic_room,
     mesh_sequence.NAME: mesh_sequence.open_mesh,
+    realsense.NAME: realsense.open_realsense,
 }
 """Name -> what opens it, given the text after the name's question mark, or after a name that ends in ':'."""
 

@@ -1,12 +1,16 @@
-"""A keyframe's messages, kept in step with the bricks that it sees."""
+"""Keyframes' messages: kept in step with the bricks that they see, and counted."""
+
+from collections.abc import Iterable
 
 import numpy as np
 import taichi as ti
+from numpy.typing import NDArray
 
 from taichi_mrf import runtime
 from taichi_mrf.inference.keyframe import VisibleBricks
 from taichi_mrf.voxels.layout import VOXELS
-from taichi_mrf.voxels.types import AnyArray, I32Array
+from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.types import F32, AnyArray, F32Array, I32Array
 
 
 def new_messages(visible: VisibleBricks, precision: str) -> "ti.Ndarray":
@@ -26,6 +30,46 @@ def carry_over(
     same = (old.cells[place] == visible.cells) & (old.identity[place] == visible.identity)
     _copy_bricks(np.where(same, place, -1).astype(np.int32), old_messages, messages)
     runtime.settle()  # before the old ones are dropped
+
+
+def count_voices(
+    slots: NDArray[np.int32], spoken: Iterable[tuple[VisibleBricks, "ti.Ndarray"]], pool: BrickPool
+) -> NDArray[np.uint8]:
+    """How many keyframes say something of each voxel of some bricks, (n,) -> (n, 512); 255 is "or more".
+
+    ``spoken`` are the keyframes' lists with their messages. What has been frozen counts as one.
+    """
+    if len(slots) == 0:
+        return np.zeros((0, VOXELS), np.uint8)
+    row_of = np.full(pool.capacity, -1, np.int32)
+    row_of[slots] = np.arange(len(slots))
+    counts = ti.ndarray(ti.i32, len(slots) * VOXELS)
+    counts.fill(0)
+    for visible, messages in spoken:
+        rows = row_of[visible.slots]
+        rows[pool.identity[visible.slots] != visible.identity] = -1  # the slot has changed hands
+        places = np.flatnonzero(rows >= 0).astype(np.int32)
+        if len(places):
+            _count_messages(places, np.ascontiguousarray(rows[places]), messages, counts)
+    if pool.evidence is not None:
+        _count_evidence(slots, pool.evidence, pool.prior_log_odds, counts)
+    result = np.minimum(counts.to_numpy(), 255).astype(np.uint8).reshape(-1, VOXELS)
+    runtime.settle()  # before the counts are dropped
+    return result
+
+
+@ti.kernel
+def _count_messages(places: I32Array, rows: I32Array, messages: AnyArray, counts: I32Array):
+    for i in range(places.shape[0] * VOXELS):
+        if messages[places[i // VOXELS] * VOXELS + i % VOXELS] != 0:
+            counts[rows[i // VOXELS] * VOXELS + i % VOXELS] += 1
+
+
+@ti.kernel
+def _count_evidence(slots: I32Array, evidence: F32Array, prior: F32, counts: I32Array):
+    for i in range(slots.shape[0] * VOXELS):
+        if evidence[slots[i // VOXELS] * VOXELS + i % VOXELS] != prior:
+            counts[i] += 1
 
 
 @ti.kernel

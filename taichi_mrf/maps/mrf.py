@@ -23,10 +23,11 @@ from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.footprint import find_footprint
 from taichi_mrf.inference.keyframe import DepthImage, Keyframe, checked_depth
-from taichi_mrf.inference.messages import carry_over, new_messages
+from taichi_mrf.inference.messages import carry_over, count_voices, new_messages
 from taichi_mrf.inference.schedule import InferReport, Progress, content_key, run_sweeps
 from taichi_mrf.inference.sweep import Sweeper, unknown_begins
 from taichi_mrf.maps.brick_book import BrickBook
+from taichi_mrf.maps.checkpoint import Checkpoint, go_back, take_checkpoint
 from taichi_mrf.maps.map_file import MapHeader, StoredKeyframe
 from taichi_mrf.maps.statistics import MapStatistics, measure
 from taichi_mrf.maps.storage import MapContents, read_contents, write_contents
@@ -157,6 +158,7 @@ class MRFMap:
         if len(keyframe.visible.slots):
             sum_product.fold(keyframe.visible.slots, self._pool.keep_evidence(), messages)
         self._book.freeze(keyframe.footprint)
+        self._pool.touch(keyframe.visible.slots)
         runtime.settle()  # before its arrays are dropped
         self._frozen[id] = keyframe.name
         del self._keyframes[id]
@@ -182,6 +184,8 @@ class MRFMap:
             chosen = sorted(self._keyframes.values(), key=content_key)
             self._pool.restart()
             for keyframe in chosen:
+                # A ray that starts further out rounds otherwise, so what earlier sweeps learnt must not show.
+                keyframe.begins, keyframe.begins_known = unknown_begins(keyframe.image), False
                 keyframe.messages = None
                 self._refresh(keyframe)
             self._messages_lost = False
@@ -190,7 +194,24 @@ class MRFMap:
             self._restore_messages()
             for keyframe in chosen:
                 self._refresh(keyframe)
+        for keyframe in chosen:
+            self._pool.touch(keyframe.visible.slots)
         return run_sweeps(chosen, self._pool, self._sweeper, sweeps, tolerance, progress)
+
+    def checkpoint(self) -> Checkpoint:
+        """What :meth:`restore` needs to undo a full :meth:`infer` that ``progress`` has stopped."""
+        return take_checkpoint(self._pool, self._keyframes.values(), self._messages_lost)
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go back to a checkpoint, since which only :meth:`infer` was called."""
+        go_back(checkpoint, self._pool, self._keyframes.values())
+        self._messages_lost = checkpoint.messages_lost
+
+    def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """How many keyframes say something of each voxel of some bricks of the pool, (n,) -> (n, 512); all
+        that are frozen count as one, and 255 means so many or more."""
+        spoken = [(k.visible, k.messages) for k in self._keyframes.values() if k.messages is not None]
+        return count_voices(slots, spoken, self._pool)
 
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
         """Marginal probability of occupied at (N, 3) points in metres, (N,) float32; the prior where
@@ -324,6 +345,7 @@ class MRFMap:
             if len(keyframe.visible.slots):
                 sum_product.withdraw(keyframe.visible.slots, self._pool.belief, messages)
                 self._pool.revision += 1
+                self._pool.touch(keyframe.visible.slots)
         self._book.disclaim(keyframe.footprint)
         runtime.settle()  # before its arrays are dropped
 

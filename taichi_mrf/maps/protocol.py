@@ -106,6 +106,11 @@ class OccupancyMap(Protocol):
         """How large the map is."""
         ...
 
+    def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """How many keyframes see each voxel of some bricks of ``view.pool``, (n,) -> (n, 512), 0 where the
+        map does not remember it."""
+        ...
+
     def save(self, path: str | Path) -> None:
         """Write the map to one .npz file. Raises MapFileError."""
         ...

@@ -37,7 +37,7 @@ from taichi_mrf.queries.points import classify, point_log_odds, probability
 from taichi_mrf.queries.profile import RayProfile
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config, warn_of_bad_sigma
-from taichi_mrf.voxels.layout import BRICK
+from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import create_topology, recycle
 from taichi_mrf.voxels.window import Window
@@ -262,6 +262,11 @@ class RecursiveMap(ABC, Generic[FootprintT]):
             other_bytes=sum(k.image_bytes for k in keyframes) + self._scratch_bytes,
         )
 
+    def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """How many keyframes see each voxel of some bricks of the pool, (n,) -> (n, 512): such a map does not
+        remember it, and says 0."""
+        return np.zeros((len(slots), VOXELS), np.uint8)
+
     def save(self, path: str | Path) -> None:
         """Write the map to one .npz file, beside it first and then into place. Raises MapFileError."""
         slots = self._pool.in_use
@@ -311,6 +316,7 @@ class RecursiveMap(ABC, Generic[FootprintT]):
         if len(slots):
             self._integrate(Scan(image, record.T_world_camera, footprint, slots))
             self._pool.revision += 1
+            self._pool.touch(slots)
         runtime.settle()  # before the image's arrays are dropped
 
     def _forget_voxels(self) -> None:

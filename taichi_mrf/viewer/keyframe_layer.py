@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.poses import Pose
 from taichi_mrf.viewer.messages import CurrentCamera, Keyframe
+from taichi_mrf.viewer.roster import Roster
 
 FRUSTUM_M = 0.15
 """Distance of a frustum's picture from its camera, metres."""
@@ -17,10 +18,6 @@ FRUSTUM_M = 0.15
 _COLORS = {"on": (38, 130, 142), "off": (170, 170, 170), "frozen": (70, 100, 190)}
 _CHOSEN = (230, 0, 126)
 _WAY = (230, 0, 126)
-_MOST_FRUSTA = 200
-"""More of them only hide each other: the oldest frozen ones are then part of the way alone."""
-
-_MOST_WAYPOINTS = 2000
 
 
 @dataclass(frozen=True)
@@ -45,23 +42,35 @@ class Placement:
 
 
 class KeyframeLayer:
-    """Owns the scene nodes /keyframes, /way, /camera and /gizmo, and knows all keyframes."""
+    """Owns the scene nodes /keyframes, /way, /camera and /gizmo."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
-        self.keyframes: dict[int, Keyframe] = {}
+        self.roster = Roster()
         self.chosen: int | None = None
         self.gizmo: viser.TransformControlsHandle | None = None
         self._frusta: dict[int, viser.CameraFrustumHandle] = {}
+        # viser remembers each name that was ever removed, so names are used again.
+        self._places: dict[int, int] = {}
+        self._free_places: list[int] = []
         self._pictures = True
+
+    @property
+    def keyframes(self) -> dict[int, Keyframe]:
+        """Those that are known, by number."""
+        return self.roster.keyframes
 
     def put(self, keyframe: Keyframe) -> None:
         """Show a keyframe that is new or has changed."""
-        self.keyframes[keyframe.id] = keyframe
-        self._draw(keyframe)
-        frozen = [id for id in self._frusta if self.keyframes[id].state == "frozen"]
-        for id in frozen[: max(0, len(self._frusta) - _MOST_FRUSTA)]:
-            self._frusta.pop(id).remove()
+        forgotten = self.roster.put(keyframe)
+        for id in forgotten:
+            del self._frusta[id]  # its node is the next one's
+            self._free_places.append(self._places.pop(id))
+        if self.chosen in forgotten:
+            self.release()
+            self.chosen = min(self.keyframes)
+        if keyframe.id in self.keyframes:
+            self._draw(keyframe)
 
     def choose(self, id: int | None) -> None:
         """Mark a keyframe as the one that buttons act on."""
@@ -79,8 +88,7 @@ class KeyframeLayer:
 
     def draw_way(self) -> None:
         """Draw the camera's way through all keyframes, in the order of their numbers."""
-        points = np.array([self.keyframes[id].T_world_camera[:3, 3] for id in sorted(self.keyframes)])
-        points = points[:: -(-len(points) // _MOST_WAYPOINTS) or 1]
+        points = self.roster.way_m()
         if len(points) > 1:
             segments = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
             self._scene.add_line_segments("/way", segments, _WAY, thickness=2.0, thickness_units="screen")
@@ -126,7 +134,9 @@ class KeyframeLayer:
         for frustum in self._frusta.values():
             frustum.remove()
         self._frusta.clear()
-        self.keyframes.clear()
+        self._places.clear()
+        self._free_places.clear()
+        self.roster = Roster()
         self.chosen = None
         for name in ("/way", "/camera"):
             self._scene.remove_by_name(name)
@@ -135,8 +145,10 @@ class KeyframeLayer:
         place = Placement.of(keyframe.T_world_camera)
         fov, aspect = _view_angles(keyframe.camera)
         is_chosen = keyframe.id == self.chosen
+        if keyframe.id not in self._places:
+            self._places[keyframe.id] = self._free_places.pop() if self._free_places else len(self._places)
         self._frusta[keyframe.id] = self._scene.add_camera_frustum(
-            f"/keyframes/{keyframe.id}",
+            f"/keyframes/{self._places[keyframe.id]}",
             fov,
             aspect,
             scale=_frustum_scale(fov, aspect),

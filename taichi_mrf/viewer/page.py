@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import viser
 
-from taichi_mrf.poses import Pose
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.coloring import Scale, legend_html
 from taichi_mrf.viewer.downloads import Downloads
@@ -21,7 +20,7 @@ from taichi_mrf.viewer.keyframe_layer import KeyframeLayer, Placement
 from taichi_mrf.viewer.look import up_of
 from taichi_mrf.viewer.map_scene import MapScene
 from taichi_mrf.viewer.options import ViewOptions
-from taichi_mrf.viewer.panel import CHOSEN_KEYFRAME, SPEEDS, Panel
+from taichi_mrf.viewer.panel import CHOSEN_KEYFRAME, POSITION_STEP_M, SPEEDS, Panel
 from taichi_mrf.viewer.picking import first_pixel, first_voxel
 
 _NOTICE_COLORS: dict[str, Any] = {"info": "blue", "warning": "yellow", "error": "red"}
@@ -42,7 +41,6 @@ class Page:
         self._eye = Eye(server)
         self._map: MapScene | None = None
         self._voxel_size = 0.0
-        self._original: dict[int, Pose] = {}
         self._scale: Scale | None = None
         server.scene.configure_default_lights(cast_shadow=False)
         server.scene.on_click()(self._scene_clicked)
@@ -106,7 +104,6 @@ class Page:
             self._map.clear()
         self._map, self._voxel_size = MapScene(self._server, hello), hello.voxel_size
         self._keyframes.clear()
-        self._original.clear()
         self._panel.ray.clear()
         self._panel.show_hello(hello)
         self._panel.show_keyframes({}, None)
@@ -115,7 +112,6 @@ class Page:
         if not self._keyframes.keyframes:
             self._eye.set_up(up_of(keyframe.T_world_camera))
             self._keyframes.chosen = keyframe.id
-        self._original.setdefault(keyframe.id, keyframe.T_world_camera)
         self._keyframes.put(keyframe)
         self._keyframes.draw_way()
         self._panel.show_keyframes(self._keyframes.keyframes, self._keyframes.chosen)
@@ -124,8 +120,7 @@ class Page:
         """Draw what has changed of the map, if it is time."""
         if self._map is None:
             return
-        crossed = [k.crossed for k in self._keyframes.keyframes.values() if k.state != "off"]
-        if not self._map.flush(self._options, self._eye.up, crossed):
+        if not self._map.flush(self._options, self._eye.up, self._keyframes.roster.crossed()):
             return
         box = self._map.box_m()
         if box is not None:
@@ -185,7 +180,7 @@ class Page:
         elif pressed.button == "Move":
             self._toggle_gizmo()
         elif pressed.button == "Put back":
-            self._ask(m.Move(keyframe, self._original[keyframe]))
+            self._ask(m.Move(keyframe, self._keyframes.roster.recorded[keyframe]))
         elif pressed.button == "Ray of pixel":
             u, v = self._panel.pixel.value
             self._ask(m.PixelRay(keyframe, u, v))
@@ -213,7 +208,9 @@ class Page:
             self._choose(self._panel.chosen_keyframe())
         elif widget == "position" and self._keyframes.chosen is not None:
             T = self._keyframes.keyframes[self._keyframes.chosen].T_world_camera.copy()
-            T[:3, 3] = self._panel.position.value
+            typed = np.array(self._panel.position.value)
+            # The box holds rounded numbers, and to round the other two coordinates is not to move them.
+            T[:3, 3] = np.where(np.abs(typed - T[:3, 3]) > 0.51 * POSITION_STEP_M, typed, T[:3, 3])
             self._ask(m.Move(self._keyframes.chosen, T))
 
     def _choose(self, keyframe: int | None) -> None:

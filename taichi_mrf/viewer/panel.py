@@ -25,11 +25,11 @@ SAVE_BUTTONS = {
 SPEEDS = {"as fast as it goes": 0.0, "0.25x": 0.25, "0.5x": 0.5, "1x": 1.0, "2x": 2.0, "4x": 4.0}
 CURRENT_CAMERA, CHOSEN_KEYFRAME = "current camera", "chosen keyframe"
 NO_KEYFRAME = "none yet"
+POSITION_STEP_M = 0.01
 
 _MAP_OPTIONS = ("color_by", "threshold", "size", "shade", "cut_axis", "cut_at", "bricks", "beside")
 _PAGE_OPTIONS = ("follow", "pictures", "dark")
 _MOST_NOTICES = 6
-_LISTED_KEYFRAMES = 500
 
 
 class Panel:
@@ -126,7 +126,7 @@ class Panel:
 
     def show_keyframes(self, keyframes: dict[int, Keyframe], chosen: int | None) -> None:
         """List the keyframes and what is chosen among them."""
-        listed = [keyframes[id] for id in sorted(keyframes)][-_LISTED_KEYFRAMES:]
+        listed = [keyframes[id] for id in sorted(keyframes)]
         self._names = {f"{each.id}: {each.name} ({each.state})": each.id for each in listed}
         self.keyframe.options = list(self._names) or [NO_KEYFRAME]
         name = next((name for name, id in self._names.items() if id == chosen), None)
@@ -156,7 +156,10 @@ class Panel:
         self.keyframe.on_update(lambda event: self._chosen(event, "keyframe"))
         self._buttons(gui.add_button_group("Do", KEYFRAME_BUTTONS))
         self.position: Any = gui.add_vector3(
-            "Position (m)", (0.0, 0.0, 0.0), step=0.01, hint="Where its camera stands; change it to move it."
+            "Position (m)",
+            (0.0, 0.0, 0.0),
+            step=POSITION_STEP_M,
+            hint="Where its camera stands; change it to move it.",
         )
         self.position.on_update(lambda event: self._chosen(event, "position"))
         self._keyframe_text = gui.add_markdown("")

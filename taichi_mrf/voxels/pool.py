@@ -6,6 +6,9 @@ anew whenever the pool grows. What only the host needs (coordinates, owners, ide
 """
 
 import heapq
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
@@ -22,6 +25,15 @@ GROWTH = 1.2
 
 MOST_BRICKS = 2**31 // VOXELS - 1
 """Taichi refuses arrays of 2^31 elements."""
+
+
+@dataclass(frozen=True)
+class PoolSnapshot:
+    """What queries read of a pool, as it was at one moment."""
+
+    belief: "ti.Ndarray"
+    bricks: NDArray[np.int32]
+    owners: NDArray[np.int32]
 
 
 class BrickPool:
@@ -41,6 +53,7 @@ class BrickPool:
         self.owners = np.zeros(0, np.int32)
         self.identity = np.zeros(0, np.int64)
         self.revision = 0  # changes whenever the beliefs do
+        self._touched = np.zeros(0, bool)
         self._free: list[int] = []
         self._born = 0
 
@@ -68,6 +81,7 @@ class BrickPool:
         # An identity is never given twice, so a slot that changes hands can be told from one that did not.
         self.identity[slots] = self._born + np.arange(len(bricks))
         self._born += len(bricks)
+        self.touch(slots)
         _fill_bricks(self.belief, slots, self.prior_log_odds)
         if self.evidence is not None:
             _fill_bricks(self.evidence, slots, self.prior_log_odds)
@@ -83,10 +97,44 @@ class BrickPool:
     def restart(self) -> None:
         """Set all beliefs to what inference starts from."""
         self.revision += 1
+        self._touched[:] = True
         if self.evidence is not None:
             self.belief.copy_from(self.evidence)
         else:
             self.belief.fill(self.prior_log_odds)
+
+    def touch(self, slots: NDArray[np.int32]) -> None:
+        """Note that what is known of these bricks may have changed."""
+        self._touched[slots] = True
+
+    def take_touched(self) -> NDArray[np.int32]:
+        """Slots, ascending, of the bricks that may have changed since this was last called."""
+        slots = np.flatnonzero(self._touched & (self.owners > 0)).astype(np.int32)
+        self._touched[:] = False
+        return slots
+
+    def snapshot(self) -> PoolSnapshot:
+        """The bricks and beliefs as they are now, which later changes do not touch."""
+        belief = ti.ndarray(ti.f32, self.belief.shape)
+        belief.copy_from(self.belief)
+        return PoolSnapshot(belief, self.bricks.copy(), self.owners.copy())
+
+    def restore(self, snapshot: PoolSnapshot) -> None:
+        """Set the beliefs back to a snapshot's. The bricks must still be the same."""
+        self.revision += 1
+        self._touched[:] = True
+        self.belief.copy_from(snapshot.belief)
+        runtime.settle()  # before the snapshot is dropped
+
+    @contextmanager
+    def showing(self, snapshot: PoolSnapshot) -> Iterator[None]:
+        """Let queries and files see a snapshot while the block runs, which must not change the pool."""
+        now = PoolSnapshot(self.belief, self.bricks, self.owners)
+        self.belief, self.bricks, self.owners = snapshot.belief, snapshot.bricks, snapshot.owners
+        try:
+            yield
+        finally:
+            self.belief, self.bricks, self.owners = now.belief, now.bricks, now.owners
 
     def keep_evidence(self) -> "ti.Ndarray":
         """The evidence channel, made when something is frozen for the first time."""
@@ -107,6 +155,7 @@ class BrickPool:
         self.revision += 1
         if channel == "evidence":
             self.keep_evidence()
+        self.touch(slots)
         _write_bricks(getattr(self, channel), slots, np.ascontiguousarray(values, np.float32).reshape(-1))
 
     def _affordable(self) -> int:
@@ -134,6 +183,7 @@ class BrickPool:
         self.bricks = np.concatenate([self.bricks, np.zeros((more, 3), np.int32)])
         self.owners = np.concatenate([self.owners, np.zeros(more, np.int32)])
         self.identity = np.concatenate([self.identity, np.full(more, -1, np.int64)])
+        self._touched = np.concatenate([self._touched, np.zeros(more, bool)])
         for slot in range(self.capacity, capacity):
             heapq.heappush(self._free, slot)
         self.capacity = capacity

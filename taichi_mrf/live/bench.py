@@ -1,0 +1,144 @@
+"""What a keyframe costs the viewer: time on the server, and bytes to each browser.
+
+The page's own parts are used with a real server and one client that only reads, so that the bytes are
+those that went over the wire.
+"""
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import viser
+import websockets
+from websockets.asyncio.client import connect
+from websockets.typing import Origin, Subprotocol
+
+from taichi_mrf.config import Config
+from taichi_mrf.errors import TaichiMRFError
+from taichi_mrf.frame import Frame
+from taichi_mrf.live.publish import Publisher
+from taichi_mrf.maps.create import create_map
+from taichi_mrf.viewer.look import up_of
+from taichi_mrf.viewer.map_scene import MapScene
+from taichi_mrf.viewer.messages import Bricks, Hello
+from taichi_mrf.viewer.options import ViewOptions
+from taichi_mrf.viewer.server import start_server
+
+_QUIET_S = 0.3
+"""A client that has got nothing for so long has got everything."""
+
+
+@dataclass(frozen=True)
+class ViewerRow:
+    """One keyframe. ``publish`` is what the mapper spends on finding the changes, ``draw`` the page's thread
+    on turning them into what is sent, both in seconds; ``changed`` are the bricks that were told of,
+    ``sent`` the bytes that one browser got, ``shown`` the voxels of the map that the page then shows."""
+
+    publish: float
+    draw: float
+    changed: int
+    sent: int
+    shown: int
+
+
+def bench_viewer(
+    frames: Sequence[Frame], config: Config, advance: Callable[[int], None] = lambda done: None
+) -> list[ViewerRow]:
+    """Map frames one by one as a live run does, and measure each for the viewer. Needs Taichi to run.
+
+    Raises TaichiMRFError if no port is free.
+    """
+    m = create_map(config, frames[0].camera)
+    publisher = Publisher("map", m.view.pool, m.seen_by)
+    server = start_server("127.0.0.1", 0, "bench")
+    reader = _Reader(server)
+    try:
+        prior = m.view.pool.prior_log_odds
+        hello = Hello("bench", "", "", config.method, m.voxel_size, prior, config.volume.min_evidence, "")
+        scene = MapScene(server, hello)
+        up = up_of(frames[0].T_world_camera)
+        reader.settled()
+        rows = []
+        for done, frame in enumerate(frames, start=1):
+            keyframe = m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera, name=frame.name)
+            m.infer(keyframes=[keyframe], sweeps=1)
+            begin = time.perf_counter()
+            changes = publisher.changes()
+            published = time.perf_counter()
+            rows.append(_drawn(scene, changes, up, reader, published - begin))
+            advance(done)
+        return rows
+    finally:
+        reader.close()
+        server.stop()
+
+
+def _drawn(
+    scene: MapScene, changes: Bricks | None, up: tuple[int, int], reader: "_Reader", publish: float
+) -> ViewerRow:
+    """Draw one keyframe's changes, and wait until the client has them."""
+    before = reader.received
+    time.sleep(max(0.0, scene.patience() or 0.0))  # as the page does, which draws 8 times a second at most
+    begin = time.perf_counter()
+    if changes is not None:
+        scene.take(changes)
+    scene.flush(ViewOptions(), up, [])
+    draw = time.perf_counter() - begin
+    reader.settled()
+    changed = 0 if changes is None else len(changes.bricks) + len(changes.removed)
+    return ViewerRow(publish, draw, changed, reader.received - before, scene.layers["map"].voxels_shown)
+
+
+class _Reader:
+    """A browser that draws nothing: it takes what it is sent, on a thread of its own."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self.received = 0
+        self._last = time.monotonic()
+        self._loop = asyncio.new_event_loop()
+        self._problem: BaseException | None = None
+        self._connected = threading.Event()
+        port = server.get_port()
+        self._task = self._loop.create_task(self._read(port))
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+        self._connected.wait()
+        if self._problem is not None:
+            raise TaichiMRFError(f"the viewer's server does not answer: {self._problem}")
+
+    def settled(self) -> None:
+        """Wait until nothing more comes."""
+        begin = time.monotonic()
+        while time.monotonic() < max(begin, self._last) + _QUIET_S:
+            time.sleep(0.02)
+
+    def close(self) -> None:
+        """Leave."""
+        self._loop.call_soon_threadsafe(self._task.cancel)
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            self._loop.run_until_complete(self._task)
+        except (asyncio.CancelledError, websockets.ConnectionClosed):
+            pass
+        except OSError as error:
+            self._problem = error
+        finally:
+            self._connected.set()
+            self._loop.close()
+
+    async def _read(self, port: int) -> None:
+        async with connect(
+            f"ws://127.0.0.1:{port}",
+            origin=Origin(f"http://127.0.0.1:{port}"),
+            subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
+            max_size=None,
+            compression=None,
+        ) as connection:
+            self._connected.set()
+            async for message in connection:
+                self.received += len(message)
+                self._last = time.monotonic()

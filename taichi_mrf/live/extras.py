@@ -1,0 +1,97 @@
+"""What is shown beside the map when a user wants it: images of a view, and OctoMap's way with the frames."""
+
+import dataclasses
+import time
+
+from taichi_mrf.inference.schedule import Progress
+from taichi_mrf.live.beside import Beside
+from taichi_mrf.live.pictures import view_images
+from taichi_mrf.live.run import Run
+from taichi_mrf.viewer.messages import Notice, Watch
+
+NOTHING = Watch(images=False, view=None, beside=False)
+
+IMAGE_SECONDS = 1.0
+"""Images are made at most so often."""
+
+
+class Extras:
+    """Keeps the extras up to date, while nothing more important is to be done."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._watch = NOTHING
+        self._beside: Beside | None = None
+        self._shown_version = -1
+        self._images_made = float("-inf")
+
+    def watch(self, wanted: Watch) -> None:
+        """Take over what is wanted; the work is done later."""
+        if wanted != self._watch:
+            self._watch, self._shown_version = wanted, -1
+
+    def nothing_wanted(self) -> None:
+        """A new viewer has asked for nothing yet."""
+        self._watch, self._beside = NOTHING, None
+
+    def start_over(self) -> None:
+        """The map begins anew; what is wanted stays."""
+        self._beside, self._shown_version = None, -1
+
+    def work(self, progress: Progress) -> bool:
+        """Do one piece of the work that is left, and say whether there was any. ``progress`` can stop it."""
+        if self._make_images():
+            return True
+        if not self._watch.beside:
+            if self._beside is not None:
+                self._run.send(self._beside.everything_gone())
+                self._beside = None
+            return False
+        try:
+            return self._catch_up(progress)
+        except Exception as error:  # the map itself goes on without the one beside it
+            self._run.send(Notice(f"beside the map: {error}", "error"))
+            self._watch = dataclasses.replace(self._watch, beside=False)
+            return True
+
+    def answer(self) -> None:
+        """While the map is being inferred: images of it as it was, where another view is wanted."""
+        self._make_images()
+
+    def _catch_up(self, progress: Progress) -> bool:
+        mapper = self._run.mapper
+        if self._beside is None:
+            self._beside = Beside(self._run.source.config, mapper.map.noise)
+            frozen = len(mapper.roster.with_state("frozen"))
+            if frozen:
+                text = f"beside the map {frozen} frozen keyframes are missing: their images are forgotten"
+                self._run.send(Notice(text, "warning"))
+        if not self._beside.catch_up(mapper, progress):
+            return False
+        changes = self._beside.changes()
+        if changes is not None:
+            self._run.send(changes)
+        return True
+
+    def _make_images(self) -> bool:
+        now = time.monotonic()
+        old = self._watch.images and self._shown_version != self._run.version
+        if not old or now - self._images_made < IMAGE_SECONDS:
+            return False
+        self._shown_version, self._images_made = self._run.version, now
+        self._run.guarded(self._send_images)
+        return True
+
+    def _send_images(self) -> None:
+        mapper, frame = self._run.mapper, self._run.current
+        entry = None if self._watch.view is None else mapper.roster.entries.get(self._watch.view)
+        if entry is not None:
+            self._run.send(
+                view_images(
+                    mapper.map, entry.name, entry.camera, entry.T_world_camera, mapper.depth_of(entry)
+                )
+            )
+        elif frame is not None:
+            self._run.send(
+                view_images(mapper.map, frame.name, frame.camera, frame.T_world_camera, frame.depth_m)
+            )

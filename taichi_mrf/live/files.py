@@ -1,0 +1,42 @@
+"""The files that a live run leaves: the map, its voxels, its parameters."""
+
+import tempfile
+from pathlib import Path
+from typing import Literal
+
+from taichi_mrf.config import Config
+from taichi_mrf.config_text import commented_yaml
+from taichi_mrf.export.atomic import write_text
+from taichi_mrf.export.ply import write_voxels
+from taichi_mrf.maps.protocol import OccupancyMap
+
+MAP_FILE, VOXEL_FILE, CONFIG_FILE = "map.npz", "voxels.ply", "config.yaml"
+
+FileKind = Literal["map", "ply"]
+
+
+def write_file(kind: FileKind, m: OccupancyMap, folder: Path) -> Path:
+    """Write one of the files to a folder that exists. Raises MapFileError."""
+    if kind == "map":
+        m.save(folder / MAP_FILE)
+        return folder / MAP_FILE
+    centres, probability = m.voxels(min_probability=0.5)
+    write_voxels(folder / VOXEL_FILE, centres, probability, m.voxel_size)
+    return folder / VOXEL_FILE
+
+
+def file_content(kind: FileKind, m: OccupancyMap, out: Path | None) -> tuple[str, bytes]:
+    """Name and content of one of the files, which is also left in the run's folder if it has one.
+
+    Raises MapFileError.
+    """
+    with tempfile.TemporaryDirectory() as temporary:
+        path = write_file(kind, m, out or Path(temporary))
+        return path.name, path.read_bytes()
+
+
+def write_all(m: OccupancyMap, config: Config, folder: Path) -> list[Path]:
+    """Write all files of a run: the map first, it is what the time went into. Raises MapFileError."""
+    written = [write_file("map", m, folder)]
+    write_text(folder / CONFIG_FILE, commented_yaml(config))
+    return [*written, write_file("ply", m, folder), folder / CONFIG_FILE]

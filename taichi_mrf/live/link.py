@@ -1,0 +1,158 @@
+"""The line to the viewer, a process of its own that shows the page.
+
+The viewer is spawned, never forked: a fork of a process in which Taichi runs hangs. Sending never waits: one
+thread writes to the pipe whatever lies in the outbox. Requests are read by whoever maps, when it has time.
+"""
+
+import multiprocessing
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing.connection import Connection, wait
+from typing import Protocol
+
+from taichi_mrf.live.outbox import Outbox
+from taichi_mrf.viewer.messages import Notice, Quit, Request, Update
+
+GOODBYE_SECONDS = 0.5
+"""What the viewer gets to end by itself, before it is ended."""
+
+FORCE_SECONDS = 0.1
+"""What it gets after each signal."""
+
+
+Serve = Callable[[Connection, str, int], None]
+"""The main function of a viewer's process: its end of the line, and where to listen."""
+
+
+class Link(Protocol):
+    """What a session asks of the line to its viewer."""
+
+    @property
+    def lost(self) -> str | None:
+        """Why nobody is there any more, None as long as somebody is."""
+        ...
+
+    def send(self, update: Update) -> None:
+        """Pass an update on; never waits, and does nothing once the link is lost."""
+        ...
+
+    def requests(self) -> list[Request]:
+        """The requests that have come since the last call; never waits."""
+        ...
+
+    def wait(self, timeout: float) -> None:
+        """Wait until there is a request, the link is lost, or ``timeout`` seconds have passed."""
+        ...
+
+
+class ViewerLink:
+    """A viewer process and the line to it. Use it as a context, or :meth:`close` it."""
+
+    def __init__(self, host: str, port: int, serve: Serve | None = None) -> None:
+        """Start the viewer; its first request will be Listening. ``serve`` is what the process runs, by
+        default the page."""
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe(duplex=True)
+        self._process = context.Process(
+            target=serve or _serve_page, args=(theirs, host, port), name="taichi-mrf viewer", daemon=True
+        )
+        with _interrupts_ignored():
+            self._process.start()
+        theirs.close()  # so that the end of their process is the end of the line
+        self._outbox = Outbox()
+        self._lost: str | None = None
+        self._heard: list[Request] = []
+        self._sender = threading.Thread(target=self._send_all, name="viewer outbox", daemon=True)
+        self._sender.start()
+
+    @property
+    def lost(self) -> str | None:
+        """Why the viewer is gone, None as long as it is there."""
+        if self._lost is None and not self._process.is_alive():
+            self._hear()  # it may have said why
+            self._lost = (
+                self._lost or f"the viewer's process has ended (exit status {self._process.exitcode})"
+            )
+        return self._lost
+
+    def send(self, update: Update) -> None:
+        """Put an update into the outbox."""
+        self._outbox.put(update)
+
+    def requests(self) -> list[Request]:
+        """What the viewer has asked for since the last call."""
+        self._hear()
+        heard, self._heard = self._heard, []
+        return heard
+
+    def wait(self, timeout: float) -> None:
+        """Sleep until the viewer says something or ends, at most ``timeout`` seconds."""
+        if self.lost is None:
+            wait([self._connection, self._process.sentinel], timeout)
+        else:
+            time.sleep(timeout)
+
+    def close(self) -> None:
+        """End the viewer: by asking, then by force. Nothing is left of it afterwards."""
+        self._outbox.close()
+        self._process.join(GOODBYE_SECONDS)
+        for end in (self._process.terminate, self._process.kill):
+            if self._process.is_alive():
+                end()
+                self._process.join(FORCE_SECONDS)
+        self._sender.join(GOODBYE_SECONDS)
+        self._connection.close()
+
+    def __enter__(self) -> "ViewerLink":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _hear(self) -> None:
+        """Read what has come from the viewer. That the line has ended is told by the process's end, which
+        follows, or else here."""
+        try:
+            while self._connection.poll():
+                request = self._connection.recv()
+                if isinstance(request, Notice):  # there is no page, and this is why
+                    self._lost = request.text
+                else:
+                    self._heard.append(request)
+        except (EOFError, OSError):
+            self._process.join(GOODBYE_SECONDS)
+            if self._process.is_alive():
+                self._lost = self._lost or "the viewer has closed the line"
+
+    def _send_all(self) -> None:
+        try:
+            while not isinstance(update := self._outbox.take(), Quit):
+                self._connection.send(update)
+            self._connection.send(update)
+        except (OSError, ValueError):  # the viewer is gone, or the line is closed
+            self._outbox.close()
+
+
+@contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """A process that is started meanwhile ignores Ctrl-C from its first instruction on; whoever started it
+    tells it when to end."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    saved = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, saved)
+
+
+def _serve_page(connection: Connection, host: str, port: int) -> None:
+    """What runs in the viewer's process. Imported late: the page's libraries are of no use to mapping."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    from taichi_mrf.viewer.process import run_viewer
+
+    run_viewer(connection, host, port)

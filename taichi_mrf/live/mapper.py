@@ -1,0 +1,228 @@
+"""The map of a live run with its keyframes: taking them in, editing them, and settling the map.
+
+While frames come, each new keyframe is swept once against what is known. That is quick, but leaves a map that
+depends on the order of events. To settle it means full inference, after which it is the map that its
+keyframes give, bit for bit, whatever has happened to them.
+"""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.errors import KeyframeError
+from taichi_mrf.frame import Frame
+from taichi_mrf.inference.schedule import InferProgress
+from taichi_mrf.live.pictures import thumbnail
+from taichi_mrf.live.publish import Publisher
+from taichi_mrf.live.ray_answers import Seer
+from taichi_mrf.live.roster import Entry, Roster
+from taichi_mrf.maps.mrf import MRFMap
+from taichi_mrf.maps.protocol import MappedKeyframe, OccupancyMap
+from taichi_mrf.maps.recursive import RecursiveMap
+from taichi_mrf.poses import Pose, as_pose
+from taichi_mrf.viewer import messages
+from taichi_mrf.viewer.messages import LOG_ODDS_STEP
+
+FORGOTTEN = np.full((1, 1, 3), 90, np.uint8)
+"""The picture of a keyframe whose depth image is gone."""
+
+
+class Mapper:
+    """A map, and the roster of its keyframes.
+
+    ``unsettled`` says that keyframes have come, gone or moved since the last full inference, ``edited`` that
+    some of them by a user's hand. ``to_renew`` are keyframes (numbers of the roster) around an edit that have
+    not been swept since.
+    """
+
+    def __init__(self, m: OccupancyMap, first_id: int = 0) -> None:
+        """A map that may have keyframes already; the viewer's numbers begin at ``first_id``."""
+        self.map = m
+        self.roster = Roster(next_id=first_id)
+        for id, keyframe in m.keyframes.items():
+            self.roster.add(keyframe, keyframe.rays, thumbnail(keyframe.depth_m), id)
+        self.publisher = Publisher(
+            "map", m.view.pool, m.seen_by, prior_is_unknown=isinstance(m, RecursiveMap)
+        )
+        # A map from a file has beliefs but no messages, and edits would have to infer them first.
+        self.lacks_messages = bool(m.keyframes) and isinstance(m, MRFMap)
+        self.unsettled, self.edited = self.lacks_messages or self.stale, False
+        self.to_renew: list[int] = []
+
+    @property
+    def min_evidence(self) -> float:
+        """Log-odds nearer to the prior than this are unknown, as they are published."""
+        return LOG_ODDS_STEP if isinstance(self.map, RecursiveMap) else self.map.config.volume.min_evidence
+
+    @property
+    def stale(self) -> bool:
+        """Whether the map shows nothing of the last edits until it is settled."""
+        return isinstance(self.map, RecursiveMap) and self.map.stale
+
+    def take_in(self, frame: Frame) -> Entry:
+        """Add a frame as a keyframe and sweep it once. Raises what the map raises, and is then unchanged."""
+        map_id = self._add(frame.depth_m, frame.T_world_camera, frame)
+        rays = self.map.keyframes[map_id].rays
+        self.unsettled = True
+        return self.roster.add(frame, rays, thumbnail(frame.depth_m), map_id)
+
+    def switch(self, id: int, on: bool) -> Entry:
+        """Take a keyframe out of the map, keeping its image, or bring it back. Raises KeyframeError."""
+        entry = self._changeable(id)
+        if on == (entry.state == "on"):
+            return entry
+        if on:
+            assert entry.depth_m is not None
+            entry.map_id = self._add(entry.depth_m, entry.T_world_camera, entry)
+            entry.depth_m, entry.state = None, "on"
+            self._edited(self._near(entry))
+        else:
+            near, depth_m = self._near(entry), self._keyframe(entry).depth_m
+            self.map.remove_keyframe(self._map_id(entry))
+            entry.map_id, entry.depth_m, entry.state = None, depth_m, "off"
+            self._edited(near)
+        return entry
+
+    def move(self, id: int, T_world_camera: Pose) -> Entry:
+        """Give a keyframe another pose. Raises KeyframeError."""
+        entry, T = self._changeable(id), as_pose(T_world_camera)
+        if entry.state == "on":
+            near = self._near(entry)
+            self.map.move_keyframe(self._map_id(entry), T)
+            self._sweep(entry)
+            self._edited([*near, *self._near(entry)])
+        entry.T_world_camera = T
+        return entry
+
+    def freeze(self, id: int, by_hand: bool = True) -> messages.Keyframe:
+        """Fold a keyframe into the map for good; returns the last that is to be said of it, because its image
+        is forgotten. Raises KeyframeError."""
+        entry = self._changeable(id)
+        if not isinstance(self.map, MRFMap):
+            raise KeyframeError(f"a map of the method {self.map.config.method} cannot freeze keyframes")
+        if entry.state == "off":
+            raise KeyframeError(f"keyframe {id} ({entry.name}) is off: switch it on to freeze it")
+        crossed = self.crossed(entry)
+        self.map.freeze_keyframe(self._map_id(entry))
+        picture, entry.picture = entry.picture, FORGOTTEN
+        entry.map_id, entry.state = None, "frozen"
+        self.unsettled, self.edited = True, self.edited or by_hand
+        self.to_renew = [each for each in self.to_renew if each != id]
+        return self._message(entry, picture, crossed)
+
+    def renew_one(self) -> None:
+        """Sweep the next of the keyframes around an edit."""
+        entry = self.roster.find(self.to_renew.pop(0))
+        if entry.state == "on":
+            self._sweep(entry)
+
+    def settle(self, go_on: Callable[[InferProgress], bool]) -> bool:
+        """Full inference. ``go_on`` is called after each keyframe; while it runs, all queries and files show
+        the map as it was before. If it returns False the map is that again; returns whether it was completed.
+        """
+        m, pool = self.map, self.map.view.pool
+        checkpoint = m.checkpoint() if isinstance(m, MRFMap) else None
+        before = checkpoint.pool if checkpoint is not None else pool.snapshot()
+
+        def progress(step: InferProgress) -> bool:
+            with pool.showing(before):
+                return go_on(step)
+
+        complete = False
+        try:
+            complete = m.infer(progress=progress).complete
+        except Exception:
+            self.unsettled = self.lacks_messages = False  # or it would be tried again without end
+            raise
+        finally:
+            if not complete and checkpoint is not None and isinstance(m, MRFMap):
+                m.restore(checkpoint)
+        if complete:
+            self.unsettled = self.edited = self.lacks_messages = False
+            self.to_renew.clear()
+        return complete
+
+    def describe(self, entry: Entry) -> messages.Keyframe:
+        """What the viewer must know of a keyframe."""
+        return self._message(entry, entry.picture, self.crossed(entry))
+
+    def crossed(self, entry: Entry) -> NDArray[np.int32]:
+        """The bricks that a keyframe's rays go through, (n, 3); none for one that is not on, and none in a
+        map all of whose crossed bricks exist."""
+        if entry.state != "on" or not isinstance(self.map, MRFMap):
+            return np.zeros((0, 3), np.int32)
+        footprint = self.map.keyframes[self._map_id(entry)].footprint
+        return footprint.window.bricks_of(footprint.crossed)
+
+    def depth_of(self, entry: Entry) -> NDArray[np.float32] | None:
+        """A keyframe's depth image, (H, W) in metres; None once it is frozen."""
+        return self._keyframe(entry).depth_m if entry.state == "on" else entry.depth_m
+
+    def seer(self, entry: Entry) -> Seer:
+        """A keyframe as what rays can be asked of. Raises KeyframeError for a frozen one."""
+        depth_m = self.depth_of(entry)
+        if depth_m is None:
+            raise KeyframeError(f"keyframe {entry.id} ({entry.name}) is frozen: its image is forgotten")
+        return Seer(entry.name, entry.T_world_camera, entry.camera, depth_m)
+
+    def seers_near(self, point: NDArray[np.float64]) -> Iterator[Seer]:
+        """All keyframes that are on, the nearest to a point first."""
+        entries = self.roster.with_state("on")
+        entries.sort(key=lambda entry: float(np.linalg.norm(entry.T_world_camera[:3, 3] - point)))
+        return map(self.seer, entries)
+
+    def _add(self, depth_m: NDArray[np.float32], T_world_camera: Pose, of: Frame | Entry) -> int:
+        map_id = self.map.add_keyframe(depth_m, T_world_camera, of.camera, of.name)
+        if not self.stale:
+            try:
+                self.map.infer(sweeps=1, keyframes=[map_id])
+            except BaseException:
+                self.map.remove_keyframe(map_id)
+                raise
+        return map_id
+
+    def _sweep(self, entry: Entry) -> None:
+        if not self.stale:
+            self.map.infer(sweeps=1, keyframes=[self._map_id(entry)])
+
+    def _edited(self, near: list[int]) -> None:
+        self.unsettled = self.edited = True
+        if not self.stale:
+            self.to_renew += [id for id in dict.fromkeys(near) if id not in self.to_renew]
+
+    def _near(self, entry: Entry) -> list[int]:
+        """The other keyframes that see some of the bricks that this one sees."""
+        if not isinstance(self.map, MRFMap):
+            return []
+        keyframes = self.map.keyframes
+        slots = keyframes[self._map_id(entry)].visible.slots
+        others = [each for each in self.roster.with_state("on") if each is not entry]
+        return [o.id for o in others if np.isin(keyframes[self._map_id(o)].visible.slots, slots).any()]
+
+    def _changeable(self, id: int) -> Entry:
+        entry = self.roster.find(id)
+        if entry.state == "frozen":
+            raise KeyframeError(f"keyframe {id} ({entry.name}) is frozen")
+        return entry
+
+    def _map_id(self, entry: Entry) -> int:
+        assert entry.map_id is not None, f"{entry.name} is {entry.state}"
+        return entry.map_id
+
+    def _keyframe(self, entry: Entry) -> MappedKeyframe:
+        return self.map.keyframes[self._map_id(entry)]
+
+    def _message(
+        self, entry: Entry, picture: NDArray[np.uint8], crossed: NDArray[np.int32]
+    ) -> messages.Keyframe:
+        return messages.Keyframe(
+            entry.id,
+            entry.name,
+            entry.T_world_camera,
+            entry.camera,
+            entry.rays,
+            entry.state,
+            picture,
+            crossed,
+        )

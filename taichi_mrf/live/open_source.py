@@ -1,0 +1,36 @@
+"""What a live run maps: a source of frames with a new map, or a map from a file."""
+
+import dataclasses
+from pathlib import Path
+
+from taichi_mrf import runtime
+from taichi_mrf.config import Config
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.live.replay import Replay
+from taichi_mrf.live.run import Source
+from taichi_mrf.maps.create import create_map, load_map
+from taichi_mrf.maps.map_file import open_map_file, read_header
+
+
+def open_source(
+    name: str, config: Config, *, every: int, limit: int | None, speed: float, loop: bool
+) -> tuple[Source, list[str]]:
+    """Start Taichi and open a source; returns it with sentences that the user should see.
+
+    Raises TaichiMRFError: DatasetError, MapFileError, BackendError, ConfigError.
+    """
+    runtime.init(config.runtime.arch, config.runtime.threads, config.runtime.debug)
+    path = Path(name)
+    if path.suffix == ".npz" and path.is_file():
+        with open_map_file(path) as file:
+            header = read_header(path, file)
+        parameters = dataclasses.replace(header.config, runtime=config.runtime)
+        note = f"{path.name} is a saved map: its own parameters are in force."
+        return Source(path.name, parameters, lambda: load_map(path)), [note]
+    dataset = open_dataset(name, color=False)
+
+    def new_replay() -> Replay:
+        hold_out = config.evaluation.hold_out
+        return Replay(dataset, every=every, limit=limit, loop=loop, hold_out=hold_out, speed=speed)
+
+    return Source(name, config, lambda: create_map(config, dataset.camera), new_replay), dataset.notes

@@ -1,0 +1,163 @@
+"""Updates that wait for the viewer: what is overtaken before it was sent is never sent.
+
+A viewer that is slower than mapping, or stopped altogether, must cost mapping neither time nor memory
+without end. So an update takes the place of an older one that it makes pointless, and bricks are merged
+brick by brick: what waits is never more than the map and its keyframes are.
+"""
+
+import threading
+from collections.abc import Hashable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.viewer.messages import (
+    Bricks,
+    CurrentCamera,
+    File,
+    Hello,
+    Images,
+    Keyframe,
+    Layer,
+    Notice,
+    Quit,
+    RayAnswer,
+    Status,
+    Update,
+)
+
+BRICKS_AT_ONCE = 2048
+"""Bricks sent in one piece (3 MB), so that other updates need not wait for a whole map."""
+
+MOST = {Notice: 50, File: 4}
+"""So many of these wait at most; the oldest are dropped first."""
+
+LATEST_ONLY = (Status, CurrentCamera, Images, RayAnswer)
+
+MERGE_FACTOR = 2
+"""Waiting bricks are merged when there are so many times more of them than after the last time, so that
+each is copied a few times at most."""
+
+
+class Outbox:
+    """A queue that one thread fills and another empties."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._waiting: dict[Hashable, Update | WaitingBricks | Quit] = {}
+        self._number = 0
+        self._closed = False
+
+    def put(self, update: Update) -> None:
+        """Add an update; returns at once."""
+        with self._changed:
+            if self._closed:
+                return
+            if isinstance(update, Hello):
+                self._forget_the_map()
+            if isinstance(update, Bricks):
+                waiting = self._waiting.setdefault(("bricks", update.layer), WaitingBricks(update.layer))
+                assert isinstance(waiting, WaitingBricks)
+                waiting.add(update)
+            else:
+                self._waiting[self._key(update)] = update
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Let go of all that waits; the last thing to take is Quit."""
+        with self._changed:
+            self._waiting = {"quit": Quit()}
+            self._closed = True
+            self._changed.notify()
+
+    def take(self) -> Update | Quit:
+        """The next update, once there is one. After Quit nothing comes any more."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting)
+            key = next(iter(self._waiting))
+            update = self._waiting.pop(key)
+            if isinstance(update, WaitingBricks):
+                part, rest = update.take(BRICKS_AT_ONCE)
+                if rest is not None:
+                    self._waiting[key] = rest
+                return part
+            return update
+
+    def __len__(self) -> int:
+        """Updates that wait."""
+        with self._changed:
+            return len(self._waiting)
+
+    def _key(self, update: Update) -> Hashable:
+        """Updates with the same key take each other's place."""
+        if isinstance(update, LATEST_ONLY):
+            return type(update).__name__
+        if isinstance(update, Keyframe):
+            return "keyframe", update.id
+        if isinstance(update, Hello):
+            return Hello.__name__
+        self._number += 1
+        kind = type(update)
+        same = [key for key in self._waiting if isinstance(key, tuple) and key[0] is kind]
+        for key in same[: max(0, len(same) + 1 - MOST[kind])]:
+            del self._waiting[key]
+        return kind, self._number
+
+    def _forget_the_map(self) -> None:
+        """A Hello makes all pointless that was said of the map before."""
+        self._waiting = {k: u for k, u in self._waiting.items() if isinstance(u, Notice | File)}
+
+
+class WaitingBricks:
+    """The bricks of one layer that wait, merged as late as possible."""
+
+    def __init__(self, layer: Layer, first: Bricks | None = None) -> None:
+        self.layer = layer
+        self._parts = [] if first is None else [first]
+        self._merged = 0 if first is None else len(first.bricks) + len(first.removed)
+
+    def add(self, bricks: Bricks) -> None:
+        """Later bricks take the place of earlier ones."""
+        self._parts.append(bricks)
+        if sum(len(p.bricks) + len(p.removed) for p in self._parts) > MERGE_FACTOR * self._merged:
+            self._merge()
+
+    def take(self, count: int) -> tuple[Bricks, "WaitingBricks | None"]:
+        """Up to ``count`` of the bricks, with all that are gone, and what still waits."""
+        whole = self._merge()
+        part = _rows(whole, slice(count), whole.removed)
+        if len(whole.bricks) <= count:
+            return part, None
+        return part, WaitingBricks(self.layer, _rows(whole, slice(count, None), whole.removed[:0]))
+
+    def _merge(self) -> Bricks:
+        whole = self._parts[0] if len(self._parts) == 1 else merged(self._parts)
+        self._parts = [whole]
+        self._merged = len(whole.bricks) + len(whole.removed)
+        return whole
+
+
+def merged(parts: list[Bricks]) -> Bricks:
+    """Several updates of one layer as one that says the same as all of them in turn."""
+    bricks = np.concatenate([part.bricks for part in parts])
+    log_odds = np.concatenate([part.log_odds for part in parts])
+    seen = np.concatenate([part.seen for part in parts])
+    removed = np.concatenate([part.removed for part in parts])
+    # The last word on each brick counts. Within one update nothing is said twice of any.
+    said = np.concatenate([np.full(len(p.bricks), i) for i, p in enumerate(parts)])
+    gone = np.concatenate([np.full(len(p.removed), i) for i, p in enumerate(parts)])
+    keys = brick_keys(np.concatenate([bricks, removed]))
+    order = np.lexsort((np.concatenate([said, gone]), keys))
+    last = order[np.append(np.diff(keys[order]) != 0, True)] if len(order) else order
+    kept, dropped = np.sort(last[last < len(bricks)]), np.sort(last[last >= len(bricks)]) - len(bricks)
+    return Bricks(parts[0].layer, bricks[kept], log_odds[kept], seen[kept], removed[dropped])
+
+
+def brick_keys(bricks: NDArray[np.int32]) -> NDArray[np.int64]:
+    """(n, 3) brick coordinates -> (n,) numbers, one for each brick within 2^20 bricks of the origin."""
+    x, y, z = (bricks.astype(np.int64) + (1 << 20)).T
+    return (x << 42) | (y << 21) | z
+
+
+def _rows(whole: Bricks, rows: slice, removed: NDArray[np.int32]) -> Bricks:
+    return Bricks(whole.layer, whole.bricks[rows], whole.log_odds[rows], whole.seen[rows], removed)

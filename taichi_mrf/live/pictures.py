@@ -1,0 +1,108 @@
+"""Depth images and accuracy as small coloured pictures."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.errors import FrameError
+from taichi_mrf.evaluation.accuracy import NO_ANSWER, NOT_JUDGED, RIGHT, WRONG, judge_view
+from taichi_mrf.maps.protocol import OccupancyMap
+from taichi_mrf.poses import Pose
+from taichi_mrf.viewer.messages import Images
+
+THUMBNAIL_WIDTH = 160
+"""Most columns of the picture that hangs in a keyframe's frustum."""
+
+IMAGE_WIDTH = 320
+"""Most columns of the images beside the map."""
+
+_NO_DEPTH = np.array([90, 90, 90], np.uint8)
+
+ACCURACY_COLORS = np.zeros((4, 3), np.uint8)
+"""RGB for each value of an accuracy image; told apart without telling red from green."""
+ACCURACY_COLORS[NOT_JUDGED] = 40, 40, 40
+ACCURACY_COLORS[NO_ANSWER] = 170, 170, 170
+ACCURACY_COLORS[WRONG] = 213, 94, 0
+ACCURACY_COLORS[RIGHT] = 0, 114, 178
+
+
+def thumbnail(depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """(H, W) axial depth in metres, 0 for none -> (h, w, 3) uint8."""
+    step = _step(depth_m.shape[1], THUMBNAIL_WIDTH)
+    return depth_colors(depth_m[::step, ::step])
+
+
+def depth_colors(
+    depth_m: NDArray[np.float32], bounds: tuple[float, float] | None = None
+) -> NDArray[np.uint8]:
+    """(H, W) depth -> (H, W, 3) uint8 of the turbo scale between two depths (default: those in the image);
+    grey where there is none, which is 0 or NaN."""
+    there = np.isfinite(depth_m) & (depth_m > 0)
+    near, far = bounds or depth_bounds(depth_m)
+    share = np.clip((np.where(there, depth_m, near) - near) / max(far - near, 1e-6), 0.0, 1.0)
+    colors = cv2.applyColorMap(np.rint(255 * share).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
+    return np.where(there[..., None], colors, _NO_DEPTH).astype(np.uint8)
+
+
+def depth_bounds(depth_m: NDArray[np.float32]) -> tuple[float, float]:
+    """The depths between which nearly all of an image lies, in metres."""
+    measured = depth_m[np.isfinite(depth_m) & (depth_m > 0)]
+    if not len(measured):
+        return 0.0, 1.0
+    near, far = np.quantile(measured, [0.01, 0.99])
+    return float(near), float(far)
+
+
+def view_images(
+    m: OccupancyMap,
+    name: str,
+    camera: PinholeCamera,
+    T_world_camera: Pose,
+    depth_m: NDArray[np.float32] | None,
+) -> Images:
+    """Measured depth, rendered depth and accuracy of a view; ``depth_m`` is None if its image is forgotten.
+
+    A pixel is right if the map's answer lies within 1.5 sigma of the measurement, sigma being one voxel.
+    """
+    step = _step(camera.width, IMAGE_WIDTH)
+    small = thinned(camera, step)
+    rendered = m.render_depth(small, T_world_camera)
+    if depth_m is None:
+        nothing = np.full((*small.shape, 3), _NO_DEPTH, np.uint8)
+        score = "its depth image was forgotten when it was frozen"
+        return Images(name, nothing, depth_colors(rendered), nothing, score)
+    measured = np.ascontiguousarray(depth_m[::step, ::step])
+    bounds = depth_bounds(measured)
+    verdict, score = np.full(small.shape, NOT_JUDGED, np.int8), "nothing to judge: no measurement"
+    try:
+        judged = judge_view(m, measured, T_world_camera, small).accuracy("1.5sigma")
+    except FrameError:  # no pixel holds a measurement within the sensor's range
+        pass
+    else:
+        verdict = judged.image
+        score = f"right {judged.score:.0%} within 1.5 sigma, no answer {judged.unanswered:.0%}"
+    return Images(
+        name,
+        depth_colors(measured, bounds),
+        depth_colors(rendered, bounds),
+        ACCURACY_COLORS[verdict],
+        score,
+    )
+
+
+def thinned(camera: PinholeCamera, step: int) -> PinholeCamera:
+    """The camera whose pixels are every ``step``-th of a camera's along both sides."""
+    return PinholeCamera(
+        -(-camera.width // step),
+        -(-camera.height // step),
+        camera.fx / step,
+        camera.fy / step,
+        camera.cx / step,
+        camera.cy / step,
+    )
+
+
+def _step(width: int, most: int) -> int:
+    """Take every so many-th pixel to have at most ``most`` of them."""
+    return -(-width // most)

@@ -1,0 +1,146 @@
+"""Which bricks the viewer must hear of: those that differ from what it was told last.
+
+The pool notes which bricks may have changed, so looking costs what changed and not what there is; comparing
+with what was sent leaves out the many that inference has touched and hardly moved.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.live.outbox import brick_keys
+from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Bricks, Layer, pack_log_odds
+from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.pool import BrickPool
+
+SeenBy = Callable[[NDArray[np.int32]], NDArray[np.uint8]]
+"""Slots (n,) -> how many keyframes see each of their voxels, (n, 512)."""
+
+_AT_ONCE = 4096
+"""Bricks that are read from the pool in one piece."""
+
+
+class Publisher:
+    """Finds the changes of one map, and remembers what has been told of it."""
+
+    def __init__(
+        self,
+        layer: Layer,
+        pool: BrickPool,
+        seen_by: SeenBy,
+        *,
+        prior_is_unknown: bool = False,
+        least_log_odds: float | None = None,
+    ) -> None:
+        """With ``prior_is_unknown`` a voxel that holds exactly the pool's prior is one that nobody has seen,
+        as in maps that integrate scan by scan: it is told as just less likely occupied than not, or all of
+        them would be shown. With ``least_log_odds`` a brick counts only if it has a known voxel above that.
+        """
+        self._layer, self._pool, self._seen_by = layer, pool, seen_by
+        self._prior_is_unknown, self._least = prior_is_unknown, least_log_odds
+        self._told = _ToldBricks()
+        self._identity = pool.identity.copy()
+        self._all = True
+
+    def changes(self) -> Bricks | None:
+        """What has changed since the last call, None if nothing has. The first time that is the whole map."""
+        touched = self._pool.take_touched()
+        slots, self._all = (self._pool.in_use if self._all else touched), False
+        parts = [self._changed(slots[i : i + _AT_ONCE]) for i in range(0, len(slots), _AT_ONCE)]
+        hidden = [part[3] for part in parts]
+        removed = np.concatenate([self._gone(), *hidden])
+        if not len(removed) and not any(len(part[0]) for part in parts):
+            return None
+        empty = (np.zeros((0, 3), np.int32), np.zeros((0, VOXELS), np.int16), np.zeros((0, VOXELS), np.uint8))
+        found = [np.concatenate([empty[i], *(part[i] for part in parts)]) for i in range(3)]
+        return Bricks(self._layer, found[0], found[1], found[2], removed)
+
+    def everything_gone(self) -> Bricks:
+        """The update that takes all that was told away again."""
+        empty = np.zeros((0, VOXELS))
+        bricks = self._told.bricks()
+        self._told, self._all = _ToldBricks(), True
+        return Bricks(
+            self._layer, bricks[:0].copy(), empty.astype(np.int16), empty.astype(np.uint8), removed=bricks
+        )
+
+    def start_over(self) -> None:
+        """Someone else listens now, who has been told nothing."""
+        self._told, self._all = _ToldBricks(), True
+
+    def _changed(
+        self, slots: NDArray[np.int32]
+    ) -> tuple[NDArray[np.int32], NDArray[np.int16], NDArray[np.uint8], NDArray[np.int32]]:
+        """Those of some bricks that are news: coordinates, log-odds, seen; and those that count no more."""
+        bricks, belief = self._pool.bricks[slots], self._pool.read("belief", slots)
+        unknown = (belief == self._pool.prior_log_odds) & self._prior_is_unknown
+        log_odds, seen = pack_log_odds(np.where(unknown, -LOG_ODDS_STEP, belief)), self._seen_by(slots)
+        hidden = bricks[:0].copy()
+        if self._least is not None:
+            counts = ((belief > self._least) & ~unknown).any(axis=1)
+            hidden = self._told.drop(bricks[~counts])
+            bricks, log_odds, seen = bricks[counts], log_odds[counts], seen[counts]
+        news = self._told.tell(bricks, log_odds, seen)
+        return bricks[news], log_odds[news], seen[news], hidden
+
+    def _gone(self) -> NDArray[np.int32]:
+        """Told bricks that do not exist any more."""
+        before, self._identity = self._identity, self._pool.identity.copy()
+        lived = before >= 0
+        if (before[lived] == self._identity[: len(before)][lived]).all():
+            return np.zeros((0, 3), np.int32)
+        there = brick_keys(self._pool.bricks[self._pool.in_use])
+        told = self._told.bricks()
+        return self._told.drop(told[~np.isin(brick_keys(told), there)])
+
+
+class _ToldBricks:
+    """What the viewer knows, by brick: rows of arrays that grow."""
+
+    def __init__(self) -> None:
+        self._rows: dict[int, int] = {}
+        self._free: list[int] = []
+        self._bricks = np.zeros((0, 3), np.int32)
+        self._log_odds = np.zeros((0, VOXELS), np.int16)
+        self._seen = np.zeros((0, VOXELS), np.uint8)
+
+    def bricks(self) -> NDArray[np.int32]:
+        """The coordinates of all, (n, 3)."""
+        return self._bricks[np.fromiter(self._rows.values(), np.int64, len(self._rows))]
+
+    def tell(
+        self, bricks: NDArray[np.int32], log_odds: NDArray[np.int16], seen: NDArray[np.uint8]
+    ) -> NDArray[np.bool_]:
+        """Remember what some bricks, each named once, hold; returns which of them are news, (n,)."""
+        keys = brick_keys(bricks).tolist()
+        rows = np.array([self._rows.get(key, -1) for key in keys], np.int64)
+        news = rows < 0
+        old = np.flatnonzero(~news)
+        same = (self._log_odds[rows[old]] == log_odds[old]).all(axis=1)
+        same &= (self._seen[rows[old]] == seen[old]).all(axis=1)
+        news[old] = ~same
+        new = np.flatnonzero(rows < 0)
+        self._reserve(len(new))
+        for i in new.tolist():
+            rows[i] = self._rows[keys[i]] = self._free.pop()
+        into = rows[news]
+        self._bricks[into], self._log_odds[into], self._seen[into] = bricks[news], log_odds[news], seen[news]
+        return news
+
+    def drop(self, bricks: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Forget bricks; returns those of them that were known."""
+        rows = [self._rows.pop(key, -1) for key in brick_keys(bricks).tolist()]
+        self._free += [row for row in rows if row >= 0]
+        return bricks[np.array(rows, np.int64) >= 0]
+
+    def _reserve(self, count: int) -> None:
+        more = count - len(self._free)
+        if more <= 0:
+            return
+        size = len(self._bricks)
+        more = max(more, size // 4, 64)
+        self._free += range(size + more - 1, size - 1, -1)
+        self._bricks = np.concatenate([self._bricks, np.zeros((more, 3), np.int32)])
+        self._log_odds = np.concatenate([self._log_odds, np.zeros((more, VOXELS), np.int16)])
+        self._seen = np.concatenate([self._seen, np.zeros((more, VOXELS), np.uint8)])

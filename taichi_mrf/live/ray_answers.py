@@ -1,0 +1,146 @@
+"""What the ray of a pixel, or through a point in the map, meets: the answer to a click."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.errors import KeyframeError
+from taichi_mrf.maps.protocol import OccupancyMap
+from taichi_mrf.poses import Pose, inverse
+from taichi_mrf.sensor.noise import LEAST_SIGMA_M, NoiseTable, evaluate
+from taichi_mrf.viewer.messages import RayAnswer
+
+BEHIND_SIGMAS = 3.0
+"""A keyframe sees a point that lies no further behind its measurement than so many sigma, or two voxels."""
+
+
+@dataclass(frozen=True)
+class Seer:
+    """A depth image that may have seen a point; ``depth_m`` (H, W) in metres, 0 for no measurement."""
+
+    name: str
+    T_world_camera: Pose
+    camera: PinholeCamera
+    depth_m: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class PixelNoise:
+    """A measurement, its bias and its sigma, as ranges along the pixel's ray in metres."""
+
+    measured_m: float
+    bias_m: float
+    sigma_m: float
+
+
+def pixel_answer(m: OccupancyMap, seer: Seer, u: float, v: float) -> RayAnswer:
+    """The ray of a pixel. Raises KeyframeError if the image has no such pixel."""
+    along = pixel_direction(seer.camera, u, v)
+    if not _in_image(seer.camera, u, v):
+        raise KeyframeError(f"{seer.name} has no pixel ({u:g}, {v:g})")
+    return _answer(m, seer, u, v, along)
+
+
+def point_answer(
+    m: OccupancyMap,
+    point: Sequence[float],
+    eye: Sequence[float],
+    wanted: Seer | None,
+    others: Iterable[Seer],
+) -> RayAnswer:
+    """The ray through a point: of the wanted keyframe if the point lies in its image, else of the first
+    other one that sees it, else from the eye, where nothing was measured."""
+    where = np.asarray(point, np.float64)
+    if not (np.isfinite(where).all() and np.isfinite(eye).all()):
+        raise KeyframeError("a point is not finite")
+    if wanted is not None and (pixel := projected(wanted, where)) is not None:
+        return _answer(m, wanted, pixel[0], pixel[1], pixel_direction(wanted.camera, pixel[0], pixel[1]))
+    for seer in others:
+        pixel = projected(seer, where)
+        if pixel is not None and _sees(m, seer, *pixel):
+            return _answer(m, seer, pixel[0], pixel[1], pixel_direction(seer.camera, pixel[0], pixel[1]))
+    start, along = np.asarray(eye, np.float64), where - np.asarray(eye, np.float64)
+    return _profiled(m, "from where you look; no keyframe sees this point", start, along, None)
+
+
+def projected(seer: Seer, point: NDArray[np.float64]) -> tuple[float, float, float] | None:
+    """(u, v, axial depth) of a world point in an image, None if it lies outside or behind."""
+    x, y, z = (inverse(seer.T_world_camera) @ np.append(point, 1.0))[:3]
+    if z <= 0:
+        return None
+    camera = seer.camera
+    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    return (float(u), float(v), float(z)) if _in_image(camera, u, v) else None
+
+
+def pixel_direction(camera: PinholeCamera, u: float, v: float) -> NDArray[np.float64]:
+    """The direction of a pixel in the camera frame, with z = 1."""
+    return np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0])
+
+
+def noise_at(
+    table: NoiseTable, camera: PinholeCamera, u: float, v: float, depth_m: float
+) -> tuple[float, float]:
+    """(bias, sigma) in metres of axial depth, of the pixel nearest to (u, v)."""
+    column, row = _nearest(camera, u, v)
+    patch = (row // table.patch) * table.columns + column // table.patch
+    sigma, bias = (float(evaluate(table.coefficients[patch, which], depth_m)) for which in (0, 1))
+    return bias, max(sigma, LEAST_SIGMA_M)
+
+
+def _answer(m: OccupancyMap, seer: Seer, u: float, v: float, along: NDArray[np.float64]) -> RayAnswer:
+    column, row = _nearest(seer.camera, u, v)
+    depth, range_per_depth = float(seer.depth_m[row, column]), float(np.linalg.norm(along))
+    noise = None
+    if depth > 0:
+        bias, sigma = noise_at(m.noise.table(seer.camera), seer.camera, u, v, depth)
+        noise = PixelNoise(depth * range_per_depth, bias * range_per_depth, sigma * range_per_depth)
+    title = f"{seer.name}, pixel ({column}, {row})"
+    start, turned = seer.T_world_camera[:3, 3], seer.T_world_camera[:3, :3] @ along
+    return _profiled(m, title, start, turned, noise)
+
+
+def _profiled(
+    m: OccupancyMap,
+    title: str,
+    start: NDArray[np.float64],
+    along: NDArray[np.float64],
+    noise: PixelNoise | None,
+) -> RayAnswer:
+    profile = m.ray_profile(start, along)
+    unit = along / np.linalg.norm(along)
+    return RayAnswer(
+        title,
+        (float(start[0]), float(start[1]), float(start[2])),
+        (float(unit[0]), float(unit[1]), float(unit[2])),
+        profile.distance,
+        profile.length,
+        profile.occupancy,
+        profile.visibility,
+        profile.omega,
+        noise.measured_m if noise else None,
+        noise.bias_m if noise else 0.0,
+        noise.sigma_m if noise else 0.0,
+    )
+
+
+def _sees(m: OccupancyMap, seer: Seer, u: float, v: float, depth_m: float) -> bool:
+    """Whether the measurement at a pixel leaves the view free up to a depth."""
+    column, row = _nearest(seer.camera, u, v)
+    measured = float(seer.depth_m[row, column])
+    if measured <= 0:
+        return False
+    _, sigma = noise_at(m.noise.table(seer.camera), seer.camera, u, v, measured)
+    return depth_m <= measured + max(BEHIND_SIGMAS * sigma, 2 * m.voxel_size)
+
+
+def _nearest(camera: PinholeCamera, u: float, v: float) -> tuple[int, int]:
+    """(column, row) of the pixel that holds (u, v)."""
+    return min(max(round(u), 0), camera.width - 1), min(max(round(v), 0), camera.height - 1)
+
+
+def _in_image(camera: PinholeCamera, u: float, v: float) -> bool:
+    return -0.5 <= u < camera.width - 0.5 and -0.5 <= v < camera.height - 0.5

@@ -1,0 +1,144 @@
+"""When the next frame of a source is due: at the recording's own pace, faster, slower, or at once.
+
+A frame's stamp is known only once it has been read, so at a given pace the next frame is read ahead. Broken
+frames are handed out as what they are, and the one after them comes next.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from taichi_mrf.datasets import Dataset
+from taichi_mrf.errors import ConfigError, DatasetError, FrameError
+from taichi_mrf.frame import Frame
+from taichi_mrf.pipeline import is_held_out
+
+
+@dataclass(frozen=True)
+class BrokenFrame:
+    """A frame that cannot be read; with ``last`` none after it can be either, as with a lost camera."""
+
+    problem: str
+    last: bool = False
+
+
+class Replay:
+    """The frames 0, ``every``, 2 ``every``, ... of a source, ``limit`` of them at most, in time.
+
+    ``number`` (from 1) is that of the frame taken last, of ``frames`` (0: without end); ``finished`` says
+    that it was the last, and ``problem`` why, if the source broke off. While ``paused``, frames can still be
+    taken one by one.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        *,
+        every: int = 1,
+        limit: int | None = None,
+        loop: bool = False,
+        hold_out: int = 0,
+        speed: float = 0.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``speed`` is the multiple of the recording's own pace, 0 as fast as possible. One frame in
+        ``hold_out`` is left out, the same as in pipeline.map_sequence. ``clock`` tells the time in seconds.
+        """
+        self._dataset, self._clock = dataset, clock
+        self._every, self._limit, self._loop, self._hold_out = every, limit, loop, hold_out
+        self.number, self.paused, self.finished, self.problem = 0, False, False, ""
+        self._next, self._readable = 1, False
+        self._ahead: Frame | BrokenFrame | None = None
+        self._begin: tuple[float, float] | None = None
+        """A moment, and the stamp that was due then."""
+        self.set_speed(speed)
+        self._find_next()
+
+    @property
+    def frames(self) -> int:
+        """Frames in a round, 0 if there is no end."""
+        if self._dataset.endless:
+            return self._limit or 0
+        return len(range(0, len(self._dataset), self._every)[: self._limit])
+
+    @property
+    def share(self) -> float:
+        """How much of the round has been taken, 0 if there is no end."""
+        return min(1.0, self.number / self.frames) if self.frames else 0.0
+
+    @property
+    def next_number(self) -> int:
+        """The number of the frame that will be taken next."""
+        return self._next
+
+    @property
+    def speed(self) -> float:
+        """The multiple of the recording's own pace, 0 as fast as possible."""
+        return self._speed
+
+    def set_speed(self, factor: float) -> None:
+        """Change the pace from here on. Raises ConfigError for what is no pace."""
+        if not (math.isfinite(factor) and factor >= 0):
+            raise ConfigError(f"a speed must be 0 or a positive number, not {factor}")
+        self._speed, self._begin = float(factor), None
+
+    def pause(self) -> None:
+        """No frame is due any more."""
+        self.paused = True
+
+    def resume(self) -> None:
+        """Go on where it was paused: the time in between does not count."""
+        self.paused, self._begin = False, None
+
+    def due_in(self) -> float | None:
+        """Seconds until the next frame is due, 0 if it is, None while paused and after the last."""
+        if self.paused or self.finished:
+            return None
+        if self._speed == 0 or self._dataset.endless:
+            return 0.0
+        if self._ahead is None:
+            self._ahead = self._read()
+        if isinstance(self._ahead, BrokenFrame) or not math.isfinite(self._ahead.stamp):
+            return 0.0
+        now, stamp = self._clock(), self._ahead.stamp
+        if self._begin is None:
+            self._begin = (now, stamp)
+        return max(0.0, self._begin[0] + (stamp - self._begin[1]) / self._speed - now)
+
+    def take(self) -> Frame | BrokenFrame | None:
+        """The next frame, due or not; None after the last."""
+        if self.finished:
+            return None
+        frame = self._ahead or self._read()
+        self._ahead = None
+        self._readable = self._readable or isinstance(frame, Frame)
+        self.number, self._next = self._next, self._next + 1
+        self._find_next()
+        if isinstance(frame, BrokenFrame) and frame.last:
+            self.finished, self.problem = True, frame.problem
+        return frame
+
+    def _read(self) -> Frame | BrokenFrame:
+        index = (self._next - 1) * self._every
+        try:
+            return self._dataset.read(index)
+        except FrameError as error:
+            return BrokenFrame(str(error))
+        except DatasetError as error:
+            return BrokenFrame(str(error), last=True)
+        except Exception as error:  # a reader's own mistake must not end mapping
+            return BrokenFrame(f"{self._dataset.frame_names[index]}: cannot be read: {error}")
+
+    def _find_next(self) -> None:
+        """Step over frames that are kept out, and into the next round if need be."""
+        while True:
+            over = self._next > self.frames and (self.frames > 0 or not self._dataset.endless)
+            if over and not (self._loop and self._readable):  # a round of broken frames is the last
+                self.finished = True
+                return
+            if over:
+                self._next, self._readable, self._begin = 1, False, None
+            if not is_held_out(self._next, self._hold_out):
+                return
+            self._next += 1

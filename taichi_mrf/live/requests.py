@@ -1,0 +1,128 @@
+"""What each request of the viewer does. Whatever goes wrong with one becomes a notice for the user."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from taichi_mrf.live.extras import Extras
+from taichi_mrf.live.files import file_content
+from taichi_mrf.live.mapper import Mapper
+from taichi_mrf.live.ray_answers import pixel_answer, point_answer
+from taichi_mrf.live.roster import Entry
+from taichi_mrf.live.run import Run
+from taichi_mrf.viewer.messages import (
+    File,
+    Freeze,
+    Listening,
+    Move,
+    Notice,
+    Pause,
+    PixelRay,
+    Quit,
+    RayThrough,
+    Request,
+    Reset,
+    Save,
+    Speed,
+    Step,
+    Switch,
+    Watch,
+)
+
+EDITS = (Switch, Freeze, Move, Reset)
+"""Requests that change the map, and so cannot be carried out while it is being inferred."""
+
+
+def goes_on(request: Request) -> bool:
+    """Whether a request starts a paused replay again."""
+    return isinstance(request, Step) or (isinstance(request, Pause) and not request.on)
+
+
+class Requests:
+    """Carries requests out."""
+
+    def __init__(
+        self,
+        run: Run,
+        extras: Extras,
+        listening: Callable[[Listening], None],
+        begin_anew: Callable[[], None],
+    ) -> None:
+        self._run = run
+        self._ways: dict[type, Callable[[Any], None]] = {
+            Listening: listening,
+            Pause: self._pause,
+            Step: self._step,
+            Speed: self._speed,
+            Reset: lambda request: begin_anew(),
+            Switch: lambda request: self._edit(request, lambda m: m.switch(request.keyframe, request.on)),
+            Move: lambda request: self._edit(
+                request, lambda m: m.move(request.keyframe, request.T_world_camera)
+            ),
+            Freeze: self._freeze,
+            RayThrough: self._ray_through,
+            PixelRay: self._pixel_ray,
+            Watch: extras.watch,
+            Save: self._save,
+            Quit: self._quit,
+        }
+
+    def carry_out(self, request: Request) -> None:
+        """Do what is asked for, or tell the user why not."""
+        self._run.guarded(lambda: self._ways[type(request)](request))
+
+    def _quit(self, request: Quit) -> None:
+        self._run.ended = True
+
+    def _pause(self, request: Pause) -> None:
+        replay = self._run.replay
+        if replay is None:
+            return
+        self._run.stepping = False
+        if request.on:
+            replay.pause()
+        else:
+            replay.resume()
+
+    def _step(self, request: Step) -> None:
+        replay = self._run.replay
+        if replay is not None and not replay.finished:
+            self._run.stepping = True
+
+    def _speed(self, request: Speed) -> None:
+        if self._run.replay is not None:
+            self._run.replay.set_speed(request.factor)
+
+    def _edit(self, request: Switch | Move, change: Callable[[Mapper], Entry]) -> None:
+        run = self._run
+        run.mapper.roster.find(request.keyframe)
+        try:
+            change(run.mapper)
+        finally:  # whatever has become of it, the viewer shows what is
+            run.send(run.describe(request.keyframe))
+            run.publish()
+
+    def _freeze(self, request: Freeze) -> None:
+        self._run.send(self._run.mapper.freeze(request.keyframe))
+        self._run.publish()
+
+    def _ray_through(self, request: RayThrough) -> None:
+        mapper, wanted = self._run.mapper, None
+        if request.keyframe is not None:
+            entry = mapper.roster.find(request.keyframe)
+            wanted = mapper.seer(entry) if entry.state != "frozen" else None
+        others = mapper.seers_near(np.asarray(request.point, np.float64))
+        self._run.send(point_answer(mapper.map, request.point, request.eye, wanted, others))
+
+    def _pixel_ray(self, request: PixelRay) -> None:
+        mapper = self._run.mapper
+        seer = mapper.seer(mapper.roster.find(request.keyframe))
+        self._run.send(pixel_answer(mapper.map, seer, request.u, request.v))
+
+    def _save(self, request: Save) -> None:
+        run = self._run
+        name, content = file_content(request.kind, run.mapper.map, run.policy.out)
+        run.send(File(name, content, request.client))
+        if run.policy.out is not None:
+            run.send(Notice(f"{name} is in {run.policy.out}"))
