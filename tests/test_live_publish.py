@@ -182,3 +182,22 @@ def test_taking_all_away_and_starting_over() -> None:
 
 def test_an_empty_map_has_nothing_to_tell() -> None:
     assert publisher_of(MRFMap(0.1)).changes() is None
+
+
+def test_who_sees_a_voxel_is_told_once_somebody_wants_to_know() -> None:
+    m = small_room.build([0, 1])
+    publisher = Publisher("map", m.view.pool, m.seen_by, counting=False)
+    first = publisher.changes()
+    assert first is not None
+    assert not first.seen.any()
+    publisher.count(True)
+    again = publisher.changes()
+    assert again is not None
+    assert {tuple(b) for b in again.bricks.tolist()} == {tuple(b) for b in first.bricks.tolist()}
+    slots = m.view.pool.in_use
+    rows = {tuple(b): row for b, row in zip(again.bricks.tolist(), again.seen, strict=True)}
+    expected = m.seen_by(slots)
+    assert expected.any()
+    for brick, seen in zip(m.view.pool.bricks[slots].tolist(), expected, strict=True):
+        np.testing.assert_array_equal(rows[tuple(brick)], seen)
+    assert publisher.changes() is None

@@ -74,6 +74,7 @@ def test_a_run_ends_in_the_map_of_its_frames() -> None:
 
 def test_the_number_of_keyframes_that_see_a_voxel_is_that_of_their_messages() -> None:
     link = FakeLink()
+    link.ask(Watch(images=False, view=None, beside=False, counts=True))
     m = finished(session_of(link))
     seen = shown(link.sent).bricks["map"]
     pool = m.view.pool

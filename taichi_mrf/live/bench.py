@@ -51,7 +51,7 @@ def bench_viewer(
     Raises TaichiMRFError if no port is free.
     """
     m = create_map(config, frames[0].camera)
-    publisher = Publisher("map", m.view.pool, m.seen_by)
+    publisher = Publisher("map", m.view.pool, m.seen_by, counting=False)
     server = start_server("127.0.0.1", 0, "bench")
     reader = _Reader(server)
     try:

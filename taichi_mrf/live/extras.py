@@ -40,6 +40,11 @@ class Extras:
 
     def work(self, progress: Progress) -> bool:
         """Do one piece of the work that is left, and say whether there was any. ``progress`` can stop it."""
+        publisher = self._run.mapper.publisher
+        if publisher.counting != self._watch.counts:
+            publisher.count(self._watch.counts)
+            self._run.publish()
+            return True
         if self._make_images():
             return True
         if not self._watch.beside:

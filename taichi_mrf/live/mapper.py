@@ -43,7 +43,7 @@ class Mapper:
         for id, keyframe in m.keyframes.items():
             self.roster.add(keyframe, keyframe.rays, thumbnail(keyframe.depth_m), id)
         self.publisher = Publisher(
-            "map", m.view.pool, m.seen_by, prior_is_unknown=isinstance(m, RecursiveMap)
+            "map", m.view.pool, m.seen_by, prior_is_unknown=isinstance(m, RecursiveMap), counting=False
         )
         # A map from a file has beliefs but no messages, and edits would have to infer them first.
         self.lacks_messages = bool(m.keyframes) and isinstance(m, MRFMap)

@@ -32,13 +32,16 @@ class Publisher:
         *,
         prior_is_unknown: bool = False,
         least_log_odds: float | None = None,
+        counting: bool = True,
     ) -> None:
         """With ``prior_is_unknown`` a voxel that holds exactly the pool's prior is one that nobody has seen,
         as in maps that integrate scan by scan: it is told as just less likely occupied than not, or all of
         them would be shown. With ``least_log_odds`` a brick counts only if it has a known voxel above that.
+        ``counting`` asks who sees each voxel, which costs a look at every keyframe's messages.
         """
         self._layer, self._pool, self._seen_by = layer, pool, seen_by
         self._prior_is_unknown, self._least = prior_is_unknown, least_log_odds
+        self.counting = counting
         self._told = _ToldBricks()
         self._identity = pool.identity.copy()
         self._all = True
@@ -65,6 +68,12 @@ class Publisher:
             self._layer, bricks[:0].copy(), empty.astype(np.int16), empty.astype(np.uint8), removed=bricks
         )
 
+    def count(self, on: bool) -> None:
+        """Count who sees the voxels from now on, or no longer; all bricks are told again."""
+        if on != self.counting:
+            self.counting = on
+            self.start_over()
+
     def start_over(self) -> None:
         """Someone else listens now, who has been told nothing."""
         self._told, self._all = _ToldBricks(), True
@@ -74,11 +83,13 @@ class Publisher:
     ) -> tuple[NDArray[np.int32], NDArray[np.int16], NDArray[np.uint8], NDArray[np.int32]]:
         """Those of some bricks that are news: coordinates, log-odds, seen; and those that count no more."""
         bricks, belief = self._pool.bricks[slots], self._pool.read("belief", slots)
-        unknown = (belief == self._pool.prior_log_odds) & self._prior_is_unknown
-        log_odds, seen = pack_log_odds(np.where(unknown, -LOG_ODDS_STEP, belief)), self._seen_by(slots)
+        log_odds = pack_log_odds(belief)
+        seen = self._seen_by(slots) if self.counting else np.zeros(log_odds.shape, np.uint8)
+        if self._prior_is_unknown:
+            log_odds[belief == self._pool.prior_log_odds] = -1
         hidden = bricks[:0].copy()
         if self._least is not None:
-            counts = ((belief > self._least) & ~unknown).any(axis=1)
+            counts = (log_odds > self._least / LOG_ODDS_STEP).any(axis=1)
             hidden = self._told.drop(bricks[~counts])
             bricks, log_odds, seen = bricks[counts], log_odds[counts], seen[counts]
         news = self._told.tell(bricks, log_odds, seen)

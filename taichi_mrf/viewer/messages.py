@@ -26,7 +26,8 @@ KeyframeState = Literal["on", "off", "frozen"]
 
 def pack_log_odds(log_odds: NDArray[np.float32]) -> NDArray[np.int16]:
     """Log-odds as they travel."""
-    return np.clip(np.floor(log_odds / LOG_ODDS_STEP), -32768, 32767).astype(np.int16)
+    steps = np.floor(log_odds * (1 / LOG_ODDS_STEP))
+    return np.clip(steps, -32768, 32767, out=steps).astype(np.int16)
 
 
 @dataclass(frozen=True)
@@ -237,12 +238,13 @@ class PixelRay:
 
 @dataclass(frozen=True)
 class Watch:
-    """Which extras to keep up to date: images of ``view`` (a keyframe, or None for the current camera), and
-    OctoMap's way beside the map."""
+    """Which extras to keep up to date: images of ``view`` (a keyframe, or None for the current camera),
+    OctoMap's way beside the map, and the ``counts`` of keyframes that see each voxel (else told as 0)."""
 
     images: bool
     view: int | None
     beside: bool
+    counts: bool = False
 
 
 @dataclass(frozen=True)

@@ -145,8 +145,9 @@ class Page:
                 dark_mode=self._options.dark, show_share_button=False, show_logo=False
             )
         if self._options.beside != before.beside:
-            self._watch()
             self._eye.look_at_everything()
+        if _extras(self._options) != _extras(before):
+            self._watch()
         self._keyframes.show_pictures(self._options.pictures)
         if self._map is not None:
             self._map.look_changed()
@@ -223,7 +224,8 @@ class Page:
     def _watch(self) -> None:
         """Tell the mapper which extras are wanted."""
         view = self._keyframes.chosen if self._panel.view.value == CHOSEN_KEYFRAME else None
-        self._ask(m.Watch(self._panel.images.value, view, self._options.beside))
+        beside, counts = _extras(self._options)
+        self._ask(m.Watch(self._panel.images.value, view, beside, counts))
 
     def _scene_clicked(self, event: viser.SceneClickEvent) -> None:
         self.inbox.put(Clicked(event.ray_origin, event.ray_direction))
@@ -243,6 +245,11 @@ class Page:
             point = voxel[0]
             chosen = self._keyframes.chosen
             self._ask(m.RayThrough((point[0], point[1], point[2]), click.origin, chosen))
+
+
+def _extras(options: ViewOptions) -> tuple[bool, bool]:
+    """Whether the options want the other map beside, and the counts of keyframes."""
+    return options.beside, options.color_by == "keyframes"
 
 
 def _latest(batch: list[m.Update | Event | None]) -> list[m.Update | Event | None]:
