@@ -10,8 +10,13 @@ one piece: the CPU's as it comes, the others' when that is done.
 import subprocess
 import sys
 import tempfile
+from contextlib import ExitStack
+from typing import IO
 
 from taichi_mrf import runtime
+
+
+Run = tuple[str, subprocess.Popen[bytes], IO[bytes]]
 
 
 def main() -> int:
@@ -22,13 +27,20 @@ def main() -> int:
         return 1
     first, *others = found
     command = [sys.executable, "-m", "pytest", *sys.argv[1:], "--arch"]
-    runs = []
-    for arch in others:
-        output = tempfile.TemporaryFile()
-        process = subprocess.Popen([*command, arch], stdout=output, stderr=subprocess.STDOUT)
-        runs.append((arch, process, output))
+    with ExitStack() as files:
+        runs = []
+        for arch in others:
+            output = files.enter_context(tempfile.TemporaryFile())
+            process = subprocess.Popen([*command, arch], stdout=output, stderr=subprocess.STDOUT)
+            runs.append((arch, process, output))
+        return _finish(first, [*command, first], runs)
+
+
+def _finish(first: str, command: list[str], runs: list[Run]) -> int:
+    """Run the first backend's tests here, then wait for the others and print what they said."""
+    others = [arch for arch, _, _ in runs]
     print(f"== pytest on {first}; beside it: {', '.join(others) or 'nothing'}", flush=True)
-    status = subprocess.run([*command, first], check=False).returncode
+    status = subprocess.run(command, check=False).returncode
     for arch, process, output in runs:
         status = status or process.wait()
         process.wait()
