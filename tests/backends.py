@@ -15,7 +15,6 @@ from typing import IO
 
 from taichi_mrf import runtime
 
-
 Run = tuple[str, subprocess.Popen[bytes], IO[bytes]]
 
 
