@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 
-DEADLINE_S = 300.0
+DEADLINE_S = 120.0
 """For what takes seconds, on a machine that is busy with something else."""
 
 _ADDRESS = re.compile(r"The map is at (http://\S+)")

@@ -10,7 +10,7 @@ import pytest
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.export.colors import marginal_colors
 from taichi_mrf.poses import as_pose
-from taichi_mrf.viewer.coloring import MOST_KEYFRAMES, legend_html, scale_of, voxel_colors
+from taichi_mrf.viewer.coloring import legend_html, scale_of, voxel_colors
 from taichi_mrf.viewer.keyframe_layer import FRUSTUM_M, Placement
 from taichi_mrf.viewer.look import look_of, up_of, up_vector
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Keyframe, RayAnswer, pack_log_odds
@@ -58,10 +58,12 @@ def test_uncertainty_is_brightest_at_one_half() -> None:
 
 
 def test_keyframes_are_counted_on_a_logarithmic_scale() -> None:
-    scale = scale_of("keyframes", 0.5, HEIGHTS)
-    seen = np.array([0, 1, 8, MOST_KEYFRAMES, 255])
+    scale = scale_of("keyframes", 0.5, HEIGHTS, most_keyframes=60)
+    assert (scale.low, scale.high) == (1.0, 64.0)
+    seen = np.array([0, 1, 8, 64, 255])
     colors = voxel_colors(scale, shown(np.zeros(5), seen), np.zeros(5))
     np.testing.assert_array_equal(colors, scale.colors[[0, 0, round(255 / 2), 255, 255]])
+    assert scale_of("keyframes", 0.5, HEIGHTS, most_keyframes=0).high == 4.0
 
 
 def test_heights_run_over_the_map() -> None:
@@ -149,19 +151,18 @@ def answer(measured_m: float | None) -> RayAnswer:
 
 
 def test_the_curves_are_steps_over_the_voxels() -> None:
-    x, occupancy, visibility, omega, band, measured = curves(answer(1.95))
+    x, band, measured, visibility, omega, occupancy = curves(answer(1.95))
     assert np.all(np.diff(x) > 0)
-    for at, p, vis, om in ((0.25, 0.2, 1.0, 0.025), (0.9, 0.4, 0.8, 0.05), (1.85, 0.9, 0.5, 1.0)):
+    for at, p, vis, om in ((1.2, 0.0, 0.8, 0.0), (1.85, 0.9, 0.5, 1.0)):
         here = np.argmin(np.abs(x - at))
         assert occupancy[here] == pytest.approx(p)
         assert visibility[here] == pytest.approx(vis)
         assert omega[here] == pytest.approx(om)
-    between = np.searchsorted(x, 1.2)
-    assert occupancy[between] == 0.0
+    assert x[0] == pytest.approx(1.8 - 0.75, abs=1e-5)
     # The band is the measurement less its bias, and one sigma to either side.
     np.testing.assert_allclose([x[band > 0].min(), x[band > 0].max()], [1.8, 1.9], atol=1e-5)
     np.testing.assert_allclose(x[measured > 0], 1.95, atol=2e-6)
-    assert not curves(answer(None))[4].any()
+    assert not curves(answer(None))[1].any()
 
 
 def test_an_empty_ray_has_curves_too() -> None:

@@ -53,6 +53,7 @@ class Progress:
             replay.paused if replay else False,
             replay.finished if replay else True,
             waiting or mapper.edited,
+            replay.speed if replay else 0.0,
         )
 
     def _rate(self) -> float:

@@ -63,7 +63,9 @@ def point_answer(
         if pixel is not None and _sees(m, seer, *pixel):
             return _answer(m, seer, pixel[0], pixel[1], pixel_direction(seer.camera, pixel[0], pixel[1]))
     start, along = np.asarray(eye, np.float64), where - np.asarray(eye, np.float64)
-    return _profiled(m, "from where you look; no keyframe sees this point", start, along, None)
+    # The eye may be anywhere, also further away than any sensor reaches.
+    reach = max(m.sensor.max_depth, 1.2 * float(np.linalg.norm(along)))
+    return _profiled(m, "from where you look; no keyframe sees this point", start, along, None, reach)
 
 
 def projected(seer: Seer, point: NDArray[np.float64]) -> tuple[float, float, float] | None:
@@ -109,8 +111,9 @@ def _profiled(
     start: NDArray[np.float64],
     along: NDArray[np.float64],
     noise: PixelNoise | None,
+    max_range: float | None = None,
 ) -> RayAnswer:
-    profile = m.ray_profile(start, along)
+    profile = m.ray_profile(start, along, max_range)
     unit = along / np.linalg.norm(along)
     return RayAnswer(
         title,

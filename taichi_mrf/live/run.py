@@ -52,13 +52,17 @@ class Run:
         self.source, self.link, self.policy = source, link, policy
         self.waiting: deque[Request] = deque()
         self.ended, self.version = False, 0
+        self.replay: Replay | None = None
         self.begin(first_id=0)
 
     def begin(self, first_id: int) -> None:
-        """Forget the map, if there is one, and start the source from its beginning. The viewer's numbers of
-        keyframes begin at ``first_id``. What is raised leaves the old map in place."""
+        """Forget the map, if there is one, and start the source from its beginning, at the speed in force. The
+        viewer's numbers of keyframes begin at ``first_id``. What is raised leaves the old map in place."""
         self.mapper = Mapper(self.source.new_map(), first_id)
-        self.replay: Replay | None = self.source.new_replay() if self.source.new_replay else None
+        replay = self.source.new_replay() if self.source.new_replay else None
+        if replay is not None and self.replay is not None:
+            replay.set_speed(self.replay.speed)
+        self.replay = replay
         self.progress = Progress()
         self.current: Frame | None = None
         self.stepping = False

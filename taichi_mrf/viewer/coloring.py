@@ -19,8 +19,6 @@ _MAPS = {
     "uncertainty": cv2.COLORMAP_MAGMA,
     "keyframes": cv2.COLORMAP_PLASMA,
 }
-MOST_KEYFRAMES = 64
-"""The bright end of the scale of keyframes, which is logarithmic."""
 
 
 _DARKENED = (0.75, 0.62, 1.0)
@@ -57,17 +55,21 @@ class Scale:
         return self.label, self.low, self.high
 
 
-def scale_of(color_by: ColorBy, threshold: float, heights_m: tuple[float, float]) -> Scale:
-    """The scale of a mode; ``heights_m`` are the lowest and the highest voxel's. That of the marginals
-    begins at one half, or at 0 if voxels less probable than that are shown."""
+def scale_of(
+    color_by: ColorBy, threshold: float, heights_m: tuple[float, float], most_keyframes: int = 1
+) -> Scale:
+    """The scale of a mode; ``heights_m`` are the lowest and the highest voxel's, ``most_keyframes`` the
+    largest number that see a voxel. The scale of marginals begins at one half, or at 0 if voxels less
+    probable than that are shown; that of keyframes is logarithmic and ends at a power of two."""
     ramp = np.arange(256, dtype=np.uint8)[:, None]
     colors = np.ascontiguousarray(cv2.applyColorMap(ramp, _MAPS[color_by])[:, 0, ::-1])
     if color_by == "height":
         return Scale(color_by, colors, *heights_m, "height (m)")
     if color_by == "keyframes":
-        share = np.log(np.maximum(np.arange(256), 1)) / np.log(MOST_KEYFRAMES)
+        doublings = max(2, int(np.ceil(np.log2(max(most_keyframes, 1)))))
+        share = np.log2(np.maximum(np.arange(256), 1)) / doublings
         label = "keyframes that see the voxel"
-        return Scale(color_by, colors, 1.0, float(MOST_KEYFRAMES), label, _numbers(share))
+        return Scale(color_by, colors, 1.0, float(2**doublings), label, _numbers(share))
     p = _probabilities()
     if color_by == "uncertainty":
         return Scale(color_by, colors, 0.0, 1.0, "uncertainty: entropy (bits)", _numbers(_entropy(p)))

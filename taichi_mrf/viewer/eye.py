@@ -41,8 +41,14 @@ class Eye:
     def camera_moved(self, T_world_camera: Pose, follow: bool) -> None:
         """Remember the mapping camera, and look over its shoulder if ``follow``."""
         self._camera = T_world_camera
-        if not follow:
+        if follow:
+            self.follow()
+
+    def follow(self) -> None:
+        """Look over the mapping camera's shoulder, if there is one."""
+        if self._camera is None:
             return
+        T_world_camera = self._camera
         position, forward = T_world_camera[:3, 3], T_world_camera[:3, 2]
         up = up_vector(self.up)
         eye, target = position - _BEHIND_M * forward + _ABOVE_M * up, position + _AHEAD_M * forward
@@ -59,7 +65,7 @@ class Eye:
         """Look at the whole box from ``low`` to ``high`` (metres): those who come later, and those who have
         not moved their view yet."""
         size = float(np.linalg.norm(high - low))
-        if self._camera is None or size < _GROWTH * self._seen_size:
+        if size < _GROWTH * self._seen_size:
             return
         self._seen_size = size
         centre = (low + high) / 2
@@ -68,7 +74,8 @@ class Eye:
         level = [axis for axis in range(3) if axis != self.up[0]]
         short, long = sorted(level, key=lambda axis: high[axis] - low[axis])
         aside = np.zeros(3)
-        aside[short], aside[long] = np.sign(self._camera[short, 3] - centre[short]) or 1.0, 0.35
+        camera = centre if self._camera is None else self._camera[:3, 3]
+        aside[short], aside[long] = np.sign(camera[short] - centre[short]) or 1.0, 0.35
         eye = centre + 0.5 * size * aside / np.linalg.norm(aside) + 0.7 * size * up
         self._view = eye, centre
         start = self._server.initial_camera

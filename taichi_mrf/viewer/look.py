@@ -35,7 +35,12 @@ def look_of(options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float) 
     return Look(
         log_odds=float(np.log(options.threshold / (1 - options.threshold))),
         cut=cut,
-        scale=scale_of(options.color_by, options.threshold, _heights_m(store, up, voxel_size)),
+        scale=scale_of(
+            options.color_by,
+            options.threshold,
+            _heights_m(store, up, voxel_size),
+            store.most_seen() if options.color_by == "keyframes" else 1,
+        ),
         point_size=options.size,
         shade=options.shade,
         up=up,

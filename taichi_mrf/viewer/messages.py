@@ -93,7 +93,8 @@ class CurrentCamera:
 @dataclass(frozen=True)
 class Status:
     """How the work stands. ``activity`` says in words what the worker is doing, ``share`` how much of that
-    is done (0 to 1), ``pending`` whether edits have not reached the map yet."""
+    is done (0 to 1), ``pending`` whether edits have not reached the map yet, ``speed`` the multiple of the
+    recording's pace (0: as fast as it goes)."""
 
     activity: str
     share: float
@@ -108,6 +109,7 @@ class Status:
     paused: bool
     finished: bool
     pending: bool
+    speed: float = 0.0
 
 
 @dataclass(frozen=True)

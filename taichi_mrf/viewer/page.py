@@ -24,6 +24,7 @@ from taichi_mrf.viewer.panel import CHOSEN_KEYFRAME, POSITION_STEP_M, SPEEDS, Pa
 from taichi_mrf.viewer.picking import first_pixel, first_voxel
 
 _NOTICE_COLORS: dict[str, Any] = {"info": "blue", "warning": "yellow", "error": "red"}
+_NOTICE_TITLES = {"info": "Note", "warning": "Note", "error": "Something went wrong"}
 _NOTICE_S = 8.0
 
 
@@ -41,6 +42,7 @@ class Page:
         self._eye = Eye(server)
         self._map: MapScene | None = None
         self._voxel_size = 0.0
+        self._two = False
         self._scale: Scale | None = None
         server.scene.configure_default_lights(cast_shadow=False)
         server.scene.on_click()(self._scene_clicked)
@@ -122,21 +124,31 @@ class Page:
             return
         if not self._map.flush(self._options, self._eye.up, self._keyframes.roster.crossed()):
             return
+        two = bool(self._map.layers["beside"].store.chunks)
+        if two != self._two:
+            self._two = two
+            self._eye.look_at_everything()
         box = self._map.box_m()
         if box is not None:
             self._eye.map_grew(*box)
-        shown = {name: layer.voxels_shown for name, layer in self._map.layers.items()}
-        self._panel.show_counts(shown["map"], shown["beside"], self._downloads.is_recording)
+        self._show_counts()
         scale = self._map.scale
         if scale is not None and (self._scale is None or scale.legend() != self._scale.legend()):
             self._scale = scale
             self._panel.show_legend(legend_html(scale))
 
+    def _show_counts(self) -> None:
+        assert self._map is not None
+        shown = {name: layer.voxels_shown for name, layer in self._map.layers.items()}
+        self._panel.show_counts(shown["map"], shown["beside"], self._downloads.is_recording)
+
     def _notify(self, notice: m.Notice) -> None:
         self._panel.show_notice(notice)
         color = _NOTICE_COLORS[notice.severity]
         for client in self._server.get_clients().values():
-            client.add_notification(notice.severity, notice.text, auto_close_seconds=_NOTICE_S, color=color)
+            client.add_notification(
+                _NOTICE_TITLES[notice.severity], notice.text, auto_close_seconds=_NOTICE_S, color=color
+            )
 
     def _options_moved(self) -> None:
         before, self._options = self._options, self._panel.options()
@@ -144,8 +156,8 @@ class Page:
             self._server.gui.configure_theme(
                 dark_mode=self._options.dark, show_share_button=False, show_logo=False
             )
-        if self._options.beside != before.beside:
-            self._eye.look_at_everything()
+        if self._options.follow and not before.follow:
+            self._eye.follow()
         if _extras(self._options) != _extras(before):
             self._watch()
         self._keyframes.show_pictures(self._options.pictures)
@@ -172,6 +184,7 @@ class Page:
             self._downloads.page(client, self._options.dark)
         elif pressed.button == "Recording":
             self._downloads.toggle_recording(client)
+            self._show_counts()
         elif keyframe is None:
             self._notify(m.Notice("There is no keyframe yet.", "warning"))
         elif pressed.button == "On/off":
@@ -204,6 +217,8 @@ class Page:
         if widget == "speed":
             self._ask(m.Speed(SPEEDS[self._panel.speed.value]))
         elif widget == "images":
+            if not self._panel.images.value:
+                self._panel.hide_images()
             self._watch()
         elif widget == "keyframe":
             self._choose(self._panel.chosen_keyframe())

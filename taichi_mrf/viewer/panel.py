@@ -42,7 +42,7 @@ class Panel:
         self._activity = gui.add_markdown("Starting …")
         self._progress: Any = gui.add_progress_bar(0.0, animated=True)
         self._buttons(gui.add_button_group("Run", RUN_BUTTONS))
-        self.speed = gui.add_dropdown(
+        self.speed: Any = gui.add_dropdown(
             "Speed", list(SPEEDS), hint="Replay the recording at a multiple of its own pace."
         )
         self.speed.on_update(lambda event: self._chosen(event, "speed"))
@@ -95,6 +95,7 @@ class Panel:
         self._activity.content = _plain(status.activity)
         self._progress.value = 100.0 * min(max(status.share, 0.0), 1.0)
         self._progress.animated = not (status.paused or status.finished)
+        self._show_speed(status.speed)
         h = self._hello
         rows = {
             "source": h.source,
@@ -114,6 +115,15 @@ class Panel:
         self._numbers.content = (
             f'<table style="margin:0 0.75em;font-size:0.85em;border-spacing:0.5em 0">{cells}</table>'
         )
+
+    def _show_speed(self, factor: float) -> None:
+        """Let the dropdown say which speed is in force, also one that only the command line offers."""
+        name = next((name for name, each in SPEEDS.items() if each == factor), f"{factor:g}x")
+        names = list(SPEEDS) if name in SPEEDS else [*SPEEDS, name]
+        if list(self.speed.options) != names:
+            self.speed.options = names
+        if self.speed.value != name:
+            self.speed.value = name
 
     def show_notice(self, notice: Notice) -> None:
         """Keep a sentence for the page, and let it pop up."""
@@ -148,6 +158,12 @@ class Panel:
             picture.visible = True
         self._score.content = f"**{_plain(images.title)}**\n\n{_plain(images.score)}"
 
+    def hide_images(self) -> None:
+        """Take the pictures away: they would go stale."""
+        for picture in (self._measured, self._rendered, self._accuracy):
+            picture.visible = False
+        self._score.content = ""
+
     def _keyframe_tab(self) -> None:
         gui = self._gui
         self.keyframe: Any = gui.add_dropdown(
@@ -178,7 +194,7 @@ class Panel:
         black = np.zeros((2, 2, 3), np.uint8)
         self._measured = gui.add_image(black, label="measured depth", visible=False)
         self._rendered = gui.add_image(black, label="depth rendered from the map", visible=False)
-        label = "accuracy: right (green), wrong (red), no answer (black)"
+        label = "accuracy: right (blue), wrong (orange), no answer (light), not judged (dark)"
         self._accuracy = gui.add_image(black, label=label, visible=False)
 
     def _button(self, name: str, hint: str) -> None:

@@ -12,13 +12,17 @@ Curves = tuple[NDArray[np.float64], ...]
 _STEP_M = 1e-6
 """Width of a step's edge on the plot's axis."""
 
+_BEFORE_M = 0.75
+"""How far before the surface the plot begins."""
+
+# What is drawn later lies on top.
 _SERIES = (
     uplot.Series(label="range (m)"),
-    uplot.Series(label="p occupied", stroke="#1f968b", width=2),
-    uplot.Series(label="visibility", stroke="#404788", width=2),
-    uplot.Series(label="omega / largest", stroke="#e6007e", width=2),
     uplot.Series(label="measured ± sigma", stroke="#e69f00", fill="#e69f0055", width=1),
     uplot.Series(label="measured", stroke="#d55e00", width=2),
+    uplot.Series(label="visibility", stroke="#404788", width=2),
+    uplot.Series(label="omega / largest", stroke="#e6007e", width=2),
+    uplot.Series(label="p occupied", stroke="#1f968b", width=2),
 )
 
 
@@ -60,14 +64,16 @@ class RayPlot:
 
 
 def curves(answer: RayAnswer) -> Curves:
-    """Range in metres and the five curves over it, all (n,); each voxel is a step."""
+    """Range in metres, and over it the measurement's band, the measurement, visibility, omega and the
+    probability of occupied, all (n,); each voxel is a step. They begin a little before the surface."""
     begins = (answer.distance - answer.length / 2).astype(np.float64)
     ends = (answer.distance + answer.length / 2).astype(np.float64)
     band = _band_m(answer)
     edges = np.concatenate([begins, ends, [] if band is None else [*band, answer.measured_m or 0.0]])
     last = _end_m(answer)
-    x = np.unique(np.concatenate([[0.0, last], edges - _STEP_M, edges + _STEP_M]))
-    x = x[(x >= 0) & (x <= last)]
+    first = max(0.0, _surface_m(answer) - _BEFORE_M)
+    x = np.unique(np.concatenate([[first, last], edges - _STEP_M, edges + _STEP_M]))
+    x = x[(x >= first) & (x <= last)]
     voxel = np.searchsorted(begins, x, side="right") - 1
     inside = (voxel >= 0) & (x < ends[voxel] if len(ends) else np.zeros(len(x), bool))
     omega = answer.omega / max(float(answer.omega.max(initial=0.0)), 1e-12)
@@ -80,7 +86,7 @@ def curves(answer: RayAnswer) -> Curves:
     measured = np.zeros(len(x))
     if answer.measured_m is not None:
         measured = (np.abs(x - answer.measured_m) <= 1.5 * _STEP_M).astype(float)
-    return x, steps[0], visibility.astype(np.float64), steps[1], in_band, measured
+    return x, in_band, measured, visibility.astype(np.float64), steps[1], steps[0]
 
 
 def _band_m(answer: RayAnswer) -> tuple[float, float] | None:
@@ -89,6 +95,15 @@ def _band_m(answer: RayAnswer) -> tuple[float, float] | None:
         return None
     middle = answer.measured_m - answer.bias_m
     return middle - answer.sigma_m, middle + answer.sigma_m
+
+
+def _surface_m(answer: RayAnswer) -> float:
+    """Where the map or the measurement has its surface, whichever is nearer."""
+    band = _band_m(answer)
+    places = [] if band is None else [band[0]]
+    if len(answer.omega):
+        places.append(float(answer.distance[np.argmax(answer.omega)]))
+    return min(places, default=0.0)
 
 
 def _end_m(answer: RayAnswer) -> float:

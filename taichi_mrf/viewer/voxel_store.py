@@ -165,6 +165,10 @@ class VoxelStore:
             + [chunk.bricks + np.array(key, np.int64) * CHUNK for key, chunk in self.chunks.items()]
         )
 
+    def most_seen(self) -> int:
+        """The largest number of keyframes that see a voxel."""
+        return max((int(chunk.seen.max(initial=0)) for chunk in self.chunks.values()), default=0)
+
     def shown(self, key: ChunkKey, log_odds: float, cut: Cut | None) -> Shown:
         """The voxels of a chunk that are at least so probable and not cut away; none if there is no chunk."""
         chunk = self.chunks.get(key)

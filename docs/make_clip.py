@@ -1,0 +1,141 @@
+"""Makes docs/images/live.gif and live.png: the built-in room in the live viewer, as a browser shows it.
+
+    python docs/make_clip.py
+
+Needs what the browser tests need: playwright (extra: dev) and Debian's chromium. The browser draws by
+software, so the pictures are taken one by one, and the clip plays them at a pace of its own.
+"""
+
+import io
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(REPOSITORY / "tests"))  # the browser tests' hands and eyes serve here too
+
+from browser import LivePage, chromium  # noqa: E402
+from live_program import LiveProgram  # noqa: E402
+
+IMAGES = REPOSITORY / "docs" / "images"
+ROOM = ("synthetic:room", "--voxel-size", "0.05", "--speed", "0.2")
+"""At this pace a frame comes in a second, in which the browser can draw and be photographed."""
+
+WIDTH, HEIGHT = 1240, 700
+CLIP_WIDTH = 800
+COLORS = 128
+CAMERA_COLOR = (230, 0, 126)
+"""Of the camera and its way: too few pixels to get a place among the colours of the clip by themselves."""
+
+FRAME_MS, LAST_MS = 150, 1500
+
+ORBIT_SHOTS, ORBIT_PIXELS = 20, 15.0
+CUT_SHOTS, CUT_FROM, CUT_TO = 16, 0.85, 0.35
+
+
+def main() -> None:
+    """Run the room once and write both files."""
+    with LiveProgram(*ROOM) as program, chromium() as browser:
+        with LivePage(browser, program.address, WIDTH, HEIGHT) as page:
+            shots = keyframes_arriving(page) + orbit(page) + cut_moving_through(page)
+        write_clip(shots, IMAGES / "live.gif")
+        with LivePage(browser, program.address, 1280, 800) as page:
+            small_colors(still(page), 255).save(IMAGES / "live.png", optimize=True)
+    for name in ("live.gif", "live.png"):
+        print(f"wrote {IMAGES / name}: {(IMAGES / name).stat().st_size / 1e6:.1f} MB, {len(shots)} pictures")
+
+
+def shot(page: LivePage) -> Image.Image:
+    """What the page looks like, once it has drawn what it knows."""
+    page.pause(0.4)
+    return Image.open(io.BytesIO(page.page.screenshot())).convert("RGB")
+
+
+def keyframes_arriving(page: LivePage) -> list[Image.Image]:
+    """One picture for each keyframe, from the first one on."""
+    close_warning(page)
+    page.press("Reset")
+    page.until(lambda seen: len(seen.keyframes) < 2, "a new beginning")
+    shots: list[Image.Image] = []
+    counts = [0]
+    while True:
+        seen = page.until(lambda seen: seen.settled or len(seen.keyframes) > counts[-1], "a keyframe")
+        shots.append(shot(page))
+        counts.append(len(seen.keyframes))
+        if seen.settled:
+            return shots
+
+
+def orbit(page: LivePage) -> list[Image.Image]:
+    """A turn around the map, by dragging beside it."""
+    shots, mouse, (x, y) = [], page.page.mouse, (0.3 * WIDTH, 0.9 * HEIGHT)
+    mouse.move(x, y)
+    mouse.down()
+    for i in range(1, ORBIT_SHOTS + 1):
+        mouse.move(x + i * ORBIT_PIXELS, y)
+        shots.append(shot(page))
+    mouse.up()
+    return shots
+
+
+def cut_moving_through(page: LivePage) -> list[Image.Image]:
+    """A level cut that sinks into the room, so that free space is seen."""
+    shots = []
+    page.slide("Cut at", CUT_FROM)
+    page.select("Cut axis", "z")
+    page.page.mouse.move(0.3 * WIDTH, 0.9 * HEIGHT)
+    for share in np.linspace(CUT_FROM, CUT_TO, CUT_SHOTS):
+        page.slide("Cut at", round(float(share), 3))
+        page.until(lambda seen: seen.agrees, "the cut")
+        shots.append(shot(page))
+    page.select("Cut axis", "none")
+    page.until_settled()
+    return shots
+
+
+def still(page: LivePage) -> Image.Image:
+    """The whole map, with the ray of a pixel of one keyframe."""
+    page.until_settled()
+    close_warning(page)
+    page.tab("Keyframes")
+    page.select("Keyframe", re.compile("room-0009"))
+    page.tab("Ray")
+    page.fill("Pixel (u, v)", 160, 130)
+    page.press("Ray of pixel")
+    page.until(lambda seen: "/ray" in seen.nodes, "the ray")
+    page.pause(1.0)
+    return shot(page)
+
+
+def close_warning(page: LivePage) -> None:
+    """Send away what the page says of browsers that draw by software."""
+    page.page.locator(".mantine-Notification-closeButton").first.click()
+    page.pause(0.5)
+
+
+def small_colors(picture: Image.Image, count: int) -> Image.Image:
+    """The same in few colours, which makes files small."""
+    return picture.quantize(count, dither=Image.Dither.NONE)
+
+
+def side_by_side(pictures: list[Image.Image]) -> Image.Image:
+    """Pictures of one size as one."""
+    return Image.fromarray(np.concatenate([np.asarray(each) for each in pictures], axis=1))
+
+
+def write_clip(shots: list[Image.Image], path: Path) -> None:
+    """A GIF of all pictures in the same few colours."""
+    size = CLIP_WIDTH, round(CLIP_WIDTH * HEIGHT / WIDTH)
+    small = [each.resize(size, Image.Resampling.LANCZOS) for each in shots]
+    rare = Image.new("RGB", (size[0] // 4, size[1]), CAMERA_COLOR)
+    palette = small_colors(side_by_side([*small[:: len(small) // 8], rare]), COLORS)
+    frames = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in small]
+    durations = [FRAME_MS] * (len(frames) - 1) + [LAST_MS]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)
+
+
+if __name__ == "__main__":
+    main()
