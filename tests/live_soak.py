@@ -30,26 +30,24 @@ OPTIONS = ("synthetic:room", "--loop", "--keep-live", "24")
 
 @dataclass(frozen=True)
 class Sample:
-    """Memory at one moment, in MB: the part of the resident pages that is each process's own share (PSS)."""
+    """Resident memory of both processes at one moment, in MB."""
 
     seconds: float
     mapper: float
     viewer: float
-    mapper_rss: float
-    viewer_rss: float
     received: float
     """MB that the client has got since the beginning."""
 
 
-def memory_mb(pid: int) -> tuple[float, float]:
-    """PSS and RSS of a process, MB."""
+def memory_mb(pid: int) -> float:
+    """Resident memory of a process, MB. Its proportional share (PSS) would move whenever another program
+    that uses the same libraries comes or goes."""
     fields = dict(
         line.split(":", 1)
         for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:]
         if ":" in line
     )
-    pss, rss = (int(fields[name].split()[0]) / 1024 for name in ("Pss", "Rss"))
-    return pss, rss
+    return int(fields["Rss"].split()[0]) / 1024
 
 
 class Drain:
@@ -92,9 +90,8 @@ def soak(minutes: float, to: Path, options: tuple[str, ...]) -> list[Sample]:
             time.sleep(INTERVAL_S)
             if drain.lost:
                 raise SystemExit(f"the client was lost: {drain.lost}; the program said {program.said}")
-            (mapper_pss, mapper_rss), (viewer_pss, viewer_rss) = memory_mb(program.pid), memory_mb(viewer)
             seconds, received = time.monotonic() - begin, drain.received / 1e6
-            sample = Sample(seconds, mapper_pss, viewer_pss, mapper_rss, viewer_rss, received)
+            sample = Sample(seconds, memory_mb(program.pid), memory_mb(viewer), received)
             samples.append(sample)
             writer.writerow([f"{value:.1f}" for value in vars(sample).values()])
             file.flush()
