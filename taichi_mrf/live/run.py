@@ -57,7 +57,8 @@ class Run:
 
     def begin(self, first_id: int) -> None:
         """Forget the map, if there is one, and start the source from its beginning, at the speed in
-        force. The viewer's numbers of keyframes begin at ``first_id``. What is raised leaves the old map in place."""
+        force. The viewer's numbers of keyframes begin at ``first_id``. What is raised leaves the old map in
+        place."""
         self.mapper = Mapper(self.source.new_map(), first_id)
         replay = self.source.new_replay() if self.source.new_replay else None
         if replay is not None and self.replay is not None:
