@@ -13,6 +13,7 @@ from taichi_mrf.commands.calibrate import Calibrate
 from taichi_mrf.commands.eval import Eval
 from taichi_mrf.commands.flags import registry
 from taichi_mrf.commands.info import Info
+from taichi_mrf.commands.laser import Laser, laser_settings
 from taichi_mrf.commands.live import Live
 from taichi_mrf.commands.map import Map, file_settings
 from taichi_mrf.errors import TaichiMRFError
@@ -50,9 +51,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return ABORTED
 
 
-def parse(arguments: Sequence[str]) -> Map | Live | Info | Bench | Calibrate | Eval:
+def parse(arguments: Sequence[str]) -> Map | Live | Info | Bench | Calibrate | Eval | Laser:
     """The command that the arguments ask for. Exits with status 2 where they cannot be parsed."""
     settings = file_settings(arguments[1:]) if arguments[:1] in (["map"], ["live"]) else file_settings([])
+    laser = laser_settings(arguments[1:] if arguments[:1] == ["laser"] else [])
     commands = (
         Annotated[
             Map,
@@ -65,6 +67,12 @@ def parse(arguments: Sequence[str]) -> Map | Live | Info | Bench | Calibrate | E
         | Annotated[Bench, tyro.conf.subcommand("bench", default=Bench(), prefix_name=False)]
         | Annotated[Calibrate, tyro.conf.subcommand("calibrate", prefix_name=False)]
         | Annotated[Eval, tyro.conf.subcommand("eval", prefix_name=False)]
+        | Annotated[
+            Laser,
+            tyro.conf.subcommand(
+                "laser", default=Laser(tyro.MISSING, tyro.MISSING, settings=laser), prefix_name=False
+            ),
+        ]
     )
     return tyro.cli(
         commands,

@@ -24,7 +24,7 @@ FLOORS = [
         "",
     },
     {"sensor", "keyframes"},
-    {"inference", "queries", "datasets", "export", "viewer"},
+    {"inference", "queries", "datasets", "export", "viewer", "factor_graph"},
     {"maps"},
     {"pipeline"},
     {"evaluation", "calibration"},

@@ -8,8 +8,9 @@ from tyro.constructors import ConstructorRegistry, StructConstructorSpec, Struct
 from taichi_mrf import config
 from taichi_mrf.calibration import options as calibration_options
 from taichi_mrf.config_text import field_help
+from taichi_mrf.factor_graph import config as factor_graph_config
 
-DEFINITIONS = (config.__name__, calibration_options.__name__)
+DEFINITIONS = (config.__name__, calibration_options.__name__, factor_graph_config.__name__)
 """The modules whose dataclasses are parameters."""
 
 registry = ConstructorRegistry()

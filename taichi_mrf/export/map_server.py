@@ -1,0 +1,43 @@
+"""2D maps in the format of ROS's map_server: a grey image and a YAML file that says where it lies."""
+
+from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from taichi_mrf.export.atomic import atomic_path, write_text
+
+OCCUPIED_GREY, FREE_GREY, UNKNOWN_GREY = 0, 254, 205
+OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196
+"""From which probability on map_server holds a cell to be occupied, and up to which to be free; the three
+grey values stand for 1, 0.004 and 0.196, the last of which it reads as unknown."""
+
+
+def grey_image(occupied: NDArray[np.bool_], seen: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Cells (rows, columns), rows from the lowest y up, as an image whose top row has the highest y."""
+    grey = np.where(occupied, OCCUPIED_GREY, FREE_GREY)
+    return np.flipud(np.where(seen, grey, UNKNOWN_GREY)).astype(np.uint8)
+
+
+def write_map_server(
+    folder: Path, image: NDArray[np.uint8], cell_size: float, lower_x_y: tuple[float, float]
+) -> list[Path]:
+    """Write ``map.pgm`` and ``map.yaml``; returns their paths. Raises MapFileError.
+
+    ``lower_x_y`` is the outer corner of the image's lower left pixel, in metres, as is ``cell_size``.
+    """
+    pgm, description = folder / "map.pgm", folder / "map.yaml"
+    height, width = image.shape
+    with atomic_path(pgm) as temporary:
+        temporary.write_bytes(f"P5\n{width} {height}\n255\n".encode("ascii") + image.tobytes())
+    values = {
+        "image": pgm.name,
+        "resolution": float(cell_size),
+        "origin": [float(lower_x_y[0]), float(lower_x_y[1]), 0.0],
+        "negate": 0,
+        "occupied_thresh": OCCUPIED_THRESHOLD,
+        "free_thresh": FREE_THRESHOLD,
+    }
+    write_text(description, yaml.safe_dump(values, sort_keys=False, default_flow_style=None))
+    return [pgm, description]

@@ -1,0 +1,139 @@
+"""Dual decomposition by block-coordinate ascent, in the manner of MPLP: the bound never falls.
+
+Beside the multipliers t of dual_decomposition.py, each cell keeps the rest r, minus the sum of its
+multipliers, as a slave of its own; the bound is the sum of the slaves' minima and of min(0, r). One
+iteration does two things to all beams at once, neither of which lowers it:
+
+    gather   each beam takes the d-th part of the rest of a cell that d beams cross;
+    give     with M_i what occupied then costs more than free in cell i, min-marginal of the whole beam, it
+             gives back M_i / m for each of its m contested cells, on whose label the beams do not agree.
+
+Giving all of one cell's M would leave the sum of the beam's minimum and of the cell's own unchanged; giving
+the m-th part of each is the mean of m such steps, and a minimum of linear functions is concave.
+
+Everything is whole units, as in dual_decomposition.py, so the bound is exact.
+"""
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf.factor_graph.config import LaserConfig
+from taichi_mrf.factor_graph.dual_decomposition import units32
+from taichi_mrf.factor_graph.first_occupied import left_alone, message, next_ahead, next_behind
+from taichi_mrf.factor_graph.graph import FactorGraph
+from taichi_mrf.factor_graph.potentials import (
+    UNITS,
+    beam_of,
+    energy_of_first,
+    energy_of_none,
+    is_gaussian,
+    sensor_vector,
+    tables,
+)
+from taichi_mrf.factor_graph.workers import Workers, share_begin
+from taichi_mrf.voxels.types import I32, F32Array2, I32Array, I64Array, IVec3, Template, Vec5
+
+NEVER = 2**29
+"""Stands for an infinite cost, in units; far above every energy, and its double still fits 32 bits."""
+
+MOST_GIVEN = 4000 * int(UNITS)
+"""A beam gives no more than this at once; less than all is as good, and multipliers stay within 32 bits."""
+
+
+@ti.kernel
+def _gather_and_give(
+    begins: I32Array, cells: I32Array, hits: I32Array, rays: F32Array2, shape: IVec3, sensor: Vec5,
+    multipliers: I32Array, share: I32Array, contested: I32Array,
+    given: I64Array, marginal: I64Array, want_free: I32Array, want_occupied: I32Array, bound: I64Array,
+    scratch: I32Array, longest: I32, workers: I32, spread: I32, gaussian: Template,
+):  # fmt: skip
+    """One iteration over all beams.
+
+    ``share`` is what each beam takes of a cell's rest. ``given`` receives what they give back, ``marginal``
+    the sum of their min-marginals, the wants which labels they ask for, and ``bound`` the sum of the slaves'
+    minima after gathering.
+    """
+    for iteration in range(workers * spread):
+        if iteration % spread == 0:
+            worker = iteration // spread
+            trace = worker * longest
+            beams = begins.shape[0] - 1
+            for f in range(
+                share_begin(worker, workers, 0, beams), share_begin(worker + 1, workers, 0, beams)
+            ):
+                beam = beam_of(f, begins, hits, rays, gaussian)
+                ahead = NEVER
+                open_cells = 0
+                alone = ti.cast(0, ti.i64)
+                for step in range(beam.steps):
+                    edge = beam.begin + step
+                    cell = cells[edge]
+                    t = multipliers[edge] + share[cell]
+                    multipliers[edge] = t
+                    open_cells += contested[cell]
+                    scratch[trace + step] = ahead
+                    here = units32(energy_of_first(beam, step, cell, sensor, shape, gaussian))
+                    # Nothing behind a cell that is surely occupied depends on how sure it is.
+                    ahead = ti.max(-NEVER, next_ahead(ahead, here, t, False))
+                    alone += left_alone(t, False)
+                behind = units32(energy_of_none(beam, sensor))
+                for back in range(beam.steps):
+                    step = beam.steps - 1 - back
+                    edge = beam.begin + step
+                    cell = cells[edge]
+                    t = multipliers[edge]
+                    here = units32(energy_of_first(beam, step, cell, sensor, shape, gaussian))
+                    both = t + message(scratch[trace + step], here, behind, False)
+                    if both < 0:
+                        want_occupied[cell] = 1
+                    elif both > 0:
+                        want_free[cell] = 1
+                    ti.atomic_add(marginal[cell], ti.cast(both, ti.i64))
+                    if contested[cell] == 1:
+                        # Towards zero: a beam that gave a unit too much could lower the bound.
+                        gift = ti.min(MOST_GIVEN, ti.abs(both)) // open_cells
+                        if both < 0:
+                            gift = -gift
+                        multipliers[edge] = t - gift
+                        ti.atomic_add(given[cell], ti.cast(gift, ti.i64))
+                    behind = next_behind(behind, here, t, False)
+                ti.atomic_add(bound[0], behind + alone)
+
+
+class BlockAscent:
+    """Multipliers and rests; one iteration over all beams at a time."""
+
+    def __init__(self, graph: FactorGraph, config: LaserConfig) -> None:
+        self.graph, self.config = graph, config
+        self.workers = Workers(graph)
+        self.scratch = ti.ndarray(ti.i32, self.workers.number * graph.longest)
+        self.multipliers = ti.ndarray(ti.i32, max(1, graph.edges))
+        self.multipliers.fill(0)
+        cells = graph.grid.cells
+        self.degrees = np.maximum(graph.degrees.to_numpy(), 1).astype(np.int64)
+        self.rest, self.marginal = np.zeros(cells, np.int64), np.zeros(cells, np.int64)
+        self.contested = np.ones(cells, np.int32)
+        self.dual = -np.inf
+
+    def iterate(self) -> float:
+        """Gather, note the bound, give; returns the share of cells on which beams do not agree."""
+        graph, workers, cells = self.graph, self.workers, self.graph.grid.cells
+        share = np.sign(self.rest) * np.minimum(np.abs(self.rest) // self.degrees, MOST_GIVEN)
+        self.rest -= share * graph.degrees.to_numpy()
+        given, bound = np.zeros(cells, np.int64), np.zeros(1, np.int64)
+        want_free, want_occupied = np.zeros(cells, np.int32), np.zeros(cells, np.int32)
+        self.marginal.fill(0)
+        _gather_and_give(
+            *tables(graph), sensor_vector(graph, self.config), self.multipliers, share.astype(np.int32),
+            self.contested, given, self.marginal, want_free, want_occupied, bound, self.scratch,
+            workers.longest, workers.number, workers.spread, is_gaussian(self.config),
+        )  # fmt: skip
+        self.dual = max(self.dual, (int(bound[0]) + int(np.minimum(self.rest, 0).sum())) / UNITS)
+        self.rest += given
+        self.contested = want_free & want_occupied
+        return float(self.contested.sum()) / max(1, int(graph.connected.sum()))
+
+    def labels(self) -> NDArray[np.uint8]:
+        """(cells,): 1 where occupied costs the beams less in sum."""
+        return (self.marginal < 0).astype(np.uint8)

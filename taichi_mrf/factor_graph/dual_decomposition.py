@@ -1,0 +1,179 @@
+"""Dual decomposition by subgradients (section V-B, Alg. 2), with the bound that it proves.
+
+Each beam is a slave that minimises its own energy plus multipliers (eq. 23): one number t for each edge,
+what occupied costs this beam more than free. If a cell's multipliers sum to zero, every labelling of the
+whole graph costs the same with them as without, so the sum of the slaves' minima is a lower bound of the
+least energy. The subgradient of that bound is where each slave puts its ones; projected onto multipliers
+that sum to zero,
+
+    t_if += step / (r + 1) * (x_i^f - mean over f of x_i^f)
+
+which is zero in cells on which the slaves agree. (Alg. 2 charges each disagreeing slave for its own choice
+instead, by the same amount on either side, which is this up to a common offset where opinions are even; its
+sum is not zero, and so it would not bound anything.) Eq. 24 then picks the label for which a disagreeing
+cell's slaves have been charged the most.
+
+Multipliers are integers of 1 / UNITS. What rounding leaves of a cell's sum is known exactly; it counts as a
+slave of its own, of that cell alone, and goes back into the multipliers at the next step. The bound is exact.
+"""
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf.factor_graph.config import LaserConfig
+from taichi_mrf.factor_graph.first_occupied import left_alone, next_behind
+from taichi_mrf.factor_graph.graph import FactorGraph
+from taichi_mrf.factor_graph.potentials import (
+    UNITS,
+    Beam,
+    beam_of,
+    energy_of_first,
+    energy_of_none,
+    is_gaussian,
+    sensor_vector,
+    tables,
+)
+from taichi_mrf.voxels.types import I32, F32Array2, I32Array, I64Array, IVec3, Template, Vec5
+
+
+@ti.func
+def units32(value: ti.f32) -> I32:
+    """An energy in whole units, as the judge counts it."""
+    return ti.cast(ti.round(value * UNITS), ti.i32)
+
+
+@ti.func
+def solve_slave(
+    beam: Beam, cells: Template, multipliers: Template, sensor: Vec5, shape: IVec3, gaussian: Template
+):
+    """(value, step of the first occupied cell) of a beam's least energy with its multipliers, in units.
+
+    Behind its first occupied cell, whatever has a negative multiplier is occupied.
+    """
+    behind = units32(energy_of_none(beam, sensor))
+    alone = ti.cast(0, ti.i64)
+    first: ti.i32 = beam.steps
+    for back in range(beam.steps):
+        step = beam.steps - 1 - back
+        t = multipliers[beam.begin + step]
+        cell = 0
+        if ti.static(gaussian):
+            cell = cells[beam.begin + step]
+        here = units32(energy_of_first(beam, step, cell, sensor, shape, gaussian))
+        if here + ti.max(0, t) < behind + ti.max(0, -t):
+            first = step
+        behind = next_behind(behind, here, t, False)
+        alone += left_alone(t, False)
+    return behind + alone, first
+
+
+@ti.kernel
+def _solve_slaves(
+    begins: I32Array, cells: I32Array, hits: I32Array, rays: F32Array2, shape: IVec3, sensor: Vec5,
+    multipliers: I32Array, awake: I32Array, firsts: I32Array, values: I64Array, ones: I32Array,
+    sums: I64Array, gaussian: Template,
+):  # fmt: skip
+    """Eq. 23 for every beam whose multipliers have changed; count each cell's ones, and sum the values."""
+    for f in range(begins.shape[0] - 1):
+        if awake[f] == 1:
+            beam = beam_of(f, begins, hits, rays, gaussian)
+            value, first = solve_slave(beam, cells, multipliers, sensor, shape, gaussian)
+            ti.atomic_add(sums[0], value - values[f])
+            values[f] = value
+            firsts[f] = first
+        first_edge = begins[f] + firsts[f]
+        for edge in range(first_edge, begins[f + 1]):
+            if edge == first_edge or multipliers[edge] < 0:
+                ti.atomic_add(ones[cells[edge]], 1)
+
+
+@ti.kernel
+def _choose_steps(
+    ones: I32Array, degrees: I32Array, rest: I64Array, charged: I64Array, step: ti.f32,
+    if_free: I32Array, if_occupied: I32Array, sums: I64Array,
+):  # fmt: skip
+    """What each cell's multipliers grow by where a slave says free, and where it says occupied.
+
+    ``rest`` is minus the sum of a cell's multipliers; ``charged`` what slaves were charged for occupied less
+    what they were for free (eq. 24). sums[1] is the value of the rest's own slaves, sums[2] counts
+    disagreeing cells.
+    """
+    for cell in range(ones.shape[0]):
+        yes, all_of_them = ones[cell], degrees[cell]
+        if_free[cell] = 0
+        if_occupied[cell] = 0
+        ti.atomic_add(sums[1], ti.min(ti.cast(0, ti.i64), rest[cell]))
+        if 0 < yes < all_of_them:
+            mean = ti.cast(yes, ti.f32) / all_of_them
+            back = ti.cast(rest[cell], ti.f32) / all_of_them
+            down = ti.cast(ti.round(back - step * UNITS * mean), ti.i32)
+            up = ti.cast(ti.round(back + step * UNITS * (1.0 - mean)), ti.i32)
+            if_free[cell] = down
+            if_occupied[cell] = up
+            rest[cell] -= ti.cast(up, ti.i64) * yes + ti.cast(down, ti.i64) * (all_of_them - yes)
+            charged[cell] += ti.cast(step * UNITS, ti.i64) * (2 * yes - all_of_them)
+            ti.atomic_add(sums[2], ti.cast(1, ti.i64))
+
+
+@ti.kernel
+def _change_multipliers(
+    begins: I32Array, cells: I32Array, firsts: I32Array, if_free: I32Array, if_occupied: I32Array,
+    multipliers: I32Array, awake: I32Array,
+):  # fmt: skip
+    """Take the step in every cell on which slaves disagree, and mark the beams that it concerns."""
+    for f in range(begins.shape[0] - 1):
+        first_edge = begins[f] + firsts[f]
+        concerned = 0
+        for edge in range(begins[f], begins[f + 1]):
+            cell = cells[edge]
+            if if_occupied[cell] != 0 or if_free[cell] != 0:
+                t = multipliers[edge]
+                occupied = edge == first_edge or (edge > first_edge and t < 0)
+                multipliers[edge] = t + (if_occupied[cell] if occupied else if_free[cell])
+                concerned = 1
+        awake[f] = concerned
+
+
+class DualDecomposition:
+    """Multipliers and what the slaves last said; one iteration of Alg. 2 at a time."""
+
+    def __init__(self, graph: FactorGraph, config: LaserConfig) -> None:
+        self.graph, self.config = graph, config
+        self.multipliers = ti.ndarray(ti.i32, max(1, graph.edges))
+        self.multipliers.fill(0)
+        beams, cells = graph.beams, graph.grid.cells
+        self.awake, self.firsts = np.ones(beams, np.int32), np.zeros(beams, np.int32)
+        self.values = np.zeros(beams, np.int64)
+        self.ones, self.if_free, self.if_occupied = (np.zeros(cells, np.int32) for _ in range(3))
+        self.rest, self.charged = np.zeros(cells, np.int64), np.zeros(cells, np.int64)
+        self.slaves_value = 0
+        self.iteration = 0
+        self.dual = -np.inf
+
+    def iterate(self) -> float:
+        """Solve the slaves, note the bound, take a step; returns the share of cells in disagreement."""
+        graph, sums = self.graph, np.zeros(3, np.int64)
+        self.ones.fill(0)
+        _solve_slaves(
+            *tables(graph), sensor_vector(graph, self.config), self.multipliers, self.awake, self.firsts,
+            self.values, self.ones, sums, is_gaussian(self.config),
+        )  # fmt: skip
+        step = self.config.step / (self.iteration + 1)
+        _choose_steps(
+            self.ones, graph.degrees, self.rest, self.charged, step, self.if_free, self.if_occupied, sums
+        )
+        _change_multipliers(
+            graph.begins, graph.cells, self.firsts, self.if_free, self.if_occupied, self.multipliers,
+            self.awake,
+        )  # fmt: skip
+        self.slaves_value += int(sums[0])
+        self.dual = max(self.dual, (self.slaves_value + int(sums[1])) / UNITS)
+        self.iteration += 1
+        return int(sums[2]) / max(1, int(graph.connected.sum()))
+
+    def labels(self) -> NDArray[np.uint8]:
+        """(cells,): what the slaves agree on, and else eq. 24."""
+        degrees = self.graph.degrees.to_numpy()
+        agreed = (self.ones == 0) | (self.ones == degrees)
+        return np.where(agreed, (self.ones > 0), self.charged > 0).astype(np.uint8)

@@ -1,0 +1,41 @@
+"""The inverse sensor model (eqs. 4 to 6): every cell for itself, log-odds added up beam by beam."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf.factor_graph.graph import FactorGraph
+from taichi_mrf.voxels.types import I32Array
+
+
+@ti.kernel
+def _count_ends(begins: I32Array, cells: I32Array, hits: I32Array, ends: I32Array):
+    for f in range(begins.shape[0] - 1):
+        if hits[f] == 1 and begins[f + 1] > begins[f]:
+            ti.atomic_add(ends[cells[begins[f + 1] - 1]], 1)
+
+
+@dataclass(frozen=True)
+class InverseModel:
+    """Labels and marginals, (cells,): what no beam crosses is free, at one half."""
+
+    labels: NDArray[np.uint8]
+    marginals: NDArray[np.float32]
+
+
+def ends_of_beams(graph: FactorGraph) -> NDArray[np.int32]:
+    """(cells,): how many beams with a return end in each cell."""
+    ends = np.zeros(graph.grid.cells, np.int32)
+    if graph.beams:
+        _count_ends(graph.begins, graph.cells, graph.hits, ends)
+    return ends
+
+
+def inverse_model(graph: FactorGraph, log_odds: float) -> InverseModel:
+    """A return says occupied of the cell that it lies in, by ``log_odds``, and free of each one before it."""
+    returns = ends_of_beams(graph)
+    votes = 2 * returns.astype(np.int64) - graph.degrees.to_numpy()
+    marginals = 1.0 / (1.0 + np.exp(np.clip(-log_odds * votes, -700, 700)))
+    return InverseModel((votes > 0).astype(np.uint8), marginals.astype(np.float32))

@@ -1,0 +1,141 @@
+"""One call for every method: iterate, judge the labelling by its energy, and keep the best one."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.factor_graph.belief_propagation import BeliefPropagation
+from taichi_mrf.factor_graph.block_ascent import BlockAscent
+from taichi_mrf.factor_graph.config import LaserConfig, Method
+from taichi_mrf.factor_graph.descent import descended
+from taichi_mrf.factor_graph.dual_decomposition import DualDecomposition
+from taichi_mrf.factor_graph.graph import FactorGraph
+from taichi_mrf.factor_graph.inverse import inverse_model
+from taichi_mrf.factor_graph.metropolis_hastings import MetropolisHastings
+from taichi_mrf.factor_graph.potentials import energy, judged
+
+__all__ = ["METHODS", "Solution", "Step", "energy", "solve"]
+
+METHODS: tuple[str, ...] = get_args(Method)
+"""Names of all methods."""
+
+PROVED = 1e-9
+"""A dual that is this near to the energy, as a share of it, proves that the labelling is the best."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """Where a method stands after an iteration."""
+
+    seconds: float
+    """Since the method began, compiling kernels included."""
+
+    iteration: int
+    """0 is the first."""
+
+    energy: float
+    """Of this iteration's labelling."""
+
+    dual: float | None
+    """The best lower bound so far; None for methods that prove none."""
+
+    residual: float
+    """Share of the cells on which slaves disagree (dual decomposition), whose belief has moved (belief
+    propagation) or whose label has changed (Metropolis-Hastings)."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What a method found; the labelling is that of the least energy which it came across."""
+
+    labels: NDArray[np.uint8]
+    """(cells,): 1 for occupied. A cell that no beam crosses is free."""
+
+    marginals: NDArray[np.float32] | None
+    """(cells,): probability of occupied, None for methods that only look for the best labelling."""
+
+    energy: float
+    dual: float | None
+    trace: tuple[Step, ...]
+
+    explained: float
+    """Share of the beams that the labelling explains: only the last cell is occupied, or, without a return,
+    none."""
+
+
+class _Iterative(Protocol):
+    """What an iterative method is to :func:`solve`."""
+
+    def iterate(self) -> float: ...
+
+    def labels(self) -> NDArray[np.uint8]: ...
+
+
+def solve(
+    graph: FactorGraph, config: LaserConfig, progress: Callable[[Step], bool] = lambda step: True
+) -> Solution:
+    """Label the graph by ``config.method``, for at most ``config.iterations`` iterations.
+
+    ``progress`` is called after each iteration; where it returns False the method stops, and what it has
+    found is kept. Taichi must run.
+    """
+    started = time.perf_counter()
+    if config.method == "inverse":
+        model = inverse_model(graph, config.log_odds)
+        value, explained = judged(graph, config, model.labels)
+        step = Step(time.perf_counter() - started, 0, value, None, 0.0)
+        progress(step)
+        return Solution(model.labels, model.marginals, value, None, (step,), explained)
+    return _iterated(_method(graph, config), graph, config, progress, started)
+
+
+def _method(graph: FactorGraph, config: LaserConfig) -> _Iterative:
+    if config.method in ("mh", "mh-heat"):
+        return MetropolisHastings(graph, config)
+    if config.method in ("bp", "max-product"):
+        return BeliefPropagation(graph, config)
+    if config.method == "dd-block":
+        return BlockAscent(graph, config)
+    return DualDecomposition(graph, config)
+
+
+def _iterated(
+    method: _Iterative,
+    graph: FactorGraph,
+    config: LaserConfig,
+    progress: Callable[[Step], bool],
+    started: float,
+) -> Solution:
+    best = np.zeros(graph.grid.cells, np.uint8)
+    least, explained = judged(graph, config, best)
+    trace: list[Step] = []
+    dual: float | None = None
+    for iteration in range(config.iterations):
+        if isinstance(method, MetropolisHastings) and iteration == int(config.burn_in * config.iterations):
+            method.forget()
+        residual = method.iterate()
+        labels = method.labels()
+        value, share = judged(graph, config, labels)
+        if value < least or iteration == 0:
+            least, explained, best = value, share, labels
+        dual = method.dual if isinstance(method, DualDecomposition | BlockAscent) else None
+        seconds = time.perf_counter() - started
+        trace.append(Step(seconds, iteration, value, dual, residual))
+        go_on = progress(trace[-1]) and not 0 < config.seconds <= seconds
+        proved = dual is not None and least - dual <= PROVED * abs(least)
+        still = residual == 0 and not isinstance(method, MetropolisHastings)
+        if not go_on or proved or still:
+            break
+    if config.polish > 0 and not isinstance(method, MetropolisHastings) and trace:
+        best = descended(graph, config, best, config.polish)
+        least, explained = judged(graph, config, best)
+        trace.append(Step(time.perf_counter() - started, len(trace), least, dual, trace[-1].residual))
+        progress(trace[-1])
+    marginals = None
+    if config.method != "max-product" and isinstance(method, MetropolisHastings | BeliefPropagation):
+        marginals = method.marginals()
+    return Solution(best, marginals, least, dual, tuple(trace), explained)
