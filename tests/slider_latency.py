@@ -31,7 +31,7 @@ _MEASURE = """async ([slider, step]) => {
   return await answer;
 }"""
 
-PAUSE_S = 0.3
+PAUSE_S = 1.0
 """Between an answer and the next question, so that the page has drawn what it got."""
 
 

@@ -20,7 +20,7 @@ from taichi_mrf.viewer.messages import Listening
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
-NICENESS = 5
+NICENESS = 10
 """Mapping leaves the page the processor when both want it."""
 
 SHORTEST_LIFE_SECONDS = 30.0

@@ -4,7 +4,7 @@ Changes are collected, and sent at most :data:`UPDATES_PER_SECOND` times.
 """
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import viser
@@ -100,10 +100,17 @@ class MapScene:
             return max(0.0, self._news_at + REST_S - now)
         return None
 
-    def flush(self, options: ViewOptions, up: Up, crossed: Iterable[NDArray[np.int32]]) -> bool:
+    def flush(
+        self,
+        options: ViewOptions,
+        up: Up,
+        crossed: Iterable[NDArray[np.int32]],
+        announce: Callable[[], None] = lambda: None,
+    ) -> bool:
         """Send what has changed, unless that was done a moment ago; returns whether it was.
 
-        ``crossed`` are bricks (n, 3) that rays went through.
+        ``crossed`` are bricks (n, 3) that rays went through. ``announce`` is called before the voxels go out,
+        when it is known how many there will be: a browser that draws slowly then shows the number first.
         """
         waited = self.patience()
         if waited is None or waited > 0:
@@ -114,11 +121,14 @@ class MapScene:
         everything = self._all_dirty or (self._look is not None and not look.same_everywhere(self._look))
         map_changed = everything or bool(self._dirty["map"])
         any_changed = map_changed or bool(self._dirty["beside"])
+        for name, layer in self.layers.items():
+            chunks = layer.all_chunks() if everything else self._dirty[name]
+            layer.prepare(chunks | (layer.inexact() if rested else set()), look, exactly=rested)
+            self._dirty[name] = set()
+        announce()
         with self._server.atomic():
-            for name, layer in self.layers.items():
-                chunks = layer.all_chunks() if everything else self._dirty[name]
-                layer.refresh(chunks | (layer.inexact() if rested else set()), look, exactly=rested)
-                self._dirty[name] = set()
+            for layer in self.layers.values():
+                layer.send()
             if map_changed:
                 self._draw_cut(look, crossed)
                 self._brick_lines.show(self.store.bricks() if options.bricks else None)

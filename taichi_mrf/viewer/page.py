@@ -5,6 +5,7 @@ is dealt with on one thread, so that no two ever change the same node.
 """
 
 import queue
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -24,6 +25,10 @@ from taichi_mrf.viewer.panel import CHOSEN_KEYFRAME, POSITION_STEP_M, SPEEDS, Pa
 from taichi_mrf.viewer.picking import first_pixel, first_voxel
 
 _NOTICE_COLORS: dict[str, Any] = {"info": "blue", "warning": "yellow", "error": "red"}
+_HEAD_START_S = 0.01
+"""What the event loop needs to send a sentence before the voxels that it is about: they go out in one
+piece, and a browser that draws by software is busy with them for half a second."""
+
 _NOTICE_TITLES = {"info": "Note", "warning": "Note", "error": "Something went wrong"}
 _NOTICE_S = 8.0
 
@@ -122,7 +127,8 @@ class Page:
         """Draw what has changed of the map, if it is time."""
         if self._map is None:
             return
-        if not self._map.flush(self._options, self._eye.up, self._keyframes.roster.crossed()):
+        crossed = self._keyframes.roster.crossed()
+        if not self._map.flush(self._options, self._eye.up, crossed, self._show_counts):
             return
         two = bool(self._map.layers["beside"].store.chunks)
         if two != self._two:
@@ -131,7 +137,6 @@ class Page:
         box = self._map.box_m()
         if box is not None:
             self._eye.map_grew(*box)
-        self._show_counts()
         scale = self._map.scale
         if scale is not None and (self._scale is None or scale.legend() != self._scale.legend()):
             self._scale = scale
@@ -141,6 +146,8 @@ class Page:
         assert self._map is not None
         shown = {name: layer.voxels_shown for name, layer in self._map.layers.items()}
         self._panel.show_counts(shown["map"], shown["beside"], self._downloads.is_recording)
+        self._server.flush()
+        time.sleep(_HEAD_START_S)
 
     def _notify(self, notice: m.Notice) -> None:
         self._panel.show_notice(notice)

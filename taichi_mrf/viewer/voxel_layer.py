@@ -60,12 +60,14 @@ class VoxelLayer:
         self.origin_m = np.zeros(3)
         self.bytes_sent = 0
         self._sent: dict[ChunkKey, _Sent] = {}
+        self._prepared: dict[ChunkKey, _Sent | None] = {}
         self._nodes: dict[ChunkKey, viser.PointCloudHandle] = {}
 
     @property
     def voxels_shown(self) -> int:
-        """Voxels that the clients have been sent and shall show."""
-        return sum(len(sent.cells) for sent in self._sent.values())
+        """Voxels that the clients show once everything that is prepared has been sent."""
+        ahead: dict[ChunkKey, _Sent | None] = {**self._sent, **self._prepared}
+        return sum(len(each.cells) for each in ahead.values() if each is not None)
 
     def place(self, origin_m: NDArray[np.float64]) -> None:
         """Put the whole layer somewhere else in the world."""
@@ -73,10 +75,20 @@ class VoxelLayer:
         for key, node in self._nodes.items():
             node.position = self._position(key)
 
-    def refresh(self, chunks: set[ChunkKey], look: Look, exactly: bool = False) -> None:
-        """Bring chunks up to date. Unless ``exactly``, colours that moved a little are left for later."""
+    def prepare(self, chunks: set[ChunkKey], look: Look, exactly: bool = False) -> None:
+        """Work out what has to be sent of some chunks; :meth:`send` does it. Unless ``exactly``, colours that
+        moved a little are left for later."""
         for key in sorted(chunks):
-            self._refresh_chunk(key, look, exactly)
+            self._prepare_chunk(key, look, exactly)
+
+    def send(self) -> None:
+        """Bring the scene to what was prepared."""
+        for key, now in self._prepared.items():
+            if now is None:
+                self._take_out(key)
+            else:
+                self._send(key, now)
+        self._prepared.clear()
 
     def inexact(self) -> set[ChunkKey]:
         """The chunks that were left for later."""
@@ -89,6 +101,7 @@ class VoxelLayer:
     def clear(self) -> None:
         """Take everything out of the scene, and forget the map."""
         self.store = VoxelStore()
+        self._prepared.clear()
         for key in list(self._sent):
             self._take_out(key)
 
@@ -99,12 +112,12 @@ class VoxelLayer:
             centres.append(sent.cells * self._voxel_size + self._position(key))
         return np.concatenate(centres)
 
-    def _refresh_chunk(self, key: ChunkKey, look: Look, exactly: bool) -> None:
+    def _prepare_chunk(self, key: ChunkKey, look: Look, exactly: bool) -> None:
         shown = self.store.shown(key, look.log_odds, look.cut)
         before = self._sent.get(key)
         if not len(shown.cells):
             if before is not None:
-                self._take_out(key)
+                self._prepared[key] = None
             return
         axis, sign = look.up
         heights = sign * (key[axis] * CHUNK_VOXELS + 0.5 + shown.cells[:, axis]) * self._voxel_size
@@ -121,7 +134,7 @@ class VoxelLayer:
             if moved <= NOTICEABLE and not exactly:
                 before.exact = False
                 return
-        self._send(key, now)
+        self._prepared[key] = now
 
     def _send(self, key: ChunkKey, now: _Sent) -> None:
         self._nodes[key] = self._scene.add_point_cloud(

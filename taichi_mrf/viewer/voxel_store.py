@@ -16,6 +16,11 @@ ChunkKey = tuple[int, int, int]
 
 _IN_BRICK = offsets_in_brick().astype(np.uint8)
 _NOWHERE = -1
+_BITS = VOXELS.bit_length() - 1
+
+_CODES = np.stack(np.unravel_index(np.arange(CHUNK**3), (CHUNK,) * 3), axis=1).astype(np.uint8)
+_CELLS = (_CODES[:, None] * BRICK + _IN_BRICK).reshape(-1, 3)
+"""Where each voxel of each brick of a chunk is in it, 0..63: (512 * 512, 3)."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +64,6 @@ class Chunk:
     def __init__(self) -> None:
         self._row = np.full(CHUNK**3, _NOWHERE, np.int16)
         self._codes = np.zeros(0, np.int16)
-        # Where each voxel is in the chunk: kept, because finding it took half the time of drawing.
-        self._cells = np.zeros((0, VOXELS, 3), np.uint8)
         self.log_odds = np.zeros((0, VOXELS), np.int16)
         self.seen = np.zeros((0, VOXELS), np.uint8)
 
@@ -70,7 +73,7 @@ class Chunk:
     @property
     def bricks(self) -> NDArray[np.int32]:
         """Coordinates (n, 3) of the bricks in this chunk, 0..7."""
-        return _bricks_of(self._codes)
+        return _CODES[self._codes].astype(np.int32)
 
     def put(self, codes: NDArray[np.int16], log_odds: NDArray[np.int16], seen: NDArray[np.uint8]) -> None:
         """Set the voxels of some bricks, known by their numbers in the chunk."""
@@ -78,7 +81,6 @@ class Chunk:
         if len(new):
             self._row[new] = np.arange(len(self), len(self) + len(new))
             self._codes = np.concatenate([self._codes, new])
-            self._cells = np.concatenate([self._cells, _cells_of(new)])
             more = len(new), VOXELS
             self.log_odds = np.concatenate([self.log_odds, np.zeros(more, np.int16)])
             self.seen = np.concatenate([self.seen, np.zeros(more, np.uint8)])
@@ -88,7 +90,7 @@ class Chunk:
     def remove(self, codes: NDArray[np.int16]) -> None:
         """Forget some bricks; those that are not there are no error."""
         keep = ~np.isin(self._codes, codes)
-        self._codes, self._cells = self._codes[keep], self._cells[keep]
+        self._codes = self._codes[keep]
         self.log_odds, self.seen = self.log_odds[keep], self.seen[keep]
         self._row[:] = _NOWHERE
         self._row[self._codes] = np.arange(len(self))
@@ -97,7 +99,7 @@ class Chunk:
         """The voxels of at least these log-odds; with ``hidden_above`` = (axis, cell), only those whose
         cell along that axis is at most that."""
         voxels = np.flatnonzero(self.log_odds.reshape(-1) >= np.ceil(log_odds / LOG_ODDS_STEP))
-        cells = self._cells.reshape(-1, 3)[voxels]
+        cells = _CELLS[self._codes.astype(np.int32)[voxels >> _BITS] << _BITS | voxels & VOXELS - 1]
         if hidden_above is not None:
             kept = cells[:, hidden_above[0]] <= hidden_above[1]
             voxels, cells = voxels[kept], cells[kept]
@@ -108,20 +110,9 @@ class Chunk:
         rows = np.flatnonzero(self.bricks[:, axis] == cell // BRICK)
         voxels = np.flatnonzero(_IN_BRICK[:, axis] == cell % BRICK)
         others = [other for other in range(3) if other != axis]
-        layer = np.ix_(rows, voxels)
-        return self._cells[layer][..., others].reshape(-1, 2).astype(np.int32), self.log_odds[layer].reshape(
-            -1
-        )
-
-
-def _bricks_of(codes: NDArray[np.int16]) -> NDArray[np.int32]:
-    """Numbers of bricks in a chunk as coordinates (n, 3), 0..7."""
-    return np.stack(np.unravel_index(codes, (CHUNK,) * 3), axis=1).astype(np.int32)
-
-
-def _cells_of(codes: NDArray[np.int16]) -> NDArray[np.uint8]:
-    """The cells (n, 512, 3) in the chunk, 0..63, of the voxels of some bricks."""
-    return (_bricks_of(codes) * BRICK).astype(np.uint8)[:, None] + _IN_BRICK
+        cells = _CELLS.reshape(CHUNK**3, VOXELS, 3)[np.ix_(self._codes[rows], voxels)]
+        log_odds = self.log_odds[np.ix_(rows, voxels)]
+        return cells[..., others].reshape(-1, 2).astype(np.int32), log_odds.reshape(-1)
 
 
 class VoxelStore:
@@ -129,6 +120,7 @@ class VoxelStore:
 
     def __init__(self) -> None:
         self.chunks: dict[ChunkKey, Chunk] = {}
+        self._bounds: dict[ChunkKey, tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
 
     def put(
         self, bricks: NDArray[np.int32], log_odds: NDArray[np.int16], seen: NDArray[np.uint8]
@@ -138,6 +130,7 @@ class VoxelStore:
         for key, codes, rows in _by_chunk(bricks):
             self.chunks.setdefault(key, Chunk()).put(codes, log_odds[rows], seen[rows])
             changed.add(key)
+        self._forget_bounds(changed)
         return changed
 
     def remove(self, bricks: NDArray[np.int32]) -> set[ChunkKey]:
@@ -149,14 +142,22 @@ class VoxelStore:
                 changed.add(key)
                 if not len(self.chunks[key]):
                     del self.chunks[key]
+        self._forget_bounds(changed)
         return changed
 
     def bounds(self) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
         """Lowest and highest brick coordinates, (3,) each; None for an empty map."""
         if not self.chunks:
             return None
-        all_bricks = self.bricks()
-        return all_bricks.min(axis=0), all_bricks.max(axis=0)
+        for key in self.chunks.keys() - self._bounds.keys():
+            bricks = self.chunks[key].bricks + np.array(key, np.int64) * CHUNK
+            self._bounds[key] = bricks.min(axis=0), bricks.max(axis=0)
+        lows, highs = zip(*self._bounds.values(), strict=True)
+        return np.min(lows, axis=0), np.max(highs, axis=0)
+
+    def _forget_bounds(self, changed: set[ChunkKey]) -> None:
+        for key in changed:
+            self._bounds.pop(key, None)
 
     def bricks(self) -> NDArray[np.int64]:
         """World coordinates (n, 3) of all bricks."""
