@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import yaml
 
-from taichi_mrf.config_values import from_dict
+from taichi_mrf.config_values import from_dict, read_yaml
 from taichi_mrf.errors import ConfigError
 
 Arch = Literal["auto", "cuda", "vulkan", "cpu"]
@@ -341,13 +341,7 @@ def _check(ok: bool, name: str, problem: str) -> None:
 def load(path: str | Path) -> Config:
     """Read a YAML file. Table paths in it are relative to its folder. Raises ConfigError."""
     path = Path(path)
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
-    return with_absolute_tables(from_dict(Config, values, str(path)), path.parent)
+    return with_absolute_tables(from_dict(Config, read_yaml(path), str(path)), path.parent)
 
 
 def with_absolute_tables(config: Config, folder: Path) -> Config:

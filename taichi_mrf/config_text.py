@@ -11,8 +11,6 @@ from typing import Any
 
 import yaml
 
-from taichi_mrf.config import Config
-
 _WIDTH = 100
 
 
@@ -32,8 +30,8 @@ def field_help(cls: type) -> dict[str, str]:
     return texts
 
 
-def commented_yaml(config: Config) -> str:
-    """All parameters as commented YAML, which :func:`taichi_mrf.config.load` reads back unchanged."""
+def commented_yaml(config: Any) -> str:
+    """All parameters of a configuration dataclass as commented YAML, which reads back unchanged."""
     return "".join(_section(config, ""))
 
 

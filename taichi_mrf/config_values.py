@@ -8,7 +8,10 @@ import dataclasses
 import difflib
 import types
 import typing
+from pathlib import Path
 from typing import Any, Literal, TypeVar
+
+import yaml
 
 from taichi_mrf.errors import ConfigError
 
@@ -30,6 +33,16 @@ def overridden(config: T, overrides: dict[str, Any], where: str) -> T:
         if key not in names:
             raise unknown_key(key, names, where)
     return dataclasses.replace(config, **overrides)  # type: ignore[type-var]
+
+
+def read_yaml(path: Path) -> Any:
+    """The plain values of a YAML file. Raises ConfigError, which names the file."""
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
 
 
 def from_dict(cls: type[T], values: Any, where: str) -> T:

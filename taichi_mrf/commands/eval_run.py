@@ -7,15 +7,14 @@ from typing import Any
 
 import yaml
 from rich.console import Console
-from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table as RichTable
 
 import taichi_mrf
 from taichi_mrf import runtime
 from taichi_mrf.commands.eval import Eval
 from taichi_mrf.commands.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.commands.output import output_folder
+from taichi_mrf.commands.print_table import print_table
 from taichi_mrf.config import Config, to_yaml
 from taichi_mrf.errors import DatasetError, TaichiMRFError
 from taichi_mrf.evaluation.experiments.fig7 import run_fig7
@@ -26,7 +25,7 @@ from taichi_mrf.evaluation.experiments.stereo import run_stereo
 from taichi_mrf.evaluation.experiments.table1 import run_table1
 from taichi_mrf.evaluation.experiments.table2 import run_table2
 from taichi_mrf.evaluation.experiments.table3 import run_table3
-from taichi_mrf.evaluation.experiments.tables import Table, entry_text
+from taichi_mrf.evaluation.experiments.tables import Table
 from taichi_mrf.export.atomic import write_text
 
 Run = Callable[[Experiment], tuple[list[Table], list[Path]]]
@@ -40,10 +39,6 @@ EXPERIMENTS: dict[str, tuple[Run, tuple[float, ...]]] = {
     "stereo": (run_stereo, (0.2,)),
 }
 """Name -> what runs it, and its own voxel sizes."""
-
-
-_WIDEST = 1000
-"""Columns of text that no table needs."""
 
 
 def run_eval(options: Eval) -> int:
@@ -72,7 +67,7 @@ def run_eval(options: Eval) -> int:
                 failed += 1
                 continue
             for table in tables:
-                _print(console, table)
+                print_table(console, table)
             for path in paths:
                 console.print(str(path), markup=False, highlight=False, soft_wrap=True)
     if failed:
@@ -143,19 +138,3 @@ def _configuration(name: str, options: Eval, sizes: tuple[float, ...]) -> str:
         + "maps:\n"
         + "".join(f"  {line}\n" for line in to_yaml(Config()).splitlines())
     )
-
-
-def _print(console: Console, table: Table) -> None:
-    shown = RichTable(title=table.title, title_justify="left")
-    cells = [[entry_text(entry, table.digits) for entry in row] for row in table.rows]
-    for number, column in enumerate(zip(table.columns, *cells, strict=True)):
-        longest_word = max(len(word) for cell in column for word in cell.split())
-        shown.add_column(column[0], justify="right" if number else "left", min_width=longest_word)
-    for row in cells:
-        shown.add_row(*row)
-    # Chopped words and numbers cannot be read: rather let a narrow terminal wrap the lines of a wide table.
-    needed = Measurement.get(console, console.options.update(max_width=_WIDEST), shown)
-    width = needed.minimum if console.is_terminal else needed.maximum
-    Console(width=max(console.width, width)).print(shown)
-    for note in table.notes:
-        console.print(note, markup=False, highlight=False)

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-import yaml
 
 from taichi_mrf.config import RuntimeConfig
-from taichi_mrf.config_values import from_dict
+from taichi_mrf.config_values import from_dict, read_yaml
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.factor_graph.config import LaserConfig
 
@@ -110,10 +109,4 @@ def laser_settings(arguments: Sequence[str]) -> LaserConfig:
 
 def load_laser_config(path: Path) -> LaserConfig:
     """Read a YAML file of parameters. Raises ConfigError."""
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
-    return from_dict(LaserConfig, values, str(path))
+    return from_dict(LaserConfig, read_yaml(path), str(path))

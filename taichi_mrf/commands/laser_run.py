@@ -5,12 +5,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeElapsedColumn
 
 from taichi_mrf import runtime
 from taichi_mrf.commands.interrupt import StopRequest, stop_on_signals
@@ -19,6 +18,7 @@ from taichi_mrf.commands.laser_files import Outcome, write_comparison, write_ene
 from taichi_mrf.commands.laser_report import comparison_table, laser_report
 from taichi_mrf.commands.output import output_folder
 from taichi_mrf.commands.print_table import print_table
+from taichi_mrf.commands.progress import TransientBar
 from taichi_mrf.commands.report import report_json
 from taichi_mrf.config_text import commented_yaml
 from taichi_mrf.datasets.laser_beams import beams_of
@@ -155,7 +155,7 @@ def _write(
         plan = None if registration is None else registration.plan
         written += write_comparison(options.out, maps, way, plan)
         written += write_table(options.out, comparison_table(scans.name, outcomes))
-    write_text(options.out / CONFIG_FILE, commented_yaml(cast(Any, options.settings)))
+    write_text(options.out / CONFIG_FILE, commented_yaml(options.settings))
     return [*written, options.out / CONFIG_FILE]
 
 
@@ -166,34 +166,20 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     seconds[stage] = time.perf_counter() - start
 
 
-class _EnergyBar:
+class _EnergyBar(TransientBar):
     """A bar of the method that runs, with its energy; silent where the output is not a terminal."""
 
     def __init__(self, console: Console, iterations: int) -> None:
-        self._progress = Progress(
+        super().__init__(
+            console,
             TextColumn("{task.description:12}"),
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn("{task.fields[energy]}"),
             TimeElapsedColumn(),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
         )
         self._iterations = iterations
         self._task: TaskID | None = None
-
-    def __enter__(self) -> "_EnergyBar":
-        self._progress.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._progress.stop()
 
     def begin(self, method: str) -> None:
         """Take the bar of the method before away."""

@@ -1,6 +1,7 @@
-"""The progress bar of a mapping run: a listener of the pipeline."""
+"""Progress bars, and that of a mapping run: a listener of the pipeline."""
 
 from types import TracebackType
+from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import (
@@ -17,6 +18,8 @@ from rich.text import Text
 
 from taichi_mrf.pipeline import Event, FrameEvent, KeyframeAdded, KeyframeSwept
 
+Bar = TypeVar("Bar", bound="TransientBar")
+
 
 class _RateColumn(ProgressColumn):
     """How many keyframes pass in a second."""
@@ -26,24 +29,13 @@ class _RateColumn(ProgressColumn):
         return Text(f"{rate:.1f} keyframes/s" if rate else "")
 
 
-class ProgressBar:
-    """Shows one stage at a time on a terminal; silent where the output is not one."""
+class TransientBar:
+    """A bar on a terminal that is gone when the block ends; silent where the output is not a terminal."""
 
-    def __init__(self, console: Console) -> None:
-        self._progress = Progress(
-            TextColumn("{task.description:9}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            _RateColumn(),
-            TimeRemainingColumn(),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        )
-        self._stage = ""
-        self._task: TaskID | None = None
+    def __init__(self, console: Console, *columns: ProgressColumn) -> None:
+        self._progress = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
-    def __enter__(self) -> "ProgressBar":
+    def __enter__(self: Bar) -> Bar:
         self._progress.start()
         return self
 
@@ -54,6 +46,22 @@ class ProgressBar:
         traceback: TracebackType | None,
     ) -> None:
         self._progress.stop()
+
+
+class ProgressBar(TransientBar):
+    """Shows one stage at a time on a terminal; silent where the output is not one."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__(
+            console,
+            TextColumn("{task.description:9}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            _RateColumn(),
+            TimeRemainingColumn(),
+        )
+        self._stage = ""
+        self._task: TaskID | None = None
 
     def listen(self, event: Event) -> None:
         """Show what the pipeline has just done."""
