@@ -112,26 +112,31 @@ class BlockAscent:
         self.multipliers.fill(0)
         cells = graph.grid.cells
         self.degrees = np.maximum(graph.degrees.to_numpy(), 1).astype(np.int64)
+        # On the device: what a kernel leaves untouched of a NumPy array is undefined on Vulkan.
+        self.given, self.sums, self.bound = (ti.ndarray(ti.i64, n) for n in (cells, cells, 1))
+        self.want_free, self.want_occupied = ti.ndarray(ti.i32, cells), ti.ndarray(ti.i32, cells)
         self.rest, self.marginal = np.zeros(cells, np.int64), np.zeros(cells, np.int64)
         self.contested = np.ones(cells, np.int32)
         self.dual = -np.inf
 
     def iterate(self) -> float:
         """Gather, note the bound, give; returns the share of cells on which beams do not agree."""
-        graph, workers, cells = self.graph, self.workers, self.graph.grid.cells
+        graph, workers = self.graph, self.workers
         share = np.sign(self.rest) * np.minimum(np.abs(self.rest) // self.degrees, MOST_GIVEN)
         self.rest -= share * graph.degrees.to_numpy()
-        given, bound = np.zeros(cells, np.int64), np.zeros(1, np.int64)
-        want_free, want_occupied = np.zeros(cells, np.int32), np.zeros(cells, np.int32)
-        self.marginal.fill(0)
+        for found in (self.given, self.sums, self.bound, self.want_free, self.want_occupied):
+            found.fill(0)
         _gather_and_give(
             *tables(graph), sensor_vector(graph, self.config), self.multipliers, share.astype(np.int32),
-            self.contested, given, self.marginal, want_free, want_occupied, bound, self.scratch,
-            workers.longest, workers.number, workers.spread, is_gaussian(self.config),
+            self.contested, self.given, self.sums, self.want_free, self.want_occupied, self.bound,
+            self.scratch, workers.longest, workers.number, workers.spread, is_gaussian(self.config),
         )  # fmt: skip
-        self.dual = max(self.dual, (int(bound[0]) + int(np.minimum(self.rest, 0).sum())) / UNITS)
-        self.rest += given
-        self.contested = want_free & want_occupied
+        self.marginal = self.sums.to_numpy()
+        self.dual = max(
+            self.dual, (int(self.bound.to_numpy()[0]) + int(np.minimum(self.rest, 0).sum())) / UNITS
+        )
+        self.rest += self.given.to_numpy()
+        self.contested = self.want_free.to_numpy() & self.want_occupied.to_numpy()
         return float(self.contested.sum()) / max(1, int(graph.connected.sum()))
 
     def labels(self) -> NDArray[np.uint8]:
