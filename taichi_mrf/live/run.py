@@ -82,8 +82,6 @@ class Run:
                 prior_log_odds=m.view.pool.prior_log_odds,
                 min_evidence=self.mapper.min_evidence,
                 parameters=to_yaml(self.source.config),
-                lower=m.config.volume.lower,
-                upper=m.config.volume.upper,
             )
         )
         for entry in self.mapper.roster.entries.values():

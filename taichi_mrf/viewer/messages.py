@@ -43,8 +43,6 @@ class Hello:
     min_evidence: float
     parameters: str
     """The effective configuration as YAML."""
-    lower: tuple[float, float, float] | None = None
-    upper: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
