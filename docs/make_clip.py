@@ -25,8 +25,8 @@ ROOM = ("synthetic:room", "--voxel-size", "0.05", "--speed", "0.2")
 """At this pace a frame comes in a second, in which the browser can draw and be photographed."""
 
 WIDTH, HEIGHT = 1240, 700
-CLIP_WIDTH = 800
-COLORS = 128
+CLIP_WIDTH = 640
+COLORS = 96
 CAMERA_COLOR = (230, 0, 126)
 """Of the camera and its way: too few pixels to get a place among the colours of the clip by themselves."""
 
