@@ -16,6 +16,7 @@ from taichi_mrf.factor_graph.block_ascent import BlockAscent
 from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.dual_decomposition import DualDecomposition
 from taichi_mrf.factor_graph.graph import FactorGraph, build_graph
+from taichi_mrf.factor_graph.potentials import UNITS
 from taichi_mrf.factor_graph.solve import METHODS, Step, energy, solve
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -101,6 +102,19 @@ def test_the_dual_never_exceeds_the_least_energy(seed: int, number: int, sensor:
         assert found.energy == pytest.approx(exact.energies.min(), abs=1e-2)
 
 
+@settings(max_examples=40)
+@given(seed=SEEDS, number=st.integers(1, 12), sensor=SENSORS)
+def test_the_dual_is_a_bound_when_slaves_are_charged_the_whole_step(
+    seed: int, number: int, sensor: str
+) -> None:
+    graph, config, exact = setting(
+        random_beams(seed, number), method="dd", sensor=sensor, charge="whole", iterations=60, sigma=0.2
+    )
+    found = solve(graph, config)
+    assert found.dual is not None
+    assert found.dual <= exact.energies.min() + 1e-3 * number
+
+
 @settings(max_examples=20)
 @given(seed=SEEDS, number=st.integers(2, 10))
 def test_block_ascent_never_lowers_the_bound(seed: int, number: int) -> None:
@@ -114,10 +128,26 @@ def test_block_ascent_never_lowers_the_bound(seed: int, number: int) -> None:
         last = ascent.dual
 
 
-@settings(max_examples=15)
-@given(seed=SEEDS, number=st.integers(1, 10))
-def test_multipliers_and_their_rest_sum_to_zero(seed: int, number: int) -> None:
-    graph, config, _ = setting(random_beams(seed, number), method="dd", step=333.0)
+def test_whole_charges_are_the_step_for_each_slaves_own_choice() -> None:
+    graph, config, _ = prepared(random_beams(7, 10), method="dd", charge="whole", step=64.0)
+    dual = DualDecomposition(graph, config)
+    dual.iterate()
+    ones, degrees = dual.ones.copy(), graph.degrees.to_numpy()
+    apart = (ones > 0) & (ones < degrees)
+    assert apart.any()
+    begins, cells = graph.begins.to_numpy(), graph.cells.to_numpy()
+    for f in range(graph.beams):
+        for edge in range(begins[f], begins[f + 1]):
+            # The first slaves have no multipliers, so behind the first occupied cell all are free.
+            sign = 1 if edge == begins[f] + dual.firsts[f] else -1
+            wanted = sign * 64.0 * UNITS if apart[cells[edge]] else 0
+            assert dual.multipliers[edge] == wanted
+
+
+@settings(max_examples=30)
+@given(seed=SEEDS, number=st.integers(1, 10), charge=st.sampled_from(["mean", "whole"]))
+def test_multipliers_and_their_rest_sum_to_zero(seed: int, number: int, charge: str) -> None:
+    graph, config, _ = setting(random_beams(seed, number), method="dd", step=333.0, charge=charge)
     dual = DualDecomposition(graph, config)
     for _ in range(20):
         dual.iterate()

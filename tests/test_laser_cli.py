@@ -232,6 +232,17 @@ def test_a_log_without_a_floor_plan_is_mapped(tmp_path: Path) -> None:
     assert 6.0 <= columns * report["cell_size"] <= 1.9 + 6.0 + margin
 
 
+def test_steps_are_compared_and_drawn_without_a_floor_plan(tmp_path: Path) -> None:
+    log, out = tmp_path / "walk.log", tmp_path / "out"
+    log.write_text("\n".join(flaser([3.0] * 60, (0.1 * i, 0.0, 0.0)) for i in range(10)) + "\n")
+    printed = mapped(log, "--out", out, "--steps", "20,500", "--charge", "whole", *QUICK)
+    assert names(out) == COMPARISON | {"dd-step-20", "dd-step-500"}
+    assert "dd-step-500" in printed
+    methods = report_of(out)["methods"]
+    assert list(methods) == ["dd-step-20", "dd-step-500"]
+    assert methods["dd-step-20"]["dual"] != methods["dd-step-500"]["dual"]
+
+
 def test_every_and_limit_choose_scans(tmp_path: Path) -> None:
     mapped(SMALL, "--out", tmp_path, "--every", "3", "--limit", "10", "--method", "inverse", *QUICK)
     assert report_of(tmp_path)["scans"] == 10
@@ -259,6 +270,10 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, capsys: pytest.Captur
         ((SMALL, "--truth", config, "--truth-size", "1,1"), ("laser.yaml", "not an image")),
         ((SMALL, "--config", config), ("laser.yaml", "cell_sise", "did you mean 'cell_size'")),
         ((SMALL, "--every", "0"), ("--every",)),
+        ((SMALL, "--steps", "20,big"), ("--steps", "'20,big'")),
+        ((SMALL, "--steps", "20,-1"), ("step", "positive")),
+        ((SMALL, "--steps", "20,1e9"), ("step", "at most 10000")),
+        ((SMALL, "--steps", "20,50", "--compare"), ("--compare", "--steps")),
         ((far,), ("far.log", "no beam")),
     ):
         assert main(["laser", *map(str, arguments), "--out", str(out), "--runtime.arch", "cpu"]) == BAD_INPUT

@@ -2,16 +2,16 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import tyro
 
 from taichi_mrf.config import RuntimeConfig
 from taichi_mrf.config_values import from_dict, read_yaml
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.factor_graph.config import LaserConfig
+from taichi_mrf.factor_graph.config import LaserConfig, Method
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,9 @@ class Laser:
 
     compare: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Run every method, and draw their energies against time and their maps side by side."""
+
+    steps: Annotated[str | None, tyro.conf.arg(metavar="A,B,..")] = None
+    """Run dual decomposition with each of these first steps, and draw their energies against time."""
 
     truth: Annotated[Path | None, tyro.conf.arg(metavar="IMAGE")] = None
     """Floor plan to judge the map by, dark where there is a wall, centred on the scans' origin."""
@@ -74,6 +77,9 @@ class Laser:
             raise ConfigError("--truth and --truth-size go together: the image, and how many metres it spans")
         if self.truth_size is not None:
             self.truth_size_x_y()
+        if self.compare and self.steps is not None:
+            raise ConfigError("--compare and --steps are two different comparisons: give one of them")
+        self.runs()
 
     def truth_size_x_y(self) -> tuple[float, float]:
         """The floor plan's width and height in metres. Raises ConfigError if the text is not two numbers."""
@@ -84,6 +90,23 @@ class Laser:
         if not (0 < width < math.inf and 0 < height < math.inf):
             raise ConfigError(f"--truth-size must be W,H in metres, such as 16,16, not {self.truth_size!r}")
         return width, height
+
+    def runs(self) -> dict[str, LaserConfig]:
+        """What is to be run, by name: one method, all of them, or the steps. Raises ConfigError."""
+        if self.compare:
+            return {name: replace(self.settings, method=name) for name in get_args(Method)}
+        if self.steps is None:
+            return {self.settings.method: self.settings}
+        runs = {}
+        for text in self.steps.split(","):
+            try:
+                step = float(text)
+            except ValueError:
+                raise ConfigError(
+                    f"--steps must be numbers with commas between them, such as 20,50,100, not {self.steps!r}"
+                ) from None
+            runs[f"dd-step-{step:g}"] = replace(self.settings, method="dd", step=step)
+        return runs
 
     def run(self) -> int:
         """Map, write everything, and print the report. Raises TaichiMRFError."""

@@ -5,7 +5,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 from rich.console import Console
@@ -31,9 +30,8 @@ from taichi_mrf.evaluation.floor_plan_frame import Registration, register
 from taichi_mrf.evaluation.floor_plan_scores import floor_plan_scores, true_cells
 from taichi_mrf.evaluation.laser_map import LaserMap
 from taichi_mrf.export.atomic import write_text
-from taichi_mrf.factor_graph.config import Method
 from taichi_mrf.factor_graph.graph import FactorGraph, build_graph
-from taichi_mrf.factor_graph.solve import METHODS, Solution, Step, solve
+from taichi_mrf.factor_graph.solve import Solution, Step, solve
 
 CONFIG_FILE, REPORT_FILE = "config.yaml", "report.json"
 
@@ -106,13 +104,12 @@ def _solve_all(
     bar: "_EnergyBar",
     request: StopRequest,
 ) -> dict[str, Outcome]:
-    """Each method's outcome, until the run is to stop: that of the first is kept in any case."""
+    """Each run's outcome, until the run is to stop: that of the first is kept in any case."""
     outcomes: dict[str, Outcome] = {}
-    for method in METHODS if options.compare else (options.settings.method,):
+    for name, settings in options.runs().items():
         if outcomes and request():
             break
-        bar.begin(method)
-        settings = dataclasses.replace(options.settings, method=cast(Method, method))
+        bar.begin(name)
 
         def listen(step: Step) -> bool:
             bar.show(step)
@@ -124,7 +121,7 @@ def _solve_all(
         if registration is not None:
             truth = true_cells(registration.plan, laser_map, scans.pose_x_y_theta[:, :2])
             scores = floor_plan_scores(laser_map, truth)
-        outcomes[method] = Outcome(solution, laser_map, scores)
+        outcomes[name] = Outcome(solution, laser_map, scores)
     return outcomes
 
 
@@ -145,13 +142,14 @@ def _write(
     """The maps first: they are what the time went into."""
     way = scans.pose_x_y_theta[:, :2]
     written = []
-    for method, outcome in outcomes.items():
-        folder = options.out / method if options.compare else options.out
+    several = len(options.runs()) > 1
+    for name, outcome in outcomes.items():
+        folder = options.out / name if several else options.out
         folder.mkdir(exist_ok=True)
-        written += write_outcome(folder, scans.name, method, outcome, way)
-    if options.compare:
+        written += write_outcome(folder, scans.name, name, outcome, way)
+    if several:
         written += write_energies(options.out, scans.name, outcomes)
-        maps = {method: outcome.map for method, outcome in outcomes.items()}
+        maps = {name: outcome.map for name, outcome in outcomes.items()}
         plan = None if registration is None else registration.plan
         written += write_comparison(options.out, maps, way, plan)
         written += write_table(options.out, comparison_table(scans.name, outcomes))

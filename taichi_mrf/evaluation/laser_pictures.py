@@ -1,5 +1,6 @@
 """Pictures of 2D laser mapping: energy against time, one map, and the maps of all methods side by side."""
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -31,7 +32,10 @@ _PANELS_ACROSS = 4
 
 
 def method_name(method: str) -> str:
-    """A method's name in full, or as it is where it has none."""
+    """A run's name in full: that of its method, and its step if it has one; or as it is."""
+    of_step = re.fullmatch(r"(.+)-step-(.+)", method)
+    if of_step:
+        return f"{METHOD_NAMES.get(of_step[1], of_step[1])}, step {of_step[2]}"
     return METHOD_NAMES.get(method, method)
 
 

@@ -17,6 +17,9 @@ Schedule = Literal["parallel", "random", "residual"]
 MOST_ENERGY = 4000.0
 """Largest energy of a beam: multipliers are kept as 32-bit integers in units of 1 / 4096."""
 
+MOST_STEP = 10000.0
+"""Largest first step of dual decomposition: a million of them, each smaller than the last, still fit."""
+
 
 @dataclass(frozen=True)
 class LaserConfig:
@@ -93,6 +96,11 @@ class LaserConfig:
     step: float = 50.0
     """Dual decomposition: the first step; step i is this divided by i + 1."""
 
+    charge: Literal["mean", "whole"] = "mean"
+    """Dual decomposition: what a step charges each beam for what it says of a cell in disagreement. mean is
+    the projected subgradient, by how far the beam is from the mean of all; whole charges all of them the
+    whole step, as Alg. 2 is printed."""
+
     polish: int = 5
     """Belief propagation and dual decomposition: most sweeps of descent over the best labelling in the end,
     each of which flips every cell whose flip lowers the energy. 0 leaves it as the paper has it."""
@@ -108,6 +116,7 @@ class LaserConfig:
             _check(abs(getattr(self, name)) <= MOST_ENERGY, name, f"must lie within +-{MOST_ENERGY:g}")
         for name in ("iterations", "polish"):
             _check(getattr(self, name) >= 0, name, "must not be negative")
+        _check(self.step <= MOST_STEP, "step", f"must be at most {MOST_STEP:g}")
         _check(0 <= self.seed < 2**31, "seed", "must lie between 0 and 2^31 - 1")
         _check(1 <= self.chains <= 1024, "chains", "must lie between 1 and 1024")
         _check(1 <= self.batches <= 4096, "batches", "must lie between 1 and 4096")

@@ -8,13 +8,14 @@ that sum to zero,
 
     t_if += step / (r + 1) * (x_i^f - mean over f of x_i^f)
 
-which is zero in cells on which the slaves agree. (Alg. 2 charges each disagreeing slave for its own choice
-instead, by the same amount on either side, which is this up to a common offset where opinions are even; its
-sum is not zero, and so it would not bound anything.) Eq. 24 then picks the label for which a disagreeing
-cell's slaves have been charged the most.
+which is zero in cells on which the slaves agree. Alg. 2 as it is printed charges each slave of such a cell
+the whole step for its own choice instead (``charge: whole``): the same up to a common offset where opinions
+are even, but where one beam of a thousand disagrees all the others are turned against what they said. Eq. 24
+then picks the label for which a disagreeing cell's slaves have been charged the most.
 
-Multipliers are integers of 1 / UNITS. What rounding leaves of a cell's sum is known exactly; it counts as a
-slave of its own, of that cell alone, and goes back into the multipliers at the next step. The bound is exact.
+Multipliers are integers of 1 / UNITS. What a cell's sum lacks to zero, by rounding or by whole charges, is
+known exactly and counts as a slave of its own, of that cell alone: the bound is exact with either rule. What
+rounding left goes back into the multipliers at the next step.
 """
 
 import numpy as np
@@ -91,7 +92,7 @@ def _solve_slaves(
 @ti.kernel
 def _choose_steps(
     ones: I32Array, degrees: I32Array, rest: I64Array, charged: I64Array, step: ti.f32,
-    if_free: I32Array, if_occupied: I32Array, sums: I64Array,
+    if_free: I32Array, if_occupied: I32Array, sums: I64Array, whole: Template,
 ):  # fmt: skip
     """What each cell's multipliers grow by where a slave says free, and where it says occupied.
 
@@ -105,10 +106,12 @@ def _choose_steps(
         if_occupied[cell] = 0
         ti.atomic_add(sums[1], ti.min(ti.cast(0, ti.i64), rest[cell]))
         if 0 < yes < all_of_them:
-            mean = ti.cast(yes, ti.f32) / all_of_them
-            back = ti.cast(rest[cell], ti.f32) / all_of_them
+            mean, back = ti.cast(yes, ti.f32) / all_of_them, ti.cast(rest[cell], ti.f32) / all_of_them
             down = ti.cast(ti.round(back - step * UNITS * mean), ti.i32)
             up = ti.cast(ti.round(back + step * UNITS * (1.0 - mean)), ti.i32)
+            if ti.static(whole):
+                up = ti.cast(ti.round(step * UNITS), ti.i32)
+                down = -up
             if_free[cell] = down
             if_occupied[cell] = up
             rest[cell] -= ti.cast(up, ti.i64) * yes + ti.cast(down, ti.i64) * (all_of_them - yes)
@@ -161,8 +164,9 @@ class DualDecomposition:
         )  # fmt: skip
         step = self.config.step / (self.iteration + 1)
         _choose_steps(
-            self.ones, graph.degrees, self.rest, self.charged, step, self.if_free, self.if_occupied, sums
-        )
+            self.ones, graph.degrees, self.rest, self.charged, step, self.if_free, self.if_occupied, sums,
+            self.config.charge == "whole",
+        )  # fmt: skip
         _change_multipliers(
             graph.begins, graph.cells, self.firsts, self.if_free, self.if_occupied, self.multipliers,
             self.awake,
