@@ -9,7 +9,7 @@ import dataclasses
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_type_hints
 
 import yaml
 
@@ -60,6 +60,10 @@ class SensorConfig:
 @dataclass(frozen=True)
 class InferenceConfig:
     """How the marginals are computed (MRFMap, sections III and IV)."""
+
+    method: Literal["sum-product", "max-product"] = "sum-product"
+    """sum-product gives each voxel's marginal probability; max-product asks, for either state of a voxel, how
+    well the best explanation of all measurements does, and its odds are those of the two."""
 
     sweeps: int = 3
     """Gauss-Seidel sweeps over all keyframes."""
@@ -117,6 +121,11 @@ class InferenceConfig:
     """How messages are stored. float16 halves the memory and moves beliefs by at most 0.006."""
 
     def __post_init__(self) -> None:
+        for name in ("method", "likelihood", "average", "message_precision"):
+            choices = get_args(get_type_hints(type(self))[name])
+            _check(
+                getattr(self, name) in choices, f"inference.{name}", f"must be one of {', '.join(choices)}"
+            )
         _check(self.sweeps >= 0, "inference.sweeps", "must not be negative")
         _check(0 <= self.tolerance <= 1, "inference.tolerance", "must lie between 0 and 1")
         _check(0 <= self.damping < 1, "inference.damping", "must be at least 0 and less than 1")

@@ -36,7 +36,7 @@ def test_beams_in_three_dimensions() -> None:
         cells[begins[f] : begins[f + 1]].tolist() == cells_of(beams, f, graph.grid) for f in range(200)
     )
     assert same >= 198  # float32 may cut another way past an edge
-    assert graph.image(np.zeros(graph.grid.cells)).shape == graph.grid.shape
+    assert graph.grid.image(np.zeros(graph.grid.cells)).shape == graph.grid.shape
 
 
 def test_the_beams_of_each_cell_are_the_same_edges_seen_from_the_other_side() -> None:
@@ -62,7 +62,7 @@ def test_a_beam_within_one_cell_and_no_beams_at_all() -> None:
 
 def test_an_image_has_x_to_the_right_and_y_upwards() -> None:
     graph = build_graph(beams_of([(0.1, 0.1, 0.0, 1.7, True)]), CELL)
-    rows, columns = np.nonzero(graph.image(graph.connected))
+    rows, columns = np.nonzero(graph.grid.image(graph.connected))
     assert len(set(rows.tolist())) == 1
     assert columns.tolist() == list(range(columns[0], columns[0] + 4))
 

@@ -10,7 +10,7 @@ import taichi as ti
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from taichi_mrf.factor_graph.first_occupied import NEVER, left_alone, message, next_ahead, next_behind
+from taichi_mrf.inference.first_occupied import NEVER, left_alone, message, next_ahead, next_behind
 from taichi_mrf.voxels.types import I32, F32Array, Template
 
 pytestmark = pytest.mark.usefixtures("backend")

@@ -1,5 +1,7 @@
 """The marginals against brute force where the graph is a tree, and against float64 NumPy where it is not."""
 
+from typing import Literal
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
@@ -9,8 +11,9 @@ from oracles.forward import Noise
 
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import InferenceConfig
+from taichi_mrf.inference.prior import prior_probability
 from taichi_mrf.inference.schedule import content_key
-from taichi_mrf.maps.mrf import MRFMap, prior_probability
+from taichi_mrf.maps.mrf import MRFMap
 from taichi_mrf.sensor.noise import PolynomialNoise
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -76,8 +79,18 @@ def well_cut(rays: list[reference.Ray], longest: int) -> bool:
 
 
 @settings(max_examples=60)
-@given(seed=seeds, depth=shallow, sigma=wide, prior=priors, bias=st.floats(-0.05, 0.05))
-def test_one_ray_equals_enumeration(seed: int, depth: float, sigma: float, prior: float, bias: float) -> None:
+@given(
+    seed=seeds, depth=shallow, sigma=wide, prior=priors, bias=st.floats(-0.05, 0.05),
+    method=st.sampled_from(["sum-product", "max-product"]),
+)  # fmt: skip
+def test_one_ray_equals_enumeration(
+    seed: int,
+    depth: float,
+    sigma: float,
+    prior: float,
+    bias: float,
+    method: Literal["sum-product", "max-product"],
+) -> None:
     rng = np.random.default_rng(seed)
     T = random_pose(rng)
     sensor, config = Noise((sigma,), (bias,)), InferenceConfig(prior=prior, **EXACT)
@@ -85,15 +98,22 @@ def test_one_ray_equals_enumeration(seed: int, depth: float, sigma: float, prior
     assume(well_cut(rays, 12))
     m = MRFMap(VOXEL, PolynomialNoise((sigma,), (bias,)), inference=config, max_depth=0.75)
     m.add_keyframe(image(depth), T, ONE_PIXEL)
-    m.infer(sweeps=2)
-    exact = reference.enumerate_marginals(rays, prior, config.outlier_floor)
+    m.infer(sweeps=2, method=method)
+    exact = reference.enumerate_marginals(rays, prior, config.outlier_floor, method == "max-product")
     np.testing.assert_allclose(marginals(m, list(exact)), list(exact.values()), atol=1e-4)
 
 
 @settings(max_examples=60, suppress_health_check=[HealthCheck.filter_too_much])
-@given(seed=seeds, depths=st.tuples(shallow, shallow), sigma=wide, prior=priors)
+@given(
+    seed=seeds, depths=st.tuples(shallow, shallow), sigma=wide, prior=priors,
+    method=st.sampled_from(["sum-product", "max-product"]),
+)  # fmt: skip
 def test_two_rays_that_share_one_voxel_equal_enumeration(
-    seed: int, depths: tuple[float, float], sigma: float, prior: float
+    seed: int,
+    depths: tuple[float, float],
+    sigma: float,
+    prior: float,
+    method: Literal["sum-product", "max-product"],
 ) -> None:
     rng = np.random.default_rng(seed)
     shared = (rng.integers(-20, 20, 3) + rng.uniform(0.2, 0.8, 3)) * VOXEL
@@ -110,8 +130,8 @@ def test_two_rays_that_share_one_voxel_equal_enumeration(
     for depth, T in zip(depths, poses, strict=True):
         m.add_keyframe(image(depth), T, ONE_PIXEL)
     assume({s.voxel for ray in rays for s in ray.segments} <= allocated(m))
-    m.infer(sweeps=6)
-    exact = reference.enumerate_marginals(rays, prior, config.outlier_floor)
+    m.infer(sweeps=6, method=method)
+    exact = reference.enumerate_marginals(rays, prior, config.outlier_floor, method == "max-product")
     np.testing.assert_allclose(marginals(m, list(exact)), list(exact.values()), atol=1e-4)
 
 
@@ -127,6 +147,7 @@ def test_two_rays_that_share_one_voxel_equal_enumeration(
     damping=st.sampled_from([0.0, 0.3]),
     sweeps=st.integers(1, 5),
     free_share=st.sampled_from([0.0, 0.25, 1.0]),
+    method=st.sampled_from(["sum-product", "max-product"]),
 )
 def test_loops_equal_the_numpy_schedule(
     seed: int,
@@ -139,10 +160,12 @@ def test_loops_equal_the_numpy_schedule(
     damping: float,
     sweeps: int,
     free_share: float,
+    method: Literal["sum-product", "max-product"],
 ) -> None:
     rng = np.random.default_rng(seed)
     camera = PinholeCamera(pixels[0], pixels[1], 8.0, 8.0, (pixels[0] - 1) / 2, (pixels[1] - 1) / 2)
     config = InferenceConfig(
+        method=method,
         sweeps=sweeps,
         likelihood=likelihood,  # type: ignore[arg-type]
         average=average,  # type: ignore[arg-type]

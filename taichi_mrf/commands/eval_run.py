@@ -17,6 +17,7 @@ from taichi_mrf.commands.output import output_folder
 from taichi_mrf.commands.print_table import print_table
 from taichi_mrf.config import Config, to_yaml
 from taichi_mrf.errors import DatasetError, TaichiMRFError
+from taichi_mrf.evaluation.experiments.exact import run_exact
 from taichi_mrf.evaluation.experiments.fig7 import run_fig7
 from taichi_mrf.evaluation.experiments.fig10 import run_fig10
 from taichi_mrf.evaluation.experiments.folds import Experiment
@@ -37,6 +38,7 @@ EXPERIMENTS: dict[str, tuple[Run, tuple[float, ...]]] = {
     "fig7": (run_fig7, (0.05, 0.02)),
     "fig10": (run_fig10, (0.05, 0.02, 0.01)),
     "stereo": (run_stereo, (0.2,)),
+    "exact": (run_exact, (0.05,)),
 }
 """Name -> what runs it, and its own voxel sizes."""
 

@@ -30,6 +30,7 @@ from taichi_mrf.evaluation.floor_plan_frame import Registration, register
 from taichi_mrf.evaluation.floor_plan_scores import floor_plan_scores, true_cells
 from taichi_mrf.evaluation.laser_map import LaserMap
 from taichi_mrf.export.atomic import write_text
+from taichi_mrf.factor_graph.beams import Grid
 from taichi_mrf.factor_graph.graph import FactorGraph, build_graph
 from taichi_mrf.factor_graph.solve import Solution, Step, solve
 
@@ -126,13 +127,15 @@ def _solve_all(
 
 
 def _laser_map(graph: FactorGraph, solution: Solution) -> LaserMap:
+    grid = graph.grid
+    assert isinstance(grid, Grid)
     marginals = solution.marginals
     return LaserMap(
-        occupied=graph.image(solution.labels) > 0,
-        seen=graph.image(graph.connected),
-        marginals=None if marginals is None else np.ascontiguousarray(graph.image(marginals)),
-        cell_size=graph.grid.cell_size,
-        lower_cell=(graph.grid.lower[0], graph.grid.lower[1]),
+        occupied=grid.image(solution.labels) > 0,
+        seen=grid.image(graph.connected),
+        marginals=None if marginals is None else np.ascontiguousarray(grid.image(marginals)),
+        cell_size=grid.cell_size,
+        lower_cell=(grid.lower[0], grid.lower[1]),
     )
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
 
 
 @dataclass(frozen=True)
@@ -84,3 +85,33 @@ class Grid:
         """Values of all cells, (cells,), as (y, x) with the lowest y first for a layer, else (x, y, z)."""
         box = values.reshape(self.shape)
         return box[:, :, 0].T if self.shape[2] == 1 else box
+
+
+@dataclass(frozen=True)
+class BrickCells:
+    """The voxels of some bricks of a map, brick by brick: cell i is voxel i % 512 of brick i // 512.
+
+    ``bricks`` (n, 3) int32 are brick coordinates in the world.
+    """
+
+    cell_size: float
+    bricks: NDArray[np.int32]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """As Grid.shape, though only the product means anything."""
+        return len(self.bricks), VOXELS, 1
+
+    @property
+    def cells(self) -> int:
+        """How many cells there are."""
+        return len(self.bricks) * VOXELS
+
+    def centres(self) -> NDArray[np.float64]:
+        """(cells, 3) in metres."""
+        corners = self.bricks[:, None].astype(np.float64) * BRICK
+        return ((corners + offsets_in_brick()[None]).reshape(-1, 3) + 0.5) * self.cell_size
+
+    def image(self, values: NDArray) -> NDArray:
+        """Values of all cells, (cells,), as (bricks, 8, 8, 8)."""
+        return values.reshape(-1, BRICK, BRICK, BRICK)

@@ -16,17 +16,17 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.config import LaserConfig
-from taichi_mrf.factor_graph.first_occupied import NEVER, message, next_ahead, next_behind
 from taichi_mrf.factor_graph.graph import FactorGraph
 from taichi_mrf.factor_graph.potentials import (
     beam_of,
     energy_of_first,
     energy_of_none,
-    is_gaussian,
+    model_kind,
     sensor_vector,
     tables,
 )
 from taichi_mrf.factor_graph.workers import Workers, share_begin
+from taichi_mrf.inference.first_occupied import NEVER, message, next_ahead, next_behind
 from taichi_mrf.voxels.types import (
     F32,
     I32,
@@ -52,9 +52,9 @@ def to_fine(value: F32) -> ti.i64:
 @ti.kernel
 def send(
     order: I32Array, begin: I32, end: I32,
-    begins: I32Array, cells: I32Array, hits: I32Array, rays: F32Array2, shape: IVec3, sensor: Vec5,
+    begins: I32Array, cells: I32Array, hits: I32Array, model: F32Array2, shape: IVec3, sensor: Vec5,
     belief: I64Array, messages: F32Array, change: I64Array, damping: F32, tolerance: F32, awake: I32Array,
-    scratch: F32Array2, longest: I32, workers: I32, spread: I32, gaussian: Template, soft: Template,
+    scratch: F32Array2, longest: I32, workers: I32, spread: I32, kind: Template, soft: Template,
 ):  # fmt: skip
     """Renew the messages of beams ``order[begin:end]`` (eqs. 17 and 20), and add what they changed up.
 
@@ -67,7 +67,7 @@ def send(
             for i in range(
                 share_begin(worker, workers, begin, end), share_begin(worker + 1, workers, begin, end)
             ):
-                beam = beam_of(order[i], begins, hits, rays, gaussian)
+                beam = beam_of(order[i], begins, hits, model, kind)
                 ahead = NEVER
                 held_back = 0.0
                 for step in range(beam.steps):
@@ -76,14 +76,14 @@ def send(
                     incoming = ti.cast(belief[cell] - to_fine(messages[edge]), ti.f32) / FINE
                     scratch[trace + step, 0] = incoming
                     scratch[trace + step, 1] = ahead
-                    here = energy_of_first(beam, step, cell, sensor, shape, gaussian)
+                    here = energy_of_first(beam, step, cell, model, sensor, shape, kind)
                     ahead = next_ahead(ahead, here, incoming, soft)
-                behind = energy_of_none(beam, sensor)
+                behind = energy_of_none(beam, model, sensor, kind)
                 for back in range(beam.steps):
                     step = beam.steps - 1 - back
                     edge = beam.begin + step
                     cell = cells[edge]
-                    here = energy_of_first(beam, step, cell, sensor, shape, gaussian)
+                    here = energy_of_first(beam, step, cell, model, sensor, shape, kind)
                     old = messages[edge]
                     wanted = message(scratch[trace + step, 1], here, behind, soft)
                     new = old + (1.0 - damping) * (wanted - old)
@@ -149,6 +149,8 @@ class BeliefPropagation:
         self.changed, self.awake = np.zeros(cells, np.int32), np.ones(graph.beams, np.int32)
         self.random = np.random.default_rng(config.seed)
         energies = (config.energy_explained, config.energy_free, config.energy_wrong)
+        if graph.has_table:
+            energies = (-graph.largest_energy, graph.largest_energy, 0.0)
         # What is more certain than every energy and a beam's own message is as good as certain.
         self.most = int(FINE * (2 * (max(energies) - min(energies)) + 2 * 20))
 
@@ -187,6 +189,6 @@ class BeliefPropagation:
                 order, begin, min(begin + size, len(order)), *tables(graph),
                 sensor_vector(graph, self.config), self.belief, self.messages, self.change,
                 self.config.damping, self.config.tolerance, self.awake, workers.scratch, workers.longest,
-                workers.number, workers.spread, is_gaussian(self.config), self.soft,
+                workers.number, workers.spread, model_kind(graph, self.config), self.soft,
             )  # fmt: skip
             _apply(self.belief, self.change)

@@ -20,18 +20,18 @@ from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.dual_decomposition import units32
-from taichi_mrf.factor_graph.first_occupied import left_alone, message, next_ahead, next_behind
 from taichi_mrf.factor_graph.graph import FactorGraph
 from taichi_mrf.factor_graph.potentials import (
     UNITS,
     beam_of,
     energy_of_first,
     energy_of_none,
-    is_gaussian,
+    model_kind,
     sensor_vector,
     tables,
 )
 from taichi_mrf.factor_graph.workers import Workers, share_begin
+from taichi_mrf.inference.first_occupied import left_alone, message, next_ahead, next_behind
 from taichi_mrf.voxels.types import I32, F32Array2, I32Array, I64Array, IVec3, Template, Vec5
 
 NEVER = 2**29
@@ -43,10 +43,10 @@ MOST_GIVEN = 4000 * int(UNITS)
 
 @ti.kernel
 def _gather_and_give(
-    begins: I32Array, cells: I32Array, hits: I32Array, rays: F32Array2, shape: IVec3, sensor: Vec5,
+    begins: I32Array, cells: I32Array, hits: I32Array, model: F32Array2, shape: IVec3, sensor: Vec5,
     multipliers: I32Array, share: I32Array, contested: I32Array,
     given: I64Array, marginal: I64Array, want_free: I32Array, want_occupied: I32Array, bound: I64Array,
-    scratch: I32Array, longest: I32, workers: I32, spread: I32, gaussian: Template,
+    scratch: I32Array, longest: I32, workers: I32, spread: I32, kind: Template,
 ):  # fmt: skip
     """One iteration over all beams.
 
@@ -62,7 +62,7 @@ def _gather_and_give(
             for f in range(
                 share_begin(worker, workers, 0, beams), share_begin(worker + 1, workers, 0, beams)
             ):
-                beam = beam_of(f, begins, hits, rays, gaussian)
+                beam = beam_of(f, begins, hits, model, kind)
                 ahead = NEVER
                 open_cells = 0
                 alone = ti.cast(0, ti.i64)
@@ -73,17 +73,17 @@ def _gather_and_give(
                     multipliers[edge] = t
                     open_cells += contested[cell]
                     scratch[trace + step] = ahead
-                    here = units32(energy_of_first(beam, step, cell, sensor, shape, gaussian))
+                    here = units32(energy_of_first(beam, step, cell, model, sensor, shape, kind))
                     # Nothing behind a cell that is surely occupied depends on how sure it is.
                     ahead = ti.max(-NEVER, next_ahead(ahead, here, t, False))
                     alone += left_alone(t, False)
-                behind = units32(energy_of_none(beam, sensor))
+                behind = units32(energy_of_none(beam, model, sensor, kind))
                 for back in range(beam.steps):
                     step = beam.steps - 1 - back
                     edge = beam.begin + step
                     cell = cells[edge]
                     t = multipliers[edge]
-                    here = units32(energy_of_first(beam, step, cell, sensor, shape, gaussian))
+                    here = units32(energy_of_first(beam, step, cell, model, sensor, shape, kind))
                     both = t + message(scratch[trace + step], here, behind, False)
                     if both < 0:
                         want_occupied[cell] = 1
@@ -129,7 +129,7 @@ class BlockAscent:
         _gather_and_give(
             *tables(graph), sensor_vector(graph, self.config), self.multipliers, share.astype(np.int32),
             self.contested, self.given, self.sums, self.want_free, self.want_occupied, self.bound,
-            self.scratch, workers.longest, workers.number, workers.spread, is_gaussian(self.config),
+            self.scratch, workers.longest, workers.number, workers.spread, model_kind(graph, self.config),
         )  # fmt: skip
         self.marginal = self.sums.to_numpy()
         self.dual = max(

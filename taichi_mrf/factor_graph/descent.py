@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.flips import SPREAD, find_firsts, flip, flip_change
 from taichi_mrf.factor_graph.graph import FactorGraph
-from taichi_mrf.factor_graph.potentials import is_gaussian, sensor_vector, tables
+from taichi_mrf.factor_graph.potentials import model_kind, sensor_vector, tables
 from taichi_mrf.voxels.types import I32, AnyArray, F32Array2, I32Array, IVec3, Template, Vec5
 
 
 @ti.kernel
 def _descend(
-    begins: I32Array, cells: I32Array, hits: I32Array, rays: F32Array2, shape: IVec3, sensor: Vec5,
+    begins: I32Array, cells: I32Array, hits: I32Array, model: F32Array2, shape: IVec3, sensor: Vec5,
     cell_begins: I32Array, cell_beams: I32Array, cell_steps: AnyArray,
-    labels: I32Array, firsts: I32Array, gaussian: Template, spread: I32,
+    labels: I32Array, firsts: I32Array, kind: Template, spread: I32,
 ) -> ti.i32:  # fmt: skip
     """One sweep over all cells, by one thread; returns how many were flipped."""
     flips = 0
@@ -27,8 +27,8 @@ def _descend(
         if iteration == 0:
             for cell in range(labels.shape[0]):
                 change = flip_change(
-                    cell, labels, 0, firsts, 0, begins, cells, hits, rays, shape, sensor,
-                    cell_begins, cell_beams, cell_steps, gaussian,
+                    cell, labels, 0, firsts, 0, begins, cells, hits, model, shape, sensor,
+                    cell_begins, cell_beams, cell_steps, kind,
                 )  # fmt: skip
                 if change < 0:
                     flip(cell, labels, 0, firsts, 0, begins, cells, cell_begins, cell_beams, cell_steps)
@@ -48,7 +48,7 @@ def descended(
     for _ in range(sweeps):
         flips = _descend(
             *tables(graph), sensor_vector(graph, config), lists.begins, lists.beams, lists.steps, state,
-            firsts, is_gaussian(config), SPREAD,
+            firsts, model_kind(graph, config), SPREAD,
         )  # fmt: skip
         if flips == 0:
             break

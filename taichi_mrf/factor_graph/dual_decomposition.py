@@ -23,18 +23,19 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.config import LaserConfig
-from taichi_mrf.factor_graph.first_occupied import left_alone, next_behind
 from taichi_mrf.factor_graph.graph import FactorGraph
 from taichi_mrf.factor_graph.potentials import (
+    GAUSSIAN,
     UNITS,
     Beam,
     beam_of,
     energy_of_first,
     energy_of_none,
-    is_gaussian,
+    model_kind,
     sensor_vector,
     tables,
 )
+from taichi_mrf.inference.first_occupied import left_alone, next_behind
 from taichi_mrf.voxels.types import I32, F32Array2, I32Array, I64Array, IVec3, Template, Vec5
 
 
@@ -46,22 +47,28 @@ def units32(value: ti.f32) -> I32:
 
 @ti.func
 def solve_slave(
-    beam: Beam, cells: Template, multipliers: Template, sensor: Vec5, shape: IVec3, gaussian: Template
+    beam: Beam,
+    cells: Template,
+    multipliers: Template,
+    model: Template,
+    sensor: Vec5,
+    shape: IVec3,
+    kind: Template,
 ):
     """(value, step of the first occupied cell) of a beam's least energy with its multipliers, in units.
 
     Behind its first occupied cell, whatever has a negative multiplier is occupied.
     """
-    behind = units32(energy_of_none(beam, sensor))
+    behind = units32(energy_of_none(beam, model, sensor, kind))
     alone = ti.cast(0, ti.i64)
     first: ti.i32 = beam.steps
     for back in range(beam.steps):
         step = beam.steps - 1 - back
         t = multipliers[beam.begin + step]
         cell = 0
-        if ti.static(gaussian):
+        if ti.static(kind == GAUSSIAN):
             cell = cells[beam.begin + step]
-        here = units32(energy_of_first(beam, step, cell, sensor, shape, gaussian))
+        here = units32(energy_of_first(beam, step, cell, model, sensor, shape, kind))
         if here + ti.max(0, t) < behind + ti.max(0, -t):
             first = step
         behind = next_behind(behind, here, t, False)
@@ -71,15 +78,15 @@ def solve_slave(
 
 @ti.kernel
 def _solve_slaves(
-    begins: I32Array, cells: I32Array, hits: I32Array, rays: F32Array2, shape: IVec3, sensor: Vec5,
+    begins: I32Array, cells: I32Array, hits: I32Array, model: F32Array2, shape: IVec3, sensor: Vec5,
     multipliers: I32Array, awake: I32Array, firsts: I32Array, values: I64Array, ones: I32Array,
-    sums: I64Array, gaussian: Template,
+    sums: I64Array, kind: Template,
 ):  # fmt: skip
     """Eq. 23 for every beam whose multipliers have changed; count each cell's ones, and sum the values."""
     for f in range(begins.shape[0] - 1):
         if awake[f] == 1:
-            beam = beam_of(f, begins, hits, rays, gaussian)
-            value, first = solve_slave(beam, cells, multipliers, sensor, shape, gaussian)
+            beam = beam_of(f, begins, hits, model, kind)
+            value, first = solve_slave(beam, cells, multipliers, model, sensor, shape, kind)
             ti.atomic_add(sums[0], value - values[f])
             values[f] = value
             firsts[f] = first
@@ -160,7 +167,7 @@ class DualDecomposition:
         self.ones.fill(0)
         _solve_slaves(
             *tables(graph), sensor_vector(graph, self.config), self.multipliers, self.awake, self.firsts,
-            self.values, self.ones, sums, is_gaussian(self.config),
+            self.values, self.ones, sums, model_kind(graph, self.config),
         )  # fmt: skip
         step = self.config.step / (self.iteration + 1)
         _choose_steps(

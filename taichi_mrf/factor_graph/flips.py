@@ -50,8 +50,8 @@ def after_flip(
 @ti.func
 def flip_change(
     cell: I32, labels: Template, base: I32, firsts: Template, beam_base: I32,
-    begins: Template, cells: Template, hits: Template, rays: Template, shape: IVec3, sensor: Vec5,
-    cell_begins: Template, cell_beams: Template, cell_steps: Template, gaussian: Template,
+    begins: Template, cells: Template, hits: Template, model: Template, shape: IVec3, sensor: Vec5,
+    cell_begins: Template, cell_beams: Template, cell_steps: Template, kind: Template,
 ):  # fmt: skip
     """What flipping ``cell`` adds to the energy, in units: a sum of integers, so the list's order is free."""
     occupied = labels[base + cell]
@@ -61,10 +61,10 @@ def flip_change(
         step = ti.cast(cell_steps[i], ti.i32)
         first = firsts[beam_base + f]
         if step <= first:
-            beam = beam_of(f, begins, hits, rays, gaussian)
+            beam = beam_of(f, begins, hits, model, kind)
             new = after_flip(first, step, occupied, beam.begin, beam.steps, cells, labels, base)
-            change += to_units(energy_of(beam, new, cells, sensor, shape, gaussian))
-            change -= to_units(energy_of(beam, first, cells, sensor, shape, gaussian))
+            change += to_units(energy_of(beam, new, cells, model, sensor, shape, kind))
+            change -= to_units(energy_of(beam, first, cells, model, sensor, shape, kind))
     return change
 
 

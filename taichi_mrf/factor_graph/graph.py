@@ -14,7 +14,7 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
-from taichi_mrf.factor_graph.beams import Beams, Grid
+from taichi_mrf.factor_graph.beams import Beams, BrickCells, Grid
 from taichi_mrf.factor_graph.kernels import count_cells, count_degrees, write_beams_of_cells, write_cells
 from taichi_mrf.voxels.memory import available_bytes
 
@@ -49,7 +49,7 @@ class CellLists:
 class FactorGraph:
     """Cells, beams and the edges between them."""
 
-    grid: Grid
+    grid: Grid | BrickCells
     beams: int
     edges: int
     longest: int
@@ -64,11 +64,21 @@ class FactorGraph:
     hits: ti.Ndarray
     """(beams,) int32: 1 where something returned."""
 
-    rays: ti.Ndarray
-    """(beams, 7) float32: origin, direction and range, in cell sizes from the grid's lowest corner."""
+    model: ti.Ndarray
+    """What the sensor model needs of each beam: (beams, 7) float32, its origin, direction and range in cell
+    sizes from the grid's lowest corner; or, with ``has_table``, (edges + beams, 1) float32, its energies."""
 
     degrees: ti.Ndarray
     """(cells,) int32: the beams that cross a cell; 0 for a disconnected one."""
+
+    has_table: bool = False
+    """Whether ``model`` holds the energies themselves: of beam f, from ``begins[f] + f`` on, one for each of
+    its cells to be the first occupied one, and one for none."""
+
+    @cached_property
+    def largest_energy(self) -> float:
+        """Of the table, the largest absolute value; 0 without one."""
+        return float(np.abs(self.model.to_numpy()).max()) if self.has_table else 0.0
 
     @cached_property
     def lists(self) -> CellLists:
@@ -89,16 +99,13 @@ class FactorGraph:
     @property
     def nbytes(self) -> int:
         """Bytes of the graph with the lists of both sides, and of what one method keeps beside it."""
-        return needed_bytes(self.beams, self.edges, self.grid.cells)
-
-    def image(self, values: NDArray) -> NDArray:
-        """Values of all cells as (rows, columns), the lowest y first, or as (x, y, z) if there are layers."""
-        return self.grid.image(values)
+        return needed_bytes(self.beams, self.edges, self.grid.cells, self.has_table)
 
 
-def needed_bytes(beams: int, edges: int, cells: int) -> int:
+def needed_bytes(beams: int, edges: int, cells: int, has_table: bool = False) -> int:
     """Bytes of a graph of that size, and of what one method keeps beside it."""
-    return BEAM_BYTES * beams + EDGE_BYTES * edges + CELL_BYTES * cells
+    table = 4 * (edges + beams) if has_table else 0
+    return BEAM_BYTES * beams + EDGE_BYTES * edges + CELL_BYTES * cells + table
 
 
 def build_graph(beams: Beams, cell_size: float, memory_limit_gb: float = 0.0) -> FactorGraph:
@@ -108,7 +115,7 @@ def build_graph(beams: Beams, cell_size: float, memory_limit_gb: float = 0.0) ->
     the memory that the graph would take, before it is taken.
     """
     grid = Grid.around(beams, cell_size)
-    _check_capacity(grid, len(beams), 0, memory_limit_gb)
+    check_capacity(len(beams), grid.cells, 0, memory_limit_gb)
     rays = np.zeros((max(1, len(beams)), 7), np.float32)
     rays[: len(beams), :3] = grid.to_cells(beams.origins)
     rays[: len(beams), 3:6] = beams.directions
@@ -121,7 +128,7 @@ def build_graph(beams: Beams, cell_size: float, memory_limit_gb: float = 0.0) ->
         count_cells(ray_array, shape, counts)
     np.cumsum(counts, out=begins[1:])
     edges = int(begins[-1])
-    _check_capacity(grid, len(beams), edges, memory_limit_gb)
+    check_capacity(len(beams), grid.cells, edges, memory_limit_gb)
     begin_array = _array(begins.astype(np.int32))
     cells, degrees = ti.ndarray(ti.i32, max(1, edges)), ti.ndarray(ti.i32, grid.cells)
     degrees.fill(0)
@@ -134,18 +141,21 @@ def build_graph(beams: Beams, cell_size: float, memory_limit_gb: float = 0.0) ->
     return FactorGraph(grid, len(beams), edges, longest, begin_array, cells, _array(hits), ray_array, degrees)
 
 
-def _check_capacity(grid: Grid, beams: int, edges: int, limit_gb: float) -> None:
-    wanted = needed_bytes(beams, edges, grid.cells)
+def check_capacity(
+    beams: int, cells: int, edges: int, limit_gb: float, has_table: bool = False,
+    advice: str = "choose a larger cell size or a smaller max_range",
+) -> None:  # fmt: skip
+    """Raise CapacityError if a graph of that size would not fit, or could not be numbered."""
+    wanted = needed_bytes(beams, edges, cells, has_table)
     free = available_bytes()
     limit = limit_gb * 1e9 if limit_gb > 0 else (0.9 * free if free is not None else None)
-    what = f"a factor graph of {beams:,} beams, {grid.cells:,} cells and {edges:,} edges"
-    advice = "choose a larger cell size or a smaller max_range"
+    what = f"a factor graph of {beams:,} beams, {cells:,} cells and {edges:,} edges"
     if limit is not None and wanted > limit:
         raise CapacityError(
             f"{what} would take {wanted / 1e9:.3g} GB of memory and {limit / 1e9:.3g} GB are to "
             f"be had; {advice}"
         )
-    if max(edges, grid.cells) > MOST_EDGES:
+    if max(edges + beams, cells) > MOST_EDGES:
         raise CapacityError(
             f"{what} would take {wanted / 1e9:.3g} GB of memory and has more than 2^31 - 1 of them; {advice}"
         )

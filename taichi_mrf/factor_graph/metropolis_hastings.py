@@ -18,7 +18,7 @@ from taichi_mrf.factor_graph.graph import FactorGraph
 from taichi_mrf.factor_graph.inverse import ends_of_beams, inverse_model
 from taichi_mrf.factor_graph.potentials import (
     UNITS,
-    is_gaussian,
+    model_kind,
     sensor_vector,
     tables,
 )
@@ -31,12 +31,12 @@ PROPOSAL, ACCEPTANCE = 0, 1
 
 @ti.kernel
 def _run(
-    begins: I32Array, cells: I32Array, hits: I32Array, rays: F32Array2, shape: IVec3, sensor: Vec5,
+    begins: I32Array, cells: I32Array, hits: I32Array, model: F32Array2, shape: IVec3, sensor: Vec5,
     cell_begins: I32Array, cell_beams: I32Array, cell_steps: AnyArray,
     warm: I32Array, heated: I32, bias: I32, base_bias: I32, seed: I32, chains: I32, size: I32,
     counter: ti.i64, proposals: I32,
     labels: I32Array, firsts: I32Array, occupied_since: I64Array, occupied_for: I64Array, energies: I64Array,
-    gaussian: Template, spread: I32,
+    kind: Template, spread: I32,
 ):  # fmt: skip
     """Alg. 1: make ``proposals`` in every chain, from number ``counter`` on.
 
@@ -59,8 +59,8 @@ def _run(
                 cell = warm[place]
                 occupied = labels[base + cell]
                 change = flip_change(
-                    cell, labels, base, firsts, chain * beams, begins, cells, hits, rays, shape, sensor,
-                    cell_begins, cell_beams, cell_steps, gaussian,
+                    cell, labels, base, firsts, chain * beams, begins, cells, hits, model, shape, sensor,
+                    cell_begins, cell_beams, cell_steps, kind,
                 )  # fmt: skip
                 chance = ti.log(uniform(random_bits(seed, chain, now, ACCEPTANCE)))
                 if change <= 0 or chance < -ti.cast(change, ti.f32) / UNITS:
@@ -113,7 +113,7 @@ class MetropolisHastings:
             *tables(graph), sensor_vector(graph, config), lists.begins, lists.beams, lists.steps,
             self.warm, self.heated, bias, 1000, config.seed, config.chains, graph.grid.cells,
             self.counter, proposals, self.state, self.firsts, self.occupied_since, self.occupied_for,
-            self.changes, is_gaussian(config), SPREAD,
+            self.changes, model_kind(graph, config), SPREAD,
         )  # fmt: skip
         self.counter += proposals
         return float((before != self.state).sum()) / (proposals * config.chains)

@@ -1,15 +1,16 @@
 """Forward sensor models (section VI), and the energy of a labelling by which every method is judged.
 
-Energies are negative log-likelihoods. Both models depend on nothing but the first occupied cell of a beam:
+Energies are negative log-likelihoods. All models depend on nothing but the first occupied cell of a beam:
 
     piecewise (eq. 26)   its last one: energy_explained; an earlier one: energy_wrong; none: energy_free
     Gaussian (eq. 25)    at distance d from the origin: -log N(d; z, sigma), at most energy_wrong; none:
                          energy_free, which is the otherwise of eq. 27
+    table                what the graph's table holds for each of its cells, and for none
 
-and a beam without a return is explained if all its cells are free, and wrong otherwise. The patterns of
-section VI-B, with free nodes behind the first occupied one, are therefore "cell k is the first occupied
-one" and "no cell is occupied", for both models, and every message and every slave is found in one pass
-there and one back (first_occupied.py).
+and with the first two a beam without a return is explained if all its cells are free, and wrong otherwise.
+The patterns of section VI-B, with free nodes behind the first occupied one, are therefore "cell k is the
+first occupied one" and "no cell is occupied", for all models, and every message and every slave is found in
+one pass there and one back (inference/first_occupied.py).
 """
 
 import math
@@ -39,11 +40,18 @@ UNITS = 4096.0
 EXPLAINED, FREE, WRONG, PRECISION, OFFSET = range(5)
 """Places in the vector of a sensor model's numbers."""
 
+PIECEWISE, GAUSSIAN, TABLE = range(3)
+"""Sensor models, for kernels that are compiled for one of them."""
+
+NEARLY_BEST = 4.5
+"""By a table, a beam is explained if its energy is within this of its least one: three sigma."""
+
 
 @ti.dataclass
 class Beam(Struct):
     """A factor: its cells are edges ``begin`` to ``begin + steps - 1``. Lengths are in cell sizes."""
 
+    number: I32
     begin: I32
     steps: I32
     hit: I32
@@ -61,28 +69,34 @@ def sensor_vector(graph: FactorGraph, config: LaserConfig) -> "ti.Vector":
     return ti.Vector([*energies, precision, offset], ti.f32)
 
 
-def is_gaussian(config: LaserConfig) -> bool:
-    """Which of the two models, for kernels that are compiled for one."""
-    return config.sensor == "gaussian"
+def model_kind(graph: FactorGraph, config: LaserConfig) -> int:
+    """Which of the models: the graph's table if it has one, else as configured."""
+    if graph.has_table:
+        return TABLE
+    return GAUSSIAN if config.sensor == "gaussian" else PIECEWISE
 
 
 @ti.func
-def beam_of(f: I32, begins: Template, hits: Template, rays: Template, gaussian: Template) -> Beam:
+def beam_of(f: I32, begins: Template, hits: Template, model: Template, kind: Template) -> Beam:
     """Factor f; its geometry is only read for the Gaussian model."""
     origin, direction, reach = Vec3(0.0), Vec3(0.0), 0.0
-    if ti.static(gaussian):
-        origin = Vec3(rays[f, 0], rays[f, 1], rays[f, 2])
-        direction = Vec3(rays[f, 3], rays[f, 4], rays[f, 5])
-        reach = rays[f, 6]
-    return Beam(begins[f], begins[f + 1] - begins[f], hits[f], origin, direction, reach)
+    if ti.static(kind == GAUSSIAN):
+        origin = Vec3(model[f, 0], model[f, 1], model[f, 2])
+        direction = Vec3(model[f, 3], model[f, 4], model[f, 5])
+        reach = model[f, 6]
+    return Beam(f, begins[f], begins[f + 1] - begins[f], hits[f], origin, direction, reach)
 
 
 @ti.func
-def energy_of_first(beam: Beam, step: I32, cell: I32, sensor: Vec5, shape: IVec3, gaussian: Template) -> F32:
+def energy_of_first(
+    beam: Beam, step: I32, cell: I32, model: Template, sensor: Vec5, shape: IVec3, kind: Template
+) -> F32:
     """Energy of a beam whose first occupied cell is its ``step``-th, which has the number ``cell``."""
     energy = sensor[WRONG]
-    if beam.hit == 1:
-        if ti.static(gaussian):
+    if ti.static(kind == TABLE):
+        energy = model[beam.begin + beam.number + step, 0]
+    elif beam.hit == 1:
+        if ti.static(kind == GAUSSIAN):
             layer, row, column = cell % shape[2], cell // shape[2] % shape[1], cell // shape[2] // shape[1]
             centre = Vec3(column + 0.5, row + 0.5, layer + 0.5)
             deviation = (centre - beam.origin).dot(beam.direction) - beam.reach
@@ -93,9 +107,12 @@ def energy_of_first(beam: Beam, step: I32, cell: I32, sensor: Vec5, shape: IVec3
 
 
 @ti.func
-def energy_of_none(beam: Beam, sensor: Vec5) -> F32:
+def energy_of_none(beam: Beam, model: Template, sensor: Vec5, kind: Template) -> F32:
     """Energy of a beam whose cells are all free."""
-    return sensor[FREE] if beam.hit == 1 else sensor[EXPLAINED]
+    energy = sensor[FREE] if beam.hit == 1 else sensor[EXPLAINED]
+    if ti.static(kind == TABLE):
+        energy = model[beam.begin + beam.number + beam.steps, 0]
+    return energy
 
 
 @ti.func
@@ -114,38 +131,57 @@ def first_occupied(beam: Beam, cells: Template, labels: Template) -> I32:
 
 
 @ti.func
-def energy_of(beam: Beam, first: I32, cells: Template, sensor: Vec5, shape: IVec3, gaussian: Template) -> F32:
+def energy_of(
+    beam: Beam, first: I32, cells: Template, model: Template, sensor: Vec5, shape: IVec3, kind: Template
+) -> F32:
     """Energy of a beam whose first occupied cell is step ``first``, or of all free at the number of steps."""
-    energy = energy_of_none(beam, sensor)
+    energy = energy_of_none(beam, model, sensor, kind)
     if first < beam.steps:
-        energy = energy_of_first(beam, first, cells[beam.begin + first], sensor, shape, gaussian)
+        energy = energy_of_first(beam, first, cells[beam.begin + first], model, sensor, shape, kind)
     return energy
+
+
+@ti.func
+def is_explained(
+    beam: Beam, first: I32, energy: F32, cells: Template, model: Template, sensor: Vec5, shape: IVec3,
+    kind: Template,
+) -> I32:  # fmt: skip
+    """Whether ``first`` is what the beam's measurement asks for."""
+    explained = ti.cast(first == beam.steps - beam.hit, ti.i32)
+    if ti.static(kind == TABLE):
+        least = energy
+        for other in range(beam.steps + 1):
+            least = ti.min(least, energy_of(beam, other, cells, model, sensor, shape, kind))
+        explained = ti.cast(energy <= least + NEARLY_BEST, ti.i32)
+    return explained
 
 
 @ti.kernel
 def _judge(
-    begins: I32Array, cells: I32Array, hits: I32Array, rays: F32Array2, shape: IVec3, sensor: Vec5,
-    labels: I32Array, sums: I64Array, gaussian: Template,
+    begins: I32Array, cells: I32Array, hits: I32Array, model: F32Array2, shape: IVec3, sensor: Vec5,
+    labels: I32Array, sums: I64Array, kind: Template,
 ):  # fmt: skip
     """Add up the energies of all beams, in units, and count the explained ones."""
     for f in range(begins.shape[0] - 1):
-        beam = beam_of(f, begins, hits, rays, gaussian)
+        beam = beam_of(f, begins, hits, model, kind)
         first = first_occupied(beam, cells, labels)
-        ti.atomic_add(sums[0], to_units(energy_of(beam, first, cells, sensor, shape, gaussian)))
-        if first == beam.steps - beam.hit:
+        energy = energy_of(beam, first, cells, model, sensor, shape, kind)
+        ti.atomic_add(sums[0], to_units(energy))
+        if is_explained(beam, first, energy, cells, model, sensor, shape, kind):
             ti.atomic_add(sums[1], ti.cast(1, ti.i64))
 
 
 def judged(graph: FactorGraph, config: LaserConfig, labels: NDArray[np.uint8]) -> tuple[float, float]:
     """(energy, share of beams explained) of a labelling, (cells,), 1 for occupied.
 
-    A beam is explained if its last cell is its first occupied one, or without a return if all are free.
+    A beam is explained if its last cell is its first occupied one, or without a return if all are free; by
+    a table, if it is within NEARLY_BEST of its least energy.
     """
     sums = np.zeros(2, np.int64)
     if graph.beams:
         _judge(
             *tables(graph), sensor_vector(graph, config), np.ascontiguousarray(labels, np.int32), sums,
-            is_gaussian(config),
+            model_kind(graph, config),
         )  # fmt: skip
     return float(sums[0]) / UNITS, float(sums[1]) / max(1, graph.beams)
 
@@ -156,5 +192,6 @@ def energy(graph: FactorGraph, config: LaserConfig, labels: NDArray[np.uint8]) -
 
 
 def tables(graph: FactorGraph) -> "tuple[ti.Ndarray, ti.Ndarray, ti.Ndarray, ti.Ndarray, ti.Vector]":
-    """What kernels over beams read: where each one's cells begin, cells, hits, geometry, the grid's shape."""
-    return graph.begins, graph.cells, graph.hits, graph.rays, ti.Vector(graph.grid.shape, ti.i32)
+    """What kernels over beams read: where each one's cells begin, cells, hits, geometry or table, and the
+    grid's shape."""
+    return graph.begins, graph.cells, graph.hits, graph.model, ti.Vector(graph.grid.shape, ti.i32)

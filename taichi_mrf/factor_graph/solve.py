@@ -8,6 +8,7 @@ from typing import Protocol, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.errors import ConfigError
 from taichi_mrf.factor_graph.belief_propagation import BeliefPropagation
 from taichi_mrf.factor_graph.block_ascent import BlockAscent
 from taichi_mrf.factor_graph.config import LaserConfig, Method
@@ -81,9 +82,16 @@ def solve(
     """Label the graph by ``config.method``, for at most ``config.iterations`` iterations.
 
     ``progress`` is called after each iteration; where it returns False the method stops, and what it has
-    found is kept. Taichi must run.
+    found is kept. Taichi must run. Raises ConfigError for a method that needs beams which end where they
+    measured, on a graph of depth rays, which do not.
     """
     started = time.perf_counter()
+    sampled = config.method in ("mh", "mh-heat")
+    needs_ends = config.method in ("inverse", "mh-heat") or (sampled and config.start == "inverse")
+    if graph.has_table and needs_ends:
+        raise ConfigError(
+            f"{config.method} from {config.start} labels needs beams that end where they measured"
+        )
     if config.method == "inverse":
         model = inverse_model(graph, config.log_odds)
         value, explained = judged(graph, config, model.labels)

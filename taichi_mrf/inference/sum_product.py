@@ -15,14 +15,17 @@ message for each voxel that it sees, and a sweep over it is four steps:
     backward   tell each voxel what that implies for it                                    (13), (14)
     finish     average over rays, renew the keyframe's message, update the beliefs          (7), (8)
 
-Messages and beliefs are log-odds. A voxel counts by the length l (in voxel sizes) that a ray spends in
-it: it lets the ray pass with probability (1 - m)^l where m is its probability of being occupied.
+With ``maximise`` the middle two are those of max_product.py. Messages and beliefs are log-odds. A voxel
+counts by the length l (in voxel sizes) that a ray spends in it: it lets the ray pass with probability
+(1 - m)^l where m is its probability of being occupied.
 """
 
 import taichi as ti
 
 from taichi_mrf.inference.accumulators import add_message, length_sum, mean_message
+from taichi_mrf.inference.first_occupied import NEVER
 from taichi_mrf.inference.log_odds import clamped_log_odds, exp_of_negative, logistic, softplus
+from taichi_mrf.inference.max_product import best_message, cost, see_best
 from taichi_mrf.inference.rays import deals, dealt_pixel, is_cast, pixel_direction
 from taichi_mrf.sensor.forward import (
     SUPPORT,
@@ -70,7 +73,7 @@ class ForwardPass(Struct):
     support: F32  # depth before which no surface can have made the measurement
     voxels_per_depth: F32  # length of the ray, in voxels, for one metre of axial depth
     visibility: F32  # prod_{k < i} (1 - m_k)^{l_k}
-    explained: F32  # sum_{j < i} of eq. 11
+    explained: F32  # sum_{j < i} of eq. 11; for max-product the least cost of such an explanation
     first: F32  # depth at which the ray enters its first voxel
     voxels: I32
     trace: I32  # where this ray's steps are written down
@@ -102,7 +105,8 @@ def send_messages(
     log_free: F32Array, sums: I64Array, scale: F32, clamp: F32,
     trace_voxel: I32Array, trace: Vec4Array, longest: I32, steps: I32Array,
     workers: I32, tile: I32, spread: I32,
-    likelihood: Template, segment_lengths: Template, log_average: Template, block_dim: Template,
+    likelihood: Template, segment_lengths: Template, log_average: Template, maximise: Template,
+    block_dim: Template,
 ):  # fmt: skip
     """Follow the rays of a keyframe there and back, and sum up what they tell each voxel.
 
@@ -144,11 +148,11 @@ def send_messages(
                 # Forward: eq. 11 for each voxel, from the camera outwards.
                 ahead = ForwardPass(
                     measured, here, depth_of_deviation(measured, SUPPORT, here), direction.norm(),
-                    1.0, 0.0, end, 0, worker * longest,
+                    1.0, NEVER if ti.static(maximise) else 0.0, end, 0, worker * longest,
                 )  # fmt: skip
                 walk_voxels(
                     ray, begin, end, shape, chunks, bricks, _see_voxel, ahead,
-                    (log_free, trace_voxel, trace, voxel_size, likelihood, segment_lengths),
+                    (log_free, trace_voxel, trace, voxel_size, likelihood, segment_lengths, maximise, floor),
                 )  # fmt: skip
 
                 if begins_known == 0 and ahead.first < begins[block]:
@@ -158,22 +162,27 @@ def send_messages(
                 # What gets through to where the map ends may have met its surface there.
                 behind = 0.0
                 if end < last:
-                    behind = ahead.visibility * beyond_likelihood(measured, end, here)
+                    behind = beyond_likelihood(measured, end, here)
+                behind = cost(behind, floor + TINY) if ti.static(maximise) else ahead.visibility * behind
 
                 # Backward: eqs. 13 and 14 for each voxel, from the far end.
                 for step in range(ahead.voxels):
                     j = ahead.trace + ahead.voxels - 1 - step
-                    length, free, here_density, before = trace[j][0], trace[j][1], trace[j][2], trace[j][3]
-                    occupied = occupied_message(before, here_density, floor)
-                    empty = empty_message(before, behind, free, floor)
-                    message = occupied / (occupied + empty)
-                    if ti.static(log_average):
-                        message = clamped_log_odds(occupied, empty, clamp, largest)
+                    message = 0.0
+                    if ti.static(maximise):
+                        message = best_message(trace[j], behind, clamp, log_average)
+                    else:
+                        free, here_density, before = trace[j][1], trace[j][2], trace[j][3]
+                        occupied = occupied_message(before, here_density, floor)
+                        empty = empty_message(before, behind, free, floor)
+                        message = occupied / (occupied + empty)
+                        if ti.static(log_average):
+                            message = clamped_log_odds(occupied, empty, clamp, largest)
+                        behind += (1.0 - free) * here_density
                     weight = 1.0
                     if ti.static(segment_lengths):
-                        weight = length
+                        weight = trace[j][0]
                     add_message(sums, trace_voxel[j], weight, message, scale)
-                    behind += (1.0 - free) * here_density
 
 
 @ti.func
@@ -181,21 +190,24 @@ def _see_voxel(ahead: Template, context: Template, voxel: I32, near: F32, far: F
     """One voxel of the forward pass; ``near`` and ``far`` bound the ray's segment in it, in axial depth."""
     length = (far - near) * ahead.voxels_per_depth
     log_free = context[0][voxel]
-    free = exp_of_negative(length * log_free if ti.static(context[5]) else log_free)
-
-    # Eq. 4, and eq. 11: the voxel is seen, it is occupied, and it explains the measurement.
+    if ti.static(context[5]):
+        log_free *= length
     density = 0.0
     if far > ahead.support:
-        density = ahead.visibility * surface_likelihood(
-            ahead.measured, near, far, ahead.noise, context[3], context[4]
-        )
+        density = surface_likelihood(ahead.measured, near, far, ahead.noise, context[3], context[4])
     if ahead.voxels == 0:
         ahead.first = near
     j = ahead.trace + ahead.voxels
     context[1][j] = voxel
-    context[2][j] = Vec4(length, free, density, ahead.explained)
-    ahead.explained += (1.0 - free) * density
-    ahead.visibility *= free
+    if ti.static(context[6]):
+        context[2][j] = see_best(ahead.explained, length, log_free, density, context[7] + TINY)
+    else:
+        # Eq. 4, and eq. 11: the voxel is seen, it is occupied, and it explains the measurement.
+        free = exp_of_negative(log_free)
+        density *= ahead.visibility
+        context[2][j] = Vec4(length, free, density, ahead.explained)
+        ahead.explained += (1.0 - free) * density
+        ahead.visibility *= free
     ahead.voxels += 1
     return 1
 

@@ -136,7 +136,8 @@ class Sweeper:
             self.log_free, self.sums, scale, config.message_clamp,
             self.trace_voxel, self.trace, footprint.longest, self.steps,
             workers.number, workers.tile, workers.spread,
-            LIKELIHOODS[config.likelihood], config.segment_lengths, log_average, workers.block,
+            LIKELIHOODS[config.likelihood], config.segment_lengths, log_average,
+            config.method == "max-product", workers.block,
         )  # fmt: skip
         keyframe.begins_known = True
         self.index.clear(window, visible.cells)

@@ -7,9 +7,10 @@ them, which keyframes see them. The computation itself is inference/sum_product.
 import math
 import weakref
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import taichi as ti
@@ -19,11 +20,14 @@ from taichi_mrf import runtime
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import Config, InferenceConfig, SensorConfig, VolumeConfig
 from taichi_mrf.config_values import overridden
-from taichi_mrf.errors import ConfigError, KeyframeError
+from taichi_mrf.errors import KeyframeError
+from taichi_mrf.factor_graph.depth_graph import depth_graph
+from taichi_mrf.factor_graph.graph import FactorGraph
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.footprint import find_footprint
 from taichi_mrf.inference.keyframe import DepthImage, Keyframe, checked_depth
 from taichi_mrf.inference.messages import carry_over, count_voices, new_messages
+from taichi_mrf.inference.prior import prior_probability
 from taichi_mrf.inference.schedule import InferReport, Progress, content_key, run_sweeps
 from taichi_mrf.inference.sweep import Sweeper, unknown_begins
 from taichi_mrf.maps.brick_book import BrickBook
@@ -37,7 +41,7 @@ from taichi_mrf.queries.points import classify, point_log_odds, probability
 from taichi_mrf.queries.profile import RayProfile
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config, warn_of_bad_sigma
-from taichi_mrf.voxels.layout import BRICK
+from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import create_topology, recycle
 
@@ -169,14 +173,18 @@ class MRFMap:
         tolerance: float | None = None,
         keyframes: Iterable[int] | None = None,
         progress: Progress | None = None,
+        method: Literal["sum-product", "max-product"] | None = None,
     ) -> InferReport:
         """Compute the marginals by loopy belief propagation.
 
         Without ``keyframes`` all of them are swept, from no messages and in an order that depends on
         what they hold: the map is a function of the set of keyframes. With ``keyframes`` (ids) only
         those are renewed, starting from what is known, which costs no more than they do.
-        ``progress`` is called after each keyframe and stops inference by returning False.
+        ``progress`` is called after each keyframe and stops inference by returning False. ``method`` takes
+        the place of the configuration's, from now on. Raises ConfigError for one that there is not.
         """
+        if method is not None and method != self.config.inference.method:
+            self._use(method)
         config = self.config.inference
         sweeps = config.sweeps if sweeps is None else sweeps
         tolerance = config.tolerance if tolerance is None else tolerance
@@ -197,6 +205,25 @@ class MRFMap:
         for keyframe in chosen:
             self._pool.touch(keyframe.visible.slots)
         return run_sweeps(chosen, self._pool, self._sweeper, sweeps, tolerance, progress)
+
+    def factor_graph(self, every: int = 1, memory_limit_gb: float = 0.0) -> FactorGraph:
+        """The factor graph without average messages, for factor_graph.solve: a factor for each ray of every
+        ``every``-th pixel, both ways, and one for each voxel's prior; its cells are the pool's voxels.
+        Raises CapacityError, which names its size, if it does not fit."""
+        keyframes = sorted(self._keyframes.values(), key=content_key)
+        for keyframe in keyframes:
+            self._refresh(keyframe)
+        parts = (self.sensor, self.config.inference, self.config.volume)
+        return depth_graph(keyframes, self._pool, self.voxel_size, *parts, every, memory_limit_gb)
+
+    def adopt(self, log_odds: NDArray[np.float32]) -> None:
+        """Believe these log-odds of the cells of :meth:`factor_graph`, (cells,), until the next infer."""
+        self._pool.restart()
+        for keyframe in self._keyframes.values():
+            keyframe.messages = None
+        self._pool.write("belief", self._pool.in_use, log_odds.reshape(-1, VOXELS).astype(np.float32))
+        self._pool.touch(self._pool.in_use)
+        self._messages_lost = bool(self._keyframes)
 
     def checkpoint(self) -> Checkpoint:
         """What :meth:`restore` needs to undo a full :meth:`infer` that ``progress`` has stopped."""
@@ -363,21 +390,15 @@ class MRFMap:
                 carry_over(old, old_messages, keyframe.visible, keyframe.messages)
         return keyframe.messages
 
+    def _use(self, method: str) -> None:
+        """Infer by this method from now on: no keyframe has sent its messages by it yet."""
+        inference = overridden(self.config.inference, {"method": method}, "MRFMap.infer")
+        self.config = replace(self.config, inference=inference)
+        self._sweeper.inference = inference
+        for keyframe in self._keyframes.values():
+            keyframe.revision = -1
+
     def _restore_messages(self) -> None:
         """A loaded map has no messages, because they are large and follow from the images."""
         if self._messages_lost:
             self.infer()
-
-
-def prior_probability(inference: InferenceConfig, voxel_size: float) -> float:
-    """The prior of a voxel: as given, or 1 - exp(-density * voxel size), which is the chance of meeting
-    a surface on the way through a voxel."""
-    if inference.prior is not None:
-        return inference.prior
-    prior = -math.expm1(-inference.surface_density * voxel_size)
-    if not 0 < prior < 1:
-        raise ConfigError(
-            f"inference.surface_density {inference.surface_density} and voxel_size {voxel_size} give a prior "
-            f"of {prior}"
-        )
-    return prior

@@ -115,6 +115,48 @@ def ray_messages(
     return out
 
 
+def best_messages(
+    ray: Ray, incoming: dict[Voxel, float], config: InferenceConfig
+) -> list[tuple[Voxel, float, float]]:
+    """As :func:`ray_messages`, by the likeliest explanation for either state instead of their sum."""
+    steps = [
+        (segment, density)
+        for segment, density in zip(ray.segments, ray.densities, strict=True)
+        if segment.voxel in incoming
+    ]
+    floor = config.outlier_floor + 1e-30
+    costs = [-math.log(density + floor) for _, density in steps] + [-math.log(ray.beyond + floor)]
+    free, occupied = [], []
+    for segment, _ in steps:
+        length = segment.length if config.segment_lengths else 1.0
+        log_free = -length * math.log1p(math.exp(incoming[segment.voxel]))
+        free.append(-log_free)
+        occupied.append(-math.log(-math.expm1(log_free)))
+    out = []
+    for i, (segment, _) in enumerate(steps):
+        least = {}
+        for state in (0, 1):
+            best = math.inf
+            for first in range(len(steps) + 1):
+                if (first > i and state == 1) or (first == i and state == 0):
+                    continue
+                total = costs[first]
+                for j in range(len(steps)):
+                    if j == i:
+                        continue
+                    if j < first:
+                        total += free[j]
+                    elif j == first:
+                        total += occupied[j]
+                    else:
+                        total += min(free[j], occupied[j])
+                best = min(best, total)
+            least[state] = best
+        weight = segment.length if config.segment_lengths else 1.0
+        out.append((segment.voxel, weight, logistic(least[0] - least[1])))
+    return out
+
+
 def infer(
     keyframes: list[list[Ray]],
     voxels: set[Voxel],
@@ -126,6 +168,7 @@ def infer(
     clamp = config.cavity_clamp
     lowest = max(-clamp, logit(config.free_share * prior)) if config.free_share > 0 else -clamp
     sent: list[dict[Voxel, float]] = [{} for _ in keyframes]
+    messages_of = best_messages if config.method == "max-product" else ray_messages
     for _ in range(config.sweeps):
         for rays, messages in zip(keyframes, sent, strict=True):
             seen = {s.voxel for ray in rays for s in ray.segments if s.voxel in belief}
@@ -133,8 +176,9 @@ def infer(
             weights: dict[Voxel, float] = dict.fromkeys(seen, 0.0)
             sums: dict[Voxel, float] = dict.fromkeys(seen, 0.0)
             for ray in rays:
-                for voxel, weight, q in ray_messages(ray, incoming, config):
+                for voxel, weight, q in messages_of(ray, incoming, config):
                     if config.average == "log_odds":
+                        q = min(1 - 1e-16, max(1e-300, q))
                         q = min(config.message_clamp, max(-config.message_clamp, logit(q)))
                     weights[voxel] += weight
                     sums[voxel] += weight * q
@@ -151,11 +195,14 @@ def infer(
     return belief
 
 
-def enumerate_marginals(rays: list[Ray], prior: float, floor: float) -> dict[Voxel, float]:
+def enumerate_marginals(
+    rays: list[Ray], prior: float, floor: float, maximise: bool = False
+) -> dict[Voxel, float]:
     """Eq. 1 summed over every assignment of the voxels: exact marginals of occupied.
 
-    A ray's factor is eq. 3 with the depth variable summed out: the density of the measurement at the
-    first occupied voxel, or beyond, plus the outlier floor.
+    With ``maximise`` of the likeliest assignment of either state, as odds. A ray's factor is eq. 3 with the
+    depth variable summed out: the density of the measurement at the first occupied voxel, or beyond, plus
+    the outlier floor.
     """
     voxels = sorted({s.voxel for ray in rays for s in ray.segments})
     column = {v: i for i, v in enumerate(voxels)}
@@ -167,4 +214,9 @@ def enumerate_marginals(rays: list[Ray], prior: float, floor: float) -> dict[Vox
         for segment, density in zip(reversed(ray.segments), reversed(ray.densities), strict=True):
             factor = np.where(states[:, column[segment.voxel]] == 1, density, factor)
         weight = weight * (factor + floor)
+    if maximise:
+        best = {
+            v: (weight[states[:, i] == 0].max(), weight[states[:, i] == 1].max()) for v, i in column.items()
+        }
+        return {v: float(occupied / (free + occupied)) for v, (free, occupied) in best.items()}
     return {v: float((weight * states[:, i]).sum() / weight.sum()) for v, i in column.items()}

@@ -1,0 +1,20 @@
+"""What is believed of a voxel before anybody has looked."""
+
+import math
+
+from taichi_mrf.config import InferenceConfig
+from taichi_mrf.errors import ConfigError
+
+
+def prior_probability(inference: InferenceConfig, voxel_size: float) -> float:
+    """The prior of a voxel: as given, or 1 - exp(-density * voxel size), which is the chance of meeting
+    a surface on the way through a voxel."""
+    if inference.prior is not None:
+        return inference.prior
+    prior = -math.expm1(-inference.surface_density * voxel_size)
+    if not 0 < prior < 1:
+        raise ConfigError(
+            f"inference.surface_density {inference.surface_density} and voxel_size {voxel_size} give a prior "
+            f"of {prior}"
+        )
+    return prior
