@@ -76,7 +76,15 @@ def test_sum_product_is_exact_on_trees(seed: int, number: int, sensor: str, sche
 def test_the_best_labelling_of_a_tree_is_found(seed: int, number: int, sensor: str, method: str) -> None:
     beams = tree(seed, number)
     graph, config, exact = setting(
-        beams, method=method, sensor=sensor, damping=0.0, iterations=300, step=1000.0, polish=0, sigma=0.2
+        beams,
+        method=method,
+        sensor=sensor,
+        damping=0.0,
+        iterations=300,
+        step=1000.0,
+        polish=0,
+        sigma=0.2,
+        charge="mean",
     )
     found = solve(graph, config)
     least = exact.energies.min()
@@ -91,7 +99,13 @@ def test_the_best_labelling_of_a_tree_is_found(seed: int, number: int, sensor: s
 @given(seed=SEEDS, number=st.integers(1, 12), sensor=SENSORS, method=st.sampled_from(["dd", "dd-block"]))
 def test_the_dual_never_exceeds_the_least_energy(seed: int, number: int, sensor: str, method: str) -> None:
     graph, config, exact = setting(
-        random_beams(seed, number), method=method, sensor=sensor, iterations=60, step=400.0, sigma=0.2
+        random_beams(seed, number),
+        method=method,
+        sensor=sensor,
+        iterations=60,
+        step=400.0,
+        sigma=0.2,
+        charge="mean",
     )
     found = solve(graph, config)
     assert found.dual is not None

@@ -31,7 +31,7 @@ class LaserConfig:
     max_range: float = 0.0
     """A beam is cut off at this range (metres) and then hits nothing; 0 means no limit."""
 
-    method: Method = "dd"
+    method: Method = "bp"
     """inverse is the inverse sensor model, mh Metropolis-Hastings, mh-heat the same with a heat map, bp
     sum-product belief propagation, max-product its maximising form, dd dual decomposition by subgradients,
     dd-block dual decomposition by block-coordinate ascent."""
@@ -96,10 +96,10 @@ class LaserConfig:
     step: float = 50.0
     """Dual decomposition: the first step; step i is this divided by i + 1."""
 
-    charge: Literal["mean", "whole"] = "mean"
-    """Dual decomposition: what a step charges each beam for what it says of a cell in disagreement. mean is
-    the projected subgradient, by how far the beam is from the mean of all; whole charges all of them the
-    whole step, as Alg. 2 is printed."""
+    charge: Literal["whole", "mean"] = "whole"
+    """Dual decomposition: what a step charges each beam for what it says of a cell in disagreement. whole
+    charges all of them the whole step, as Alg. 2 is printed; mean is the projected subgradient, by how far
+    the beam is from the mean of all, which with a step of 1000 ends lower and has a far better bound."""
 
     polish: int = 5
     """Belief propagation and dual decomposition: most sweeps of descent over the best labelling in the end,

@@ -3,15 +3,17 @@
 Each beam is a slave that minimises its own energy plus multipliers (eq. 23): one number t for each edge,
 what occupied costs this beam more than free. If a cell's multipliers sum to zero, every labelling of the
 whole graph costs the same with them as without, so the sum of the slaves' minima is a lower bound of the
-least energy. The subgradient of that bound is where each slave puts its ones; projected onto multipliers
-that sum to zero,
+least energy. In a cell on which slaves disagree, Alg. 2 charges each of them the step for its own choice,
+
+    t_if += step / (r + 1)      where the slave says occupied, and -= where it says free
+
+(``charge: whole``). Where opinions are even that is the subgradient of the bound, projected onto multipliers
+that sum to zero, up to a common offset; but where one beam of a thousand disagrees, all the others are turned
+against what they said. The projected subgradient itself (``charge: mean``) is
 
     t_if += step / (r + 1) * (x_i^f - mean over f of x_i^f)
 
-which is zero in cells on which the slaves agree. Alg. 2 as it is printed charges each slave of such a cell
-the whole step for its own choice instead (``charge: whole``): the same up to a common offset where opinions
-are even, but where one beam of a thousand disagrees all the others are turned against what they said. Eq. 24
-then picks the label for which a disagreeing cell's slaves have been charged the most.
+Eq. 24 then picks the label for which a disagreeing cell's slaves have been charged the most.
 
 Multipliers are integers of 1 / UNITS. What a cell's sum lacks to zero, by rounding or by whole charges, is
 known exactly and counts as a slave of its own, of that cell alone: the bound is exact with either rule. What
