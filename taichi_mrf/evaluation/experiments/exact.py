@@ -229,8 +229,8 @@ def _table(name: str, scene: Scene, voxel_size: float, every: int, result: Resul
         "Difference of marginals, and labels (p > 0.5), against the first row, over those voxels; labels of "
         "dual decomposition and max-product count as certain. Energy: of the labels, in the graph of all "
         "rays; bound: no labelling is lower.",
-        f"The last iteration of the first row moved {100 * first['residual']:.2g}% of the voxels by more than "
-        f"{PASSED_ON['tolerance']} (log-odds).",
+        f"The last iteration of the first row moved {100 * first['residual']:.2g}% of the voxels by more "
+        f"than {PASSED_ON['tolerance']} (log-odds).",
         "1.5sigma, 5cm, log-likelihood: on the views that are no keyframes, all pixels.",
     ]
     columns = [
