@@ -146,7 +146,10 @@ class BeliefPropagation:
         self.messages.fill(0.0)
         cells = graph.grid.cells
         self.belief, self.change, self.seen = (np.zeros(cells, np.int64) for _ in range(3))
-        self.changed, self.awake = np.zeros(cells, np.int32), np.ones(graph.beams, np.int32)
+        self.changed = np.zeros(cells, np.int32)
+        # On the device: what a kernel leaves untouched of a NumPy array is undefined on Vulkan.
+        self.awake = ti.ndarray(ti.i32, max(1, graph.beams))
+        self.awake.fill(1)
         self.random = np.random.default_rng(config.seed)
         energies = (config.energy_explained, config.energy_free, config.energy_wrong)
         if graph.has_table:
@@ -160,7 +163,7 @@ class BeliefPropagation:
         if schedule == "random":
             self._send(self.random.permutation(self.graph.beams).astype(np.int32), self.config.batches)
         elif schedule == "residual":
-            self._send(np.flatnonzero(self.awake).astype(np.int32), 1)
+            self._send(np.flatnonzero(self.awake.to_numpy()[: self.graph.beams]).astype(np.int32), 1)
         else:
             self._send(np.arange(self.graph.beams, dtype=np.int32), 1)
         moved = _mark_changed(
@@ -168,7 +171,7 @@ class BeliefPropagation:
         )
         if schedule == "residual":
             _mark_awake(self.graph.begins, self.graph.cells, self.changed, self.awake)
-        held_back = self.config.damping > 0 and self.awake.any()
+        held_back = self.config.damping > 0 and self.graph.beams > 0 and self.awake.to_numpy().any()
         return max(moved, int(held_back)) / max(1, int(self.graph.connected.sum()))
 
     def labels(self) -> NDArray[np.uint8]:
