@@ -80,7 +80,7 @@ def test_the_best_labelling_of_a_tree_is_found(seed: int, number: int, sensor: s
         method=method,
         sensor=sensor,
         damping=0.0,
-        iterations=300,
+        iterations=5000,
         step=1000.0,
         polish=0,
         sigma=0.2,

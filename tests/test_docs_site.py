@@ -1,0 +1,34 @@
+"""The documentation site is built without a warning, and names every parameter."""
+
+import dataclasses
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from taichi_mrf.config import Config
+from taichi_mrf.factor_graph.config import LaserConfig
+
+
+def names(section: Any, prefix: str = "") -> Iterator[str]:
+    for field in dataclasses.fields(section):
+        value = getattr(section, field.name)
+        if dataclasses.is_dataclass(value):
+            yield from names(value, f"{prefix}{field.name}.")
+        else:
+            yield prefix + field.name
+
+
+def test_the_site_is_built_without_a_warning(repository: Path, tmp_path: Path) -> None:
+    built = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)],
+        cwd=repository, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert built.returncode == 0, built.stderr
+    page = (tmp_path / "parameters" / "index.html").read_text(encoding="utf-8")
+    for name in [*names(Config()), *names(LaserConfig())]:
+        assert f"<code>{name}</code>" in page
+    front = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert "taichi-mrf live" in front
+    assert 'href="live/"' in front
