@@ -33,15 +33,18 @@ def crossing(
     rng = np.random.default_rng(seed)
     shared = (rng.integers(-20, 20, 3) + rng.uniform(0.2, 0.8, 3)) * VOXEL
     config = InferenceConfig(prior=prior, **EXACT)
-    m = MRFMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=0.4)
-    rays = []
+    poses, rays = [], []
     for depth in depths:
         direction = rng.normal(size=3)
         direction /= np.linalg.norm(direction)
-        T = look_along(shared - direction * rng.uniform(0.05, 0.3), direction, rng)
-        m.add_keyframe(image(depth), T, ONE_PIXEL)
-        rays += reference.cast(image(depth), T, ONE_PIXEL, VOXEL, Noise((sigma,)), config, max_depth=0.4)
+        poses.append(look_along(shared - direction * rng.uniform(0.05, 0.3), direction, rng))
+        rays += reference.cast(
+            image(depth), poses[-1], ONE_PIXEL, VOXEL, Noise((sigma,)), config, max_depth=0.4
+        )
     assume(well_cut(rays, 9))
+    m = MRFMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=0.4)
+    for depth, T in zip(depths, poses, strict=True):
+        m.add_keyframe(image(depth), T, ONE_PIXEL)
     assume({s.voxel for ray in rays for s in ray.segments} <= allocated(m))
     return m, rays, config
 
@@ -53,7 +56,7 @@ def at_voxels(graph: FactorGraph, values: np.ndarray, voxels: list[reference.Vox
     return values[[number[v] for v in voxels]]
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.filter_too_much])
+@settings(max_examples=12, suppress_health_check=[HealthCheck.filter_too_much])
 @given(seed=seeds, depths=st.tuples(shallow, shallow), sigma=st.floats(0.25, 0.6), prior=st.floats(0.02, 0.6))
 def test_sum_product_on_a_tree_of_rays_is_exact(
     seed: int, depths: tuple[float, float], sigma: float, prior: float
@@ -71,7 +74,7 @@ def test_sum_product_on_a_tree_of_rays_is_exact(
     np.testing.assert_allclose(found[untouched], prior, atol=1e-5)
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.filter_too_much])
+@settings(max_examples=20, suppress_health_check=[HealthCheck.filter_too_much])
 @given(
     seed=seeds, depths=st.tuples(shallow, shallow, shallow), sigma=st.floats(0.25, 0.6),
     prior=st.floats(0.05, 0.45), method=st.sampled_from(["max-product", "dd", "dd-block", "mh"]),
@@ -105,7 +108,7 @@ def test_energies_are_those_of_the_joint_distribution_and_bounds_bound_them(
         assert found.dual <= energies.min() + rounding
 
 
-@settings(max_examples=20, suppress_health_check=[HealthCheck.filter_too_much])
+@settings(max_examples=8, suppress_health_check=[HealthCheck.filter_too_much])
 @given(seed=seeds, depths=st.lists(shallow, min_size=3, max_size=5), method=st.sampled_from(["sum", "max"]))
 def test_with_one_ray_in_each_keyframe_the_map_is_the_graphs(
     seed: int, depths: list[float], method: str

@@ -22,7 +22,7 @@ class Workers:
             self.number, self.spread = 64, 512
         else:
             most = SCRATCH_BYTES // (8 * graph.longest)
-            self.number, self.spread = max(256, min(65536, most)), 1
+            self.number, self.spread = max(256, min(65536, most, graph.beams)), 1
         self.longest = graph.longest
         self.scratch = ti.ndarray(ti.f32, (self.number * self.longest, 2))
 
