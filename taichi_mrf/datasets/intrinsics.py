@@ -11,13 +11,21 @@ from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config_values import from_dict
 from taichi_mrf.datasets.base import ReadOptions
 from taichi_mrf.datasets.images import image_size
+from taichi_mrf.datasets.open3d_json import read_intrinsics
 from taichi_mrf.errors import ConfigError, DatasetError
 
 PRIMESENSE = PinholeCamera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
 """What drivers of PrimeSense cameras (Kinect 1, Xtion) assume, and ROS with them."""
 
-CAMERA_FILES = ("camera.txt", "camera.yaml", "camera-intrinsics.txt", "intrinsics.txt")
-"""camera.txt: width height fx fy cx cy; camera.yaml: the same by name; the others: the 3 x 3 matrix."""
+CAMERA_FILES = (
+    "camera.txt",
+    "camera.yaml",
+    "camera-intrinsics.txt",
+    "intrinsics.txt",
+    "camera_intrinsic.json",
+)
+"""camera.txt: width height fx fy cx cy; camera.yaml: the same by name; camera_intrinsic.json: Open3D's; the
+others: the 3 x 3 or 4 x 4 matrix."""
 
 
 def find_camera(
@@ -34,10 +42,12 @@ def find_camera(
     """
     if options.camera is not None:
         return options.camera, []
+    if options.intrinsics is not None:
+        return PinholeCamera(*_image_size(default, depth_files), *options.intrinsics), []
     for name in CAMERA_FILES:
         path = folder / name
         if path.is_file():
-            return _read_camera(path, default, depth_files), []
+            return read_camera(path, default, depth_files), []
     k = default
     note = (
         f"no {' or '.join(CAMERA_FILES)} in {folder}: assumed the camera of {default_name}, "
@@ -46,7 +56,11 @@ def find_camera(
     return default, [note]
 
 
-def _read_camera(path: Path, default: PinholeCamera, depth_files: Iterable[Path]) -> PinholeCamera:
+def read_camera(path: Path, default: PinholeCamera, depth_files: Iterable[Path]) -> PinholeCamera:
+    """The camera in a file of one of the layouts above; ``default`` gives the image size where neither the
+    file nor ``depth_files`` do. Raises DatasetError, whose text names the file."""
+    if path.suffix == ".json":
+        return read_intrinsics(path)
     try:
         text = path.read_text(encoding="utf-8")
         if path.suffix == ".yaml":
@@ -54,8 +68,10 @@ def _read_camera(path: Path, default: PinholeCamera, depth_files: Iterable[Path]
         numbers = [float(word) for line in text.splitlines() for word in line.split("#")[0].split()]
         if len(numbers) == 6:
             return _camera_from_numbers(numbers)
-        if len(numbers) == 9:
-            return _camera_from_matrix(np.reshape(numbers, (3, 3)), default, depth_files)
+        if len(numbers) in (9, 16):
+            side = 3 if len(numbers) == 9 else 4
+            K = np.reshape(numbers, (side, side))[:3, :3]
+            return _camera_from_matrix(K, default, depth_files)
     except ConfigError as error:
         raise DatasetError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
     except OSError as error:
@@ -63,7 +79,7 @@ def _read_camera(path: Path, default: PinholeCamera, depth_files: Iterable[Path]
     except ValueError as error:
         raise DatasetError(f"{path}: holds something that is not a number: {error}") from error
     raise DatasetError(
-        f"{path}: holds {len(numbers)} numbers; expected width height fx fy cx cy, or a 3 x 3 matrix"
+        f"{path}: holds {len(numbers)} numbers; expected width height fx fy cx cy, or a 3 x 3 or 4 x 4 matrix"
     )
 
 
@@ -90,13 +106,17 @@ def _camera_from_yaml(text: str, path: Path) -> PinholeCamera:
 def _camera_from_matrix(K: np.ndarray, default: PinholeCamera, depth_files: Iterable[Path]) -> PinholeCamera:
     if K[0, 1] or K[1, 0] or tuple(K[2]) != (0.0, 0.0, 1.0):
         raise ConfigError("not the matrix of a pinhole camera without skew: fx 0 cx / 0 fy cy / 0 0 1")
-    width, height = default.width, default.height
-    for depth_file in depth_files:
-        try:
-            width, height = image_size(depth_file)
-            break
-        except DatasetError:  # a broken image is reported when its frame is read
-            continue
+    width, height = _image_size(default, depth_files)
     return PinholeCamera(
         width, height, fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2])
     )
+
+
+def _image_size(default: PinholeCamera, depth_files: Iterable[Path]) -> tuple[int, int]:
+    """(width, height) of the first image that can be read, else the default camera's."""
+    for depth_file in depth_files:
+        try:
+            return image_size(depth_file)
+        except DatasetError:  # a broken image is reported when its frame is read
+            continue
+    return default.width, default.height

@@ -6,7 +6,8 @@ trajectory's layout says of the recording:
 - stamped (``*.freiburg``; Handa et al., ICRA 2014): the stamp is the image's number; ICL-NUIM's camera, 5000
   steps a metre. ICL-NUIM's world and camera have y up and are left-handed (its fy is -480); both are
   mirrored here. The published trajectories start at image 1; what lies outside them is dropped and counted.
-- ``.log`` (Choi et al., CVPR 2015): Redwood's camera, 525 525 319.5 239.5, 1000 steps a metre.
+- ``.log`` (Choi et al., CVPR 2015) and Open3D's ``.json``: Redwood's camera, 525 525 319.5 239.5, or the one
+  that the trajectory holds; 1000 steps a metre.
 - rows of 3 x 4 matrices: 5000 steps a metre, ICL-NUIM's camera where the folder's name holds ``icl``, else
   Redwood's.
 
@@ -22,13 +23,14 @@ import numpy as np
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.datasets.base import Dataset, ReadOptions
 from taichi_mrf.datasets.intrinsics import PRIMESENSE, find_camera
+from taichi_mrf.datasets.open3d_json import is_trajectory_json, read_trajectory_json
 from taichi_mrf.datasets.recording import RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory, is_trajectory, read_trajectory
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.poses import Pose
 
 NAME = "ICL-NUIM / Redwood"
-LOOKS_FOR = "NNNN.png (here or in depth/) and a trajectory (.log, .freiburg or rows of 3 x 4 matrices)"
+LOOKS_FOR = "NNNN.png (here or in depth/) and a trajectory (.log, .json, .freiburg or rows of matrices)"
 ICL_NUIM = PinholeCamera(width=640, height=480, fx=481.2, fy=480.0, cx=319.5, cy=239.5)
 FRAMES_PER_SECOND = 30.0
 COLOR_FOLDERS = ("rgb", "color", "image")
@@ -45,7 +47,7 @@ def recognises(folder: Path) -> bool:
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     """List the images in the order of their numbers, each with its pose of the trajectory."""
     images = _numbered_images(folder)
-    trajectory = _find_trajectory(folder)
+    trajectory, recorded = _find_trajectory(folder)
     poses, notes = _poses_by_number(list(images), trajectory)
     left_handed = trajectory.path.suffix == ".freiburg"
     if left_handed:
@@ -58,13 +60,12 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     if not frames:
         raise DatasetError(f"{trajectory.path}: has a pose for none of the {len(images)} images in {folder}")
     redwood = trajectory.layout == "log" or (trajectory.layout == "rows" and "icl" not in folder.name.lower())
+    default, name = (PRIMESENSE, "Redwood") if redwood else (ICL_NUIM, "ICL-NUIM")
     camera, assumed = find_camera(
-        folder,
-        options,
-        PRIMESENSE if redwood else ICL_NUIM,
-        "Redwood" if redwood else "ICL-NUIM",
-        (frame.depth_file for frame in frames),
+        folder, options, recorded or default, name, (frame.depth_file for frame in frames)
     )
+    if recorded is not None and camera == recorded:
+        assumed = []
     return Recording(
         name=folder.name,
         camera=camera,
@@ -86,15 +87,23 @@ def _numbered_images(folder: Path) -> dict[int, Path]:
     return {}
 
 
-def _find_trajectory(folder: Path) -> Trajectory:
+def _find_trajectory(folder: Path) -> tuple[Trajectory, PinholeCamera | None]:
+    """The only trajectory of a recording, and the camera that it holds, if it does."""
     suffixes = (".txt", ".log", ".freiburg")
-    candidates = [p for p in sorted(folder.iterdir()) if p.suffix in suffixes and is_trajectory(p)]
+    candidates = [
+        path
+        for path in sorted(folder.iterdir())
+        if (path.suffix in suffixes and is_trajectory(path))
+        or (path.suffix == ".json" and is_trajectory_json(path))
+    ]
     if not candidates:
         raise DatasetError(f"{folder}: numbered images without a trajectory; looked for {LOOKS_FOR}")
     if len(candidates) > 1:
         names = ", ".join(path.name for path in candidates)
         raise DatasetError(f"{folder}: holds several trajectories, {names}: keep one")
-    return read_trajectory(candidates[0])
+    if candidates[0].suffix == ".json":
+        return read_trajectory_json(candidates[0])
+    return read_trajectory(candidates[0]), None
 
 
 def _poses_by_number(

@@ -1,21 +1,25 @@
-"""``realsense:``: depth images from an Intel RealSense camera that is plugged in, as long as it is.
+"""``realsense:``: depth images from an Intel RealSense camera that is plugged in, or from a recording of one.
 
-The camera is taken to stand still: its pose is one and the same for all frames, at the origin, level, looking
-along x. Poses of a camera that moves come in a later version. Options follow the name,
-``realsense:width=848&height=480&fps=30``.
+``realsense:width=848&height=480&fps=30`` is a camera, as long as it is plugged in; ``realsense:FILE`` is what
+its library has recorded (realsense_file.py). ``?poses=FILE`` gives the poses of the depth camera in TUM's
+layout, by the stamps of its images. Without them the camera is taken to stand still: its pose is one and the
+same for all frames, at the origin, level, looking along x.
 """
 
 import importlib
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, overload
+from pathlib import Path
+from typing import Any, overload
 
 import numpy as np
 
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.datasets.base import Dataset, ReadOptions
 from taichi_mrf.datasets.query_options import parse_options
+from taichi_mrf.datasets.realsense_file import Player, RealSenseFile
+from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.frame import Frame
 from taichi_mrf.poses import Pose, look_at
@@ -27,10 +31,8 @@ TIMEOUT_MS = 500
 
 MISSES = 4
 
-NOTES = (
-    "the camera is taken to stand still: poses of one that moves come in a later version",
-    "frames come without end: --keep-live N bounds the memory, --keyframes.* thins them out",
-)
+STANDS_STILL = "the camera is taken to stand still: ?poses=FILE gives the poses of one that moves"
+ENDLESS = "frames come without end: --keep-live N bounds the memory, --keyframes.* thins them out"
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,9 @@ class RealSenseOptions:
 
     fps: int = 30
     """Images in a second."""
+
+    poses: str = ""
+    """A file of the camera's poses: stamp tx ty tz qx qy qz qw."""
 
 
 class _EndlessNames(Sequence[str]):
@@ -63,16 +68,25 @@ class _EndlessNames(Sequence[str]):
         return f"realsense-{index:06d}"
 
 
+def _standing_still() -> Pose:
+    return look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+
+
 @dataclass
 class RealSense(Dataset):
     """A RealSense camera. ``pipeline`` is pyrealsense2's, started; ``depth_scale`` is metres a step."""
 
-    endless: ClassVar[bool] = True
-
     pipeline: Any = None
     depth_scale: float = 0.001
-    T_world_camera: Pose = field(default_factory=lambda: look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)))
+    trajectory: TimedPoses | None = None
+    largest_gap: float = INTERPOLATION_GAP
+    T_world_camera: Pose = field(default_factory=_standing_still)
     misses: int = 0
+
+    @property
+    def endless(self) -> bool:
+        """A camera never ends."""
+        return True
 
     @property
     def frame_names(self) -> Sequence[str]:
@@ -95,24 +109,53 @@ class RealSense(Dataset):
         if steps.shape != self.camera.shape:
             raise FrameError(f"{name}: the image has the shape {steps.shape}, not {self.camera.shape}")
         depth_m = (steps * np.float32(self.depth_scale)).astype(np.float32)
-        return Frame(depth_m, self.T_world_camera, self.camera, image.get_timestamp() / 1000.0, name)
+        stamp = image.get_timestamp() / 1000.0
+        return Frame(depth_m, self._pose(name, stamp), self.camera, stamp, name)
+
+    def _pose(self, name: str, stamp: float) -> Pose:
+        if self.trajectory is None:
+            return self.T_world_camera
+        pose = self.trajectory.at(stamp, self.largest_gap)
+        if pose is None:
+            raise FrameError(f"{name}: no poses within {self.largest_gap:g} s of its stamp {stamp:.3f} s")
+        return pose
 
 
-def open_realsense(query: str, options: ReadOptions) -> RealSense:
-    """Start the first RealSense camera that is found.
+def open_realsense(text: str, options: ReadOptions) -> Dataset:
+    """Start the first RealSense camera that is found, or open a recording: ``FILE?option=value&...``, where
+    either may be missing.
 
     Raises DatasetError, whose text says what to install or what the camera's library says, for a wrong
     option, and for a depth scale, which the camera knows itself.
     """
-    wanted = parse_options(RealSenseOptions, query.removeprefix("?"), NAME)
+    file, wanted = _file_and_options(text)
     if options.depth_scale is not None:
         raise DatasetError(f"{NAME} has no depth_scale, the camera knows its own")
+    trajectory = read_timed_poses(Path(wanted.poses)) if wanted.poses else None
     try:
         rs = importlib.import_module("pyrealsense2")
     except ImportError as error:
         raise DatasetError(
             f"{NAME} needs pyrealsense2, which is not installed: pip install 'taichi-mrf[realsense]'"
         ) from error
+    gap = INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
+    if file:
+        return _open_recording(rs, Path(file), trajectory, gap, options)
+    return _open_camera(rs, wanted, trajectory, gap, options)
+
+
+def _file_and_options(text: str) -> tuple[str, RealSenseOptions]:
+    """What follows the colon, as a file's name and options; options alone may do without the question
+    mark."""
+    file, mark, query = text.partition("?")
+    if not mark and "=" in text and not Path(text).exists():
+        file, query = "", text
+    return file, parse_options(RealSenseOptions, query, f"{NAME}{file}")
+
+
+def _open_camera(
+    rs: Any, wanted: RealSenseOptions, trajectory: TimedPoses | None, gap: float, options: ReadOptions
+) -> RealSense:
     pipeline, config = rs.pipeline(), rs.config()
     config.enable_stream(rs.stream.depth, wanted.width, wanted.height, rs.format.z16, wanted.fps)
     try:
@@ -121,9 +164,48 @@ def open_realsense(query: str, options: ReadOptions) -> RealSense:
         raise DatasetError(f"{NAME} cannot be started: {error}") from error
     stream = profile.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
     camera = PinholeCamera(stream.width, stream.height, stream.fx, stream.fy, stream.ppx, stream.ppy)
-    scale = float(profile.get_device().first_depth_sensor().get_depth_scale())
     source = RealSense(
-        NAME, options.camera or camera, notes=list(NOTES), pipeline=pipeline, depth_scale=scale
+        NAME,
+        options.camera or camera,
+        notes=[ENDLESS] if trajectory is not None else [STANDS_STILL, ENDLESS],
+        pipeline=pipeline,
+        depth_scale=float(profile.get_device().first_depth_sensor().get_depth_scale()),
+        trajectory=trajectory,
+        largest_gap=gap,
     )
     weakref.finalize(source, pipeline.stop)
+    return source
+
+
+def _open_recording(
+    rs: Any, path: Path, trajectory: TimedPoses | None, gap: float, options: ReadOptions
+) -> RealSenseFile:
+    if not path.is_file():
+        raise DatasetError(f"{NAME}{path}: there is no such file")
+    player = Player(rs, path)
+    images = [listed for listed, _ in player.images()]
+    if not images:
+        raise DatasetError(f"{path}: holds no depth images")
+    still = _standing_still()
+    poses = [still if trajectory is None else trajectory.at(each.stamp, gap) for each in images]
+    posed = [(each, pose) for each, pose in zip(images, poses, strict=True) if pose is not None]
+    if not posed:
+        raise DatasetError(
+            f"{path}: none of its {len(images)} depth images ({images[0].stamp:.3f} to "
+            f"{images[-1].stamp:.3f} s) has poses within {gap:g} s on both sides"
+        )
+    dropped = len(images) - len(posed)
+    notes = [STANDS_STILL] if trajectory is None else []
+    if dropped:
+        notes.append(f"{dropped} of {len(images)} images dropped: no poses within {gap:g} s on both sides")
+    source = RealSenseFile(
+        path.stem,
+        options.camera or player.camera,
+        notes=notes,
+        dropped=dropped,
+        player=player,
+        listed=[each for each, _ in posed],
+        poses=[pose for _, pose in posed],
+    )
+    weakref.finalize(source, player.close)
     return source

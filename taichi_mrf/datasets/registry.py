@@ -1,4 +1,5 @@
-"""Which reader opens a source: a folder is recognised by what is in it, a built-in one by its name.
+"""Which reader opens a source: a folder is recognised by what is in it, a file by its name, a built-in one by
+its.
 
 A new folder format is a module with NAME, LOOKS_FOR, ``recognises(folder)`` and
 ``open_folder(folder, options)``, and a place in FOLDER_FORMATS; the first that recognises a folder wins.
@@ -12,15 +13,21 @@ from typing import Protocol
 
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.datasets import (
+    frames_npz,
     mesh_sequence,
     numbered_depth,
     realsense,
+    replica,
+    ros_bag,
+    scannet,
     seven_scenes,
+    stereo_file,
     stereo_pairs,
     synthetic_room,
     tum_rgbd,
 )
 from taichi_mrf.datasets.base import Dataset, ReadOptions
+from taichi_mrf.datasets.resampled import resampled
 from taichi_mrf.errors import DatasetError
 
 
@@ -37,7 +44,19 @@ class FolderFormat(Protocol):
         """List the recording's frames. Raises DatasetError."""
 
 
-FOLDER_FORMATS: tuple[FolderFormat, ...] = (seven_scenes, tum_rgbd, numbered_depth, stereo_pairs)
+FOLDER_FORMATS: tuple[FolderFormat, ...] = (
+    seven_scenes,
+    tum_rgbd,
+    scannet,
+    replica,
+    numbered_depth,
+    stereo_pairs,
+    ros_bag,
+    frames_npz,
+)
+
+FILES = ".bag, .mcap or .db3 (ROS), .npz (frames), .yaml (stereo pairs)"
+"""What a file may be."""
 
 _BUILT_IN: dict[str, Callable[[str, ReadOptions], Dataset]] = {
     synthetic_room.NAME: synthetic_room.open_synthetic_room,
@@ -53,25 +72,35 @@ def open_dataset(
     camera: PinholeCamera | None = None,
     depth_scale: float | None = None,
     color: bool = True,
-    max_time_gap: float = 0.02,
+    max_time_gap: float | None = None,
+    intrinsics: tuple[float, float, float, float] | None = None,
+    undistort: tuple[float, ...] | None = None,
+    image_scale: float = 1.0,
 ) -> Dataset:
-    """Open a recording (a folder) or a built-in source such as ``synthetic:room?frames=60``.
+    """Open a recording (a folder or a file) or a built-in source such as ``synthetic:room?frames=60``.
 
-    ``camera`` takes the place of the intrinsics that the recording or its format gives, ``depth_scale``
-    (steps per metre) that of the scale of its depth images. ``color=False`` leaves colour images
-    unread. ``max_time_gap`` (seconds) bounds the difference in time between a depth image and the pose
-    that it is given, in formats with stamps. Raises DatasetError, whose text names the source and says
-    what was looked for.
+    The keywords are the fields of :class:`ReadOptions`: what the recording does not say, or says wrongly.
+    Raises DatasetError, whose text names the source and says what was looked for.
     """
-    options = ReadOptions(camera, depth_scale, color, max_time_gap)
-    folder = Path(source)
+    options = ReadOptions(camera, depth_scale, color, max_time_gap, intrinsics, undistort, image_scale)
+    path = Path(source)
     scheme = re.match(r"([a-z][a-z0-9_]+):", str(source))  # two letters at least: C:\ is a folder
     try:
-        if scheme and not folder.exists():
-            return _open_built_in(str(source), options)
-        return _open_folder(folder, options)
+        if scheme and not path.exists():
+            dataset = _open_built_in(str(source), options)
+        else:
+            dataset = _open_path(str(source), options)
     except OSError as error:
-        raise DatasetError(f"{folder}: cannot be read: {error.strerror}") from error
+        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
+    return _as_wanted(dataset, options)
+
+
+def _as_wanted(dataset: Dataset, options: ReadOptions) -> Dataset:
+    """What all readers have in common: the caller's intrinsics, and images picked anew."""
+    if options.intrinsics is not None:
+        dataset.camera = PinholeCamera(dataset.camera.width, dataset.camera.height, *options.intrinsics)
+    distortion = dataset.distortion if options.undistort is None else options.undistort
+    return resampled(dataset, distortion, options.stride)
 
 
 def recognise(folder: Path) -> FolderFormat | None:
@@ -79,20 +108,65 @@ def recognise(folder: Path) -> FolderFormat | None:
     return next((each for each in FOLDER_FORMATS if each.recognises(folder)), None)
 
 
-def _open_folder(folder: Path, options: ReadOptions) -> Dataset:
-    if not folder.exists():
+def format_name(source: str | Path) -> str:
+    """What the format of a source that can be opened is called."""
+    path, _ = _path_and_query(str(source))
+    if path.is_dir():
+        found = recognise(path)
+        return found.NAME if found is not None else "folder"
+    if path.is_file():
+        readers = (ros_bag, frames_npz)
+        return next((each.NAME for each in readers if each.recognises_file(path)), stereo_file.NAME)
+    return str(source).partition("?")[0]
+
+
+def bag_path(source: str) -> Path | None:
+    """The bag that a source names, None if it is something else."""
+    path, _ = _path_and_query(source)
+    return path if ros_bag.is_bag(path) else None
+
+
+def _path_and_query(source: str) -> tuple[Path, str]:
+    """A path and what follows a question mark in its name, unless that is part of the path."""
+    path, mark, query = source.rpartition("?")
+    return (Path(path), query) if mark and not Path(source).exists() else (Path(source), "")
+
+
+def _open_path(source: str, options: ReadOptions) -> Dataset:
+    path, query = _path_and_query(source)
+    if not path.exists():
         raise DatasetError(
-            f"{folder}: there is no such folder, nor a built-in source of that name ({', '.join(_BUILT_IN)})"
+            f"{path}: there is no such folder or file, nor a built-in source of that name "
+            f"({', '.join(_BUILT_IN)})"
         )
-    if not folder.is_dir():
-        raise DatasetError(f"{folder}: is a file; a recording is the folder that holds the images and poses")
+    if ros_bag.is_bag(path):
+        return ros_bag.open_bag(path, query, options)
+    if query:
+        raise DatasetError(f"{path}: takes no options after a question mark; bags and built-in sources do")
+    return _open_folder(path, options) if path.is_dir() else _open_file(path, options)
+
+
+def _open_file(path: Path, options: ReadOptions) -> Dataset:
+    if frames_npz.recognises_file(path):
+        return frames_npz.open_file(path, options)
+    if path.suffix in stereo_file.SUFFIXES:
+        return stereo_file.open_file(path, options)
+    raise DatasetError(
+        f"{path}: is a file, and none that is known here: {FILES}; other recordings are the folder that "
+        "holds the images and poses"
+    )
+
+
+def _open_folder(folder: Path, options: ReadOptions) -> Dataset:
     folder_format = recognise(folder)
     if folder_format is not None:
         return folder_format.open_folder(folder.resolve(), options)
     children = sorted(folder.iterdir())
     if not children:
         raise DatasetError(f"{folder}: the folder is empty; looked for {_looked_for()}")
-    inside = [child.name for child in children if child.is_dir() and recognise(child)]
+    inside = [
+        child.name for child in children if ros_bag.is_bag(child) or (child.is_dir() and recognise(child))
+    ]
     if inside:
         raise DatasetError(f"{folder}: holds recordings, is none itself; name one: {', '.join(inside[:8])}")
     raise DatasetError(f"{folder}: no recording that is known here; looked for {_looked_for()}")

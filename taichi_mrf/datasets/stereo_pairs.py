@@ -9,7 +9,7 @@
 Depth is not recorded: it is matched when a frame is read.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.datasets.base import Dataset, ReadOptions
 from taichi_mrf.datasets.images import image_size, read_color
 from taichi_mrf.datasets.stereo_calibration import read_rig
@@ -128,19 +129,15 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     return StereoPairs(
         name=folder.name,
         camera=rig.camera,
-        notes=[_noise_note(rig, left, right), *stamp_notes],
+        notes=[noise_note(rig, left, right), *stamp_notes],
         pairs=pairs,
         baseline_m=rig.baseline_m,
         color=options.color,
     )
 
 
-def _check_count(path: Path, what: str, count: int, names: Sequence[str]) -> None:
-    if count != len(names):
-        raise DatasetError(f"{path}: holds {count} {what} for {len(names)} stereo pairs")
-
-
-def _noise_note(rig: StereoRig, left: str, right: str) -> str:
+def noise_note(rig: StereoRig, left: str, right: str) -> str:
+    """What a report should say of depth that is matched in the images ``left`` and ``right``."""
     lambda_ = rig.sigma()[2]
     return (
         f"depth comes from stereo: {left} and {right} by semi-global matching, "
@@ -166,20 +163,26 @@ def _needed(path: Path) -> Path:
 
 def _read_rig(folder: Path, left: str, names: Sequence[str], options: ReadOptions) -> StereoRig:
     calibration = _needed(folder / CALIBRATION)
-    if options.camera is None:
-        return read_rig(calibration, *_first_size(folder / left, names))
-    recorded = read_rig(calibration, options.camera.width, options.camera.height)
-    return StereoRig(options.camera, recorded.baseline_m)
+    if options.camera is not None:
+        recorded = read_rig(calibration, options.camera.width, options.camera.height)
+        return StereoRig(options.camera, recorded.baseline_m)
+    recorded = read_rig(calibration, *first_size(folder / left, (folder / left / name for name in names)))
+    if options.intrinsics is None:
+        return recorded
+    camera = PinholeCamera(recorded.camera.width, recorded.camera.height, *options.intrinsics)
+    return StereoRig(camera, recorded.baseline_m)
 
 
-def _first_size(folder: Path, names: Sequence[str]) -> tuple[int, int]:
-    """(width, height) of the first image that can be read; a broken one is reported with its frame."""
-    for name in names:
+def first_size(where: Path, images: Iterable[Path]) -> tuple[int, int]:
+    """(width, height) of the first image that can be read; a broken one is reported with its frame.
+
+    Raises DatasetError, which names ``where`` they are, if none can be read."""
+    for image in images:
         try:
-            return image_size(folder / name)
+            return image_size(image)
         except DatasetError:
             continue
-    raise DatasetError(f"{folder}: none of its images can be read")
+    raise DatasetError(f"{where}: none of its images can be read")
 
 
 def _stamps(path: Path, count: int) -> tuple[list[float], list[str]]:
@@ -187,6 +190,11 @@ def _stamps(path: Path, count: int) -> tuple[list[float], list[str]]:
     if not path.is_file():
         note = f"no {TIMES} in {path.parent}: assumed {SECONDS_PER_FRAME:g} s from one pair to the next"
         return [SECONDS_PER_FRAME * i for i in range(count)], [note]
+    return read_times(path), []
+
+
+def read_times(path: Path) -> list[float]:
+    """A file with a stamp in seconds a line. Raises DatasetError, which names the file and the line."""
     stamps = []
     for number, line in enumerate(_text(path).splitlines(), start=1):
         if not line.strip():
@@ -197,7 +205,7 @@ def _stamps(path: Path, count: int) -> tuple[list[float], list[str]]:
             raise DatasetError(f"{path} line {number}: expected a stamp in seconds") from None
         if not np.isfinite(stamps[-1]):
             raise DatasetError(f"{path} line {number}: the stamp is not finite")
-    return stamps, []
+    return stamps
 
 
 def _text(path: Path) -> str:

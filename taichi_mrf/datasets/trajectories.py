@@ -39,7 +39,7 @@ class RecordedPose:
 
     def T_world_camera(self) -> Pose:
         """The pose, (4, 4), its rotation projected. Raises KeyframeError if it is no rigid transform."""
-        return as_pose(_from_quaternion(self.values) if self.values.shape == (7,) else self.values)
+        return as_pose(pose_from_quaternion(self.values) if self.values.shape == (7,) else self.values)
 
 
 @dataclass(frozen=True)
@@ -99,8 +99,11 @@ def read_matrix_file(path: Path) -> Pose:
     return as_pose(np.reshape(numbers, (-1, 4)))
 
 
-def _from_quaternion(values: NDArray[np.float64]) -> Pose:
-    """tx ty tz qx qy qz qw to a (4, 4) matrix; the quaternion is normalised."""
+def pose_from_quaternion(values: NDArray[np.float64]) -> Pose:
+    """tx ty tz qx qy qz qw, (7,), to a (4, 4) matrix; the quaternion is normalised.
+
+    Raises KeyframeError if a value is not finite or the quaternion is zero.
+    """
     if not np.isfinite(values).all():
         raise KeyframeError("a pose holds a value that is not finite (NaN or infinity)")
     norm = np.linalg.norm(values[3:])

@@ -20,6 +20,8 @@ from taichi_mrf.errors import DatasetError
 NAME = "TUM RGB-D"
 LOOKS_FOR = "depth.txt and groundtruth.txt"
 STEPS_PER_METRE = 5000.0
+LARGEST_GAP = 0.02
+"""Seconds between a depth image and its pose if nothing else is said."""
 DEPTH_LIST, COLOR_LIST, POSES = "depth.txt", "rgb.txt", "groundtruth.txt"
 
 CAMERAS = {
@@ -36,15 +38,16 @@ def recognises(folder: Path) -> bool:
 
 
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
-    """List the depth images that have a pose within ``options.max_time_gap``, by their stamps."""
+    """List the depth images that have a pose within the largest gap, by their stamps."""
     if not (folder / POSES).is_file():
         raise DatasetError(f"{folder / POSES}: is missing; {DEPTH_LIST} lies beside it without poses")
     depth = _read_list(folder / DEPTH_LIST)
     trajectory = read_trajectory(folder / POSES)
     if trajectory.layout != "stamped":
         raise DatasetError(f"{trajectory.path}: expected lines of stamp tx ty tz qx qy qz qw")
+    gap = LARGEST_GAP if options.max_time_gap is None else options.max_time_gap
     stamps = [stamp for stamp, _ in depth]
-    partners = associate(stamps, [pose.key for pose in trajectory.poses], options.max_time_gap)
+    partners = associate(stamps, [pose.key for pose in trajectory.poses], gap)
     matched = [
         (stamp, path, trajectory.poses[partner])
         for (stamp, path), partner in zip(depth, partners, strict=True)
@@ -54,18 +57,15 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         first, last = trajectory.poses[0].key, trajectory.poses[-1].key
         raise DatasetError(
             f"{folder}: none of {len(depth)} depth images ({stamps[0]:.3f} to {stamps[-1]:.3f} s) has a pose "
-            f"within {options.max_time_gap:g} s ({POSES}: {first:.3f} to {last:.3f} s)"
+            f"within {gap:g} s ({POSES}: {first:.3f} to {last:.3f} s)"
         )
-    colors = _colors(folder, [stamp for stamp, _, _ in matched], options)
+    colors = _colors(folder, [stamp for stamp, _, _ in matched], options, gap)
     frames = [_frame(*parts, color) for parts, color in zip(matched, colors, strict=True)]
     default, default_name = _default_camera(folder)
     camera, notes = find_camera(folder, options, default, default_name, (f.depth_file for f in frames))
     dropped = len(depth) - len(frames)
     if dropped:
-        notes.append(
-            f"{dropped} of {len(depth)} depth images dropped: no pose of their own within "
-            f"{options.max_time_gap:g} s"
-        )
+        notes.append(f"{dropped} of {len(depth)} depth images dropped: no pose of their own within {gap:g} s")
     return Recording(
         name=folder.name,
         camera=camera,
@@ -88,12 +88,12 @@ def _frame(stamp: float, depth_file: Path, pose: RecordedPose, color_file: Path 
     )
 
 
-def _colors(folder: Path, stamps: list[float], options: ReadOptions) -> list[Path | None]:
+def _colors(folder: Path, stamps: list[float], options: ReadOptions, gap: float) -> list[Path | None]:
     path = folder / COLOR_LIST
     if not (options.color and path.is_file()):
         return [None] * len(stamps)
     color = _read_list(path)
-    partners = associate(stamps, [stamp for stamp, _ in color], options.max_time_gap)
+    partners = associate(stamps, [stamp for stamp, _ in color], gap)
     return [None if partner is None else color[partner][1] for partner in partners]
 
 

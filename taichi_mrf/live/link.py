@@ -51,9 +51,11 @@ class Link(Protocol):
 class ViewerLink:
     """A viewer process and the line to it. Use it as a context, or :meth:`close` it."""
 
-    def __init__(self, host: str, port: int, serve: Serve | None = None) -> None:
+    def __init__(
+        self, host: str, port: int, serve: Serve | None = None, outbox: Outbox | None = None
+    ) -> None:
         """Start the viewer; its first request will be Listening. ``serve`` is what the process runs, by
-        default the page."""
+        default the live page; ``outbox`` knows which updates take each other's place there."""
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe(duplex=True)
         self._process = context.Process(
@@ -62,7 +64,7 @@ class ViewerLink:
         with _interrupts_ignored():
             self._process.start()
         theirs.close()  # so that the end of their process is the end of the line
-        self._outbox = Outbox()
+        self._outbox = Outbox() if outbox is None else outbox
         self._lost: str | None = None
         self._heard: list[Request] = []
         self._sender = threading.Thread(target=self._send_all, name="viewer outbox", daemon=True)

@@ -5,7 +5,8 @@ from pathlib import Path
 
 from taichi_mrf import runtime
 from taichi_mrf.config import Config
-from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets import frames_npz, open_dataset
+from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.live.replay import Replay
 from taichi_mrf.live.run import Source
 from taichi_mrf.maps.create import create_map, load_map
@@ -13,21 +14,29 @@ from taichi_mrf.maps.map_file import open_map_file, read_header
 
 
 def open_source(
-    name: str, config: Config, *, every: int, limit: int | None, speed: float, loop: bool
+    name: str,
+    config: Config,
+    *,
+    every: int,
+    limit: int | None,
+    speed: float,
+    loop: bool,
+    reading: SourceFlags | None = None,
 ) -> tuple[Source, list[str]]:
-    """Start Taichi and open a source; returns it with sentences that the user should see.
+    """Start Taichi and open a source, read as ``reading`` says; returns it with sentences that the user
+    should see.
 
     Raises TaichiMRFError: DatasetError, MapFileError, BackendError, ConfigError.
     """
     runtime.init(config.runtime.arch, config.runtime.threads, config.runtime.debug)
     path = Path(name)
-    if path.suffix == ".npz" and path.is_file():
+    if path.suffix == ".npz" and path.is_file() and not frames_npz.recognises_file(path):
         with open_map_file(path) as file:
             header = read_header(path, file)
         parameters = dataclasses.replace(header.config, runtime=config.runtime)
         note = f"{path.name} is a saved map: its own parameters are in force."
         return Source(path.name, parameters, lambda: load_map(path)), [note]
-    dataset = open_dataset(name, color=False)
+    dataset = open_dataset(name, color=False, **(reading or SourceFlags()).keywords())
 
     def new_replay() -> Replay:
         hold_out = config.evaluation.hold_out

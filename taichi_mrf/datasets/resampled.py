@@ -1,0 +1,139 @@
+"""Frames whose pixels are picked anew from those of another dataset: undistorted, thinned out, or both.
+
+Each pixel that comes out holds one recorded measurement, nearest to where its ray went through the recorded
+image; nothing is averaged. Depths on either side of an edge would otherwise mix into surfaces that are not
+there, and the mean or the least of several pixels would have another noise than the sensor model says (the
+least of four is one sigma too near).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.errors import ConfigError, DatasetError, FrameError
+from taichi_mrf.frame import Frame
+
+
+@dataclass
+class Resampled(Dataset):
+    """The frames of ``source``, each pixel of them picked from the recorded image.
+
+    ``rows`` and ``columns`` (H, W) int64 say which pixel each of this camera's pixels takes, -1 where its ray
+    did not meet the recorded image, which is no measurement.
+    """
+
+    source: Dataset = field(kw_only=True)
+    rows: NDArray[np.int64] = field(kw_only=True)
+    columns: NDArray[np.int64] = field(kw_only=True)
+
+    @property
+    def endless(self) -> bool:
+        """Whether the source is."""
+        return self.source.endless
+
+    @property
+    def frame_names(self) -> Sequence[str]:
+        """The source's."""
+        return self.source.frame_names
+
+    def read(self, index: int) -> Frame:
+        """Read the source's frame and pick its pixels. Raises what the source raises."""
+        frame = self.source.read(index)
+        if frame.depth_m.shape != self.source.camera.shape:
+            raise FrameError(f"{frame.name}: the image has the shape {frame.depth_m.shape}")
+        outside = self.rows < 0
+        depth_m = frame.depth_m[self.rows, self.columns]
+        depth_m[outside] = 0.0
+        color = None
+        if frame.color is not None:
+            color = frame.color[self.rows, self.columns]
+            color[outside] = 0
+        return replace(frame, depth_m=depth_m, camera=self.camera, color=color)
+
+
+def resampled(dataset: Dataset, distortion: Sequence[float], stride: int) -> Dataset:
+    """The dataset with its images undistorted and one in ``stride`` of their rows and columns kept.
+
+    ``distortion`` are OpenCV's coefficients of the recorded images (none or zeros: they are a pinhole
+    camera's). The camera keeps its intrinsics but for the stride. Raises DatasetError if nothing would be
+    left of an image.
+    """
+    distorted = any(distortion)
+    if not distorted and stride == 1:
+        return dataset
+    try:
+        camera, first = strided(dataset.camera, stride)
+    except ConfigError as error:
+        raise DatasetError(f"{dataset.name}: image_scale 1/{stride} leaves no pixel: {error}") from error
+    rows, columns = np.meshgrid(
+        first[0] + stride * np.arange(camera.height),
+        first[1] + stride * np.arange(camera.width),
+        indexing="ij",
+    )
+    notes = list(dataset.notes)
+    if distorted:
+        rows, columns = _recorded_pixels(dataset.camera, distortion, rows, columns)
+        share = float((rows < 0).mean())
+        notes.append(
+            f"images undistorted with {', '.join(f'{k:g}' for k in distortion)}, "
+            f"{share:.1%} of their pixels lie outside the recorded ones"
+        )
+    if stride > 1:
+        notes.append(f"one in {stride} rows and columns is read: {camera.width} x {camera.height} pixels")
+    return Resampled(
+        name=dataset.name,
+        camera=camera,
+        notes=notes,
+        dropped=dataset.dropped,
+        source=dataset,
+        rows=rows,
+        columns=columns,
+    )
+
+
+def strided(camera: PinholeCamera, stride: int) -> tuple[PinholeCamera, tuple[int, int]]:
+    """The camera of every ``stride``-th row and column, and the (row, column) of the first that is kept.
+
+    Its rays are exactly those of the kept pixels: a principal point that were scaled about the image's corner
+    would be off by up to half a recorded pixel. Raises ConfigError if no row or no column is left.
+    """
+    first = (stride - 1) // 2
+    thin = PinholeCamera(
+        width=len(range(first, camera.width, stride)),
+        height=len(range(first, camera.height, stride)),
+        fx=camera.fx / stride,
+        fy=camera.fy / stride,
+        cx=(camera.cx - first) / stride,
+        cy=(camera.cy - first) / stride,
+    )
+    return thin, (first, first)
+
+
+def _recorded_pixels(
+    camera: PinholeCamera, distortion: Sequence[float], rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Which recorded pixel saw along the ray of each undistorted pixel, -1 where none did."""
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+    rays = camera.rays()[rows, columns]
+    seen, _ = cv2.projectPoints(
+        rays.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), K, np.asarray(distortion, np.float64)
+    )
+    u, v = np.rint(seen.reshape(*rows.shape, 2)).transpose(2, 0, 1)
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    inside &= np.hypot(rays[..., 0], rays[..., 1]) < _validity(distortion, camera.largest_slant())
+    return np.where(inside, v, -1).astype(np.int64), np.where(inside, u, -1).astype(np.int64)
+
+
+def _validity(distortion: Sequence[float], reach: float) -> float:
+    """The tangent of the angle off the axis up to which the lens model is one-to-one, at most ``reach``:
+    beyond, a polynomial that was fitted to the image turns back and would show its inside once more."""
+    k1, k2, _, _, k3, k4, k5, k6 = (*distortion, *[0.0] * (8 - len(distortion)))
+    r = np.linspace(0.0, reach, 4096)
+    bent = r * (1 + r**2 * (k1 + r**2 * (k2 + r**2 * k3))) / (1 + r**2 * (k4 + r**2 * (k5 + r**2 * k6)))
+    turns = np.flatnonzero(np.diff(bent) <= 0)
+    return float(r[turns[0]]) if len(turns) else float("inf")

@@ -1,0 +1,57 @@
+"""The flags that say of a recording what its files do not say: one group for every command that reads one.
+
+Whether the values make sense is checked where they are used (base.ReadOptions). Nothing is imported here that
+would make the command line's help wait.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from taichi_mrf.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class SourceFlags:
+    """What a user says about SOURCE; :meth:`keywords` are arguments of ``open_dataset``."""
+
+    depth_scale: float | None = None
+    """Steps of the depth images per metre, such as 1000 for millimetres, in place of the format's own."""
+
+    camera: str | None = None
+    """Intrinsics fx,fy,cx,cy in pixels, in place of the recording's."""
+
+    undistort: str | None = None
+    """Undo a lens' distortion k1,k2,p1,p2[,k3] (as OpenCV has them); zeros leave the images as they are."""
+
+    image_scale: float = 1.0
+    """Read 1/n of the rows and columns: 1, 0.5, 0.333, 0.25, ... Pixels are left out, none are mixed."""
+
+    max_time_gap: float | None = None
+    """Largest difference in seconds between a depth image and the poses on either side of it."""
+
+    def __post_init__(self) -> None:
+        self.keywords()
+
+    def keywords(self) -> dict[str, Any]:
+        """The arguments of ``open_dataset`` that say the same. Raises ConfigError, which names the flag."""
+        return {
+            "depth_scale": self.depth_scale,
+            "intrinsics": _numbers("--camera", self.camera, (4,), "fx,fy,cx,cy"),
+            "undistort": _numbers("--undistort", self.undistort, (4, 5, 8), "k1,k2,p1,p2[,k3]"),
+            "image_scale": self.image_scale,
+            "max_time_gap": self.max_time_gap,
+        }
+
+
+def _numbers(flag: str, text: str | None, counts: tuple[int, ...], wanted: str) -> tuple[float, ...] | None:
+    """The numbers of a comma-separated text, None for None."""
+    if text is None:
+        return None
+    try:
+        values = tuple(float(word) for word in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) not in counts or not all(map(math.isfinite, values)):
+        raise ConfigError(f"{flag} takes {wanted}, not {text!r}")
+    return values

@@ -1,0 +1,67 @@
+"""What a sequence of frames is like: its length, camera, way and depth range, from a few of its frames."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.errors import DatasetError, FrameError
+
+LOOKED_AT = 8
+"""Frames, evenly spread, that a summary reads."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """``frames`` is None for a source without end. ``depth_range`` are the 1st and 99th percentile of the
+    depths in metres of the frames that were looked at, ``measured`` the share of their pixels that have one;
+    ``centre_range`` the lowest and the highest camera position in metres. The three are None if no frame
+    could be read, for ``problem``.
+    """
+
+    frames: int | None
+    camera: PinholeCamera
+    seconds: float | None
+    depth_range: tuple[float, float] | None
+    measured: float | None
+    centre_range: tuple[tuple[float, ...], tuple[float, ...]] | None
+    problem: str | None
+
+
+def summarise(dataset: Dataset) -> Summary:
+    """Read a few frames of a sequence. Those that are broken are left out, the first one's problem being
+    kept."""
+    count = 1 if dataset.endless else len(dataset)
+    indices = np.unique(np.linspace(0, count - 1, min(count, LOOKED_AT)).round().astype(int))
+    depths, centres, stamps, problem = [], [], [], None
+    measured = pixels = 0
+    for index in indices:
+        try:
+            frame = dataset.read(int(index))
+        except FrameError as error:
+            problem = problem or str(error)
+            continue
+        except DatasetError as error:
+            problem = problem or str(error)
+            break
+        seen = frame.depth_m[frame.depth_m > 0]
+        depths.append(seen)
+        measured, pixels = measured + seen.size, pixels + frame.depth_m.size
+        centres.append(frame.T_world_camera[:3, 3])
+        stamps.append(frame.stamp)
+    values = np.concatenate(depths) if depths else np.empty(0)
+    low_high = np.percentile(values, [1, 99]) if values.size else None
+    return Summary(
+        frames=None if dataset.endless else count,
+        camera=dataset.camera,
+        seconds=float(stamps[-1] - stamps[0]) if len(stamps) > 1 else None,
+        depth_range=None if low_high is None else (float(low_high[0]), float(low_high[1])),
+        measured=measured / pixels if pixels else None,
+        centre_range=_range(np.array(centres)) if centres else None,
+        problem=problem,
+    )
+
+
+def _range(points: np.ndarray) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    return tuple(map(float, points.min(axis=0))), tuple(map(float, points.max(axis=0)))

@@ -1,0 +1,111 @@
+"""Poses with stamps, and the pose in between two of them.
+
+A body that moves on while its pose is taken at its own times is, at the time of a depth image, on the
+straight line between the neighbouring positions and on the great circle between the neighbouring rotations
+(slerp: K. Shoemake, "Animating Rotation with Quaternion Curves", SIGGRAPH 1985). How far apart these may be
+in time is bounded, so that nothing is made up where a trajectory has a hole.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.datasets.trajectories import pose_from_quaternion, read_trajectory
+from taichi_mrf.errors import DatasetError, KeyframeError
+from taichi_mrf.poses import Pose
+
+INTERPOLATION_GAP = 0.1
+"""Seconds that a neighbouring pose may be away from an image if nothing else is said: poses at 5 Hz and
+more."""
+
+_NEARLY_EQUAL = 1e-9
+"""Below this angle (radians) the chord stands for the arc, whose formula divides by its sine."""
+
+
+class TimedPoses:
+    """A trajectory that can be asked for the pose at any time inside it.
+
+    ``stamps`` (N,) float64 are seconds, ascending; ``poses`` (N, 4, 4) take points of the moving frame to the
+    fixed one.
+    """
+
+    def __init__(self, stamps: Sequence[float] | NDArray, poses: Sequence[Pose] | NDArray) -> None:
+        """Sort the poses by their stamps; of several with one stamp the last one given counts."""
+        keys = np.asarray(stamps, np.float64)
+        order = np.argsort(keys, kind="stable")
+        last = np.append(np.diff(keys[order]) > 0, True)[: len(order)]
+        self.stamps: NDArray[np.float64] = keys[order][last]
+        self.poses: NDArray[np.float64] = np.asarray(poses, np.float64).reshape(-1, 4, 4)[order][last]
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def at(self, stamp: float, largest_gap: float) -> Pose | None:
+        """The pose (4, 4) at a time, or None.
+
+        It is None outside the trajectory, and where one of the two neighbours in time is further than
+        ``largest_gap`` seconds away. A pose with this very stamp is its own neighbour on both sides.
+        """
+        after = int(np.searchsorted(self.stamps, stamp))
+        # A little wider than the gap, so that the rounding of a difference decides nothing.
+        window = largest_gap + 2 * np.spacing(abs(stamp) + largest_gap)
+        if after < len(self) and self.stamps[after] == stamp:
+            return self.poses[after].copy()
+        if not 0 < after < len(self):
+            return None
+        first, last = self.stamps[after - 1], self.stamps[after]
+        if max(stamp - first, last - stamp) > window:
+            return None
+        return interpolate(self.poses[after - 1], self.poses[after], (stamp - first) / (last - first))
+
+
+def interpolate(T_first: Pose, T_last: Pose, share: float) -> Pose:
+    """The rigid transform (4, 4) at ``share`` (0 to 1) of the way from the first to the last: its translation
+    on the straight line, its rotation on the shorter arc, at constant angular velocity."""
+    q_first, q_last = quaternion(T_first[:3, :3]), quaternion(T_last[:3, :3])
+    cosine = float(q_first @ q_last)
+    if cosine < 0:  # q and -q are one rotation; this one lies on the shorter arc
+        q_last, cosine = -q_last, -cosine
+    angle = float(np.arctan2(np.linalg.norm(q_last - cosine * q_first), cosine))
+    if angle < _NEARLY_EQUAL:
+        q = (1 - share) * q_first + share * q_last
+    else:
+        q = (np.sin((1 - share) * angle) * q_first + np.sin(share * angle) * q_last) / np.sin(angle)
+    translation = (1 - share) * T_first[:3, 3] + share * T_last[:3, 3]
+    return pose_from_quaternion(np.concatenate([translation, q]))
+
+
+def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """x y z w, (4,), of a rotation (3, 3): the eigenvector to the largest eigenvalue of a symmetric matrix
+    (I. Bar-Itzhack, "New Method for Extracting the Quaternion from a Rotation Matrix", JGCD 2000), which
+    needs no cases and keeps its digits at every angle."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
+    K = np.array(
+        [
+            [xx - yy - zz, xy + yx, xz + zx, zy - yz],
+            [xy + yx, yy - xx - zz, yz + zy, xz - zx],
+            [xz + zx, yz + zy, zz - xx - yy, yx - xy],
+            [zy - yz, xz - zx, yx - xy, xx + yy + zz],
+        ]
+    )
+    return np.linalg.eigh(K)[1][:, -1]
+
+
+def read_timed_poses(path: Path) -> TimedPoses:
+    """A file of ``stamp tx ty tz qx qy qz qw`` lines (TUM RGB-D), T_world_camera.
+
+    Raises DatasetError, whose text names the file and the line, if it is missing, of another layout, or holds
+    a pose that is none.
+    """
+    trajectory = read_trajectory(path)
+    if trajectory.layout != "stamped":
+        raise DatasetError(f"{path}: expected lines of stamp tx ty tz qx qy qz qw")
+    poses = []
+    for pose in trajectory.poses:
+        try:
+            poses.append(pose.T_world_camera())
+        except KeyframeError as error:
+            raise DatasetError(f"{pose.source}: {error}") from error
+    return TimedPoses([pose.key for pose in trajectory.poses], poses)
