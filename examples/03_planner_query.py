@@ -10,8 +10,6 @@ pip install 'taichi_mrf[mesh]'.
 import numpy as np
 
 import taichi_mrf as tm
-from taichi_mrf.queries.cast import cast_rays
-from taichi_mrf.queries.distance import distance_field
 
 
 def main() -> None:
@@ -26,12 +24,12 @@ def main() -> None:
     start, goal = frames[0].T_world_camera[:3, 3], frames[4].T_world_camera[:3, 3]
     way = goal - start
     length = float(np.linalg.norm(way))
-    (clear,) = ~cast_rays(m, start[None], way[None], max_range=length, unknown="hit").hit
+    (clear,) = ~tm.cast_rays(m, start[None], way[None], max_range=length, unknown="hit").hit
     print(f"the straight way of {length:.2f} m is {'clear' if clear else 'blocked'}")
 
     # The same for a robot that is not a point: along the way, how far is the nearest obstacle?
     steps = start + np.linspace(0, 1, 20)[:, None] * way
-    field = distance_field(m, steps.min(axis=0) - 0.5, steps.max(axis=0) + 0.5, max_distance=1.0)
+    field = tm.distance_field(m, steps.min(axis=0) - 0.5, steps.max(axis=0) + 0.5, max_distance=1.0)
     distance, gradient = field.distance_and_gradient(steps)
     nearest = int(distance.argmin())
     away = gradient[nearest] / max(1e-9, np.linalg.norm(gradient[nearest]))
@@ -40,7 +38,7 @@ def main() -> None:
     # A fan of 360 rays around the start, as a laser scanner would see the map.
     angles = np.linspace(-np.pi, np.pi, 360, endpoint=False)
     fan = np.stack([np.cos(angles), np.sin(angles), np.zeros(360)], axis=1)
-    around = cast_rays(m, start, fan, max_range=10.0, unknown="stop")
+    around = tm.cast_rays(m, start, fan, max_range=10.0, unknown="stop")
     print(f"{around.hit.sum()} of 360 rays meet a surface, {around.in_unknown.sum()} end in unknown space")
     print(f"the nearest surface is {around.range[around.hit].min():.2f} m away")
 

@@ -11,7 +11,6 @@ import numpy as np
 
 import taichi_mrf as tm
 from taichi_mrf.frame import Frame
-from taichi_mrf.queries.gain import view_gain
 
 VIEWS = 5
 
@@ -39,7 +38,7 @@ def explore(frames: list[Frame], surface: np.ndarray, choose: bool) -> float:
     for _ in range(VIEWS):
         number = left[0]
         if choose and len(left) < len(frames):
-            gains = view_gain(m, small, np.stack([frames[i].T_world_camera for i in left]), max_depth=6.0)
+            gains = tm.view_gain(m, small, np.stack([frames[i].T_world_camera for i in left]), max_depth=6.0)
             number = left[int(gains.argmax())]
         left.remove(number)
         add(m, frames[number])

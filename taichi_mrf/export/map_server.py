@@ -21,13 +21,17 @@ def grey_image(occupied: NDArray[np.bool_], seen: NDArray[np.bool_]) -> NDArray[
 
 
 def write_map_server(
-    folder: Path, image: NDArray[np.uint8], cell_size: float, lower_x_y: tuple[float, float]
+    folder: Path,
+    image: NDArray[np.uint8],
+    cell_size: float,
+    lower_x_y: tuple[float, float],
+    name: str = "map",
 ) -> list[Path]:
-    """Write ``map.pgm`` and ``map.yaml``; returns their paths. Raises MapFileError.
+    """Write ``map.pgm`` and ``map.yaml``, or of another name; returns their paths. Raises MapFileError.
 
     ``lower_x_y`` is the outer corner of the image's lower left pixel, in metres, as is ``cell_size``.
     """
-    pgm, description = folder / "map.pgm", folder / "map.yaml"
+    pgm, description = folder / f"{name}.pgm", folder / f"{name}.yaml"
     height, width = image.shape
     with atomic_path(pgm) as temporary:
         temporary.write_bytes(f"P5\n{width} {height}\n255\n".encode("ascii") + image.tobytes())

@@ -1,5 +1,9 @@
-"""Occupied voxels as a PLY point cloud, which MeshLab, CloudCompare, Blender and Open3D open."""
+"""PLY files, which MeshLab, CloudCompare, Blender and Open3D open: points and surfaces, both in colours.
 
+All are binary and little-endian; a table of named columns says what a vertex has.
+"""
+
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,42 +12,85 @@ from numpy.typing import NDArray
 from taichi_mrf.export.atomic import atomic_path
 from taichi_mrf.export.colors import LOWEST, marginal_colors
 
-_VERTEX = np.dtype(
-    [
-        *[(name, "<f4") for name in ("x", "y", "z")],
-        *[(name, "u1") for name in ("red", "green", "blue")],
-        ("occupancy", "<f4"),
-    ]
-)
+_PLACE = [(name, "<f4") for name in ("x", "y", "z")]
+_COLOR = [(name, "u1") for name in ("red", "green", "blue")]
+_TRIANGLE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 _PLY_TYPES = {"f": "float", "u": "uchar"}
 
 
 def write_voxels(
     path: str | Path, centres: NDArray[np.floating], probability: NDArray[np.floating], voxel_size: float
 ) -> None:
-    """Write voxels as one coloured point each (binary, little-endian). Raises MapFileError.
+    """Write voxels as one coloured point each. Raises MapFileError.
 
     ``centres`` (N, 3) and ``voxel_size`` are in metres, world frame. Besides its position a vertex has
     the property ``occupancy``, its marginal (N,), and the colour that stands for it.
     """
-    vertices = np.empty(len(centres), dtype=_VERTEX)
+    comments = [
+        f"voxel_size {voxel_size:.9g} metres",
+        "occupancy is the marginal probability that the voxel is occupied",
+        f"color is viridis from occupancy {LOWEST} to 1",
+    ]
+    extra = {"occupancy": np.asarray(probability, "<f4")}
+    write_points(path, centres, marginal_colors(probability), extra, comments)
+
+
+def write_points(
+    path: str | Path,
+    points: NDArray[np.floating],
+    colors: NDArray[np.uint8],
+    extra: dict[str, NDArray],
+    comments: Sequence[str],
+) -> None:
+    """Write points (N, 3) in metres with colours (N, 3) and further properties (N,) by name, float32 or
+    uint8 each. Raises MapFileError."""
+    dtype = np.dtype([*_PLACE, *_COLOR, *((name, values.dtype) for name, values in extra.items())])
+    vertices = _vertices(dtype, points, colors)
+    for name, values in extra.items():
+        vertices[name] = values
+    _write(path, vertices, None, comments)
+
+
+def write_surface(
+    path: str | Path,
+    vertices_m: NDArray[np.floating],
+    triangles: NDArray[np.integer],
+    colors: NDArray[np.uint8],
+    comments: Sequence[str],
+) -> None:
+    """Write triangles (T, 3) over vertices (V, 3) in metres, with colours (V, 3). Raises MapFileError."""
+    faces = np.empty(len(triangles), _TRIANGLE)
+    faces["count"], faces["corners"] = 3, triangles
+    _write(path, _vertices(np.dtype([*_PLACE, *_COLOR]), vertices_m, colors), faces, comments)
+
+
+def _vertices(dtype: np.dtype, points: NDArray[np.floating], colors: NDArray[np.uint8]) -> NDArray:
+    vertices = np.empty(len(points), dtype=dtype)
     for axis, name in enumerate("xyz"):
-        vertices[name] = centres[:, axis]
-    colors = marginal_colors(probability)
+        vertices[name] = points[:, axis]
     for channel, name in enumerate(("red", "green", "blue")):
         vertices[name] = colors[:, channel]
-    vertices["occupancy"] = probability
-    properties = [f"property {_PLY_TYPES[_VERTEX[name].kind]} {name}" for name in _VERTEX.names or ()]
+    return vertices
+
+
+def _write(path: str | Path, vertices: NDArray, faces: NDArray | None, comments: Sequence[str]) -> None:
+    properties = [
+        f"property {_PLY_TYPES[vertices.dtype[name].kind]} {name}" for name in vertices.dtype.names or ()
+    ]
+    surface = (
+        [f"element face {len(faces)}", "property list uchar int vertex_indices"] if faces is not None else []
+    )
     header = [
         "ply",
         "format binary_little_endian 1.0",
-        f"comment voxel_size {voxel_size:.9g} metres",
-        "comment occupancy is the marginal probability that the voxel is occupied",
-        f"comment color is viridis from occupancy {LOWEST} to 1",
+        *(f"comment {text}" for text in comments),
         f"element vertex {len(vertices)}",
         *properties,
+        *surface,
         "end_header",
     ]
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(("\n".join(header) + "\n").encode("ascii"))
         file.write(vertices.data)
+        if faces is not None:
+            file.write(faces.data)

@@ -83,7 +83,7 @@ class View:
         points = (
             np.concatenate([corners @ T_world_camera[:3, :3].T, np.zeros((1, 3))]) + T_world_camera[:3, 3]
         )
-        window = self._fill(points)
+        window = self.fill(points)
         if window is None:
             return survey
         centre, to_voxels = window[0].rays_of(T_world_camera)
@@ -114,7 +114,7 @@ class View:
         ):
             raise ConfigError("a ray needs an origin and a direction of three finite numbers")
         along = along / length
-        window = self._fill(np.stack([start, start + along * max_range]))
+        window = self.fill(np.stack([start, start + along * max_range]))
         if window is None:
             return RayProfile(*[np.zeros(0, np.float32) for _ in range(5)])
         steps = 4 * sum(window[0].shape) * BRICK
@@ -132,8 +132,11 @@ class View:
         runtime.settle()
         return RayProfile(*[a[: count[0]].copy() for a in out])
 
-    def _fill(self, points_m: NDArray[np.float64]) -> tuple[Window, NDArray[np.int32]] | None:
-        """Index the bricks in the box around some points; None if there are none."""
+    def fill(self, points_m: NDArray[np.float64]) -> tuple[Window, NDArray[np.int32]] | None:
+        """Index the bricks in the box around some points (n, 3); None if there are none.
+
+        Returns the window and its cells that were filled, with which ``index.clear`` must follow.
+        """
         slots = self.pool.in_use
         brick_m = self.voxel_size * BRICK
         lower = np.floor(points_m.min(axis=0) / brick_m)

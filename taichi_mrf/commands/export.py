@@ -1,0 +1,43 @@
+"""``taichi-mrf export``: a saved map in, files for other programs out."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from taichi_mrf.config import Arch
+from taichi_mrf.export.options import ExportOptions
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a saved map for other programs, in the formats that the files' extensions say.
+
+    .ply points, cubes or a mesh; .glb, .obj, .stl a mesh; .bt, .ot OctoMap; .pgm with .yaml a 2D map for
+    ROS's map_server; .npz arrays; .html a page that any browser opens. Example:
+    taichi-mrf export out/map.npz --to room.ply room.bt floor.pgm --z-min 0.1 --z-max 1.5
+    """
+
+    map: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MAP")]
+    """A file of MRFMap.save, LogOddsMap.save or VisibilityMap.save, such as the map.npz of a run."""
+
+    to: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE [FILE ...]")]
+    """The files to write."""
+
+    options: Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.FlagCreatePairsOff] = field(
+        default_factory=ExportOptions
+    )
+    """What the files hold."""
+
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print what was written as JSON."""
+
+    arch: Arch = "auto"
+    """Backend to read the map on."""
+
+    def run(self) -> int:
+        """Write all files and print their names. Raises TaichiMRFError."""
+        from taichi_mrf.commands.export_run import run_export
+
+        return run_export(self)

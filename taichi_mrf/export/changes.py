@@ -1,0 +1,36 @@
+"""Changes between two maps as a PLY of points: where something has appeared, and where it is gone."""
+
+from pathlib import Path
+
+import numpy as np
+
+from taichi_mrf.export.ply import write_points
+from taichi_mrf.queries.change import STATES, MapChange
+from taichi_mrf.queries.points import OCCUPIED
+
+APPEARED, VANISHED = (213, 94, 0), (0, 114, 178)
+"""RGB of voxels that are occupied in b only, and in a only; told apart without telling red from green."""
+
+
+def write_changes(path: str | Path, change: MapChange, voxel_size: float) -> int:
+    """Write the voxels that are occupied in one of the maps only; returns how many. Raises MapFileError.
+
+    Besides its position and colour a point has the properties ``before`` and ``after``, its states, and
+    ``difference``, by how much its probability has grown.
+    """
+    shown = (change.before == OCCUPIED) | (change.after == OCCUPIED)
+    appeared = change.after[shown] == OCCUPIED
+    colors = np.where(appeared[:, None], APPEARED, VANISHED).astype(np.uint8)
+    extra = {
+        "before": change.before[shown].astype(np.uint8),
+        "after": change.after[shown].astype(np.uint8),
+        "difference": change.difference[shown].astype("<f4"),
+    }
+    states = ", ".join(f"{number} {name}" for number, name in enumerate(STATES))
+    comments = [
+        f"voxel_size {voxel_size:.9g} metres",
+        f"before and after are states: {states}",
+        f"color is {APPEARED} where something has appeared, {VANISHED} where it is gone",
+    ]
+    write_points(path, change.points[shown], colors, extra, comments)
+    return int(shown.sum())

@@ -1,0 +1,40 @@
+"""Surfaces as files: PLY by our own writer; glTF (.glb), OBJ and STL by trimesh, of the extra ``mesh``."""
+
+from pathlib import Path
+
+import numpy as np
+
+from taichi_mrf.export.atomic import atomic_path
+from taichi_mrf.export.colors import LOWEST
+from taichi_mrf.export.ply import write_surface
+from taichi_mrf.export.surface import Surface
+from taichi_mrf.poses import Pose
+from taichi_mrf.queries.libraries import library
+
+
+def write_mesh(
+    path: str | Path, surface: Surface, voxel_size: float, T_gltf_world: Pose | None = None
+) -> None:
+    """Write a surface in the format of the file's extension: .ply, .glb, .obj or .stl, which has no colours.
+
+    ``T_gltf_world`` is where the world stands in a .glb, in which y is up; the vertices stay in the world,
+    and the file's only node holds it. Raises MapFileError, and TaichiMRFError without trimesh for all but
+    .ply.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix == ".ply":
+        comments = [f"voxel_size {voxel_size:.9g} metres", f"color is viridis from occupancy {LOWEST} to 1"]
+        write_surface(path, surface.vertices_m, surface.triangles, surface.colors, comments)
+        return
+    trimesh = library("trimesh", f"{suffix} files", "mesh")
+    mesh = trimesh.Trimesh(
+        surface.vertices_m, surface.triangles, vertex_colors=surface.colors, process=False, validate=False
+    )
+    whole = mesh
+    if suffix == ".glb":
+        whole = trimesh.Scene()
+        transform = np.eye(4) if T_gltf_world is None else T_gltf_world
+        whole.add_geometry(mesh, node_name="map", geom_name="map", transform=transform)
+    content = whole.export(file_type=suffix[1:])
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content.encode("ascii") if isinstance(content, str) else content)

@@ -1,0 +1,45 @@
+"""Maps as OctoMap's files: ``.ot`` with the log-odds, ``.bt`` with what is free and what is occupied.
+
+The format is that of OctoMap's AbstractOcTree::write and OccupancyOcTreeBase::writeBinary: a header in text,
+then the nodes in pre-order. In an ``.ot`` each has a float32 and a bit for each child; in a ``.bt`` only the
+inner ones are written, with two bits for each child.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from taichi_mrf.export.atomic import atomic_path
+from taichi_mrf.export.octree import Nodes, octree_of
+from taichi_mrf.queries.known_bricks import QueriedMap
+
+FULL_HEADER, BINARY_HEADER = "# Octomap OcTree file", "# Octomap OcTree binary file"
+"""First lines, by which OctoMap knows its files."""
+
+FULL_NODE = np.dtype([("value", "<f4"), ("children", "u1")])
+"""A node of an ``.ot``."""
+
+
+def write_ot(path: str | Path, m: QueriedMap) -> None:
+    """Write a map with its log-odds; unknown stays unknown. Raises MapFileError, CapacityError."""
+    nodes = octree_of(m, only_state=False)
+    records = np.empty(len(nodes), FULL_NODE)
+    records["value"], records["children"] = nodes.value, nodes.children
+    _write(path, FULL_HEADER, nodes, m.voxel_size, records.tobytes())
+
+
+def write_bt(path: str | Path, m: QueriedMap) -> None:
+    """Write which voxels are free and which occupied, the rest being unknown. Raises MapFileError,
+    CapacityError."""
+    nodes = octree_of(m, only_state=True)
+    inner = nodes.kinds[nodes.children != 0].astype("<u2")
+    _write(path, BINARY_HEADER, nodes, m.voxel_size, inner.tobytes())
+
+
+def _write(path: str | Path, first_line: str, nodes: Nodes, voxel_size: float, data: bytes) -> None:
+    header = (
+        f"{first_line}\n# (feel free to add / change comments, but leave the first line as it is!)\n#\n"
+        f"id OcTree\nsize {len(nodes)}\nres {voxel_size:.9g}\ndata\n"
+    )
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(header.encode("ascii") + data)

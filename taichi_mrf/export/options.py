@@ -1,0 +1,48 @@
+"""What can be chosen when a map is written for other programs; the flags of ``taichi-mrf export``."""
+
+import math
+from dataclasses import dataclass
+
+from taichi_mrf.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Each format reads what concerns it."""
+
+    threshold: float = 0.5
+    """Voxels of at least this probability are points or cubes; a mesh lies where the probability is this."""
+
+    cubes: bool = False
+    """Write the outsides of the voxels, as cubes: .ply, and .glb, .obj, .stl in place of marching cubes."""
+
+    mesh: bool = False
+    """Write a .ply as a mesh by marching cubes, like .glb, .obj and .stl, not as points."""
+
+    z_min: float | None = None
+    """Lower end in metres of the band of heights that a .pgm shows."""
+
+    z_max: float | None = None
+    """Upper end in metres of the band of heights that a .pgm shows."""
+
+    occupied_from: float = 0.5
+    """A cell of a .pgm is occupied if a voxel in the band has at least this probability."""
+
+    free_below: float = 0.5
+    """A cell of a .pgm is free if all known voxels in the band, at least one, have less than this."""
+
+    def __post_init__(self) -> None:
+        for name in ("threshold", "occupied_from", "free_below"):
+            value = getattr(self, name)
+            if not 0 < value < 1:
+                raise ConfigError(f"{name} must lie between 0 and 1, not {value}")
+        if self.free_below > self.occupied_from:
+            raise ConfigError("free_below must not be larger than occupied_from")
+        if self.cubes and self.mesh:
+            raise ConfigError("cubes and mesh are two different surfaces: choose one of them")
+        for name in ("z_min", "z_max"):
+            value = getattr(self, name)
+            if value is not None and not math.isfinite(value):
+                raise ConfigError(f"{name} must be a number, not {value}")
+        if self.z_min is not None and self.z_max is not None and self.z_min >= self.z_max:
+            raise ConfigError(f"z_min must lie below z_max, not {self.z_min} and {self.z_max}")

@@ -1,0 +1,46 @@
+"""A map as one HTML file that any browser opens, without this program and without a network.
+
+It is the scene of the live page, drawn by the same classes, as viser writes it into a file.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from taichi_mrf.export.atomic import write_text
+from taichi_mrf.export.upright import up_of_map
+from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap
+from taichi_mrf.viewer.eye import Eye
+from taichi_mrf.viewer.look import look_of
+from taichi_mrf.viewer.messages import pack_log_odds
+from taichi_mrf.viewer.options import ViewOptions
+from taichi_mrf.viewer.server import start_server
+from taichi_mrf.viewer.voxel_layer import VoxelLayer
+from taichi_mrf.voxels.layout import BRICK, VOXELS
+
+_NOT_SHOWN = np.float32(-60)
+"""Log-odds below any threshold."""
+
+
+def write_page(path: str | Path, m: QueriedMap, threshold: float = 0.5) -> None:
+    """Write a page that shows the voxels of at least this probability. Raises MapFileError, ViewerError."""
+    server = start_server("127.0.0.1", 0, Path(path).stem)
+    try:
+        layer = VoxelLayer(server.scene, "/voxels", m.voxel_size)
+        reader = BrickReader(m)
+        for bricks, log_odds, _ in reader.batches(reader.bricks):
+            # Some maps say one half of what nobody has seen, which is not to be shown.
+            seen = np.where(log_odds == reader.pool.prior_log_odds, _NOT_SHOWN, log_odds)
+            layer.store.put(bricks, pack_log_odds(seen), np.zeros((len(bricks), VOXELS), np.uint8))
+        eye = Eye(server)
+        eye.set_up(up_of_map(m))
+        bounds = layer.store.bounds()
+        if bounds is not None:
+            look = look_of(ViewOptions(threshold=threshold), layer.store, eye.up, m.voxel_size)
+            layer.prepare(layer.all_chunks(), look, exactly=True)
+            layer.send()
+            low, high = (end.astype(np.float64) * BRICK * m.voxel_size for end in (bounds[0], bounds[1] + 1))
+            eye.map_grew(low, high)
+        write_text(path, server.get_scene_serializer().as_html(dark_mode=False))
+    finally:
+        server.stop()

@@ -1,0 +1,110 @@
+"""A box of space as arrays: the probability and the state of every voxel in it, and how far a map reaches."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, bricks_between, known_bricks
+from taichi_mrf.queries.points import probability
+from taichi_mrf.voxels.layout import BRICK
+from taichi_mrf.voxels.memory import check_memory
+
+_BYTES_PER_VOXEL = 13
+"""Log-odds as they are read, the same in the order of the box, the states, and what is made of them."""
+
+FARTHEST_VOXEL = 2**22
+"""A coordinate beyond any map's; places further away count as this far."""
+
+_ON_A_FACE = 1e-6
+"""In voxels: a corner so near to a face between voxels lies on it."""
+
+
+@dataclass(frozen=True)
+class BoxOfVoxels:
+    """The voxels of an upright box. Index [i, j, k] is voxel ``lowest`` + (i, j, k) of the world.
+
+    ``log_odds`` (nx, ny, nz) float32 of being occupied; ``state`` (nx, ny, nz) int8: UNKNOWN, FREE, OCCUPIED.
+    """
+
+    log_odds: NDArray[np.float32]
+    state: NDArray[np.int8]
+    lowest: tuple[int, int, int]
+    voxel_size: float
+
+    @cached_property
+    def occupancy(self) -> NDArray[np.float32]:
+        """Probability of being occupied, (nx, ny, nz)."""
+        return probability(self.log_odds)
+
+    @property
+    def lower_m(self) -> NDArray[np.float64]:
+        """Outer corner of the first voxel, (3,) in metres."""
+        return np.array(self.lowest, np.float64) * self.voxel_size
+
+    @property
+    def upper_m(self) -> NDArray[np.float64]:
+        """Outer corner of the last voxel, (3,) in metres."""
+        return (np.array(self.lowest, np.float64) + self.state.shape) * self.voxel_size
+
+    def centres(self, axis: int) -> NDArray[np.float64]:
+        """Where the voxels' centres lie along an axis, in metres."""
+        return (
+            self.lowest[axis] + np.arange(self.state.shape[axis], dtype=np.float64) + 0.5
+        ) * self.voxel_size
+
+
+def read_box(m: QueriedMap, lower: ArrayLike, upper: ArrayLike) -> BoxOfVoxels:
+    """The voxels that a box reaches into, from corner ``lower`` to corner ``upper``, (3,) in metres.
+
+    Raises ConfigError for corners that make no box, CapacityError if it holds more voxels than fit memory.
+    """
+    return voxel_box(m, *voxels_of_box(lower, upper, m.voxel_size))
+
+
+def map_extent(m: QueriedMap) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two corners, (3,) in metres, of the box around all that the map says anything of; it ends at bricks of
+    8 voxels. Raises ConfigError for an empty map."""
+    bricks = known_bricks(m)
+    if not len(bricks):
+        raise ConfigError("the map is empty: nothing was ever seen")
+    brick_m = BRICK * m.voxel_size
+    return bricks.min(axis=0) * brick_m, (bricks.max(axis=0) + 1) * brick_m
+
+
+def voxels_of_box(
+    lower: ArrayLike, upper: ArrayLike, voxel_size: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The lowest voxel that a box in metres reaches into, and the one after the highest, (3,) each.
+
+    Raises ConfigError for corners that make no box.
+    """
+    low, high = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
+    if low.shape != (3,) or high.shape != (3,) or not np.isfinite([low, high]).all() or (low >= high).any():
+        raise ConfigError("a box needs a lower and an upper corner of three finite numbers, lower < upper")
+    first = np.floor(np.clip(low / voxel_size, -FARTHEST_VOXEL, FARTHEST_VOXEL) + _ON_A_FACE).astype(np.int64)
+    after = np.ceil(np.clip(high / voxel_size, -FARTHEST_VOXEL, FARTHEST_VOXEL) - _ON_A_FACE).astype(np.int64)
+    return first, np.maximum(after, first + 1)
+
+
+def voxel_box(
+    m: QueriedMap, first: NDArray[np.int64], after: NDArray[np.int64], reader: BrickReader | None = None
+) -> BoxOfVoxels:
+    """The voxels from ``first`` up to, but without, ``after``, (3,) voxel coordinates each.
+
+    ``reader`` saves time where many boxes of the same map are asked for. Raises CapacityError.
+    """
+    lowest, highest = first // BRICK, (after - 1) // BRICK
+    shape = highest - lowest + 1
+    voxels = float(np.prod(shape.astype(np.float64))) * BRICK**3
+    check_memory(_BYTES_PER_VOXEL * voxels, f"a box of {voxels / 1e6:.3g} million voxels")
+    reader = BrickReader(m) if reader is None else reader
+    values = reader.log_odds(bricks_between(lowest, highest))
+    in_order = values.reshape(*shape, BRICK, BRICK, BRICK).transpose(0, 3, 1, 4, 2, 5)
+    begin, end = first - lowest * BRICK, after - lowest * BRICK
+    cut = tuple(slice(int(b), int(e)) for b, e in zip(begin, end, strict=True))
+    log_odds = np.ascontiguousarray(in_order.reshape(shape * BRICK)[cut])
+    x, y, z = first.tolist()
+    return BoxOfVoxels(log_odds, reader.state(log_odds), (x, y, z), m.voxel_size)

@@ -1,0 +1,198 @@
+"""Where rays meet something: many rays at once, with a stated policy for space that nobody has seen."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import taichi as ti
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf import runtime
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.queries.known_bricks import QueriedMap
+from taichi_mrf.queries.ray_space import RaySpace
+from taichi_mrf.voxels.layout import BRICK
+from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
+from taichi_mrf.voxels.types import F32, I32, F32Array, F32Array2, I32Array, IVec3, Struct, Template, Vec3
+from taichi_mrf.voxels.window import Window
+
+Unknown = Literal["free", "stop", "hit"]
+"""What a ray does where it comes to unknown space: pass, end there without a hit, or count it as a hit."""
+
+_POLICIES: dict[str, int] = {"free": 0, "stop": 1, "hit": 2}
+_PASSED, _HIT, _STOPPED = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class RayHits:
+    """Where rays end: ``hit`` (N,) whether they met something, ``range`` (N,) float32 how far they came in
+    metres, ``point`` (N, 3) float64 where that is in the world; ``in_unknown`` (N,) whether it was unknown
+    space that ended them. A ray that nothing ends comes as far as the largest range."""
+
+    hit: NDArray[np.bool_]
+    range: NDArray[np.float32]
+    point: NDArray[np.float64]
+    in_unknown: NDArray[np.bool_]
+
+
+def cast_rays(
+    m: QueriedMap, origins: ArrayLike, directions: ArrayLike, max_range: float, unknown: Unknown = "free"
+) -> RayHits:
+    """Follow rays to the first voxel that is occupied (:meth:`state`), in one kernel for all of them.
+
+    ``origins`` and ``directions`` are (N, 3) in the world, in metres, or one of them (3,), for all rays;
+    directions need not be normalised. The range is that of the face through which the ray enters the voxel, 0
+    if it begins inside. Raises ConfigError for another policy, for arrays that do not fit or are not finite
+    and for a direction of no length, CapacityError if the rays reach through more space than fits memory.
+    """
+    if unknown not in _POLICIES:
+        raise ConfigError(f"unknown must be one of {', '.join(_POLICIES)}, not {unknown!r}")
+    start, along = _checked(origins, directions)
+    if not (np.isfinite(max_range) and max_range > 0):
+        raise ConfigError(f"max_range must be a positive number, not {max_range}")
+    end_m = np.full(len(start), max_range, np.float32)
+    outcome = np.full(len(start), _PASSED, np.int32)
+    if len(start):
+        points = np.concatenate([start, start + along * max_range])
+        if unknown == "free":
+            _through_voxels(m, start, along, points, end_m, outcome)
+        else:
+            _through_space(m, start, along, points, end_m, outcome)
+    ended_in_unknown = outcome == _STOPPED
+    hit = outcome == _HIT
+    if unknown == "hit":
+        hit |= ended_in_unknown
+    return RayHits(hit, end_m, start + along * end_m[:, None].astype(np.float64), ended_in_unknown)
+
+
+def _checked(origins: ArrayLike, directions: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    start, along = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
+    shape = np.broadcast_shapes(start.shape, along.shape) if _fit(start, along) else ()
+    if len(shape) != 2:
+        raise ConfigError(
+            f"rays need origins and directions of shape (N, 3), not {start.shape} and {along.shape}"
+        )
+    if not (np.isfinite(start).all() and np.isfinite(along).all()):
+        raise ConfigError("rays hold a value that is not finite")
+    length = np.linalg.norm(along, axis=-1, keepdims=True)
+    if (length == 0).any():
+        raise ConfigError("a ray has a direction of no length")
+    return np.broadcast_to(start, shape).copy(), np.broadcast_to(along / length, shape).copy()
+
+
+def _fit(start: NDArray[np.float64], along: NDArray[np.float64]) -> bool:
+    """Whether both hold vectors, as many or one for all."""
+    shapes = start.shape, along.shape
+    counts = {shape[0] for shape in shapes if len(shape) == 2}
+    return all(len(s) in (1, 2) and s[-1] == 3 for s in shapes) and len(counts) == 1
+
+
+def _through_voxels(
+    m: QueriedMap,
+    start: NDArray[np.float64],
+    along: NDArray[np.float64],
+    points: NDArray[np.float64],
+    end_m: NDArray[np.float32],
+    outcome: NDArray[np.int32],
+) -> None:
+    """Past everything but occupied voxels: only bricks that exist need to be looked at."""
+    filled = m.view.fill(points)
+    if filled is None:
+        return
+    window, cells = filled
+    _launch(m, window, start, along, 2**31 - 1, 0, end_m, outcome)
+    m.view.index.clear(window, cells)
+    runtime.settle()
+
+
+def _through_space(
+    m: QueriedMap,
+    start: NDArray[np.float64],
+    along: NDArray[np.float64],
+    points: NDArray[np.float64],
+    end_m: NDArray[np.float32],
+    outcome: NDArray[np.int32],
+) -> None:
+    """As far as space is known. A layer of unknown bricks lies around it, so no ray leaves the window."""
+    space = RaySpace(m)
+    known = space.known_box_m()
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    if known is not None:
+        lower, upper = np.maximum(lower, known[0]), np.minimum(upper, known[1])
+    if known is None or (lower > upper).any():
+        end_m[:], outcome[:] = 0.0, _STOPPED
+        return
+    with space.indexed(lower, upper) as window:
+        _launch(m, window, start, along, space.unknown_from, 1, end_m, outcome)
+        runtime.settle()
+        local = window.to_voxels(start)
+        outside = ((local < 0) | (local >= np.array(window.shape) * BRICK)).any(axis=1)
+    end_m[outside], outcome[outside] = 0.0, _STOPPED
+
+
+def _launch(
+    m: QueriedMap,
+    window: Window,
+    start: NDArray[np.float64],
+    along: NDArray[np.float64],
+    unknown_from: int,
+    stop_in_unknown: int,
+    end_m: NDArray[np.float32],
+    outcome: NDArray[np.int32],
+) -> None:
+    lower, upper = window.clip_box(None, None)
+    view = m.view
+    _cast(
+        window.to_voxels(start).astype(np.float32), (along / m.voxel_size).astype(np.float32),
+        float(end_m[0]), view.pool.prior_log_odds, view.volume.min_evidence, unknown_from, stop_in_unknown,
+        window.shape_vector, lower, upper, view.index.chunks, view.index.bricks, view.pool.belief,
+        end_m, outcome,
+    )  # fmt: skip
+
+
+@ti.dataclass
+class _Search(Struct):
+    """A ray that looks for its end, and by what it knows it."""
+
+    prior: F32
+    min_evidence: F32
+    unknown_from: I32
+    stop_in_unknown: I32
+    end_m: F32
+    outcome: I32
+
+
+@ti.func
+def _look(search: Template, context: Template, voxel: I32, near: F32, far: F32):
+    log_odds = search.prior
+    if voxel < search.unknown_from:
+        log_odds = context[0][voxel]
+    found = _PASSED
+    # The states of queries/points.py.
+    if log_odds > 0.0 and ti.abs(log_odds - search.prior) > search.min_evidence:
+        found = _HIT
+    elif log_odds >= search.prior - search.min_evidence and search.stop_in_unknown == 1:
+        found = _STOPPED
+    if found != _PASSED:
+        search.outcome = found
+        search.end_m = near
+    return ti.cast(found == _PASSED, ti.i32)
+
+
+@ti.kernel
+def _cast(
+    origins: F32Array2, directions: F32Array2, max_range: F32, prior: F32, min_evidence: F32,
+    unknown_from: I32, stop_in_unknown: I32, shape: IVec3, lower: Vec3, upper: Vec3,
+    chunks: I32Array, bricks: I32Array, belief: F32Array, end_m: F32Array, outcome: I32Array,
+):  # fmt: skip
+    for i in range(outcome.shape[0]):
+        ray = make_ray(
+            Vec3(origins[i, 0], origins[i, 1], origins[i, 2]),
+            Vec3(directions[i, 0], directions[i, 1], directions[i, 2]),
+        )
+        search = _Search(prior, min_evidence, unknown_from, stop_in_unknown, max_range, _PASSED)
+        begin, end = 0.0, max_range
+        clip(ray, begin, end, lower, upper)
+        walk_voxels(ray, begin, end, shape, chunks, bricks, _look, search, (belief,))
+        end_m[i] = search.end_m
+        outcome[i] = search.outcome

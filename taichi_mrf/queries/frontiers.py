@@ -1,0 +1,91 @@
+"""Frontiers: free voxels beside unknown ones, where exploration goes on (Yamauchi 1997), in clusters."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.queries.box import voxel_box
+from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, brick_keys, known_bricks, sorted_bricks
+from taichi_mrf.queries.libraries import library
+from taichi_mrf.queries.points import FREE, UNKNOWN
+from taichi_mrf.voxels.layout import CHUNK, CHUNK_VOXELS
+
+_HALF_OF_NEIGHBOURS = np.stack(np.unravel_index(np.arange(14, 27), (3, 3, 3)), axis=1) - 1
+"""13 of the 26 neighbours of a voxel; the others are these seen from the other side."""
+
+
+@dataclass(frozen=True)
+class Frontiers:
+    """Frontier voxels and their clusters, the largest first.
+
+    ``points`` (N, 3) are the voxels' centres in metres, ``cluster`` (N,) int32 which cluster each belongs to;
+    ``sizes`` (K,) int64 the clusters' numbers of voxels, ``centroids`` (K, 3) their means in metres.
+    """
+
+    points: NDArray[np.float64]
+    cluster: NDArray[np.int32]
+    sizes: NDArray[np.int64]
+    centroids: NDArray[np.float64]
+
+
+def find_frontiers(m: QueriedMap, min_voxels: int = 1) -> Frontiers:
+    """All free voxels that share a face with an unknown one; those that touch, be it at a corner, are one
+    cluster. Clusters of less than ``min_voxels`` are left out.
+
+    The map is looked at chunk by chunk, so that memory is bounded by what is found. Raises ConfigError for
+    min_voxels below 1, TaichiMRFError without SciPy.
+    """
+    if min_voxels < 1:
+        raise ConfigError(f"min_voxels must be at least 1, not {min_voxels}")
+    graphs = library("scipy.sparse", "frontiers", "mesh")
+    csgraph = library("scipy.sparse.csgraph", "frontiers", "mesh")
+    voxels = frontier_voxels(m)
+    pairs = _touching(voxels)
+    graph = graphs.coo_matrix((np.ones(len(pairs), np.int8), pairs.T), (len(voxels), len(voxels)))
+    labels = csgraph.connected_components(graph, directed=False)[1] if len(voxels) else np.zeros(0, np.int32)
+    counts = np.bincount(labels)
+    order = np.argsort(-counts, kind="stable")
+    order = order[counts[order] >= min_voxels]
+    number = np.full(len(counts), -1, np.int32)
+    number[order] = np.arange(len(order))
+    cluster = number[labels]
+    kept = cluster >= 0
+    points, cluster = (voxels[kept] + 0.5) * m.voxel_size, cluster[kept]
+    sizes = counts[order]
+    sums = [np.bincount(cluster, points[:, axis], len(order)) for axis in range(3)]
+    return Frontiers(points, cluster, sizes, np.stack(sums, axis=1) / np.maximum(sizes, 1)[:, None])
+
+
+def frontier_voxels(m: QueriedMap) -> NDArray[np.int32]:
+    """Coordinates (n, 3) of the free voxels that share a face with an unknown one, ascending by chunk."""
+    reader = BrickReader(m)
+    found = [np.zeros((0, 3), np.int32)]
+    for chunk in sorted_bricks(known_bricks(m) // CHUNK).astype(np.int64):
+        first = chunk * CHUNK_VOXELS
+        state = voxel_box(m, first - 1, first + CHUNK_VOXELS + 1, reader).state
+        unknown = state == UNKNOWN
+        beside = np.zeros((CHUNK_VOXELS,) * 3, np.bool_)
+        for axis in range(3):
+            for step in (0, 2):
+                cut = [slice(1, -1)] * 3
+                cut[axis] = slice(step, step + CHUNK_VOXELS)
+                beside |= unknown[tuple(cut)]
+        voxels = np.argwhere(beside & (state[1:-1, 1:-1, 1:-1] == FREE))
+        found.append((voxels + first).astype(np.int32))
+    return np.concatenate(found)
+
+
+def _touching(voxels: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Pairs (p, 2) of rows whose voxels touch."""
+    keys = brick_keys(voxels)  # any grid's coordinates
+    order = np.argsort(keys)
+    ascending = keys[order]
+    pairs = [np.zeros((0, 2), np.int64)]
+    for step in _HALF_OF_NEIGHBOURS:
+        wanted = brick_keys(voxels + step.astype(np.int32))
+        places = np.minimum(np.searchsorted(ascending, wanted), max(len(keys) - 1, 0))
+        there = np.flatnonzero(ascending[places] == wanted) if len(keys) else np.zeros(0, np.int64)
+        pairs.append(np.stack([there, order[places[there]]], axis=1))
+    return np.concatenate(pairs)

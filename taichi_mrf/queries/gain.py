@@ -1,0 +1,140 @@
+"""How much a view of the map would tell: the uncertainty that its rays would look at.
+
+A ray gains the entropy of what it sees, in bits, weighted by whether it is seen:
+
+    G = sum over voxels i of H(p_i) * integral over the ray's segment in i of V(t) dt / voxel size,
+    H(p) = -p log2 p - (1 - p) log2 (1 - p),    V(t) the visibility, eq. 15 of MRFMap.
+
+V falls as exp(-alpha t) within a voxel, alpha = -ln(1 - p) / voxel size, so the integral is exact. It is the
+occlusion-aware information of Isler et al. (ICRA 2016), with true lengths in place of a count of voxels.
+Unknown voxels have the entropy of what the map says of them: that of its prior in an MRFMap, 1 bit in maps
+that integrate scan by scan. What rays pass as empty holds nothing to be learnt: bricks without voxels that
+were seen to be free, and in maps that integrate scan by scan the free voxels (see Occlusion.empty_below).
+"""
+
+import numpy as np
+import taichi as ti
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf import runtime
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.inference.log_odds import exp_of_negative, logistic
+from taichi_mrf.inference.rays import pixel_direction
+from taichi_mrf.poses import Pose, as_pose
+from taichi_mrf.queries.known_bricks import QueriedMap
+from taichi_mrf.queries.occlusion import occlusion, stopped_share
+from taichi_mrf.queries.ray_space import RaySpace
+from taichi_mrf.queries.survey import OPAQUE
+from taichi_mrf.voxels.traversal import FAR, clip, make_ray, walk_voxels
+from taichi_mrf.voxels.types import F32, I32, F32Array, I32Array, IVec3, Mat3, Struct, Template, Vec3, Vec4
+
+_THINNEST = 1e-6
+"""Below this thickness a voxel dims nothing, and the integral of the visibility is the length."""
+
+
+def view_gain(
+    m: QueriedMap, camera: PinholeCamera, T_world_camera: ArrayLike, max_depth: float
+) -> NDArray[np.float64]:
+    """What views would tell, in bits: poses (N, 4, 4) -> (N,), or (4, 4) -> a number of shape ().
+
+    The sum of :func:`pixel_gain` over the image. A voxel that several rays cross counts for each, so gains
+    compare among views of one camera; few pixels are enough to rank views. Raises what that raises.
+    """
+    poses = np.asarray(T_world_camera, np.float64)
+    if poses.ndim == 2:
+        return np.array(pixel_gain(m, camera, poses, max_depth).sum(dtype=np.float64))
+    if poses.ndim != 3:
+        raise ConfigError(f"poses must be of shape (4, 4) or (N, 4, 4), not {poses.shape}")
+    space = RaySpace(m)
+    return np.array([_gain(space, camera, as_pose(T), max_depth).sum(dtype=np.float64) for T in poses])
+
+
+def pixel_gain(
+    m: QueriedMap, camera: PinholeCamera, T_world_camera: ArrayLike, max_depth: float
+) -> NDArray[np.float32]:
+    """What the ray of each pixel would tell up to an axial depth in metres, (H, W) float32 in bits.
+
+    Raises KeyframeError for a pose that is none, ConfigError for a depth that is not positive, CapacityError
+    if the view reaches through more space than fits memory.
+    """
+    return _gain(RaySpace(m), camera, as_pose(T_world_camera), max_depth)
+
+
+def _gain(
+    space: RaySpace, camera: PinholeCamera, T_world_camera: Pose, max_depth: float
+) -> NDArray[np.float32]:
+    if not (np.isfinite(max_depth) and max_depth > 0):
+        raise ConfigError(f"max_depth must be a positive number, not {max_depth}")
+    m = space.map
+    gain = np.zeros(camera.width * camera.height, np.float32)
+    centre_m = T_world_camera[:3, 3]
+    ends = camera.rays()[:: camera.height - 1 or 1, :: camera.width - 1 or 1].reshape(-1, 3) * max_depth
+    points = np.concatenate([ends @ T_world_camera[:3, :3].T + centre_m, centre_m[None]])
+    with space.indexed(points.min(axis=0), points.max(axis=0)) as window:
+        centre, to_voxels = window.rays_of(T_world_camera)
+        lower, upper = window.clip_box(None, None)
+        view = m.view
+        _gain_rays(
+            camera.width, ti.Vector([camera.fx, camera.fy, camera.cx, camera.cy], ti.f32), centre, to_voxels,
+            max_depth, view.pool.prior_log_odds, view.occlusion.empty_below, space.unknown_from,
+            window.shape_vector, lower, upper, view.index.chunks, view.index.bricks, view.pool.belief, gain,
+        )  # fmt: skip
+        runtime.settle()
+    return gain.reshape(camera.shape)
+
+
+@ti.dataclass
+class _Look(Struct):
+    """A ray that looks for what is not certain."""
+
+    voxels_per_depth: F32
+    prior: F32
+    empty_below: F32
+    unknown_from: I32
+    visibility: F32
+    bits: F32
+
+
+@ti.func
+def _entropy(log_odds: F32):
+    """Bits of a voxel, the same for p and 1 - p; what is as good as certain has none."""
+    p = logistic(-ti.abs(log_odds))
+    bits = 0.0
+    if p > 1e-7:
+        bits = -(p * ti.log(p) + (1.0 - p) * ti.log(1.0 - p)) / ti.log(2.0)
+    return bits
+
+
+@ti.func
+def _learn(look: Template, context: Template, voxel: I32, near: F32, far: F32):
+    log_odds = look.prior
+    if voxel < look.unknown_from:
+        log_odds = context[0][voxel]
+    length = (far - near) * look.voxels_per_depth
+    # Unknown voxels dim here, in every kind of map: what lies behind them is less likely to be seen.
+    alpha = occlusion(log_odds, FAR, look.empty_below)
+    seen = length
+    if alpha * length > _THINNEST:
+        seen = stopped_share(alpha * length) / alpha
+    if log_odds >= look.empty_below:
+        look.bits += _entropy(log_odds) * look.visibility * seen
+    look.visibility *= exp_of_negative(-alpha * length)
+    return ti.cast(look.visibility > OPAQUE, ti.i32)
+
+
+@ti.kernel
+def _gain_rays(
+    width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3, max_depth: F32,
+    prior: F32, empty_below: F32, unknown_from: I32,
+    shape: IVec3, lower: Vec3, upper: Vec3, chunks: I32Array, bricks: I32Array, belief: F32Array,
+    gain: F32Array,
+):  # fmt: skip
+    for pixel in range(gain.shape[0]):
+        direction = to_voxels @ pixel_direction(pixel % width, pixel // width, intrinsics)
+        look = _Look(direction.norm(), prior, empty_below, unknown_from, 1.0, 0.0)
+        path = make_ray(centre, direction)
+        begin, end = 0.0, max_depth
+        clip(path, begin, end, lower, upper)
+        walk_voxels(path, begin, end, shape, chunks, bricks, _learn, look, (belief,))
+        gain[pixel] = look.bits

@@ -1,0 +1,35 @@
+"""The examples of docs/queries.md, pasted one after the other."""
+
+import re
+from pathlib import Path
+
+import pytest
+from queried_maps import room_map
+
+from taichi_mrf.export.formats import extensions
+
+
+@pytest.fixture
+def page(repository: Path) -> str:
+    return (repository / "docs" / "queries.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.usefixtures("backend")
+def test_the_examples_run(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    room_map("mrf").save(tmp_path / "map.npz")
+    monkeypatch.chdir(tmp_path)
+    examples = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert len(examples) == 10
+    names: dict[str, object] = {}
+    for example in examples:
+        assert len(example.splitlines()) <= 3
+        exec(example, names)  # what the page tells people to run
+    assert capsys.readouterr().out.count("\n") >= 5
+    assert {path.name for path in tmp_path.iterdir()} == {"map.npz", "room.bt", "floor.pgm", "floor.yaml"}
+
+
+def test_the_table_names_every_format(page: str) -> None:
+    table = "\n".join(line for line in page.splitlines() if line.startswith("|"))
+    assert all(f"`{extension}" in table for extension in extensions())
