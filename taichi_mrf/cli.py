@@ -10,17 +10,23 @@ import tyro
 import taichi_mrf
 from taichi_mrf.commands.bench import Bench
 from taichi_mrf.commands.calibrate import Calibrate
+from taichi_mrf.commands.diff import Diff
 from taichi_mrf.commands.eval import Eval
+from taichi_mrf.commands.export import Export
 from taichi_mrf.commands.flags import registry
+from taichi_mrf.commands.import_map import Import
 from taichi_mrf.commands.info import Info
 from taichi_mrf.commands.laser import Laser, laser_settings
 from taichi_mrf.commands.live import Live
 from taichi_mrf.commands.map import Map, file_settings
+from taichi_mrf.commands.tune import Tune
 from taichi_mrf.errors import TaichiMRFError
 
 PROGRAM = "taichi-mrf"
-COMING = ("tune",)
-"""Applications whose place is taken, but which a later version brings."""
+WITH_SETTINGS = ("map", "live", "tune")
+"""Commands whose flags change the parameters of --config's file."""
+
+Command = Map | Live | Tune | Export | Import | Diff | Info | Bench | Calibrate | Eval | Laser
 
 BAD_INPUT = 2
 ABORTED = 130
@@ -34,8 +40,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"{PROGRAM} {taichi_mrf.__version__}")
         return 0
     try:
-        if arguments and arguments[0] in COMING:
-            raise TaichiMRFError(f"{arguments[0]} is not in this version yet")
         return parse(arguments).run()
     except TaichiMRFError as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
@@ -51,9 +55,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return ABORTED
 
 
-def parse(arguments: Sequence[str]) -> Map | Live | Info | Bench | Calibrate | Eval | Laser:
+def parse(arguments: Sequence[str]) -> Command:
     """The command that the arguments ask for. Exits with status 2 where they cannot be parsed."""
-    settings = file_settings(arguments[1:]) if arguments[:1] in (["map"], ["live"]) else file_settings([])
+    settings = file_settings(arguments[1:] if arguments and arguments[0] in WITH_SETTINGS else [])
     laser = laser_settings(arguments[1:] if arguments[:1] == ["laser"] else [])
     commands = (
         Annotated[
@@ -63,6 +67,13 @@ def parse(arguments: Sequence[str]) -> Map | Live | Info | Bench | Calibrate | E
             ),
         ]
         | Annotated[Live, tyro.conf.subcommand("live", default=Live(settings=settings), prefix_name=False)]
+        | Annotated[
+            Tune,
+            tyro.conf.subcommand("tune", default=Tune(tyro.MISSING, settings=settings), prefix_name=False),
+        ]
+        | Annotated[Export, tyro.conf.subcommand("export", prefix_name=False)]
+        | Annotated[Import, tyro.conf.subcommand("import", prefix_name=False)]
+        | Annotated[Diff, tyro.conf.subcommand("diff", prefix_name=False)]
         | Annotated[Info, tyro.conf.subcommand("info", prefix_name=False)]
         | Annotated[Bench, tyro.conf.subcommand("bench", default=Bench(), prefix_name=False)]
         | Annotated[Calibrate, tyro.conf.subcommand("calibrate", prefix_name=False)]

@@ -24,11 +24,11 @@ FLOORS = [
         "",
     },
     {"sensor", "keyframes"},
-    {"inference", "queries", "datasets", "export", "viewer", "factor_graph"},
+    {"inference", "queries", "datasets", "export", "viewer", "factor_graph", "alignment"},
     {"maps"},
     {"pipeline"},
     {"evaluation", "calibration"},
-    {"live"},
+    {"live", "tune"},
     {"commands", "cli", "__main__"},
 ]
 """From the ground up; the empty name is the package itself, which loads its public names when asked."""

@@ -24,7 +24,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Bench:
-    """Time each stage of mapping on a sequence, at several voxel sizes."""
+    """Time each stage of mapping on a sequence, at several voxel sizes.
+
+    Example: taichi-mrf bench recording/ --voxel-sizes 0.05 0.02 --frames 30
+    """
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = "synthetic:room"
     """A folder, whose format is recognised, or a built-in sequence."""

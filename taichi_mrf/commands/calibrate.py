@@ -16,7 +16,7 @@ class Calibrate:
 
     The true depth comes from --true-depth, or from a chessboard in --images, or from the motion capture of
     camera and board in --camera-poses and --board-poses (with --images). docs/calibration.md tells how to
-    record.
+    record. Example: taichi-mrf calibrate depth/ --true-depth true/ --out sensor/
     """
 
     depth: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DEPTH")]

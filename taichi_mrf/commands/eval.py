@@ -18,6 +18,7 @@ class Eval:
 
     Tables are written as CSV, LaTeX and PNG, with the configuration of every map. A run that was
     interrupted goes on where it was when it is started again with the same --out.
+    Example: taichi-mrf eval table1 --data scenes/ --voxel-sizes 0.05 --limit 3
     """
 
     experiment: Annotated[Name, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERIMENT")]

@@ -19,7 +19,8 @@ class Laser:
     """Map 2D laser scans with known poses by inference on a factor graph whose factors are whole beams.
 
     Flags take precedence over the file of --config, and that over the defaults. Ctrl-C ends the method that
-    runs, and keeps the map that it has by then (exit status 130).
+    runs, and keeps the map that it has by then (exit status 130). Example: taichi-mrf laser walk.log.gz --out
+    runs/floor --cell-size 0.05
     """
 
     scans: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCANS")]
@@ -59,6 +60,9 @@ class Laser:
 
     memory_limit_gb: float = 0.0
     """Most memory for the factor graph in GB; 0 means what the machine has free."""
+
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the report as JSON, and nothing else, on stdout."""
 
     settings: Annotated[LaserConfig, tyro.conf.arg(name="")] = field(default_factory=LaserConfig)
     """Parameters."""

@@ -42,7 +42,7 @@ _NO_RETURN_IS_FREE = {"auto": None, "free": True, "ignore": False}
 
 def run_laser(options: Laser) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
-    console = Console()
+    console = Console(stderr=options.json)
     with (
         output_folder(options.out),
         stop_on_signals(lambda text: console.print(f"[yellow]{text}[/]")) as request,
@@ -64,6 +64,10 @@ def run_laser(options: Laser) -> int:
         interrupted = request()
         report = laser_report(options.scans, scans, graph, outcomes, registration, seconds, interrupted)
         write_text(options.out / REPORT_FILE, report_json(report))
+        status = 0 if request.signal is None else 128 + request.signal
+        if options.json:
+            print(report_json(report), end="")
+            return status
         print_table(console, comparison_table(scans.name, outcomes))
         console.print(
             f"{graph.beams:,} beams, {graph.edges:,} edges, {report['cells_seen']:,} cells of "
@@ -76,7 +80,7 @@ def run_laser(options: Laser) -> int:
             console.print("Stopped before the end.", style="yellow")
         for path in [*written, options.out / REPORT_FILE]:
             console.print(str(path), markup=False, highlight=False, soft_wrap=True)
-    return 0 if request.signal is None else 128 + request.signal
+    return status
 
 
 def _some(scans: LaserScans, options: Laser) -> LaserScans:

@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from taichi_mrf.config import Config
+from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError
 
 
@@ -15,7 +16,8 @@ class Live:
     """Map a sequence or a camera, and show the map in the browser while it grows.
 
     Keyframes can be switched off and on, moved and frozen there, and rays asked what they meet. Ctrl-C ends
-    it and, with --out, keeps what is mapped (exit status 130).
+    it and, with --out, keeps what is mapped (exit status 130). Example: taichi-mrf live recording/ --out
+    runs/desk --open
     """
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = "synthetic:room"
@@ -55,6 +57,9 @@ class Live:
 
     open: bool = False
     """Open the page in a browser on this machine."""
+
+    reading: Annotated[SourceFlags, tyro.conf.arg(name="")] = field(default_factory=SourceFlags)
+    """How SOURCE is read."""
 
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
     """Parameters."""

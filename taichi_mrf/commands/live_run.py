@@ -56,6 +56,7 @@ def run_live(options: Live) -> int:
             limit=options.limit,
             speed=options.speed,
             loop=options.loop,
+            reading=options.reading,
         )
         for note in notes:
             say(note)

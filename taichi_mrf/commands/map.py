@@ -9,6 +9,7 @@ import tyro
 
 from taichi_mrf import config as configuration
 from taichi_mrf.config import Config
+from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError
 
 CONFIG_FILE = "config.yaml"
@@ -20,11 +21,12 @@ class Map:
     """Map a recorded or built-in sequence.
 
     Flags take precedence over the file of --config, and that over the defaults. Ctrl-C keeps what is
-    mapped (exit status 130).
+    mapped (exit status 130). Example: taichi-mrf map walk.bag --out runs/walk --voxel-size 0.02
     """
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
-    """A folder, whose format is recognised, or a built-in sequence such as synthetic:room."""
+    """A folder, whose format is recognised, a bag (walk.bag?depth=/TOPIC&pose=/TOPIC), another file of
+    frames, or a built-in sequence such as synthetic:room. 'taichi-mrf info SOURCE' says what is in it."""
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Folder for the results; it is made if need be."""
@@ -46,6 +48,12 @@ class Map:
 
     pictures: bool = True
     """Draw the map from above, in perspective, and against the measured depth."""
+
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the report as JSON, and nothing else, on stdout."""
+
+    reading: Annotated[SourceFlags, tyro.conf.arg(name="")] = field(default_factory=SourceFlags)
+    """How SOURCE is read."""
 
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
     """Parameters."""

@@ -43,7 +43,7 @@ _PICTURED_FRAMES = 3
 
 def run_map(options: Map) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
-    console = Console()
+    console = Console(stderr=options.json)
     settings = with_absolute_tables(options.settings, Path.cwd())
     with (
         output_folder(options.out),
@@ -52,7 +52,7 @@ def run_map(options: Map) -> int:
         start = time.perf_counter()
         runtime.init(settings.runtime.arch, settings.runtime.threads, settings.runtime.debug)
         previous = _resumed_map(options.out, settings) if options.resume else None
-        dataset = open_dataset(options.source, color=False)
+        dataset = open_dataset(options.source, color=False, **options.reading.keywords())
         opening = time.perf_counter() - start
         with ProgressBar(console) as progress, _collected_warnings() as warned:
             result = map_sequence(
@@ -75,6 +75,9 @@ def run_map(options: Map) -> int:
         if options.resume:
             report["skipped_frames"] = _skipped_before(options.out) | report["skipped_frames"]
         write_text(options.out / REPORT_FILE, report_json(report))
+        if options.json:
+            print(report_json(report), end="")
+            return _exit_status(request)
         print_report(console, report, [*written, options.out / REPORT_FILE])
         look = LOOK_AT_PICTURES if options.pictures else "Open"
         live = f"taichi-mrf live {options.out / MAP_FILE} {LIVE_VIEW}"

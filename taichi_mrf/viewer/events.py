@@ -27,6 +27,13 @@ class Chosen:
 
 
 @dataclass(frozen=True)
+class KnobMoved:
+    """The slider or box of the parameter of this name was used."""
+
+    name: str
+
+
+@dataclass(frozen=True)
 class Clicked:
     """A click into the scene: the ray from the eye, in the world."""
 
@@ -46,4 +53,4 @@ class Joined:
     client: int
 
 
-Event = OptionsMoved | Pressed | Chosen | Clicked | Dragged | Joined
+Event = OptionsMoved | Pressed | Chosen | KnobMoved | Clicked | Dragged | Joined

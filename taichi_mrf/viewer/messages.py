@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.poses import Pose
+from taichi_mrf.viewer.tune_messages import TuneRequest, TuneUpdate
 
 LOG_ODDS_STEP = 1 / 512
 """Log-odds travel as int16 multiples of this, rounded down, so that their sign, and with it the threshold
@@ -159,7 +160,7 @@ class File:
     client: int
 
 
-Update = Hello | Bricks | Keyframe | CurrentCamera | Status | Notice | RayAnswer | Images | File
+Update = Hello | Bricks | Keyframe | CurrentCamera | Status | Notice | RayAnswer | Images | File | TuneUpdate
 
 
 @dataclass(frozen=True)
@@ -274,4 +275,5 @@ Request = (
     | Watch
     | Save
     | Quit
+    | TuneRequest
 )

@@ -3,10 +3,14 @@
 It is spawned by whoever maps, and ends when told to or when that process is gone.
 """
 
+import queue
 import signal
 import threading
+from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, Protocol
+
+import viser
 
 from taichi_mrf.errors import ViewerError
 from taichi_mrf.viewer.messages import Listening, Notice, Quit, Request
@@ -16,10 +20,25 @@ from taichi_mrf.viewer.server import start_server
 TITLE = "taichi_mrf"
 
 
-def run_viewer(connection: "Connection[Any, Any]", host: str, port: int) -> None:
+class AnyPage(Protocol):
+    """What owns the scene and the widgets: of live, or of tune."""
+
+    inbox: queue.SimpleQueue[Any]
+
+    def run(self) -> None:
+        """Serve until None is put into the inbox."""
+
+
+def run_viewer(
+    connection: "Connection[Any, Any]",
+    host: str,
+    port: int,
+    new_page: Callable[[viser.ViserServer, Callable[[Request], None]], AnyPage] = Page,
+) -> None:
     """Serve the page until the mapper says Quit or is gone.
 
-    The first message back is Listening, or a Notice that says why there is no page.
+    The first message back is Listening, or a Notice that says why there is no page. ``new_page`` makes the
+    page, given the server and what sends a request to the mapper.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the mapper hears it too, and says when to end
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -37,7 +56,7 @@ def run_viewer(connection: "Connection[Any, Any]", host: str, port: int) -> None
             except OSError:
                 page.inbox.put(None)
 
-    page = Page(server, ask)
+    page = new_page(server, ask)
     ask(Listening(server.get_host(), server.get_port()))
     threading.Thread(target=_listen, args=(connection, page), daemon=True, name="listener").start()
     try:
@@ -46,7 +65,7 @@ def run_viewer(connection: "Connection[Any, Any]", host: str, port: int) -> None
         server.stop()
 
 
-def _listen(connection: "Connection[Any, Any]", page: Page) -> None:
+def _listen(connection: "Connection[Any, Any]", page: AnyPage) -> None:
     """Put what the mapper says into the page's inbox, to the end."""
     try:
         while True:

@@ -3,23 +3,14 @@
 import dataclasses
 import typing
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import viser
 
 from taichi_mrf.config_text import field_help
+from taichi_mrf.viewer.ranges import Range
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Range:
-    """The smallest and largest value of a slider, and its step."""
-
-    least: float
-    most: float
-    step: float
 
 
 class OptionWidgets(Generic[T]):
@@ -40,7 +31,7 @@ class OptionWidgets(Generic[T]):
             if only and field.name not in only:
                 continue
             value = getattr(options, field.name)
-            handle = _widget(gui, label_of(field.name), hints[field.name], value, texts[field.name])
+            handle = add_widget(gui, label_of(field.name), hints[field.name], value, texts[field.name])
             handle.on_update(lambda event: changed())
             self.handles[field.name] = handle
 
@@ -56,7 +47,9 @@ def label_of(name: str) -> str:
     return name.replace("_", " ").capitalize()
 
 
-def _widget(gui: viser.GuiApi, label: str, hint: Any, value: Any, text: str) -> Any:
+def add_widget(gui: viser.GuiApi, label: str, hint: Any, value: Any, text: str) -> Any:
+    """The widget for a value of the type ``hint``, with ``text`` as its help: a slider for a number with a
+    Range, a dropdown for a Literal, a checkbox for a bool. Raises TypeError for any other type."""
     if typing.get_origin(hint) is Annotated:
         limits = next(each for each in typing.get_args(hint) if isinstance(each, Range))
         return gui.add_slider(label, limits.least, limits.most, limits.step, value, hint=text)

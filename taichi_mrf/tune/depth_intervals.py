@@ -1,0 +1,177 @@
+"""How far the depths that a map predicts can be trusted, where nothing but measurements is known.
+
+A map and its sensor's noise predict a distribution of the measurement of each pixel: the one whose density
+accuracy.py takes the logarithm of. If it is right, a measurement falls below the distribution's q-quantile
+in a share q of all pixels, so the probabilities of "no more than what was measured" are spread evenly over
+0 to 1 (the probability integral transform: Gneiting, Balabdaoui and Raftery, J. R. Stat. Soc. B, 2007).
+"""
+
+# mypy: disable-error-code="return-value"
+# ruff: noqa: ANN202 - Taichi does not allow `-> None` on a kernel or a func.
+
+from collections.abc import Sequence
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf import runtime
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.evaluation.accuracy import OUTLIERS
+from taichi_mrf.inference.log_odds import exp_of_negative
+from taichi_mrf.inference.rays import pixel_direction
+from taichi_mrf.poses import Pose
+from taichi_mrf.queries.occlusion import occlusion, stopped_share
+from taichi_mrf.queries.survey import OPAQUE
+from taichi_mrf.queries.view import View
+from taichi_mrf.sensor.forward import (
+    SUPPORT,
+    PixelNoise,
+    normal_density,
+    normal_tail,
+    pixel_noise,
+    polynomial,
+    sigma_at,
+)
+from taichi_mrf.sensor.noise import NoiseTable
+from taichi_mrf.voxels.layout import BRICK
+from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
+from taichi_mrf.voxels.types import (
+    F32,
+    I32,
+    F32Array,
+    F32Array3,
+    I32Array,
+    IVec3,
+    Mat3,
+    Struct,
+    Template,
+    Vec3,
+    Vec4,
+    Vec5,
+)
+from taichi_mrf.voxels.window import Window
+
+LEVELS = np.linspace(0.05, 0.95, 19)
+"""Central intervals of so much probability are looked at."""
+
+
+@ti.dataclass
+class Prediction(Struct):
+    """What is known of a ray on its way from the camera; depths are axial, in metres."""
+
+    voxels_per_depth: F32
+    unknown: F32
+    empty_below: F32
+    measured: F32
+    noise: PixelNoise
+    visibility: F32
+    below: F32  # probability of a surface so far whose measurement is no more than that
+
+
+def probability_below(
+    view: View,
+    measured_m: NDArray[np.float32],
+    T_world_camera: Pose,
+    camera: PinholeCamera,
+    noise: NoiseTable,
+    max_depth: float,
+) -> NDArray[np.float32]:
+    """For each measurement of (H, W) ``measured_m`` that is not 0, row by row, the probability that the map
+    gives to measuring no more than that, (n,). ``max_depth`` is where rays end, in metres."""
+    chosen = np.flatnonzero((measured_m > 0) & (measured_m <= max_depth)).astype(np.int32)
+    below = np.zeros(len(chosen), np.float32)
+    slots = view.pool.in_use
+    if len(chosen) and len(slots):
+        bricks = view.pool.bricks[slots]
+        middles_m = (bricks + 0.5) * (BRICK * view.voxel_size)
+        window = Window.covering(middles_m.min(axis=0), middles_m.max(axis=0), view.voxel_size)
+        cells = window.cells_of(bricks)
+        view.index.fill(window, cells, slots)
+        centre, to_voxels = window.rays_of(T_world_camera)
+        lower, upper = window.clip_box(view.volume.lower, view.volume.upper)
+        _follow(
+            chosen, np.ascontiguousarray(measured_m.reshape(-1)[chosen], np.float32), camera.width,
+            ti.Vector([camera.fx, camera.fy, camera.cx, camera.cy], ti.f32), centre, to_voxels, max_depth,
+            view.occlusion.unknown, view.occlusion.empty_below, noise.coefficients, noise.patch,
+            noise.columns, window.shape_vector, lower, upper, view.index.chunks, view.index.bricks,
+            view.pool.belief, below,
+        )  # fmt: skip
+        view.index.clear(window, cells)
+        runtime.settle()
+    anywhere = np.clip(measured_m.reshape(-1)[chosen] / max_depth, 0.0, 1.0)
+    if not len(slots):
+        below = anywhere
+    return ((1.0 - OUTLIERS) * below + OUTLIERS * anywhere).astype(np.float32)
+
+
+def interval_error(below: Sequence[NDArray[np.float32]]) -> float:
+    """Mean absolute difference between the probability of central intervals and the share of measurements
+    in them, over LEVELS; NaN without a measurement. 0 is perfect, 0.5 the worst."""
+    every = np.concatenate([np.zeros(0, np.float32), *below])
+    if not len(every):
+        return float("nan")
+    width = np.sort(np.abs(2.0 * every - 1.0))
+    inside = np.searchsorted(width, LEVELS, side="right") / len(width)
+    return float(np.mean(np.abs(inside - LEVELS)))
+
+
+@ti.func
+def _normal_below(x: F32) -> F32:
+    """Standard normal probability of no more than x."""
+    mass = normal_tail(ti.abs(x))
+    if x >= 0.0:
+        mass = 1.0 - mass
+    return mass
+
+
+@ti.func
+def _mean_below(low: F32, high: F32) -> F32:
+    """The mean of the standard normal distribution function over [low, high]."""
+    mean = 0.0
+    if low >= SUPPORT:
+        mean = 1.0
+    elif high > -SUPPORT:
+        if high - low > 1e-2:
+            top = high * _normal_below(high) + normal_density(high)
+            bottom = low * _normal_below(low) + normal_density(low)
+            mean = (top - bottom) / (high - low)
+        else:
+            mean = _normal_below(0.5 * (low + high))
+    return mean
+
+
+@ti.func
+def _predict_voxel(ray: Template, context: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of a ray, whose segment in it reaches from axial depth ``near`` to ``far``."""
+    alpha = occlusion(context[0][voxel], ray.unknown, ray.empty_below)
+    thickness = alpha * (far - near) * ray.voxels_per_depth
+    here = ray.visibility * stopped_share(thickness)
+    ray.visibility *= exp_of_negative(-thickness)
+    sigma = sigma_at(ray.noise, 0.5 * (near + far))
+    high = (ray.measured - near - polynomial(ray.noise.bias, near)) / sigma
+    low = (ray.measured - far - polynomial(ray.noise.bias, far)) / sigma
+    ray.below += here * _mean_below(ti.min(low, high), high)
+    return ti.cast(ray.visibility > OPAQUE, ti.i32)
+
+
+@ti.kernel
+def _follow(
+    chosen: I32Array, measured: F32Array, width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
+    max_depth: F32, unknown: F32, empty_below: F32, noise: F32Array3, patch: I32, columns: I32,
+    shape: IVec3, lower: Vec3, upper: Vec3, chunks: I32Array, bricks: I32Array, belief: F32Array,
+    below: F32Array,
+):  # fmt: skip
+    for i in range(chosen.shape[0]):
+        u, v = chosen[i] % width, chosen[i] // width
+        ray = Prediction(
+            0.0, unknown, empty_below, measured[i], PixelNoise(Vec5(0.0), Vec5(0.0)), 1.0, 0.0
+        )  # fmt: skip
+        ray.noise = pixel_noise(noise, patch, columns, u, v)
+        direction = to_voxels @ pixel_direction(u, v, intrinsics)
+        ray.voxels_per_depth = direction.norm()
+        path = make_ray(centre, direction)
+        begin, end = 0.0, max_depth
+        clip(path, begin, end, lower, upper)
+        walk_voxels(path, begin, end, shape, chunks, bricks, _predict_voxel, ray, (belief, 0))
+        below[i] = ray.below + ray.visibility * ti.min(1.0, ray.measured / max_depth)

@@ -1,0 +1,83 @@
+"""Where a map is right in the held-out views, kept for every try so that any two can be compared."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.evaluation.accuracy import RIGHT, JudgedView
+from taichi_mrf.frame import Frame
+from taichi_mrf.live.pictures import ACCURACY_COLORS, IMAGE_WIDTH, depth_colors
+from taichi_mrf.tune.history import History
+from taichi_mrf.viewer.tune_messages import HeldOutView
+
+BETTER, WORSE, SAME = (0, 114, 178), (213, 94, 0), (225, 225, 225)
+"""Colours of a pixel that is right only now, that was right only before, and of any other."""
+
+_MOST_TRIES = 500
+"""Pictures of more tries than this are not kept, but for the pinned one."""
+
+
+class HeldOutPictures:
+    """The accuracy images of the held-out views by try: losslessly compressed, a few kilobytes each."""
+
+    def __init__(self, frames: Sequence[Frame]) -> None:
+        self._frames = frames
+        self._verdicts: dict[int, list[tuple[bytes, float, float]]] = {}
+
+    def keep(self, number: int, views: Sequence[JudgedView], pixel_stride: int, pinned: int) -> None:
+        """Remember how the map of a try did in each view."""
+        self._verdicts[number] = [_packed(view, pixel_stride) for view in views]
+        for old in list(self._verdicts):
+            if len(self._verdicts) > _MOST_TRIES and old not in (number, pinned):
+                del self._verdicts[old]
+
+    def show(self, view: int, number: int, history: History) -> HeldOutView | None:
+        """One view under a try, beside the reference; None if there is no such view or no picture yet."""
+        if not 0 <= view < len(self._frames) or number not in self._verdicts:
+            return None
+        frame = self._frames[view]
+        reference = history.pinned if history.pinned in self._verdicts else None
+        shown = self._verdicts[number][view]
+        beside = None if reference is None else self._verdicts[reference][view]
+        now, then = _verdict(shown[0]), None if beside is None else _verdict(beside[0])
+        change, change_title = None, ""
+        if then is not None and reference != number and then.shape == now.shape:
+            better, worse = (now == RIGHT) & (then != RIGHT), (now != RIGHT) & (then == RIGHT)
+            change = np.where(better[..., None], BETTER, np.where(worse[..., None], WORSE, SAME))
+            change_title = f"from A to B: {better.mean():.1%} became right, {worse.mean():.1%} wrong"
+        step = _step(frame.depth_m)
+        return HeldOutView(
+            name=frame.name,
+            measured=depth_colors(frame.depth_m[::step, ::step]),
+            accuracy=ACCURACY_COLORS[now],
+            title=_title(number, shown),
+            reference=None if then is None else ACCURACY_COLORS[then],
+            reference_title="" if beside is None or reference is None else _title(reference, beside),
+            change=None if change is None else change.astype(np.uint8),
+            change_title=change_title,
+        )
+
+
+def _packed(view: JudgedView, pixel_stride: int) -> tuple[bytes, float, float]:
+    judged = view.accuracy("1.5sigma")
+    step = max(_step(view.depth_m), pixel_stride)
+    # Where only some pixels were judged the picture is of these.
+    first = pixel_stride // 2
+    small = np.ascontiguousarray(judged.image[first::step, first::step])
+    return cv2.imencode(".png", small.astype(np.uint8))[1].tobytes(), judged.score, judged.unanswered
+
+
+def _verdict(packed: bytes) -> NDArray[np.uint8]:
+    verdict = cv2.imdecode(np.frombuffer(packed, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert verdict is not None
+    return verdict.astype(np.uint8)
+
+
+def _title(number: int, shown: tuple[bytes, float, float]) -> str:
+    return f"try {number}: right {shown[1]:.1%} within 1.5 sigma, no answer {shown[2]:.1%}"
+
+
+def _step(depth_m: NDArray[np.float32]) -> int:
+    return -(-depth_m.shape[1] // IMAGE_WIDTH)

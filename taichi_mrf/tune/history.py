@@ -1,0 +1,118 @@
+"""The table of all tries: their parameters, their scores, which of them is the reference; as files."""
+
+import csv
+import dataclasses
+import io
+from dataclasses import dataclass
+from typing import Any
+
+from taichi_mrf.config import Config
+from taichi_mrf.config_text import commented_yaml, differences
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.viewer.tune_messages import By, Tried
+from taichi_mrf.viewer.tune_scores import Scores, figures, scores_in_words
+
+
+@dataclass
+class Attempt:
+    """One line of the table."""
+
+    number: int
+    config: Config
+    scores: Scores
+    by: By
+
+    def message(self) -> Tried:
+        """As the page is told of it."""
+        return Tried(self.number, self.config, self.scores, self.by)
+
+
+class History:
+    """All tries on one working set, in the order in which they were made, numbered from 0.
+
+    ``pinned`` is the number of the reference, the first try until another one is chosen.
+    """
+
+    def __init__(self, source: str) -> None:
+        self.source = source
+        self.attempts: list[Attempt] = []
+        self.pinned = 0
+
+    def note(self, config: Config, scores: Scores, by: By) -> Attempt:
+        """Enter a try. The same parameters again are the same try, whose scores become those of more pixels
+        if they are."""
+        known = next((each for each in self.attempts if each.config == config), None)
+        if known is None:
+            known = Attempt(len(self.attempts), config, scores, by)
+            self.attempts.append(known)
+        elif scores.pixel_stride <= known.scores.pixel_stride:
+            known.scores = scores
+        return known
+
+    def find(self, number: int) -> Attempt:
+        """A try by its number. Raises ConfigError if there is none."""
+        if not 0 <= number < len(self.attempts):
+            raise ConfigError(f"there is no try {number}")
+        return self.attempts[number]
+
+    def pin(self, number: int) -> None:
+        """Make a try the reference. Raises ConfigError if there is none of that number."""
+        self.pinned = self.find(number).number
+
+    def parameters(self) -> list[str]:
+        """Names of all parameters in which some try differs from the first one."""
+        names: dict[str, None] = {}
+        for each in self.attempts:
+            names |= dict.fromkeys(differences(self.attempts[0].config, each.config))
+        return list(names)
+
+    def to_yaml(self, number: int, comments: tuple[str, ...] = ()) -> str:
+        """A try's parameters as YAML that ``map --config`` and ``live --config`` accept, with its scores and
+        further ``comments`` as a comment at the head."""
+        attempt = self.find(number)
+        lines = [
+            f"Found with taichi-mrf tune: try {attempt.number} of {self.source}.",
+            *self._changes(attempt),
+            "Scores on held-out views:",
+            *(f"  {line}" for line in scores_in_words(attempt.scores)),
+            *comments,
+        ]
+        head = "".join(f"# {' '.join(line.splitlines())}\n" for line in lines)
+        return f"{head}\n{commented_yaml(attempt.config)}"
+
+    def to_csv(self) -> str:
+        """The table: a line for each try, with the parameters that were changed in any, and all scores in
+        metres, seconds and shares of one."""
+        names = self.parameters()
+        kinds = [field.name for field in dataclasses.fields(Scores)]
+        text = io.StringIO()
+        table = csv.writer(text, lineterminator="\n")
+        table.writerow(["try", "by", "reference", *names, *kinds])
+        for each in self.attempts:
+            values = [_plain(value_of(each.config, name)) for name in names]
+            scores = figures(each.scores)
+            is_reference = int(each.number == self.pinned)
+            table.writerow([each.number, each.by, is_reference, *values, *(scores[kind] for kind in kinds)])
+        return text.getvalue()
+
+    def _changes(self, attempt: Attempt) -> list[str]:
+        first = self.attempts[0].config
+        changed = differences(first, attempt.config)
+        if not changed:
+            return ["The parameters are those that tuning began with."]
+        return [
+            "Changed from where tuning began:",
+            *(f"  {n}: {value_of(attempt.config, n)} (was {value_of(first, n)})" for n in changed),
+        ]
+
+
+def value_of(config: Config, name: str) -> Any:
+    """The value of a parameter by its dotted name, a polynomial as a whole."""
+    value: Any = config
+    for field in name.split("."):
+        value = getattr(value, field)
+    return value
+
+
+def _plain(value: Any) -> Any:
+    return " ".join(map(str, value)) if isinstance(value, tuple) else value

@@ -1,0 +1,193 @@
+"""The automatic search: which parameters to try next, so that held-out measurements become likelier.
+
+The search itself is Optuna's tree-structured Parzen estimator (Bergstra et al., NIPS 2011), which comes with
+the extra ``auto``. What is maximised is the log-likelihood of the held-out measurements under map and noise
+together: a sigma that is too small is punished by what it calls impossible, one that is too large by its
+flat density.
+"""
+
+import dataclasses
+import importlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args, get_origin
+
+from taichi_mrf.config import Config
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.viewer.ranges import Range
+from taichi_mrf.viewer.tune_knobs import KNOBS, Knob
+
+SIGMA_SCALE = "sensor.sigma_scale"
+"""No parameter of its own: all coefficients of sensor.sigma times this."""
+
+SIGMA_SCALES = Range(0.25, 16.0, 0.0)
+
+LOGARITHMIC = ("inference.surface_density", "voxel_size")
+"""Searched by factors and not by steps, beside those whose sliders stand for powers of ten."""
+
+DEFAULT_SEARCH = (
+    "inference.surface_density",
+    "inference.outlier_floor",
+    "inference.message_clamp",
+    "inference.free_share",
+    SIGMA_SCALE,
+)
+"""What is searched unless told: what depends on the sensor and the scene more than on the map's purpose."""
+
+Scalar = float | int | str | bool
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """One parameter to search, and where: a range, by factors if ``log``, or some choices."""
+
+    name: str
+    least: float = 0.0
+    most: float = 0.0
+    log: bool = False
+    whole: bool = False
+    choices: tuple[Scalar, ...] = ()
+
+
+def dimensions(names: Sequence[str], start: Config) -> list[Dimension]:
+    """The search space of some parameters.
+
+    Raises ConfigError for a name that cannot be searched, and for a parameter that changes nothing under
+    the configuration ``start``.
+    """
+    if not names:
+        raise ConfigError("--search needs at least one parameter")
+    return [_dimension(name, start) for name in dict.fromkeys(names)]
+
+
+class Search:
+    """A search of ``tries`` steps. Ask for parameters, try them, tell how that went.
+
+    ``told`` counts the steps that were made, ``best`` is what did best among them, None before the first.
+    """
+
+    def __init__(self, start: Config, names: Sequence[str], tries: int, seed: int) -> None:
+        """The first try is the configuration ``start`` itself, so that the best is never worse.
+        Raises ConfigError for names that cannot be searched, and if Optuna is not installed."""
+        self.start, self.tries, self.told = start, tries, 0
+        self.best: Config | None = None
+        self.best_log_likelihood = -math.inf
+        self._dimensions = dimensions(names, start)
+        optuna = _optuna()
+        optuna.logging.set_verbosity(optuna.logging.ERROR)
+        self._failed = optuna.trial.TrialState.FAIL
+        self._study = optuna.create_study(
+            direction="maximize", sampler=optuna.samplers.TPESampler(seed=seed, multivariate=True)
+        )
+        self._study.enqueue_trial({each.name: _value_of(start, each) for each in self._dimensions})
+        self._asked: tuple[Any, Config] | None = None
+
+    @property
+    def done(self) -> bool:
+        """Whether all tries were made."""
+        return self.told >= self.tries
+
+    def ask(self) -> Config:
+        """What to try next; the same until :meth:`tell`."""
+        while self._asked is None:
+            trial = self._study.ask()
+            config = self.start
+            try:
+                for each in self._dimensions:
+                    config = _with_value(config, each, _suggest(trial, each), self.start)
+            except ConfigError:  # parameters that each are in range may contradict each other
+                self._study.tell(trial, state=self._failed)
+            else:
+                self._asked = trial, config
+        return self._asked[1]
+
+    def tell(self, log_likelihood: float) -> None:
+        """How the last one did; NaN if it could not be mapped or judged."""
+        assert self._asked is not None
+        (trial, config), self._asked = self._asked, None
+        self.told += 1
+        if math.isfinite(log_likelihood):
+            self._study.tell(trial, log_likelihood)
+            if log_likelihood > self.best_log_likelihood:
+                self.best, self.best_log_likelihood = config, log_likelihood
+        else:
+            self._study.tell(trial, state=self._failed)
+
+
+def require_optuna() -> None:
+    """Raises ConfigError if Optuna is not installed."""
+    _optuna()
+
+
+def _optuna() -> Any:
+    try:
+        return importlib.import_module("optuna")
+    except ImportError as error:
+        raise ConfigError("--auto needs Optuna: pip install 'taichi-mrf[auto]'") from error
+
+
+def _dimension(name: str, start: Config) -> Dimension:
+    if name == SIGMA_SCALE:
+        if start.sensor.sigma_table is not None:
+            raise ConfigError(f"{name} scales sensor.sigma, but sensor.sigma_table is in force")
+        return Dimension(name, SIGMA_SCALES.least, SIGMA_SCALES.most, log=True)
+    knob = _knob(name)
+    if not knob.applies(start):
+        raise ConfigError(f"--search {name}: changes nothing with the other parameters as they are")
+    if knob.range is None:
+        return Dimension(name, choices=_choices(knob))
+    least, most = knob.range.least, knob.range.most
+    if knob.decades:
+        return Dimension(name, 10.0**least, 10.0**most, log=True)
+    whole = knob.parameter.hint is int
+    return Dimension(name, least, most, log=name in LOGARITHMIC, whole=whole)
+
+
+def _knob(name: str) -> Knob:
+    knob = next((each for each in KNOBS if each.name == name), None)
+    if knob is None:
+        known = ", ".join([each.name for each in KNOBS] + [SIGMA_SCALE])
+        raise ConfigError(f"--search {name}: cannot be searched; those that can be are: {known}")
+    return knob
+
+
+def _choices(knob: Knob) -> tuple[Scalar, ...]:
+    if get_origin(knob.parameter.hint) is Literal:
+        return get_args(knob.parameter.hint)
+    return False, True
+
+
+def _suggest(trial: Any, dimension: Dimension) -> Scalar:
+    if dimension.choices:
+        chosen: Scalar = trial.suggest_categorical(dimension.name, dimension.choices)
+    elif dimension.whole:
+        chosen = trial.suggest_int(dimension.name, int(dimension.least), int(dimension.most))
+    else:
+        value = trial.suggest_float(dimension.name, dimension.least, dimension.most, log=dimension.log)
+        chosen = _rounded(value)
+    return chosen
+
+
+def _value_of(config: Config, dimension: Dimension) -> Scalar:
+    """Where the search begins, brought into the range."""
+    if dimension.name == SIGMA_SCALE:
+        return 1.0
+    value: Scalar = _knob(dimension.name).value_of(config)
+    if dimension.choices:
+        return value
+    within = min(max(float(value), dimension.least), dimension.most)
+    return int(within) if dimension.whole else within
+
+
+def _with_value(config: Config, dimension: Dimension, value: Scalar, start: Config) -> Config:
+    if dimension.name == SIGMA_SCALE:
+        scale = float(value)
+        sigma = start.sensor.sigma if scale == 1 else tuple(_rounded(scale * c) for c in start.sensor.sigma)
+        return dataclasses.replace(config, sensor=dataclasses.replace(config.sensor, sigma=sigma))
+    return _knob(dimension.name).parameter.replaced(config, value)
+
+
+def _rounded(value: float) -> float:
+    """To four digits: more mean nothing, and nobody can read them."""
+    return float(f"{value:.4g}")

@@ -1,0 +1,290 @@
+"""A tuning session: parameters come from a person or from the search, maps and scores go to the page.
+
+One thread does all of it, because Taichi has one owner. A try is made in two passes, of some of the pixels
+first and then of all, and between two keyframes requests are heard: parameters that are newer than those
+being tried end the try at once, so what is worked on is never older than the last touch of a slider.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from taichi_mrf import runtime
+from taichi_mrf.config import Config
+from taichi_mrf.datasets import Dataset
+from taichi_mrf.errors import ConfigError, TaichiMRFError
+from taichi_mrf.live.link import Link
+from taichi_mrf.tune.files import csv_file, yaml_file
+from taichi_mrf.tune.held_out_pictures import HeldOutPictures
+from taichi_mrf.tune.history import Attempt, History
+from taichi_mrf.tune.map_publisher import MapPublisher
+from taichi_mrf.tune.residuals import residuals_of
+from taichi_mrf.tune.search import Search
+from taichi_mrf.tune.trial import Trial, run_trial
+from taichi_mrf.tune.verdict import Judged, contenders, judge_unseen
+from taichi_mrf.tune.working_set import WorkingSet, coarse_stride, read_working_set
+from taichi_mrf.viewer.messages import File, Listening, Notice, Quit, Request
+from taichi_mrf.viewer.tune_messages import (
+    Activity,
+    By,
+    ChooseFrames,
+    Chosen,
+    FrameChoice,
+    LookAt,
+    Pin,
+    Pinned,
+    SaveTries,
+    StopSearch,
+    Try,
+    Tuning,
+)
+
+WAIT_SECONDS = 0.25
+"""So long at most it takes until a signal is noticed while there is nothing to do."""
+
+
+@dataclass(frozen=True)
+class Policy:
+    """What a session does by itself. ``out``: folder for the files that a user saves. ``search_stride``: the
+    automatic search looks at every so many-th pixel, 0 for that of a first look. ``leave_when_done``: end
+    with the search."""
+
+    out: Path | None = None
+    search_stride: int = 0
+    leave_when_done: bool = False
+
+
+class TuneSession:
+    """Works on one sequence. ``history`` holds all tries; ``frames`` is the working set."""
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        config: Config,
+        choice: FrameChoice,
+        link: Link,
+        policy: Policy,
+        *,
+        search: Search | None = None,
+        listening: Callable[[Listening], None] = lambda where: None,
+        tried: Callable[[Attempt], None] = lambda attempt: None,
+    ) -> None:
+        """Reads the working set and tells the page of it. ``search`` is carried out at first. ``listening``
+        is called when the viewer says where its page is, ``tried`` after each try.
+        Raises TaichiMRFError."""
+        self._dataset, self._config, self._link, self._policy = dataset, config, link, policy
+        self.search, self._tried = search, tried
+        self.verdict: list[Judged] = []
+        self._ended, self._view = False, 0
+        self._should_stop: Callable[[], bool] = lambda: False
+        self._ways: dict[type, Callable[[Any], None]] = {
+            Listening: listening,
+            Try: self._want,
+            Pin: self._pin,
+            LookAt: self._look_at,
+            ChooseFrames: self._choose_frames,
+            SaveTries: self._save,
+            StopSearch: lambda request: self._stop_search(),
+            Quit: lambda request: self._quit(),
+        }
+        self._begin(choice)
+
+    def run(self, should_stop: Callable[[], bool]) -> None:
+        """Work until told to stop: by ``should_stop``, by the viewer, or because the link is lost."""
+        self._should_stop = should_stop
+        while not self._is_over():
+            self._hear()
+            if self._is_over():
+                return
+            if self._wanted is not None:
+                self._guarded(self._try_wanted)
+            elif self.search is not None and not self.search.done:
+                self._guarded(self._search_once)
+            elif self.search is not None and self.search.best is not None and not self._is_judged:
+                self._guarded(self._judge_found)
+            elif self._policy.leave_when_done:
+                return
+            else:
+                self._link.send(Activity("waiting: all scores are up to date", 1.0, busy=False))
+                self._link.wait(WAIT_SECONDS)
+
+    def _begin(self, choice: FrameChoice) -> None:
+        """Start on a working set, with an empty table; what is raised leaves the old one in place."""
+        self.frames: WorkingSet = read_working_set(self._dataset, choice, keep_unseen=self.search is not None)
+        self.history = History(self.frames.source)
+        self._pictures = HeldOutPictures(self.frames.held_out)
+        self._publisher = MapPublisher(self.frames.source, self._link)
+        self._current: int | None = None
+        self._coarse = coarse_stride(self.frames.camera)
+        self._is_judged = self.search is None
+        self._newer = 0
+        self._wanted: tuple[Config, By] | None = (self._config, "start")
+        backend = runtime.choice()
+        self._link.send(
+            Tuning(
+                source=self.frames.source,
+                backend=backend.name if backend else "",
+                device=backend.device if backend else "",
+                config=self._config,
+                choice=self.frames.choice,
+                frames=len(self._dataset),
+                training=tuple(frame.name for frame in self.frames.training),
+                held_out=tuple(frame.name for frame in self.frames.held_out),
+                unseen=tuple(frame.name for frame in self.frames.unseen),
+            )
+        )
+        for problem in (*self._dataset.notes, *self.frames.skipped):
+            self._link.send(Notice(problem, "warning"))
+
+    def _is_over(self) -> bool:
+        return self._should_stop() or self._ended or self._link.lost is not None
+
+    def _hear(self) -> None:
+        for request in self._link.requests():
+            self._carry_out(request)
+
+    def _carry_out(self, request: Request) -> None:
+        self._guarded(lambda: self._ways[type(request)](request))
+
+    def _guarded(self, work: Callable[[], None]) -> None:
+        """Do some work; what goes wrong with one try or one request becomes a notice."""
+        try:
+            work()
+        except TaichiMRFError as error:
+            self._link.send(Notice(" ".join(str(error).split()), "error"))
+
+    def _want(self, request: Try) -> None:
+        self._wanted = request.config, "hand"
+        self._newer += 1
+
+    def _go_on(self) -> Callable[[str, float], bool]:
+        """Whether a try that begins now is still wanted."""
+        began_with = self._newer
+
+        def go_on(activity: str, share: float) -> bool:
+            prefix = "" if self.search is None or self.search.done else f"{self._search_text()}: "
+            self._link.send(Activity(prefix + activity, share, busy=True))
+            self._hear()
+            return self._newer == began_with and not self._is_over()
+
+        return go_on
+
+    def _try_wanted(self) -> None:
+        """Both passes of what was asked for last."""
+        assert self._wanted is not None
+        (config, by), self._wanted = self._wanted, None
+        for pixel_stride in dict.fromkeys((self._coarse, 1)):
+            trial = run_trial(config, self.frames, pixel_stride=pixel_stride, go_on=self._go_on())
+            if trial is None:
+                return
+            attempt = self._note(trial, by)
+            if pixel_stride == 1:
+                self._config = config
+                self._show(trial, attempt)
+
+    def _search_once(self) -> None:
+        """One step of the search. Abandoned for a person's wish, it is made again afterwards."""
+        assert self.search is not None
+        config, stride = self.search.ask(), self._policy.search_stride or self._coarse
+        try:
+            trial = run_trial(config, self.frames, pixel_stride=stride, go_on=self._go_on())
+        except TaichiMRFError:
+            self.search.tell(float("nan"))
+            raise
+        if trial is None:
+            return
+        self.search.tell(trial.scores.log_likelihood)
+        attempt = self._note(trial, "search")
+        if self.search.best == config:
+            self._show(trial, attempt)
+        if self.search.done:
+            self._show_found()
+
+    def _show_found(self) -> None:
+        """Map with what the search has found, with all pixels."""
+        assert self.search is not None
+        if self.search.best is not None:
+            self._wanted = self.search.best, "search"
+
+    def _stop_search(self) -> None:
+        if self.search is not None and not self.search.done:
+            self.search.tries = self.search.told
+            self._newer += 1
+            self._show_found()
+
+    def _judge_found(self) -> None:
+        """Once, after the search: what it was worth on the views that were kept back."""
+        assert self.search is not None
+        assert self.search.best is not None
+        compared = contenders(self.search.start, self.search.best)
+        judged = judge_unseen(self.frames, compared, self._go_on())
+        if judged is None:
+            return
+        self._is_judged, self.verdict = True, judged
+        gain = judged[-1].scores.log_likelihood - judged[0].scores.log_likelihood
+        right = judged[-1].scores.accuracy_sigma - judged[0].scores.accuracy_sigma
+        self._link.send(
+            Notice(
+                f"The search has ended. On {len(self.frames.unseen)} views that were never looked at before, "
+                f"what it found changes the log-likelihood by {gain:+.3f} and the share of right pixels "
+                f"(1.5 sigma) by {100 * right:+.1f} points against the shipped defaults."
+            )
+        )
+
+    def _search_text(self) -> str:
+        assert self.search is not None
+        return f"search, {self.search.told + 1} of {self.search.tries}"
+
+    def _note(self, trial: Trial, by: By) -> Attempt:
+        """Enter a try into the table, and tell of it."""
+        attempt = self.history.note(trial.config, trial.scores, by)
+        self._pictures.keep(attempt.number, trial.views, trial.scores.pixel_stride, self.history.pinned)
+        self._link.send(attempt.message())
+        if attempt.number == self.history.pinned:
+            self._link.send(Pinned(self.history.pinned))
+        if by != "search" and trial.scores.pixel_stride == self._coarse:  # once is enough
+            for text in trial.warnings:
+                self._link.send(Notice(text, "warning"))
+        self._tried(attempt)
+        return attempt
+
+    def _show(self, trial: Trial, attempt: Attempt) -> None:
+        """Let map, plot and pictures be those of a try."""
+        self._current = attempt.number
+        self._link.send(Chosen(attempt.number, attempt.config))
+        self._publisher.show(trial)
+        self._link.send(residuals_of(attempt.number, trial.views))
+        self._send_pictures()
+
+    def _send_pictures(self) -> None:
+        if self._current is not None:
+            shown = self._pictures.show(self._view, self._current, self.history)
+            if shown is not None:
+                self._link.send(shown)
+
+    def _pin(self, request: Pin) -> None:
+        self.history.pin(request.number)
+        self._link.send(Pinned(self.history.pinned))
+        self._send_pictures()
+
+    def _look_at(self, request: LookAt) -> None:
+        if not 0 <= request.view < len(self.frames.held_out):
+            raise ConfigError(f"there is no held-out view {request.view}")
+        self._view = request.view
+        self._send_pictures()
+
+    def _choose_frames(self, request: ChooseFrames) -> None:
+        if self.search is not None:
+            raise ConfigError("the frames stay those of the search: start anew, without --auto, for others")
+        self._begin(request.choice)
+
+    def _save(self, request: SaveTries) -> None:
+        make = yaml_file if request.kind == "yaml" else csv_file
+        name, text = make(self.history, request.number, self._policy.out)
+        self._link.send(File(name, text.encode(), request.client))
+        if self._policy.out is not None:
+            self._link.send(Notice(f"{name} is in {self._policy.out}"))
+
+    def _quit(self) -> None:
+        self._ended = True

@@ -1,0 +1,144 @@
+"""One try: parameters in, a fresh map of the training frames out, and its scores on the held-out ones."""
+
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.config import Config
+from taichi_mrf.evaluation.accuracy import JudgedView, judge_view
+from taichi_mrf.evaluation.depth_error import pooled_depth_error
+from taichi_mrf.frame import Frame
+from taichi_mrf.keyframes import KeyframeSelector
+from taichi_mrf.maps.create import create_map
+from taichi_mrf.maps.protocol import OccupancyMap
+from taichi_mrf.tune.depth_intervals import interval_error, probability_below
+from taichi_mrf.tune.voxel_truth import VoxelTruth
+from taichi_mrf.tune.working_set import WorkingSet, thinned
+from taichi_mrf.viewer.tune_scores import Scores
+
+INTERVAL_PIXELS = 5_000
+"""Measurements of a view that the calibration of depths is worked out from."""
+
+GoOn = Callable[[str, float], bool]
+"""Asked between two keyframes: told what is being done and how much of it is (0 to 1), it says whether the
+try is still wanted."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A try that ran to its end: its map, the held-out views as they were judged, and what the map had to
+    say of the parameters."""
+
+    config: Config
+    map: OccupancyMap
+    views: tuple[JudgedView, ...]
+    scores: Scores
+    warnings: tuple[str, ...]
+
+
+def run_trial(
+    config: Config,
+    frames: WorkingSet,
+    *,
+    pixel_stride: int = 1,
+    judged: Sequence[Frame] | None = None,
+    go_on: GoOn = lambda activity, share: True,
+) -> Trial | None:
+    """Map the training frames with some parameters and judge the map; None if it was abandoned.
+
+    Of the training frames those are mapped that the configuration's thresholds take for keyframes. With
+    ``pixel_stride`` only every so many-th pixel along both sides is mapped and judged. ``judged`` are the
+    frames that score, the held-out ones by default. Raises what the map raises, TaichiMRFError among it.
+    """
+    judged = frames.held_out if judged is None else judged
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        begin = time.perf_counter()
+        m = _build(config, frames, pixel_stride, go_on)
+        if m is None:
+            return None
+        seconds = time.perf_counter() - begin
+    views: list[JudgedView] = []
+    below: list[NDArray[np.float32]] = []
+    for number, frame in enumerate(judged):
+        if not go_on(f"judging {frame.name}", number / len(judged)):
+            return None
+        view = judge(m, frame, pixel_stride)
+        views.append(view)
+        below.append(_probability_below(m, view, frame))
+    truth = frames.truth if pixel_stride == 1 else None
+    scores = _score(m, views, below, seconds, pixel_stride, truth)
+    said = tuple(dict.fromkeys(str(each.message) for each in caught if each.category is UserWarning))
+    return Trial(config, m, tuple(views), scores, said)
+
+
+def judge(m: OccupancyMap, frame: Frame, pixel_stride: int = 1) -> JudgedView:
+    """A frame followed through the map, with the noise that the map believes in. Raises FrameError if it
+    holds no measurement in the sensor's range."""
+    depth_m = thinned(frame, pixel_stride).depth_m
+    return judge_view(m, depth_m, frame.T_world_camera, frame.camera, noise=m.noise)
+
+
+def _build(config: Config, frames: WorkingSet, pixel_stride: int, go_on: GoOn) -> OccupancyMap | None:
+    m = create_map(config, frames.camera)
+    selector = KeyframeSelector(config.keyframes)
+    for number, frame in enumerate(frames.training):
+        if not go_on(f"adding {frame.name}", number / len(frames.training)):
+            return None
+        if selector.wants(frame.T_world_camera):
+            selector.accept(frame.T_world_camera)
+            image = thinned(frame, pixel_stride)
+            m.add_keyframe(image.depth_m, frame.T_world_camera, frame.camera, frame.name)
+    report = m.infer(
+        progress=lambda step: go_on(
+            f"sweep {step.sweep} of {step.sweeps}",
+            ((step.sweep - 1) * step.keyframes + step.keyframe) / (step.sweeps * step.keyframes),
+        )
+    )
+    return m if report.complete else None
+
+
+def _probability_below(m: OccupancyMap, view: JudgedView, frame: Frame) -> NDArray[np.float32]:
+    """Of some of a view's measurements, evenly spread over its rows."""
+    pixels = np.flatnonzero(view.measured_m)
+    some = np.zeros_like(view.measured_m)
+    kept = pixels[:: max(1, len(pixels) // INTERVAL_PIXELS)]
+    some.flat[kept] = view.measured_m.flat[kept]
+    return probability_below(m.view, some, frame.T_world_camera, frame.camera, view.noise, view.max_depth)
+
+
+def _score(
+    m: OccupancyMap,
+    views: Sequence[JudgedView],
+    below: Sequence[NDArray[np.float32]],
+    seconds: float,
+    pixel_stride: int,
+    truth: VoxelTruth | None,
+) -> Scores:
+    """The figures of all views' pixels together."""
+    pixels = np.array([int(view.judged.sum()) for view in views])
+
+    def pooled(of_view: Callable[[JudgedView], float]) -> float:
+        return float(np.average([of_view(view) for view in views], weights=pixels))
+
+    error = pooled_depth_error((view.answer_m, view.depth_m) for view in views)
+    statistics = m.statistics()
+    return Scores(
+        accuracy_voxel=pooled(lambda view: view.accuracy("voxel").score),
+        accuracy_sigma=pooled(lambda view: view.accuracy("1.5sigma").score),
+        accuracy_5cm=pooled(lambda view: view.accuracy("5cm").score),
+        unanswered=pooled(lambda view: view.accuracy("5cm").unanswered),
+        median_abs_m=error.median_abs,
+        rms_m=error.rms,
+        log_likelihood=pooled(JudgedView.log_likelihood),
+        depth_calibration=interval_error(below),
+        voxel_calibration=float("nan") if truth is None else truth.calibration_error(m),
+        seconds=seconds,
+        voxels=statistics.voxels,
+        keyframes=statistics.keyframes,
+        pixel_stride=pixel_stride,
+    )

@@ -1,0 +1,113 @@
+"""The few frames of a sequence that parameters are tuned on, and who among them does what.
+
+Training frames make the map, held-out frames score it, and unseen frames, which an automatic search keeps
+back, say at the end whether what was found holds for views that nobody has tuned on.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.datasets import Dataset
+from taichi_mrf.errors import ConfigError, DatasetError, FrameError
+from taichi_mrf.frame import Frame
+from taichi_mrf.pipeline import is_held_out
+from taichi_mrf.tune.voxel_truth import VoxelTruth, truth_of
+from taichi_mrf.viewer.tune_messages import FrameChoice
+
+LARGEST_STRIDE = 10
+"""Frames that are further apart in a recording may not see each other's surfaces any more."""
+
+FIRST_LOOK_COLUMNS = 160
+
+
+@dataclass(frozen=True)
+class WorkingSet:
+    """Frames in memory. ``choice`` is what was asked for, with the stride that was taken; ``skipped`` names
+    the frames that could not be read, and why; ``truth`` is what is known of the scene, if it is."""
+
+    source: str
+    camera: PinholeCamera
+    choice: FrameChoice
+    training: tuple[Frame, ...]
+    held_out: tuple[Frame, ...]
+    unseen: tuple[Frame, ...] = ()
+    skipped: tuple[str, ...] = ()
+    truth: VoxelTruth | None = None
+
+
+def read_working_set(dataset: Dataset, choice: FrameChoice, keep_unseen: bool = False) -> WorkingSet:
+    """Read the chosen frames; with ``keep_unseen`` every second held-out frame is kept back.
+
+    A broken frame is left out. Raises DatasetError for a source that never ends and one without frames to
+    train on and to hold out, ConfigError for a choice that lies outside the sequence.
+    """
+    if dataset.endless:
+        raise DatasetError(
+            f"{dataset.name}: parameters are tuned on frames that can be read again: record it"
+        )
+    choice = _settled(choice, len(dataset))
+    indices = range(choice.first, len(dataset), choice.stride)[: choice.count]
+    roles: dict[str, list[tuple[int, Frame]]] = {"training": [], "held_out": [], "unseen": []}
+    skipped, held_out = [], 0
+    for number, index in enumerate(indices, start=1):
+        role = "training"
+        if is_held_out(number, choice.hold_out):
+            role = "unseen" if keep_unseen and held_out % 2 else "held_out"
+            held_out += 1
+        try:
+            frame = dataset.read(index)
+        except FrameError as error:
+            skipped.append(str(error))
+            continue
+        if (frame.depth_m > 0).any():
+            roles[role].append((index, frame))
+    for role, wanted in (("training", True), ("held_out", True), ("unseen", keep_unseen)):
+        if wanted and not roles[role]:
+            found = f"; the first that is broken: {skipped[0]}" if skipped else ""
+            raise DatasetError(
+                f"{dataset.name}: no {role.replace('_', '-')} frame among the {len(indices)} chosen{found}"
+            )
+    frames = {role: tuple(frame for _, frame in found) for role, found in roles.items()}
+    truth = truth_of(dataset, [index for index, _ in roles["training"]])
+    return WorkingSet(
+        dataset.name,
+        dataset.camera,
+        choice,
+        frames["training"],
+        frames["held_out"],
+        frames["unseen"],
+        tuple(skipped),
+        truth,
+    )
+
+
+def coarse_stride(camera: PinholeCamera) -> int:
+    """Every so many-th pixel along both sides is enough for a first look: about 160 columns."""
+    return max(1, camera.width // FIRST_LOOK_COLUMNS)
+
+
+def thinned(frame: Frame, pixel_stride: int) -> Frame:
+    """The frame with every ``pixel_stride``-th pixel along both sides; the others measure nothing.
+
+    The camera stays as it is, and so does the patch of a noise table that a pixel belongs to.
+    """
+    if pixel_stride == 1:
+        return frame
+    kept = np.zeros_like(frame.depth_m)
+    some = np.s_[pixel_stride // 2 :: pixel_stride, pixel_stride // 2 :: pixel_stride]
+    kept[some] = frame.depth_m[some]
+    # A frame of a few pixels only may have measured something between those.
+    return dataclasses.replace(frame, depth_m=kept) if (kept > 0).any() else frame
+
+
+def _settled(choice: FrameChoice, frames: int) -> FrameChoice:
+    """The choice with a stride: by default frames are spread evenly, but not too far apart."""
+    if not 0 <= choice.first < frames:
+        raise ConfigError(f"the first frame must lie between 0 and {frames - 1}, not {choice.first}")
+    if choice.stride > 0:
+        return choice
+    spread = max(1, min(LARGEST_STRIDE, (frames - choice.first) // choice.count))
+    return dataclasses.replace(choice, stride=spread)

@@ -1,0 +1,40 @@
+"""``--json``: the same facts for programs, and nothing else on stdout."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+SMALL = "synthetic:room?frames=3&width=80&height=60"
+
+
+def said(*arguments: str | Path) -> Any:
+    done = subprocess.run(
+        [sys.executable, "-m", "taichi_mrf", *map(str, arguments), "--json"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_a_map_and_what_was_mapped(tmp_path: Path) -> None:
+    report = said(
+        "map", SMALL, "--out", tmp_path, "--voxel-size", "0.1", "--no-pictures", "--runtime.arch", "cpu"
+    )
+    assert report == json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
+    facts = said("info", SMALL, "--arch", "cpu")
+    assert (facts["frames"], facts["camera"]["width"], facts["format"]) == (3, 80, "synthetic:room")
+
+
+def test_a_floor_map(tmp_path: Path) -> None:
+    source = "synthetic:floor-plan?scans=20&beams=31"
+    report = said("laser", source, "--out", tmp_path, "--iterations", "3", "--runtime.arch", "cpu")
+    assert report == json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
+
+
+def test_the_backends() -> None:
+    facts = said("info", "--arch", "cpu")
+    assert facts["backend"] == "cpu"
+    assert set(facts["backends"]) == {"cpu", "vulkan", "cuda"}
+    assert facts["versions"]["taichi"].startswith("1.7")
