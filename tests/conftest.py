@@ -13,6 +13,9 @@ from hypothesis import HealthCheck, settings
 from taichi_mrf import runtime
 from taichi_mrf.errors import BackendError
 
+SETTINGS_OF_A_TEST = "_hypothesis_internal_use_settings"
+"""Where hypothesis keeps what @settings said; it has no public way to ask."""
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 # Kernels compile inside the first example and machines are shared: nothing here is held to a time.
@@ -34,6 +37,19 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     used = [item for item in items if "backend" in getattr(item, "fixturenames", ())]
     config.hook.pytest_deselected(items=[item for item in items if item not in used])
     items[:] = used
+    if config.getoption("--arch") == "vulkan":
+        for item in items:
+            _take_fewer_examples(item)
+
+
+def _take_fewer_examples(item: pytest.Item) -> None:
+    """A software device takes seconds for what a CPU does at once, and a maker of maps needs a dozen kernels
+    for each example: a third of the CPU's examples shows whether kernels do the same there."""
+    test = getattr(item, "obj", None)
+    chosen: settings | None = getattr(test, SETTINGS_OF_A_TEST, None)
+    if chosen is not None:
+        fewer = settings(chosen, max_examples=max(3, chosen.max_examples // 3))
+        setattr(getattr(test, "__func__", test), SETTINGS_OF_A_TEST, fewer)
 
 
 @pytest.fixture(scope="session")
