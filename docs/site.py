@@ -36,7 +36,8 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
         markdown = re.sub(rf"\]\((?:\.\./)?{re.escape(source)}(#[^)]*)?\)", rf"]({page}\1)", markdown)
     markdown = re.sub(r"\]\((?:\.\./)?docs/\)", "](architecture.md)", markdown)
     markdown = re.sub(r"\]\((?:\.\./)?docs/([^)]+)\)", r"](\1)", markdown)
-    return re.sub(r"\[([^\]]+)\]\((?:\.\./)?(LICENSE|examples/[^)]*|configs/[^)]*)\)", r"\1", markdown)
+    elsewhere = r"(?:LICENSE|(?:examples|configs|taichi_mrf)/)[^)]*"
+    return re.sub(rf"\[([^\]]+)\]\((?:\.\./)?{elsewhere}\)", r"\1", markdown)
 
 
 def parameters_page() -> str:

@@ -13,8 +13,8 @@ from typing import Any, Literal, get_args, get_type_hints
 
 import yaml
 
-from taichi_mrf.config_values import from_dict, read_yaml
-from taichi_mrf.errors import ConfigError
+from taichi_mrf.config_poses import KeyframeConfig, PoseConfig
+from taichi_mrf.config_values import check_field, from_dict, read_yaml
 
 Arch = Literal["auto", "cuda", "vulkan", "cpu"]
 Method = Literal["mrf", "log_odds", "visibility"]
@@ -48,13 +48,13 @@ class SensorConfig:
     """Rays end here (metres); a measurement beyond says only that the space up to here is free."""
 
     def __post_init__(self) -> None:
-        _check(len(self.sigma) >= 1, "sensor.sigma", "needs at least one coefficient")
-        _check(all(map(math.isfinite, self.sigma)), "sensor.sigma", "holds a value that is not finite")
-        _check(len(self.bias) >= 1, "sensor.bias", "needs at least one coefficient")
-        _check(all(map(math.isfinite, self.bias)), "sensor.bias", "holds a value that is not finite")
-        _check(self.patch >= 1, "sensor.patch", "must be at least 1 pixel")
-        _check(self.min_depth >= 0, "sensor.min_depth", "must not be negative")
-        _check(self.max_depth > self.min_depth, "sensor.max_depth", "must be more than sensor.min_depth")
+        check_field(len(self.sigma) >= 1, "sensor.sigma", "needs at least one coefficient")
+        check_field(all(map(math.isfinite, self.sigma)), "sensor.sigma", "holds a value that is not finite")
+        check_field(len(self.bias) >= 1, "sensor.bias", "needs at least one coefficient")
+        check_field(all(map(math.isfinite, self.bias)), "sensor.bias", "holds a value that is not finite")
+        check_field(self.patch >= 1, "sensor.patch", "must be at least 1 pixel")
+        check_field(self.min_depth >= 0, "sensor.min_depth", "must not be negative")
+        check_field(self.max_depth > self.min_depth, "sensor.max_depth", "must be more than sensor.min_depth")
 
 
 @dataclass(frozen=True)
@@ -123,21 +123,21 @@ class InferenceConfig:
     def __post_init__(self) -> None:
         for name in ("method", "likelihood", "average", "message_precision"):
             choices = get_args(get_type_hints(type(self))[name])
-            _check(
+            check_field(
                 getattr(self, name) in choices, f"inference.{name}", f"must be one of {', '.join(choices)}"
             )
-        _check(self.sweeps >= 0, "inference.sweeps", "must not be negative")
-        _check(0 <= self.tolerance <= 1, "inference.tolerance", "must lie between 0 and 1")
-        _check(0 <= self.damping < 1, "inference.damping", "must be at least 0 and less than 1")
-        _check(self.surface_density > 0, "inference.surface_density", "must be positive")
-        _check(self.prior is None or 0 < self.prior < 1, "inference.prior", "must lie between 0 and 1")
-        _check(self.outlier_floor >= 0, "inference.outlier_floor", "must not be negative")
-        _check(self.end_sigmas > 0, "inference.end_sigmas", "must be positive")
-        _check(self.rays_per_voxel >= 0, "inference.rays_per_voxel", "must not be negative")
-        _check(self.min_length >= 0, "inference.min_length", "must not be negative")
-        _check(0 < self.message_clamp <= 30, "inference.message_clamp", "must lie between 0 and 30")
-        _check(0 < self.cavity_clamp <= 60, "inference.cavity_clamp", "must lie between 0 and 60")
-        _check(0 <= self.free_share <= 1, "inference.free_share", "must lie between 0 and 1")
+        check_field(self.sweeps >= 0, "inference.sweeps", "must not be negative")
+        check_field(0 <= self.tolerance <= 1, "inference.tolerance", "must lie between 0 and 1")
+        check_field(0 <= self.damping < 1, "inference.damping", "must be at least 0 and less than 1")
+        check_field(self.surface_density > 0, "inference.surface_density", "must be positive")
+        check_field(self.prior is None or 0 < self.prior < 1, "inference.prior", "must lie between 0 and 1")
+        check_field(self.outlier_floor >= 0, "inference.outlier_floor", "must not be negative")
+        check_field(self.end_sigmas > 0, "inference.end_sigmas", "must be positive")
+        check_field(self.rays_per_voxel >= 0, "inference.rays_per_voxel", "must not be negative")
+        check_field(self.min_length >= 0, "inference.min_length", "must not be negative")
+        check_field(0 < self.message_clamp <= 30, "inference.message_clamp", "must lie between 0 and 30")
+        check_field(0 < self.cavity_clamp <= 60, "inference.cavity_clamp", "must lie between 0 and 60")
+        check_field(0 <= self.free_share <= 1, "inference.free_share", "must lie between 0 and 1")
 
 
 @dataclass(frozen=True)
@@ -170,11 +170,11 @@ class LogOddsConfig:
     """Take the sensor's known bias out of the measurements first."""
 
     def __post_init__(self) -> None:
-        _check(0.5 < self.hit < 1, "log_odds.hit", "must lie between 0.5 and 1")
-        _check(0 < self.miss < 0.5, "log_odds.miss", "must lie between 0 and 0.5")
-        _check(0 < self.lowest < 0.5, "log_odds.lowest", "must lie between 0 and 0.5")
-        _check(0.5 < self.highest < 1, "log_odds.highest", "must lie between 0.5 and 1")
-        _check(self.max_range >= 0, "log_odds.max_range", "must not be negative")
+        check_field(0.5 < self.hit < 1, "log_odds.hit", "must lie between 0.5 and 1")
+        check_field(0 < self.miss < 0.5, "log_odds.miss", "must lie between 0 and 0.5")
+        check_field(0 < self.lowest < 0.5, "log_odds.lowest", "must lie between 0 and 0.5")
+        check_field(0.5 < self.highest < 1, "log_odds.highest", "must lie between 0.5 and 1")
+        check_field(self.max_range >= 0, "log_odds.max_range", "must not be negative")
 
 
 @dataclass(frozen=True)
@@ -213,34 +213,13 @@ class VisibilityConfig:
 
     def __post_init__(self) -> None:
         for name in ("hit_if_free", "hit_if_occupied", "hit_if_hidden"):
-            _check(0 < getattr(self, name) < 1, f"visibility.{name}", "must lie between 0 and 1")
+            check_field(0 < getattr(self, name) < 1, f"visibility.{name}", "must lie between 0 and 1")
         for name in ("visible_if_occluded", "visible_if_clear", "q_min", "q_max"):
-            _check(0 <= getattr(self, name) <= 1, f"visibility.{name}", "must lie from 0 to 1")
-        _check(self.q_min < self.q_max, "visibility.q_max", "must be more than visibility.q_min")
-        _check(0 < self.lowest < 0.5, "visibility.lowest", "must lie between 0 and 0.5")
-        _check(0.5 < self.highest < 1, "visibility.highest", "must lie between 0.5 and 1")
-        _check(self.max_range >= 0, "visibility.max_range", "must not be negative")
-
-
-@dataclass(frozen=True)
-class KeyframeConfig:
-    """Which frames become keyframes (section V): those that have moved enough."""
-
-    rotation: float = 0.0
-    """A frame that is rotated by more than this (radians, tangent norm) becomes a keyframe; 0 means that
-    rotation does not count."""
-
-    translation: float = 0.0
-    """A frame that is translated by more than this (metres) becomes a keyframe; 0 means that translation
-    does not count. With both at 0 every frame is a keyframe."""
-
-    against: Literal["last", "all"] = "last"
-    """Compare with the last keyframe, as in the paper, or with all earlier ones, so that a place that is
-    visited again adds nothing."""
-
-    def __post_init__(self) -> None:
-        _check(self.rotation >= 0, "keyframes.rotation", "must not be negative")
-        _check(self.translation >= 0, "keyframes.translation", "must not be negative")
+            check_field(0 <= getattr(self, name) <= 1, f"visibility.{name}", "must lie from 0 to 1")
+        check_field(self.q_min < self.q_max, "visibility.q_max", "must be more than visibility.q_min")
+        check_field(0 < self.lowest < 0.5, "visibility.lowest", "must lie between 0 and 0.5")
+        check_field(0.5 < self.highest < 1, "visibility.highest", "must lie between 0.5 and 1")
+        check_field(self.max_range >= 0, "visibility.max_range", "must not be negative")
 
 
 @dataclass(frozen=True)
@@ -264,13 +243,13 @@ class VolumeConfig:
     """A voxel whose log-odds lie nearer than this to the prior counts as unknown."""
 
     def __post_init__(self) -> None:
-        _check((self.lower is None) == (self.upper is None), "volume.lower", "goes with volume.upper")
+        check_field((self.lower is None) == (self.upper is None), "volume.lower", "goes with volume.upper")
         if self.lower is not None and self.upper is not None:
             ok = all(a < b for a, b in zip(self.lower, self.upper, strict=True))
-            _check(ok, "volume.upper", "must lie above volume.lower on every axis")
-        _check(8 <= self.dense_bricks <= 1024, "volume.dense_bricks", "must lie between 8 and 1024")
-        _check(self.memory_limit_gb >= 0, "volume.memory_limit_gb", "must not be negative")
-        _check(self.min_evidence >= 0, "volume.min_evidence", "must not be negative")
+            check_field(ok, "volume.upper", "must lie above volume.lower on every axis")
+        check_field(8 <= self.dense_bricks <= 1024, "volume.dense_bricks", "must lie between 8 and 1024")
+        check_field(self.memory_limit_gb >= 0, "volume.memory_limit_gb", "must not be negative")
+        check_field(self.min_evidence >= 0, "volume.min_evidence", "must not be negative")
 
 
 @dataclass(frozen=True)
@@ -283,7 +262,7 @@ class EvaluationConfig:
 
     def __post_init__(self) -> None:
         ok = self.hold_out == 0 or self.hold_out >= 2
-        _check(ok, "evaluation.hold_out", "must be 0, or at least 2 so that frames are left to map")
+        check_field(ok, "evaluation.hold_out", "must be 0, or at least 2 so that frames are left to map")
 
 
 @dataclass(frozen=True)
@@ -300,7 +279,7 @@ class RuntimeConfig:
     """Let Taichi check array bounds (slow)."""
 
     def __post_init__(self) -> None:
-        _check(self.threads >= 0, "runtime.threads", "must not be negative")
+        check_field(self.threads >= 0, "runtime.threads", "must not be negative")
 
 
 @dataclass(frozen=True)
@@ -328,6 +307,9 @@ class Config:
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     """Which frames become keyframes."""
 
+    poses: PoseConfig = field(default_factory=PoseConfig)
+    """Whether depth may move keyframes whose poses are slightly wrong."""
+
     volume: VolumeConfig = field(default_factory=VolumeConfig)
     """Where the map may be."""
 
@@ -339,12 +321,7 @@ class Config:
 
     def __post_init__(self) -> None:
         ok = math.isfinite(self.voxel_size) and self.voxel_size > 0
-        _check(ok, "voxel_size", f"must be a positive number of metres, not {self.voxel_size}")
-
-
-def _check(ok: bool, name: str, problem: str) -> None:
-    if not ok:
-        raise ConfigError(f"{name} {problem}")
+        check_field(ok, "voxel_size", f"must be a positive number of metres, not {self.voxel_size}")
 
 
 def load(path: str | Path) -> Config:

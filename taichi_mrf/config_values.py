@@ -95,3 +95,9 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
     if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
         raise ConfigError(f"{where} must be of type {hint.__name__}, not {value!r}")
     return float(value) if hint is float else value
+
+
+def check_field(ok: bool, name: str, problem: str) -> None:
+    """Raise ConfigError, which names the field, unless its value is possible."""
+    if not ok:
+        raise ConfigError(f"{name} {problem}")

@@ -11,12 +11,14 @@ from dataclasses import dataclass, field
 
 from taichi_mrf.config import Config
 from taichi_mrf.datasets import Dataset
-from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 from taichi_mrf.frame import Frame
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.keyframes import KeyframeSelector
 from taichi_mrf.maps.create import create_map
+from taichi_mrf.maps.mrf import MRFMap
 from taichi_mrf.maps.protocol import OccupancyMap
+from taichi_mrf.maps.refinement import PoseChange, PoseRefiner
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,18 @@ class KeyframeSwept:
     rays: int
 
 
-Event = FrameEvent | KeyframeSwept
+@dataclass(frozen=True)
+class KeyframeRefined:
+    """One more keyframe was aligned with all others, or left alone: the ``number``-th (from 1) of
+    ``keyframes``."""
+
+    round: int
+    rounds: int
+    number: int
+    keyframes: int
+
+
+Event = FrameEvent | KeyframeSwept | KeyframeRefined
 Listener = Callable[[Event], None]
 
 
@@ -71,7 +84,8 @@ class MappingResult:
 
     ``skipped`` tells for each broken frame by name what is wrong with it, ``held_out`` the dataset
     indices of the frames that were kept out, ``seconds`` the time of each stage. ``interrupted`` is true
-    if the run was told to stop before its end; the map holds everything up to there.
+    if the run was told to stop before its end; the map holds everything up to there. ``poses`` are, if they
+    were refined, the recorded and the refined pose of every keyframe.
     """
 
     map: OccupancyMap
@@ -82,6 +96,7 @@ class MappingResult:
     sweeps: int = 0
     residual: float | None = None
     interrupted: bool = False
+    poses: list[PoseChange] = field(default_factory=list)
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -106,20 +121,26 @@ def map_sequence(
 ) -> MappingResult:
     """Map the frames 0, ``every``, 2 ``every``, ... of a dataset, ``limit`` of them at most.
 
-    All keyframes are added first, then the marginals are inferred. ``should_stop`` is asked between
-    keyframes. A run that it ends makes one sweep over the keyframes there are if it has not yet, so that
-    the map is usable. ``resume_from`` is the map of such a run, of this dataset: its keyframes are kept
-    and the frames after the last of them are added, which ends in the map of an undisturbed run.
+    All keyframes are added first, then the marginals are inferred. With ``config.poses.refine`` each is
+    aligned with those before it as it is added, and all with each other before the marginals are inferred.
+    ``should_stop`` is asked between keyframes. A run that it ends makes one sweep over the keyframes there
+    are if it has not yet, so that the map is usable. ``resume_from`` is the map of such a run, of this
+    dataset: its keyframes are kept and the frames after the last of them are added, which ends in the map
+    of an undisturbed run.
 
     Raises FrameError for a broken frame unless ``skip_bad_frames``, DatasetError if no frame became a
-    keyframe or the map to resume is of another recording, and what the map raises.
+    keyframe or the map to resume is of another recording, ConfigError if poses are to be refined in a map
+    that cannot, and what the map raises.
     """
     start = create_map(config, dataset.camera) if resume_from is None else resume_from
     result = MappingResult(start)
     indices = range(0, len(dataset), every)[:limit]
-    _add_keyframes(result, dataset, indices, config, listener, skip_bad_frames, should_stop)
+    refiner = _refiner(result.map, config)
+    _add_keyframes(result, dataset, indices, config, listener, skip_bad_frames, should_stop, refiner)
     if not result.map.keyframes:
         raise DatasetError(_why_empty(dataset, result))
+    if refiner is not None:
+        _refine(result, refiner, config.poses.rounds, listener, should_stop)
     _infer(result, listener, should_stop)
     return result
 
@@ -132,8 +153,9 @@ def _add_keyframes(
     listener: Listener,
     skip_bad_frames: bool,
     should_stop: Callable[[], bool],
+    refiner: PoseRefiner | None,
 ) -> None:
-    """Allocate every selected frame, without inference."""
+    """Allocate every selected frame, without inference but for what ``refiner`` needs."""
     names = dataset.frame_names
     mapped = {keyframe.name: keyframe for keyframe in result.map.keyframes.values()}
     foreign = mapped.keys() - set(names)
@@ -143,6 +165,8 @@ def _add_keyframes(
     last_mapped = -1
     for index in indices:
         if names[index] in mapped:
+            if refiner is not None:
+                refiner.know(names[index], dataset.read(index).T_world_camera)
             selector.accept(mapped[names[index]].T_world_camera)
             last_mapped = index
 
@@ -174,8 +198,41 @@ def _add_keyframes(
                 keyframe = result.map.add_keyframe(
                     frame.depth_m, frame.T_world_camera, frame.camera, name=frame.name
                 )
+            if refiner is not None:
+                with result.timed("refining"):
+                    refiner.place(keyframe)
             selector.accept(frame.T_world_camera)
             listener(KeyframeAdded(*place, keyframe, result.map.keyframes[keyframe].rays))
+
+
+def _refiner(m: OccupancyMap, config: Config) -> PoseRefiner | None:
+    if not config.poses.refine:
+        return None
+    if not isinstance(m, MRFMap):
+        raise ConfigError(
+            f"poses.refine needs the method mrf; a map by {config.method} cannot move keyframes"
+        )
+    return PoseRefiner(m, config.poses)
+
+
+def _refine(
+    result: MappingResult,
+    refiner: PoseRefiner,
+    rounds: int,
+    listener: Listener,
+    should_stop: Callable[[], bool],
+) -> None:
+    """Align all keyframes with each other."""
+
+    def progress(round: int, number: int, keyframes: int) -> bool:
+        listener(KeyframeRefined(round, rounds, number, keyframes))
+        result.interrupted = result.interrupted or should_stop()
+        return not result.interrupted
+
+    with result.timed("refining"):
+        if not result.interrupted:
+            refiner.rounds(progress)
+    result.poses = refiner.changes()
 
 
 def _infer(result: MappingResult, listener: Listener, should_stop: Callable[[], bool]) -> None:

@@ -14,6 +14,7 @@ FLOORS = [
         "errors",
         "poses",
         "config",
+        "config_poses",
         "config_text",
         "config_values",
         "camera",

@@ -44,7 +44,7 @@ _PICTURED_FRAMES = 3
 def run_map(options: Map) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
     console = Console(stderr=options.json)
-    settings = with_absolute_tables(options.settings, Path.cwd())
+    settings = with_absolute_tables(options.parameters(), Path.cwd())
     with (
         output_folder(options.out),
         stop_on_signals(lambda text: console.print(f"[yellow]{text}[/]")) as request,

@@ -6,7 +6,7 @@ them, which keyframes see them. The computation itself is inference/sum_product.
 
 import math
 import weakref
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -17,8 +17,9 @@ import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf import runtime
+from taichi_mrf.alignment.refine import Aligner, RefinedPose
 from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.config import Config, InferenceConfig, SensorConfig, VolumeConfig
+from taichi_mrf.config import Config, InferenceConfig, PoseConfig, SensorConfig, VolumeConfig
 from taichi_mrf.config_values import overridden
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.factor_graph.depth_graph import depth_graph
@@ -34,7 +35,7 @@ from taichi_mrf.maps.brick_book import BrickBook
 from taichi_mrf.maps.checkpoint import Checkpoint, go_back, take_checkpoint
 from taichi_mrf.maps.map_file import MapHeader, StoredKeyframe
 from taichi_mrf.maps.statistics import MapStatistics, measure
-from taichi_mrf.maps.storage import MapContents, read_contents, write_contents
+from taichi_mrf.maps.storage import contents_of, read_contents, write_contents
 from taichi_mrf.poses import as_pose
 from taichi_mrf.queries.extract import extract_voxels
 from taichi_mrf.queries.points import classify, point_log_odds, probability
@@ -84,6 +85,7 @@ class MRFMap:
         self._book = BrickBook(topology, self._pool, self.voxel_size)
         self._sweeper = Sweeper(self.voxel_size, self.sensor, inference, self.config.volume)
         self.view = View(self._pool, self.voxel_size, self.config.volume)
+        self._aligner = Aligner(self.view, self.sensor.max_depth)
         self._keyframes: dict[int, Keyframe] = {}
         self._frozen: dict[int, str] = {}
         self._next_id = 0
@@ -92,14 +94,12 @@ class MRFMap:
     @classmethod
     def from_config(cls, config: Config, camera: PinholeCamera) -> "MRFMap":
         """A map with a configuration's parameters; ``camera`` is what its noise tables must fit."""
-        return cls(
-            config.voxel_size,
-            noise_from_config(config.sensor, camera),
-            inference=config.inference,
-            volume=config.volume,
-            min_depth=config.sensor.min_depth,
-            max_depth=config.sensor.max_depth,
-        )
+        return cls._with(config, noise_from_config(config.sensor, camera))
+
+    @classmethod
+    def _with(cls, config: Config, noise: NoiseModel) -> "MRFMap":
+        depths = {"min_depth": config.sensor.min_depth, "max_depth": config.sensor.max_depth}
+        return cls(config.voxel_size, noise, inference=config.inference, volume=config.volume, **depths)
 
     @property
     def keyframes(self) -> Mapping[int, Keyframe]:
@@ -145,6 +145,22 @@ class MRFMap:
         except Exception:
             self._keyframes[id] = self._place(id, keyframe.name, keyframe.image, keyframe.T_world_camera)
             raise
+
+    def refine_pose(
+        self, id: int, config: PoseConfig | None = None, guesses: Sequence[ArrayLike] = ()
+    ) -> RefinedPose:
+        """Move a keyframe to the pose under which its depth is most likely in the map of the others, if that
+        is near and better; its messages then begin anew. The search begins at its pose, or at that one of
+        ``guesses``, (4, 4) each, that fits better. Raises KeyframeError if there is no such keyframe."""
+        keyframe = self._find(id)
+        self._restore_messages()
+        if keyframe.messages is not None:
+            self._refresh(keyframe)
+        poses = [as_pose(T) for T in guesses]
+        refined = self._aligner.refine(keyframe, self._keyframes, self._frozen, config or PoseConfig(), poses)
+        if refined.accepted:
+            self.move_keyframe(id, refined.T_world_camera)
+        return refined
 
     def freeze_keyframe(self, id: int) -> None:
         """Fold a keyframe's messages into what inference starts from, and forget its image.
@@ -282,41 +298,17 @@ class MRFMap:
 
     def save(self, path: str | Path) -> None:
         """Write the map to one .npz file, beside it first and then into place. Raises MapFileError."""
-        slots = self._pool.in_use
-        live = np.zeros(self._pool.capacity, np.int32)
-        for keyframe in self._keyframes.values():
-            surface = keyframe.footprint.window.bricks_of(keyframe.footprint.surface)
-            live[self._book.topology.slots(surface)] += 1
-        keyframes = [
-            StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera)
-            for k in self._keyframes.values()
-        ]
-        write_contents(
-            Path(path),
-            MapContents(
-                MapHeader(self.config, self.noise, keyframes, self._next_id),
-                self._pool.bricks[slots],
-                self._pool.read("belief", slots),
-                None if self._pool.evidence is None else self._pool.read("evidence", slots),
-                self._pool.owners[slots] - live[slots],
-                self._book.frozen_crossed,
-                self._frozen,
-            ),
-        )
+        keyframes = list(self._keyframes.values())
+        stored = [StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera) for k in keyframes]
+        header = MapHeader(self.config, self.noise, stored, self._next_id)
+        write_contents(Path(path), contents_of(header, self._book, keyframes, self._frozen))
 
     @classmethod
     def load(cls, path: str | Path) -> "MRFMap":
         """Read a map that can be queried at once and extended. Raises MapFileError."""
         contents = read_contents(Path(path))
-        header, config = contents.header, contents.header.config
-        m = cls(
-            config.voxel_size,
-            header.noise,
-            inference=config.inference,
-            volume=config.volume,
-            min_depth=config.sensor.min_depth,
-            max_depth=config.sensor.max_depth,
-        )
+        header = contents.header
+        m = cls._with(header.config, header.noise)
         if len(contents.bricks):
             m._book.topology.anchor(contents.bricks[len(contents.bricks) // 2])
             m._book.topology.check(contents.bricks, m.voxel_size)

@@ -5,6 +5,7 @@ keyframes' images and poses. Messages are not: they are the largest part of a ma
 from the rest. Beliefs are, so that a loaded map answers queries at once.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.export.atomic import write_npz
+from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.maps.brick_book import BrickBook
 from taichi_mrf.maps.map_file import MapHeader, open_map_file, read_header
 from taichi_mrf.voxels.layout import VOXELS
 
@@ -29,6 +32,26 @@ class MapContents:
     frozen_owners: NDArray[np.int32]
     frozen_crossed: NDArray[np.int32]
     frozen: dict[int, str]
+
+
+def contents_of(
+    header: MapHeader, book: BrickBook, keyframes: Iterable[Keyframe], frozen: dict[int, str]
+) -> MapContents:
+    """What is to be stored of a map; ``keyframes`` are those that can still be moved."""
+    pool = book.pool
+    slots = pool.in_use
+    live = np.zeros(pool.capacity, np.int32)
+    for keyframe in keyframes:
+        live[book.topology.slots(keyframe.footprint.window.bricks_of(keyframe.footprint.surface))] += 1
+    return MapContents(
+        header,
+        pool.bricks[slots],
+        pool.read("belief", slots),
+        None if pool.evidence is None else pool.read("evidence", slots),
+        pool.owners[slots] - live[slots],
+        book.frozen_crossed,
+        frozen,
+    )
 
 
 def write_contents(path: Path, contents: MapContents) -> None:

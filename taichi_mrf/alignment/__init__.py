@@ -1,0 +1,6 @@
+"""Poses that are slightly wrong: moving a keyframe to where its depth fits the map of all others.
+
+A depth image becomes points with normals (oriented_points), those of the other keyframes the surface that
+they have measured, voxel by voxel (surfels, surfel_grid). Point-to-plane distances to it are summed up on the
+device (point_to_plane), levenberg takes the steps, and refine decides whether to move at all.
+"""

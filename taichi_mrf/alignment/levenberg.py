@@ -1,0 +1,76 @@
+"""Gauss-Newton with Levenberg's damping on SE(3), which leaves alone what the points do not tell.
+
+A camera that sees one flat wall can slide along it and turn about its normal without any residual changing.
+Such directions are found among the eigenvectors of the normal equations, with rotations measured by how far
+they move a typical point, and get no step.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.alignment.point_to_plane import NormalEquations, PointToPlane
+from taichi_mrf.alignment.recorded import Recorded
+from taichi_mrf.alignment.se3 import moved
+from taichi_mrf.poses import Pose
+
+MOST_STEPS = 12
+"""Steps at one level, tried ones included."""
+
+SMALLEST_STEP_M = 2e-4
+"""A step that moves points by less than this ends a level."""
+
+OBSERVABLE = 0.005
+"""Least share of the largest eigenvalue that a direction needs to be moved in."""
+
+
+@dataclass(frozen=True)
+class Aligned:
+    """Where a level ended, with the equations there and how many of the six directions were told."""
+
+    T_world_camera: Pose
+    equations: NormalEquations
+    directions: int
+
+
+def align(problem: PointToPlane, T_world_camera: Pose, recorded: Recorded, lever_m: float) -> Aligned:
+    """Steps from a pose while they lower the cost: of the residuals, and of leaving where it was recorded.
+
+    ``lever_m`` is the distance of a typical point.
+    """
+    T, here = T_world_camera, problem.linearised(T_world_camera)
+    worth = here.worth
+    damping, directions = 1e-3, 0
+    for _ in range(MOST_STEPS):
+        step, directions = solve(here, worth, recorded, T, lever_m, damping)
+        if np.linalg.norm(step * _scale(lever_m)) < SMALLEST_STEP_M:
+            break
+        tried_T = moved(T, step)
+        tried = problem.linearised(tried_T)
+        if worth * tried.cost + recorded.cost(tried_T) < worth * here.cost + recorded.cost(T):
+            T, here, damping = tried_T, tried, max(1e-4, damping / 10)
+        elif damping > 1:
+            break
+        else:
+            damping *= 10
+    return Aligned(T, here, directions)
+
+
+def solve(
+    equations: NormalEquations, worth: float, recorded: Recorded, T: Pose, lever_m: float, damping: float
+) -> tuple[NDArray[np.float64], int]:
+    """The damped step (6,) from the pose T, 0 along directions that the points do not tell, and the number of
+    those that they do."""
+    scale = _scale(lever_m)
+    values, vectors = np.linalg.eigh(equations.H / np.outer(scale, scale))
+    told = vectors[:, values > OBSERVABLE * max(values[-1], 1e-12)]
+    H = told.T @ ((worth * equations.H + recorded.H) / np.outer(scale, scale)) @ told
+    g = told.T @ ((worth * equations.g + recorded.gradient(T)) / scale)
+    H[np.diag_indices_from(H)] *= 1 + damping
+    return (told @ np.linalg.solve(H, -g)) / scale, told.shape[1]
+
+
+def _scale(lever_m: float) -> NDArray[np.float64]:
+    """Metres that a unit of each component of a step moves a typical point."""
+    return np.array([1.0, 1.0, 1.0, lever_m, lever_m, lever_m])

@@ -1,0 +1,46 @@
+"""How likely a keyframe's depth is in the map of all others, from where it stands or from elsewhere."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from taichi_mrf import runtime
+from taichi_mrf.inference import sum_product
+from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.poses import Pose
+from taichi_mrf.queries.view import View
+
+STRIDE = 4
+"""Every how many-th pixel, both ways, is asked."""
+
+OUTLIERS = 0.01
+"""Share of the measurements that may come from anywhere in the sensor's range."""
+
+
+@contextmanager
+def map_of_others(view: View, keyframe: Keyframe) -> Iterator[None]:
+    """Let the view see, while the block runs, what all but one keyframe believe (eq. 6).
+
+    The messages of ``keyframe``, if it has any, must fit its visible bricks, and those be up to date.
+    """
+    cavity = view.pool.snapshot()
+    if keyframe.messages is not None and len(keyframe.visible.slots):
+        sum_product.withdraw(keyframe.visible.slots, cavity.belief, keyframe.messages)
+    with view.pool.showing(cavity):
+        yield
+    runtime.settle()  # before the snapshot is dropped
+
+
+def log_likelihood(view: View, keyframe: Keyframe, T_world_camera: Pose, max_depth: float) -> float:
+    """Mean log density, per metre, of every STRIDE-th pixel's depth, measured from a pose."""
+    measured = np.zeros(keyframe.camera.shape, np.float32)
+    every = slice(STRIDE // 2, None, STRIDE)
+    measured[every, every] = keyframe.depth_m[every, every]
+    asked = measured > 0
+    if not asked.any():
+        return float("nan")
+    survey = view.survey(keyframe.camera, T_world_camera, max_depth, measured, keyframe.image.noise_table)
+    anywhere = 1.0 / max_depth
+    explained = survey.likelihood[asked] + anywhere * survey.visibility[asked].astype(np.float64)
+    return float(np.mean(np.log((1.0 - OUTLIERS) * explained + OUTLIERS * anywhere)))

@@ -1,0 +1,134 @@
+"""Points with normals from a depth image: planes fitted to small squares of pixels, on the backend."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf import runtime
+from taichi_mrf.inference.keyframe import DepthImage
+from taichi_mrf.inference.rays import pixel_direction
+from taichi_mrf.sensor.forward import depth_of_deviation, pixel_noise, sigma_at
+from taichi_mrf.voxels.types import I32, F32Array, F32Array2, F32Array3, Vec3, Vec4
+
+STRIDE = 2
+"""Pixels between points along both axes of the image."""
+
+WINDOW = 0.016
+"""Half the side of the square that a plane is fitted to, in radians: 8 pixels of a camera of 640 x 480. Half
+of that leaves so much noise in the normals that poses of small images are wrong by centimetres."""
+
+LEAST_WINDOW = 2
+"""The same in pixels, at least."""
+
+MOST_STEPS = 4
+"""A wider square than this many pixels to each side is looked at in wider steps."""
+
+LARGEST_JUMP = 0.05
+"""A neighbour whose depth differs by more than this share of a pixel's own lies on another surface."""
+
+LEAST_SHARE = 0.6
+"""A plane needs this share of the square's pixels."""
+
+STEEPEST = 0.2
+"""Cosine of the largest incidence (78 degrees) at which a measurement still says where a surface is."""
+
+
+@dataclass(frozen=True)
+class OrientedPoints:
+    """Points of a depth image in its camera's frame, row by row.
+
+    ``points`` (N, 3) float32 metres, freed of the sensor's bias; ``normals`` (N, 3) float32 unit vectors
+    towards the camera; ``sigmas`` (N,) float32 metres, the sensor's noise along the normal. ``places`` (N, 2)
+    int32 are the column and row of the grid of every STRIDE-th pixel.
+    """
+
+    points: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    sigmas: NDArray[np.float32]
+    places: NDArray[np.int32]
+
+    def thinned(self, every: int) -> "OrientedPoints":
+        """Those in every ``every``-th column and row."""
+        kept = (self.places % every == 0).all(axis=1)
+        return OrientedPoints(self.points[kept], self.normals[kept], self.sigmas[kept], self.places[kept])
+
+
+def oriented_points(image: DepthImage, max_depth: float) -> OrientedPoints:
+    """The points of a depth image, up to ``max_depth`` metres, around which the surface is smooth."""
+    camera = image.camera
+    columns, rows = -(-camera.width // STRIDE), -(-camera.height // STRIDE)
+    half = max(LEAST_WINDOW, round(WINDOW * min(camera.fx, camera.fy)))
+    step = -(-half // MOST_STEPS)
+    depth, sigmas = np.zeros((2, columns * rows), np.float32)
+    normals = np.zeros((columns * rows, 3), np.float32)
+    fit_planes(
+        image.depth, camera.width, image.intrinsics, image.noise, image.noise_table.patch,
+        image.noise_table.columns, step, half // step, columns, depth, normals, sigmas,
+    )  # fmt: skip
+    runtime.settle()
+    found = np.flatnonzero((depth > 0) & (depth <= max_depth))
+    places = np.stack([found % columns, found // columns], axis=1).astype(np.int32)
+    u, v = places[:, 0] * STRIDE, places[:, 1] * STRIDE
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(found))], axis=1)
+    points = (rays * depth[found, None]).astype(np.float32)
+    return OrientedPoints(points, normals[found], sigmas[found], places)
+
+
+@ti.kernel
+def fit_planes(
+    measured: F32Array, width: I32, intrinsics: Vec4, noise: F32Array3, patch: I32, noise_columns: I32,
+    step: I32, steps: I32, columns: I32, depth: F32Array, normals: F32Array2, sigmas: F32Array,
+):  # fmt: skip
+    """A plane for every STRIDE-th pixel; ``depth`` is 0 where there is none.
+
+    The inverse depth of a plane is linear in the pixel's place: 1 / z = a du + b dv + c, whose coefficients
+    are the plane's normal but for its length. The least squares are those of the pixels around.
+    """
+    for point in range(depth.shape[0]):
+        u, v = point % columns * STRIDE, point // columns * STRIDE
+        height = measured.shape[0] // width
+        here = measured[v * width + u]
+        depth[point] = 0.0
+        sigmas[point] = 0.0
+        for axis in ti.static(range(3)):
+            normals[point, axis] = 0.0
+        n, du, dv, q = 0.0, 0.0, 0.0, 0.0
+        uu, uv, vv, uq, vq = 0.0, 0.0, 0.0, 0.0, 0.0
+        if here > 0.0:
+            for row in range(-steps, steps + 1):
+                for column in range(-steps, steps + 1):
+                    x, y = u + column * step, v + row * step
+                    there = 0.0
+                    if x >= 0 and y >= 0 and x < width and y < height:
+                        there = measured[y * width + x]
+                    if there > 0.0 and ti.abs(there - here) < LARGEST_JUMP * here:
+                        i, j = ti.cast(x - u, ti.f32), ti.cast(y - v, ti.f32)
+                        # From the pixel's own, so that no digits are lost.
+                        inverse = 1.0 / there - 1.0 / here
+                        n += 1.0
+                        du += i
+                        dv += j
+                        q += inverse
+                        uu += i * i
+                        uv += i * j
+                        vv += j * j
+                        uq += i * inverse
+                        vq += j * inverse
+        if n >= LEAST_SHARE * (2 * steps + 1) ** 2:
+            uu, uv, vv = uu - du * du / n, uv - du * dv / n, vv - dv * dv / n
+            uq, vq = uq - du * q / n, vq - dv * q / n
+            determinant = uu * vv - uv * uv
+            a, b = (uq * vv - vq * uv) / determinant, (vq * uu - uq * uv) / determinant
+            c = (q - a * du - b * dv) / n + 1.0 / here
+            slope = Vec3(a * intrinsics[0], b * intrinsics[1], 0.0)
+            ray = pixel_direction(u, v, intrinsics)
+            slope[2] = c - slope[0] * ray[0] - slope[1] * ray[1]
+            normal = -slope.normalized()
+            if -normal.dot(ray) > STEEPEST * ray.norm():
+                own = pixel_noise(noise, patch, noise_columns, u, v)
+                depth[point] = depth_of_deviation(here, 0.0, own)
+                sigmas[point] = -normal.dot(ray) * sigma_at(own, depth[point])
+                for axis in ti.static(range(3)):
+                    normals[point, axis] = normal[axis]

@@ -1,0 +1,188 @@
+"""How far points lie from the surface, and what that asks of the camera's pose: residuals and Jacobian.
+
+A point p of the camera frame is moved by T exp(xi), xi = (rho, omega), to P = T (p + rho + omega x p). Its
+residual is the mean over the surfels in the 27 cells around P, weighted by how near and how well known they
+are, of the distance from each one's plane; with the mean normal n, and m = R^T n,
+
+    r = n . (P - mu)        dr / dxi = (m, p x m)
+
+The surfels are held fixed while the pose moves. Residuals count in units of sigma, which is the sensor's
+along the normal and what the surface departs from its planes together, by Tukey's biweight.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf import runtime
+from taichi_mrf.alignment.oriented_points import OrientedPoints
+from taichi_mrf.alignment.recorded import SURFACE_SIGMA_M
+from taichi_mrf.alignment.surfel_grid import SurfelGrid
+from taichi_mrf.alignment.surfels import ROUGHNESS
+from taichi_mrf.poses import Pose
+from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.numbering import flat, voxel_number
+from taichi_mrf.voxels.types import F32, I32, F32Array, F32Array2, I32Array, IVec3, Mat3, Template, Vec3
+
+TUKEY = 4.685
+"""Sigmas beyond which a residual says nothing (95% efficiency for normal errors)."""
+
+LARGEST_COST = TUKEY**2 / 6
+"""What a residual beyond that costs, and a point that has no surface near it."""
+
+REACH = 0.6
+"""Standard deviation, in cells, of the weight that a surfel has by its distance from a point."""
+
+ALIKE = 0.7
+"""Cosine of the largest angle (46 degrees) between a point's normal and that of a surfel of its surface."""
+
+LEAST_WEIGHT = 1e-3
+"""Weight below which there is no surface around a point: a thousandth of one good measurement right there."""
+
+_TERMS = 6 * 6 + 6 + 4
+_COST, _POINTS, _WEIGHT, _SQUARES = 42, 43, 44, 45
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """A least-squares problem around one pose: ``H`` (6, 6) and ``g`` (6,) of the step xi with H xi = -g.
+
+    ``weight`` is the sum of the weights in H and g, per square metre. ``cost`` is Tukey's, summed over all
+    ``total`` points; ``matched`` is the number of points with a surface near them; ``rms_m`` the weighted RMS
+    of their residuals in metres.
+    """
+
+    H: NDArray[np.float64]
+    g: NDArray[np.float64]
+    weight: float
+    cost: float
+    matched: int
+    total: int
+    rms_m: float
+
+    @property
+    def overlap(self) -> float:
+        """Share of the points with a surface near them."""
+        return self.matched / max(1, self.total)
+
+    @property
+    def worth(self) -> float:
+        """The factor that makes of all points one measurement with the sigma of a surface, less where few of
+        them overlap."""
+        return self.overlap / (self.weight * SURFACE_SIGMA_M**2) if self.weight > 0 else 0.0
+
+
+class PointToPlane:
+    """The residuals of some points against some surfels, for one pose after the other."""
+
+    def __init__(self, points: OrientedPoints, grid: SurfelGrid) -> None:
+        self.grid, self.total = grid, len(points.points)
+        self._points, self._normals = _upload(points.points), _upload(points.normals)
+        self._sigmas = _upload(points.sigmas)
+        cpu = runtime.active() == "cpu"
+        self._strips, self._spread = (64, 512) if cpu else (2048, 1)
+
+    def linearised(self, T_world_camera: Pose) -> NormalEquations:
+        """Residuals and their derivatives at a pose."""
+        sums = np.zeros((self._strips, _TERMS), np.float32)
+        if self.total and self.grid.count:
+            centre, to_cells = self.grid.window.rays_of(T_world_camera)
+            rotation = ti.Matrix(T_world_camera[:3, :3].tolist(), ti.f32)
+            accumulate(
+                self._points, self._normals, self._sigmas, self.total, centre, to_cells, rotation,
+                self.grid.cell_size, self.grid.window.shape_vector, self.grid.index.bricks,
+                self.grid.places, self.grid.planes, self._strips, self._spread, sums,
+            )  # fmt: skip
+            runtime.settle()
+        total = sums.sum(axis=0, dtype=np.float64)
+        matched = round(total[_POINTS])
+        cost = total[_COST] + LARGEST_COST * (self.total - matched)
+        rms_m = float(np.sqrt(total[_SQUARES] / total[_WEIGHT])) if total[_WEIGHT] > 0 else 0.0
+        return NormalEquations(
+            total[:36].reshape(6, 6), total[36:42], float(total[_WEIGHT]), cost, matched, self.total, rms_m
+        )
+
+
+def _upload(values: NDArray[np.float32]) -> "ti.Ndarray":
+    array = ti.ndarray(ti.f32, values.shape if len(values) else (1, *values.shape[1:]))
+    if len(values):
+        array.from_numpy(np.ascontiguousarray(values))
+    return array
+
+
+@ti.func
+def surface_at(P: Vec3, normal: Vec3, shape: IVec3, bricks: Template, places: Template, planes: Template):
+    """(signed distance in cells, unit normal, weight) of the surface around P, in cells from the window's
+    corner, whose normal is like ``normal``; the weight is 0 where there is none."""
+    weight, distance = 0.0, 0.0
+    mean = Vec3(0.0)
+    base = ti.floor(P, ti.i32)
+    for dx, dy, dz in ti.static(ti.ndrange((-1, 2), (-1, 2), (-1, 2))):
+        cell = base + IVec3(dx, dy, dz)
+        if cell.min() >= 0 and (shape * BRICK - cell).min() > 0:
+            brick = bricks[flat(cell // BRICK, shape)]
+            if brick >= 0:
+                row = places[brick * VOXELS + voxel_number(cell % BRICK)]
+                if row >= 0:
+                    away = P - Vec3(planes[row, 1], planes[row, 2], planes[row, 3])
+                    n = Vec3(planes[row, 4], planes[row, 5], planes[row, 6])
+                    if n.dot(normal) > ALIKE:
+                        w = planes[row, 0] * ti.exp(-0.5 / (REACH * REACH) * away.dot(away))
+                        weight += w
+                        distance += w * n.dot(away)
+                        mean += w * n
+    if weight > LEAST_WEIGHT:
+        distance /= weight
+        mean = mean.normalized()
+    else:
+        weight = 0.0
+    return distance, mean, weight
+
+
+@ti.kernel
+def accumulate(
+    points: F32Array2, normals: F32Array2, sigmas: F32Array, total: I32,
+    centre: Vec3, to_cells: Mat3, rotation: Mat3, cell_size: F32,
+    shape: IVec3, bricks: I32Array, places: I32Array, planes: F32Array2,
+    strips: I32, spread: I32, sums: F32Array2,
+):  # fmt: skip
+    """Sum up H (36), g (6), cost, points, weights and weighted squares, one row of ``sums`` for each strip.
+
+    A strip's points are added up one after the other, so that the sums do not depend on the number of
+    threads. On a CPU a strip stands for ``spread`` iterations, of which Taichi gives a thread no fewer.
+    """
+    for iteration in range(strips * spread):
+        if iteration % spread == 0:
+            strip = iteration // spread
+            H = ti.Matrix.zero(ti.f32, 6, 6)
+            g = ti.Vector.zero(ti.f32, 6)
+            cost, found, weights, squares = 0.0, 0.0, 0.0, 0.0
+            size = (total + strips - 1) // strips
+            for i in range(strip * size, ti.min(total, (strip + 1) * size)):
+                p = Vec3(points[i, 0], points[i, 1], points[i, 2])
+                facing = rotation @ Vec3(normals[i, 0], normals[i, 1], normals[i, 2])
+                distance, n, weight = surface_at(centre + to_cells @ p, facing, shape, bricks, places, planes)
+                if weight > 0.0:
+                    r = distance * cell_size
+                    sigma = ti.sqrt(sigmas[i] ** 2 + (ROUGHNESS * cell_size) ** 2)
+                    inside = ti.max(0.0, 1.0 - (r / (TUKEY * sigma)) ** 2)
+                    w = inside * inside / (sigma * sigma)
+                    m = rotation.transpose() @ n
+                    turn = p.cross(m)
+                    J = ti.Vector([m[0], m[1], m[2], turn[0], turn[1], turn[2]])
+                    H += w * J.outer_product(J)
+                    g += w * r * J
+                    cost += LARGEST_COST * (1.0 - inside * inside * inside)
+                    found += 1.0
+                    weights += w
+                    squares += w * r * r
+            for a in ti.static(range(6)):
+                sums[strip, 36 + a] = g[a]
+                for b in ti.static(range(6)):
+                    sums[strip, 6 * a + b] = H[a, b]
+            sums[strip, _COST] = cost
+            sums[strip, _POINTS] = found
+            sums[strip, _WEIGHT] = weights
+            sums[strip, _SQUARES] = squares

@@ -1,0 +1,59 @@
+"""Small steps of a pose: the exponential map of SE(3), its inverse, and how steps change frames."""
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf.poses import Pose
+
+_SMALL = 1e-2
+"""Radians below which a series is more precise than the closed form."""
+
+
+def moved(T_world_camera: Pose, xi: ArrayLike) -> Pose:
+    """T exp(xi): the camera displaced by the twist ``xi`` (6,), translation in metres and then rotation
+    vector in radians, both in its own frame."""
+    step = np.asarray(xi, np.float64)
+    E = np.eye(4)
+    E[:3, :3] = cv2.Rodrigues(step[3:])[0]
+    E[:3, 3] = _left_jacobian(step[3:]) @ step[:3]
+    return T_world_camera @ E
+
+
+def twist(T: Pose) -> NDArray[np.float64]:
+    """The xi, (6,), of T = exp(xi)."""
+    omega = _rotation_vector(T[:3, :3])
+    return np.concatenate([np.linalg.solve(_left_jacobian(omega), T[:3, 3]), omega])
+
+
+def adjoint(T_a_b: Pose) -> NDArray[np.float64]:
+    """(6, 6): what takes a twist in frame b to the same one in frame a."""
+    R = T_a_b[:3, :3]
+    A = np.zeros((6, 6))
+    A[:3, :3] = A[3:, 3:] = R
+    A[:3, 3:] = cross_matrix(T_a_b[:3, 3]) @ R
+    return A
+
+
+def cross_matrix(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3): what a cross product with v from the left does."""
+    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+
+def _rotation_vector(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3,) radians. OpenCV's own rounds angles below about 1e-5 to 0."""
+    sine = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    size, cosine = float(np.linalg.norm(sine)), 0.5 * (float(np.trace(R)) - 1.0)
+    if cosine <= 0:
+        return np.asarray(cv2.Rodrigues(R)[0].ravel())
+    return sine * (np.arctan2(size, cosine) / size) if size > 0 else sine
+
+
+def _left_jacobian(omega: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What a rotation does to the translation of the same twist, (3, 3)."""
+    angle = float(np.linalg.norm(omega))
+    first, second = 0.5 - angle**2 / 24, 1 / 6 - angle**2 / 120
+    if angle > _SMALL:
+        first, second = (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    K = cross_matrix(omega)
+    return np.asarray(np.eye(3) + first * K + second * K @ K)

@@ -1,0 +1,129 @@
+"""Refining the poses of a whole sequence: each keyframe as it comes, then all of them together.
+
+The first keyframe fixes the frame. A new one is aligned by MRFMap.refine_pose with the map so far. At the end
+alignment/joint.py moves all of them at once, because one after the other they would only slowly take out
+what has added up on the way.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from taichi_mrf.alignment.joint import align_jointly
+from taichi_mrf.alignment.likelihood import log_likelihood, map_of_others
+from taichi_mrf.alignment.oriented_points import OrientedPoints, oriented_points
+from taichi_mrf.config import PoseConfig
+from taichi_mrf.maps.mrf import MRFMap
+from taichi_mrf.poses import Pose, inverse, tangent_norms
+
+LOSS = 0.1
+"""Log-likelihood per pixel that a round may cost. One after the other keyframes fit each other a little
+better than all together, who heed where they were recorded; if they do not fit, more is lost by far."""
+
+SETTLED = 0.02
+"""Share of a voxel: rounds end when no keyframe was moved further."""
+
+
+@dataclass(frozen=True)
+class PoseChange:
+    """Where a keyframe was recorded, and where it stands in the map."""
+
+    keyframe: int
+    name: str
+    T_recorded: Pose
+    T_refined: Pose
+
+    @property
+    def translation_m(self) -> float:
+        """How far it was moved."""
+        return tangent_norms(self.T_recorded, self.T_refined)[1]
+
+    @property
+    def rotation_rad(self) -> float:
+        """How far it was turned."""
+        return tangent_norms(self.T_recorded, self.T_refined)[0]
+
+
+class PoseRefiner:
+    """Refines the keyframes of one map."""
+
+    def __init__(self, m: MRFMap, config: PoseConfig) -> None:
+        self._map, self._config = m, config
+        self._recorded: dict[int, Pose] = {}
+
+    def know(self, name: str, T_recorded: Pose) -> None:
+        """Take note of where a keyframe was recorded that was placed in an earlier run."""
+        id = next(id for id, keyframe in self._map.keyframes.items() if keyframe.name == name)
+        self._recorded[id] = T_recorded
+
+    def place(self, keyframe: int) -> None:
+        """Align a new keyframe, which stands where it was recorded, with those before it; then let it speak.
+
+        Recorded poses may be wrong each by itself, or drift, in which case the last keyframe was moved by
+        about as much as this one has to be. The search begins at the better of the two.
+        """
+        T_recorded = self._map.keyframes[keyframe].T_world_camera
+        if self._recorded:
+            last = max(self._recorded)
+            T_last = self._map.keyframes[last].T_world_camera
+            carried = T_last @ inverse(self._recorded[last]) @ T_recorded
+            self._map.refine_pose(keyframe, self._config, [carried])
+        self._recorded[keyframe] = T_recorded
+        self._map.infer(keyframes=[keyframe], sweeps=1)
+
+    def rounds(self, on_keyframe: Callable[[int, int, int], bool]) -> None:
+        """Align all keyframes with each other and with where they were recorded, until they stay where they
+        are or the configuration's rounds are over. A round that makes their depth less likely is undone.
+
+        ``on_keyframe`` is told, after each, the round, the keyframe's number in it (both from 1) and how many
+        there are; it ends everything by returning False. The marginals are to be inferred again afterwards.
+        """
+        ids = sorted(self._map.keyframes)
+        before = self._log_likelihood()
+        for round in range(1, self._config.rounds + 1):
+            stood = {id: self._map.keyframes[id].T_world_camera for id in ids}
+            found = align_jointly(self._points(), stood, self._recorded, self._config)
+            for number, id in enumerate(ids, start=1):
+                self._move(id, found[id])
+                if not on_keyframe(round, number, len(ids)):
+                    return
+            furthest = max(tangent_norms(stood[id], self._map.keyframes[id].T_world_camera)[1] for id in ids)
+            if furthest < SETTLED * self._map.voxel_size:
+                return
+            after = self._log_likelihood()
+            if not after > before - LOSS:
+                for id in ids:
+                    self._move(id, stood[id])
+                return
+            before = after
+
+    def changes(self) -> list[PoseChange]:
+        """What became of every keyframe."""
+        keyframes = self._map.keyframes
+        return [
+            PoseChange(id, keyframes[id].name, T_recorded, keyframes[id].T_world_camera)
+            for id, T_recorded in self._recorded.items()
+        ]
+
+    def _points(self) -> dict[int, OrientedPoints]:
+        max_depth = self._map.sensor.max_depth
+        return {id: oriented_points(k.image, max_depth) for id, k in self._map.keyframes.items()}
+
+    def _move(self, id: int, T_world_camera: Pose) -> None:
+        """Move a keyframe, unless that is further than allowed."""
+        T_now = self._map.keyframes[id].T_world_camera
+        rotation, translation = tangent_norms(T_now, T_world_camera)
+        near = rotation <= self._config.max_rotation and translation <= self._config.max_translation
+        if near and not np.array_equal(T_now, T_world_camera):
+            self._map.move_keyframe(id, T_world_camera)
+
+    def _log_likelihood(self) -> float:
+        """Mean log-likelihood of the keyframes' depth, each in the map of the others after one sweep."""
+        self._map.infer(sweeps=1)
+        view, max_depth = self._map.view, self._map.sensor.max_depth
+        found = []
+        for keyframe in self._map.keyframes.values():
+            with map_of_others(view, keyframe):
+                found.append(log_likelihood(view, keyframe, keyframe.T_world_camera, max_depth))
+        return float(np.nanmean(found)) if found else float("nan")
