@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from small_room import VOXEL_SIZE, add, build, frames, probes
 
+from taichi_mrf.alignment.likelihood import log_likelihood, map_of_others
 from taichi_mrf.alignment.se3 import adjoint, moved, twist
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import PoseConfig
@@ -215,3 +216,15 @@ def test_a_loaded_map_can_be_refined(tmp_path: object) -> None:
     loaded = MRFMap.load(path)
     found = [each.refine_pose(2).T_world_camera for each in (m, loaded)]
     np.testing.assert_allclose(found[0], found[1], atol=1e-6)
+
+
+def test_the_map_of_others_is_what_they_believe() -> None:
+    """Of a map of one keyframe nothing is left but the prior; afterwards it is as it was."""
+    m = build([0])
+    centres, before = m.voxels(min_probability=0.0)
+    assert (np.abs(before - m.prior) > 0.05).mean() > 0.05
+    with map_of_others(m.view, m.keyframes[0]):
+        np.testing.assert_allclose(m.occupancy(centres), m.prior, atol=1e-5)
+        alone = log_likelihood(m.view, m.keyframes[0], frames()[0].T_world_camera, 10.0)
+    np.testing.assert_array_equal(m.occupancy(centres), before)
+    assert log_likelihood(m.view, m.keyframes[0], frames()[0].T_world_camera, 10.0) > alone + 1

@@ -16,7 +16,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from taichi_mrf.pipeline import Event, FrameEvent, KeyframeAdded, KeyframeSwept
+from taichi_mrf.pipeline import Event, FrameEvent, KeyframeAdded, KeyframeRefined, KeyframeSwept
 
 Bar = TypeVar("Bar", bound="TransientBar")
 
@@ -70,6 +70,9 @@ class ProgressBar(TransientBar):
         elif isinstance(event, KeyframeSwept):
             done = (event.sweep - 1) * event.keyframes + event.number
             self.advance("Inferring", done, event.sweeps * event.keyframes, 1)
+        elif isinstance(event, KeyframeRefined):
+            done = (event.round - 1) * event.keyframes + event.number
+            self.advance("Aligning", done, event.rounds * event.keyframes, 1)
 
     def advance(self, stage: str, done: int, total: int, keyframes: int = 0) -> None:
         """Move the bar of a stage, which takes the place of the stage before."""

@@ -13,8 +13,11 @@ import taichi_mrf
 from taichi_mrf import runtime
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.evaluation.held_out import HeldOutCheck
+from taichi_mrf.maps.refinement import PoseChange
 from taichi_mrf.pipeline import MappingResult
 from taichi_mrf.voxels.memory import peak_memory_mb
+
+_REFINED_NOTE = "Accuracy is that of the held-out frames at their recorded poses, which were not refined."
 
 
 def run_report(
@@ -42,9 +45,20 @@ def run_report(
         "residual": result.residual,
         "seconds": {stage: round(seconds, 3) for stage, seconds in result.seconds.items()},
         "accuracy": None if check is None else {"frames": check.frames, **dataclasses.asdict(check.error)},
+        "poses": [_pose_report(change) for change in result.poses],
         "skipped_frames": result.skipped,
         "dropped_frames": dataset.dropped,
-        "notes": list(dataset.notes),
+        "notes": [*dataset.notes, *([_REFINED_NOTE] if result.poses and check else [])],
+    }
+
+
+def _pose_report(change: PoseChange) -> dict[str, Any]:
+    return {
+        "keyframe": change.name,
+        "moved_m": round(change.translation_m, 6),
+        "turned_rad": round(change.rotation_rad, 6),
+        "T_recorded": change.T_recorded.tolist(),
+        "T_refined": change.T_refined.tolist(),
     }
 
 
