@@ -149,6 +149,22 @@ def test_a_stopped_run_goes_on_with_the_recorded_poses_of_its_keyframes() -> Non
     assert (errors([change.T_refined for change in whole.poses]) < 0.5 * errors(wrong)).all()
 
 
+def test_a_stop_in_the_rounds_undoes_the_round() -> None:
+    wrong = disturbed(1)
+    told: list[Event] = []
+
+    def stop() -> bool:
+        return any(isinstance(event, KeyframeRefined) and event.number == 3 for event in told)
+
+    stopped = map_sequence(WrongPoses(wrong), REFINE, told.append, should_stop=stop)
+    assert stopped.interrupted
+    assert stopped.sweeps == 1
+    without = replace(REFINE, poses=replace(REFINE.poses, rounds=0))
+    as_added = map_sequence(WrongPoses(wrong), without)
+    for change, expected in zip(stopped.poses, as_added.poses, strict=True):
+        np.testing.assert_array_equal(change.T_refined, expected.T_refined)
+
+
 def test_without_it_nothing_is_moved() -> None:
     wrong = disturbed(1)
     result = map_sequence(WrongPoses(wrong), replace(REFINE, poses=PoseConfig()), limit=2)

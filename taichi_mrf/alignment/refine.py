@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from taichi_mrf.alignment.levenberg import Aligned, align
 from taichi_mrf.alignment.likelihood import log_likelihood, map_of_others
@@ -85,29 +86,28 @@ class Aligner:
         points = oriented_points(keyframe.image, self.max_depth)
         if len(points.points) < LEAST_POINTS:
             return replace(outcome, reason="holds too few points on smooth surfaces")
-        others = self._surfels_but(keyframe, keyframes, frozen)
+        levels = _levels(points, self._surfels_around(points, (start, *guesses), keyframe, keyframes, frozen))
+        fits = [levels[0].linearised(T) for T in (start, *guesses)]
+        best = int(np.argmin([fit.cost for fit in fits]))
+        begin = (start, *guesses)[best]
+        outcome = replace(outcome, pixels=fits[best].matched, overlap=fits[best].overlap)
+        if outcome.overlap < config.min_overlap:
+            share = f"{100 * outcome.overlap:.0f}% of its points lie near what others have measured"
+            return replace(outcome, reason=f"{share}, and {100 * config.min_overlap:.0f}% are needed")
+        lever_m = float(np.median(np.linalg.norm(points.points, axis=1)))
+        found = _aligned(levels, begin, Recorded(begin, config), lever_m)
+        before = levels[-1].linearised(start)
+        outcome = _measured(outcome, before, found)
+        rotation, translation = tangent_norms(start, found.T_world_camera)
+        if translation + lever_m * rotation < IN_PLACE * self.view.voxel_size:
+            return replace(outcome, reason="fits where it stands")
+        if found.equations.cost >= before.cost:
+            return replace(outcome, reason="fits nowhere better")
+        turned, shifted = tangent_norms(begin, found.T_world_camera)
+        if shifted > config.max_translation or turned > config.max_rotation:
+            how_far = f"{shifted:.3f} m and {turned:.3f} radians"
+            return replace(outcome, reason=f"fits only {how_far} away, which is further than allowed")
         with map_of_others(self.view, keyframe):
-            levels = _levels(points, others)
-            fits = [levels[0].linearised(T) for T in (start, *guesses)]
-            best = int(np.argmin([fit.cost for fit in fits]))
-            begin = (start, *guesses)[best]
-            outcome = replace(outcome, pixels=fits[best].matched, overlap=fits[best].overlap)
-            if outcome.overlap < config.min_overlap:
-                share = f"{100 * outcome.overlap:.0f}% of its points lie near what others have measured"
-                return replace(outcome, reason=f"{share}, and {100 * config.min_overlap:.0f}% are needed")
-            lever_m = float(np.median(np.linalg.norm(points.points, axis=1)))
-            found = _aligned(levels, begin, Recorded(begin, config), lever_m)
-            before = levels[-1].linearised(start)
-            outcome = _measured(outcome, before, found)
-            rotation, translation = tangent_norms(start, found.T_world_camera)
-            if translation + lever_m * rotation < IN_PLACE * self.view.voxel_size:
-                return replace(outcome, reason="fits where it stands")
-            if found.equations.cost >= before.cost:
-                return replace(outcome, reason="fits nowhere better")
-            turned, shifted = tangent_norms(begin, found.T_world_camera)
-            if shifted > config.max_translation or turned > config.max_rotation:
-                how_far = f"{shifted:.3f} m and {turned:.3f} radians"
-                return replace(outcome, reason=f"fits only {how_far} away, which is further than allowed")
             outcome = replace(
                 outcome,
                 log_likelihood_before=log_likelihood(self.view, keyframe, start, self.max_depth),
@@ -125,10 +125,18 @@ class Aligner:
             accepted=True,
         )
 
-    def _surfels_but(
-        self, keyframe: Keyframe, keyframes: Mapping[int, Keyframe], frozen: Mapping[int, str]
+    def _surfels_around(
+        self,
+        points: OrientedPoints,
+        poses: Sequence[Pose],
+        keyframe: Keyframe,
+        keyframes: Mapping[int, Keyframe],
+        frozen: Mapping[int, str],
     ) -> Surfels:
-        """The surfels of all keyframes but one, with those of new and moved ones found anew."""
+        """The surfels of all keyframes but one around where its points would be with any of some poses.
+
+        Those of new and moved keyframes are found anew.
+        """
         size = self.view.voxel_size
         self._surfels = {id: kept for id, kept in self._surfels.items() if id in keyframes or id in frozen}
         for other in keyframes.values():
@@ -136,7 +144,16 @@ class Aligner:
             if other is not keyframe and (known is None or known[0] is not other.T_world_camera):
                 found = surfels_of(oriented_points(other.image, self.max_depth), other.T_world_camera, size)
                 self._surfels[other.id] = (other.T_world_camera, found)
-        return merged([surfels for id, (_, surfels) in self._surfels.items() if id != keyframe.id], size)
+        lower, upper = _bounds(points, poses)
+        margin = 2 * max(size, COARSEST_M)
+        others = [surfels for id, (_, surfels) in self._surfels.items() if id != keyframe.id]
+        return merged([surfels.within(lower - margin, upper + margin) for surfels in others], size)
+
+
+def _bounds(points: OrientedPoints, poses: Sequence[Pose]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The corners of a box, in metres in the world, around the points as seen from each of some poses."""
+    world = np.concatenate([points.points @ T[:3, :3].T + T[:3, 3] for T in poses])
+    return world.min(axis=0), world.max(axis=0)
 
 
 def _levels(points: OrientedPoints, surface: Surfels) -> list[PointToPlane]:

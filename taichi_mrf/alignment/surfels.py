@@ -39,6 +39,13 @@ class Surfels:
         axes = [(self.keys >> shift) & (2 * _HALF - 1) for shift in (42, 21, 0)]
         return (np.stack(axes, axis=1) - _HALF).astype(np.int32)
 
+    def within(self, lower_m: NDArray[np.float64], upper_m: NDArray[np.float64]) -> "Surfels":
+        """Those in a box of metres in the world, but for parts of a cell."""
+        first, last = np.floor(lower_m / self.cell_size), np.floor(upper_m / self.cell_size)
+        cells = self.cells
+        inside = ((cells >= first) & (cells <= last)).all(axis=1)
+        return Surfels(self.keys[inside], self.sums[inside], self.cell_size)
+
     def coarser(self, factor: int) -> "Surfels":
         """The same in cells ``factor`` times as wide."""
         if factor == 1:

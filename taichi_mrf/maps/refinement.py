@@ -5,7 +5,7 @@ alignment/joint.py moves all of them at once, because one after the other they w
 what has added up on the way.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,7 +77,8 @@ class PoseRefiner:
         are or the configuration's rounds are over. A round that makes their depth less likely is undone.
 
         ``on_keyframe`` is told, after each, the round, the keyframe's number in it (both from 1) and how many
-        there are; it ends everything by returning False. The marginals are to be inferred again afterwards.
+        there are; by returning False it ends the rounds, of which this one is undone. The marginals are to
+        be inferred again afterwards.
         """
         ids = sorted(self._map.keyframes)
         before = self._log_likelihood()
@@ -87,14 +88,14 @@ class PoseRefiner:
             for number, id in enumerate(ids, start=1):
                 self._move(id, found[id])
                 if not on_keyframe(round, number, len(ids)):
+                    self._undo(stood)
                     return
             furthest = max(tangent_norms(stood[id], self._map.keyframes[id].T_world_camera)[1] for id in ids)
             if furthest < SETTLED * self._map.voxel_size:
                 return
             after = self._log_likelihood()
             if not after > before - LOSS:
-                for id in ids:
-                    self._move(id, stood[id])
+                self._undo(stood)
                 return
             before = after
 
@@ -109,6 +110,10 @@ class PoseRefiner:
     def _points(self) -> dict[int, OrientedPoints]:
         max_depth = self._map.sensor.max_depth
         return {id: oriented_points(k.image, max_depth) for id, k in self._map.keyframes.items()}
+
+    def _undo(self, stood: Mapping[int, Pose]) -> None:
+        for id, T_world_camera in stood.items():
+            self._move(id, T_world_camera)
 
     def _move(self, id: int, T_world_camera: Pose) -> None:
         """Move a keyframe, unless that is further than allowed."""
