@@ -9,6 +9,7 @@ import viser
 
 from taichi_mrf.viewer.events import Chosen, Event, OptionsMoved, Pressed
 from taichi_mrf.viewer.messages import Hello, Images, Keyframe, Notice, Status
+from taichi_mrf.viewer.notices import notices_html
 from taichi_mrf.viewer.options import ViewOptions
 from taichi_mrf.viewer.ray_plot import RayPlot
 from taichi_mrf.viewer.widgets import OptionWidgets
@@ -213,12 +214,7 @@ class Panel:
             self._tell(Chosen(widget))
 
     def _list_notices(self) -> None:
-        colors = {"info": "inherit", "warning": "#c77700", "error": "#c62828"}
-        lines = "".join(
-            f'<p style="margin:0.2em 0;color:{colors[each.severity]}">{html.escape(each.text)}</p>'
-            for each in self._notices
-        )
-        self._notice_list.content = f'<div style="margin:0.5em 0.75em;font-size:0.85em">{lines}</div>'
+        self._notice_list.content = notices_html(self._notices)
 
 
 def _plain(text: str) -> str:

@@ -10,6 +10,7 @@ import viser
 from taichi_mrf.config import Config
 from taichi_mrf.viewer.events import Chosen, Event, KnobMoved, OptionsMoved, Pressed
 from taichi_mrf.viewer.messages import Notice
+from taichi_mrf.viewer.notices import notices_html
 from taichi_mrf.viewer.options import ViewOptions
 from taichi_mrf.viewer.tune_knob_widgets import KnobWidgets
 from taichi_mrf.viewer.tune_knobs import KNOBS, Section
@@ -241,12 +242,7 @@ class TunePanel:
             self._tell(Chosen(widget))
 
     def _list_notices(self) -> None:
-        colors = {"info": "inherit", "warning": "#c77700", "error": "#c62828"}
-        lines = "".join(
-            f'<p style="margin:0.2em 0;color:{colors[each.severity]}">{html.escape(each.text)}</p>'
-            for each in self._notices
-        )
-        self._notice_list.content = f'<div style="margin:0.5em 0.75em;font-size:0.85em">{lines}</div>'
+        self._notice_list.content = notices_html(self._notices)
 
 
 def _rows(rows: dict[str, str]) -> str:
