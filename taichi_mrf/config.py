@@ -71,6 +71,10 @@ class InferenceConfig:
     tolerance: float = 0.0
     """Stop before the last sweep when no more than this share of the voxels moved by over 0.01."""
 
+    renew_tolerance: float = 0.2
+    """While frames come, a keyframe is swept again once others have moved more than this share of the
+    marginals that it sees by over 0.01 each. It does not touch full inference."""
+
     damping: float = 0.0
     """Share of a keyframe's old message that is kept when it is renewed, 0 to below 1."""
 
@@ -97,8 +101,12 @@ class InferenceConfig:
     counts once, as eqs. 11 to 14 are printed."""
 
     rays_per_voxel: float = 0.0
-    """Rays that a keyframe casts at least at a voxel that faces it: where a voxel covers more pixels, only
-    every second, third, ... of them is cast. 0 casts every pixel."""
+    """Rays that a keyframe casts at least at a voxel that faces it: where a voxel covers more pixels, not
+    each has a ray of its own. 0 casts every pixel."""
+
+    ray_choice: Literal["bundle", "thin"] = "bundle"
+    """How pixels go without a ray: bundled with neighbours whose measurements agree, as one ray with their
+    mean that counts as many as they are, or (thin) left out but for every second, third, ... of them."""
 
     average: Literal["probability", "log_odds"] = "log_odds"
     """What is averaged, weighted by length, over a keyframe's rays through a voxel."""
@@ -121,13 +129,14 @@ class InferenceConfig:
     """How messages are stored. float16 halves the memory and moves beliefs by at most 0.006."""
 
     def __post_init__(self) -> None:
-        for name in ("method", "likelihood", "average", "message_precision"):
+        for name in ("method", "likelihood", "ray_choice", "average", "message_precision"):
             choices = get_args(get_type_hints(type(self))[name])
             check_field(
                 getattr(self, name) in choices, f"inference.{name}", f"must be one of {', '.join(choices)}"
             )
         check_field(self.sweeps >= 0, "inference.sweeps", "must not be negative")
         check_field(0 <= self.tolerance <= 1, "inference.tolerance", "must lie between 0 and 1")
+        check_field(self.renew_tolerance >= 0, "inference.renew_tolerance", "must not be negative")
         check_field(0 <= self.damping < 1, "inference.damping", "must be at least 0 and less than 1")
         check_field(self.surface_density > 0, "inference.surface_density", "must be positive")
         check_field(self.prior is None or 0 < self.prior < 1, "inference.prior", "must lie between 0 and 1")

@@ -160,6 +160,37 @@ def test_no_voxel_gets_more_rays_than_the_scale_allows(
         assert length * scale + 0.5 * count < 2**31
 
 
+@settings(max_examples=100)
+@given(
+    camera=cameras,
+    pixel=st.tuples(st.floats(0, 1), st.floats(0, 1)),
+    distance=st.floats(1, 60),
+    side=st.sampled_from([2, 4, 8]),
+)
+def test_rays_that_stand_for_many_pixels_do_not_overflow_either(
+    camera: PinholeCamera, pixel: tuple, distance: float, side: int
+) -> None:
+    """The image in blocks, each one ray through its middle that counts as all its pixels."""
+    T = look_at((0, 0, 0), (1.0, 0.1, 0.0))
+    ray = camera.rays()[int(pixel[1] * (camera.height - 1)), int(pixel[0] * (camera.width - 1))] @ T[:3, :3].T
+    towards_camera = np.where(ray > 0, 0, BRICK - 1)
+    brick = np.array([3, -70, 12])
+    T[:3, 3] = brick * BRICK + towards_camera + 0.5 - distance * ray / np.linalg.norm(ray)
+    window = Window((0, -80, 8), (16, 16, 16), 1.0)
+    pixels = camera.width * camera.height
+    scale = finest_scale(camera, pixels, T, window, brick[None].astype(np.int32), side)
+    if min(camera.width, camera.height) < side:
+        return
+    middle = (side - 1) / 2
+    blocks = PinholeCamera(
+        camera.width // side, camera.height // side, camera.fx / side, camera.fy / side,
+        (camera.cx - middle) / side, (camera.cy - middle) / side,
+    )  # fmt: skip
+    count, length = rays_through(blocks, T, brick * BRICK + towards_camera)
+    assert count * side**2 * LONGEST * scale <= 2**31
+    assert side**2 * length * scale + 0.5 * count < 2**31
+
+
 def test_far_voxels_get_a_finer_scale() -> None:
     """At 4 m and 2 cm a VGA camera's 307200 rays are some 30 a voxel: seven more binary digits at least."""
     camera = PinholeCamera(640, 480, 525, 525, 319.5, 239.5)

@@ -21,7 +21,8 @@ from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import InferenceConfig, SensorConfig, VolumeConfig
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.inference.footprint import find_footprint, visible_box
-from taichi_mrf.inference.keyframe import DepthImage, Footprint
+from taichi_mrf.inference.keyframe import DepthImage, Footprint, RayList
+from taichi_mrf.inference.ray_list import RayLister
 from taichi_mrf.poses import Pose, look_at
 from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS
@@ -128,10 +129,14 @@ def assert_between(footprint: Footprint, rays: Rays, box: tuple[NDArray, NDArray
     assert set(footprint.surface.tolist()) < set(footprint.crossed.tolist())
 
 
+def every_ray(image: DepthImage) -> RayList:
+    return RayLister(VOXEL, InferenceConfig(rays_per_voxel=0.0)).rays_of(image)
+
+
 def footprint_of(
     image: DepthImage, T: Pose, volume: VolumeConfig | None = None, sensor: SensorConfig = SENSOR
 ) -> Footprint:
-    return find_footprint(image, T, VOXEL, sensor, INFERENCE, volume or VolumeConfig())
+    return find_footprint(image, every_ray(image), T, VOXEL, sensor, INFERENCE, volume or VolumeConfig())
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -173,7 +178,9 @@ def test_surfaces_are_where_the_measurement_may_have_come_from() -> None:
 def test_rays_can_go_on_beyond_their_end(beyond: float) -> None:
     """As if every ray ended so many metres of axial depth further away; surfaces begin where they did."""
     image, T = uploaded(scene(5)), POSES["oblique"]
-    footprint = find_footprint(image, T, VOXEL, SENSOR, INFERENCE, VolumeConfig(), beyond_m=beyond)
+    footprint = find_footprint(
+        image, every_ray(image), T, VOXEL, SENSOR, INFERENCE, VolumeConfig(), beyond_m=beyond
+    )
     rays = rays_of(image, T, footprint.window, 1e9)
     further = replace(rays, end=np.minimum(rays.end + beyond, SENSOR.max_depth))
     assert_between(footprint, further, whole(footprint.window))
@@ -236,7 +243,7 @@ def test_a_volume_behind_the_camera_is_not_seen() -> None:
 def test_a_view_with_too_many_bricks_is_an_error() -> None:
     image = uploaded(np.full(CAMERA.shape, 5.0))
     with pytest.raises(CapacityError, match="voxel size of 1e-05 m"):
-        find_footprint(image, POSES["oblique"], 1e-5, SENSOR, INFERENCE, VolumeConfig())
+        find_footprint(image, every_ray(image), POSES["oblique"], 1e-5, SENSOR, INFERENCE, VolumeConfig())
 
 
 @ti.dataclass

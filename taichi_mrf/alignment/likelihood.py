@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
+import taichi as ti
 
 from taichi_mrf import runtime
 from taichi_mrf.inference import sum_product
@@ -26,7 +27,8 @@ def map_of_others(view: View, keyframe: Keyframe) -> Iterator[None]:
     """
     cavity = view.pool.snapshot()
     if keyframe.messages is not None and len(keyframe.visible.slots):
-        sum_product.withdraw(keyframe.visible.slots, cavity.belief, keyframe.messages)
+        moved = ti.ndarray(ti.i32, len(keyframe.visible.slots))
+        sum_product.withdraw(keyframe.visible.slots, cavity.belief, keyframe.messages, moved)
     with view.pool.showing(cavity):
         yield
     runtime.settle()  # before the snapshot is dropped

@@ -23,6 +23,7 @@ from taichi_mrf.evaluation.experiments.fig10 import run_fig10
 from taichi_mrf.evaluation.experiments.folds import Experiment
 from taichi_mrf.evaluation.experiments.ledger import Ledger
 from taichi_mrf.evaluation.experiments.poses import run_poses
+from taichi_mrf.evaluation.experiments.rays import run_rays
 from taichi_mrf.evaluation.experiments.stereo import run_stereo
 from taichi_mrf.evaluation.experiments.table1 import run_table1
 from taichi_mrf.evaluation.experiments.table2 import run_table2
@@ -41,6 +42,7 @@ EXPERIMENTS: dict[str, tuple[Run, tuple[float, ...]]] = {
     "stereo": (run_stereo, (0.2,)),
     "exact": (run_exact, (0.05,)),
     "poses": (run_poses, (0.05,)),
+    "rays": (run_rays, (0.05, 0.02, 0.01)),
 }
 """Name -> what runs it, and its own voxel sizes."""
 

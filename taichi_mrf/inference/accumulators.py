@@ -52,13 +52,19 @@ def mean_message(packed: ti.i64) -> F32:
 
 
 def finest_scale(
-    camera: PinholeCamera, rays: int, T_world_camera: Pose, window: Window, bricks: NDArray[np.int32]
+    camera: PinholeCamera,
+    rays: int,
+    T_world_camera: Pose,
+    window: Window,
+    bricks: NDArray[np.int32],
+    widest: int = 1,
 ) -> float:
     """The largest power of two by which lengths can be scaled before a sum could overflow 31 bits.
 
     A voxel at a distance of D voxels lies in the cone of the sphere around it, which no more pixels
     can meet than fit in the cone's solid angle at the image's corner, where pixels are densest.
-    ``bricks`` (n, 3) are those that the rays may meet.
+    ``bricks`` (n, 3) are those that the rays may meet; ``rays`` are counted as the pixels that they stand
+    for, squares of ``widest`` pixels a side at most.
     """
     centre = window.to_voxels(T_world_camera[:3, 3]) + np.asarray(window.lowest) * BRICK
     low = bricks.astype(np.float64) * BRICK
@@ -71,6 +77,6 @@ def finest_scale(
         density = camera.fx * camera.fy * slant**3  # pixels for each unit of solid angle
         radius = math.asin(HALF_VOXEL / distance)
         solid_angle = 2 * math.pi * (1 - math.cos(radius))
-        rim = 2 * math.pi * radius * slant**2 * max(camera.fx, camera.fy)  # pixels cut by the cone's edge
-        most = min(most, density * solid_angle + rim + 4)
+        rim = 2 * math.pi * radius * slant**2 * max(camera.fx, camera.fy)  # pixels along the cone's edge
+        most = min(most, density * solid_angle + rim * widest + 4 * widest**2)
     return 2.0 ** math.floor(math.log2(2**31 / (LONGEST * max(most, 1.0) + 1)))

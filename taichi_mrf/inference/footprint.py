@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from taichi_mrf.config import InferenceConfig, SensorConfig, VolumeConfig
 from taichi_mrf.errors import CapacityError
-from taichi_mrf.inference.keyframe import DepthImage, Footprint
-from taichi_mrf.inference.rays import is_cast, pixel_direction, stride_metres
+from taichi_mrf.inference.keyframe import DepthImage, Footprint, RayList
+from taichi_mrf.inference.ray_list import block_of
+from taichi_mrf.inference.rays import pixel_direction
 from taichi_mrf.poses import Pose
 from taichi_mrf.sensor.forward import depth_of_deviation, pixel_noise
 from taichi_mrf.sensor.noise import LEAST_SIGMA_M, evaluate
@@ -41,6 +42,7 @@ TILE = 32
 
 def find_footprint(
     image: DepthImage,
+    rays: RayList,
     T_world_camera: Pose,
     voxel_size: float,
     sensor: SensorConfig,
@@ -48,7 +50,7 @@ def find_footprint(
     volume: VolumeConfig,
     beyond_m: float = 0.0,
 ) -> Footprint:
-    """Follow every ray of an image from the camera to ``end_sigmas`` beyond its measurement, and
+    """Follow every ray of an image's list from the camera to ``end_sigmas`` beyond its measurement, and
     ``beyond_m`` metres of axial depth more.
 
     Raises CapacityError if the space that the image sees has too many bricks at this voxel size.
@@ -64,8 +66,7 @@ def find_footprint(
     marks = np.zeros(window.cells, np.int32)
     longest = np.ones(1, np.int32)
     _mark(
-        image.depth, image.camera.width, stride_metres(image.camera, voxel_size, inference),
-        image.intrinsics, centre, to_voxels,
+        rays.blocks, rays.depth, rays.number, image.camera.width, image.intrinsics, centre, to_voxels,
         image.noise, image.noise_table.patch, image.noise_table.columns,
         sensor.max_depth, inference.end_sigmas, beyond_m,
         window.shape_vector, box_lower, box_upper, marks, longest,
@@ -153,26 +154,26 @@ def _mark_brick(mark: Template, context: Template, ray: Template, brick: IVec3, 
 
 @ti.kernel
 def _mark(
-    depth: F32Array, width: I32, stride_metres: F32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
+    blocks: I32Array, depth: F32Array, rays: I32, width: I32,
+    intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
     noise: F32Array3, patch: I32, columns: I32,
     max_depth: F32, end_sigmas: F32, beyond_m: F32,
     shape: IVec3, box_lower: Vec3, box_upper: Vec3, marks: I32Array, longest: I32Array,
 ):  # fmt: skip
-    for pixel in range(depth.shape[0]):
-        measured = depth[pixel]
-        u, v = pixel % width, pixel // width
-        if is_cast(u, v, measured, stride_metres):
-            direction = to_voxels @ pixel_direction(u, v, intrinsics)
-            ray = make_ray(centre, direction)
-            noise_here = pixel_noise(noise, patch, columns, u, v)
-            last = depth_of_deviation(measured, -end_sigmas, noise_here) + beyond_m
-            begin, end = 0.0, ti.min(last, max_depth)
-            clip(ray, begin, end, box_lower, box_upper)
-            mark = _Mark(depth_of_deviation(measured, end_sigmas, noise_here), 0)
-            walk_bricks(ray, begin, end, shape, marks, False, _mark_brick, mark, (shape, marks))
-            if end > begin:
-                # A step along the ray leaves a voxel through a face, or enters a brick anew.
-                faces = (end - begin) * (ti.abs(direction[0]) + ti.abs(direction[1]) + ti.abs(direction[2]))
-                steps = ti.cast(faces, ti.i32) + 4 + 2 * mark.bricks
-                if steps > longest[0]:
-                    ti.atomic_max(longest[0], steps)
+    for i in range(rays):
+        measured = depth[i]
+        u, v, side = block_of(blocks[i], width)
+        direction = to_voxels @ pixel_direction(u + 0.5 * (side - 1), v + 0.5 * (side - 1), intrinsics)
+        ray = make_ray(centre, direction)
+        noise_here = pixel_noise(noise, patch, columns, u + side // 2, v + side // 2)
+        last = depth_of_deviation(measured, -end_sigmas, noise_here) + beyond_m
+        begin, end = 0.0, ti.min(last, max_depth)
+        clip(ray, begin, end, box_lower, box_upper)
+        mark = _Mark(depth_of_deviation(measured, end_sigmas, noise_here), 0)
+        walk_bricks(ray, begin, end, shape, marks, False, _mark_brick, mark, (shape, marks))
+        if end > begin:
+            # A step along the ray leaves a voxel through a face, or enters a brick anew.
+            faces = (end - begin) * (ti.abs(direction[0]) + ti.abs(direction[1]) + ti.abs(direction[2]))
+            steps = ti.cast(faces, ti.i32) + 4 + 2 * mark.bricks
+            if steps > longest[0]:
+                ti.atomic_max(longest[0], steps)

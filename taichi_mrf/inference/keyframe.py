@@ -69,6 +69,26 @@ class DepthImage:
 
 
 @dataclass(frozen=True)
+class RayList:
+    """The rays of a depth image, tile after tile.
+
+    ``blocks`` (n) int32 says which pixels a ray stands for (ray_list.py), ``depth`` (n) float32 is its
+    measurement, axial depth in metres. There is at least one entry; ``number`` of them are rays. ``widest``
+    is the largest number of pixels along a block's side.
+    """
+
+    blocks: ti.Ndarray
+    depth: ti.Ndarray
+    number: int
+    widest: int
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the list."""
+        return 8 * self.blocks.shape[0]
+
+
+@dataclass(frozen=True)
 class Footprint:
     """What a depth image's rays cross, which depends on its pose and on nothing else in the map.
 
@@ -100,14 +120,16 @@ class VisibleBricks:
 class Keyframe:
     """One keyframe of a map.
 
-    ``messages`` is (bricks * 512) log-odds, in the order of ``visible``; ``begins`` is, for each
-    block of pixels, the depth up to which its rays cross none of these bricks, once it is known;
-    ``revision`` is that of the beliefs right after its last sweep.
+    ``messages`` is (bricks * 512) log-odds, in the order of ``visible``; ``begins`` is, for each ray of the
+    list, the depth up to which it crosses none of these bricks, once it is known; ``revision`` is that of
+    the beliefs right after its last sweep, and ``heard`` (bricks) how often marginals of each brick had moved
+    by then.
     """
 
     id: int
     name: str
     image: DepthImage
+    ray_list: RayList
     T_world_camera: Pose
     footprint: Footprint
     visible: VisibleBricks
@@ -115,6 +137,7 @@ class Keyframe:
     begins_known: bool = False
     revision: int = -1
     messages: ti.Ndarray | None = None
+    heard: NDArray[np.int64] | None = None
 
     @property
     def camera(self) -> PinholeCamera:
@@ -132,8 +155,8 @@ class Keyframe:
 
     @property
     def image_bytes(self) -> int:
-        """Bytes of the depth image."""
-        return self.image.depth.shape[0] * 4
+        """Bytes of the depth image and of the list of its rays."""
+        return self.image.depth.shape[0] * 4 + self.ray_list.nbytes + self.begins.shape[0] * 4
 
     @property
     def voxel_bytes(self) -> int:

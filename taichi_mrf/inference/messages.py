@@ -24,12 +24,20 @@ def carry_over(
     old: VisibleBricks, old_messages: "ti.Ndarray", visible: VisibleBricks, messages: "ti.Ndarray"
 ) -> None:
     """Copy the messages to those bricks that were on the old list and are still the same."""
-    if len(old.cells) == 0 or len(visible.cells) == 0:
-        return
+    place = places_of(old, visible)
+    if (place >= 0).any():
+        _copy_bricks(place, old_messages, messages)
+    runtime.settle()  # before the old ones are dropped
+
+
+def places_of(old: VisibleBricks, visible: VisibleBricks) -> NDArray[np.int32]:
+    """Where each brick of a list (n) stood on an older list of the same keyframe; -1 for one that was not on
+    it, or was another brick."""
+    if len(old.cells) == 0:
+        return np.full(len(visible.cells), -1, np.int32)
     place = np.minimum(np.searchsorted(old.cells, visible.cells), len(old.cells) - 1)
     same = (old.cells[place] == visible.cells) & (old.identity[place] == visible.identity)
-    _copy_bricks(np.where(same, place, -1).astype(np.int32), old_messages, messages)
-    runtime.settle()  # before the old ones are dropped
+    return np.where(same, place, -1).astype(np.int32)
 
 
 _STRIP = 64

@@ -26,7 +26,8 @@ from taichi_mrf.inference.accumulators import add_message, length_sum, mean_mess
 from taichi_mrf.inference.first_occupied import NEVER
 from taichi_mrf.inference.log_odds import clamped_log_odds, exp_of_negative, logistic, softplus
 from taichi_mrf.inference.max_product import best_message, cost, see_best
-from taichi_mrf.inference.rays import deals, dealt_pixel, is_cast, pixel_direction
+from taichi_mrf.inference.ray_list import block_of
+from taichi_mrf.inference.rays import deals, dealt_ray, pixel_direction
 from taichi_mrf.sensor.forward import (
     SUPPORT,
     PixelNoise,
@@ -56,9 +57,6 @@ from taichi_mrf.voxels.types import (
 
 TINY = 1e-30
 """Keeps a ray that explains nothing, without an outlier floor, from dividing zero by zero."""
-
-BLOCK = 4
-"""Pixels along each side of the blocks that share the depth of their first brick."""
 
 MOVED = 0.01
 """A marginal that changes by more than this counts as moved (the residual of a sweep)."""
@@ -97,14 +95,14 @@ def cavity(
 
 @ti.kernel
 def send_messages(
-    depth: F32Array, begins: F32Array, begins_known: I32,
-    width: I32, stride_metres: F32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
+    blocks: I32Array, depth: F32Array, rays: I32, begins: F32Array, begins_known: I32,
+    width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
     noise: F32Array3, patch: I32, columns: I32,
     voxel_size: F32, max_depth: F32, end_sigmas: F32, floor: F32,
     shape: IVec3, box_lower: Vec3, box_upper: Vec3, chunks: I32Array, bricks: I32Array,
     log_free: F32Array, sums: I64Array, scale: F32, clamp: F32,
     trace_voxel: I32Array, trace: Vec4Array, longest: I32, steps: I32Array,
-    workers: I32, tile: I32, spread: I32,
+    workers: I32, run: I32, spread: I32,
     likelihood: Template, segment_lengths: Template, log_average: Template, maximise: Template,
     block_dim: Template,
 ):  # fmt: skip
@@ -113,36 +111,34 @@ def send_messages(
     A worker follows one ray after the other and writes each ray's steps into its own part of the trace,
     so that the way back need not be walked again. ``longest`` is never less than a ray has voxels.
     ``steps`` receives each worker's number of voxels crossed.
-    ``begins`` holds, for each block of BLOCK x BLOCK pixels, the depth at which the first ray meets a
-    brick: learnt by the sweep that does not know it yet, and where later sweeps start.
-    Rays are dealt out in square tiles of the image, ``tile`` pixels wide, whose rays cross the same bricks.
+    ``begins`` holds the depth at which each ray meets its first brick: learnt by the sweep that does not
+    know it yet, and where later sweeps start. Rays are dealt out in runs of ``run`` neighbours; one that
+    stands for a block of pixels counts as many as they are.
     """
     if ti.static(block_dim > 0):
         ti.loop_config(block_dim=block_dim)
     for iteration in range(workers * spread):
         worker = iteration // spread
-        height = depth.shape[0] // width
         largest = ti.exp(clamp)
         turns = 0
         if iteration % spread == 0:
-            turns = deals(workers, tile, width, height)
+            turns = deals(workers, run, rays)
             steps[worker] = 0
         for turn in range(turns):
-            u, v = dealt_pixel(worker, turn, workers, tile, width)
-            measured = 0.0
-            if u < width and v < height:
-                measured = depth[v * width + u]
-            if is_cast(u, v, measured, stride_metres):
-                direction = to_voxels @ pixel_direction(u, v, intrinsics)
+            i = dealt_ray(worker, turn, workers, run)
+            if i < rays:
+                measured = depth[i]
+                u, v, side = block_of(blocks[i], width)
+                middle = 0.5 * (side - 1)
+                direction = to_voxels @ pixel_direction(u + middle, v + middle, intrinsics)
                 ray = make_ray(centre, direction)
-                here = pixel_noise(noise, patch, columns, u, v)
+                here = pixel_noise(noise, patch, columns, u + side // 2, v + side // 2)
 
                 # The ray ends where its measurement has nothing more to say, or where the map does.
                 last = depth_of_deviation(measured, -end_sigmas, here)
-                block = (v // BLOCK) * ((width + BLOCK - 1) // BLOCK) + u // BLOCK
                 begin, end = 0.0, ti.min(last, max_depth)
                 if begins_known == 1:
-                    begin = begins[block]
+                    begin = begins[i]
                 clip(ray, begin, end, box_lower, box_upper)
 
                 # Forward: eq. 11 for each voxel, from the camera outwards.
@@ -155,8 +151,8 @@ def send_messages(
                     (log_free, trace_voxel, trace, voxel_size, likelihood, segment_lengths, maximise, floor),
                 )  # fmt: skip
 
-                if begins_known == 0 and ahead.first < begins[block]:
-                    ti.atomic_min(begins[block], ahead.first)
+                if begins_known == 0:
+                    begins[i] = ahead.first
                 steps[worker] += ahead.voxels
 
                 # What gets through to where the map ends may have met its surface there.
@@ -179,9 +175,9 @@ def send_messages(
                         if ti.static(log_average):
                             message = clamped_log_odds(occupied, empty, clamp, largest)
                         behind += (1.0 - free) * here_density
-                    weight = 1.0
+                    weight = ti.cast(side * side, ti.f32)
                     if ti.static(segment_lengths):
-                        weight = trace[j][0]
+                        weight *= trace[j][0]
                     add_message(sums, trace_voxel[j], weight, message, scale)
 
 
@@ -250,16 +246,28 @@ def finish(
             j = slots[i // VOXELS] * VOXELS + i % VOXELS
             before = belief[j]
             belief[j] = before + change
-            # No marginal changes by more than a quarter of its log-odds' change.
-            if ti.abs(change) > 4.0 * MOVED and ti.abs(logistic(before + change) - logistic(before)) > MOVED:
+            if _moves(before, change):
                 moved[i // VOXELS] += 1
 
 
+@ti.func
+def _moves(log_odds: F32, change: F32) -> I32:
+    """Whether a marginal changes by more than MOVED; never by more than a quarter of its log-odds' change."""
+    moves = 0
+    if ti.abs(change) > 4.0 * MOVED:
+        moves = ti.abs(logistic(log_odds + change) - logistic(log_odds)) > MOVED
+    return moves
+
+
 @ti.kernel
-def withdraw(slots: I32Array, belief: F32Array, messages: AnyArray):
-    """Take a keyframe's messages out of the beliefs."""
+def withdraw(slots: I32Array, belief: F32Array, messages: AnyArray, moved: I32Array):
+    """Take a keyframe's messages out of the beliefs; ``moved`` counts as in :func:`finish`."""
     for i in range(slots.shape[0] * VOXELS):
-        belief[slots[i // VOXELS] * VOXELS + i % VOXELS] -= ti.cast(messages[i], ti.f32)
+        j = slots[i // VOXELS] * VOXELS + i % VOXELS
+        message = ti.cast(messages[i], ti.f32)
+        if _moves(belief[j], -message):
+            moved[i // VOXELS] += 1
+        belief[j] -= message
 
 
 @ti.kernel

@@ -11,8 +11,7 @@ from taichi_mrf import runtime
 from taichi_mrf.config import InferenceConfig, SensorConfig, VolumeConfig
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.accumulators import finest_scale
-from taichi_mrf.inference.keyframe import DepthImage, Keyframe
-from taichi_mrf.inference.rays import stride_metres
+from taichi_mrf.inference.keyframe import Keyframe, RayList
 from taichi_mrf.sensor.forward import AUTO, CENTRE, SEGMENT
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
@@ -28,21 +27,21 @@ TRACE_BYTES = 20
 
 @dataclass(frozen=True)
 class Workers:
-    """How rays are dealt out: to how many workers, in square tiles of how many pixels a side, how many
-    loop iterations a worker stands for, and the block size on a GPU."""
+    """How rays are dealt out: to how many workers, in runs of how many neighbours, how many loop iterations
+    a worker stands for, and the block size on a GPU."""
 
     number: int
-    tile: int
+    run: int
     spread: int
     block: int
 
 
 def workers_for(arch: str, software: bool, longest: int) -> Workers:
-    """On a CPU a worker is a strip of the image whose trace stays in the cache; on a GPU it is a thread,
+    """On a CPU a worker takes runs of rays, and its trace stays in the cache; on a GPU it is a thread,
     neighbours take neighbouring rays, and the trace is bounded to half a GB."""
     if arch == "cpu":
         # Taichi gives a CPU thread no fewer than 512 iterations of a loop at a time.
-        return Workers(64, 32, 512, 0)
+        return Workers(64, 256, 512, 0)
     if software:
         return Workers(1024, 1, 1, runtime.SOFTWARE_BLOCK)
     most = (512 << 20) // (TRACE_BYTES * longest)
@@ -58,10 +57,9 @@ def least_log_odds(inference: InferenceConfig, prior_log_odds: float) -> float:
     return max(-inference.cavity_clamp, math.log(chance / (1.0 - chance)))
 
 
-def unknown_begins(image: DepthImage) -> "ti.Ndarray":
-    """The depth at which each block of an image's pixels meets its first brick: not known, so never."""
-    across, down = (-(-side // sum_product.BLOCK) for side in (image.camera.width, image.camera.height))
-    begins = ti.ndarray(ti.f32, across * down)
+def unknown_begins(rays: RayList) -> "ti.Ndarray":
+    """The depth at which each ray meets its first brick: not known, so never."""
+    begins = ti.ndarray(ti.f32, rays.blocks.shape[0])
     begins.fill(FAR)
     return begins
 
@@ -101,7 +99,7 @@ class Sweeper:
 
         Returns how many voxels of each visible brick moved, or None if it sees no brick.
         """
-        config, image = self.inference, keyframe.image
+        config, image, rays = self.inference, keyframe.image, keyframe.ray_list
         visible, footprint = keyframe.visible, keyframe.footprint
         n = len(visible.slots)
         if n == 0:
@@ -113,7 +111,12 @@ class Sweeper:
         centre, to_voxels = window.rays_of(keyframe.T_world_camera)
         box_lower, box_upper = window.clip_box(self.volume.lower, self.volume.upper)
         scale = finest_scale(
-            image.camera, image.rays, keyframe.T_world_camera, window, window.bricks_of(visible.cells)
+            image.camera,
+            image.rays,
+            keyframe.T_world_camera,
+            window,
+            window.bricks_of(visible.cells),
+            rays.widest,
         )
         log_average = config.average == "log_odds"
 
@@ -127,15 +130,14 @@ class Sweeper:
         # Eqs. 4, 11, 13 and 14: what the rays make of that and of their measurements.
         self.index.fill(window, visible.cells, np.arange(n, dtype=np.int32))
         sum_product.send_messages(
-            image.depth, keyframe.begins, int(keyframe.begins_known),
-            image.camera.width, stride_metres(image.camera, self.voxel_size, config),
-            image.intrinsics, centre, to_voxels,
+            rays.blocks, rays.depth, rays.number, keyframe.begins, int(keyframe.begins_known),
+            image.camera.width, image.intrinsics, centre, to_voxels,
             image.noise, image.noise_table.patch, image.noise_table.columns,
             self.voxel_size, self.sensor.max_depth, config.end_sigmas, config.outlier_floor,
             window.shape_vector, box_lower, box_upper, self.index.chunks, self.index.bricks,
             self.log_free, self.sums, scale, config.message_clamp,
             self.trace_voxel, self.trace, footprint.longest, self.steps,
-            workers.number, workers.tile, workers.spread,
+            workers.number, workers.run, workers.spread,
             LIKELIHOODS[config.likelihood], config.segment_lengths, log_average,
             config.method == "max-product", workers.block,
         )  # fmt: skip
@@ -149,8 +151,10 @@ class Sweeper:
             config.message_clamp, config.damping, config.min_length, self.moved, log_average,
         )  # fmt: skip
         pool.revision += 1
-        keyframe.revision = pool.revision
-        return self.moved.to_numpy()[:n]
+        moved = self.moved.to_numpy()[:n]
+        pool.stir(visible.slots, moved)
+        keyframe.revision, keyframe.heard = pool.revision, pool.stirred[visible.slots]
+        return moved
 
     def _reserve(self, bricks: int, steps: int, workers: int) -> None:
         runtime.settle()

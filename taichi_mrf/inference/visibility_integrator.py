@@ -12,6 +12,7 @@ from taichi_mrf.config import InferenceConfig, SensorConfig, VisibilityConfig, V
 from taichi_mrf.inference import visibility_scan
 from taichi_mrf.inference.footprint import find_footprint
 from taichi_mrf.inference.keyframe import DepthImage, Footprint
+from taichi_mrf.inference.ray_list import RayLister
 from taichi_mrf.poses import Pose
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.memory import check_memory
@@ -34,6 +35,7 @@ class VisibilityIntegrator:
         # A depth is never more than its range, so what lies deeper need not be looked at.
         self.sensor = dataclasses.replace(sensor, max_depth=min(sensor.max_depth, self.max_range))
         self.index = WindowIndex()
+        self.lister = RayLister(voxel_size, InferenceConfig(rays_per_voxel=0.0))  # every pixel
         self.occluded = ti.ndarray(ti.f32, VOXELS)
         self.visible = ti.ndarray(ti.i32, VOXELS)
         self.inside = ti.ndarray(ti.i32, VOXELS)
@@ -51,8 +53,9 @@ class VisibilityIntegrator:
         to_its_end = InferenceConfig(end_sigmas=visibility_scan.SURE_SIGMAS)
         beyond_m = visibility_scan.BEYOND_VOXELS * self.voxel_size
         footprint = find_footprint(
-            image, T_world_camera, self.voxel_size, self.sensor, to_its_end, self.volume, beyond_m
-        )
+            image, self.lister.rays_of(image), T_world_camera, self.voxel_size, self.sensor, to_its_end,
+            self.volume, beyond_m,
+        )  # fmt: skip
         voxels = len(footprint.crossed) * VOXELS
         check_memory(
             voxels * (4.0 + SCRATCH_BYTES),

@@ -4,6 +4,8 @@ A brick exists as long as some keyframe has measured a surface in it, and is giv
 of them. Keyframes' footprints go in and out; nothing here knows what inference does with the voxels.
 """
 
+from collections import deque
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +15,9 @@ from taichi_mrf.voxels.topology import Topology
 
 Bricks = NDArray[np.int32]
 
+REMEMBERED = 64
+"""Changes of the set of bricks that are kept, so that few lists must be made anew."""
+
 
 class BrickBook:
     """Keeps topology and pool in step. ``version`` changes whenever a brick comes or goes."""
@@ -20,6 +25,7 @@ class BrickBook:
     def __init__(self, topology: Topology, pool: BrickPool, voxel_size: float) -> None:
         self.topology, self.pool, self.voxel_size = topology, pool, voxel_size
         self.version = 0
+        self._changes: deque[Bricks] = deque(maxlen=REMEMBERED)
         self.frozen_crossed: Bricks = np.zeros((0, 3), np.int32)
 
     def claim(self, footprint: Footprint) -> None:
@@ -41,7 +47,7 @@ class BrickBook:
         """New bricks (n, 3) at the prior, owned by nobody yet; returns their slots."""
         slots = self.pool.allocate(bricks)
         self.topology.insert(bricks, slots)
-        self.version += 1
+        self._note_change(bricks)
         return slots
 
     def disclaim(self, footprint: Footprint) -> None:
@@ -54,7 +60,7 @@ class BrickBook:
         if orphans.any():
             self.topology.erase(surface[orphans])
             self.pool.release(slots[orphans])
-            self.version += 1
+            self._note_change(surface[orphans])
 
     def freeze(self, footprint: Footprint) -> None:
         """Keep a footprint for good: its bricks stay, and what it crossed stays seen.
@@ -71,6 +77,29 @@ class BrickBook:
         self.topology.add_crossings(self.frozen_crossed, -1)
         self.frozen_crossed = np.ascontiguousarray(together, np.int32)
         self.topology.add_crossings(self.frozen_crossed, 1)
+
+    def start_over(self) -> None:
+        """Note that all bricks may have come or gone."""
+        self.version += 1
+        self._changes.clear()
+
+    def visible_again(self, footprint: Footprint, old: VisibleBricks) -> VisibleBricks:
+        """What a keyframe sees now that once saw ``old``: the same list, if none of the bricks that its rays
+        cross has come or gone since, which costs no more than to look at those that have."""
+        steps = self.version - old.version
+        if steps > len(self._changes):
+            return self.visible(footprint)
+        for bricks in list(self._changes)[len(self._changes) - steps :]:
+            cells = footprint.window.cells_of(bricks)
+            place = np.minimum(np.searchsorted(footprint.crossed, cells), len(footprint.crossed) - 1)
+            if len(footprint.crossed) and (footprint.crossed[place] == cells).any():
+                return self.visible(footprint)
+        old.version = self.version
+        return old
+
+    def _note_change(self, bricks: Bricks) -> None:
+        self.version += 1
+        self._changes.append(bricks)
 
     def visible(self, footprint: Footprint) -> VisibleBricks:
         """The bricks that exist among those that a keyframe's rays cross."""

@@ -13,7 +13,6 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf import runtime
@@ -24,16 +23,18 @@ from taichi_mrf.config_values import overridden
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.factor_graph.depth_graph import depth_graph
 from taichi_mrf.factor_graph.graph import FactorGraph
-from taichi_mrf.inference import sum_product
-from taichi_mrf.inference.footprint import find_footprint
+from taichi_mrf.inference.affected import Renewal
 from taichi_mrf.inference.keyframe import DepthImage, Keyframe, checked_depth
-from taichi_mrf.inference.messages import carry_over, count_voices, new_messages
+from taichi_mrf.inference.messages import count_voices
 from taichi_mrf.inference.prior import prior_probability
+from taichi_mrf.inference.ray_list import RayLister
 from taichi_mrf.inference.schedule import InferReport, Progress, content_key, run_sweeps
 from taichi_mrf.inference.sweep import Sweeper, unknown_begins
+from taichi_mrf.inference.whereabouts import Whereabouts
 from taichi_mrf.maps.brick_book import BrickBook
 from taichi_mrf.maps.checkpoint import Checkpoint, go_back, take_checkpoint
 from taichi_mrf.maps.map_file import MapHeader, StoredKeyframe
+from taichi_mrf.maps.placing import Placing
 from taichi_mrf.maps.statistics import MapStatistics, measure
 from taichi_mrf.maps.storage import contents_of, read_contents, write_contents
 from taichi_mrf.poses import as_pose
@@ -42,7 +43,7 @@ from taichi_mrf.queries.points import classify, point_log_odds, probability
 from taichi_mrf.queries.profile import RayProfile
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config, warn_of_bad_sigma
-from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import create_topology, recycle
 
@@ -83,7 +84,12 @@ class MRFMap:
         topology = create_topology(runtime.active() or "cpu", self.config.volume.dense_bricks)
         weakref.finalize(self, recycle, topology)
         self._book = BrickBook(topology, self._pool, self.voxel_size)
+        lister = RayLister(self.voxel_size, inference)
+        whereabouts = Whereabouts()
+        parts = (self.sensor, inference, self.config.volume)
+        self._placing = Placing(self._book, lister, *parts, whereabouts)
         self._sweeper = Sweeper(self.voxel_size, self.sensor, inference, self.config.volume)
+        self._renewal = Renewal(self._pool, self._sweeper, whereabouts, self._placing.refresh)
         self.view = View(self._pool, self.voxel_size, self.config.volume)
         self._aligner = Aligner(self.view, self.sensor.max_depth)
         self._keyframes: dict[int, Keyframe] = {}
@@ -122,7 +128,7 @@ class MRFMap:
         """
         T = as_pose(T_world_camera)
         image = self._upload(depth_m, camera)
-        keyframe = self._place(self._next_id, name or f"keyframe {self._next_id}", image, T)
+        keyframe = self._placing.place(self._next_id, name or f"keyframe {self._next_id}", image, T)
         self._keyframes[keyframe.id] = keyframe
         self._next_id += 1
         return keyframe.id
@@ -131,19 +137,19 @@ class MRFMap:
         """Take a keyframe out, with all that it has said, and the bricks that only it wanted."""
         keyframe = self._find(id)
         self._restore_messages()
-        self._take_out(keyframe)
+        self._placing.take_out(keyframe)
         del self._keyframes[id]
 
     def move_keyframe(self, id: int, T_world_camera: ArrayLike) -> None:
         """Give a keyframe another pose, as a SLAM back-end does; its messages begin anew."""
         keyframe = self._find(id)
-        T = as_pose(T_world_camera)
+        T, before = as_pose(T_world_camera), keyframe.T_world_camera
         self._restore_messages()
-        self._take_out(keyframe)
+        self._placing.take_out(keyframe)
         try:
-            self._keyframes[id] = self._place(id, keyframe.name, keyframe.image, T)
+            self._keyframes[id] = self._placing.place(id, keyframe.name, keyframe.image, T)
         except Exception:
-            self._keyframes[id] = self._place(id, keyframe.name, keyframe.image, keyframe.T_world_camera)
+            self._keyframes[id] = self._placing.place(id, keyframe.name, keyframe.image, before)
             raise
 
     def refine_pose(
@@ -155,7 +161,7 @@ class MRFMap:
         keyframe = self._find(id)
         self._restore_messages()
         if keyframe.messages is not None:
-            self._refresh(keyframe)
+            self._placing.refresh(keyframe)
         poses = [as_pose(T) for T in guesses]
         refined = self._aligner.refine(keyframe, self._keyframes, self._frozen, config or PoseConfig(), poses)
         if refined.accepted:
@@ -174,12 +180,7 @@ class MRFMap:
             raise KeyframeError(
                 f"keyframe {id} ({keyframe.name}) has no messages to freeze: call infer first"
             )
-        messages = self._refresh(keyframe)
-        if len(keyframe.visible.slots):
-            sum_product.fold(keyframe.visible.slots, self._pool.keep_evidence(), messages)
-        self._book.freeze(keyframe.footprint)
-        self._pool.touch(keyframe.visible.slots)
-        runtime.settle()  # before its arrays are dropped
+        self._placing.freeze(keyframe)
         self._frozen[id] = keyframe.name
         del self._keyframes[id]
 
@@ -209,18 +210,40 @@ class MRFMap:
             self._pool.restart()
             for keyframe in chosen:
                 # A ray that starts further out rounds otherwise, so what earlier sweeps learnt must not show.
-                keyframe.begins, keyframe.begins_known = unknown_begins(keyframe.image), False
+                keyframe.begins, keyframe.begins_known = unknown_begins(keyframe.ray_list), False
                 keyframe.messages = None
-                self._refresh(keyframe)
+                self._placing.refresh(keyframe)
             self._messages_lost = False
         else:
             chosen = [self._find(id) for id in keyframes]
             self._restore_messages()
             for keyframe in chosen:
-                self._refresh(keyframe)
+                self._placing.refresh(keyframe)
         for keyframe in chosen:
             self._pool.touch(keyframe.visible.slots)
         return run_sweeps(chosen, self._pool, self._sweeper, sweeps, tolerance, progress)
+
+    def renew(
+        self,
+        keyframes: Iterable[int] = (),
+        tolerance: float | None = None,
+        seconds: float | None = None,
+        progress: Progress | None = None,
+    ) -> InferReport:
+        """Bring the marginals up to date without beginning anew: sweep ``keyframes`` (ids), new ones for
+        instance, then those to whom others have said something new, the most affected first, until no
+        keyframe has had more than ``tolerance`` of its voxels' marginals moved since its last sweep.
+
+        Begins no further sweep after ``seconds``; what is left is done by the next call. The report's
+        ``residual`` is the largest share left, its ``sweeps`` count keyframes. ``tolerance`` defaults to
+        ``inference.renew_tolerance``. The map then depends a little on the order of events, which
+        :meth:`infer` does not.
+        """
+        first = [self._find(id).id for id in keyframes]
+        self._restore_messages()
+        if tolerance is None:
+            tolerance = self.config.inference.renew_tolerance
+        return self._renewal.run(self._keyframes, first, tolerance, seconds, progress)
 
     def factor_graph(self, every: int = 1, memory_limit_gb: float = 0.0) -> FactorGraph:
         """The factor graph without average messages, for factor_graph.solve: a factor for each ray of every
@@ -228,7 +251,7 @@ class MRFMap:
         Raises CapacityError, which names its size, if it does not fit."""
         keyframes = sorted(self._keyframes.values(), key=content_key)
         for keyframe in keyframes:
-            self._refresh(keyframe)
+            self._placing.refresh(keyframe)
         parts = (self.sensor, self.config.inference, self.config.volume)
         return depth_graph(keyframes, self._pool, self.voxel_size, *parts, every, memory_limit_gb)
 
@@ -319,7 +342,7 @@ class MRFMap:
         for stored in header.keyframes:
             image = m._upload(stored.depth_m, stored.camera)
             T_world_camera = as_pose(stored.T_world_camera)
-            m._keyframes[stored.id] = m._place(stored.id, stored.name, image, T_world_camera)
+            m._keyframes[stored.id] = m._placing.place(stored.id, stored.name, image, T_world_camera)
         if len(contents.bricks):
             m._pool.write("belief", slots, contents.belief)
             if contents.evidence is not None:
@@ -344,43 +367,6 @@ class MRFMap:
         if not self._keyframes:
             warn_of_bad_sigma(image.noise_table, self.sensor.min_depth, self.sensor.max_depth)
         return image
-
-    def _place(self, id: int, name: str, image: DepthImage, T_world_camera: NDArray[np.float64]) -> Keyframe:
-        """Find out which bricks a keyframe needs and sees, and claim them."""
-        footprint = find_footprint(
-            image, T_world_camera, self.voxel_size, self.sensor, self.config.inference, self.config.volume
-        )
-        camera_brick = np.floor(T_world_camera[:3, 3] / (self.voxel_size * BRICK))
-        self._book.topology.anchor(np.clip(camera_brick, -(2**30), 2**30).astype(np.int32))
-        self._book.claim(footprint)
-        return Keyframe(
-            id, name, image, T_world_camera, footprint, self._book.visible(footprint), unknown_begins(image)
-        )
-
-    def _take_out(self, keyframe: Keyframe) -> None:
-        """Undo :meth:`_place`, and withdraw the keyframe's messages."""
-        if keyframe.messages is not None:
-            messages = self._refresh(keyframe)
-            if len(keyframe.visible.slots):
-                sum_product.withdraw(keyframe.visible.slots, self._pool.belief, messages)
-                self._pool.revision += 1
-                self._pool.touch(keyframe.visible.slots)
-        self._book.disclaim(keyframe.footprint)
-        runtime.settle()  # before its arrays are dropped
-
-    def _refresh(self, keyframe: Keyframe) -> "ti.Ndarray":
-        """Bring a keyframe's bricks and messages up to date; bricks new to it get no message yet."""
-        old, old_messages = keyframe.visible, keyframe.messages
-        if old.version != self._book.version:
-            keyframe.visible = self._book.visible(keyframe.footprint)
-            keyframe.begins = unknown_begins(keyframe.image)
-            keyframe.begins_known = False
-        if old_messages is None or keyframe.visible is not old:
-            keyframe.messages = new_messages(keyframe.visible, self.config.inference.message_precision)
-            keyframe.revision = -1
-            if old_messages is not None:
-                carry_over(old, old_messages, keyframe.visible, keyframe.messages)
-        return keyframe.messages
 
     def _use(self, method: str) -> None:
         """Infer by this method from now on: no keyframe has sent its messages by it yet."""

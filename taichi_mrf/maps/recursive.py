@@ -324,4 +324,4 @@ class RecursiveMap(ABC, Generic[FootprintT]):
         self._pool.release(self._pool.in_use)
         self._pool.revision += 1
         self._book.topology.clear()
-        self._book.version += 1
+        self._book.start_over()

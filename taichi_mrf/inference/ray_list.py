@@ -1,0 +1,189 @@
+"""Which rays a keyframe casts: its pixels, or bundles of pixels where a voxel covers many.
+
+Near the camera a voxel covers hundreds of pixels, whose rays all tell it the same. Square blocks of pixels
+are therefore put together, from 2 x 2 up, as long as a voxel at their depth is still met by the wanted number
+of rays and their measurements agree. The ray through a block's middle carries their mean depth, and counts as
+many as they are. What does not agree, such as the rim of a surface, stays in single pixels.
+"""
+
+import math
+
+import numpy as np
+import taichi as ti
+
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.config import InferenceConfig
+from taichi_mrf.inference.keyframe import DepthImage, RayList
+from taichi_mrf.sensor.forward import pixel_noise, sigma_at
+from taichi_mrf.voxels.types import F32, I32, F32Array, F32Array3, I32Array, Struct, Template
+
+TILE = 32
+"""Pixels along each side of the tiles in whose order the rays are listed, and of the largest block: the rays
+of a tile cross the same bricks."""
+
+LEVELS = 5
+"""A block of level n has 2^n pixels along each side."""
+
+BITS = 3
+"""Of a ray's number, for its level; the rest is the number of its block's first pixel."""
+
+AGREE_VOXELS = 0.5
+AGREE_SIGMAS = 2.0
+"""Measurements agree if they differ by no more than either of these."""
+
+SPREAD = 512
+"""Taichi gives a CPU thread no fewer iterations than this; each tile is made to count for so many."""
+
+
+@ti.func
+def block_of(ray: I32, width: I32):
+    """The first pixel (u, v) and the side, in pixels, of the block that a ray of the list stands for."""
+    pixel = ray >> BITS
+    return pixel % width, pixel // width, 1 << (ray & ((1 << BITS) - 1))
+
+
+def stride_metres(camera: PinholeCamera, voxel_size: float, rays_per_voxel: float) -> float:
+    """Distance between rays, in pixels, times the depth in metres: a voxel at depth z covers
+    voxel_size * f / z pixels along each side. 0 casts every pixel."""
+    if rays_per_voxel == 0:
+        return 0.0
+    return voxel_size * min(camera.fx, camera.fy) / math.sqrt(rays_per_voxel)
+
+
+class RayLister:
+    """Makes the lists of rays for one voxel size; owns the scratch, which grows to the largest image."""
+
+    def __init__(self, voxel_size: float, inference: InferenceConfig) -> None:
+        self.voxel_size, self.inference = voxel_size, inference
+        self._nearest = ti.ndarray(ti.f32, 1)
+        self._farthest = ti.ndarray(ti.f32, 1)
+        self._mean = ti.ndarray(ti.f32, 1)
+        self._level = ti.ndarray(ti.i32, 1)
+
+    def rays_of(self, image: DepthImage) -> RayList:
+        """The rays that an image casts, wherever it was taken."""
+        camera = image.camera
+        self._reserve(camera.width * camera.height)
+        tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
+        stride = stride_metres(camera, self.voxel_size, self.inference.rays_per_voxel)
+        counts, widest = np.zeros(tiles, np.int32), np.ones(tiles, np.int32)
+        _choose(
+            image.depth, camera.width, image.noise, image.noise_table.patch, image.noise_table.columns,
+            stride, AGREE_VOXELS * self.voxel_size, AGREE_SIGMAS,
+            self._nearest, self._farthest, self._mean, self._level, counts,
+            self.inference.ray_choice == "thin",
+        )  # fmt: skip
+        number = int(counts.sum())
+        blocks, depth = ti.ndarray(ti.i32, max(1, number)), ti.ndarray(ti.f32, max(1, number))
+        first = np.cumsum(counts, dtype=np.int32) - counts
+        _write_down(camera.width, camera.height, self._mean, self._level, first, blocks, depth, widest)
+        return RayList(blocks, depth, number, int(widest.max()))
+
+    def _reserve(self, pixels: int) -> None:
+        if pixels > self._level.shape[0]:
+            self._nearest, self._farthest, self._mean = (ti.ndarray(ti.f32, pixels) for _ in range(3))
+            self._level = ti.ndarray(ti.i32, pixels)
+
+
+@ti.dataclass
+class _Blocks(Struct):
+    """What is asked of a block of pixels before it becomes one ray."""
+
+    width: I32
+    stride_metres: F32
+    agree_m: F32
+    agree_sigmas: F32
+
+
+@ti.func
+def _is_thinned_out(u: I32, v: I32, measured: F32, stride_metres: F32) -> I32:
+    """Whether pixel (u, v) lies beside the grid for its depth."""
+    stride = ti.max(1, ti.cast(stride_metres / measured, ti.i32))
+    return u % stride != 0 or v % stride != 0
+
+
+@ti.func
+def _merge(asked: Template, u: I32, v: I32, n: I32, noise: Template, patch: I32, columns: I32,
+           nearest: Template, farthest: Template, mean: Template, level: Template):  # fmt: skip
+    """Make one block of level ``n`` at pixel (u, v) of the four below it, if they are there and agree."""
+    half = 1 << (n - 1)
+    a = v * asked.width + u
+    b, c = a + half, a + half * asked.width
+    d = c + half
+    if level[a] == n - 1 and level[b] == n - 1 and level[c] == n - 1 and level[d] == n - 1:
+        near = ti.min(nearest[a], nearest[b], nearest[c], nearest[d])
+        far = ti.max(farthest[a], farthest[b], farthest[c], farthest[d])
+        sigma = sigma_at(pixel_noise(noise, patch, columns, u + half, v + half), near)
+        fits = 2 * half * near <= asked.stride_metres
+        if fits and far - near <= ti.max(asked.agree_m, asked.agree_sigmas * sigma):
+            nearest[a] = near
+            farthest[a] = far
+            mean[a] = 0.25 * (mean[a] + mean[b] + mean[c] + mean[d])
+            level[a] = n
+            level[b] = -1
+            level[c] = -1
+            level[d] = -1
+
+
+@ti.kernel
+def _choose(
+    depth: F32Array, width: I32, noise: F32Array3, patch: I32, columns: I32,
+    stride_metres: F32, agree_m: F32, agree_sigmas: F32,
+    nearest: F32Array, farthest: F32Array, mean: F32Array, level: I32Array, counts: I32Array, thin: Template,
+):  # fmt: skip
+    """Give each pixel the level of the block that begins there, or -1 if none does; count them by tile."""
+    asked = _Blocks(width, stride_metres, agree_m, agree_sigmas)
+    height = depth.shape[0] // width
+    across = (width + TILE - 1) // TILE
+    for iteration in range(counts.shape[0] * SPREAD):
+        if iteration % SPREAD == 0:
+            tile = iteration // SPREAD
+            left, top = tile % across * TILE, tile // across * TILE
+            right, bottom = ti.min(left + TILE, width), ti.min(top + TILE, height)
+            for v in range(top, bottom):
+                for u in range(left, right):
+                    i = v * width + u
+                    measured = depth[i]
+                    nearest[i] = measured
+                    farthest[i] = measured
+                    mean[i] = measured
+                    level[i] = 0 if measured > 0.0 else -1
+                    if ti.static(thin):  # noqa: SIM102 (a static condition stands alone)
+                        if measured > 0.0 and _is_thinned_out(u, v, measured, stride_metres):
+                            level[i] = -1
+            if ti.static(not thin):
+                for n in range(1, LEVELS + 1):
+                    for block in range((TILE >> n) * (TILE >> n)):
+                        u = left + block % (TILE >> n) * (1 << n)
+                        v = top + block // (TILE >> n) * (1 << n)
+                        if u + (1 << n) <= right and v + (1 << n) <= bottom:
+                            _merge(asked, u, v, n, noise, patch, columns, nearest, farthest, mean, level)
+            rays = 0
+            for v in range(top, bottom):
+                for u in range(left, right):
+                    rays += ti.cast(level[v * width + u] >= 0, ti.i32)
+            counts[tile] = rays
+
+
+@ti.kernel
+def _write_down(
+    width: I32, height: I32, mean: F32Array, level: I32Array, first: I32Array,
+    blocks: I32Array, depth: F32Array, widest: I32Array,
+):  # fmt: skip
+    """List the blocks that begin in each tile, from its first place in the list on."""
+    across = (width + TILE - 1) // TILE
+    for iteration in range(first.shape[0] * SPREAD):
+        if iteration % SPREAD == 0:
+            tile = iteration // SPREAD
+            left, top = tile % across * TILE, tile // across * TILE
+            ray = first[tile]
+            highest = 0
+            for v in range(top, ti.min(top + TILE, height)):
+                for u in range(left, ti.min(left + TILE, width)):
+                    i = v * width + u
+                    if level[i] >= 0:
+                        blocks[ray] = (i << BITS) + level[i]
+                        depth[ray] = mean[i]
+                        highest = ti.max(highest, level[i])
+                        ray += 1
+            widest[tile] = 1 << highest

@@ -1,0 +1,93 @@
+"""Keyframes in and out of a map: which bricks they need and see, and their messages in step with that."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+
+from taichi_mrf import runtime
+from taichi_mrf.config import InferenceConfig, SensorConfig, VolumeConfig
+from taichi_mrf.inference import sum_product
+from taichi_mrf.inference.footprint import find_footprint
+from taichi_mrf.inference.keyframe import DepthImage, Keyframe
+from taichi_mrf.inference.messages import carry_over, new_messages, places_of
+from taichi_mrf.inference.ray_list import RayLister
+from taichi_mrf.inference.sweep import unknown_begins
+from taichi_mrf.inference.whereabouts import Whereabouts
+from taichi_mrf.maps.brick_book import BrickBook
+from taichi_mrf.poses import Pose
+from taichi_mrf.voxels.layout import BRICK, VOXELS
+
+
+@dataclass(frozen=True)
+class Placing:
+    """What it takes to place keyframes in a map, and to take them out again."""
+
+    book: BrickBook
+    lister: RayLister
+    sensor: SensorConfig
+    inference: InferenceConfig
+    volume: VolumeConfig
+    whereabouts: Whereabouts
+
+    def place(self, id: int, name: str, image: DepthImage, T_world_camera: Pose) -> Keyframe:
+        """Find out which bricks a keyframe needs and sees, and claim them. Raises CapacityError if there is
+        no room for them."""
+        rays, voxel_size = self.lister.rays_of(image), self.book.voxel_size
+        footprint = find_footprint(
+            image, rays, T_world_camera, voxel_size, self.sensor, self.inference, self.volume
+        )
+        camera_brick = np.floor(T_world_camera[:3, 3] / (voxel_size * BRICK))
+        self.book.topology.anchor(np.clip(camera_brick, -(2**30), 2**30).astype(np.int32))
+        self.book.claim(footprint)
+        self.whereabouts.put(id, footprint.window)
+        visible = self.book.visible(footprint)
+        return Keyframe(id, name, image, rays, T_world_camera, footprint, visible, unknown_begins(rays))
+
+    def take_out(self, keyframe: Keyframe) -> None:
+        """Undo :meth:`place`, and withdraw the keyframe's messages."""
+        pool = self.book.pool
+        if keyframe.messages is not None:
+            messages, slots = self.refresh(keyframe), keyframe.visible.slots
+            if len(slots):
+                moved = ti.ndarray(ti.i32, len(slots))
+                moved.fill(0)
+                sum_product.withdraw(slots, pool.belief, messages, moved)
+                pool.revision += 1
+                pool.stir(slots, moved.to_numpy())
+                pool.touch(slots)
+        self.book.disclaim(keyframe.footprint)
+        self.whereabouts.drop(keyframe.id)
+        runtime.settle()  # before its arrays are dropped
+
+    def freeze(self, keyframe: Keyframe) -> None:
+        """Add a keyframe's messages to what inference starts from, and keep its bricks for good."""
+        pool, messages = self.book.pool, self.refresh(keyframe)
+        if len(keyframe.visible.slots):
+            sum_product.fold(keyframe.visible.slots, pool.keep_evidence(), messages)
+        self.book.freeze(keyframe.footprint)
+        self.whereabouts.drop(keyframe.id)
+        pool.touch(keyframe.visible.slots)
+        runtime.settle()  # before its arrays are dropped
+
+    def refresh(self, keyframe: Keyframe) -> "ti.Ndarray":
+        """Bring a keyframe's bricks and messages up to date; bricks new to it get no message yet."""
+        old, old_messages = keyframe.visible, keyframe.messages
+        if old.version != self.book.version:
+            visible = self.book.visible_again(keyframe.footprint, old)
+            if visible is not old:
+                if keyframe.heard is not None:
+                    # Of a brick that is new to it the keyframe has heard nothing: all of it counts as moved.
+                    place = places_of(old, visible)
+                    heard = np.where(place >= 0, keyframe.heard[place], -VOXELS) if len(old.cells) else None
+                    keyframe.heard = heard
+                keyframe.visible = visible
+                keyframe.begins = unknown_begins(keyframe.ray_list)
+                keyframe.begins_known = False
+        if old_messages is None or keyframe.visible is not old:
+            keyframe.messages = new_messages(keyframe.visible, self.inference.message_precision)
+            keyframe.revision = -1
+            if old_messages is not None:
+                carry_over(old, old_messages, keyframe.visible, keyframe.messages)
+        assert keyframe.messages is not None
+        return keyframe.messages
