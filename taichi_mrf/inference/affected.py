@@ -10,9 +10,11 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from taichi_mrf import runtime
-from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
+from taichi_mrf.inference.messages import places_of
 from taichi_mrf.inference.schedule import InferProgress, InferReport, Progress
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.inference.whereabouts import Whereabouts
@@ -23,12 +25,25 @@ from taichi_mrf.voxels.pool import BrickPool
 def moved_share(keyframe: Keyframe, pool: BrickPool) -> float:
     """The share of the voxels seen by a keyframe whose marginals have moved since its last sweep; 1 if it was
     never swept. A marginal counts each time that it moves by over 0.01, a brick as its voxels at most."""
-    if keyframe.heard is None or keyframe.messages is None:
+    visible = keyframe.visible if keyframe.coming is None else keyframe.coming
+    heard = heard_of(keyframe, visible)
+    if heard is None or keyframe.messages is None:
         return 1.0
-    if len(keyframe.heard) == 0:
+    if len(heard) == 0:
         return 0.0
-    moved = np.minimum(pool.stirred[keyframe.visible.slots] - keyframe.heard, VOXELS)
+    moved = np.minimum(pool.stirred[visible.slots] - heard, VOXELS)
     return float(moved.sum()) / (len(moved) * VOXELS)
+
+
+def heard_of(keyframe: Keyframe, visible: VisibleBricks) -> NDArray[np.int64] | None:
+    """``heard`` of a keyframe for a newer list of its bricks: nothing of one that was not on the old, all of
+    which then counts as moved."""
+    if visible is keyframe.visible or keyframe.heard is None:
+        return keyframe.heard
+    place = places_of(keyframe.visible, visible)
+    heard = np.full(len(place), -VOXELS, np.int64)
+    heard[place >= 0] = keyframe.heard[place[place >= 0]]
+    return heard
 
 
 class Renewal:
@@ -39,10 +54,12 @@ class Renewal:
         pool: BrickPool,
         sweeper: Sweeper,
         whereabouts: Whereabouts,
+        look_again: Callable[[Keyframe], object],
         refresh: Callable[[Keyframe], object],
     ) -> None:
-        """``refresh`` brings a keyframe's bricks and messages up to date."""
-        self.pool, self.sweeper, self.whereabouts, self.refresh = pool, sweeper, whereabouts, refresh
+        """``look_again`` brings the list of a keyframe's bricks up to date, ``refresh`` its messages too."""
+        self.pool, self.sweeper, self.whereabouts = pool, sweeper, whereabouts
+        self.look_again, self.refresh = look_again, refresh
         self._waiting: set[int] = set()
 
     def run(
@@ -91,7 +108,7 @@ class Renewal:
         """How much of what the waiting keyframes were told is out of date; the others wait no longer."""
         shares = {}
         for id in self._waiting & keyframes.keys():
-            self.refresh(keyframes[id])
+            self.look_again(keyframes[id])
             shares[id] = moved_share(keyframes[id], self.pool)
         shares = {id: share for id, share in shares.items() if share > tolerance}
         self._waiting = set(shares)

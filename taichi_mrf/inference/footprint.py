@@ -16,7 +16,7 @@ from taichi_mrf.inference.rays import pixel_direction
 from taichi_mrf.poses import Pose
 from taichi_mrf.sensor.forward import depth_of_deviation, pixel_noise
 from taichi_mrf.sensor.noise import LEAST_SIGMA_M, evaluate
-from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.memory import check_memory
 from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.traversal import clip, make_ray, walk_bricks
@@ -49,9 +49,11 @@ def find_footprint(
     inference: InferenceConfig,
     volume: VolumeConfig,
     beyond_m: float = 0.0,
+    scouts: int = 1,
 ) -> Footprint:
     """Follow every ray of an image's list from the camera to ``end_sigmas`` beyond its measurement, and
-    ``beyond_m`` metres of axial depth more.
+    ``beyond_m`` metres of axial depth more. Near its measurement each ray counts; of the way there only that
+    of every ``scouts``-th ray is followed, so that bricks may go unnoticed that few rays graze.
 
     Raises CapacityError if the space that the image sees has too many bricks at this voxel size.
     """
@@ -68,7 +70,7 @@ def find_footprint(
     _mark(
         rays.blocks, rays.depth, rays.number, image.camera.width, image.intrinsics, centre, to_voxels,
         image.noise, image.noise_table.patch, image.noise_table.columns,
-        sensor.max_depth, inference.end_sigmas, beyond_m,
+        sensor.max_depth, inference.end_sigmas, beyond_m, scouts,
         window.shape_vector, box_lower, box_upper, marks, longest,
     )  # fmt: skip
     crossed = np.flatnonzero(marks).astype(np.int32)
@@ -137,7 +139,6 @@ def visible_box(
 @ti.dataclass
 class _Mark(Struct):
     surface_begin: F32  # depth from which a brick is near the measured surface
-    bricks: I32
 
 
 @ti.func
@@ -148,7 +149,6 @@ def _mark_brick(mark: Template, context: Template, ray: Template, brick: IVec3, 
     cell = flat(brick, context[0])
     if (context[1][cell] & kind) != kind:  # most bricks are marked already, and reading is cheaper
         ti.atomic_or(context[1][cell], kind)
-    mark.bricks += 1
     return 1
 
 
@@ -157,23 +157,26 @@ def _mark(
     blocks: I32Array, depth: F32Array, rays: I32, width: I32,
     intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
     noise: F32Array3, patch: I32, columns: I32,
-    max_depth: F32, end_sigmas: F32, beyond_m: F32,
+    max_depth: F32, end_sigmas: F32, beyond_m: F32, scouts: I32,
     shape: IVec3, box_lower: Vec3, box_upper: Vec3, marks: I32Array, longest: I32Array,
 ):  # fmt: skip
     for i in range(rays):
         measured = depth[i]
-        u, v, side = block_of(blocks[i], width)
-        direction = to_voxels @ pixel_direction(u + 0.5 * (side - 1), v + 0.5 * (side - 1), intrinsics)
+        u, v, wide, high = block_of(blocks[i], width)
+        direction = to_voxels @ pixel_direction(u + 0.5 * (wide - 1), v + 0.5 * (high - 1), intrinsics)
         ray = make_ray(centre, direction)
-        noise_here = pixel_noise(noise, patch, columns, u + side // 2, v + side // 2)
+        noise_here = pixel_noise(noise, patch, columns, u + wide // 2, v + high // 2)
         last = depth_of_deviation(measured, -end_sigmas, noise_here) + beyond_m
         begin, end = 0.0, ti.min(last, max_depth)
         clip(ray, begin, end, box_lower, box_upper)
-        mark = _Mark(depth_of_deviation(measured, end_sigmas, noise_here), 0)
-        walk_bricks(ray, begin, end, shape, marks, False, _mark_brick, mark, (shape, marks))
         if end > begin:
             # A step along the ray leaves a voxel through a face, or enters a brick anew.
             faces = (end - begin) * (ti.abs(direction[0]) + ti.abs(direction[1]) + ti.abs(direction[2]))
-            steps = ti.cast(faces, ti.i32) + 4 + 2 * mark.bricks
+            bricks = ti.cast(faces / BRICK, ti.i32) + 4
+            steps = ti.cast(faces, ti.i32) + 4 + 2 * bricks
             if steps > longest[0]:
                 ti.atomic_max(longest[0], steps)
+        mark = _Mark(depth_of_deviation(measured, end_sigmas, noise_here))
+        if i % scouts != 0:
+            begin = ti.max(begin, mark.surface_begin)
+        walk_bricks(ray, begin, end, shape, marks, False, _mark_brick, mark, (shape, marks))

@@ -123,7 +123,7 @@ class Keyframe:
     ``messages`` is (bricks * 512) log-odds, in the order of ``visible``; ``begins`` is, for each ray of the
     list, the depth up to which it crosses none of these bricks, once it is known; ``revision`` is that of
     the beliefs right after its last sweep, and ``heard`` (bricks) how often marginals of each brick had moved
-    by then.
+    by then. ``coming`` is what the keyframe sees now, if its messages are still those of ``visible``.
     """
 
     id: int
@@ -138,6 +138,7 @@ class Keyframe:
     revision: int = -1
     messages: ti.Ndarray | None = None
     heard: NDArray[np.int64] | None = None
+    coming: VisibleBricks | None = None
 
     @property
     def camera(self) -> PinholeCamera:

@@ -1,9 +1,9 @@
 """Which rays a keyframe casts: its pixels, or bundles of pixels where a voxel covers many.
 
-Near the camera a voxel covers hundreds of pixels, whose rays all tell it the same. Square blocks of pixels
-are therefore put together, from 2 x 2 up, as long as a voxel at their depth is still met by the wanted number
-of rays and their measurements agree. The ray through a block's middle carries their mean depth, and counts as
-many as they are. What does not agree, such as the rim of a surface, stays in single pixels.
+Near the camera a voxel covers hundreds of pixels, whose rays all tell it the same. Blocks of pixels are
+therefore put together, two of a size at a time, as long as a voxel at their depth is still met by the wanted
+number of rays and their measurements agree. The ray through a block's middle carries their mean depth, and
+counts as many as they are. What does not agree, such as the rim of a surface, stays in single pixels.
 """
 
 import math
@@ -21,10 +21,11 @@ TILE = 32
 """Pixels along each side of the tiles in whose order the rays are listed, and of the largest block: the rays
 of a tile cross the same bricks."""
 
-LEVELS = 5
-"""A block of level n has 2^n pixels along each side."""
+LEVELS = 10
+"""A block of level n has 2^n pixels: the odd levels put two blocks side by side, the even ones two above each
+other, so that a block is square or twice as wide as high."""
 
-BITS = 3
+BITS = 4
 """Of a ray's number, for its level; the rest is the number of its block's first pixel."""
 
 AGREE_VOXELS = 0.5
@@ -37,9 +38,9 @@ SPREAD = 512
 
 @ti.func
 def block_of(ray: I32, width: I32):
-    """The first pixel (u, v) and the side, in pixels, of the block that a ray of the list stands for."""
-    pixel = ray >> BITS
-    return pixel % width, pixel // width, 1 << (ray & ((1 << BITS) - 1))
+    """The first pixel (u, v) of the block that a ray of the list stands for, its columns and its rows."""
+    pixel, level = ray >> BITS, ray & ((1 << BITS) - 1)
+    return pixel % width, pixel // width, 1 << (level + 1) // 2, 1 << level // 2
 
 
 def stride_metres(camera: PinholeCamera, voxel_size: float, rays_per_voxel: float) -> float:
@@ -105,24 +106,20 @@ def _is_thinned_out(u: I32, v: I32, measured: F32, stride_metres: F32) -> I32:
 @ti.func
 def _merge(asked: Template, u: I32, v: I32, n: I32, noise: Template, patch: I32, columns: I32,
            nearest: Template, farthest: Template, mean: Template, level: Template):  # fmt: skip
-    """Make one block of level ``n`` at pixel (u, v) of the four below it, if they are there and agree."""
-    half = 1 << (n - 1)
+    """Make one block of level ``n`` at pixel (u, v) of the two below it, if they are there and agree."""
+    wide, high = 1 << (n + 1) // 2, 1 << n // 2
     a = v * asked.width + u
-    b, c = a + half, a + half * asked.width
-    d = c + half
-    if level[a] == n - 1 and level[b] == n - 1 and level[c] == n - 1 and level[d] == n - 1:
-        near = ti.min(nearest[a], nearest[b], nearest[c], nearest[d])
-        far = ti.max(farthest[a], farthest[b], farthest[c], farthest[d])
-        sigma = sigma_at(pixel_noise(noise, patch, columns, u + half, v + half), near)
-        fits = 2 * half * near <= asked.stride_metres
+    b = a + (wide // 2 if n % 2 == 1 else high // 2 * asked.width)
+    if level[a] == n - 1 and level[b] == n - 1:
+        near, far = ti.min(nearest[a], nearest[b]), ti.max(farthest[a], farthest[b])
+        sigma = sigma_at(pixel_noise(noise, patch, columns, u + wide // 2, v + high // 2), near)
+        fits = wide * high * near * near <= asked.stride_metres * asked.stride_metres
         if fits and far - near <= ti.max(asked.agree_m, asked.agree_sigmas * sigma):
             nearest[a] = near
             farthest[a] = far
-            mean[a] = 0.25 * (mean[a] + mean[b] + mean[c] + mean[d])
+            mean[a] = 0.5 * (mean[a] + mean[b])
             level[a] = n
             level[b] = -1
-            level[c] = -1
-            level[d] = -1
 
 
 @ti.kernel
@@ -153,10 +150,11 @@ def _choose(
                             level[i] = -1
             if ti.static(not thin):
                 for n in range(1, LEVELS + 1):
-                    for block in range((TILE >> n) * (TILE >> n)):
-                        u = left + block % (TILE >> n) * (1 << n)
-                        v = top + block // (TILE >> n) * (1 << n)
-                        if u + (1 << n) <= right and v + (1 << n) <= bottom:
+                    wide, high = 1 << (n + 1) // 2, 1 << n // 2
+                    for block in range(TILE * TILE >> n):
+                        u = left + block % (TILE // wide) * wide
+                        v = top + block // (TILE // wide) * high
+                        if u + wide <= right and v + high <= bottom:
                             _merge(asked, u, v, n, noise, patch, columns, nearest, farthest, mean, level)
             rays = 0
             for v in range(top, bottom):
@@ -186,4 +184,4 @@ def _write_down(
                         depth[ray] = mean[i]
                         highest = ti.max(highest, level[i])
                         ray += 1
-            widest[tile] = 1 << highest
+            widest[tile] = 1 << (highest + 1) // 2

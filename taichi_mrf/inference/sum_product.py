@@ -128,11 +128,11 @@ def send_messages(
             i = dealt_ray(worker, turn, workers, run)
             if i < rays:
                 measured = depth[i]
-                u, v, side = block_of(blocks[i], width)
-                middle = 0.5 * (side - 1)
-                direction = to_voxels @ pixel_direction(u + middle, v + middle, intrinsics)
+                u, v, wide, high = block_of(blocks[i], width)
+                middle = pixel_direction(u + 0.5 * (wide - 1), v + 0.5 * (high - 1), intrinsics)
+                direction = to_voxels @ middle
                 ray = make_ray(centre, direction)
-                here = pixel_noise(noise, patch, columns, u + side // 2, v + side // 2)
+                here = pixel_noise(noise, patch, columns, u + wide // 2, v + high // 2)
 
                 # The ray ends where its measurement has nothing more to say, or where the map does.
                 last = depth_of_deviation(measured, -end_sigmas, here)
@@ -175,7 +175,7 @@ def send_messages(
                         if ti.static(log_average):
                             message = clamped_log_odds(occupied, empty, clamp, largest)
                         behind += (1.0 - free) * here_density
-                    weight = ti.cast(side * side, ti.f32)
+                    weight = ti.cast(wide * high, ti.f32)
                     if ti.static(segment_lengths):
                         weight *= trace[j][0]
                     add_message(sums, trace_voxel[j], weight, message, scale)

@@ -38,3 +38,4 @@ def go_back(checkpoint: Checkpoint, pool: BrickPool, keyframes: Iterable[Keyfram
     pool.restore(checkpoint.pool)
     for keyframe in keyframes:
         keyframe.visible, keyframe.messages, keyframe.heard = checkpoint.messages[keyframe.id]
+        keyframe.coming = None

@@ -89,7 +89,8 @@ class MRFMap:
         parts = (self.sensor, inference, self.config.volume)
         self._placing = Placing(self._book, lister, *parts, whereabouts)
         self._sweeper = Sweeper(self.voxel_size, self.sensor, inference, self.config.volume)
-        self._renewal = Renewal(self._pool, self._sweeper, whereabouts, self._placing.refresh)
+        kept = (self._placing.look_again, self._placing.refresh)
+        self._renewal = Renewal(self._pool, self._sweeper, whereabouts, *kept)
         self.view = View(self._pool, self.voxel_size, self.config.volume)
         self._aligner = Aligner(self.view, self.sensor.max_depth)
         self._keyframes: dict[int, Keyframe] = {}

@@ -8,15 +8,19 @@ import taichi as ti
 from taichi_mrf import runtime
 from taichi_mrf.config import InferenceConfig, SensorConfig, VolumeConfig
 from taichi_mrf.inference import sum_product
+from taichi_mrf.inference.affected import heard_of
 from taichi_mrf.inference.footprint import find_footprint
 from taichi_mrf.inference.keyframe import DepthImage, Keyframe
-from taichi_mrf.inference.messages import carry_over, new_messages, places_of
+from taichi_mrf.inference.messages import carry_over, new_messages
 from taichi_mrf.inference.ray_list import RayLister
 from taichi_mrf.inference.sweep import unknown_begins
 from taichi_mrf.inference.whereabouts import Whereabouts
 from taichi_mrf.maps.brick_book import BrickBook
 from taichi_mrf.poses import Pose
-from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.layout import BRICK
+
+SCOUTS = 4
+"""Of so many neighbouring rays one is followed through free space to find the bricks that they cross."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +38,8 @@ class Placing:
         """Find out which bricks a keyframe needs and sees, and claim them. Raises CapacityError if there is
         no room for them."""
         rays, voxel_size = self.lister.rays_of(image), self.book.voxel_size
-        footprint = find_footprint(
-            image, rays, T_world_camera, voxel_size, self.sensor, self.inference, self.volume
-        )
+        parts = (voxel_size, self.sensor, self.inference, self.volume)
+        footprint = find_footprint(image, rays, T_world_camera, *parts, scouts=SCOUTS)
         camera_brick = np.floor(T_world_camera[:3, 3] / (voxel_size * BRICK))
         self.book.topology.anchor(np.clip(camera_brick, -(2**30), 2**30).astype(np.int32))
         self.book.claim(footprint)
@@ -70,20 +73,21 @@ class Placing:
         pool.touch(keyframe.visible.slots)
         runtime.settle()  # before its arrays are dropped
 
+    def look_again(self, keyframe: Keyframe) -> None:
+        """Find out what a keyframe sees now, and leave its messages as they are."""
+        seen = keyframe.visible if keyframe.coming is None else keyframe.coming
+        visible = self.book.visible_again(keyframe.footprint, seen)
+        keyframe.coming = None if visible is keyframe.visible else visible
+
     def refresh(self, keyframe: Keyframe) -> "ti.Ndarray":
         """Bring a keyframe's bricks and messages up to date; bricks new to it get no message yet."""
         old, old_messages = keyframe.visible, keyframe.messages
-        if old.version != self.book.version:
-            visible = self.book.visible_again(keyframe.footprint, old)
-            if visible is not old:
-                if keyframe.heard is not None:
-                    # Of a brick that is new to it the keyframe has heard nothing: all of it counts as moved.
-                    place = places_of(old, visible)
-                    heard = np.where(place >= 0, keyframe.heard[place], -VOXELS) if len(old.cells) else None
-                    keyframe.heard = heard
-                keyframe.visible = visible
-                keyframe.begins = unknown_begins(keyframe.ray_list)
-                keyframe.begins_known = False
+        self.look_again(keyframe)
+        if keyframe.coming is not None:
+            keyframe.heard = heard_of(keyframe, keyframe.coming)
+            keyframe.visible, keyframe.coming = keyframe.coming, None
+            keyframe.begins = unknown_begins(keyframe.ray_list)
+            keyframe.begins_known = False
         if old_messages is None or keyframe.visible is not old:
             keyframe.messages = new_messages(keyframe.visible, self.inference.message_precision)
             keyframe.revision = -1
