@@ -38,28 +38,39 @@ def listed(depth: NDArray[np.float32], **parameters: object) -> RayList:
     return RayLister(VOXEL, InferenceConfig(**parameters)).rays_of(image)  # type: ignore[arg-type]
 
 
-def blocks_of(rays: RayList, width: int) -> list[tuple[int, int, int, float]]:
-    """u, v, side and depth of each ray."""
+Block = tuple[int, int, int, int]
+"""First column and row, columns, rows."""
+
+
+def blocks_of(rays: RayList, width: int) -> list[tuple[Block, float]]:
+    """The block and the depth of each ray."""
     numbers = rays.blocks.to_numpy()[: rays.number]
-    pixels, sides = numbers >> BITS, 1 << (numbers & ((1 << BITS) - 1))
-    columns = (pixels % width, pixels // width, sides, rays.depth.to_numpy()[: rays.number])
-    return list(zip(*(c.tolist() for c in columns), strict=True))
+    pixels, levels = numbers >> BITS, numbers & ((1 << BITS) - 1)
+    columns = (pixels % width, pixels // width, 2 ** ((levels + 1) // 2), 2 ** (levels // 2))
+    depths = rays.depth.to_numpy()[: rays.number].tolist()
+    return list(zip(zip(*(c.tolist() for c in columns), strict=True), depths, strict=True))
 
 
-def oracle(depth: NDArray[np.float32], wanted: float) -> dict[tuple[int, int, int], float]:
-    """Blocks from single pixels up, as long as four of a size lie together, are few enough and agree."""
+def oracle(depth: NDArray[np.float32], wanted: float) -> dict[Block, float]:
+    """Blocks from single pixels up, as long as two of a size lie together, are few enough and agree."""
     height, width = depth.shape
     stride = stride_metres(camera_of(width, height), VOXEL, wanted)
-    found = {(u, v, 1): float(depth[v, u]) for v, u in zip(*np.nonzero(depth), strict=True)}
-    for level in range(1, LEVELS + 1):
-        side, half = 1 << level, 1 << (level - 1)
-        for v in range(0, height - side + 1, side):
-            for u in range(0, width - side + 1, side):
-                parts = [(u + a, v + b, half) for b in (0, half) for a in (0, half)]
-                patch = depth[v : v + side, u : u + side]
+    found = {(u, v, 1, 1): float(depth[v, u]) for v, u in zip(*np.nonzero(depth), strict=True)}
+    wide, high = 1, 1
+    for _ in range(LEVELS):
+        half_wide, half_high = wide, high
+        wide, high = (2 * wide, high) if wide == high else (wide, 2 * high)
+        for v in range(0, height - high + 1, high):
+            for u in range(0, width - wide + 1, wide):
+                parts = [
+                    (u, v, half_wide, half_high),
+                    (u + wide - half_wide, v + high - half_high, half_wide, half_high),
+                ]
+                patch = depth[v : v + high, u : u + wide]
                 agrees = np.ptp(patch) <= max(AGREE_VOXELS * VOXEL, AGREE_SIGMAS * SIGMA_M)
-                if all(part in found for part in parts) and side * patch.min() <= stride and agrees:
-                    found[u, v, side] = float(np.mean([found.pop(part) for part in parts]))
+                fits = wide * high * patch.min() ** 2 <= stride**2
+                if all(part in found for part in parts) and fits and agrees:
+                    found[u, v, wide, high] = float(np.mean([found.pop(part) for part in parts]))
     return found
 
 
@@ -79,16 +90,16 @@ def test_bundles_are_those_of_the_oracle(
     depth = depth.astype(np.float32)
     rays = listed(depth, rays_per_voxel=wanted)
     expected = oracle(depth, wanted)
-    found = {(u, v, side): z for u, v, side, z in blocks_of(rays, width)}
+    found = dict(blocks_of(rays, width))
     # float32 may round a spread or a quotient that lies at its bound to the other side.
     assert len(found.keys() ^ expected.keys()) <= 0.02 * len(expected)
     for block in found.keys() & expected.keys():
         assert found[block] == pytest.approx(expected[block], rel=1e-6)
     covered = np.zeros(depth.shape, int)
-    for u0, v0, side, _ in blocks_of(rays, width):
-        covered[v0 : v0 + side, u0 : u0 + side] += 1
+    for u0, v0, wide, high in found:
+        covered[v0 : v0 + high, u0 : u0 + wide] += 1
     np.testing.assert_array_equal(covered, depth > 0)
-    assert rays.widest == max((side for _, _, side in found), default=1)
+    assert rays.widest == max((wide for _, _, wide, _ in found), default=1)
 
 
 @pytest.mark.parametrize("parameters", [{"rays_per_voxel": 0.0}, {"rays_per_voxel": 1e9}])
@@ -96,7 +107,7 @@ def test_every_pixel_with_a_measurement_has_a_ray(parameters: dict[str, float]) 
     depth = np.random.default_rng(2).uniform(0.2, 3.0, (48, 70)).astype(np.float32)
     depth[::5, ::7] = 0
     rays = listed(depth, **parameters)
-    measured = {(u, v, 1, float(depth[v, u])) for v, u in zip(*np.nonzero(depth), strict=True)}
+    measured = {((u, v, 1, 1), float(depth[v, u])) for v, u in zip(*np.nonzero(depth), strict=True)}
     assert set(blocks_of(rays, 70)) == measured
     assert rays.number == len(measured)
 
@@ -113,8 +124,8 @@ def test_rays_are_thinned_by_what_a_voxel_covers(wanted: float) -> None:
         (depth > 0) & (u % np.maximum(1, np.floor(stride)) == 0) & (v % np.maximum(1, np.floor(stride)) == 0)
     )
     found = np.zeros(depth.shape, bool)
-    for u0, v0, side, z in blocks_of(rays, 64):
-        assert (side, z) == (1, depth[v0, u0])
+    for (u0, v0, *size), z in blocks_of(rays, 64):
+        assert (size, z) == ([1, 1], depth[v0, u0])
         found[v0, u0] = True
     # float32 may round a quotient that lies next to a whole number to its other side.
     stride[depth == 0] = 0.5
@@ -124,7 +135,7 @@ def test_rays_are_thinned_by_what_a_voxel_covers(wanted: float) -> None:
 
 def test_rays_of_a_tile_stand_together() -> None:
     depth = np.full((70, 90), 2.0, np.float32)
-    tiles = [(v // TILE, u // TILE) for u, v, _, _ in blocks_of(listed(depth, rays_per_voxel=0.0), 90)]
+    tiles = [(v // TILE, u // TILE) for (u, v, _, _), _ in blocks_of(listed(depth, rays_per_voxel=0.0), 90)]
     assert tiles == sorted(tiles)
 
 
