@@ -17,6 +17,7 @@ from taichi_mrf.commands.output import output_folder
 from taichi_mrf.commands.print_table import print_table
 from taichi_mrf.config import Config, to_yaml
 from taichi_mrf.errors import DatasetError, TaichiMRFError
+from taichi_mrf.evaluation.experiments.endless import run_endless
 from taichi_mrf.evaluation.experiments.exact import run_exact
 from taichi_mrf.evaluation.experiments.fig7 import run_fig7
 from taichi_mrf.evaluation.experiments.fig10 import run_fig10
@@ -43,6 +44,7 @@ EXPERIMENTS: dict[str, tuple[Run, tuple[float, ...]]] = {
     "exact": (run_exact, (0.05,)),
     "poses": (run_poses, (0.05,)),
     "rays": (run_rays, (0.05, 0.02, 0.01)),
+    "endless": (run_endless, (0.1,)),
 }
 """Name -> what runs it, and its own voxel sizes."""
 

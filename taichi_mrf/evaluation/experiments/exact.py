@@ -86,9 +86,9 @@ def run_exact(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     return tables, [path for table in tables for path in write_table(experiment.out, table)]
 
 
-def room_scene(views: int) -> Scene:
-    """The built-in room as an experiment's scene."""
-    dataset = open_dataset(f"synthetic:room?frames={views}", color=False)
+def room_scene(views: int, options: str = "") -> Scene:
+    """The built-in room as an experiment's scene; ``options`` are more of its own, such as "&seed=1"."""
+    dataset = open_dataset(f"synthetic:room?frames={views}{options}", color=False)
     assert isinstance(dataset, SyntheticRoom)
     found = []
     for index in range(len(dataset)):
