@@ -114,7 +114,8 @@ def run_endless(experiment: Experiment) -> tuple[list[Table], list[Path]]:
         ["kept", "voxels", *FIGURES, "points from all", "ms a keyframe, at first", "at last", "MB"],
         rows,
         [
-            "Milliseconds: medians of the first and the last tenth. The time of 'all' is that of adding; it is inferred in full once, at the end."
+            "Milliseconds: medians of the first and the last tenth.",
+            "The time of 'all' is that of adding; it is inferred in full once, at the end.",
         ],
     )
     return [table], [*write_table(experiment.out, table), *paths]
