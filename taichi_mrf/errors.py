@@ -28,6 +28,10 @@ class FrameError(DatasetError):
     """
 
 
+class LostFrameError(FrameError):
+    """Where a frame was taken could not be found out; the text names the frame and says why."""
+
+
 class KeyframeError(TaichiMRFError):
     """A keyframe does not exist, is frozen, or was given data of the wrong shape."""
 

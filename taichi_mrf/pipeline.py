@@ -11,14 +11,14 @@ from dataclasses import dataclass, field
 
 from taichi_mrf.config import Config
 from taichi_mrf.datasets import Dataset
-from taichi_mrf.errors import ConfigError, DatasetError, FrameError
+from taichi_mrf.errors import DatasetError, FrameError, LostFrameError
 from taichi_mrf.frame import Frame
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.keyframes import KeyframeSelector
 from taichi_mrf.maps.create import create_map
-from taichi_mrf.maps.mrf import MRFMap
 from taichi_mrf.maps.protocol import OccupancyMap
-from taichi_mrf.maps.refinement import PoseChange, PoseRefiner
+from taichi_mrf.maps.refinement import PoseChange, PoseRefiner, refiner_of
+from taichi_mrf.maps.tracking import Track, Tracker, keyframe_steps, tracker_of
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class FramePassed(FrameEvent):
 
 @dataclass(frozen=True)
 class FrameSkipped(FrameEvent):
-    """The frame is broken, and was left out; ``problem`` says what is wrong with it."""
+    """The frame is broken, or tracking lost it, and it was left out; ``problem`` says what is wrong."""
 
     problem: str
 
@@ -82,10 +82,11 @@ Listener = Callable[[Event], None]
 class MappingResult:
     """What :func:`map_sequence` made.
 
-    ``skipped`` tells for each broken frame by name what is wrong with it, ``held_out`` the dataset
+    ``skipped`` tells for each broken or lost frame by name what is wrong with it, ``held_out`` the dataset
     indices of the frames that were kept out, ``seconds`` the time of each stage. ``interrupted`` is true
     if the run was told to stop before its end; the map holds everything up to there. ``poses`` are, if they
-    were refined, the recorded and the refined pose of every keyframe.
+    were refined, the recorded and the refined pose of every keyframe; ``track`` says, if poses were not
+    recorded but found, where each frame was taken.
     """
 
     map: OccupancyMap
@@ -97,6 +98,7 @@ class MappingResult:
     residual: float | None = None
     interrupted: bool = False
     poses: list[PoseChange] = field(default_factory=list)
+    track: Track | None = None
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -123,20 +125,22 @@ def map_sequence(
 
     All keyframes are added first, then the marginals are inferred. With ``config.poses.refine`` each is
     aligned with those before it as it is added, and all with each other before the marginals are inferred.
+    Frames of a tracked dataset, those that are kept out included, are first aligned with the map so far.
     ``should_stop`` is asked between keyframes. A run that it ends makes one sweep over the keyframes there
     are if it has not yet, so that the map is usable. ``resume_from`` is the map of such a run, of this
     dataset: its keyframes are kept and the frames after the last of them are added, which ends in the map
     of an undisturbed run.
 
     Raises FrameError for a broken frame unless ``skip_bad_frames``, DatasetError if no frame became a
-    keyframe or the map to resume is of another recording, ConfigError if poses are to be refined in a map
-    that cannot, and what the map raises.
+    keyframe or the map to resume is of another recording, ConfigError if poses are to be refined
+    or tracked in a map that cannot, and what the map raises.
     """
     start = create_map(config, dataset.camera) if resume_from is None else resume_from
     result = MappingResult(start)
     indices = range(0, len(dataset), every)[:limit]
-    refiner = _refiner(result.map, config)
-    _add_keyframes(result, dataset, indices, config, listener, skip_bad_frames, should_stop, refiner)
+    refiner = refiner_of(result.map, config.poses)
+    tracker = tracker_of(result.map, config.poses) if dataset.tracked else None
+    _add_keyframes(result, dataset, indices, config, listener, skip_bad_frames, should_stop, refiner, tracker)
     if not result.map.keyframes:
         raise DatasetError(_why_empty(dataset, result))
     if refiner is not None:
@@ -154,20 +158,28 @@ def _add_keyframes(
     skip_bad_frames: bool,
     should_stop: Callable[[], bool],
     refiner: PoseRefiner | None,
+    tracker: Tracker | None,
 ) -> None:
     """Allocate every selected frame, without inference but for what ``refiner`` needs."""
     names = dataset.frame_names
-    mapped = {keyframe.name: keyframe for keyframe in result.map.keyframes.values()}
+    mapped = {keyframe.name: (id, keyframe) for id, keyframe in result.map.keyframes.items()}
     foreign = mapped.keys() - set(names)
     if foreign:
         raise DatasetError(f"the map to resume has a keyframe '{min(foreign)}', which {dataset.name} has not")
-    selector = KeyframeSelector(config.keyframes)
+    selector = KeyframeSelector(config.keyframes if tracker is None else keyframe_steps(config.keyframes))
+    # A camera's images cannot be read again, and its poses are not known before they are tracked.
+    hold_out = 0 if tracker is not None and dataset.endless else config.evaluation.hold_out
+    result.track = None if tracker is None else Track()
     last_mapped = -1
     for index in indices:
         if names[index] in mapped:
+            id, keyframe = mapped[names[index]]
+            if tracker is not None:
+                tracker.resume(id)
             if refiner is not None:
-                refiner.know(names[index], dataset.read(index).T_world_camera)
-            selector.accept(mapped[names[index]].T_world_camera)
+                tracked = tracker is not None
+                refiner.know(id, keyframe.T_world_camera if tracked else dataset.read(index).T_world_camera)
+            selector.accept(keyframe.T_world_camera)
             last_mapped = index
 
     for number, index in enumerate(indices, start=1):
@@ -179,7 +191,8 @@ def _add_keyframes(
         if names[index] in mapped:
             listener(FramePassed(*place, reason="in the map already"))
             continue
-        if is_held_out(number, config.evaluation.hold_out):
+        held_out = is_held_out(number, hold_out)
+        if held_out and tracker is None:
             result.held_out.append(index)
             listener(FramePassed(*place, reason="kept out to check the map"))
             continue
@@ -187,32 +200,29 @@ def _add_keyframes(
             listener(FramePassed(*place, reason="looked at before"))
             continue
         frame = _read(result, dataset, index, skip_bad_frames)
+        if frame is not None and tracker is not None:
+            frame = _tracked(result, tracker, index, frame)
         if frame is None:
             listener(FrameSkipped(*place, problem=result.skipped[names[index]]))
+        elif held_out:
+            result.held_out.append(index)
+            listener(FramePassed(*place, reason="kept out to check the map"))
         elif not selector.wants(frame.T_world_camera):
             listener(FramePassed(*place, reason="too near to a keyframe"))
         elif not (frame.depth_m > 0).any():
             listener(FramePassed(*place, reason="holds no measurement"))
         else:
             with result.timed("adding"):
-                keyframe = result.map.add_keyframe(
+                added = result.map.add_keyframe(
                     frame.depth_m, frame.T_world_camera, frame.camera, name=frame.name
                 )
             if refiner is not None:
                 with result.timed("refining"):
-                    refiner.place(keyframe)
+                    refiner.place(added)
+            if tracker is not None:
+                tracker.took(added)
             selector.accept(frame.T_world_camera)
-            listener(KeyframeAdded(*place, keyframe, result.map.keyframes[keyframe].rays))
-
-
-def _refiner(m: OccupancyMap, config: Config) -> PoseRefiner | None:
-    if not config.poses.refine:
-        return None
-    if not isinstance(m, MRFMap):
-        raise ConfigError(
-            f"poses.refine needs the method mrf; a map by {config.method} cannot move keyframes"
-        )
-    return PoseRefiner(m, config.poses)
+            listener(KeyframeAdded(*place, added, result.map.keyframes[added].rays))
 
 
 def _refine(
@@ -265,6 +275,19 @@ def _read(result: MappingResult, dataset: Dataset, index: int, skip_bad_frames: 
                 raise
             result.skipped[dataset.frame_names[index]] = str(error)
             return None
+
+
+def _tracked(result: MappingResult, tracker: Tracker, index: int, frame: Frame) -> Frame | None:
+    """The frame where it was taken, or None if that cannot be found out."""
+    assert result.track is not None
+    with result.timed("tracking"):
+        try:
+            found, result.track.frames[index] = tracker.follow(frame)
+        except LostFrameError as error:
+            result.track.lost += 1
+            result.skipped[frame.name] = str(error)
+            return None
+        return found
 
 
 def _why_empty(dataset: Dataset, result: MappingResult) -> str:

@@ -22,7 +22,7 @@ SMALLEST_STEP_M = 2e-4
 """A step that moves points by less than this ends a level."""
 
 OBSERVABLE = 0.005
-"""Least share of the largest eigenvalue that a direction needs to be moved in."""
+"""Least share of the largest eigenvalue that a direction needs to be moved in, by default."""
 
 
 @dataclass(frozen=True)
@@ -34,16 +34,23 @@ class Aligned:
     directions: int
 
 
-def align(problem: PointToPlane, T_world_camera: Pose, recorded: Recorded, lever_m: float) -> Aligned:
+def align(
+    problem: PointToPlane,
+    T_world_camera: Pose,
+    recorded: Recorded,
+    lever_m: float,
+    observable: float = OBSERVABLE,
+) -> Aligned:
     """Steps from a pose while they lower the cost: of the residuals, and of leaving where it was recorded.
 
-    ``lever_m`` is the distance of a typical point.
+    ``lever_m`` is the distance of a typical point, ``observable`` the least share of the largest eigenvalue
+    that a direction needs to be moved in.
     """
     T, here = T_world_camera, problem.linearised(T_world_camera)
     worth = here.worth
     damping, directions = 1e-3, 0
     for _ in range(MOST_STEPS):
-        step, directions = solve(here, worth, recorded, T, lever_m, damping)
+        step, directions = solve(here, worth, recorded, T, lever_m, damping, observable)
         if np.linalg.norm(step * _scale(lever_m)) < SMALLEST_STEP_M:
             break
         tried_T = moved(T, step)
@@ -58,13 +65,19 @@ def align(problem: PointToPlane, T_world_camera: Pose, recorded: Recorded, lever
 
 
 def solve(
-    equations: NormalEquations, worth: float, recorded: Recorded, T: Pose, lever_m: float, damping: float
+    equations: NormalEquations,
+    worth: float,
+    recorded: Recorded,
+    T: Pose,
+    lever_m: float,
+    damping: float,
+    observable: float = OBSERVABLE,
 ) -> tuple[NDArray[np.float64], int]:
     """The damped step (6,) from the pose T, 0 along directions that the points do not tell, and the number of
     those that they do."""
     scale = _scale(lever_m)
     values, vectors = np.linalg.eigh(equations.H / np.outer(scale, scale))
-    told = vectors[:, values > OBSERVABLE * max(values[-1], 1e-12)]
+    told = vectors[:, values > observable * max(values[-1], 1e-12)]
     H = told.T @ ((worth * equations.H + recorded.H) / np.outer(scale, scale)) @ told
     g = told.T @ ((worth * equations.g + recorded.gradient(T)) / scale)
     H[np.diag_indices_from(H)] *= 1 + damping

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import tyro
 
+from taichi_mrf.commands.pose_flags import PoseFlags
 from taichi_mrf.config import Config
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError
@@ -25,7 +26,8 @@ class Live:
     (map.npz)."""
 
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Folder for map.npz, voxels.ply and config.yaml; it is made if need be."""
+    """Folder for map.npz, voxels.ply, config.yaml and, where poses are tracked, trajectory.txt; it is made if
+    need be."""
 
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
     """A YAML file of parameters, such as those in configs/."""
@@ -60,6 +62,9 @@ class Live:
 
     reading: Annotated[SourceFlags, tyro.conf.arg(name="")] = field(default_factory=SourceFlags)
     """How SOURCE is read."""
+
+    poses: Annotated[PoseFlags, tyro.conf.arg(name="")] = field(default_factory=PoseFlags)
+    """What becomes of SOURCE's poses."""
 
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
     """Parameters."""

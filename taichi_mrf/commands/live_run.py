@@ -34,7 +34,7 @@ def run_live(options: Live) -> int:
     def say(text: str) -> None:
         console.print(text, highlight=False, soft_wrap=True, markup=False)
 
-    settings = with_absolute_tables(options.settings, Path.cwd())
+    settings = with_absolute_tables(options.poses.parameters(options.settings), Path.cwd())
     with ExitStack() as stack:
         if options.out is not None:
             stack.enter_context(output_folder(options.out))
@@ -57,6 +57,7 @@ def run_live(options: Live) -> int:
             speed=options.speed,
             loop=options.loop,
             reading=options.reading,
+            track=options.poses.track_poses,
         )
         for note in notes:
             say(note)
@@ -64,7 +65,10 @@ def run_live(options: Live) -> int:
         session = Session(source, page.link, policy, page.listening)
         problem = _run(session.run, session.reconnect, page, request)
         if options.out is not None:
-            for path in write_all(session.state.mapper.map, source.config, options.out):
+            track = session.state.track if source.tracked else None
+            if track is not None:
+                say(f"tracking: {len(track.frames)} frames found, {track.lost} lost")
+            for path in write_all(session.state.mapper.map, source.config, options.out, track):
                 say(f"wrote {path}")
     if problem is not None:
         raise TaichiMRFError(problem)

@@ -1,13 +1,14 @@
 """``taichi-mrf map``: a sequence in, a folder with the map, a report and pictures out."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from taichi_mrf import config as configuration
+from taichi_mrf.commands.pose_flags import PoseFlags
 from taichi_mrf.config import Config
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError
@@ -46,10 +47,6 @@ class Map:
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Go on with the map in DIR, with its parameters, after the last frame that is in it."""
 
-    refine_poses: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Align each new keyframe with those before it, and all with each other at the end; the same as
-    --poses.refine."""
-
     pictures: bool = True
     """Draw the map from above, in perspective, and against the measured depth."""
 
@@ -59,6 +56,9 @@ class Map:
     reading: Annotated[SourceFlags, tyro.conf.arg(name="")] = field(default_factory=SourceFlags)
     """How SOURCE is read."""
 
+    poses: Annotated[PoseFlags, tyro.conf.arg(name="")] = field(default_factory=PoseFlags)
+    """What becomes of SOURCE's poses."""
+
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
     """Parameters."""
 
@@ -67,12 +67,6 @@ class Map:
             value = getattr(self, name)
             if isinstance(value, int) and value < 1:
                 raise ConfigError(f"--{name} must be at least 1, not {value}")
-
-    def parameters(self) -> Config:
-        """The parameters with what flags of their own say."""
-        if not self.refine_poses:
-            return self.settings
-        return replace(self.settings, poses=replace(self.settings.poses, refine=True))
 
     def run(self) -> int:
         """Map, write everything, and print the report. Raises TaichiMRFError."""

@@ -19,17 +19,20 @@ from taichi_mrf.commands.report import print_report, report_json, run_report
 from taichi_mrf.config import Config, load, with_absolute_tables
 from taichi_mrf.config_text import commented_yaml, differences
 from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets.reposed import reposed
 from taichi_mrf.errors import ConfigError, FrameError, MapFileError
 from taichi_mrf.evaluation.held_out import HeldOutCheck, check_held_out
 from taichi_mrf.evaluation.pictures import write_pictures
 from taichi_mrf.export.atomic import write_text
 from taichi_mrf.export.ply import write_voxels
+from taichi_mrf.export.trajectory import write_trajectory
 from taichi_mrf.frame import Frame
 from taichi_mrf.maps.create import load_map
 from taichi_mrf.maps.protocol import OccupancyMap
 from taichi_mrf.pipeline import MappingResult, map_sequence
 
 MAP_FILE, VOXEL_FILE, REPORT_FILE = "map.npz", "voxels.ply", "report.json"
+TRAJECTORY_FILE = "trajectory.txt"
 
 MAY_CHANGE = ("inference.sweeps", "inference.tolerance", "runtime.")
 """Parameters (or groups) that may differ from those of the run that --resume goes on with."""
@@ -44,7 +47,7 @@ _PICTURED_FRAMES = 3
 def run_map(options: Map) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
     console = Console(stderr=options.json)
-    settings = with_absolute_tables(options.parameters(), Path.cwd())
+    settings = with_absolute_tables(options.poses.parameters(options.settings), Path.cwd())
     with (
         output_folder(options.out),
         stop_on_signals(lambda text: console.print(f"[yellow]{text}[/]")) as request,
@@ -52,7 +55,8 @@ def run_map(options: Map) -> int:
         start = time.perf_counter()
         runtime.init(settings.runtime.arch, settings.runtime.threads, settings.runtime.debug)
         previous = _resumed_map(options.out, settings) if options.resume else None
-        dataset = open_dataset(options.source, color=False, **options.reading.keywords())
+        track = options.poses.track_poses
+        dataset = open_dataset(options.source, color=False, track=track, **options.reading.keywords())
         opening = time.perf_counter() - start
         with ProgressBar(console) as progress, _collected_warnings() as warned:
             result = map_sequence(
@@ -66,10 +70,11 @@ def run_map(options: Map) -> int:
                 resume_from=previous,
             )
             result.seconds = {"opening": opening, **result.seconds}
-            check = _check(result, dataset, progress)
+            posed = dataset if result.track is None else reposed(dataset, result.track.poses(result.map))
+            check = _check(result, posed, progress)
             written = _write_map(options.out, result, settings, progress)
             if options.pictures:
-                written += _write_pictures(options.out, result, dataset, progress)
+                written += _write_pictures(options.out, result, posed, progress)
         report = run_report(result, dataset, options.source, check)
         report["notes"] += [str(warning.message) for warning in warned]
         if options.resume:
@@ -136,7 +141,11 @@ def _write_map(folder: Path, result: MappingResult, settings: Config, progress: 
         centres, probability = result.map.voxels(min_probability=0.5)
         write_voxels(folder / VOXEL_FILE, centres, probability, result.map.voxel_size)
         progress.advance("Writing", 2, 2)
-    return [folder / MAP_FILE, folder / VOXEL_FILE, folder / CONFIG_FILE]
+        written = [folder / MAP_FILE, folder / VOXEL_FILE, folder / CONFIG_FILE]
+        if result.track is not None:
+            write_trajectory(folder / TRAJECTORY_FILE, result.track.trajectory(result.map))
+            written.append(folder / TRAJECTORY_FILE)
+    return written
 
 
 def _write_pictures(

@@ -53,6 +53,7 @@ def run_tune(options: Tune) -> int:
         # Imported late: the page starts meanwhile, in a process of its own.
         from taichi_mrf import runtime
         from taichi_mrf.datasets import open_dataset
+        from taichi_mrf.errors import DatasetError
         from taichi_mrf.tune.search import DEFAULT_SEARCH, Search
         from taichi_mrf.tune.session import Policy, TuneSession
 
@@ -61,6 +62,8 @@ def run_tune(options: Tune) -> int:
             search = Search(settings, options.names or DEFAULT_SEARCH, options.auto, options.seed)
         runtime.init(settings.runtime.arch, settings.runtime.threads, settings.runtime.debug)
         dataset = open_dataset(options.source, color=False, **options.reading.keywords())
+        if dataset.tracked:
+            raise DatasetError(f"{options.source}: tune needs poses: map it, and give poses=trajectory.txt")
         told: set[int] = set()
         count = options.frames or (FRAMES_TO_SEARCH if search else FRAMES_BY_HAND)
         session = TuneSession(

@@ -8,9 +8,19 @@ from dataclasses import dataclass, field
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.frame import Frame
+from taichi_mrf.poses import Pose, look_at
 
 DISTORTION_COUNTS = (4, 5, 8)
 """How many distortion coefficients a lens may have; OpenCV's other models are not for depth cameras."""
+
+
+TRACK = "track"
+"""In place of a file of poses: find them from the images."""
+
+
+def start_pose() -> Pose:
+    """Where a camera stands whose poses are not known: at the origin, level, looking along x."""
+    return look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -39,6 +49,9 @@ class ReadOptions:
 
     image_scale: float = 1.0
     """Reads 1/n of the rows and columns: 1, 1/2, 1/3, ..."""
+
+    track: bool = False
+    """The recording's poses, if it has any, are of no interest: who maps it finds them from the images."""
 
     def __post_init__(self) -> None:
         scale = self.depth_scale
@@ -77,9 +90,10 @@ class Dataset(ABC):
 
     ``notes`` are sentences that a report should show: what was assumed or left out. ``dropped`` counts the
     depth images that have no pose near enough in time. ``distortion`` are OpenCV's coefficients of the images
-    as they were recorded, where the recording knows them: :func:`open_dataset` undoes them. A frame that
-    cannot be read does not stop the others: :meth:`read` raises FrameError for it and the next one can be
-    read.
+    as they were recorded, where the recording knows them: :func:`open_dataset` undoes them. If it is
+    ``tracked``, the poses of its frames say nothing but where the first was taken: who maps them finds the
+    others (maps/tracking.py). A frame that cannot be read does not stop the others: :meth:`read` raises
+    FrameError for it and the next one can be read.
     """
 
     name: str
@@ -87,6 +101,7 @@ class Dataset(ABC):
     notes: list[str] = field(default_factory=list)
     dropped: int = 0
     distortion: tuple[float, ...] = ()
+    tracked: bool = False
 
     @property
     def endless(self) -> bool:

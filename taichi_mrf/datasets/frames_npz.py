@@ -2,8 +2,8 @@
 
 ``depth_m`` (N, H, W) float is axial depth in metres, 0 or NaN where there is none, or uint16 with
 ``depth_scale``, its steps per metre; ``T_world_camera`` is (N, 4, 4) or (N, 3, 4); ``K`` (3, 3), or ``fx``,
-``fy``, ``cx``, ``cy``. ``stamp`` (N,) in seconds and ``color`` (N, H, W, 3) uint8 RGB may be left out.
-Without the N, a file is one frame.
+``fy``, ``cx``, ``cy``. ``stamp`` (N,) in seconds and ``color`` (N, H, W, 3) uint8 RGB may be left out, and
+so may poses that are to be found (``ReadOptions.track``). Without the N, a file is one frame.
 """
 
 import math
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.datasets.base import Dataset, ReadOptions
+from taichi_mrf.datasets.base import Dataset, ReadOptions, start_pose
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeError
 from taichi_mrf.frame import Frame
 from taichi_mrf.poses import as_pose
@@ -135,7 +135,8 @@ def _read_part(path: Path, options: ReadOptions) -> Part:
             raise DatasetError(f"{path}: {DEPTH} is {dtype} {shape}; expected (N, H, W) of floats or uint16")
         height, width = shape[-2:]
         count = shape[0] if len(shape) == 3 else 1
-        poses = _array(path, file, POSE)
+        unposed = options.track and POSE not in file
+        poses = np.tile(start_pose(), (count, 1, 1)) if unposed else _array(path, file, POSE)
         if poses.size != count * math.prod(poses.shape[-2:]) or poses.shape[-2:] not in (
             (4, 4),
             (3, 4),

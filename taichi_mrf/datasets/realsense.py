@@ -2,8 +2,9 @@
 
 ``realsense:width=848&height=480&fps=30`` is a camera, as long as it is plugged in; ``realsense:FILE`` is what
 its library has recorded (realsense_file.py). ``?poses=FILE`` gives the poses of the depth camera in TUM's
-layout, by the stamps of its images. Without them the camera is taken to stand still: its pose is one and the
-same for all frames, at the origin, level, looking along x.
+layout, by the stamps of its images; ``?poses=track`` leaves them to be found by whoever maps the frames.
+Without either the camera is taken to stand still: its pose is one and the same for all frames, at the origin,
+level, looking along x.
 """
 
 import importlib
@@ -16,13 +17,13 @@ from typing import Any, overload
 import numpy as np
 
 from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.datasets.base import Dataset, ReadOptions
+from taichi_mrf.datasets.base import TRACK, Dataset, ReadOptions, start_pose
 from taichi_mrf.datasets.query_options import parse_options
 from taichi_mrf.datasets.realsense_file import Player, RealSenseFile
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.frame import Frame
-from taichi_mrf.poses import Pose, look_at
+from taichi_mrf.poses import Pose
 
 NAME = "realsense:"
 
@@ -31,7 +32,9 @@ TIMEOUT_MS = 500
 
 MISSES = 4
 
-STANDS_STILL = "the camera is taken to stand still: ?poses=FILE gives the poses of one that moves"
+STANDS_STILL = (
+    "the camera is taken to stand still: ?poses=FILE gives the poses of one that moves, or ?poses=track"
+)
 ENDLESS = "frames come without end: --keep-live N bounds the memory, --keyframes.* thins them out"
 
 
@@ -49,7 +52,7 @@ class RealSenseOptions:
     """Images in a second."""
 
     poses: str = ""
-    """A file of the camera's poses: stamp tx ty tz qx qy qz qw."""
+    """A file of the camera's poses: stamp tx ty tz qx qy qz qw; or track, to find them from the images."""
 
 
 class _EndlessNames(Sequence[str]):
@@ -68,10 +71,6 @@ class _EndlessNames(Sequence[str]):
         return f"realsense-{index:06d}"
 
 
-def _standing_still() -> Pose:
-    return look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
-
-
 @dataclass
 class RealSense(Dataset):
     """A RealSense camera. ``pipeline`` is pyrealsense2's, started; ``depth_scale`` is metres a step."""
@@ -80,7 +79,7 @@ class RealSense(Dataset):
     depth_scale: float = 0.001
     trajectory: TimedPoses | None = None
     largest_gap: float = INTERPOLATION_GAP
-    T_world_camera: Pose = field(default_factory=_standing_still)
+    T_world_camera: Pose = field(default_factory=start_pose)
     misses: int = 0
 
     @property
@@ -131,7 +130,8 @@ def open_realsense(text: str, options: ReadOptions) -> Dataset:
     file, wanted = _file_and_options(text)
     if options.depth_scale is not None:
         raise DatasetError(f"{NAME} has no depth_scale, the camera knows its own")
-    trajectory = read_timed_poses(Path(wanted.poses)) if wanted.poses else None
+    tracked = options.track or wanted.poses == TRACK
+    trajectory = read_timed_poses(Path(wanted.poses)) if wanted.poses and not tracked else None
     try:
         rs = importlib.import_module("pyrealsense2")
     except ImportError as error:
@@ -139,9 +139,15 @@ def open_realsense(text: str, options: ReadOptions) -> Dataset:
             f"{NAME} needs pyrealsense2, which is not installed: pip install 'taichi-mrf[realsense]'"
         ) from error
     gap = INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
+    source: RealSense | RealSenseFile
     if file:
-        return _open_recording(rs, Path(file), trajectory, gap, options)
-    return _open_camera(rs, wanted, trajectory, gap, options)
+        source = _open_recording(rs, Path(file), trajectory, gap, options)
+    else:
+        source = _open_camera(rs, wanted, trajectory, gap, options)
+    source.tracked = tracked
+    if not tracked and trajectory is None:
+        source.notes.insert(0, STANDS_STILL)
+    return source
 
 
 def _file_and_options(text: str) -> tuple[str, RealSenseOptions]:
@@ -167,7 +173,7 @@ def _open_camera(
     source = RealSense(
         NAME,
         options.camera or camera,
-        notes=[ENDLESS] if trajectory is not None else [STANDS_STILL, ENDLESS],
+        notes=[ENDLESS],
         pipeline=pipeline,
         depth_scale=float(profile.get_device().first_depth_sensor().get_depth_scale()),
         trajectory=trajectory,
@@ -186,7 +192,7 @@ def _open_recording(
     images = [listed for listed, _ in player.images()]
     if not images:
         raise DatasetError(f"{path}: holds no depth images")
-    still = _standing_still()
+    still = start_pose()
     poses = [still if trajectory is None else trajectory.at(each.stamp, gap) for each in images]
     posed = [(each, pose) for each, pose in zip(images, poses, strict=True) if pose is not None]
     if not posed:
@@ -195,7 +201,7 @@ def _open_recording(
             f"{images[-1].stamp:.3f} s) has poses within {gap:g} s on both sides"
         )
     dropped = len(images) - len(posed)
-    notes = [STANDS_STILL] if trajectory is None else []
+    notes = []
     if dropped:
         notes.append(f"{dropped} of {len(images)} images dropped: no poses within {gap:g} s on both sides")
     source = RealSenseFile(

@@ -76,13 +76,14 @@ def open_dataset(
     intrinsics: tuple[float, float, float, float] | None = None,
     undistort: tuple[float, ...] | None = None,
     image_scale: float = 1.0,
+    track: bool = False,
 ) -> Dataset:
     """Open a recording (a folder or a file) or a built-in source such as ``synthetic:room?frames=60``.
 
     The keywords are the fields of :class:`ReadOptions`: what the recording does not say, or says wrongly.
     Raises DatasetError, whose text names the source and says what was looked for.
     """
-    options = ReadOptions(camera, depth_scale, color, max_time_gap, intrinsics, undistort, image_scale)
+    options = ReadOptions(camera, depth_scale, color, max_time_gap, intrinsics, undistort, image_scale, track)
     path = Path(source)
     scheme = re.match(r"([a-z][a-z0-9_]+):", str(source))  # two letters at least: C:\ is a folder
     try:
@@ -100,7 +101,9 @@ def _as_wanted(dataset: Dataset, options: ReadOptions) -> Dataset:
     if options.intrinsics is not None:
         dataset.camera = PinholeCamera(dataset.camera.width, dataset.camera.height, *options.intrinsics)
     distortion = dataset.distortion if options.undistort is None else options.undistort
-    return resampled(dataset, distortion, options.stride)
+    picked = resampled(dataset, distortion, options.stride)
+    picked.tracked = dataset.tracked or options.track
+    return picked
 
 
 def recognise(folder: Path) -> FolderFormat | None:

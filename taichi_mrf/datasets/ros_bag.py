@@ -3,17 +3,18 @@
 The fields of :class:`BagOptions` are all options that there are; without any, the only depth topic and the
 only source of poses are taken. On opening, each depth message is looked at for its stamp; images are decoded
 when their frame is read. A pose is interpolated between its neighbours in time, and an image that has none
-near enough is left out and counted. Reading needs the extra ``ros``.
+near enough is left out and counted. ``poses=track`` leaves all poses to be found by whoever maps the frames.
+Reading needs the extra ``ros``.
 """
 
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.datasets import ros_messages as messages
-from taichi_mrf.datasets.base import Dataset, ReadOptions
+from taichi_mrf.datasets.base import TRACK, Dataset, ReadOptions
 from taichi_mrf.datasets.query_options import parse_options
 from taichi_mrf.datasets.ros_poses import BagPoses, PoseChoice, find_poses
 from taichi_mrf.datasets.ros_reader import METADATA, SUFFIXES, Entry, RosReader, is_bag
@@ -104,12 +105,15 @@ def open_bag(path: Path, query: str, options: ReadOptions) -> RosBag:
     pose.
     """
     chosen = parse_options(BagOptions, query, str(path))
+    if options.track:
+        chosen = replace(chosen, poses=TRACK)
     reader = RosReader(path)
     try:
         if any(name.startswith(REALSENSE) for name in reader.topics):
             raise DatasetError(
                 f"{path}: is a recording of Intel's RealSense library, without poses: "
-                f"realsense:{path}?poses=FILE plays it, with poses from lines of stamp tx ty tz qx qy qz qw"
+                f"realsense:{path}?poses=FILE plays it, with poses from lines of stamp tx ty tz qx qy qz qw, "
+                "or ?poses=track"
             )
         bag = _open(reader, chosen, options)
     except DatasetError:
@@ -151,6 +155,7 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> RosBag
         poses=[pose for _, _, pose in posed],
         names=[f"{i:06d}" for i, _, _ in posed],
         depth_scale=options.depth_scale,
+        tracked=chosen.poses == TRACK,
     )
 
 

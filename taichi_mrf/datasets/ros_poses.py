@@ -6,6 +6,7 @@ the bag.
   any.
 - The tree alone tells it if the camera's frame hangs in it by something that moves.
 - A file of poses in TUM's layout tells where the camera is, by the stamps of the bag's images.
+- Nothing tells it, and whoever maps the images is to find it.
 """
 
 from collections.abc import Callable
@@ -13,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from taichi_mrf.datasets import ros_messages as messages
+from taichi_mrf.datasets.base import TRACK, start_pose
 from taichi_mrf.datasets.ros_messages import frame_name
 from taichi_mrf.datasets.ros_reader import RosReader
 from taichi_mrf.datasets.ros_topics import FROM_TF, DepthTopic, choose, pose_topics, read_tree
@@ -23,7 +25,8 @@ from taichi_mrf.poses import Pose, as_pose
 
 NO_POSES = (
     "{path}: holds no poses (no Odometry, PoseStamped or tf of a moving {frame}); ?poses=FILE takes them "
-    "from lines of stamp tx ty tz qx qy qz qw, as a tracker or SLAM writes them"
+    "from lines of stamp tx ty tz qx qy qz qw, as a tracker or SLAM writes them, and ?poses=track finds them "
+    "from the images"
 )
 
 
@@ -35,7 +38,8 @@ class PoseChoice:
     """The topic of poses, or tf."""
 
     poses: str = ""
-    """A file of the camera's poses in TUM's layout, in place of any topic."""
+    """A file of the camera's poses in TUM's layout, in place of any topic; or track, to find them from the
+    images."""
 
     frame: str = ""
     """The fixed frame that the map is made in."""
@@ -69,6 +73,8 @@ def find_poses(reader: RosReader, depth: DepthTopic, choice: PoseChoice) -> BagP
     Raises DatasetError, whose text names the file and lists the candidates or the frames, if there are none
     or several, or if frames that were named do not hang together.
     """
+    if choice.poses == TRACK:
+        return BagPoses(lambda stamp, largest_gap: start_pose(), "found from the images")
     if choice.poses:
         timed = read_timed_poses(Path(choice.poses))
         return BagPoses(timed.at, f"{choice.poses}: {_span(timed)}")

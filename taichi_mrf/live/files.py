@@ -8,9 +8,12 @@ from taichi_mrf.config import Config
 from taichi_mrf.config_text import commented_yaml
 from taichi_mrf.export.atomic import write_text
 from taichi_mrf.export.ply import write_voxels
+from taichi_mrf.export.trajectory import write_trajectory
 from taichi_mrf.maps.protocol import OccupancyMap
+from taichi_mrf.maps.tracking import Track
 
 MAP_FILE, VOXEL_FILE, CONFIG_FILE = "map.npz", "voxels.ply", "config.yaml"
+TRAJECTORY_FILE = "trajectory.txt"
 
 FileKind = Literal["map", "ply"]
 
@@ -35,8 +38,12 @@ def file_content(kind: FileKind, m: OccupancyMap, out: Path | None) -> tuple[str
         return path.name, path.read_bytes()
 
 
-def write_all(m: OccupancyMap, config: Config, folder: Path) -> list[Path]:
+def write_all(m: OccupancyMap, config: Config, folder: Path, track: Track | None = None) -> list[Path]:
     """Write all files of a run: the map first, it is what the time went into. Raises MapFileError."""
     written = [write_file("map", m, folder)]
     write_text(folder / CONFIG_FILE, commented_yaml(config))
-    return [*written, write_file("ply", m, folder), folder / CONFIG_FILE]
+    written += [write_file("ply", m, folder), folder / CONFIG_FILE]
+    if track is not None:
+        write_trajectory(folder / TRAJECTORY_FILE, track.trajectory(m))
+        written.append(folder / TRAJECTORY_FILE)
+    return written

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.config import PoseConfig
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.frame import Frame
 from taichi_mrf.inference.schedule import InferProgress
@@ -20,6 +21,7 @@ from taichi_mrf.live.roster import Entry, Roster
 from taichi_mrf.maps.mrf import MRFMap
 from taichi_mrf.maps.protocol import MappedKeyframe, OccupancyMap
 from taichi_mrf.maps.recursive import RecursiveMap
+from taichi_mrf.maps.refinement import refiner_of
 from taichi_mrf.poses import Pose, as_pose
 from taichi_mrf.viewer import messages
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
@@ -32,13 +34,16 @@ class Mapper:
     """A map, and the roster of its keyframes.
 
     ``unsettled`` says that keyframes have come, gone or moved since the last full inference, ``edited`` that
-    some of them by a user's hand. ``to_renew`` are keyframes (numbers of the roster) around an edit that have
+    some of them by a user's hand, and ``unaligned``, if poses are refined, that keyframes have come since all
+    were aligned with each other. ``to_renew`` are keyframes (numbers of the roster) around an edit that have
     not been swept since.
     """
 
-    def __init__(self, m: OccupancyMap, first_id: int = 0) -> None:
-        """A map that may have keyframes already; the viewer's numbers begin at ``first_id``."""
+    def __init__(self, m: OccupancyMap, first_id: int = 0, poses: PoseConfig | None = None) -> None:
+        """A map that may have keyframes already; the viewer's numbers begin at ``first_id``. Raises
+        ConfigError if ``poses`` asks for what the map cannot do."""
         self.map = m
+        self.refiner = refiner_of(m, poses or PoseConfig())
         self.roster = Roster(next_id=first_id)
         for id, keyframe in m.keyframes.items():
             self.roster.add(keyframe, keyframe.rays, thumbnail(keyframe.depth_m), id)
@@ -48,6 +53,7 @@ class Mapper:
         # A map from a file has beliefs but no messages, and edits would have to infer them first.
         self.lacks_messages = bool(m.keyframes) and isinstance(m, MRFMap)
         self.unsettled, self.edited = self.lacks_messages or self.stale, False
+        self.unaligned = False
         self.to_renew: list[int] = []
 
     @property
@@ -61,11 +67,15 @@ class Mapper:
         return isinstance(self.map, RecursiveMap) and self.map.stale
 
     def take_in(self, frame: Frame) -> Entry:
-        """Add a frame as a keyframe and sweep it once. Raises what the map raises, and is then unchanged."""
-        map_id = self._add(frame.depth_m, frame.T_world_camera, frame)
-        rays = self.map.keyframes[map_id].rays
-        self.unsettled = True
-        return self.roster.add(frame, rays, thumbnail(frame.depth_m), map_id)
+        """Add a frame as a keyframe, align it if poses are refined, and sweep it once. Raises what the map
+        raises, and is then unchanged."""
+        refiner = self.refiner
+        place = self._sweep_id if refiner is None else refiner.place
+        map_id = self._add(frame.depth_m, frame.T_world_camera, frame, place)
+        self.unsettled, self.unaligned = True, refiner is not None
+        entry = self.roster.add(frame, self.map.keyframes[map_id].rays, thumbnail(frame.depth_m), map_id)
+        entry.T_world_camera = entry.T_home = self.map.keyframes[map_id].T_world_camera
+        return entry
 
     def switch(self, id: int, on: bool) -> Entry:
         """Take a keyframe out of the map, keeping its image, or bring it back. Raises KeyframeError."""
@@ -74,7 +84,9 @@ class Mapper:
             return entry
         if on:
             assert entry.depth_m is not None
-            entry.map_id = self._add(entry.depth_m, entry.T_world_camera, entry)
+            entry.map_id = self._add(entry.depth_m, entry.T_world_camera, entry, self._sweep_id)
+            if self.refiner is not None:
+                self.refiner.know(entry.map_id, entry.T_recorded)
             entry.depth_m, entry.state = None, "on"
             self._edited(self._near(entry))
         else:
@@ -92,8 +104,18 @@ class Mapper:
             self.map.move_keyframe(self._map_id(entry), T)
             self._sweep(entry)
             self._edited([*near, *self._near(entry)])
-        entry.T_world_camera = T
+        entry.T_world_camera, entry.moved_by_hand = T, True
         return entry
+
+    def align(self, entry: Entry, T_world_camera: Pose) -> bool:
+        """Put a keyframe that is on where alignment wants it, and sweep it once; returns whether it moved."""
+        if np.array_equal(entry.T_world_camera, T_world_camera):
+            return False
+        self.map.move_keyframe(self._map_id(entry), T_world_camera)
+        self._sweep(entry)
+        self.unsettled = True
+        entry.T_world_camera = entry.T_home = T_world_camera
+        return True
 
     def freeze(self, id: int, by_hand: bool = True) -> messages.Keyframe:
         """Fold a keyframe into the map for good; returns the last that is to be said of it, because its image
@@ -172,19 +194,28 @@ class Mapper:
         entries.sort(key=lambda entry: float(np.linalg.norm(entry.T_world_camera[:3, 3] - point)))
         return map(self.seer, entries)
 
-    def _add(self, depth_m: NDArray[np.float32], T_world_camera: Pose, of: Frame | Entry) -> int:
+    def _add(
+        self,
+        depth_m: NDArray[np.float32],
+        T_world_camera: Pose,
+        of: Frame | Entry,
+        place: Callable[[int], None],
+    ) -> int:
+        """Add a keyframe and ``place`` it, or leave nothing of it."""
         map_id = self.map.add_keyframe(depth_m, T_world_camera, of.camera, of.name)
-        if not self.stale:
-            try:
-                self.map.infer(sweeps=1, keyframes=[map_id])
-            except BaseException:
-                self.map.remove_keyframe(map_id)
-                raise
+        try:
+            place(map_id)
+        except BaseException:
+            self.map.remove_keyframe(map_id)
+            raise
         return map_id
 
     def _sweep(self, entry: Entry) -> None:
+        self._sweep_id(self._map_id(entry))
+
+    def _sweep_id(self, map_id: int) -> None:
         if not self.stale:
-            self.map.infer(sweeps=1, keyframes=[self._map_id(entry)])
+            self.map.infer(sweeps=1, keyframes=[map_id])
 
     def _edited(self, near: list[int]) -> None:
         self.unsettled = self.edited = True
@@ -225,4 +256,5 @@ class Mapper:
             entry.state,
             picture,
             crossed,
+            entry.T_home,
         )

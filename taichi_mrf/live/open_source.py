@@ -1,6 +1,7 @@
 """What a live run maps: a source of frames with a new map, or a map from a file."""
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 
 from taichi_mrf import runtime
@@ -22,9 +23,10 @@ def open_source(
     speed: float,
     loop: bool,
     reading: SourceFlags | None = None,
+    track: bool = False,
 ) -> tuple[Source, list[str]]:
     """Start Taichi and open a source, read as ``reading`` says; returns it with sentences that the user
-    should see.
+    should see. With ``track`` the poses of its frames are to be found.
 
     Raises TaichiMRFError: DatasetError, MapFileError, BackendError, ConfigError.
     """
@@ -36,10 +38,11 @@ def open_source(
         parameters = dataclasses.replace(header.config, runtime=config.runtime)
         note = f"{path.name} is a saved map: its own parameters are in force."
         return Source(path.name, parameters, lambda: load_map(path)), [note]
-    dataset = open_dataset(name, color=False, **(reading or SourceFlags()).keywords())
+    dataset = open_dataset(name, color=False, track=track, **(reading or SourceFlags()).keywords())
 
     def new_replay() -> Replay:
         hold_out = config.evaluation.hold_out
         return Replay(dataset, every=every, limit=limit, loop=loop, hold_out=hold_out, speed=speed)
 
-    return Source(name, config, lambda: create_map(config, dataset.camera), new_replay), dataset.notes
+    new_map = partial(create_map, config, dataset.camera)
+    return Source(name, config, new_map, new_replay, dataset.tracked), dataset.notes

@@ -15,7 +15,11 @@ from taichi_mrf.viewer.messages import KeyframeState
 @dataclass
 class Entry:
     """One keyframe. ``map_id`` is its number in the map while it is on; ``depth_m`` (H, W) is its depth image
-    in metres, 0 for no measurement, while it is off. A frozen one has neither any more."""
+    in metres, 0 for no measurement, while it is off. A frozen one has neither any more.
+
+    ``T_recorded`` is where it was recorded and ``T_home`` where alignment has placed it, which is the same if
+    poses are not refined; a user may have put it elsewhere (``moved_by_hand``).
+    """
 
     id: int
     name: str
@@ -26,6 +30,10 @@ class Entry:
     map_id: int | None
     state: KeyframeState = "on"
     depth_m: NDArray[np.float32] | None = None
+    moved_by_hand: bool = False
+
+    def __post_init__(self) -> None:
+        self.T_recorded = self.T_home = self.T_world_camera
 
 
 @dataclass

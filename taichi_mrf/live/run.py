@@ -7,25 +7,29 @@ from pathlib import Path
 
 from taichi_mrf import runtime
 from taichi_mrf.config import Config, to_yaml
-from taichi_mrf.errors import CapacityError
+from taichi_mrf.errors import CapacityError, LostFrameError
 from taichi_mrf.frame import Frame
 from taichi_mrf.live.link import Link
 from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.live.progress import Progress
 from taichi_mrf.live.replay import Replay
 from taichi_mrf.maps.protocol import OccupancyMap
+from taichi_mrf.maps.tracking import Track, tracker_of
 from taichi_mrf.viewer.messages import CurrentCamera, Hello, Keyframe, Notice, Request, Update
+
+WAY_BACK = "bring the camera back to where it was then, or to where it started"
 
 
 @dataclass(frozen=True)
 class Source:
     """What is mapped: how to make its map (an empty one, or one from a file), and how to replay its frames,
-    which a saved map has not."""
+    which a saved map has not. ``tracked`` says that their poses are to be found."""
 
     name: str
     config: Config
     new_map: Callable[[], OccupancyMap]
     new_replay: Callable[[], Replay] | None = None
+    tracked: bool = False
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,7 @@ class Run:
 
     ``stepping`` says that one more keyframe is to be taken whatever the pace, ``ended`` that the run is over,
     ``current`` is the frame that was read last. ``waiting`` are the requests that have not been carried out.
+    ``tracker`` finds the poses of a tracked source, and ``track`` remembers them for ``policy.out``.
     ``version`` changes with the map that is shown and with the current camera.
     """
 
@@ -59,7 +64,10 @@ class Run:
         """Forget the map, if there is one, and start the source from its beginning, at the speed in
         force. The viewer's numbers of keyframes begin at ``first_id``. What is raised leaves the old map in
         place."""
-        self.mapper = Mapper(self.source.new_map(), first_id)
+        poses = self.source.config.poses
+        self.mapper = Mapper(self.source.new_map(), first_id, poses)
+        self.tracker = tracker_of(self.mapper.map, poses) if self.source.tracked else None
+        self.track = Track()
         replay = self.source.new_replay() if self.source.new_replay else None
         if replay is not None and self.replay is not None:
             replay.set_speed(self.replay.speed)
@@ -105,6 +113,25 @@ class Run:
         self.version += 1
         self.send(CurrentCamera(frame.name, frame.T_world_camera, frame.camera))
 
+    def located(self, frame: Frame) -> Frame | None:
+        """The frame where it was taken; None if that cannot be found out, of which the viewer is told when it
+        begins and when it is over."""
+        if self.tracker is None:
+            return frame
+        lost = self.tracker.lost
+        try:
+            found, tracked = self.tracker.follow(frame)
+        except LostFrameError as error:
+            self.track.lost += 1
+            if not lost:
+                self.send(Notice(f"{error}; {WAY_BACK}", "warning"))
+            return None
+        if lost:
+            self.send(Notice(f"{frame.name}: tracking goes on after {lost} lost frames"))
+        if self.policy.out is not None:
+            self.track.frames[len(self.track.frames)] = tracked
+        return found
+
     def describe(self, id: int) -> Keyframe:
         """What the viewer must know of a keyframe."""
         return self.mapper.describe(self.mapper.roster.find(id))
@@ -149,7 +176,7 @@ class Run:
     @property
     def is_done(self) -> bool:
         """Whether all frames are in the map, and it is the one that they give."""
-        return not self.has_frames_left and not self.mapper.unsettled
+        return not (self.has_frames_left or self.mapper.unsettled or self.mapper.unaligned)
 
     @property
     def idle_activity(self) -> str:

@@ -3,7 +3,9 @@
 One thread does all of it, one piece after the other, because Taichi has one owner:
 
     requests that have come
-    a frame, if one is due                     add it, sweep it once, publish what has changed
+    a frame, if one is due                     find its pose if need be, add it, align it if poses are to be
+                                               refined, sweep it once, publish what has changed
+    else rounds of alignment                   once the sequence has ended, if poses are to be refined
     else full inference, if the map needs it   requests are answered from the map as it was before
     else what is shown beside the map
     else wait
@@ -20,7 +22,10 @@ from taichi_mrf.live.link import Link
 from taichi_mrf.live.progress import sweeping
 from taichi_mrf.live.replay import BrokenFrame, Replay
 from taichi_mrf.live.requests import EDITS, Requests, goes_on
+from taichi_mrf.live.roster import Entry
+from taichi_mrf.live.rounds import Rounds
 from taichi_mrf.live.run import Policy, Run, Source
+from taichi_mrf.maps.tracking import keyframe_steps
 from taichi_mrf.viewer.messages import Listening, Notice, Request
 
 WAIT_SECONDS = 0.25
@@ -42,7 +47,7 @@ class Session:
         self.state = Run(source, link, policy)
         self._extras = Extras(self.state)
         self._requests = Requests(self.state, self._extras, listening, self._begin_anew)
-        self._selector = KeyframeSelector(source.config.keyframes)
+        self._selector = self._new_selector()
         self._should_stop: Callable[[], bool] = lambda: False
 
     def run(self, should_stop: Callable[[], bool]) -> None:
@@ -71,7 +76,12 @@ class Session:
     def _begin_anew(self) -> None:
         self.state.begin(self.state.mapper.roster.next_id)
         self._extras.start_over()
-        self._selector = KeyframeSelector(self.state.source.config.keyframes)
+        self._selector = self._new_selector()
+
+    def _new_selector(self) -> KeyframeSelector:
+        source = self.state.source
+        config = source.config.keyframes
+        return KeyframeSelector(keyframe_steps(config) if source.tracked else config)
 
     def _is_over(self) -> bool:
         return self._should_stop() or self.state.ended or self.state.link.lost is not None
@@ -97,6 +107,8 @@ class Session:
             self._take_frame(state.replay)
             self._extras.work(self._go_on)
             return True
+        if mapper.unaligned and not state.has_frames_left:
+            return self._align()
         if mapper.unsettled and not state.is_replaying:
             return self._settle()
         return self._extras.work(self._go_on)
@@ -112,7 +124,7 @@ class Session:
         if isinstance(frame, BrokenFrame):
             text = f"{frame.problem}; what is mapped stays" if frame.last else frame.problem
             self.state.send(Notice(text, "error"))
-        elif frame is not None:
+        elif frame is not None and (frame := self.state.located(frame)) is not None:
             self.state.show_camera(frame)
             if self._selector.wants(frame.T_world_camera) and (frame.depth_m > 0).any():
                 self._tell(f"adding {frame.name}", replay.share)
@@ -123,6 +135,8 @@ class Session:
     def _take_in(self, frame: Frame) -> None:
         state = self.state
         entry = state.mapper.take_in(frame)
+        if state.tracker is not None and entry.map_id is not None:
+            state.tracker.took(entry.map_id)
         self._selector.accept(frame.T_world_camera)
         state.progress.keyframe_taken()
         state.send(state.mapper.describe(entry))
@@ -143,11 +157,32 @@ class Session:
         self.state.guarded(settle)
         return True
 
+    def _align(self) -> bool:
+        state, mapper = self.state, self.state.mapper
+        assert mapper.refiner is not None
+
+        def show(entry: Entry) -> None:
+            state.send(mapper.describe(entry))
+            state.publish()
+
+        def align() -> None:
+            assert mapper.refiner is not None
+            mapper.unaligned = False  # or what goes wrong would be tried again without end
+            mapper.unaligned = not Rounds(mapper, mapper.refiner, self._go_on_aligning, show).run()
+            state.publish()
+
+        state.guarded(align)
+        return True
+
+    def _go_on_aligning(self, activity: str, share: float) -> bool:
+        self._tell(activity, share)
+        return self._go_on()
+
     def _go_on_sweeping(self, step: InferProgress) -> bool:
         self._tell(*sweeping(step))
         return self._go_on(step)
 
-    def _go_on(self, step: InferProgress) -> bool:
+    def _go_on(self, step: InferProgress | None = None) -> bool:
         """Between two steps of a long piece of work: answer what can be, and say whether to go on."""
         state = self.state
         self._hear()

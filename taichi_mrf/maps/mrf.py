@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf import runtime
+from taichi_mrf.alignment.keyframe_surfels import KeyframeSurfels
 from taichi_mrf.alignment.refine import Aligner, RefinedPose
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import Config, InferenceConfig, PoseConfig, SensorConfig, VolumeConfig
@@ -92,7 +93,7 @@ class MRFMap:
         kept = (self._placing.look_again, self._placing.refresh)
         self._renewal = Renewal(self._pool, self._sweeper, whereabouts, *kept)
         self.view = View(self._pool, self.voxel_size, self.config.volume)
-        self._aligner = Aligner(self.view, self.sensor.max_depth)
+        self.aligner = Aligner(self.view, KeyframeSurfels(self.voxel_size, max_depth))
         self._keyframes: dict[int, Keyframe] = {}
         self._frozen: dict[int, str] = {}
         self._next_id = 0
@@ -164,7 +165,7 @@ class MRFMap:
         if keyframe.messages is not None:
             self._placing.refresh(keyframe)
         poses = [as_pose(T) for T in guesses]
-        refined = self._aligner.refine(keyframe, self._keyframes, self._frozen, config or PoseConfig(), poses)
+        refined = self.aligner.refine(keyframe, self._keyframes, config or PoseConfig(), poses)
         if refined.accepted:
             self.move_keyframe(id, refined.T_world_camera)
         return refined
@@ -182,6 +183,7 @@ class MRFMap:
                 f"keyframe {id} ({keyframe.name}) has no messages to freeze: call infer first"
             )
         self._placing.freeze(keyframe)
+        self.aligner.surface.freeze(keyframe)
         self._frozen[id] = keyframe.name
         del self._keyframes[id]
 

@@ -5,7 +5,7 @@ alignment/joint.py moves all of them at once, because one after the other they w
 what has added up on the way.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,9 @@ from taichi_mrf.alignment.joint import align_jointly
 from taichi_mrf.alignment.likelihood import log_likelihood, map_of_others
 from taichi_mrf.alignment.oriented_points import OrientedPoints, oriented_points
 from taichi_mrf.config import PoseConfig
+from taichi_mrf.errors import ConfigError
 from taichi_mrf.maps.mrf import MRFMap
+from taichi_mrf.maps.protocol import OccupancyMap
 from taichi_mrf.poses import Pose, inverse, tangent_norms
 
 LOSS = 0.1
@@ -49,13 +51,12 @@ class PoseRefiner:
     """Refines the keyframes of one map."""
 
     def __init__(self, m: MRFMap, config: PoseConfig) -> None:
-        self._map, self._config = m, config
+        self._map, self.config = m, config
         self._recorded: dict[int, Pose] = {}
 
-    def know(self, name: str, T_recorded: Pose) -> None:
-        """Take note of where a keyframe was recorded that was placed in an earlier run."""
-        id = next(id for id, keyframe in self._map.keyframes.items() if keyframe.name == name)
-        self._recorded[id] = T_recorded
+    def know(self, keyframe: int, T_recorded: Pose) -> None:
+        """Take note of where a keyframe was recorded that is placed already."""
+        self._recorded[keyframe] = T_recorded
 
     def place(self, keyframe: int) -> None:
         """Align a new keyframe, which stands where it was recorded, with those before it; then let it speak.
@@ -64,11 +65,14 @@ class PoseRefiner:
         about as much as this one has to be. The search begins at the better of the two.
         """
         T_recorded = self._map.keyframes[keyframe].T_world_camera
-        if self._recorded:
-            last = max(self._recorded)
+        placed = [id for id in self._recorded if id in self._map.keyframes]
+        guesses = []
+        if placed:
+            last = max(placed)
             T_last = self._map.keyframes[last].T_world_camera
-            carried = T_last @ inverse(self._recorded[last]) @ T_recorded
-            self._map.refine_pose(keyframe, self._config, [carried])
+            guesses.append(T_last @ inverse(self._recorded[last]) @ T_recorded)
+        if placed or self._map.frozen:
+            self._map.refine_pose(keyframe, self.config, guesses)
         self._recorded[keyframe] = T_recorded
         self._map.infer(keyframes=[keyframe], sweeps=1)
 
@@ -80,31 +84,49 @@ class PoseRefiner:
         there are; by returning False it ends the rounds, of which this one is undone. The marginals are to
         be inferred again afterwards.
         """
-        ids = sorted(self._map.keyframes)
-        before = self._log_likelihood()
-        for round in range(1, self._config.rounds + 1):
-            stood = {id: self._map.keyframes[id].T_world_camera for id in ids}
-            found = align_jointly(self._points(), stood, self._recorded, self._config)
-            for number, id in enumerate(ids, start=1):
-                self._move(id, found[id])
-                if not on_keyframe(round, number, len(ids)):
+        before = self._inferred_log_likelihood()
+        for round in range(1, self.config.rounds + 1):
+            stood = {id: keyframe.T_world_camera for id, keyframe in self._map.keyframes.items()}
+            for number, (id, T_world_camera) in enumerate(self.joint().items(), start=1):
+                self._move(id, T_world_camera)
+                if not on_keyframe(round, number, len(stood)):
                     self._undo(stood)
                     return
-            furthest = max(tangent_norms(stood[id], self._map.keyframes[id].T_world_camera)[1] for id in ids)
-            if furthest < SETTLED * self._map.voxel_size:
+            if has_settled(self._map, stood):
                 return
-            after = self._log_likelihood()
-            if not after > before - LOSS:
+            after = self._inferred_log_likelihood()
+            if is_worse(before, after):
                 self._undo(stood)
                 return
             before = after
+
+    def joint(
+        self, fixed: Collection[int] = (), on_pair: Callable[[], None] = lambda: None
+    ) -> dict[int, Pose]:
+        """Where all keyframes, by id, fit each other and where they were recorded; nothing is moved here. One
+        that would go further than allowed stays, as do those that are ``fixed``. What ``on_pair`` raises ends
+        the search."""
+        stood = {id: keyframe.T_world_camera for id, keyframe in self._map.keyframes.items()}
+        found = align_jointly(self._points(), stood, self._recorded, self.config, fixed, on_pair)
+        return {id: T if self._is_near(stood[id], T) else stood[id] for id, T in found.items()}
+
+    def log_likelihood(self, on_keyframe: Callable[[], None] = lambda: None) -> float:
+        """Mean log-likelihood of the keyframes' depth, each in the map of the others, right after a sweep
+        over all of them."""
+        view, max_depth = self._map.view, self._map.sensor.max_depth
+        found = []
+        for keyframe in self._map.keyframes.values():
+            on_keyframe()
+            with map_of_others(view, keyframe):
+                found.append(log_likelihood(view, keyframe, keyframe.T_world_camera, max_depth))
+        return float(np.nanmean(found)) if found else float("nan")
 
     def changes(self) -> list[PoseChange]:
         """What became of every keyframe."""
         keyframes = self._map.keyframes
         return [
-            PoseChange(id, keyframes[id].name, T_recorded, keyframes[id].T_world_camera)
-            for id, T_recorded in self._recorded.items()
+            PoseChange(id, keyframe.name, self._recorded[id], keyframe.T_world_camera)
+            for id, keyframe in keyframes.items()
         ]
 
     def _points(self) -> dict[int, OrientedPoints]:
@@ -116,19 +138,36 @@ class PoseRefiner:
             self._move(id, T_world_camera)
 
     def _move(self, id: int, T_world_camera: Pose) -> None:
-        """Move a keyframe, unless that is further than allowed."""
-        T_now = self._map.keyframes[id].T_world_camera
-        rotation, translation = tangent_norms(T_now, T_world_camera)
-        near = rotation <= self._config.max_rotation and translation <= self._config.max_translation
-        if near and not np.array_equal(T_now, T_world_camera):
+        if not np.array_equal(self._map.keyframes[id].T_world_camera, T_world_camera):
             self._map.move_keyframe(id, T_world_camera)
 
-    def _log_likelihood(self) -> float:
-        """Mean log-likelihood of the keyframes' depth, each in the map of the others after one sweep."""
+    def _is_near(self, T_now: Pose, T_world_camera: Pose) -> bool:
+        rotation, translation = tangent_norms(T_now, T_world_camera)
+        return rotation <= self.config.max_rotation and translation <= self.config.max_translation
+
+    def _inferred_log_likelihood(self) -> float:
         self._map.infer(sweeps=1)
-        view, max_depth = self._map.view, self._map.sensor.max_depth
-        found = []
-        for keyframe in self._map.keyframes.values():
-            with map_of_others(view, keyframe):
-                found.append(log_likelihood(view, keyframe, keyframe.T_world_camera, max_depth))
-        return float(np.nanmean(found)) if found else float("nan")
+        return self.log_likelihood()
+
+
+def refiner_of(m: OccupancyMap, config: PoseConfig) -> PoseRefiner | None:
+    """What refines the poses of a map, None if they are to stay. Raises ConfigError if the map's method
+    cannot move keyframes."""
+    if not config.refine:
+        return None
+    if not isinstance(m, MRFMap):
+        method = m.config.method
+        raise ConfigError(f"poses.refine needs the method mrf; a map by {method} cannot move keyframes")
+    return PoseRefiner(m, config)
+
+
+def has_settled(m: MRFMap, stood: Mapping[int, Pose]) -> bool:
+    """Whether no keyframe has moved far from where it stood."""
+    keyframes = m.keyframes
+    moved_m = [tangent_norms(T, keyframes[id].T_world_camera)[1] for id, T in stood.items()]
+    return max(moved_m, default=0.0) < SETTLED * m.voxel_size
+
+
+def is_worse(before: float, after: float) -> bool:
+    """Whether a round made the depth less likely by more than it may."""
+    return not after > before - LOSS

@@ -67,7 +67,8 @@ class Keyframe:
     """A keyframe that is new or has changed.
 
     ``picture`` is the depth image in colours, (h, w, 3) uint8 and small; ``crossed`` (n, 3) int32 are the
-    bricks that its rays go through, which are known to be free where the map has no voxels.
+    bricks that its rays go through, which are known to be free where the map has no voxels. ``T_home`` is
+    where *Put back* puts it; None means where the first message of it said.
     """
 
     id: int
@@ -78,6 +79,7 @@ class Keyframe:
     state: KeyframeState
     picture: NDArray[np.uint8]
     crossed: NDArray[np.int32]
+    T_home: Pose | None = None
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,11 @@ class Roster:
     def put(self, keyframe: Keyframe) -> list[int]:
         """Remember a keyframe that is new or has changed; returns the numbers of those that are forgotten."""
         self.keyframes[keyframe.id] = keyframe
-        self.recorded.setdefault(keyframe.id, keyframe.T_world_camera)
+        home = keyframe.T_home
+        if home is not None:
+            self.recorded[keyframe.id] = home
+        else:
+            self.recorded.setdefault(keyframe.id, keyframe.T_world_camera)
         frozen = [id for id in sorted(self.keyframes) if self.keyframes[id].state == "frozen"]
         forgotten = frozen[: max(0, len(frozen) - MOST_FROZEN)]
         for id in forgotten:

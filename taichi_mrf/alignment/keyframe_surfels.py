@@ -1,0 +1,61 @@
+"""The surface that all keyframes of one map have measured, kept up to date as they come, move and go."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.alignment.oriented_points import oriented_points
+from taichi_mrf.alignment.surfels import Surfels, merged, surfels_of
+from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.poses import Pose
+
+
+class KeyframeSurfels:
+    """Surfels by keyframe, in cells of ``cell_size`` metres. Those of keyframes that have not moved are kept;
+    those of frozen ones are added up, so that they cost no more than the surface they have seen.
+
+    ``revision`` changes with the surface.
+    """
+
+    def __init__(self, cell_size: float, max_depth: float) -> None:
+        self.cell_size, self.max_depth, self.revision = cell_size, max_depth, 0
+        self._kept: dict[int, tuple[Pose, Surfels]] = {}
+        self._frozen: Surfels | None = None
+
+    def update(self, keyframes: Mapping[int, Keyframe], without: int | None = None) -> None:
+        """Measure what is new or has moved, and forget what is gone. ``without`` is a keyframe that is not
+        asked for now."""
+        gone = [id for id in self._kept if id not in keyframes]
+        for id in gone:
+            del self._kept[id]
+        self.revision += len(gone)
+        for id, keyframe in keyframes.items():
+            if id != without:
+                self._measure(keyframe)
+
+    def freeze(self, keyframe: Keyframe) -> None:
+        """Keep for good what a keyframe has measured. Before the first :meth:`update` nothing is kept: who
+        never aligns does not pay for it."""
+        if not (self._kept or self._frozen is not None):
+            return
+        self._measure(keyframe)
+        _, surfels = self._kept.pop(keyframe.id)
+        parts = [surfels] if self._frozen is None else [self._frozen, surfels]
+        self._frozen = merged(parts, self.cell_size)
+
+    def around(
+        self, lower_m: NDArray[np.float64], upper_m: NDArray[np.float64], without: int | None = None
+    ) -> Surfels:
+        """The surface in a box of metres in the world, of all keyframes but perhaps one."""
+        parts = [surfels for id, (_, surfels) in self._kept.items() if id != without]
+        if self._frozen is not None:
+            parts.append(self._frozen)
+        return merged([surfels.within(lower_m, upper_m) for surfels in parts], self.cell_size)
+
+    def _measure(self, keyframe: Keyframe) -> None:
+        known, T_world_camera = self._kept.get(keyframe.id), keyframe.T_world_camera
+        if known is None or known[0] is not T_world_camera:
+            points = oriented_points(keyframe.image, self.max_depth)
+            self._kept[keyframe.id] = (T_world_camera, surfels_of(points, T_world_camera, self.cell_size))
+            self.revision += 1

@@ -1,0 +1,19 @@
+"""Poses in TUM RGB-D's layout, ``stamp tx ty tz qx qy qz qw``: what ``?poses=FILE`` and other tools read."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from taichi_mrf.datasets.timed_poses import quaternion
+from taichi_mrf.export.atomic import write_text
+from taichi_mrf.poses import Pose
+
+HEADER = "# stamp tx ty tz qx qy qz qw (T_world_camera, metres; camera axes x right, y down, z forward)"
+
+
+def write_trajectory(path: Path, poses: Iterable[tuple[float, Pose]]) -> None:
+    """Write stamps in seconds with their poses, (4, 4) T_world_camera. Raises MapFileError."""
+    lines = [HEADER]
+    for stamp, T_world_camera in poses:
+        numbers = (*T_world_camera[:3, 3], *quaternion(T_world_camera[:3, :3]))
+        lines.append(" ".join([f"{stamp:.6f}", *(f"{number:.9f}" for number in numbers)]))
+    write_text(path, "\n".join(lines) + "\n")
