@@ -219,8 +219,8 @@ def _add_keyframes(
             if refiner is not None:
                 with result.timed("refining"):
                     refiner.place(added)
-            if tracker is not None:
-                tracker.took(added)
+            if tracker is not None and result.track is not None:
+                result.track.frames[index] = tracker.took(added)
             selector.accept(frame.T_world_camera)
             listener(KeyframeAdded(*place, added, result.map.keyframes[added].rays))
 

@@ -13,6 +13,7 @@ from taichi_mrf.live.link import Link
 from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.live.progress import Progress
 from taichi_mrf.live.replay import Replay
+from taichi_mrf.live.roster import Entry
 from taichi_mrf.maps.protocol import OccupancyMap
 from taichi_mrf.maps.tracking import Track, tracker_of
 from taichi_mrf.viewer.messages import CurrentCamera, Hello, Keyframe, Notice, Request, Update
@@ -131,6 +132,13 @@ class Run:
         if self.policy.out is not None:
             self.track.frames[len(self.track.frames)] = tracked
         return found
+
+    def tracked_keyframe(self, entry: Entry) -> None:
+        """The frame that was located last has become a keyframe."""
+        if self.tracker is not None and entry.map_id is not None:
+            tracked = self.tracker.took(entry.map_id)
+            if self.track.frames:
+                self.track.frames[len(self.track.frames) - 1] = tracked
 
     def describe(self, id: int) -> Keyframe:
         """What the viewer must know of a keyframe."""

@@ -135,8 +135,7 @@ class Session:
     def _take_in(self, frame: Frame) -> None:
         state = self.state
         entry = state.mapper.take_in(frame)
-        if state.tracker is not None and entry.map_id is not None:
-            state.tracker.took(entry.map_id)
+        state.tracked_keyframe(entry)
         self._selector.accept(frame.T_world_camera)
         state.progress.keyframe_taken()
         state.send(state.mapper.describe(entry))

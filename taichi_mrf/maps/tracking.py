@@ -120,13 +120,15 @@ class Tracker:
             self._last = None  # what lies between is not known, so neither is the motion
         return self._found(frame, located.T_world_camera, located.directions)
 
-    def took(self, keyframe: int) -> None:
-        """The frame that was followed last is this keyframe of the map, and may have been moved a little."""
+    def took(self, keyframe: int) -> TrackedFrame:
+        """The frame that was followed last is this keyframe of the map, and may have been moved a little;
+        returns where it is now said to have been taken."""
         assert self._last is not None
         T_world_camera = self._map.keyframes[keyframe].T_world_camera
         self._keyframe = keyframe
         self._last = self._tracked(self._last.name, self._last.stamp, T_world_camera, self._last.directions)
         self._first = self._first or self._last
+        return self._last
 
     def resume(self, keyframe: int) -> None:
         """Go on from a keyframe that was mapped in an earlier run."""
