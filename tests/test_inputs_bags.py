@@ -200,6 +200,14 @@ def test_poses_from_a_file(make: Callable[..., Path], tmp_path: Path) -> None:
     np.testing.assert_allclose(dataset.read(1).T_world_camera, world_body(1), atol=1e-6)
 
 
+def test_poses_can_be_left_to_be_tracked(make: Callable[..., Path]) -> None:
+    path = make(images)
+    for dataset in (open_dataset(f"{path}?poses=track"), open_dataset(path, track=True)):
+        assert dataset.tracked
+        assert (len(dataset), dataset.dropped) == (COUNT, 0)
+        np.testing.assert_array_equal(dataset.read(0).T_world_camera, dataset.read(1).T_world_camera)
+
+
 def test_images_without_poses_are_left_out_and_counted(make: Callable[..., Path]) -> None:
     def write(bag: Bag) -> None:
         images(bag)

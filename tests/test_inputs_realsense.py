@@ -193,6 +193,16 @@ def test_a_camera_can_be_thinned_out(library: type[Pipeline]) -> None:
     np.testing.assert_allclose(source.read(0).depth_m, STEPS[::2, ::2] * 0.0005, rtol=1e-6)
 
 
+def test_poses_can_be_left_to_be_tracked(library: type[Pipeline], recording: Path) -> None:
+    for name in ("realsense:?poses=track", f"realsense:{recording}?poses=track"):
+        source = open_dataset(name)
+        assert source.tracked
+        assert not any("stand still" in note for note in source.notes)
+        assert source.read(0).T_world_camera.shape == (4, 4)
+    assert len(open_dataset(f"realsense:{recording}", track=True)) == COUNT
+    assert not open_dataset("realsense:").tracked
+
+
 def test_poses_that_cannot_be_read_are_named(library: type[Pipeline], tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"nowhere\.txt"):
         open_dataset(f"realsense:?poses={tmp_path}/nowhere.txt")

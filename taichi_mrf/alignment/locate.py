@@ -67,15 +67,24 @@ class Locator:
         config: PoseConfig,
     ) -> Located:
         """The pose of an image in what some keyframes have measured. A search begins at each of the guesses;
-        that counts which fits best. ``config`` says how far from a guess, and how much overlap is needed."""
+        that counts which fits best and is nearest to its guess. ``config`` says how far from a guess, and how much overlap is needed."""
         points = oriented_points(image, self._surface.max_depth)
         if len(points.points) < LEAST_POINTS:
             return Located(None, "too few points on smooth surfaces")
         self._surface.update(keyframes)
         levels = levels_of(points, self._grids_around(points, guesses))
         lever_m = float(np.median(np.linalg.norm(points.points, axis=1)))
-        ends = [aligned(levels, T, Recorded(T, config), lever_m, OBSERVABLE) for T in guesses]
-        best = int(np.argmin([end.equations.cost for end in ends]))
+        priors = [Recorded(T, config) for T in guesses]
+        ends = [
+            aligned(levels, T, prior, lever_m, OBSERVABLE) for T, prior in zip(guesses, priors, strict=True)
+        ]
+        # Where depth tells too little, ends that fit alike differ in how far they are from their guess.
+        worth = max(end.equations.worth for end in ends)
+        costs = [
+            worth * end.equations.cost + prior.cost(end.T_world_camera)
+            for end, prior in zip(ends, priors, strict=True)
+        ]
+        best = int(np.argmin(costs))
         guess, end = guesses[best], ends[best]
         overlap, agreement = end.equations.overlap, _agreement(end.equations)
         reason = ""
