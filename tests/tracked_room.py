@@ -20,7 +20,7 @@ START = np.eye(4)
 
 @cache
 def frames() -> list[Frame]:
-    """A quarter of the way around the room: 7 cm and 4.5 degrees from one image to the next, as of a camera
+    """A quarter of the way around the room: 8 cm and 4 degrees from one image to the next, as of a camera
     that is carried about at 10 images a second, with a Kinect 1's noise."""
     dataset = open_dataset("synthetic:room?frames=100&width=160&height=120", color=False)
     return [replace(dataset.read(i), stamp=i / 10) for i in range(COUNT)]

@@ -20,7 +20,7 @@ LEAST_AGREEMENT = 0.5
 """Share of the points with a surface near them that must lie on it, or the image was taken elsewhere."""
 
 FIRST_CELLS_M = 0.2
-"""Width of the first level's cells. With 0.08 a camera that moves by 11 cm and 5 degrees from one image to
+"""Width of the first level's cells. With 0.08 a camera that moves by 9 cm and 6 degrees from one image to
 the next is lost at once; with 0.3 it is found no better."""
 
 OBSERVABLE = 0.0005
@@ -67,7 +67,8 @@ class Locator:
         config: PoseConfig,
     ) -> Located:
         """The pose of an image in what some keyframes have measured. A search begins at each of the guesses;
-        that counts which fits best and is nearest to its guess. ``config`` says how far from a guess, and how much overlap is needed."""
+        the end that fits best and is nearest to its guess counts. ``config`` says how far from a guess, and
+        how much overlap is needed."""
         points = oriented_points(image, self._surface.max_depth)
         if len(points.points) < LEAST_POINTS:
             return Located(None, "too few points on smooth surfaces")
