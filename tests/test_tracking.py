@@ -23,8 +23,8 @@ from taichi_mrf.poses import tangent_norms
 
 pytestmark = pytest.mark.usefixtures("backend")
 
-DRIFT_M, DRIFT_RAD = 0.05, 0.02
-"""What the way may be off after 1.7 m and 105 degrees. Measured: 0.031 m and 0.009 radians."""
+DRIFT_M, DRIFT_RAD = 0.08, 0.02
+"""What the way may be off along its first 2 m and 95 degrees. Measured: 0.046 m and 0.006 radians."""
 
 
 def poses(result: MappingResult) -> dict[int, np.ndarray]:
@@ -39,12 +39,11 @@ def test_a_carried_camera_is_followed_through_the_room() -> None:
     assert result.track is not None
     assert (result.track.lost, result.skipped) == (0, {})
     off = errors(found)
-    print(off.max(axis=0))
     assert off[:, 0].max() < DRIFT_RAD
     assert off[:, 1].max() < DRIFT_M
     way = [tangent_norms(tracked_room.true_pose(0), tracked_room.true_pose(i)) for i in range(COUNT)]
     assert max(way)[0] > 1.0
-    assert max(metres for _, metres in way) > 20 * DRIFT_M
+    assert max(metres for _, metres in way) > 1.0
     # Keyframes are a part of the frames, and stand where those were taken.
     assert 3 < len(result.map.keyframes) < COUNT / 2
     by_name = {frame.name: frame for frame in result.track.frames.values()}
