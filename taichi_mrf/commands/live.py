@@ -45,8 +45,8 @@ class Live:
     """Begin again when the sequence has ended, with the frames as new keyframes."""
 
     keep_live: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Freeze the oldest keyframes when there are more than N that could still be changed, so that an endless
-    run needs no more and more memory."""
+    """Freeze keyframes when there are more than N that could still be changed, first those that have left the
+    view, so that an endless run needs no more and more memory."""
 
     exit_when_done: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """End once the sequence is mapped."""

@@ -1,8 +1,8 @@
 """The map of a live run with its keyframes: taking them in, editing them, and settling the map.
 
-While frames come, each new keyframe is swept once against what is known. That is quick, but leaves a map that
-depends on the order of events. To settle it means full inference, after which it is the map that its
-keyframes give, bit for bit, whatever has happened to them.
+While frames come, each new keyframe is swept once against what is known, and then those to whom it said
+something new. That is quick, but leaves a map that depends on the order of events. To settle it means full
+inference, after which it is the map that its keyframes give, bit for bit, whatever has happened to them.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,6 +18,7 @@ from taichi_mrf.live.pictures import thumbnail
 from taichi_mrf.live.publish import Publisher
 from taichi_mrf.live.ray_answers import Seer
 from taichi_mrf.live.roster import Entry, Roster
+from taichi_mrf.maps.freezing import surplus
 from taichi_mrf.maps.mrf import MRFMap
 from taichi_mrf.maps.protocol import MappedKeyframe, OccupancyMap
 from taichi_mrf.maps.recursive import RecursiveMap
@@ -25,6 +26,9 @@ from taichi_mrf.maps.refinement import refiner_of
 from taichi_mrf.poses import Pose, as_pose
 from taichi_mrf.viewer import messages
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
+
+RENEW_SECONDS = 0.1
+"""So long at most keyframes are swept again at a time, before a frame or a request may be due."""
 
 FORGOTTEN = np.full((1, 1, 3), 90, np.uint8)
 """The picture of a keyframe whose depth image is gone."""
@@ -35,8 +39,8 @@ class Mapper:
 
     ``unsettled`` says that keyframes have come, gone or moved since the last full inference, ``edited`` that
     some of them by a user's hand, and ``unaligned``, if poses are refined, that keyframes have come since all
-    were aligned with each other. ``to_renew`` are keyframes (numbers of the roster) around an edit that have
-    not been swept since.
+    were aligned with each other. ``unanswered`` says that keyframes may have heard something new
+    that they have not been swept for.
     """
 
     def __init__(self, m: OccupancyMap, first_id: int = 0, poses: PoseConfig | None = None) -> None:
@@ -54,7 +58,7 @@ class Mapper:
         self.lacks_messages = bool(m.keyframes) and isinstance(m, MRFMap)
         self.unsettled, self.edited = self.lacks_messages or self.stale, False
         self.unaligned = False
-        self.to_renew: list[int] = []
+        self.unanswered = False
 
     @property
     def min_evidence(self) -> float:
@@ -72,7 +76,8 @@ class Mapper:
         refiner = self.refiner
         place = self._sweep_id if refiner is None else refiner.place
         map_id = self._add(frame.depth_m, frame.T_world_camera, frame, place)
-        self.unsettled, self.unaligned = True, refiner is not None
+        self.unsettled = self.unanswered = True
+        self.unaligned = refiner is not None
         entry = self.roster.add(frame, self.map.keyframes[map_id].rays, thumbnail(frame.depth_m), map_id)
         entry.T_world_camera = entry.T_home = self.map.keyframes[map_id].T_world_camera
         return entry
@@ -88,22 +93,20 @@ class Mapper:
             if self.refiner is not None:
                 self.refiner.know(entry.map_id, entry.T_recorded)
             entry.depth_m, entry.state = None, "on"
-            self._edited(self._near(entry))
         else:
-            near, depth_m = self._near(entry), self._keyframe(entry).depth_m
+            depth_m = self._keyframe(entry).depth_m
             self.map.remove_keyframe(self._map_id(entry))
             entry.map_id, entry.depth_m, entry.state = None, depth_m, "off"
-            self._edited(near)
+        self.unsettled = self.edited = self.unanswered = True
         return entry
 
     def move(self, id: int, T_world_camera: Pose) -> Entry:
         """Give a keyframe another pose. Raises KeyframeError."""
         entry, T = self._changeable(id), as_pose(T_world_camera)
         if entry.state == "on":
-            near = self._near(entry)
             self.map.move_keyframe(self._map_id(entry), T)
             self._sweep(entry)
-            self._edited([*near, *self._near(entry)])
+            self.unsettled = self.edited = self.unanswered = True
         entry.T_world_camera, entry.moved_by_hand = T, True
         return entry
 
@@ -130,14 +133,22 @@ class Mapper:
         picture, entry.picture = entry.picture, FORGOTTEN
         entry.map_id, entry.state = None, "frozen"
         self.unsettled, self.edited = True, self.edited or by_hand
-        self.to_renew = [each for each in self.to_renew if each != id]
         return self._message(entry, picture, crossed)
 
-    def renew_one(self) -> None:
-        """Sweep the next of the keyframes around an edit."""
-        entry = self.roster.find(self.to_renew.pop(0))
-        if entry.state == "on":
-            self._sweep(entry)
+    def renew(self) -> None:
+        """Sweep the keyframes that have heard most, for RENEW_SECONDS at most; the rest waits."""
+        if self.stale or not isinstance(self.map, MRFMap):
+            self.unanswered = False
+        else:
+            self.unanswered = not self.map.renew(seconds=RENEW_SECONDS).complete
+
+    def surplus(self, newest: Entry, keep: int) -> list[Entry]:
+        """Of more than ``keep`` keyframes that are on those to freeze: first what has left the view."""
+        on = self.roster.with_state("on")
+        if not isinstance(self.map, MRFMap):
+            return on[: max(0, len(on) - keep)]
+        entry_of = {self._map_id(entry): entry for entry in on}
+        return [entry_of[id] for id in surplus(self.map, self._map_id(newest), keep)]
 
     def settle(self, go_on: Callable[[InferProgress], bool]) -> bool:
         """Full inference. ``go_on`` is called after each keyframe; while it runs, all queries and files show
@@ -162,7 +173,7 @@ class Mapper:
                 m.restore(checkpoint)
         if complete:
             self.unsettled = self.edited = self.lacks_messages = False
-            self.to_renew.clear()
+            self.unanswered = False
         return complete
 
     def describe(self, entry: Entry) -> messages.Keyframe:
@@ -216,20 +227,6 @@ class Mapper:
     def _sweep_id(self, map_id: int) -> None:
         if not self.stale:
             self.map.infer(sweeps=1, keyframes=[map_id])
-
-    def _edited(self, near: list[int]) -> None:
-        self.unsettled = self.edited = True
-        if not self.stale:
-            self.to_renew += [id for id in dict.fromkeys(near) if id not in self.to_renew]
-
-    def _near(self, entry: Entry) -> list[int]:
-        """The other keyframes that see some of the bricks that this one sees."""
-        if not isinstance(self.map, MRFMap):
-            return []
-        keyframes = self.map.keyframes
-        slots = keyframes[self._map_id(entry)].visible.slots
-        others = [each for each in self.roster.with_state("on") if each is not entry]
-        return [o.id for o in others if np.isin(keyframes[self._map_id(o)].visible.slots, slots).any()]
 
     def _changeable(self, id: int) -> Entry:
         entry = self.roster.find(id)

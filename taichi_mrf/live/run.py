@@ -35,7 +35,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Policy:
-    """What a run does by itself. ``keep_live``: most keyframes that are on before the oldest are frozen, None
+    """What a run does by itself. ``keep_live``: most keyframes that are on before some are frozen, None
     for no limit. ``out``: folder for the files that a user saves. ``leave_when_done``: end once the source
     has ended and the map is settled."""
 

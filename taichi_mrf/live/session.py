@@ -4,7 +4,9 @@ One thread does all of it, one piece after the other, because Taichi has one own
 
     requests that have come
     a frame, if one is due                     find its pose if need be, add it, align it if poses are to be
-                                               refined, sweep it once, publish what has changed
+                                               refined, sweep it once, and for a while those to whom it said
+                                               something new; publish what has changed
+    else more of those, if any are left
     else rounds of alignment                   once the sequence has ended, if poses are to be refined
     else full inference, if the map needs it   requests are answered from the map as it was before
     else what is shown beside the map
@@ -98,14 +100,14 @@ class Session:
         state, mapper = self.state, self.state.mapper
         if mapper.stale and mapper.unsettled:
             return self._settle()
-        if mapper.to_renew and state.is_replaying:
-            self._tell("sweeping the keyframes around the edit", 0.0)
-            state.guarded(mapper.renew_one)
-            state.publish()
-            return True
         if state.replay is not None and state.is_replaying and self._is_due(state.replay):
             self._take_frame(state.replay)
             self._extras.work(self._go_on)
+            return True
+        if mapper.unanswered and state.is_replaying:
+            self._tell("sweeping keyframes that have heard something new", 0.0)
+            state.guarded(mapper.renew)
+            state.publish()
             return True
         if mapper.unaligned and not state.has_frames_left:
             return self._align()
@@ -139,10 +141,10 @@ class Session:
         self._selector.accept(frame.T_world_camera)
         state.progress.keyframe_taken()
         state.send(state.mapper.describe(entry))
+        state.mapper.renew()
         if state.policy.keep_live is not None:
-            live = state.mapper.roster.with_state("on")
-            for oldest in live[: max(0, len(live) - state.policy.keep_live)]:
-                state.send(state.mapper.freeze(oldest.id, by_hand=False))
+            for each in state.mapper.surplus(entry, state.policy.keep_live):
+                state.send(state.mapper.freeze(each.id, by_hand=False))
         state.publish()
         if state.stepping and state.replay is not None:
             state.stepping = False
