@@ -100,7 +100,7 @@ class InferenceConfig:
     """Weigh a voxel by the length that the ray spends in it (section IV-A). Without it every voxel
     counts once, as eqs. 11 to 14 are printed."""
 
-    rays_per_voxel: float = 0.0
+    rays_per_voxel: float = 10.0
     """Rays that a keyframe casts at least at a voxel that faces it: where a voxel covers more pixels, not
     each has a ray of its own. 0 casts every pixel."""
 

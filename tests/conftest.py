@@ -34,12 +34,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if config.getoption("--arch") == "cpu":
         return
-    used = [item for item in items if "backend" in getattr(item, "fixturenames", ())]
+    used = [item for item in items if _is_for_every_backend(item)]
     config.hook.pytest_deselected(items=[item for item in items if item not in used])
     items[:] = used
     if config.getoption("--arch") == "vulkan":
         for item in items:
             _take_fewer_examples(item)
+
+
+def _is_for_every_backend(item: pytest.Item) -> bool:
+    fixtures = getattr(item, "fixturenames", ())
+    return "backend" in fixtures and "one_backend" not in fixtures
 
 
 def _take_fewer_examples(item: pytest.Item) -> None:
@@ -60,6 +65,12 @@ def backend(request: pytest.FixtureRequest) -> str:
         return runtime.init(arch)
     except BackendError as error:
         pytest.fail(f"--arch {arch}: {error}", pytrace=False)
+
+
+@pytest.fixture(scope="session")
+def one_backend(backend: str) -> str:
+    """The same, for tests of what is no backend's business: one run of them is enough, on the CPU."""
+    return backend
 
 
 @pytest.fixture(scope="session")

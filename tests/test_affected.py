@@ -11,6 +11,8 @@ from taichi_mrf.inference.whereabouts import Whereabouts
 from taichi_mrf.maps.mrf import MRFMap
 from taichi_mrf.voxels.window import Window
 
+pytestmark = pytest.mark.usefixtures("one_backend")
+
 ROOM = range(6)
 
 
@@ -54,7 +56,6 @@ def test_those_whose_box_meets_the_bricks_are_near(
     assert whereabouts.near(bricks[:0].astype(np.int32)) == set()
 
 
-@pytest.mark.usefixtures("backend")
 @pytest.mark.parametrize("tolerance", [0.2, 0.05])
 def test_nobody_is_left_with_more_than_the_tolerance(tolerance: float) -> None:
     m = MRFMap(small_room.VOXEL_SIZE)

@@ -26,7 +26,7 @@ from taichi_mrf.pipeline import Event, KeyframeAdded, KeyframeRefined, KeyframeS
 from taichi_mrf.poses import Pose, tangent_norms
 from taichi_mrf.sensor.noise import PolynomialNoise
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = pytest.mark.usefixtures("one_backend")
 
 COUNT = 8
 REFINE = Config(

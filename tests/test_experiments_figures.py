@@ -23,7 +23,7 @@ HELD_OUT = COFFIN_VIEWS - 1
 
 
 @pytest.fixture(scope="module")
-def data(backend: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def data(one_backend: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_data(tmp_path_factory.mktemp("data"))
 
 

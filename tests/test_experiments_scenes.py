@@ -32,12 +32,12 @@ Damage = Callable[[Path], object]
 
 
 @pytest.fixture(scope="module")
-def data(backend: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def data(one_backend: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_data(tmp_path_factory.mktemp("data"))
 
 
 @pytest.fixture
-def spare(backend: str, tmp_path: Path) -> Path:
+def spare(one_backend: str, tmp_path: Path) -> Path:
     """A data folder to be damaged."""
     return make_data(tmp_path)
 

@@ -70,7 +70,7 @@ def segments(view: SceneView, centres: NDArray) -> tuple[NDArray, NDArray]:
     return np.maximum(np.minimum(low, high).max(axis=-1), 0), np.maximum(low, high).min(axis=-1)
 
 
-@pytest.mark.usefixtures("backend")
+@pytest.mark.usefixtures("one_backend")
 @settings(max_examples=40)
 @example(seed=0, voxels=0)
 @given(seed=st.integers(0, 2**32 - 1), voxels=st.integers(1, 60))
@@ -155,7 +155,7 @@ def test_artefacts_between_two_thresholds() -> None:
     assert ratio(swept, nothing, 0.7, 0.75) is None
 
 
-@pytest.mark.usefixtures("backend")
+@pytest.mark.usefixtures("one_backend")
 def test_a_lie_is_an_artefact_and_the_wall_is_none() -> None:
     """A wall 5 m ahead; the first view measured a box at 3 m that is not there."""
     camera = CAMERA.scaled(6)
@@ -178,7 +178,7 @@ def test_a_lie_is_an_artefact_and_the_wall_is_none() -> None:
     assert seen.coverage(0.5) == 1.0
 
 
-@pytest.mark.usefixtures("backend")
+@pytest.mark.usefixtures("one_backend")
 def test_the_map_grows_as_the_papers_fig_5a() -> None:
     scene = corridor_scene(PolynomialNoise((0.0, 0.0, 7.5e-4)))
     grown = grow(visibility(), scene, 0.2, 70, 2)
@@ -239,7 +239,7 @@ def test_a_street_at_half_resolution(tmp_path: Path) -> None:
     np.testing.assert_allclose(sigma, 0.286 / (FOCAL * BASELINE) * 16, rtol=1e-5)
 
 
-@pytest.mark.usefixtures("backend")
+@pytest.mark.usefixtures("one_backend")
 def test_the_whole_experiment_runs_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stereo, "GROWTH_UPDATES", {0.4: 12})
     monkeypatch.setattr(stereo, "GROWTH_ON_STREET", (0.4,))
@@ -282,7 +282,7 @@ def street(shared_data: Path) -> Scene:
 
 
 @pytest.mark.shared_data
-@pytest.mark.usefixtures("backend")
+@pytest.mark.usefixtures("one_backend")
 def test_on_the_real_street_mrf_leaves_the_fewest_artefacts(street: Scene) -> None:
     at = {}
     for row in (Row(octomap_style()), Row(visibility_at_once()), Row(mrf_of_street(), 1, 0.03)):
@@ -294,7 +294,7 @@ def test_on_the_real_street_mrf_leaves_the_fewest_artefacts(street: Scene) -> No
 
 
 @pytest.mark.shared_data
-@pytest.mark.usefixtures("backend")
+@pytest.mark.usefixtures("one_backend")
 def test_a_real_pair_grows_like_the_corridor(street: Scene) -> None:
     grown = grow(visibility(), street, 0.4, 40, 2)
     assert updates_to(grown, 10.0) == pytest.approx(0.5 * 65, abs=6)

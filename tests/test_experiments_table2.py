@@ -42,7 +42,7 @@ OCCUPANCY = [
 
 
 @pytest.fixture(scope="module")
-def data(backend: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def data(one_backend: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_data(tmp_path_factory.mktemp("data"))
 
 

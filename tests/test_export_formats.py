@@ -26,7 +26,7 @@ from taichi_mrf.maps.log_odds import LogOddsMap
 from taichi_mrf.queries.known_bricks import bricks_between, seen_free_bricks
 from taichi_mrf.voxels.layout import BRICK
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = pytest.mark.usefixtures("one_backend")
 
 METHODS = ["mrf", "log_odds", "visibility"]
 BAND = {"z_min": -0.9, "z_max": 0.3}

@@ -7,6 +7,8 @@ import small_room
 from taichi_mrf.maps.freezing import surplus
 from taichi_mrf.maps.mrf import MRFMap
 
+pytestmark = pytest.mark.usefixtures("one_backend")
+
 
 @pytest.fixture
 def m() -> MRFMap:

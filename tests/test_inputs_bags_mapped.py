@@ -30,7 +30,7 @@ DISPLACEMENT, TURN = (0.03, 0.02, -0.01), (0.01, -0.02, 0.05)
 
 
 @pytest.fixture(scope="module")
-def frames(backend: str) -> Frames:
+def frames(one_backend: str) -> Frames:
     return room()
 
 

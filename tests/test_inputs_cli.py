@@ -105,8 +105,8 @@ def test_info_of_a_folder(tmp_path: Path) -> None:
     assert "Note: frame frame-000000:" in said("info", folder)[1]
 
 
-def test_info_of_the_room(backend: str) -> None:
-    status, out, errors = said("info", "synthetic:room?frames=3&width=40&height=30", "--arch", backend)
+def test_info_of_the_room(one_backend: str) -> None:
+    status, out, errors = said("info", "synthetic:room?frames=3&width=40&height=30", "--arch", one_backend)
     assert (status, errors) == (0, "")
     assert re.search(r"format +│ +synthetic:room", out)
     assert re.search(r"way +│ +x -?\d+\.\d\d to", out)

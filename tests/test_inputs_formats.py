@@ -302,7 +302,7 @@ def test_other_files_are_not_taken_for_frames(tmp_path: Path) -> None:
 
 
 def test_live_takes_frames_for_frames_and_not_for_a_map(
-    tmp_path: Path, content: Content, backend: str
+    tmp_path: Path, content: Content, one_backend: str
 ) -> None:
     from taichi_mrf.config import Config
 

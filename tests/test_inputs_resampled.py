@@ -143,7 +143,7 @@ def test_intrinsics_are_the_callers(folder: Path) -> None:
     assert not any("assumed the camera" in note for note in told.notes)
 
 
-def test_a_rendered_source_is_rendered_with_them(backend: str) -> None:
+def test_a_rendered_source_is_rendered_with_them(one_backend: str) -> None:
     plain = open_dataset("synthetic:room?frames=1&width=40&height=30&noise=none")
     narrow = open_dataset(
         "synthetic:room?frames=1&width=40&height=30&noise=none", intrinsics=(66.0, 66.0, 19.5, 14.5)

@@ -11,7 +11,7 @@ from taichi_mrf.config import Config
 from taichi_mrf.maps.create import create_map
 from taichi_mrf.viewer.messages import Images, PixelRay, RayAnswer, RayThrough, Switch, Watch
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = pytest.mark.usefixtures("one_backend")
 
 
 def test_a_pixels_ray_has_its_measurement_along_the_ray() -> None:

@@ -18,7 +18,7 @@ from live_scene import (
 
 from taichi_mrf.viewer.messages import Bricks, Freeze, Keyframe, Move, Request, Switch, Update
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = pytest.mark.usefixtures("one_backend")
 
 
 def test_off_is_the_map_without_it_and_on_brings_it_back_bit_for_bit() -> None:

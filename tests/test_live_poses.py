@@ -50,7 +50,7 @@ from taichi_mrf.viewer.messages import (
     Update,
 )
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = pytest.mark.usefixtures("one_backend")
 
 COUNT = 6
 REFINE = Config(

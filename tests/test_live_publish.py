@@ -14,7 +14,7 @@ from taichi_mrf.maps.mrf import MRFMap
 from taichi_mrf.maps.protocol import OccupancyMap
 from taichi_mrf.viewer.messages import Bricks, pack_log_odds
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = pytest.mark.usefixtures("one_backend")
 
 FRAMES = 4
 

@@ -56,7 +56,7 @@ from taichi_mrf.viewer.messages import (
     Watch,
 )
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = pytest.mark.usefixtures("one_backend")
 
 
 def test_a_run_ends_in_the_map_of_its_frames() -> None:

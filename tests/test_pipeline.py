@@ -23,7 +23,7 @@ from taichi_mrf.pipeline import (
     map_sequence,
 )
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = pytest.mark.usefixtures("one_backend")
 
 CAMERA = PinholeCamera(width=32, height=24, fx=30.0, fy=30.0, cx=15.5, cy=11.5)
 WALL_M = 1.5

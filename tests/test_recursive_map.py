@@ -20,7 +20,7 @@ from taichi_mrf.maps.recursive import RecursiveMap
 from taichi_mrf.maps.visibility import VisibilityMap
 from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = pytest.mark.usefixtures("one_backend")
 
 METHODS: dict[Method, type[RecursiveMap]] = {"log_odds": LogOddsMap, "visibility": VisibilityMap}
 CAMERA = PinholeCamera(40, 30, 40.0, 40.0, 19.5, 14.5)

@@ -11,7 +11,7 @@ from taichi_mrf.errors import MapFileError
 from taichi_mrf.maps.mrf import MRFMap
 from taichi_mrf.sensor.noise import PatchNoise
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = pytest.mark.usefixtures("one_backend")
 
 
 def test_a_loaded_map_answers_the_same_at_once(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from taichi_mrf.maps.tracking import STEPS, Tracker, keyframe_steps
 from taichi_mrf.pipeline import Event, FrameSkipped, KeyframeAdded, MappingResult, map_sequence
 from taichi_mrf.poses import tangent_norms
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = pytest.mark.usefixtures("one_backend")
 
 DRIFT_M, DRIFT_RAD = 0.08, 0.02
 """What the way may be off along its first 2 m and 95 degrees. Measured: 0.046 m and 0.006 radians."""
