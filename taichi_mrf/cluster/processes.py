@@ -1,8 +1,8 @@
 """The processes of tasks, seen from the one that starts them.
 
 Neither multiprocessing nor ProcessPoolExecutor can do this: a Dask worker is a daemon, which may not start
-their processes; a pool breaks as a whole when one process is killed; and the environment of a process has to be
-set before it starts, because NumPy and Taichi look at it when they are loaded.
+their processes; a pool breaks as a whole when one process is killed; and the environment of a process has to
+be set before it starts, because NumPy and Taichi look at it when they are loaded.
 """
 
 import contextlib
