@@ -10,6 +10,9 @@ from typing import NoReturn
 
 from taichi_mrf.errors import DatasetError
 
+LONG = 300.0
+"""Seconds that no test waits for."""
+
 
 def double(number: int) -> int:
     """A task that always goes well, whatever it prints."""
@@ -22,11 +25,14 @@ def where(number: int) -> tuple[int, bool, dict[str, str]]:
     return os.getpid(), threading.current_thread() is threading.main_thread(), dict(os.environ)
 
 
-def refuse(number: int) -> int:
+def refuse(task: tuple[Path, int]) -> int:
     """Number 1 is bad input; all others take long, and leave a file if nobody stops them."""
-    if number != 1:
-        time.sleep(60)
-    raise DatasetError(f"number {number} is bad")
+    folder, number = task
+    if number == 1:
+        raise DatasetError(f"number {number} is bad")
+    time.sleep(LONG)
+    (folder / "not stopped").touch()
+    return number
 
 
 class PickyError(Exception):
@@ -64,6 +70,6 @@ def save_when_stopped(task: tuple[Path, int]) -> str:
     stopped = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stopped.set())
     (folder / f"{number}.pid").write_text(str(os.getpid()), encoding="utf-8")
-    if number and not stopped.wait(60):
+    if number and not stopped.wait(LONG):
         sys.exit("nobody has stopped this task")
     return "whole" if not number else "saved"

@@ -24,7 +24,9 @@ from taichi_mrf.queries.libraries import library
 LOCAL = "local"
 """In place of a scheduler's address: a cluster of Dask's own on this machine."""
 
-_CONNECT_SECONDS = 20.0
+CONNECT_SECONDS = 20.0
+"""How long a scheduler may take to answer."""
+
 _GLANCE = 0.5
 """Seconds between looks whether a task is still wanted."""
 
@@ -103,7 +105,7 @@ class DaskTasks:
         if self.scheduler == LOCAL:
             where = self._open.enter_context(self._own_cluster())
         try:
-            client = self._distributed.Client(where, timeout=_CONNECT_SECONDS, set_as_default=False)
+            client = self._distributed.Client(where, timeout=CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError) as error:
             raise ClusterError(f"no Dask scheduler answers at {self.scheduler}: {error}") from error
         self._client = self._open.enter_context(client)

@@ -80,17 +80,7 @@ def accuracy_text(row: Row) -> str:
 
 def print_summary(console: Console, rows: Sequence[Row]) -> None:
     """The rows as a table, and below it why there are sequences without a map."""
-    columns = (
-        "sequence",
-        "",
-        "seconds",
-        "keyframes",
-        "voxels",
-        "map MB",
-        "median cm",
-        "RMS cm",
-        "no answer %",
-    )
+    facts = ("seconds", "keyframes", "voxels", "map MB", "median cm", "RMS cm", "no answer %")
     cells = [
         (
             row.name,
