@@ -50,7 +50,7 @@ class _Batch:
 
     def row(self, number: int) -> Row:
         """The row of one sequence."""
-        outcome = self.outcomes.get(number, Outcome("not begun"))
+        outcome = self.outcomes.get(number, Outcome("not done"))
         return summary_row(self.names[number], self.tasks[number].source, outcome)
 
 

@@ -17,7 +17,7 @@ from taichi_mrf.config import load
 from taichi_mrf.config_text import differences
 from taichi_mrf.errors import MapFileError, TaichiMRFError
 
-Status = Literal["mapped", "finished before", "stopped", "failed", "not begun"]
+Status = Literal["mapped", "finished before", "stopped", "failed", "not done"]
 
 _FILES = (MAP_FILE, VOXEL_FILE, CONFIG_FILE)
 

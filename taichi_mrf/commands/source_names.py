@@ -36,13 +36,14 @@ def folder_names(sources: Sequence[str]) -> list[str]:
 
 def _from_short_to_long(source: str) -> list[str]:
     """What the source could be called."""
-    path, mark, query = source.partition("?")
+    path, mark, _ = source.partition("?")
     if Path(source).exists():
-        path, mark, query = source, "", ""
+        path, mark = source, ""
     folder = Path(path)
-    parts = [part for part in (*folder.parent.parts, folder.stem if query else folder.name) if part != ".."]
-    if folder.suffix and not folder.is_dir():
-        parts[-1] = folder.stem
+    if folder.name in ("", ".."):
+        folder = folder.resolve()
+    last = folder.name if folder.is_dir() else folder.stem
+    parts = [*(part for part in folder.parent.parts if part != ".."), last]
     names = [_plain("_".join(parts[-count:])) for count in range(1, len(parts) + 1)]
     return [*names, _plain(source)] if mark else names
 
