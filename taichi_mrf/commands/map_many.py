@@ -155,6 +155,8 @@ def _tell_all(batch: _Batch, console: Console, seconds: float) -> None:
         print(text, end="")
         return
     print_summary(console, rows)
+    if any(row.status in ("stopped", "not done") for row in rows):
+        console.print("[yellow]Stopped before the end; --resume goes on from here.[/]")
     for path in written:
         console.print(str(path), markup=False, highlight=False, soft_wrap=True)
 
