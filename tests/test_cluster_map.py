@@ -55,6 +55,7 @@ def assert_all_are_there_once(
     assert [row["source"] for row in rows] == list(sources)
     assert [row["name"] for row in rows] == list(NAMES[: len(sources)])
     assert {path.name for path in out.iterdir() if path.is_dir()} == {row["name"] for row in rows}
+    assert not list(out.glob("*/.*"))
     for row in rows:
         assert results(out / row["name"]) == single[row["source"]]
 
@@ -67,7 +68,7 @@ def wait_for(what: Callable[[], Any], program: "subprocess.Popen[str]") -> Any:
     return found
 
 
-def kill_child_in_the_middle(parent: int, out: Path, program: "subprocess.Popen[str]") -> psutil.Process:
+def child_in_the_middle(parent: int, out: Path, program: "subprocess.Popen[str]") -> psutil.Process:
     """A process that maps, which is held where it is so that it cannot finish before somebody is killed."""
     wait_for(lambda: out.is_dir() and any(path.is_dir() for path in out.iterdir()), program)
     child = wait_for(psutil.Process(parent).children, program)[0]
@@ -90,7 +91,7 @@ def single(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]
 def test_a_killed_process_changes_nothing(tmp_path: Path, single: dict[str, dict[str, Any]]) -> None:
     arguments = command(*SOURCES, "--out", tmp_path, "--jobs", "2", "--json", *FAST)
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as program:
-        kill_child_in_the_middle(program.pid, tmp_path, program).kill()
+        child_in_the_middle(program.pid, tmp_path, program).kill()
         stdout, stderr = program.communicate()
     assert program.returncode == 0, stderr
     assert_all_are_there_once(tmp_path, single)
@@ -108,7 +109,7 @@ def test_a_killed_dask_worker_changes_nothing(
             arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         ) as program:
             worker = cluster.workers[0].pid
-            child = kill_child_in_the_middle(worker, tmp_path, program)
+            child = child_in_the_middle(worker, tmp_path, program)
             cluster.workers[0].kill()
             child.send_signal(signal.SIGCONT)  # it notices that it is an orphan
             stdout, stderr = program.communicate()
@@ -133,6 +134,8 @@ def test_what_is_finished_is_kept(tmp_path: Path, single: dict[str, dict[str, An
     assert second["status"] in ("stopped", "not done")
     written = (tmp_path / NAMES[0] / "report.json").stat().st_mtime_ns
 
+    (tmp_path / NAMES[1]).mkdir(exist_ok=True)
+    (tmp_path / NAMES[1] / ".map.0123abcd.npz").touch()  # as if it had been killed while it wrote
     # Without --voxel-size: the parameters are those of the run that is resumed.
     done = taichi_mrf(*SOURCES[:2], "--out", tmp_path, "--resume", "--no-pictures")
     assert done.returncode == 0, done.stderr
@@ -186,7 +189,7 @@ def test_without_dask_one_line_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    assert main(["map", SOURCES[0], "--out", str(tmp_path / "out"), "--scheduler", "local"]) == 2
+    assert main(["map", *SOURCES, "--out", str(tmp_path / "out"), "--scheduler", "local"]) == 2
     assert capsys.readouterr().err == (
         "taichi-mrf: tasks on a cluster need distributed, which is not installed: "
         "pip install 'taichi-mrf[cluster]'\n"

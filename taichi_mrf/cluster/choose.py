@@ -13,7 +13,8 @@ def open_runner(jobs: int = 1, scheduler: str | None = None) -> Iterator[TaskRun
     """``jobs`` processes at a time on this machine, or the workers of a Dask scheduler: ``HOST:PORT``, or
     ``local`` for Dask's own cluster of ``jobs`` workers on this machine.
 
-    Raises ConfigError if ``jobs`` is not positive, TaichiMRFError if Dask is not installed.
+    Raises ConfigError if ``jobs`` is not positive, TaichiMRFError if Dask is not installed or the
+    scheduler does not answer.
     """
     if scheduler is None:
         yield LocalProcesses(jobs)

@@ -34,7 +34,7 @@ _GLANCE = 0.5
 class DaskTasks:
     """Tasks on the workers of a scheduler, ``jobs`` of them if it is LOCAL; use it as a context, or close it.
 
-    Raises TaichiMRFError if Dask is not installed.
+    Raises TaichiMRFError if Dask is not installed, and as a context ClusterError if nobody answers.
     """
 
     def __init__(self, scheduler: str = LOCAL, jobs: int = 1) -> None:
@@ -44,6 +44,7 @@ class DaskTasks:
         self._client: Any = None
 
     def __enter__(self) -> "DaskTasks":
+        self._connected()
         return self
 
     def __exit__(self, *error: object) -> None:

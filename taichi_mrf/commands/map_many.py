@@ -96,9 +96,10 @@ def _map_all(batch: _Batch, console: Console, request: StopRequest) -> None:
             console.print(line, highlight=False, markup=False, soft_wrap=True)
 
         bar.count(0, count)
+        waiting: list[int] = []
         try:
-            waiting = _waiting(batch, done)
             with open_runner(batch.options.jobs, batch.options.scheduler) as runner:
+                waiting = _waiting(batch, done)
                 tasks = [batch.tasks[number] for number in waiting]
                 runner.run(map_in_process, tasks, lambda index, outcome: done(waiting[index], outcome))
         except KeyboardInterrupt:

@@ -16,6 +16,7 @@ from taichi_mrf.commands.progress import ProgressBar
 from taichi_mrf.config import load
 from taichi_mrf.config_text import differences
 from taichi_mrf.errors import MapFileError, TaichiMRFError
+from taichi_mrf.export.atomic import remove_leftovers
 
 Status = Literal["mapped", "finished before", "stopped", "failed", "not done"]
 
@@ -41,6 +42,7 @@ def map_in_process(task: MapTask) -> Outcome:
             finished = finished_before(task)
             if finished is not None:
                 return finished
+            remove_leftovers(task.out)
             map_to_folder(task, silent, request)
             report = _report_in(task.out)
         except Exception as error:
