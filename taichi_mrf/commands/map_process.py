@@ -68,9 +68,7 @@ def _finished_report(task: MapTask) -> dict[str, Any] | None:
     if report.get("source") != task.source:
         raise MapFileError(f"{task.out}: holds the map of {report.get('source')}")
     changed = differences(load(task.out / CONFIG_FILE), task.settings)
-    same = (report.get("every"), report.get("limit")) == (task.every, task.limit) and all(
-        name.startswith("runtime.") for name in changed
-    )
+    same = task.choice().items() <= report.items() and all(name.startswith("runtime.") for name in changed)
     return report if same and not report.get("interrupted") else None
 
 

@@ -69,6 +69,10 @@ class MapTask:
     def __str__(self) -> str:
         return self.source
 
+    def choice(self) -> dict[str, Any]:
+        """What was asked for besides the parameters; the report says it too."""
+        return {"every": self.every, "limit": self.limit, "track_poses": self.track_poses}
+
 
 def map_task(options: Map, source: str, out: Path) -> MapTask:
     """The part of a command that concerns one of its sources."""
@@ -145,7 +149,7 @@ def map_to_folder(
         report["notes"] += [str(warning.message) for warning in warned]
         if task.resume:
             report["skipped_frames"] = _skipped_before(task.out) | report["skipped_frames"]
-        report |= {"every": task.every, "limit": task.limit}
+        report |= task.choice()
         write_text(task.out / REPORT_FILE, report_json(report))
     return report, [*written, task.out / REPORT_FILE]
 
