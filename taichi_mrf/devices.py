@@ -104,17 +104,31 @@ def best_vulkan_device(allow_software: bool) -> VulkanDevice:
 
 def cuda_device() -> str:
     """The name of the first CUDA device. Raises BackendError if there is none, saying why."""
-    cuda = _library("NVIDIA driver", {"win32": "nvcuda.dll"}, "libcuda.so.1")
-    if code := cuda.cuInit(0):
-        raise BackendError(f"the NVIDIA driver does not start (cuInit answers {code})")
-    count, name = ctypes.c_int(), ctypes.create_string_buffer(256)
-    cuda.cuDeviceGetCount(ctypes.byref(count))
-    if count.value == 0:
-        raise BackendError("the NVIDIA driver knows no device")
-    device = ctypes.c_int()
+    cuda, _ = _cuda_devices()
+    device, name = ctypes.c_int(), ctypes.create_string_buffer(256)
     cuda.cuDeviceGet(ctypes.byref(device), 0)
     cuda.cuDeviceGetName(name, len(name), device)
     return name.value.decode(errors="replace")
+
+
+def cuda_device_count() -> int:
+    """How many CUDA devices this process may use; 0 also where there is no driver."""
+    try:
+        return _cuda_devices()[1]
+    except BackendError:
+        return 0
+
+
+def _cuda_devices() -> tuple[ctypes.CDLL, int]:
+    """The started driver, and how many devices it knows. Raises BackendError if there is none."""
+    cuda = _library("NVIDIA driver", {"win32": "nvcuda.dll"}, "libcuda.so.1")
+    if code := cuda.cuInit(0):
+        raise BackendError(f"the NVIDIA driver does not start (cuInit answers {code})")
+    count = ctypes.c_int()
+    cuda.cuDeviceGetCount(ctypes.byref(count))
+    if count.value == 0:
+        raise BackendError("the NVIDIA driver knows no device")
+    return cuda, count.value
 
 
 def _library(title: str, names: dict[str, str], otherwise: str) -> ctypes.CDLL:

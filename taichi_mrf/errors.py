@@ -42,3 +42,14 @@ class MapFileError(TaichiMRFError):
 
 class ViewerError(TaichiMRFError):
     """The page cannot be served, or viser is not the version that it is guarded against."""
+
+
+class ClusterError(TaichiMRFError):
+    """The scheduler does not answer, or tasks were lost because every process that took them died.
+
+    ``lost`` says, by the task's index, what became of each such task; the others are done.
+    """
+
+    def __init__(self, text: str, lost: dict[int, str] | None = None) -> None:
+        super().__init__(text)
+        self.lost = lost or {}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from taichi_mrf.errors import MapFileError
-from taichi_mrf.export.atomic import atomic_path, write_npz, write_text
+from taichi_mrf.export.atomic import atomic_path, remove_leftovers, write_npz, write_text
 
 
 def test_text_is_written_as_it_is(tmp_path: Path) -> None:
@@ -116,3 +116,12 @@ def test_objects_are_refused_without_a_trace(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="Object arrays"):
         write_npz(tmp_path / "map.npz", {"objects": np.array([{}, None])})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_leftovers_of_killed_processes_are_removed_and_nothing_else(tmp_path: Path) -> None:
+    kept = ["map.npz", ".hidden", ".map.npz", ".a.0123456.npz"]
+    for name in (*kept, ".map.0123abcd.npz", ".voxels.00000000.ply", ".LICENSE.ffffffff"):
+        (tmp_path / name).touch()
+    remove_leftovers(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == set(kept)
+    remove_leftovers(tmp_path / "not there")

@@ -28,7 +28,7 @@ FLOORS = [
     {"inference", "queries", "datasets", "export", "viewer", "factor_graph", "alignment"},
     {"maps"},
     {"pipeline"},
-    {"evaluation", "calibration"},
+    {"evaluation", "calibration", "cluster"},
     {"live", "tune"},
     {"commands", "cli", "__main__"},
 ]

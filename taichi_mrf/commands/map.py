@@ -1,4 +1,4 @@
-"""``taichi-mrf map``: a sequence in, a folder with the map, a report and pictures out."""
+"""``taichi-mrf map``: sequences in, for each a folder with the map, a report and pictures out."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -17,20 +17,25 @@ CONFIG_FILE = "config.yaml"
 """Name of the effective configuration in the folder of a run."""
 
 
+_SOURCES = tyro.conf.arg(metavar="SOURCE...", help_behavior_hint="(required)")
+
+
 @dataclass(frozen=True)
 class Map:
-    """Map a recorded or built-in sequence.
+    """Map recorded or built-in sequences.
 
     Flags take precedence over the file of --config, and that over the defaults. Ctrl-C keeps what is
-    mapped (exit status 130). Example: taichi-mrf map walk.bag --out runs/walk --voxel-size 0.02
+    mapped (exit status 130). Examples: taichi-mrf map walk.bag --out runs/walk --voxel-size 0.02 and
+    taichi-mrf map scans/* --out runs --jobs 4
     """
 
-    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    sources: Annotated[tuple[str, ...], tyro.conf.Positional, _SOURCES]
     """A folder, whose format is recognised, a bag (walk.bag?depth=/TOPIC&pose=/TOPIC), another file of
     frames, or a built-in sequence such as synthetic:room. 'taichi-mrf info SOURCE' says what is in it."""
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
-    """Folder for the results; it is made if need be."""
+    """Folder for the results; it is made if need be. Several sources get a folder each in it, named after
+    them, and a summary of all."""
 
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
     """A YAML file of parameters, such as those in configs/."""
@@ -45,7 +50,16 @@ class Map:
     """Leave broken frames out and name them in the report, instead of stopping at the first."""
 
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Go on with the map in DIR, with its parameters, after the last frame that is in it."""
+    """Go on with the map in DIR, with its parameters, after the last frame that is in it. Of several
+    sources, those that are finished are left alone."""
+
+    jobs: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Map so many of several sources at a time, each in a process of its own. They share the cores, and have
+    one GPU each where there are several."""
+
+    scheduler: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS")] = None
+    """Map on the workers of this Dask scheduler, such as tcp://10.0.0.1:8786; 'local' starts Dask's own here,
+    with a worker for each job."""
 
     pictures: bool = True
     """Draw the map from above, in perspective, and against the measured depth."""
@@ -63,16 +77,19 @@ class Map:
     """Parameters."""
 
     def __post_init__(self) -> None:
-        for name in ("every", "limit"):
+        for name in ("every", "limit", "jobs"):
             value = getattr(self, name)
             if isinstance(value, int) and value < 1:
                 raise ConfigError(f"--{name} must be at least 1, not {value}")
+        if self.sources is not tyro.MISSING and not self.sources:
+            raise ConfigError("map needs a SOURCE")
 
     def run(self) -> int:
         """Map, write everything, and print the report. Raises TaichiMRFError."""
+        from taichi_mrf.commands.map_many import run_many
         from taichi_mrf.commands.map_run import run_map
 
-        return run_map(self)
+        return run_map(self) if len(self.sources) == 1 and self.scheduler is None else run_many(self)
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,9 @@
 import json
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from taichi_mrf.config import Config, load, with_absolute_tables
 from taichi_mrf.config_text import commented_yaml, differences
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.reposed import reposed
+from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError, FrameError, MapFileError
 from taichi_mrf.evaluation.held_out import HeldOutCheck, check_held_out
 from taichi_mrf.evaluation.pictures import write_pictures
@@ -44,50 +46,112 @@ LIVE_VIEW = "shows the map in the browser."
 _PICTURED_FRAMES = 3
 
 
+@dataclass(frozen=True)
+class MapTask:
+    """One sequence to map into a folder; all that decides what the files will hold.
+
+    Paths are relative to ``start``, the working directory of the command; those in ``settings`` are
+    absolute.
+    """
+
+    source: str
+    out: Path
+    start: Path
+    settings: Config
+    reading: SourceFlags
+    every: int = 1
+    limit: int | None = None
+    skip_bad_frames: bool = False
+    resume: bool = False
+    pictures: bool = True
+    track_poses: bool = False
+
+    def __str__(self) -> str:
+        return self.source
+
+    def choice(self) -> dict[str, Any]:
+        """What was asked for besides the parameters; the report says it too."""
+        return {"every": self.every, "limit": self.limit, "track_poses": self.track_poses}
+
+
+def map_task(options: Map, source: str, out: Path) -> MapTask:
+    """The part of a command that concerns one of its sources."""
+    start = Path.cwd()
+    return MapTask(
+        source,
+        out,
+        start,
+        with_absolute_tables(options.poses.parameters(options.settings), start),
+        options.reading,
+        options.every,
+        options.limit,
+        options.skip_bad_frames,
+        options.resume,
+        options.pictures,
+        options.poses.track_poses,
+    )
+
+
 def run_map(options: Map) -> int:
-    """Carry out the command; returns the exit status. Raises TaichiMRFError."""
+    """Carry out the command for one source; returns the exit status. Raises TaichiMRFError."""
     console = Console(stderr=options.json)
-    settings = with_absolute_tables(options.poses.parameters(options.settings), Path.cwd())
-    with (
-        output_folder(options.out),
-        stop_on_signals(lambda text: console.print(f"[yellow]{text}[/]")) as request,
-    ):
+    task = map_task(options, options.sources[0], options.out)
+    with stop_on_signals(lambda text: console.print(f"[yellow]{text}[/]")) as request:
+        with ProgressBar(console) as progress:
+            report, written = map_to_folder(task, progress, request)
+        print_run(console, options, report, written)
+    return exit_status(request)
+
+
+def print_run(console: Console, options: Map, report: dict[str, Any], written: list[Path]) -> None:
+    """Tell what one source has become."""
+    if options.json:
+        print(report_json(report), end="")
+        return
+    print_report(console, report, written)
+    look = LOOK_AT_PICTURES if options.pictures else "Open"
+    live = f"taichi-mrf live {options.out / MAP_FILE} {LIVE_VIEW}"
+    console.print(f"{look} {OPEN_VOXELS} {live}", highlight=False, markup=False)
+
+
+def map_to_folder(
+    task: MapTask, progress: ProgressBar, should_stop: Callable[[], bool]
+) -> tuple[dict[str, Any], list[Path]]:
+    """Map one sequence and write its files, the report last; returns the report and the files.
+
+    A run that ``should_stop`` ended says so in its report. Raises TaichiMRFError.
+    """
+    with output_folder(task.out):
         start = time.perf_counter()
+        settings = task.settings
         runtime.init(settings.runtime.arch, settings.runtime.threads, settings.runtime.debug)
-        previous = _resumed_map(options.out, settings) if options.resume else None
-        track = options.poses.track_poses
-        dataset = open_dataset(options.source, color=False, track=track, **options.reading.keywords())
+        previous = _resumed_map(task.out, settings) if task.resume else None
+        dataset = open_dataset(task.source, color=False, track=task.track_poses, **task.reading.keywords())
         opening = time.perf_counter() - start
-        with ProgressBar(console) as progress, _collected_warnings() as warned:
+        with _collected_warnings() as warned:
             result = map_sequence(
                 dataset,
                 settings,
                 progress.listen,
-                every=options.every,
-                limit=options.limit,
-                skip_bad_frames=options.skip_bad_frames,
-                should_stop=request,
+                every=task.every,
+                limit=task.limit,
+                skip_bad_frames=task.skip_bad_frames,
+                should_stop=should_stop,
                 resume_from=previous,
             )
             result.seconds = {"opening": opening, **result.seconds}
             posed = dataset if result.track is None else reposed(dataset, result.track.poses(result.map))
             check = _check(result, posed, progress)
-            written = _write_map(options.out, result, settings, progress)
-            if options.pictures:
-                written += _write_pictures(options.out, result, posed, progress)
-        report = run_report(result, dataset, options.source, check)
+            written = _write_map(task.out, result, settings, progress)
+            if task.pictures:
+                written += _write_pictures(task.out, result, posed, progress)
+        report = run_report(result, dataset, task.source, check)
         report["notes"] += [str(warning.message) for warning in warned]
-        if options.resume:
-            report["skipped_frames"] = _skipped_before(options.out) | report["skipped_frames"]
-        write_text(options.out / REPORT_FILE, report_json(report))
-        if options.json:
-            print(report_json(report), end="")
-            return _exit_status(request)
-        print_report(console, report, [*written, options.out / REPORT_FILE])
-        look = LOOK_AT_PICTURES if options.pictures else "Open"
-        live = f"taichi-mrf live {options.out / MAP_FILE} {LIVE_VIEW}"
-        console.print(f"{look} {OPEN_VOXELS} {live}", highlight=False, markup=False)
-    return _exit_status(request)
+        if task.resume:
+            report["skipped_frames"] = _skipped_before(task.out) | report["skipped_frames"]
+        report |= task.choice()
+        write_text(task.out / REPORT_FILE, report_json(report))
+    return report, [*written, task.out / REPORT_FILE]
 
 
 def _resumed_map(folder: Path, settings: Config) -> OccupancyMap | None:
@@ -188,6 +252,6 @@ def _skipped_before(folder: Path) -> dict[str, str]:
         raise MapFileError(f"{path}: cannot be read: {error}") from error
 
 
-def _exit_status(request: StopRequest) -> int:
+def exit_status(request: StopRequest) -> int:
     """0, or what a shell expects of a program that was stopped by a signal."""
     return 0 if request.signal is None else 128 + request.signal

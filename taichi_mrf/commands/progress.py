@@ -35,6 +35,12 @@ class TransientBar:
     def __init__(self, console: Console, *columns: ProgressColumn) -> None:
         self._progress = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
+    def count(self, done: int, total: int) -> None:
+        """Move the bar of a run with a single stage."""
+        if not self._progress.tasks:
+            self._progress.add_task("", total=total)
+        self._progress.update(self._progress.tasks[0].id, completed=done, total=total)
+
     def __enter__(self: Bar) -> Bar:
         self._progress.start()
         return self

@@ -5,6 +5,7 @@ never half of one.
 """
 
 import os
+import re
 import secrets
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -16,6 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
+
+_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}(\.[^.]+)?")
+"""What :func:`atomic_path` calls a file that is not whole yet."""
 
 
 @contextmanager
@@ -40,6 +44,14 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
             raise
     except OSError as error:
         raise MapFileError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files that killed processes have left in a folder, if there is one. Only for a
+    folder that nobody else writes to."""
+    for path in folder.glob(".*"):
+        if _TEMPORARY.fullmatch(path.name) and path.is_file():
+            path.unlink(missing_ok=True)
 
 
 def write_text(path: str | Path, text: str) -> None:

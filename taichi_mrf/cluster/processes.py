@@ -1,0 +1,115 @@
+"""The processes of tasks, seen from the one that starts them.
+
+Neither multiprocessing nor ProcessPoolExecutor can do this: a Dask worker is a daemon, which may not start
+their processes; a pool breaks as a whole when one process is killed; and the environment of a process has to
+be set before it starts, because NumPy and Taichi look at it when they are loaded.
+"""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
+
+from taichi_mrf.cluster.child import read_block, write_block
+
+_LAST_SECONDS = 60.0
+"""Longest wait for the end of a process that has answered."""
+
+
+class ProcessDiedError(Exception):
+    """A process has died before it gave an answer; the text says how."""
+
+
+class StoppedError(Exception):
+    """The tasks were asked to stop before this one could give an answer."""
+
+
+class TaskProcesses:
+    """The processes of the tasks that are under way; used from several threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._running: set[subprocess.Popen[bytes]] = set()
+        self._stopping = False
+
+    def answer(self, payload: bytes, environment: Mapping[str, str]) -> bytes:
+        """What child.answer_to says of the payload, from a new process with these environment variables too.
+
+        Raises ProcessDiedError if the process dies, StoppedError if the tasks were asked to stop.
+        """
+        process = self._start(environment)
+        try:
+            answer = _exchange(process, payload)
+        finally:
+            self._forget(process)
+        if answer is not None:
+            return answer
+        if self._stopping:
+            raise StoppedError
+        raise ProcessDiedError(_end(process.returncode))
+
+    def stop(self) -> None:
+        """Ask all to stop, and start no more."""
+        with self._lock:
+            self._stopping = True
+            for process in self._running:
+                process.terminate()
+
+    def kill(self) -> None:
+        """End all at once, and start no more."""
+        with self._lock:
+            self._stopping = True
+            for process in self._running:
+                process.kill()
+
+    def _start(self, environment: Mapping[str, str]) -> "subprocess.Popen[bytes]":
+        code = f"import sys; sys.path[:] = {sys.path!r}; from taichi_mrf.cluster.child import main; main()"
+        with self._lock:
+            if self._stopping:
+                raise StoppedError
+            process = subprocess.Popen(
+                [sys.executable, "-c", code],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                env={**os.environ, **environment},
+                start_new_session=True,  # Ctrl-C is for the parent, which tells its children
+            )
+            self._running.add(process)
+            return process
+
+    def _forget(self, process: "subprocess.Popen[bytes]") -> None:
+        """A process that has answered may end in peace, when Taichi saves its compiled kernels."""
+        try:
+            if process.poll() is None and not self._stopping:
+                process.wait(_LAST_SECONDS)
+        except subprocess.TimeoutExpired:
+            pass
+        finally:
+            with self._lock:
+                self._running.discard(process)
+            process.kill()
+            process.wait()
+            for stream in (process.stdin, process.stdout):
+                if stream is not None:
+                    stream.close()
+
+
+def _exchange(process: "subprocess.Popen[bytes]", payload: bytes) -> bytes | None:
+    """Send the task and wait for the answer; None if the process dies instead."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    with contextlib.suppress(BrokenPipeError):
+        write_block(process.stdin, payload)
+    answer = read_block(process.stdout)
+    if answer is None:
+        process.wait()
+    return answer
+
+
+def _end(returncode: int) -> str:
+    if returncode >= 0:
+        return f"its process ended with exit status {returncode} and no answer"
+    return f"its process was killed by {signal.Signals(-returncode).name}"
