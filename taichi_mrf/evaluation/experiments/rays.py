@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 EVERY_PIXEL = mrf("every pixel", rays_per_voxel=0.0)
-WANTED = (1.0, 2.0, 4.0, 9.0, 16.0)
-THINNED = (1.0, 4.0, 9.0)
+WANTED = (1.0, 2.0, 4.0, 10.0)
+THINNED = (4.0, 10.0)
 
-VIEWS = 24
+VIEWS = 12
 """Of each scene, evenly spread, or as many as it has; every JUDGED-th is kept out and judged."""
 
 JUDGED = 6
