@@ -130,7 +130,7 @@ def assert_between(footprint: Footprint, rays: Rays, box: tuple[NDArray, NDArray
 
 
 def every_ray(image: DepthImage) -> RayList:
-    return RayLister(VOXEL, InferenceConfig(rays_per_voxel=0.0)).rays_of(image)
+    return RayLister(VOXEL, InferenceConfig(ray_density=0.0)).rays_of(image)
 
 
 def footprint_of(

@@ -281,9 +281,9 @@ def test_a_sweep_is_made_again_when_others_have_spoken() -> None:
     assert m.keyframes[first].revision > revision
 
 
-def test_thinned_rays_give_nearly_the_same_map() -> None:
+def test_bundled_rays_give_nearly_the_same_map() -> None:
     room = small_room.frames()[:3]
-    every, some = (MRFMap(small_room.VOXEL_SIZE, rays_per_voxel=wanted) for wanted in (0.0, 4.0))
+    every, some = (MRFMap(small_room.VOXEL_SIZE, ray_density=wanted) for wanted in (0.0, 0.5))
     for m in (every, some):
         for frame in room:
             small_room.add(m, frame)

@@ -51,10 +51,10 @@ def blocks_of(rays: RayList, width: int) -> list[tuple[Block, float]]:
     return list(zip(zip(*(c.tolist() for c in columns), strict=True), depths, strict=True))
 
 
-def oracle(depth: NDArray[np.float32], wanted: float) -> dict[Block, float]:
+def oracle(depth: NDArray[np.float32], density: float) -> dict[Block, float]:
     """Blocks from single pixels up, as long as two of a size lie together, are few enough and agree."""
     height, width = depth.shape
-    stride = stride_metres(camera_of(width, height), VOXEL, wanted)
+    stride = stride_metres(camera_of(width, height), VOXEL, density)
     found = {(u, v, 1, 1): float(depth[v, u]) for v, u in zip(*np.nonzero(depth), strict=True)}
     wide, high = 1, 1
     for _ in range(LEVELS):
@@ -88,8 +88,8 @@ def test_bundles_are_those_of_the_oracle(
     depth[(u - width / 2) ** 2 + (v - height / 2) ** 2 < (height / 4) ** 2] += 1.0  # a rim
     depth[random.random((height, width)) < 0.02] = 0
     depth = depth.astype(np.float32)
-    rays = listed(depth, rays_per_voxel=wanted)
-    expected = oracle(depth, wanted)
+    rays = listed(depth, ray_density=wanted / 10)
+    expected = oracle(depth, wanted / 10)
     found = dict(blocks_of(rays, width))
     # float32 may round a spread or a quotient that lies at its bound to the other side.
     assert len(found.keys() ^ expected.keys()) <= 0.02 * len(expected)
@@ -102,7 +102,7 @@ def test_bundles_are_those_of_the_oracle(
     assert rays.widest == max((wide for _, _, wide, _ in found), default=1)
 
 
-@pytest.mark.parametrize("parameters", [{"rays_per_voxel": 0.0}, {"rays_per_voxel": 1e9}])
+@pytest.mark.parametrize("parameters", [{"ray_density": 0.0}, {"ray_density": 1e9}])
 def test_every_pixel_with_a_measurement_has_a_ray(parameters: dict[str, float]) -> None:
     depth = np.random.default_rng(2).uniform(0.2, 3.0, (48, 70)).astype(np.float32)
     depth[::5, ::7] = 0
@@ -116,7 +116,7 @@ def test_every_pixel_with_a_measurement_has_a_ray(parameters: dict[str, float]) 
 def test_rays_are_thinned_by_what_a_voxel_covers(wanted: float) -> None:
     depth = np.random.default_rng(1).uniform(0.2, 3.0, (48, 64)).astype(np.float32)
     depth[::5, ::7] = 0
-    rays = listed(depth, rays_per_voxel=wanted, ray_choice="thin")
+    rays = listed(depth, ray_density=wanted / 10, ray_choice="thin")
     v, u = np.mgrid[:48, :64]
     with np.errstate(divide="ignore"):
         stride = VOXEL * 50.0 / np.sqrt(wanted) / depth.astype(np.float64)  # pixels along a voxel's side
@@ -135,10 +135,10 @@ def test_rays_are_thinned_by_what_a_voxel_covers(wanted: float) -> None:
 
 def test_rays_of_a_tile_stand_together() -> None:
     depth = np.full((70, 90), 2.0, np.float32)
-    tiles = [(v // TILE, u // TILE) for (u, v, _, _), _ in blocks_of(listed(depth, rays_per_voxel=0.0), 90)]
+    tiles = [(v // TILE, u // TILE) for (u, v, _, _), _ in blocks_of(listed(depth, ray_density=0.0), 90)]
     assert tiles == sorted(tiles)
 
 
 def test_an_image_without_a_measurement_has_no_ray() -> None:
-    rays = listed(np.zeros((5, 7), np.float32), rays_per_voxel=4.0)
+    rays = listed(np.zeros((5, 7), np.float32), ray_density=4.0)
     assert (rays.number, rays.widest) == (0, 1)

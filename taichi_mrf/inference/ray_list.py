@@ -43,11 +43,12 @@ def block_of(ray: I32, width: I32):
     return pixel % width, pixel // width, 1 << (level + 1) // 2, 1 << level // 2
 
 
-def stride_metres(camera: PinholeCamera, voxel_size: float, rays_per_voxel: float) -> float:
+def stride_metres(camera: PinholeCamera, voxel_size: float, ray_density: float) -> float:
     """Distance between rays, in pixels, times the depth in metres: a voxel at depth z covers
     voxel_size * f / z pixels along each side. 0 casts every pixel."""
-    if rays_per_voxel == 0:
+    if ray_density == 0:
         return 0.0
+    rays_per_voxel = max(1.0, ray_density * 100.0 * voxel_size)
     return voxel_size * min(camera.fx, camera.fy) / math.sqrt(rays_per_voxel)
 
 
@@ -66,7 +67,7 @@ class RayLister:
         camera = image.camera
         self._reserve(camera.width * camera.height)
         tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
-        stride = stride_metres(camera, self.voxel_size, self.inference.rays_per_voxel)
+        stride = stride_metres(camera, self.voxel_size, self.inference.ray_density)
         counts, widest = np.zeros(tiles, np.int32), np.ones(tiles, np.int32)
         _choose(
             image.depth, camera.width, image.noise, image.noise_table.patch, image.noise_table.columns,

@@ -35,7 +35,7 @@ class VisibilityIntegrator:
         # A depth is never more than its range, so what lies deeper need not be looked at.
         self.sensor = dataclasses.replace(sensor, max_depth=min(sensor.max_depth, self.max_range))
         self.index = WindowIndex()
-        self.lister = RayLister(voxel_size, InferenceConfig(rays_per_voxel=0.0))  # every pixel
+        self.lister = RayLister(voxel_size, InferenceConfig(ray_density=0.0))  # every pixel
         self.occluded = ti.ndarray(ti.f32, VOXELS)
         self.visible = ti.ndarray(ti.i32, VOXELS)
         self.inside = ti.ndarray(ti.i32, VOXELS)

@@ -76,7 +76,7 @@ KNOBS = (
     Knob("inference.message_clamp", "inference", Range(0.5, 14.0, 0.1), "log-odds"),
     Knob("inference.cavity_clamp", "inference", Range(0.5, 20.0, 0.1), "log-odds"),
     Knob("inference.free_share", "inference", Range(0.0, 1.0, 0.01)),
-    Knob("inference.rays_per_voxel", "inference", Range(0.0, 16.0, 0.5)),
+    Knob("inference.ray_density", "inference", Range(0.0, 10.0, 0.5), "per cm"),
     Knob("log_odds.hit", "log_odds", Range(0.51, 0.98, 0.01)),
     Knob("log_odds.miss", "log_odds", Range(0.02, 0.49, 0.01)),
     Knob("log_odds.lowest", "log_odds", Range(0.01, 0.49, 0.01)),

@@ -22,9 +22,11 @@ from taichi_mrf.export.atomic import atomic_path
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-EVERY_PIXEL = mrf("every pixel", rays_per_voxel=0.0)
-WANTED = (1.0, 2.0, 4.0, 10.0)
-THINNED = (4.0, 10.0)
+EVERY_PIXEL = mrf("every pixel", ray_density=0.0)
+WANTED = (0.5, 1.0, 2.5, 5.0)
+"""Rays a voxel for each centimetre of its side."""
+
+THINNED = (1.0, 2.5)
 
 VIEWS = 12
 """Of each scene, evenly spread, or as many as it has; every JUDGED-th is kept out and judged."""
@@ -47,8 +49,8 @@ class _Point:
 
 def ray_contenders() -> Sequence[Contender]:
     """Every pixel, and each choice of rays."""
-    bundled = [mrf(f"bundles, {n:g} a voxel", rays_per_voxel=n) for n in WANTED]
-    thinned = [mrf(f"thinned, {n:g} a voxel", rays_per_voxel=n, ray_choice="thin") for n in THINNED]
+    bundled = [mrf(f"bundles, {n:g} per cm", ray_density=n) for n in WANTED]
+    thinned = [mrf(f"thinned, {n:g} per cm", ray_density=n, ray_choice="thin") for n in THINNED]
     return [EVERY_PIXEL, *bundled, *thinned]
 
 

@@ -40,7 +40,7 @@ PASSES = 30
 four unknown voxels an image at most, and their robot took 80 images on the way from one mapped pair to the
 next. Integrating a pair 30 times before the next one leaves three times as many artefacts."""
 
-STREET: Mapping[str, float] = {"surface_density": 0.07, "outlier_floor": 1e-2, "rays_per_voxel": 9.0}
+STREET: Mapping[str, float] = {"surface_density": 0.07, "outlier_floor": 1e-2, "ray_density": 9.0 / 20.0}
 """MRFMap's parameters: one surface in the 14 m that a ray is long in the median, in place of 2.1 per metre of
 a room; and a share of wild matches that come in patches. Chosen on every fourth pair of the first 21, judged
 on those half-way between, which are all mapped here and not judged."""
