@@ -10,7 +10,6 @@ from taichi_mrf.config import Config, EvaluationConfig
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import FrameError
 from taichi_mrf.frame import Frame
-from taichi_mrf.live.outbox import brick_keys
 from taichi_mrf.live.replay import Replay
 from taichi_mrf.live.run import Policy, Source
 from taichi_mrf.live.session import Session
@@ -18,7 +17,7 @@ from taichi_mrf.maps.create import create_map
 from taichi_mrf.maps.mrf import MRFMap
 from taichi_mrf.maps.protocol import OccupancyMap
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Bricks, Hello, Keyframe, Notice, Request, Status, Update
-from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
+from taichi_mrf.voxels.layout import BRICK, grid_keys, offsets_in_brick
 
 CONFIG = Config(voxel_size=small_room.VOXEL_SIZE, evaluation=EvaluationConfig(hold_out=0))
 
@@ -145,7 +144,7 @@ def marginals(m: OccupancyMap) -> dict[int, bytes]:
     """All beliefs by brick, bit for bit."""
     pool = m.view.pool
     slots = pool.in_use
-    keys = brick_keys(pool.bricks[slots]).tolist()
+    keys = grid_keys(pool.bricks[slots]).tolist()
     return {key: row.tobytes() for key, row in zip(keys, pool.read("belief", slots), strict=True)}
 
 

@@ -1,6 +1,7 @@
-"""The documentation site is built without a warning, and names every parameter."""
+"""The documentation site is built without a warning, names every parameter, and its pictures have makers."""
 
 import dataclasses
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -32,3 +33,24 @@ def test_the_site_is_built_without_a_warning(repository: Path, tmp_path: Path) -
     front = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert "taichi-mrf live" in front
     assert 'href="live/"' in front
+
+
+PICTURE = re.compile(r"!\[[^\]]*\]\(([^)]+)\)")
+
+
+def test_pictures_are_there_are_shown_and_come_from_a_script(repository: Path) -> None:
+    pages = [repository / "README.md", *sorted((repository / "docs").glob("*.md"))]
+    shown = {
+        (page.parent / link).resolve() for page in pages for link in PICTURE.findall(page.read_text("utf-8"))
+    }
+    pictures = set((repository / "docs" / "images").iterdir())
+    assert shown == pictures
+    scripts = "".join(path.read_text("utf-8") for path in (repository / "docs").glob("make_*.py"))
+    assert [path.name for path in pictures if f'"{path.name}"' not in scripts] == []
+
+
+def test_pictures_are_small(repository: Path) -> None:
+    sizes = {path.name: path.stat().st_size for path in (repository / "docs" / "images").glob("*.jpg")}
+    assert sizes
+    assert max(sizes.values()) < 200_000
+    assert sum(sizes.values()) < 1_000_000

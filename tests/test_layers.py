@@ -19,6 +19,7 @@ FLOORS = [
         "config_values",
         "camera",
         "frame",
+        "libraries",
         "devices",
         "runtime",
         "voxels",

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from live_scene import Shown
 
 from taichi_mrf.live.link import ViewerLink
-from taichi_mrf.live.outbox import BRICKS_AT_ONCE, Outbox, brick_keys, merged
+from taichi_mrf.live.outbox import BRICKS_AT_ONCE, Outbox, merged
 from taichi_mrf.viewer.messages import (
     Bricks,
     File,
@@ -25,7 +25,7 @@ from taichi_mrf.viewer.messages import (
     Step,
     Update,
 )
-from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.layout import VOXELS, grid_keys
 
 HELLO = Hello("room", "cpu", "", "mrf", 0.05, -2.2, 0.1, "")
 
@@ -95,7 +95,7 @@ def test_whatever_is_merged_a_viewer_ends_up_with_what_was_said(actions: list[Up
 @given(st.lists(brick_updates(), min_size=1, max_size=8))
 def test_merged_updates_name_no_brick_twice(parts: list[Bricks]) -> None:
     whole = merged(parts)
-    keys = brick_keys(np.concatenate([whole.bricks, whole.removed]))
+    keys = grid_keys(np.concatenate([whole.bricks, whole.removed]))
     assert len(np.unique(keys)) == len(keys)
     assert whole.bricks.dtype == whole.removed.dtype == np.int32
     assert (whole.log_odds.dtype, whole.seen.dtype) == (np.int16, np.uint8)
@@ -222,6 +222,6 @@ def test_why_there_is_no_page_is_passed_on() -> None:
 
 
 @pytest.mark.parametrize("place", [(0, 0, 0), (-1, 5, -4096), (4095, -4096, 17)])
-def test_brick_keys_tell_bricks_apart(place: tuple[int, int, int]) -> None:
+def test_grid_keys_tell_bricks_apart(place: tuple[int, int, int]) -> None:
     around = np.array(place) + np.stack(np.meshgrid(*[range(-2, 3)] * 3), axis=-1).reshape(-1, 3)
-    assert len(np.unique(brick_keys(around.astype(np.int32)))) == 125
+    assert len(np.unique(grid_keys(around.astype(np.int32)))) == 125

@@ -94,7 +94,7 @@ def test_what_cannot_be_searched_is_told_in_one_line() -> None:
 
 def test_without_optuna_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "optuna", None)
-    with pytest.raises(ConfigError, match=r"--auto needs Optuna: pip install 'taichi-mrf\[auto\]'"):
+    with pytest.raises(ConfigError, match=r"--auto needs optuna, .*: pip install 'taichi-mrf\[auto\]'"):
         Search(CONFIG, DEFAULT_SEARCH, 3, 0)
 
 

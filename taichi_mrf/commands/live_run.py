@@ -1,9 +1,7 @@
 """What ``taichi-mrf live`` does: start the page, map, and leave the files when it ends."""
 
-import os
 import sys
 import time
-import webbrowser
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -13,15 +11,11 @@ from rich.console import Console
 from taichi_mrf.commands.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.commands.live import Live
 from taichi_mrf.commands.output import output_folder
+from taichi_mrf.commands.serving import Say, let_the_page_go_first, tell_address, warn_of_host
 from taichi_mrf.config import with_absolute_tables
 from taichi_mrf.errors import TaichiMRFError
 from taichi_mrf.live.link import ViewerLink
 from taichi_mrf.viewer.messages import Listening
-
-LOOPBACK = ("127.0.0.1", "::1", "localhost")
-
-NICENESS = 10
-"""Mapping leaves the page the processor when both want it."""
 
 SHORTEST_LIFE_SECONDS = 30.0
 """A viewer that ends sooner than this is not started once more."""
@@ -39,10 +33,9 @@ def run_live(options: Live) -> int:
         if options.out is not None:
             stack.enter_context(output_folder(options.out))
         request = stack.enter_context(stop_on_signals(say))
-        _warn_of_host(options, say)
+        warn_of_host(options.host, options.port, "watch and change the map", say)
         page = _Page(options, say, stack)
-        # Only now, so that the viewer keeps its priority; and before Taichi starts threads, which inherit it.
-        _be_nice()
+        let_the_page_go_first()
         # Imported late: the page starts meanwhile, in a process of its own.
         from taichi_mrf.live.files import write_all
         from taichi_mrf.live.open_source import open_source
@@ -78,7 +71,7 @@ def run_live(options: Live) -> int:
 class _Page:
     """The viewer of the moment, and what is told of it on the terminal."""
 
-    def __init__(self, options: Live, say: Callable[[str], None], stack: ExitStack) -> None:
+    def __init__(self, options: Live, say: Say, stack: ExitStack) -> None:
         self._options, self._say, self._stack = options, say, stack
         self._wanted_port = options.port
         self.start()
@@ -90,13 +83,8 @@ class _Page:
 
     def listening(self, where: Listening) -> None:
         """Tell the user where the page is."""
-        host = f"[{where.host}]" if ":" in where.host else where.host
-        address = f"http://{host}:{where.port}"
-        self._say(f"The map is at {address}  (Ctrl-C ends it)")
-        if self._wanted_port not in (0, where.port):
-            self._say(f"Port {self._wanted_port} is busy, so the page took {where.port}.")
-        if self._options.open and not self.has_listened:
-            webbrowser.open(address)
+        wants_browser = self._options.open and not self.has_listened
+        tell_address(where, "The map", self._wanted_port, wants_browser, self._say)
         self.has_listened, self._wanted_port = True, where.port
 
 
@@ -120,18 +108,3 @@ def _run(
         page.link.close()
         page.start()
         reconnect(page.link)
-
-
-def _warn_of_host(options: Live, say: Callable[[str], None]) -> None:
-    if options.host in LOOPBACK:
-        return
-    say(
-        f"Warning: the page at --host {options.host} has no password: whoever can reach this machine can "
-        "watch and change the map. It is safer to leave --host away and to tunnel from where you watch: "
-        f"ssh -L {options.port}:127.0.0.1:{options.port} USER@THIS-MACHINE"
-    )
-
-
-def _be_nice() -> None:
-    if hasattr(os, "nice"):  # not on Windows
-        os.nice(NICENESS)

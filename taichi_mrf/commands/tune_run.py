@@ -1,8 +1,5 @@
 """What ``taichi-mrf tune`` does: start the page, try parameters, and leave the files when it ends."""
 
-import os
-import webbrowser
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,22 +7,19 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from taichi_mrf.commands.interrupt import stop_on_signals
-from taichi_mrf.commands.live_run import LOOPBACK, NICENESS
 from taichi_mrf.commands.output import output_folder
+from taichi_mrf.commands.serving import Say, let_the_page_go_first, tell_address, warn_of_host
 from taichi_mrf.commands.tune import FRAMES_BY_HAND, FRAMES_TO_SEARCH, Tune
 from taichi_mrf.config import with_absolute_tables
 from taichi_mrf.errors import TaichiMRFError
 from taichi_mrf.export.atomic import write_text
 from taichi_mrf.tune.link import NoPage, start_page
-from taichi_mrf.viewer.messages import Listening
 from taichi_mrf.viewer.tune_messages import FrameChoice
 
 if TYPE_CHECKING:
     from taichi_mrf.tune.history import Attempt
     from taichi_mrf.tune.search import Search
     from taichi_mrf.tune.session import TuneSession
-
-Say = Callable[[str], None]
 
 
 def run_tune(options: Tune) -> int:
@@ -40,16 +34,10 @@ def run_tune(options: Tune) -> int:
         if options.out is not None:
             stack.enter_context(output_folder(options.out))
         request = stack.enter_context(stop_on_signals(say))
-        if options.viewer and options.host not in LOOPBACK:
-            say(
-                f"Warning: the page at --host {options.host} has no password: whoever can reach this machine "
-                "can use it. It is safer to leave --host away and to tunnel from where you watch: "
-                f"ssh -L {options.port}:127.0.0.1:{options.port} USER@THIS-MACHINE"
-            )
+        if options.viewer:
+            warn_of_host(options.host, options.port, "use it", say)
         link = stack.enter_context(start_page(options.host, options.port)) if options.viewer else NoPage()
-        # Only now, so that the page keeps its priority; and before Taichi starts threads, which inherit it.
-        if hasattr(os, "nice"):  # not on Windows
-            os.nice(NICENESS)
+        let_the_page_go_first()
         # Imported late: the page starts meanwhile, in a process of its own.
         from taichi_mrf import runtime
         from taichi_mrf.datasets import open_dataset
@@ -73,7 +61,7 @@ def run_tune(options: Tune) -> int:
             link,
             Policy(options.out, options.search_stride, leave_when_done=not options.viewer),
             search=search,
-            listening=lambda where: _tell_address(where, options, say),
+            listening=lambda where: tell_address(where, "The page", options.port, options.open, say),
             tried=lambda attempt: _tell_try(attempt, session.search, told, say),
         )
         for note in dataset.notes:
@@ -109,16 +97,6 @@ def _finish(session: "TuneSession", options: Tune, say: Say) -> None:
     if attempt is not None:
         write_text(options.out / BEST_FILE, session.history.to_yaml(attempt.number, tuple(verdict)))
         say(f"wrote {options.out / BEST_FILE}")
-
-
-def _tell_address(where: Listening, options: Tune, say: Say) -> None:
-    host = f"[{where.host}]" if ":" in where.host else where.host
-    address = f"http://{host}:{where.port}"
-    say(f"The page is at {address}  (Ctrl-C ends it)")
-    if options.port not in (0, where.port):
-        say(f"Port {options.port} is busy, so the page took {where.port}.")
-    if options.open:
-        webbrowser.open(address)
 
 
 def _tell_try(attempt: "Attempt", search: "Search | None", told: set[int], say: Say) -> None:

@@ -4,7 +4,6 @@ Files are read with trimesh and rays are cast by Embree (embreex), which only th
 they come with the extra ``mesh``. World frame, metres.
 """
 
-import importlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.libraries import library
 from taichi_mrf.poses import Pose
 
 
@@ -89,10 +89,4 @@ def load_mesh(path: Path) -> TriangleMesh:
 
 
 def _library(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        package = name.partition(".")[0]
-        raise DatasetError(
-            f"meshes need {package}, which is not installed: pip install 'taichi-mrf[mesh]'"
-        ) from error
+    return library(name, "meshes need", "mesh", DatasetError)

@@ -7,7 +7,6 @@ Without either the camera is taken to stand still: its pose is one and the same 
 level, looking along x.
 """
 
-import importlib
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ from taichi_mrf.datasets.realsense_file import Player, RealSenseFile
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.frame import Frame
+from taichi_mrf.libraries import library
 from taichi_mrf.poses import Pose
 
 NAME = "realsense:"
@@ -132,12 +132,7 @@ def open_realsense(text: str, options: ReadOptions) -> Dataset:
         raise DatasetError(f"{NAME} has no depth_scale, the camera knows its own")
     tracked = options.track or wanted.poses == TRACK
     trajectory = read_timed_poses(Path(wanted.poses)) if wanted.poses and not tracked else None
-    try:
-        rs = importlib.import_module("pyrealsense2")
-    except ImportError as error:
-        raise DatasetError(
-            f"{NAME} needs pyrealsense2, which is not installed: pip install 'taichi-mrf[realsense]'"
-        ) from error
+    rs = library("pyrealsense2", f"{NAME} needs", "realsense", DatasetError)
     gap = INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
     source: RealSense | RealSenseFile
     if file:

@@ -4,7 +4,6 @@ It needs no ROS, and comes with the extra ``ros``. Whatever it says about a file
 one DatasetError here; the rest of the package sees topics by name and messages as objects with their fields.
 """
 
-import importlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 
 from taichi_mrf.datasets.ros_messages import header_ns
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.libraries import library
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 METADATA = "metadata.yaml"
@@ -114,12 +114,7 @@ def is_bag(path: Path) -> bool:
 
 
 def _library(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise DatasetError(
-            "bags need rosbags, which is not installed: pip install 'taichi-mrf[ros]'"
-        ) from error
+    return library(name, "bags need", "ros", DatasetError)
 
 
 def _said(error: BaseException) -> str:

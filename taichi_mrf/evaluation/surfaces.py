@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.maps.protocol import OccupancyMap
 from taichi_mrf.poses import Pose
+from taichi_mrf.voxels.layout import grid_keys
 
 _VIEWS = 60
 """Keyframes that are looked through, at most: more see the same surfaces again."""
@@ -155,5 +156,4 @@ def mean_vectors(
 
 def cell_keys(points: NDArray[np.floating], cell_m: float) -> NDArray[np.int64]:
     """One integer for each cell that a point (N, 3) lies in, (N,); 21 bits an axis."""
-    i, j, k = (np.floor(np.asarray(points) / cell_m).astype(np.int64) + (1 << 20)).T
-    return (i << 42) | (j << 21) | k
+    return grid_keys(np.floor(np.asarray(points) / cell_m))

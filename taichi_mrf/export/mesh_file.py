@@ -8,8 +8,8 @@ from taichi_mrf.export.atomic import atomic_path
 from taichi_mrf.export.colors import LOWEST
 from taichi_mrf.export.ply import write_surface
 from taichi_mrf.export.surface import Surface
+from taichi_mrf.libraries import library
 from taichi_mrf.poses import Pose
-from taichi_mrf.queries.libraries import library
 
 
 def write_mesh(
@@ -26,7 +26,7 @@ def write_mesh(
         comments = [f"voxel_size {voxel_size:.9g} metres", f"color is viridis from occupancy {LOWEST} to 1"]
         write_surface(path, surface.vertices_m, surface.triangles, surface.colors, comments)
         return
-    trimesh = library("trimesh", f"{suffix} files", "mesh")
+    trimesh = library("trimesh", f"{suffix} files need", "mesh")
     mesh = trimesh.Trimesh(
         surface.vertices_m, surface.triangles, vertex_colors=surface.colors, process=False, validate=False
     )

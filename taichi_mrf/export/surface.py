@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.colors import marginal_colors
+from taichi_mrf.libraries import library
 from taichi_mrf.queries.box import BoxOfVoxels, voxel_box
 from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, sorted_bricks
-from taichi_mrf.queries.libraries import library
 from taichi_mrf.voxels.layout import CHUNK, CHUNK_VOXELS
 
 _ON_GRID = 2e-5
@@ -70,7 +70,7 @@ def smooth_surface(m: QueriedMap, level: float) -> Surface:
 
     What nobody has seen counts as empty. Raises TaichiMRFError without scikit-image.
     """
-    measure = library("skimage.measure", "meshes", "mesh")
+    measure = library("skimage.measure", "meshes need", "mesh")
     vertices, triangles, values = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.float32)]
     count = 0
     for found in _chunks(m, 0, reach_back=True):

@@ -6,7 +6,8 @@ brick by brick: what waits is never more than the map and its keyframes are.
 """
 
 import threading
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
+from typing import Union
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from taichi_mrf.viewer.messages import (
     Status,
     Update,
 )
+from taichi_mrf.voxels.layout import grid_keys
 
 BRICKS_AT_ONCE = 2048
 """Bricks sent in one piece (3 MB), so that other updates need not wait for a whole map."""
@@ -39,12 +41,19 @@ MERGE_FACTOR = 2
 each is copied a few times at most."""
 
 
+Waiting = Union[Update, "WaitingBricks", Quit]
+
+
 class Outbox:
-    """A queue that one thread fills and another empties."""
+    """A queue that one thread fills and another empties.
+
+    A page with updates of its own says in a subclass which of them take each other's place (:meth:`key`), and
+    which make pointless what was said before (:meth:`still_wanted`).
+    """
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._waiting: dict[Hashable, Update | WaitingBricks | Quit] = {}
+        self._waiting: dict[Hashable, Waiting] = {}
         self._number = 0
         self._closed = False
 
@@ -53,14 +62,15 @@ class Outbox:
         with self._changed:
             if self._closed:
                 return
-            if isinstance(update, Hello):
-                self._forget_the_map()
+            wanted = self.still_wanted(update)
+            if wanted is not None:
+                self._waiting = {key: waiting for key, waiting in self._waiting.items() if wanted(waiting)}
             if isinstance(update, Bricks):
                 waiting = self._waiting.setdefault(("bricks", update.layer), WaitingBricks(update.layer))
                 assert isinstance(waiting, WaitingBricks)
                 waiting.add(update)
             else:
-                self._waiting[self._key(update)] = update
+                self._waiting[self._place(update)] = update
             self._changed.notify()
 
     def close(self) -> None:
@@ -88,24 +98,33 @@ class Outbox:
         with self._changed:
             return len(self._waiting)
 
-    def _key(self, update: Update) -> Hashable:
-        """Updates with the same key take each other's place."""
+    def key(self, update: Update) -> Hashable | None:
+        """Updates with the same key take each other's place; None: it waits beside others of its kind, of
+        which MOST says how many."""
         if isinstance(update, LATEST_ONLY):
             return type(update).__name__
         if isinstance(update, Keyframe):
             return "keyframe", update.id
         if isinstance(update, Hello):
             return Hello.__name__
+        return None
+
+    def still_wanted(self, update: Update) -> Callable[[Waiting], bool] | None:
+        """Which of what waits is still worth sending after this update; None: all. A Hello makes all
+        pointless that was said of the map before."""
+        return (lambda waiting: isinstance(waiting, Notice | File)) if isinstance(update, Hello) else None
+
+    def _place(self, update: Update) -> Hashable:
+        """Where the update waits; makes room for it if need be."""
+        key = self.key(update)
+        if key is not None:
+            return key
         self._number += 1
         kind = type(update)
         same = [key for key in self._waiting if isinstance(key, tuple) and key[0] is kind]
         for key in same[: max(0, len(same) + 1 - MOST[kind])]:
             del self._waiting[key]
         return kind, self._number
-
-    def _forget_the_map(self) -> None:
-        """A Hello makes all pointless that was said of the map before."""
-        self._waiting = {k: u for k, u in self._waiting.items() if isinstance(u, Notice | File)}
 
 
 class WaitingBricks:
@@ -146,17 +165,11 @@ def merged(parts: list[Bricks]) -> Bricks:
     # The last word on each brick counts. Within one update nothing is said twice of any.
     said = np.concatenate([np.full(len(p.bricks), i) for i, p in enumerate(parts)])
     gone = np.concatenate([np.full(len(p.removed), i) for i, p in enumerate(parts)])
-    keys = brick_keys(np.concatenate([bricks, removed]))
+    keys = grid_keys(np.concatenate([bricks, removed]))
     order = np.lexsort((np.concatenate([said, gone]), keys))
     last = order[np.append(np.diff(keys[order]) != 0, True)] if len(order) else order
     kept, dropped = np.sort(last[last < len(bricks)]), np.sort(last[last >= len(bricks)]) - len(bricks)
     return Bricks(parts[0].layer, bricks[kept], log_odds[kept], seen[kept], removed[dropped])
-
-
-def brick_keys(bricks: NDArray[np.int32]) -> NDArray[np.int64]:
-    """(n, 3) brick coordinates -> (n,) numbers, one for each brick within 2^20 bricks of the origin."""
-    x, y, z = (bricks.astype(np.int64) + (1 << 20)).T
-    return (x << 42) | (y << 21) | z
 
 
 def _rows(whole: Bricks, rows: slice, removed: NDArray[np.int32]) -> Bricks:

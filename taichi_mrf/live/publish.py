@@ -9,9 +9,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.live.outbox import brick_keys
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Bricks, Layer, pack_log_odds
-from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.layout import VOXELS, grid_keys
 from taichi_mrf.voxels.pool import BrickPool
 
 SeenBy = Callable[[NDArray[np.int32]], NDArray[np.uint8]]
@@ -101,9 +100,9 @@ class Publisher:
         lived = before >= 0
         if (before[lived] == self._identity[: len(before)][lived]).all():
             return np.zeros((0, 3), np.int32)
-        there = brick_keys(self._pool.bricks[self._pool.in_use])
+        there = grid_keys(self._pool.bricks[self._pool.in_use])
         told = self._told.bricks()
-        return self._told.drop(told[~np.isin(brick_keys(told), there)])
+        return self._told.drop(told[~np.isin(grid_keys(told), there)])
 
 
 class _ToldBricks:
@@ -124,7 +123,7 @@ class _ToldBricks:
         self, bricks: NDArray[np.int32], log_odds: NDArray[np.int16], seen: NDArray[np.uint8]
     ) -> NDArray[np.bool_]:
         """Remember what some bricks, each named once, hold; returns which of them are news, (n,)."""
-        keys = brick_keys(bricks).tolist()
+        keys = grid_keys(bricks).tolist()
         rows = np.array([self._rows.get(key, -1) for key in keys], np.int64)
         news = rows < 0
         old = np.flatnonzero(~news)
@@ -141,7 +140,7 @@ class _ToldBricks:
 
     def drop(self, bricks: NDArray[np.int32]) -> NDArray[np.int32]:
         """Forget bricks; returns those of them that were known."""
-        rows = [self._rows.pop(key, -1) for key in brick_keys(bricks).tolist()]
+        rows = [self._rows.pop(key, -1) for key in grid_keys(bricks).tolist()]
         self._free += [row for row in rows if row >= 0]
         return bricks[np.array(rows, np.int64) >= 0]
 

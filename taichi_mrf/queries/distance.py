@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.libraries import library
 from taichi_mrf.queries.box import voxel_box, voxels_of_box
 from taichi_mrf.queries.known_bricks import QueriedMap
-from taichi_mrf.queries.libraries import library
 from taichi_mrf.queries.points import FREE, OCCUPIED
 from taichi_mrf.voxels.memory import check_memory
 
@@ -74,7 +74,7 @@ def distance_field(
     a distance that is not positive, CapacityError for a box that does not fit memory, TaichiMRFError without
     SciPy.
     """
-    images = library("scipy.ndimage", "distances", "mesh")
+    images = library("scipy.ndimage", "distances need", "mesh")
     if unknown not in ("free", "occupied"):
         raise ConfigError(f"unknown must be free or occupied, not {unknown!r}")
     if not (np.isfinite(max_distance) and max_distance > 0):

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.libraries import library
 from taichi_mrf.queries.box import voxel_box
-from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, brick_keys, known_bricks, sorted_bricks
-from taichi_mrf.queries.libraries import library
+from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, known_bricks, sorted_bricks
 from taichi_mrf.queries.points import FREE, UNKNOWN
-from taichi_mrf.voxels.layout import CHUNK, CHUNK_VOXELS
+from taichi_mrf.voxels.layout import CHUNK, CHUNK_VOXELS, grid_keys
 
 _HALF_OF_NEIGHBOURS = np.stack(np.unravel_index(np.arange(14, 27), (3, 3, 3)), axis=1) - 1
 """13 of the 26 neighbours of a voxel; the others are these seen from the other side."""
@@ -39,8 +39,8 @@ def find_frontiers(m: QueriedMap, min_voxels: int = 1) -> Frontiers:
     """
     if min_voxels < 1:
         raise ConfigError(f"min_voxels must be at least 1, not {min_voxels}")
-    graphs = library("scipy.sparse", "frontiers", "mesh")
-    csgraph = library("scipy.sparse.csgraph", "frontiers", "mesh")
+    graphs = library("scipy.sparse", "frontiers need", "mesh")
+    csgraph = library("scipy.sparse.csgraph", "frontiers need", "mesh")
     voxels = frontier_voxels(m)
     pairs = _touching(voxels)
     graph = graphs.coo_matrix((np.ones(len(pairs), np.int8), pairs.T), (len(voxels), len(voxels)))
@@ -79,12 +79,12 @@ def frontier_voxels(m: QueriedMap) -> NDArray[np.int32]:
 
 def _touching(voxels: NDArray[np.int32]) -> NDArray[np.int64]:
     """Pairs (p, 2) of rows whose voxels touch."""
-    keys = brick_keys(voxels)  # any grid's coordinates
+    keys = grid_keys(voxels)
     order = np.argsort(keys)
     ascending = keys[order]
     pairs = [np.zeros((0, 2), np.int64)]
     for step in _HALF_OF_NEIGHBOURS:
-        wanted = brick_keys(voxels + step.astype(np.int32))
+        wanted = grid_keys(voxels + step.astype(np.int32))
         places = np.minimum(np.searchsorted(ascending, wanted), max(len(keys) - 1, 0))
         there = np.flatnonzero(ascending[places] == wanted) if len(keys) else np.zeros(0, np.int64)
         pairs.append(np.stack([there, order[places[there]]], axis=1))

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.poses import Pose
 from taichi_mrf.queries.points import FREE, classify
 from taichi_mrf.queries.view import View
-from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS
+from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, grid_keys
 
 Bricks = NDArray[np.int32]
 """(n, 3) brick coordinates in the world."""
@@ -53,7 +53,7 @@ class BrickReader:
     def __init__(self, m: QueriedMap) -> None:
         self.map, self.pool = m, m.view.pool
         slots = self.pool.in_use
-        keys = brick_keys(self.pool.bricks[slots])
+        keys = grid_keys(self.pool.bricks[slots])
         order = np.argsort(keys)
         self._keys, self._slots = keys[order], slots[order]
 
@@ -66,7 +66,7 @@ class BrickReader:
         """Slots in the pool, (n, 3) -> (n,), -1 for bricks without voxels."""
         if not len(self._keys):
             return np.full(len(bricks), -1, np.int32)
-        keys = brick_keys(bricks)
+        keys = grid_keys(bricks)
         rows = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
         return np.where(self._keys[rows] == keys, self._slots[rows], np.int32(-1))
 
@@ -124,15 +124,9 @@ def known_bricks(m: QueriedMap) -> Bricks:
     return sorted_bricks(np.concatenate([BrickReader(m).bricks, seen_free_bricks(m)]))
 
 
-def brick_keys(bricks: Bricks) -> NDArray[np.int64]:
-    """A number for each brick, (n, 3) -> (n,), ascending in x, then y, then z."""
-    shifted = bricks.astype(np.int64) + (1 << 20)
-    return (shifted[:, 0] << 42) | (shifted[:, 1] << 21) | shifted[:, 2]
-
-
 def sorted_bricks(bricks: Bricks) -> Bricks:
     """Each brick once, ascending."""
-    return bricks[np.unique(brick_keys(bricks), return_index=True)[1]]
+    return bricks[np.unique(grid_keys(bricks), return_index=True)[1]]
 
 
 def brick_centres(bricks: Bricks, voxel_size: float) -> NDArray[np.float64]:

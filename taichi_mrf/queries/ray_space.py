@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf import runtime
-from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, brick_keys, seen_free_bricks
-from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, seen_free_bricks
+from taichi_mrf.voxels.layout import BRICK, VOXELS, grid_keys
 from taichi_mrf.voxels.window import Window
 
 
@@ -24,7 +24,7 @@ class RaySpace:
         self.map = m
         self._reader = BrickReader(m)
         self._free = seen_free_bricks(m)
-        self._free_keys = brick_keys(self._free)
+        self._free_keys = grid_keys(self._free)
 
     @property
     def unknown_from(self) -> int:
@@ -50,7 +50,7 @@ class RaySpace:
         cells = np.arange(window.cells, dtype=np.int32)
         bricks = window.bricks_of(cells)
         slots = self._reader.slots(bricks)
-        unknown = (slots < 0) & ~np.isin(brick_keys(bricks), self._free_keys)
+        unknown = (slots < 0) & ~np.isin(grid_keys(bricks), self._free_keys)
         slots[unknown] = self._reader.pool.capacity
         there = slots >= 0
         index = self.map.view.index

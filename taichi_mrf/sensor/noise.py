@@ -125,12 +125,23 @@ def noise_from_config(config: SensorConfig, camera: PinholeCamera) -> NoiseModel
     if config.sigma_table is None and config.bias_table is None:
         return PolynomialNoise(config.sigma, config.bias)
     patches = -(-camera.width // config.patch) * -(-camera.height // config.patch)
-    sigma, bias = np.asarray([config.sigma] * patches), np.asarray([config.bias] * patches)
-    if config.sigma_table is not None:
-        sigma = _load_table(config.sigma_table, "sensor.sigma_table")
-    if config.bias_table is not None:
-        bias = _load_table(config.bias_table, "sensor.bias_table")
+    sigma, bias = patch_coefficients(config)
+    if config.sigma_table is None:
+        sigma = np.repeat(sigma, patches, axis=0)
+    if config.bias_table is None:
+        bias = np.repeat(bias, patches, axis=0)
     return PatchNoise(sigma, bias, config.patch, camera)
+
+
+def patch_coefficients(config: SensorConfig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Coefficients of sigma and of bias in ascending powers of depth: a row for each patch of the table that
+    is in force, or one for the whole image. Raises ConfigError naming field and file."""
+    sigma, bias = np.asarray([config.sigma], np.float64), np.asarray([config.bias], np.float64)
+    if config.sigma_table is not None:
+        sigma = _padded(_load_table(config.sigma_table, "sensor.sigma_table"), "sigma")
+    if config.bias_table is not None:
+        bias = _padded(_load_table(config.bias_table, "sensor.bias_table"), "bias")
+    return sigma, bias
 
 
 def evaluate(coefficients: NDArray[np.floating], depth_m: ArrayLike) -> NDArray[np.float64]:

@@ -7,7 +7,6 @@ flat density.
 """
 
 import dataclasses
-import importlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from typing import Any, Literal, get_args, get_origin
 
 from taichi_mrf.config import Config
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.libraries import library
 from taichi_mrf.viewer.ranges import Range
 from taichi_mrf.viewer.tune_knobs import KNOBS, Knob
 
@@ -121,10 +121,7 @@ def require_optuna() -> None:
 
 
 def _optuna() -> Any:
-    try:
-        return importlib.import_module("optuna")
-    except ImportError as error:
-        raise ConfigError("--auto needs Optuna: pip install 'taichi-mrf[auto]'") from error
+    return library("optuna", "--auto needs", "auto", ConfigError)
 
 
 def _dimension(name: str, start: Config) -> Dimension:

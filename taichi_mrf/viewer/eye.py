@@ -10,6 +10,10 @@ from taichi_mrf.viewer.look import Up, up_vector
 _GROWTH = 1.2
 """The first view is chosen anew when the map has grown by this factor."""
 
+_PANEL_SHARE = 0.2
+"""How far the map's middle lies left of the window's, as a share of the map's size: the panel covers the
+right."""
+
 _BEHIND_M, _ABOVE_M, _AHEAD_M = 1.5, 0.7, 2.0
 
 
@@ -76,13 +80,15 @@ class Eye:
         aside = np.zeros(3)
         camera = centre if self._camera is None else self._camera[:3, 3]
         aside[short], aside[long] = np.sign(camera[short] - centre[short]) or 1.0, 0.35
-        eye = centre + 0.5 * size * aside / np.linalg.norm(aside) + 0.7 * size * up
-        self._view = eye, centre
+        right = np.cross(up, aside) / np.linalg.norm(aside)
+        target = centre + _PANEL_SHARE * size * right
+        eye = target + 0.5 * size * aside / np.linalg.norm(aside) + 0.7 * size * up
+        self._view = eye, target
         start = self._server.initial_camera
-        start.position, start.look_at = eye, centre
+        start.position, start.look_at = eye, target
         for id, client in self._server.get_clients().items():
             if np.allclose(client.camera.position, self._placed.get(id, np.inf), atol=1e-3):
-                self._point(client, eye, centre)
+                self._point(client, eye, target)
 
     def _point(
         self, client: viser.ClientHandle, eye: NDArray[np.float64], target: NDArray[np.float64]

@@ -1,11 +1,20 @@
-"""What the user should know, as the list that every page shows of it."""
+"""What the user should know: the list that every page shows of it, and what pops up over the page."""
 
 import html
 from collections.abc import Iterable
+from typing import Literal
+
+import viser
 
 from taichi_mrf.viewer.messages import Notice
 
 _COLORS = {"info": "inherit", "warning": "#c77700", "error": "#c62828"}
+_POP_UP_COLORS: dict[str, Literal["blue", "yellow", "red"]] = {
+    "info": "blue",
+    "warning": "yellow",
+    "error": "red",
+}
+_POP_UP_S = 8.0
 
 
 def notices_html(notices: Iterable[Notice]) -> str:
@@ -15,3 +24,11 @@ def notices_html(notices: Iterable[Notice]) -> str:
         for each in notices
     )
     return f'<div style="margin:0.5em 0.75em;font-size:0.85em">{lines}</div>'
+
+
+def pop_up(server: viser.ViserServer, notice: Notice) -> None:
+    """Show a notice for some seconds in every browser that looks at the page."""
+    title = "Something went wrong" if notice.severity == "error" else "Note"
+    color = _POP_UP_COLORS[notice.severity]
+    for client in server.get_clients().values():
+        client.add_notification(title, notice.text, auto_close_seconds=_POP_UP_S, color=color)

@@ -4,10 +4,8 @@ Everything that happens, an update from the mapper or something that a viewer di
 is dealt with on one thread, so that no two ever change the same node.
 """
 
-import queue
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import viser
@@ -17,20 +15,18 @@ from taichi_mrf.viewer.coloring import Scale, legend_html
 from taichi_mrf.viewer.downloads import Downloads
 from taichi_mrf.viewer.events import Chosen, Clicked, Dragged, Event, Joined, OptionsMoved, Pressed
 from taichi_mrf.viewer.eye import Eye
+from taichi_mrf.viewer.inbox import Inbox, Item
 from taichi_mrf.viewer.keyframe_layer import KeyframeLayer, Placement
 from taichi_mrf.viewer.look import up_of
 from taichi_mrf.viewer.map_scene import MapScene
+from taichi_mrf.viewer.notices import pop_up
 from taichi_mrf.viewer.options import ViewOptions
 from taichi_mrf.viewer.panel import CHOSEN_KEYFRAME, POSITION_STEP_M, SPEEDS, Panel
 from taichi_mrf.viewer.picking import first_pixel, first_voxel
 
-_NOTICE_COLORS: dict[str, Any] = {"info": "blue", "warning": "yellow", "error": "red"}
 _HEAD_START_S = 0.01
 """What the event loop needs to send a sentence before the voxels that it is about: they go out in one
 piece, and a browser that draws by software is busy with them for half a second."""
-
-_NOTICE_TITLES = {"info": "Note", "warning": "Note", "error": "Something went wrong"}
-_NOTICE_S = 8.0
 
 
 class Page:
@@ -39,7 +35,7 @@ class Page:
     def __init__(self, server: viser.ViserServer, ask: Callable[[m.Request], None]) -> None:
         """``ask`` sends a request to the mapper, and does not wait."""
         self._server, self._ask = server, ask
-        self.inbox: queue.SimpleQueue[m.Update | Event | None] = queue.SimpleQueue()
+        self.inbox = Inbox()
         self._options = ViewOptions()
         self._panel = Panel(server.gui, server.scene, self.inbox.put)
         self._downloads = Downloads(server, lambda text: self.inbox.put(m.Notice(text, "error")))
@@ -56,12 +52,7 @@ class Page:
     def run(self) -> None:
         """Serve until None is put into the inbox."""
         while True:
-            try:
-                batch = [self.inbox.get(timeout=None if self._map is None else self._map.patience())]
-            except queue.Empty:
-                batch = []
-            while not self.inbox.empty():
-                batch.append(self.inbox.get())
+            batch = self.inbox.wait(None if self._map is None else self._map.patience())
             self._downloads.tick()
             for item in _latest(batch):
                 if item is None:
@@ -151,11 +142,7 @@ class Page:
 
     def _notify(self, notice: m.Notice) -> None:
         self._panel.show_notice(notice)
-        color = _NOTICE_COLORS[notice.severity]
-        for client in self._server.get_clients().values():
-            client.add_notification(
-                _NOTICE_TITLES[notice.severity], notice.text, auto_close_seconds=_NOTICE_S, color=color
-            )
+        pop_up(self._server, notice)
 
     def _options_moved(self) -> None:
         before, self._options = self._options, self._panel.options()
@@ -274,9 +261,9 @@ def _extras(options: ViewOptions) -> tuple[bool, bool]:
     return options.beside, options.color_by == "keyframes"
 
 
-def _latest(batch: list[m.Update | Event | None]) -> list[m.Update | Event | None]:
+def _latest(batch: list[Item]) -> list[Item]:
     """The batch without what a later item of it makes superfluous."""
-    kept: list[m.Update | Event | None] = []
+    kept: list[Item] = []
     passing: set[type] = set()
     for item in reversed(batch):
         if isinstance(item, m.Status | m.CurrentCamera | m.Images | OptionsMoved):

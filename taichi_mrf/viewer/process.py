@@ -3,7 +3,6 @@
 It is spawned by whoever maps, and ends when told to or when that process is gone.
 """
 
-import queue
 import signal
 import threading
 from collections.abc import Callable
@@ -13,6 +12,7 @@ from typing import Any, Protocol
 import viser
 
 from taichi_mrf.errors import ViewerError
+from taichi_mrf.viewer.inbox import Inbox
 from taichi_mrf.viewer.messages import Listening, Notice, Quit, Request
 from taichi_mrf.viewer.page import Page
 from taichi_mrf.viewer.server import start_server
@@ -23,7 +23,7 @@ TITLE = "taichi_mrf"
 class AnyPage(Protocol):
     """What owns the scene and the widgets: of live, or of tune."""
 
-    inbox: queue.SimpleQueue[Any]
+    inbox: Inbox
 
     def run(self) -> None:
         """Serve until None is put into the inbox."""

@@ -1,5 +1,6 @@
 """The sensor's noise as the map sees it: residuals against depth, with the curves in force over them."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,8 @@ from numpy.typing import NDArray
 from viser import uplot
 
 from taichi_mrf.config import SensorConfig
-from taichi_mrf.sensor.noise import LEAST_SIGMA_M
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.sensor.noise import LEAST_SIGMA_M, evaluate, patch_coefficients
 from taichi_mrf.viewer.tune_messages import Residuals
 
 SPREADS_SHOWN = 4.0
@@ -36,12 +38,44 @@ _SERIES = (
 )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class NoiseCurves:
+    """Bias and sigma in force: coefficients in ascending powers of depth, a row for each patch of an image.
+    ``note`` says where they come from, if not from the page's own sliders."""
+
+    sigma: NDArray[np.float64]
+    bias: NDArray[np.float64]
+    note: str = ""
+
+    @classmethod
+    def of(cls, sensor: SensorConfig) -> "NoiseCurves":
+        """Those of a configuration. A table that has gone since the map was made is left out, and said so."""
+        tables = [name for name in ("sigma", "bias") if getattr(sensor, f"{name}_table") is not None]
+        if not tables:
+            return cls(*patch_coefficients(sensor))
+        try:
+            coefficients = patch_coefficients(sensor)
+        except ConfigError as error:
+            nowhere = np.full((1, 1), np.nan)
+            return cls(nowhere, nowhere, f"The curves are not drawn: {error}.")
+        names = " and ".join(tables)
+        return cls(
+            *coefficients, f"For {names} the curves are the mean over the patches of the table in force."
+        )
+
+    def at(self, depth_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Bias and sigma at some depths, in metres, means over all patches; (n,) each."""
+        bias, sigma = (evaluate(rows[:, None, :], depth_m) for rows in (self.bias, self.sigma))
+        return bias.mean(axis=0), np.maximum(sigma, LEAST_SIGMA_M).mean(axis=0)
+
+
 class NoisePlot:
     """Owns the plot; curves follow the sliders at once, residuals come with each map."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._residuals: Residuals | None = None
         self._sensor = SensorConfig()
+        self._curves = NoiseCurves.of(self._sensor)
         nothing = tuple(np.zeros(2) for _ in _SERIES)
         self._plot: Any = gui.add_uplot(
             nothing,
@@ -62,21 +96,21 @@ class NoisePlot:
     def follow(self, sensor: SensorConfig) -> None:
         """Draw the curves of these coefficients."""
         if sensor != self._sensor:
-            self._sensor = sensor
+            self._sensor, self._curves = sensor, NoiseCurves.of(sensor)
             self._draw()
 
     def _draw(self) -> None:
         if self._residuals is None:
             return
-        data = plot_data(self._residuals, self._sensor)
-        reach = _reach_mm(self._residuals, self._sensor)
+        data = plot_data(self._residuals, self._curves)
+        reach = _reach_mm(self._residuals, self._curves)
         self._plot.scales = {"x": uplot.Scale(time=False), "y": uplot.Scale(range=(-reach, reach))}
         self._plot.data = data
         self._plot.visible = True
-        self.text.content = sentence(self._residuals, self._sensor)
+        self.text.content = sentence(self._residuals, self._curves)
 
 
-def plot_data(residuals: Residuals, sensor: SensorConfig) -> tuple[NDArray[np.float64], ...]:
+def plot_data(residuals: Residuals, curves: NoiseCurves) -> tuple[NDArray[np.float64], ...]:
     """Depth in metres, and over it in millimetres: residuals, medians and spreads of bins, bias and
     bias ± sigma; NaN where a residual or a bin has no point. All (n,)."""
     depth, bins = residuals.depth_m.astype(np.float64), residuals.bin_m
@@ -88,7 +122,7 @@ def plot_data(residuals: Residuals, sensor: SensorConfig) -> tuple[NDArray[np.fl
         column[begin : begin + len(values_m)] = 1000.0 * values_m
         return column[order]
 
-    bias, sigma = (1000.0 * curve for curve in curves_m(sensor, x[order]))
+    bias, sigma = (1000.0 * curve for curve in curves.at(x[order]))
     return (
         x[order],
         placed(0, residuals.residual_m),
@@ -101,32 +135,25 @@ def plot_data(residuals: Residuals, sensor: SensorConfig) -> tuple[NDArray[np.fl
     )
 
 
-def _reach_mm(residuals: Residuals, sensor: SensorConfig) -> float:
+def _reach_mm(residuals: Residuals, curves: NoiseCurves) -> float:
     """The largest residual that the plot has room for."""
     if not len(residuals.bin_m):
         return 100.0
-    bias, sigma = curves_m(sensor, residuals.bin_m)
+    bias, sigma = (np.nan_to_num(curve) for curve in curves.at(residuals.bin_m))
     usual_m = max(float(np.median(residuals.spread_m)), float(np.median(sigma)))
     offset_m = max(float(np.median(np.abs(residuals.median_m))), float(np.max(np.abs(bias))))
     return 1000.0 * (SPREADS_SHOWN * usual_m + offset_m)
 
 
-def curves_m(sensor: SensorConfig, depth_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Bias and sigma at some depths, as the polynomials have them; (n,) each."""
-    bias, sigma = (np.polynomial.polynomial.polyval(depth_m, terms) for terms in (sensor.bias, sensor.sigma))
-    return np.asarray(bias), np.maximum(sigma, LEAST_SIGMA_M)
-
-
-def sentence(residuals: Residuals, sensor: SensorConfig) -> str:
+def sentence(residuals: Residuals, curves: NoiseCurves) -> str:
     """What the plot says, in words."""
     if not len(residuals.bin_m):
         return "The map has no answer for the held-out views."
-    _, sigma = curves_m(sensor, residuals.bin_m)
-    ratio = float(np.median(residuals.spread_m / sigma))
-    tables = [name for name in ("sigma", "bias") if getattr(sensor, f"{name}_table") is not None]
-    note = f" The {' and the '.join(tables)} in force come from a table and are not drawn." if tables else ""
+    points = "Grey: measured minus expected depth in held-out views, mm. Blue: its median and spread. "
+    ratio = float(np.median(residuals.spread_m / curves.at(residuals.bin_m)[1]))
+    if not np.isfinite(ratio):
+        return points + curves.note
     return (
-        "Grey: measured minus expected depth in held-out views, mm. Blue: its median and spread. "
-        f"Orange: bias and bias ± sigma. The spread is **{ratio:.1f} times** sigma; the map's own error, "
-        f"some tenths of a voxel, is part of it.{note}"
-    )
+        f"{points}Orange: bias and bias ± sigma. The spread is **{ratio:.1f} times** sigma; the map's own "
+        f"error, some tenths of a voxel, is part of it. {curves.note}"
+    ).rstrip()

@@ -4,9 +4,7 @@ Everything that happens goes into one inbox and is dealt with on one thread. The
 that the sliders stand for, exactly: a slider's steps touch only the parameter that was moved.
 """
 
-import queue
 from collections.abc import Callable
-from typing import Any
 
 import viser
 
@@ -18,14 +16,13 @@ from taichi_mrf.viewer.coloring import Scale, legend_html
 from taichi_mrf.viewer.downloads import Downloads
 from taichi_mrf.viewer.events import Chosen, Event, Joined, KnobMoved, OptionsMoved, Pressed
 from taichi_mrf.viewer.eye import Eye
+from taichi_mrf.viewer.inbox import Inbox
 from taichi_mrf.viewer.keyframe_layer import KeyframeLayer
 from taichi_mrf.viewer.look import up_of
 from taichi_mrf.viewer.map_scene import MapScene
+from taichi_mrf.viewer.notices import pop_up
 from taichi_mrf.viewer.options import ViewOptions
 from taichi_mrf.viewer.tune_panel import TunePanel
-
-_NOTICE_COLORS: dict[str, Any] = {"info": "blue", "warning": "yellow", "error": "red"}
-_NOTICE_S = 8.0
 
 
 class TunePage:
@@ -34,7 +31,7 @@ class TunePage:
     def __init__(self, server: viser.ViserServer, ask: Callable[[m.Request], None]) -> None:
         """``ask`` sends a request to the tuning process, and does not wait."""
         self._server, self._ask = server, ask
-        self.inbox: queue.SimpleQueue[m.Update | Event | None] = queue.SimpleQueue()
+        self.inbox = Inbox()
         self._options, self._config = ViewOptions(), Config()
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         self._panel = TunePanel(server.gui, self._config, self.inbox.put)
@@ -56,12 +53,7 @@ class TunePage:
     def run(self) -> None:
         """Serve until None is put into the inbox."""
         while True:
-            try:
-                batch = [self.inbox.get(timeout=None if self._map is None else self._map.patience())]
-            except queue.Empty:
-                batch = []
-            while not self.inbox.empty():
-                batch.append(self.inbox.get())
+            batch = self.inbox.wait(None if self._map is None else self._map.patience())
             for item in batch:
                 if item is None:
                     return
@@ -224,10 +216,4 @@ class TunePage:
 
     def _notify(self, notice: m.Notice) -> None:
         self._panel.show_notice(notice)
-        for client in self._server.get_clients().values():
-            client.add_notification(
-                "Something went wrong" if notice.severity == "error" else "Note",
-                notice.text,
-                auto_close_seconds=_NOTICE_S,
-                color=_NOTICE_COLORS[notice.severity],
-            )
+        pop_up(self._server, notice)

@@ -1,0 +1,129 @@
+"""Makes the pictures of the documentation: docs/images/*.jpg, all or those that are named.
+
+    python docs/make_pictures.py                       # all
+    python docs/make_pictures.py mesh.jpg cuts.jpg     # these
+
+The built-in room is mapped, watched and tuned as a person would, by the command line and in a browser. Needs
+what the browser tests need (playwright, extra dev; Debian's chromium) and the extra ``mesh``. The clip of the
+front page has a script of its own, make_clip.py.
+"""
+
+import io
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(REPOSITORY / "tests"))  # the browser tests' hands and eyes serve here too
+
+import map_pictures  # noqa: E402
+import page_pictures  # noqa: E402
+from browser import LivePage, chromium  # noqa: E402
+from live_program import LiveProgram  # noqa: E402
+from PIL import Image  # noqa: E402
+from tune_program import TuneProgram  # noqa: E402
+
+import taichi_mrf  # noqa: E402
+
+IMAGES = REPOSITORY / "docs" / "images"
+ROOM = "synthetic:room"
+WIDTH = 1280
+MOST_BYTES = 140_000
+QUALITIES = range(80, 40, -4)
+"""Of JPEG, the best that is small enough wins."""
+
+Draw = Callable[[Any], Image.Image]
+
+OF_A_MAP: dict[str, Draw] = {
+    "room.jpg": map_pictures.overview,
+    "level_map.jpg": map_pictures.level_map,
+    "cuts.jpg": map_pictures.cuts,
+    "mesh.jpg": map_pictures.mesh,
+}
+"""Drawn from the folder that ``taichi-mrf map`` leaves, which is what ``make run`` does."""
+
+OF_THE_LIVE_PAGE: dict[str, Draw] = {
+    "live_cut.jpg": page_pictures.live_cut,
+    "live_keyframes.jpg": page_pictures.live_keyframes,
+    "live_images.jpg": page_pictures.live_images,
+    "live_beside.jpg": page_pictures.live_beside,
+}
+OF_THE_TUNING_PAGE: dict[str, Draw] = {
+    "tune.jpg": page_pictures.tune_noise,
+    "tune_panels.jpg": page_pictures.tune_panels,
+}
+"""Both want the tries that the first one makes."""
+
+
+def main() -> None:
+    """Make what the arguments name, or everything."""
+    known = [*OF_A_MAP, *OF_THE_LIVE_PAGE, *OF_THE_TUNING_PAGE]
+    wanted = sys.argv[1:] or known
+    strange = sorted(set(wanted) - set(known))
+    if strange:
+        sys.exit(f"no such picture: {', '.join(strange)}; there are {', '.join(known)}")
+    for pictures, source in (
+        (OF_A_MAP, a_map),
+        (OF_THE_LIVE_PAGE, the_live_page),
+        (OF_THE_TUNING_PAGE, the_tuning_page),
+    ):
+        if not set(wanted) & set(pictures):
+            continue
+        with source() as looked_at:
+            for name, draw in pictures.items():
+                if name in wanted:
+                    write(draw(looked_at), IMAGES / name)
+
+
+@contextmanager
+def a_map() -> Iterator[Path]:
+    """The folder that a run leaves."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "taichi_mrf", "map", ROOM, "--out", folder]
+        subprocess.run(command, cwd=REPOSITORY, check=True, stdout=subprocess.DEVNULL)
+        taichi_mrf.init()
+        yield Path(folder)
+
+
+@contextmanager
+def the_live_page() -> Iterator[LivePage]:
+    """The live page of the whole room."""
+    with (
+        LiveProgram(ROOM, "--voxel-size", "0.05") as program,
+        chromium() as browser,
+        LivePage(browser, program.address, WIDTH, 800) as page,
+    ):
+        page.until_settled()
+        yield page
+
+
+@contextmanager
+def the_tuning_page() -> Iterator[LivePage]:
+    """The tuning page of twelve frames of the room."""
+    with (
+        TuneProgram(ROOM, "--voxel-size", "0.05", "--port", "0") as program,
+        chromium() as browser,
+        LivePage(browser, program.address(), WIDTH, 1160) as page,
+    ):
+        page.until_settled()
+        page_pictures.make_tries(page)
+        yield page
+
+
+def write(picture: Image.Image, path: Path) -> None:
+    """A JPEG of at most MOST_BYTES."""
+    for quality in QUALITIES:
+        buffer = io.BytesIO()
+        picture.save(buffer, "JPEG", quality=quality, optimize=True, progressive=True)
+        if buffer.tell() <= MOST_BYTES:
+            break
+    path.write_bytes(buffer.getvalue())
+    print(f"wrote {path.relative_to(REPOSITORY)}: {buffer.tell() / 1000:.0f} kB, quality {quality}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,149 @@
+"""What make_pictures.py does on the live page and on the tuning page before it photographs them.
+
+Each function brings the page into the state that it names, returns the picture, and leaves the page fit for
+the next one, whatever that is.
+"""
+
+import io
+import re
+
+from browser import LivePage
+from PIL import Image
+
+TRIES = (
+    ("Parameters", "Surface density (per m)", 5.0),
+    ("Parameters", "Voxel size (m)", 0.08),
+    ("Parameters", "Voxel size (m)", 0.04),
+    ("Noise", "Sigma · 1 (m)", 0.004),
+)
+"""What is tried before the pictures of the tuning page are taken: tab, slider, value."""
+
+HIGH = 1440
+"""Pixels: a window in which the whole panel has room, with three images."""
+
+STEADY_S = 10.0
+"""A map that has not changed for so long is complete."""
+
+
+def shot(page: LivePage) -> Image.Image:
+    """What the page looks like, once it has drawn what it knows and nothing pops up over it."""
+    for button in page.page.locator(".mantine-Notification-closeButton").all():
+        button.click()
+    page.page.mouse.move(5, 5)  # off the widgets, whose hints would pop up
+    page.pause(1.5)
+    return Image.open(io.BytesIO(page.page.screenshot())).convert("RGB")
+
+
+def live_cut(page: LivePage) -> Image.Image:
+    """The map opened by a level cut at the height of the furniture."""
+    page.tab("Map")
+    page.select("Cut axis", "z")
+    page.slide("Cut at", 0.3)
+    page.until_settled()
+    picture = shot(page)
+    page.select("Cut axis", "none")
+    page.until_settled()
+    return picture
+
+
+def live_keyframes(page: LivePage) -> Image.Image:
+    """A keyframe with the gizmo that moves it, the map coloured by how many keyframes' rays went through."""
+    page.tab("Map")
+    page.select("Color by", "keyframes")
+    page.tab("Keyframes")
+    page.select("Keyframe", re.compile("room-0009"))
+    page.press("Move")
+    page.until(lambda seen: seen.settled and any("gizmo" in name for name in seen.nodes), "the gizmo")
+    picture = shot(page)
+    page.press("Move")
+    page.tab("Map")
+    page.select("Color by", "marginal")
+    page.until_settled()
+    return picture
+
+
+def live_images(page: LivePage) -> Image.Image:
+    """Measured and rendered depth and accuracy of a keyframe."""
+    page.tab("Keyframes")
+    page.select("Keyframe", re.compile("room-0009"))
+    page.tab("Images")
+    page.select("View", "chosen keyframe")
+    page.tick("Show images")
+    page.page.locator("img").nth(2).wait_for(state="visible")
+    page.until_settled()
+    picture = panel(page)
+    page.tick("Show images", on=False)
+    return picture
+
+
+def live_beside(page: LivePage) -> Image.Image:
+    """The map that OctoMap's way makes of the same keyframes, next to this one."""
+    page.tab("Map")
+    page.select("Cut axis", "z")
+    page.slide("Cut at", 0.6)
+    page.tick("Beside")
+    page.until(lambda seen: seen.beside, "the other map")
+    counts: list[int] = []
+    while len(counts) < 2 or counts[-1] != counts[-2]:  # it grows for as long as keyframes come
+        page.pause(STEADY_S)
+        counts.append(page.until(lambda seen: seen.settled, "the other map").beside)
+    picture = shot(page)
+    page.tick("Beside", on=False)
+    page.select("Cut axis", "none")
+    page.until(lambda seen: seen.settled and not seen.beside, "one map")
+    return picture
+
+
+def make_tries(page: LivePage) -> None:
+    """Some tries, one of them the reference: all pictures of the tuning page begin with them."""
+    for number, (tab, label, value) in enumerate(TRIES, start=1):
+        page.tab(tab)
+        page.slide(label, value)
+        page.until(lambda seen, n=number: seen.settled and f"Try {n}" in page.text(), f"try {number} at rest")
+    page.tab("Tries")
+    page.select("Try", re.compile("^1: "))
+    page.press("Pin")
+    page.until(lambda seen: "against try 1" in page.text(), "the reference")
+
+
+def tune_noise(page: LivePage) -> Image.Image:
+    """Map, scores, and the residuals with the curves of bias and sigma."""
+    page.tab("Noise")
+    page.page.locator(".uplot canvas").first.wait_for(state="visible")
+    return shot(page)
+
+
+def tune_panels(page: LivePage) -> Image.Image:
+    """The table of tries beside a held-out view as the reference and the try that is shown have it."""
+    page.tab("Tries")
+    tries = panel(page)
+    page.tab("Views")
+    page.until(lambda seen: page.page.locator("img").count() >= 4, "reference, this one, change, measured")
+    return side_by_side(tries, panel(page))
+
+
+def panel(page: LivePage) -> Image.Image:
+    """The tab that is in front, whole, and nothing else of the page."""
+    size = page.page.viewport_size
+    assert size is not None
+    page.page.set_viewport_size({"width": size["width"], "height": HIGH})
+    page.pause(1.0)
+    box = page.page.locator(".mantine-Paper-root").first.bounding_box()
+    tabs = page.page.get_by_role("tab").first.bounding_box()
+    assert box is not None
+    assert tabs is not None
+    edges = box["x"], tabs["y"], box["x"] + box["width"], box["y"] + box["height"]
+    picture = shot(page).crop(tuple(map(int, edges)))
+    page.page.set_viewport_size(size)
+    return picture
+
+
+def side_by_side(*pictures: Image.Image) -> Image.Image:
+    """Pictures in a row on white, their upper ends level."""
+    size = sum(each.width for each in pictures), max(each.height for each in pictures)
+    row = Image.new("RGB", size, "white")
+    left = 0
+    for picture in pictures:
+        row.paste(picture, (left, 0))
+        left += picture.width
+    return row

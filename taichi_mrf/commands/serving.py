@@ -1,0 +1,44 @@
+"""What the commands with a page have in common: who may reach it, where it is, and who goes first."""
+
+import os
+import webbrowser
+from collections.abc import Callable
+
+from taichi_mrf.viewer.messages import Listening
+
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+
+NICENESS = 10
+"""Mapping leaves the page the processor when both want it."""
+
+Say = Callable[[str], None]
+
+
+def warn_of_host(host: str, port: int, what_they_can: str, say: Say) -> None:
+    """Say what it means to serve the page to other machines, if that is what ``host`` does."""
+    if host in LOOPBACK:
+        return
+    say(
+        f"Warning: the page at --host {host} has no password: whoever can reach this machine can "
+        f"{what_they_can}. It is safer to leave --host away and to tunnel from where you watch: "
+        f"ssh -L {port}:127.0.0.1:{port} USER@THIS-MACHINE"
+    )
+
+
+def let_the_page_go_first() -> None:
+    """Lower this process's priority: once the page has been started, so that it keeps its own, and before
+    Taichi starts threads, which inherit it."""
+    if hasattr(os, "nice"):  # not on Windows
+        os.nice(NICENESS)
+
+
+def tell_address(where: Listening, what: str, wanted_port: int, open_browser: bool, say: Say) -> None:
+    """Say where the page is, and that another port was taken than the wanted one (0: any); open a browser if
+    asked."""
+    host = f"[{where.host}]" if ":" in where.host else where.host
+    address = f"http://{host}:{where.port}"
+    say(f"{what} is at {address}  (Ctrl-C ends it)")
+    if wanted_port not in (0, where.port):
+        say(f"Port {wanted_port} is busy, so the page took {where.port}.")
+    if open_browser:
+        webbrowser.open(address)

@@ -1,0 +1,21 @@
+"""Libraries that only some users need: loaded when they are first used, and one helpful line without them."""
+
+import importlib
+from typing import Any
+
+from taichi_mrf.errors import TaichiMRFError
+
+
+def library(name: str, who_needs: str, extra: str, error: type[TaichiMRFError] = TaichiMRFError) -> Any:
+    """The module ``name``, which comes with an ``extra`` of this package.
+
+    Raises ``error`` if it is not there: ``who_needs``, such as "meshes need", begins its text, which says
+    what to install.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as missing:
+        package = name.partition(".")[0]
+        raise error(
+            f"{who_needs} {package}, which is not installed: pip install 'taichi-mrf[{extra}]'"
+        ) from missing
