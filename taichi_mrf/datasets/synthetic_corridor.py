@@ -44,7 +44,7 @@ class SyntheticCorridor(RenderedSequence):
     options: CorridorOptions = CorridorOptions()
 
     @cached_property
-    def scene(self) -> Scene:  # type: ignore[override]
+    def scene(self) -> Scene:
         """The corridor and its rooms, in the world frame."""
         return corridor_scene(self.options.rooms)
 

@@ -31,7 +31,7 @@ class SyntheticRoom(RenderedSequence):
     options: RenderOptions = RoomOptions()
 
     @cached_property
-    def scene(self) -> Scene:  # type: ignore[override]
+    def scene(self) -> Scene:
         """The solids in the room, in the world frame."""
         return room_scene()
 

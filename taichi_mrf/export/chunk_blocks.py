@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-import taichi_mrf
-from taichi_mrf.config import Config, to_yaml
+from taichi_mrf.config import Config
 from taichi_mrf.export.chunk_store import Chunk, ChunkStore, StoreHeader, new_store
-from taichi_mrf.queries.known_bricks import Bricks, BrickReader, QueriedMap, known_bricks
+from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, known_bricks
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS
 
 
@@ -18,30 +17,25 @@ def by_chunk(bricks: Bricks) -> Iterator[tuple[Chunk, NDArray[np.int64]]]:
     chunks, owner = np.unique(bricks // CHUNK, axis=0, return_inverse=True)
     order = np.argsort(owner.reshape(-1), kind="stable")
     ends = np.cumsum(np.bincount(owner.reshape(-1), minlength=len(chunks)))
-    for (x, y, z), rows in zip(chunks.tolist(), np.split(order, ends[:-1]) if len(chunks) else (), strict=True):
-        yield (x, y, z), rows
+    for number, (x, y, z) in enumerate(chunks.tolist()):
+        yield (x, y, z), order[ends[number - 1] if number else 0 : ends[number]]
 
 
 def chunk_block(chunk: Chunk, bricks: Bricks, log_odds: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(64, 64, 64) log-odds of a chunk from those of its bricks, (n, 512), or (n, 1) for the same all over a
-    brick; NaN elsewhere."""
+    """(64, 64, 64) log-odds of a chunk from those of its bricks, (n, 512); NaN elsewhere."""
     block = np.full((CHUNK, BRICK, CHUNK, BRICK, CHUNK, BRICK), np.nan, np.float32)
     x, y, z = (bricks - np.array(chunk) * CHUNK).T
-    shape = (BRICK,) * 3 if log_odds.shape[1] > 1 else (1, 1, 1)
-    block[x, :, y, :, z, :] = log_odds.reshape(-1, *shape)
+    block[x, :, y, :, z, :] = log_odds.reshape(-1, BRICK, BRICK, BRICK)
     return block.reshape((CHUNK_VOXELS,) * 3)
 
 
 def write_chunks(path: str | Path, m: QueriedMap, config: Config) -> None:
-    """Write a map in memory to a store, chunk by chunk. Raises MapFileError, TaichiMRFError without zarr."""
+    """Write a map in memory, made with ``config``, to a store, chunk by chunk. Raises MapFileError,
+    TaichiMRFError without zarr."""
     reader = BrickReader(m)
-    prior = reader.pool.prior_log_odds
-    header = StoreHeader(
-        m.voxel_size, prior, prior - config.inference.message_clamp, config.volume.min_evidence,
-        to_yaml(config), taichi_mrf.__version__,
-    )  # fmt: skip
     bricks = known_bricks(m)
     with new_store(path) as folder:
+        header = StoreHeader.of(config, reader.pool.prior_log_odds)
         store = ChunkStore.create(folder, header, np.unique(bricks // CHUNK, axis=0))
         for chunk, rows in by_chunk(bricks):
             store.write(chunk, chunk_block(chunk, bricks[rows], reader.log_odds(bricks[rows])))

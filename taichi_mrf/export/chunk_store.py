@@ -1,9 +1,10 @@
 """A map as a chunked array on disk, in zarr 3, for maps that are larger than memory.
 
 The folder is a zarr group. Its array ``log_odds`` (x, y, z) float32 has a zarr chunk for each chunk of 64^3
-voxels, NaN where nothing is known, and nothing on disk where a whole chunk is unknown. ``chunks`` (n, 3) int32
-lists the chunks that there are, in the world's coordinates: chunk c covers the voxels [64 c, 64 (c + 1)). The
-attributes say the rest: see :class:`StoreHeader`, and ``origin_m``, the outer corner of the array's first voxel.
+voxels, NaN where nothing is known, and nothing on disk where a whole chunk is unknown. ``chunks`` (n, 3)
+int32 lists the chunks that there are, in the world's coordinates: chunk c covers the voxels from 64 c up to,
+but without, 64 (c + 1). The attributes say the rest: see :class:`StoreHeader`, and ``origin_m``, the outer
+corner of the array's first voxel.
 """
 
 import os
@@ -18,6 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import taichi_mrf
+from taichi_mrf.config import Config, to_yaml
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.queries.libraries import library
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
@@ -32,8 +35,8 @@ Chunk = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class StoreHeader:
-    """What holds for all voxels: ``voxel_size`` in metres, the log-odds of the ``prior`` and of space that was
-    ``seen_free`` without a surface near, the evidence from which a voxel counts as known, the configuration
+    """What holds for all voxels: ``voxel_size`` in metres, the log-odds of the prior and of space that was
+    seen to be free without a surface near, the evidence from which a voxel counts as known, the configuration
     as YAML and the version of the package that made the map."""
 
     voxel_size: float
@@ -42,6 +45,18 @@ class StoreHeader:
     min_evidence: float
     config: str
     version: str
+
+    @staticmethod
+    def of(config: Config, prior_log_odds: float) -> "StoreHeader":
+        """The header of a map that this version has made with a configuration."""
+        return StoreHeader(
+            voxel_size=config.voxel_size,
+            prior_log_odds=prior_log_odds,
+            seen_free_log_odds=prior_log_odds - config.inference.message_clamp,
+            min_evidence=config.volume.min_evidence,
+            config=to_yaml(config),
+            version=taichi_mrf.__version__,
+        )
 
 
 class ChunkStore:
@@ -62,7 +77,9 @@ class ChunkStore:
         """
         zarr = library("zarr", "maps in chunks", "store")
         path = Path(path)
-        lowest, highest = (chunks.min(axis=0), chunks.max(axis=0)) if len(chunks) else (np.zeros(3), np.zeros(3))
+        lowest, highest = (
+            (chunks.min(axis=0), chunks.max(axis=0)) if len(chunks) else (np.zeros(3), np.zeros(3))
+        )
         shape = (highest - lowest + 1).astype(int) * CHUNK_VOXELS
         origin_m = lowest * CHUNK_VOXELS * header.voxel_size
         place = {"lowest_chunk": lowest.astype(int).tolist(), "origin_m": origin_m.tolist()}
@@ -81,7 +98,7 @@ class ChunkStore:
 
     @classmethod
     def open(cls, path: str | Path) -> "ChunkStore":
-        """A store that there is. Raises MapFileError, which says what is wrong, TaichiMRFError without zarr."""
+        """A store that there is. Raises MapFileError, naming what is wrong, TaichiMRFError without zarr."""
         zarr = library("zarr", "maps in chunks", "store")
         path = Path(path)
         if not path.is_dir():

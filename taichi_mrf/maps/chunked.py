@@ -101,20 +101,23 @@ class ChunkedMap:
         (N,). Raises ConfigError for a probability outside [0, 1] and for corners that make no box."""
         if not 0 <= min_probability <= 1:
             raise ConfigError(f"min_probability must lie between 0 and 1, not {min_probability}")
-        centres, found = [np.zeros((0, 3))], [np.zeros(0, np.float32)]
+        centres: list[NDArray[np.float64]] = [np.zeros((0, 3))]
+        found = [np.zeros(0, np.float32)]
         if len(self.chunks):
             low, high = self.extent
-            first, after = voxels_of_box(low if lower is None else lower, high if upper is None else upper, self.voxel_size)
+            first, after = voxels_of_box(
+                low if lower is None else lower, high if upper is None else upper, self.voxel_size
+            )
             for begin, block in self._cut(first, after):
                 occupancy = probability(block)
                 # A comparison with NaN, which is what is unknown, is false.
                 place = np.argwhere(occupancy >= min_probability)
-                centres.append((place + begin + 0.5) * self.voxel_size)
+                centres.append(((place + begin + 0.5).astype(np.float64) * self.voxel_size)
                 found.append(occupancy[tuple(place.T)])
         return np.concatenate(centres), np.concatenate(found)
 
     def blocks(self, lower: ArrayLike, upper: ArrayLike) -> Iterator[tuple[Chunk, NDArray[np.float32]]]:
-        """The chunks that reach into a box in metres, each with its (64, 64, 64) log-odds, NaN for unknown."""
+        """The chunks that reach into a box in metres, each with (64, 64, 64) log-odds, NaN for unknown."""
         first, after = voxels_of_box(lower, upper, self.voxel_size)
         for chunk in self._chunks_between(first, after):
             yield chunk, self._block(chunk)

@@ -21,8 +21,8 @@ from taichi_mrf.voxels.pool import BrickPool
 
 @dataclass(frozen=True)
 class MapPart:
-    """What a map in chunks says of the bricks from ``lowest`` up to, but without, ``after``, (3,) each; outside
-    of them nothing is known. It has the queries of a map, but neither keyframes nor inference."""
+    """What a map in chunks says of the bricks from ``lowest`` up to, but without, ``after``, (3,) each;
+    outside of them nothing is known. It has the queries of a map, but neither keyframes nor inference."""
 
     source: ChunkedMap
     lowest: NDArray[np.int64]
@@ -43,7 +43,9 @@ class MapPart:
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
         """Probability of occupied at (N, 3) points in metres, (N,)."""
         points_m = checked_points(points)
-        return np.where(self._inside(points_m), self.source.occupancy(points_m), np.float32(self.source.prior))
+        return np.where(
+            self._inside(points_m), self.source.occupancy(points_m), np.float32(self.source.prior)
+        )
 
     def state(self, points: ArrayLike) -> NDArray[np.int8]:
         """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,)."""
@@ -56,12 +58,12 @@ class MapPart:
 
     def _inside(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         bricks = np.floor(points_m / (self.voxel_size * BRICK))
-        return ((bricks >= self.lowest) & (bricks < self.after)).all(axis=1)
+        return np.all((bricks >= self.lowest) & (bricks < self.after), axis=1)
 
 
 def take_part(m: ChunkedMap, lower: ArrayLike | None = None, upper: ArrayLike | None = None) -> MapPart:
-    """The bricks that a box reaches into, from corner to corner, (3,) in metres each, in memory; None means up
-    to the map's end. Raises ConfigError for corners that make no box or for an empty map, CapacityError if
+    """The bricks that a box reaches into, from corner to corner, (3,) in metres each, in memory; None means
+    up to the map's end. Raises ConfigError for corners that make no box or for an empty map, CapacityError if
     memory would not do."""
     runtime.init()
     low, high = m.extent

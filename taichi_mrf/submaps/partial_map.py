@@ -5,6 +5,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.config import Config
 from taichi_mrf.inference import sum_product
 from taichi_mrf.maps.mrf import MRFMap
 from taichi_mrf.queries.known_bricks import sorted_bricks
@@ -16,6 +18,13 @@ Bricks = NDArray[np.int32]
 class PartialMap(MRFMap):
     """Rounds of exchange need two things more of a map: to be told what absent keyframes say, and to tell
     what others should hear."""
+
+    @classmethod
+    def from_config(cls, config: Config, camera: PinholeCamera) -> "PartialMap":
+        """See MRFMap."""
+        m = super().from_config(config, camera)
+        assert isinstance(m, cls)
+        return m
 
     def assume(self, bricks: Bricks, evidence: NDArray[np.float32]) -> None:
         """Start inference in these bricks from these log-odds, (n, 512): the prior and what keyframes say
@@ -47,7 +56,9 @@ class PartialMap(MRFMap):
 
     def seen_bricks(self, keyframes: Iterable[int]) -> Bricks:
         """The bricks that exist and that rays of any of these keyframes, by id, cross; ascending."""
-        found = [k.footprint.window.bricks_of(k.visible.cells) for k in map(self._keyframes.get, keyframes) if k]
+        found = [
+            k.footprint.window.bricks_of(k.visible.cells) for k in map(self._keyframes.get, keyframes) if k
+        ]
         return sorted_bricks(np.concatenate([np.zeros((0, 3), np.int32), *found]))
 
     def crossed_bricks(self) -> Bricks:
