@@ -112,7 +112,7 @@ class ChunkedMap:
                 occupancy = probability(block)
                 # A comparison with NaN, which is what is unknown, is false.
                 place = np.argwhere(occupancy >= min_probability)
-                centres.append(((place + begin + 0.5).astype(np.float64) * self.voxel_size)
+                centres.append((place + begin + 0.5).astype(np.float64) * self.voxel_size)
                 found.append(occupancy[tuple(place.T)])
         return np.concatenate(centres), np.concatenate(found)
 
