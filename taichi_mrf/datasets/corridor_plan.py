@@ -92,6 +92,11 @@ def corridor_length(rooms: int) -> float:
     return -(-rooms // 2) * PITCH
 
 
+def floor_area_m2(rooms: int) -> float:
+    """Floor of the corridor and its rooms, without walls."""
+    return 2 * HALF_WIDTH * corridor_length(rooms) + rooms * LENGTH * WIDTH
+
+
 def corridor_scene(rooms: int) -> Scene:
     """The corridor with its rooms in the world frame."""
     solids = _shell(rooms)

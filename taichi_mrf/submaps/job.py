@@ -39,13 +39,13 @@ class Sequence:
 @dataclass(frozen=True)
 class Job:
     """A sequence, how it is mapped, and how it is cut. ``skipped`` tells of each broken frame by name what is
-    wrong with it; ``keyframes`` are the dataset indices of all keyframes."""
+    wrong with it; ``centres_m`` are the cameras' places of all keyframes, by their index in the dataset."""
 
     sequence: Sequence
     config: Config
     submap_size: float
     plan: Plan
-    keyframes: tuple[int, ...]
+    centres_m: dict[int, tuple[float, float, float]]
     skipped: dict[str, str]
 
     def write(self, folder: Path) -> None:
@@ -55,7 +55,7 @@ class Job:
             "sequence": asdict(self.sequence),
             "config": to_yaml(self.config),
             "submap_size": self.submap_size,
-            "keyframes": self.keyframes,
+            "centres_m": self.centres_m,
             "skipped": self.skipped,
             "plan": plan,
         }
@@ -74,7 +74,7 @@ class Job:
                 from_dict(Config, yaml.safe_load(content["config"]), str(path)),
                 content["submap_size"],
                 Plan(plan["chunks_across"], tuple(submaps)),
-                tuple(content["keyframes"]),
+                {int(index): tuple(centre) for index, centre in content["centres_m"].items()},
                 content["skipped"],
             )
         except (OSError, ValueError, KeyError, TypeError) as error:

@@ -22,10 +22,11 @@ Cell = tuple[int, int]
 
 @dataclass(frozen=True)
 class SeenKeyframe:
-    """A keyframe as far as the plan cares: its index in the dataset, and the chunks (n, 3) that its rays
-    cross."""
+    """A keyframe as far as the plan cares: its index in the dataset, where the camera was, in metres, and the
+    chunks (n, 3) that its rays cross."""
 
     index: int
+    centre_m: tuple[float, float, float]
     chunks: NDArray[np.int32]
 
 

@@ -19,7 +19,6 @@ from taichi_mrf.submaps.round_files import SubmapReport
 from taichi_mrf.submaps.survey import find_keyframes
 from taichi_mrf.submaps.task import SubmapTask, infer_submap
 
-ROUNDS = 3
 SETTLED = 0.001
 """No further round is made when no larger share of all voxels has moved in the last."""
 
@@ -56,7 +55,7 @@ def map_in_submaps(
     map_path: Path,
     runner: TaskRunner,
     *,
-    rounds: int = ROUNDS,
+    rounds: int,
     settled: float = SETTLED,
     resume: bool = False,
     skip_bad_frames: bool = False,
@@ -128,7 +127,7 @@ def _job(
         sequence, config, runner, skip_bad_frames, lambda done, total: progress("Planning", done, total)
     )
     plan = plan_submaps(keyframes, submap_size, config.voxel_size)
-    job = Job(sequence, config, submap_size, plan, tuple(k.index for k in keyframes), skipped)
+    job = Job(sequence, config, submap_size, plan, {k.index: k.centre_m for k in keyframes}, skipped)
     job.write(folder)
     return job
 

@@ -119,5 +119,6 @@ def _chosen(
             skipped[frame.name] = str(frame.problem)
         elif selector.wants(frame.T_world_camera) and len(frame.chunks):
             selector.accept(frame.T_world_camera)
-            keyframes.append(SeenKeyframe(frame.index, frame.chunks))
+            x, y, z = frame.T_world_camera[:3, 3].tolist()
+            keyframes.append(SeenKeyframe(frame.index, (x, y, z), frame.chunks))
     return keyframes, skipped
