@@ -17,7 +17,7 @@ from taichi_mrf.submaps.merge import merge_submaps
 from taichi_mrf.submaps.plan import plan_submaps
 from taichi_mrf.submaps.round_files import SubmapReport
 from taichi_mrf.submaps.survey import find_keyframes
-from taichi_mrf.submaps.task import SubmapTask, infer_submap
+from taichi_mrf.submaps.task import SubmapTask, infer_submap, is_idle
 
 SETTLED = 0.001
 """No further round is made when no larger share of all voxels has moved in the last."""
@@ -156,9 +156,18 @@ def _round(
         progress(what, len(done), len(order))
 
     tasks = [SubmapTask(str(folder.resolve()), number, round) for number in order]
-    reports = tuple(sorted(runner.run(infer, tasks, count), key=lambda report: report.submap))
+    idle = [task for task in tasks if is_idle(task)]
+    reports = [infer_submap(task) for task in idle]
+    for number, report in enumerate(reports):
+        count(number, report)
+    reports += runner.run(infer, [task for task in tasks if task not in idle], count)
+    reports.sort(key=lambda report: report.submap)
     found = RoundReport(
-        round, time.perf_counter() - begin, _mean(reports, "moved"), _mean(reports, "halo_moved"), reports
+        round=round,
+        seconds=time.perf_counter() - begin,
+        moved=_mean(reports, "moved"),
+        halo_moved=_mean(reports, "halo_moved"),
+        submaps=tuple(reports),
     )
     write_text(path, json.dumps(asdict(found)) + "\n")
     return found
@@ -171,7 +180,7 @@ def _read_round(path: Path) -> RoundReport:
         raise MapFileError(f"{path}: not a readable report of a round: {error}") from error
 
 
-def _mean(reports: tuple[SubmapReport, ...], name: str) -> float | None:
+def _mean(reports: list[SubmapReport], name: str) -> float | None:
     """A share of the voxels of all submaps, each with the weight of its core."""
     values = [(getattr(report, name), report.core_bricks) for report in reports]
     known = [(value, weight) for value, weight in values if value is not None]

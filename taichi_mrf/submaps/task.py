@@ -60,8 +60,7 @@ def infer_submap(
     if path.exists():
         return read_report(path)
     before = round_path(folder, task.round - 1, task.submap)
-    if task.round > 0 and not read_report(before).core_bricks:
-        # Rays only pass through this column, and they are the same in every round.
+    if is_idle(task):
         report = replace(read_report(before), round=task.round, seconds=0.0, moved=0.0, halo_moved=0.0)
         bricks, belief, free = read_core(before)
         write_round(path, RoundResult(bricks, belief, free, {}, report))
@@ -77,6 +76,13 @@ def infer_submap(
         result = replace(result, report=report)
     write_round(path, result)
     return result.report
+
+
+def is_idle(task: SubmapTask) -> bool:
+    """Whether there is nothing to do but to repeat what the round before has found: rays only pass through
+    this column, and they are the same in every round."""
+    before = round_path(Path(task.folder), task.round - 1, task.submap)
+    return task.round > 0 and not read_report(before).core_bricks
 
 
 def _inferred(task: SubmapTask, job: Job, progress: Callable[[InferProgress], bool]) -> RoundResult:

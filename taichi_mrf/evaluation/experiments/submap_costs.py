@@ -12,7 +12,7 @@ SECONDS_A_DAY = 86400.0
 class MeasuredCost:
     """What one keyframe and one square metre of floor cost, as measured at one voxel size.
 
-    ``seconds`` of a worker for a keyframe in one submap and one round, with all of its sweeps;
+    ``seconds`` of a CPU core for a keyframe in one submap and one round, with all of its sweeps;
     ``keyframe_mb`` that it takes in a task's memory; ``overlap`` submaps that a keyframe belongs to;
     ``rounds`` of inference that were made; ``submap_m`` the side of a column;
     ``voxels_per_m2`` near surfaces, and what each takes in memory and in the store, in bytes.
@@ -46,9 +46,15 @@ PLACES = (
     Place("city: 100 km2, a quarter of it streets and squares", 25_000_000),
 )
 COLUMNS = (
-    "place", "area (m2)", "keyframes", "submaps", "worker-days", "workers for a day", "GB a task",
+    "place",
+    "area (m2)",
+    "keyframes",
+    "submaps",
+    "core-days",
+    "cores for a day",
+    "GB a task",
     "store (GB)",
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -57,7 +63,7 @@ class Need:
 
     keyframes: float
     submaps: float
-    worker_days: float
+    core_days: float
     task_gb: float
     store_gb: float
 
@@ -75,7 +81,7 @@ def need(place: Place, cost: MeasuredCost) -> Need:
     return Need(
         keyframes=keyframes,
         submaps=place.area_m2 / column_m2,
-        worker_days=seconds / SECONDS_A_DAY,
+        core_days=seconds / SECONDS_A_DAY,
         task_gb=(in_a_task * cost.keyframe_mb * 1e6 + task_voxels * cost.memory_bytes_per_voxel) / 1e9,
         store_gb=voxels * cost.store_bytes_per_voxel / 1e9,
     )
@@ -93,20 +99,18 @@ def costs_table(costs: Sequence[MeasuredCost], places: Sequence[Place] = PLACES)
                     f"{place.area_m2:,.0f}",
                     f"{found.keyframes:,.0f}",
                     f"{found.submaps:,.0f}",
-                    f"{found.worker_days:,.2f}",
-                    f"{max(1.0, found.worker_days):,.0f}",
+                    f"{found.core_days:,.2f}",
+                    f"{max(1.0, found.core_days):,.0f}",
                     f"{found.task_gb:.2f}",
                     f"{found.store_gb:,.2f}",
                 ]
             )
     notes = [
         f"{c.voxel_size * 100:g} cm: {c.keyframes_per_m2:.2f} keyframes/m2 of 640 x 480, "
-        f"{c.seconds:.2f} s each in a submap and round, {c.overlap:.2f} submaps each, {c.rounds} rounds, "
+        f"{c.seconds:.2f} core-seconds each in a submap and round, {c.overlap:.2f} submaps each, {c.rounds} rounds, "
         f"{c.keyframe_mb:.1f} MB each, {c.voxels_per_m2:,.0f} voxels/m2 near surfaces of "
         f"{c.memory_bytes_per_voxel:.1f} bytes in memory and {c.store_bytes_per_voxel:.2f} in the store"
         for c in costs
     ]
-    notes.append(
-        "Measured on the corridor and scaled in proportion; a worker is one of the processes measured."
-    )
+    notes.append("measured on the corridor and scaled in proportion; times are those of one CPU core")
     return Table("submaps_costs", "What larger places would need", COLUMNS, rows, notes)

@@ -25,9 +25,9 @@ NEAR = 0.02
 
 @dataclass(frozen=True)
 class Equality:
-    """Shares of voxels: ``within`` NEAR, of all that have a brick in either map; ``known_within``, of those of
-    which the single map knows something; ``same_state``, of those and of the bricks that were seen to be
-    free. ``largest`` is the largest difference, ``voxels`` how many there are."""
+    """Shares of voxels: ``within`` NEAR, of all that have a brick in either map; ``known_within``, of those
+    of which the single map knows something; ``same_state``, of all voxels of all chunks that either map has.
+    ``largest`` is the largest difference, ``voxels`` how many have a brick, ``known`` how many are known."""
 
     voxels: int
     known: int
@@ -55,12 +55,12 @@ def compare(single: MRFMap, merged: ChunkedMap) -> Equality:
         known_within += int((off <= NEAR)[known_here].sum())
         largest = max(largest, float(off.max(initial=0.0)))
     return Equality(
-        voxels,
-        known,
-        within / max(1, voxels),
-        known_within / max(1, known),
-        same / max(1, looked_at),
-        largest,
+        voxels=voxels,
+        known=known,
+        within=within / max(1, voxels),
+        known_within=known_within / max(1, known),
+        same_state=same / max(1, looked_at),
+        largest=largest,
     )
 
 

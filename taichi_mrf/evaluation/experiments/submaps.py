@@ -42,21 +42,22 @@ NOTES = (
 def run_submaps(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     """The share of equal voxels after each round of exchange, and what larger places would need."""
     rows: list[list[Entry]] = []
-    costs = []
+    costs, notes = [], []
     frames = FRAMES if experiment.limit is None else min(FRAMES, experiment.limit)
     for number, voxel_size in enumerate(experiment.voxel_sizes):
         experiment.report(f"{voxel_size * 100:g} cm", number, len(experiment.voxel_sizes))
-        key = f"{NAME} | {frames} frames of {WIDTH} x {HEIGHT}, {ROOMS} rooms | {voxel_size:g} m | {SUBMAP_M:g} m"
+        scene = f"{NAME} with {ROOMS} rooms, {frames} frames of {WIDTH} x {HEIGHT}"
+        key = f"{scene} | {voxel_size:g} m | submaps of {SUBMAP_M:g} m, {ROUNDS} rounds"
         result = experiment.ledger.result(key, lambda v=voxel_size: measure(experiment, v, frames))  # type: ignore[misc]
         rows += _rows(voxel_size, result)
+        notes.append(_note(voxel_size, result))
         costs.append(MeasuredCost(**result["cost"]))
     columns = [
         "voxels", "round", "within 0.02 (%)", "known within 0.02 (%)", "same state (%)", "largest difference",
         "moved (%)", "told moved (%)", "seconds",
     ]  # fmt: skip
-    table = Table(
-        "submaps", "A map made of submaps against a single machine's", columns, rows, NOTES, digits=3
-    )
+    title = "A map made of submaps against a single machine's"
+    table = Table("submaps", title, columns, rows, [*NOTES, *notes])
     tables = [table, costs_table(costs)]
     return tables, [path for each in tables for path in write_table(experiment.out, each)]
 
@@ -70,6 +71,7 @@ def measure(experiment: Experiment, voxel_size: float, frames: int) -> Result:
     single = map_sequence(sequence.open(), config).map
     assert isinstance(single, MRFMap)
     single_seconds = time.perf_counter() - begin
+    single_mb = single.statistics().memory_mb
     folder = experiment.out / f"submaps_{voxel_size * 100:g}cm"
     shutil.rmtree(folder, ignore_errors=True)
     tasks, path = folder / "submaps", folder / "map.zarr"
@@ -93,8 +95,11 @@ def measure(experiment: Experiment, voxel_size: float, frames: int) -> Result:
         "keyframes": len(result.job.centres_m),
         "overlap": result.job.plan.overlap,
         "single_seconds": single_seconds,
-        "single_mb": single.statistics().memory_mb,
+        "single_mb": single_mb,
         "largest_task_mb": max(report.map_mb for report in result.rounds[-1].submaps),
+        "largest_task_keyframes": max(report.keyframes for report in result.rounds[-1].submaps),
+        "task_seconds": [sum(r.seconds for r in each.submaps) for each in result.rounds],
+        "sweeps": config.inference.sweeps,
         "cost": asdict(_cost(config, result, single, path)),
     }
 
@@ -108,9 +113,10 @@ def _cost(config: Config, result: SubmapsResult, single: MRFMap, path: Path) -> 
         frame = dataset.read(index)
         m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera)
     m.infer(sweeps=1)  # compiled by now
-    begin = time.perf_counter()
+    # Of the process, so that it does not depend on what else the machine does or on how many cores it has.
+    begin = time.process_time()
     m.infer()
-    seconds = (time.perf_counter() - begin) / len(m.keyframes)
+    seconds = (time.process_time() - begin) / len(m.keyframes)
     size = single.statistics()
     keyframe_bytes = sum(k.voxel_bytes + k.image_bytes for k in m.keyframes.values()) / len(m.keyframes)
     area = floor_area_m2(ROOMS)
@@ -144,6 +150,15 @@ def _rows(voxel_size: float, result: Result) -> list[list[Entry]]:
         ]
         for each in result["rounds"]
     ]
+
+
+def _note(voxel_size: float, result: Result) -> str:
+    return (
+        f"{voxel_size * 100:g} cm: {result['keyframes']} keyframes in {result['submaps']} submaps, "
+        f"{result['overlap']:.2f} each, {result['sweeps']} sweeps; killed: {result['killed'] or 'nobody'}; "
+        f"memory {result['single_mb']:.0f} MB in one map, {result['largest_task_mb']:.0f} MB in the largest "
+        f"task; {result['rounds'][-1]['voxels'] / 1e6:.2f} million voxels"
+    )
 
 
 def _percent(share: float | None) -> float | None:
