@@ -100,15 +100,14 @@ def costs_table(costs: Sequence[MeasuredCost], places: Sequence[Place] = PLACES)
                     f"{found.keyframes:,.0f}",
                     f"{found.submaps:,.0f}",
                     f"{found.core_days:,.2f}",
-                    f"{max(1.0, found.core_days):,.0f}",
                     f"{found.task_gb:.2f}",
                     f"{found.store_gb:,.2f}",
                 ]
             )
     notes = [
         f"{c.voxel_size * 100:g} cm: {c.keyframes_per_m2:.2f} keyframes/m2 of 640 x 480, "
-        f"{c.seconds:.2f} core-seconds each in a submap and round, {c.overlap:.2f} submaps each, {c.rounds} rounds, "
-        f"{c.keyframe_mb:.1f} MB each, {c.voxels_per_m2:,.0f} voxels/m2 near surfaces of "
+        f"{c.seconds:.2f} core-seconds each in a submap and round, {c.overlap:.2f} submaps each, "
+        f"{c.rounds} rounds, {c.keyframe_mb:.1f} MB each, {c.voxels_per_m2:,.0f} voxels/m2 near surfaces of "
         f"{c.memory_bytes_per_voxel:.1f} bytes in memory and {c.store_bytes_per_voxel:.2f} in the store"
         for c in costs
     ]
