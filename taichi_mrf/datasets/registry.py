@@ -125,6 +125,14 @@ def format_name(source: str | Path) -> str:
     return str(source).partition("?")[0]
 
 
+def absolute_source(source: str) -> str:
+    """The same source for a process that works in another folder."""
+    path, query = _path_and_query(source)
+    if not path.exists():
+        return source
+    return f"{path.resolve()}?{query}" if query else str(path.resolve())
+
+
 def is_rendered(source: str) -> bool:
     """Whether a source is a built-in scene, whose frames can be read only once Taichi runs."""
     return source.partition("?")[0] in (synthetic_room.NAME, synthetic_corridor.NAME)

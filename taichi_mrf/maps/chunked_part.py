@@ -19,7 +19,7 @@ from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 
 
-@dataclass(frozen=True)
+@dataclass
 class MapPart:
     """What a map in chunks says of the bricks from ``lowest`` up to, but without, ``after``, (3,) each;
     outside of them nothing is known. It has the queries of a map, but neither keyframes nor inference."""
@@ -29,16 +29,15 @@ class MapPart:
     after: NDArray[np.int64]
     view: View
     keyframes: Mapping[int, Placed] = field(default_factory=dict)
+    voxel_size: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.voxel_size = self.source.voxel_size
 
     @property
     def config(self) -> Config:
         """The parameters that the map was made with."""
         return self.source.config
-
-    @property
-    def voxel_size(self) -> float:
-        """Side of a voxel in metres."""
-        return self.source.voxel_size
 
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
         """Probability of occupied at (N, 3) points in metres, (N,)."""
