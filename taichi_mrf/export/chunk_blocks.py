@@ -21,8 +21,12 @@ def by_chunk(bricks: Bricks) -> Iterator[tuple[Chunk, NDArray[np.int64]]]:
         yield (x, y, z), order[ends[number - 1] if number else 0 : ends[number]]
 
 
-def chunk_block(chunk: Chunk, bricks: Bricks, log_odds: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(64, 64, 64) log-odds of a chunk from those of its bricks, (n, 512); NaN elsewhere."""
+def chunk_block(
+    chunk: Chunk, bricks: Bricks, log_odds: NDArray[np.float32], prior_log_odds: float
+) -> NDArray[np.float32]:
+    """(64, 64, 64) log-odds of a chunk from those of its bricks, (n, 512); NaN elsewhere, and where they are
+    the prior's: nobody has said anything of those voxels."""
+    log_odds = np.where(log_odds == np.float32(prior_log_odds), np.float32(np.nan), log_odds)
     block = np.full((CHUNK, BRICK, CHUNK, BRICK, CHUNK, BRICK), np.nan, np.float32)
     x, y, z = (bricks - np.array(chunk) * CHUNK).T
     block[x, :, y, :, z, :] = log_odds.reshape(-1, BRICK, BRICK, BRICK)
@@ -35,7 +39,8 @@ def write_chunks(path: str | Path, m: QueriedMap, config: Config) -> None:
     reader = BrickReader(m)
     bricks = known_bricks(m)
     with new_store(path) as folder:
-        header = StoreHeader.of(config, reader.pool.prior_log_odds)
+        header = StoreHeader.of(config, reader.pool.prior_log_odds, m.view.volume.min_evidence)
         store = ChunkStore.create(folder, header, np.unique(bricks // CHUNK, axis=0))
         for chunk, rows in by_chunk(bricks):
-            store.write(chunk, chunk_block(chunk, bricks[rows], reader.log_odds(bricks[rows])))
+            log_odds = reader.log_odds(bricks[rows])
+            store.write(chunk, chunk_block(chunk, bricks[rows], log_odds, header.prior_log_odds))

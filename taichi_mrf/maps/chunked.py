@@ -97,8 +97,11 @@ class ChunkedMap:
         upper: ArrayLike | None = None,
         min_probability: float = 0.5,
     ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """Voxels of at least this probability in a box, or in all of the map: centres (N, 3) in metres, and
-        (N,). Raises ConfigError for a probability outside [0, 1] and for corners that make no box."""
+        """Voxels that something is known of, of at least this probability, in a box or in all of the map:
+        centres (N, 3) in metres, and (N,).
+
+        Raises ConfigError for a probability outside [0, 1] and for corners that make no box.
+        """
         if not 0 <= min_probability <= 1:
             raise ConfigError(f"min_probability must lie between 0 and 1, not {min_probability}")
         centres: list[NDArray[np.float64]] = [np.zeros((0, 3))]

@@ -1,7 +1,7 @@
 """A box of a map in chunks, taken into memory, where all queries and exports can work on it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +11,6 @@ from taichi_mrf.config import Config
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.maps.chunked import ChunkedMap
 from taichi_mrf.queries.box import voxels_of_box
-from taichi_mrf.queries.extract import extract_voxels
 from taichi_mrf.queries.known_bricks import Placed
 from taichi_mrf.queries.points import checked_points
 from taichi_mrf.queries.view import View
@@ -52,8 +51,10 @@ class MapPart:
         return np.where(self._inside(points_m), self.source.state(points_m), np.int8(0))
 
     def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """All voxels near surfaces of at least this probability: centres (N, 3) in metres, and (N,)."""
-        return extract_voxels(self.view.pool, self.voxel_size, min_probability)
+        """All voxels that something is known of, of at least this probability: centres (N, 3) in metres, and
+        (N,)."""
+        brick_m = BRICK * self.voxel_size
+        return self.source.voxels(self.lowest * brick_m, self.after * brick_m, min_probability)
 
     def _inside(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         bricks = np.floor(points_m / (self.voxel_size * BRICK))
@@ -75,12 +76,14 @@ def take_part(m: ChunkedMap, lower: ArrayLike | None = None, upper: ArrayLike | 
         bricks = np.indices((CHUNK,) * 3).reshape(3, -1).T + np.array(chunk) * CHUNK
         inside = ((bricks >= lowest) & (bricks < after)).all(axis=1)
         # Free and unknown space without a surface near needs no voxels: occupancy() and state() know it.
-        near = ~np.isnan(values[:, 0]) & (values != np.float32(m.header.seen_free_log_odds)).any(axis=1)
+        known = ~np.isnan(values)
+        near = (known & (values != np.float32(m.header.seen_free_log_odds))).any(axis=1)
         taken = np.flatnonzero(inside & near)
         if len(taken):
             slots = pool.allocate(bricks[taken].astype(np.int32))
             pool.owners[slots] = 1
-            pool.write("belief", slots, values[taken])
+            pool.write("belief", slots, np.where(known, values, m.header.prior_log_odds)[taken])
     if not len(pool.in_use):
         raise ConfigError("there is no surface in this box of the map")
-    return MapPart(m, lowest, after, View(pool, m.voxel_size, m.config.volume))
+    volume = replace(m.config.volume, min_evidence=m.header.min_evidence)
+    return MapPart(m, lowest, after, View(pool, m.voxel_size, volume))

@@ -18,7 +18,7 @@ def merge_submaps(folder: Path, job: Job, round: int, path: Path) -> None:
     each is written once, and no more than one submap's core is ever in memory. Raises MapFileError."""
     files = [round_path(folder, round, number) for number in range(len(job.plan.submaps))]
     prior = prior_probability(job.config.inference, job.config.voxel_size)
-    header = StoreHeader.of(job.config, math.log(prior / (1 - prior)))
+    header = StoreHeader.of(job.config, math.log(prior / (1 - prior)), job.config.volume.min_evidence)
     chunks = [np.unique(np.concatenate(read_places(file)) // CHUNK, axis=0) for file in files]
     with new_store(path) as place:
         store = ChunkStore.create(place, header, np.unique(np.concatenate(chunks), axis=0))
@@ -27,4 +27,5 @@ def merge_submaps(folder: Path, job: Job, round: int, path: Path) -> None:
             empty = np.full((len(free), VOXELS), header.seen_free_log_odds, np.float32)
             bricks, belief = np.concatenate([bricks, free]), np.concatenate([belief, empty])
             for chunk, rows in by_chunk(bricks):
-                store.write(chunk, chunk_block(chunk, bricks[rows], belief[rows]))
+                block = chunk_block(chunk, bricks[rows], belief[rows], header.prior_log_odds)
+                store.write(chunk, block)
