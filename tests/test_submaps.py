@@ -26,6 +26,7 @@ from taichi_mrf.submaps.job import Job, Sequence
 from taichi_mrf.submaps.partial_map import PartialMap
 from taichi_mrf.submaps.plan import SeenKeyframe, chunks_for, plan_submaps
 from taichi_mrf.submaps.rounds import SubmapsResult, map_in_submaps
+from taichi_mrf.submaps.task import share_moved
 from taichi_mrf.voxels.layout import CHUNK
 
 zarr = pytest.importorskip("zarr", reason="maps in chunks need the extra store")
@@ -33,7 +34,7 @@ zarr = pytest.importorskip("zarr", reason="maps in chunks need the extra store")
 SOURCE = "synthetic:corridor?rooms=2&frames=24&width=80&height=60"
 SEQUENCE = Sequence(SOURCE, SourceFlags().keywords())
 CONFIG = Config(0.1, evaluation=EvaluationConfig(hold_out=0))
-SUBMAP_M = 6.4
+SUBMAP_M = 12.8
 
 chunk = st.tuples(*[st.integers(-9, 9)] * 3)
 seen = st.lists(st.sets(chunk, min_size=1, max_size=6), min_size=1, max_size=8)
@@ -153,8 +154,17 @@ def test_nothing_is_done_twice(exchanged: Path) -> None:
     result = mapped(exchanged, 1, resume=True)
     assert {path: path.stat().st_mtime_ns for path in files} == files
     assert [each.round for each in result.rounds] == [0, 1]
+    assert result.rounds[0].moved is None
     assert result.rounds[1].moved is not None
-    assert 0 < result.rounds[1].moved < 0.01
+    assert result.rounds[1].moved < 0.01
+
+
+def test_what_moved_is_a_share_of_probabilities() -> None:
+    before = np.array([[0.0, 0.0, -9.0, 9.0]], np.float32)
+    now = np.array([[0.2, 0.0, -7.0, 7.0]], np.float32)  # only the first by more than 0.01 of probability
+    assert share_moved([(now, before)]) == 0.25
+    assert share_moved([(now, before), (before, before)]) == 0.125
+    assert share_moved([]) == 0.0
 
 
 def test_only_the_same_run_is_gone_on_with(exchanged: Path) -> None:
@@ -162,7 +172,7 @@ def test_only_the_same_run_is_gone_on_with(exchanged: Path) -> None:
     for other, config, size, named in (
         (sequence, CONFIG, SUBMAP_M, "source"),
         (SEQUENCE, Config(0.2, evaluation=CONFIG.evaluation), SUBMAP_M, "voxel_size"),
-        (SEQUENCE, CONFIG, 12.8, "submap_size"),
+        (SEQUENCE, CONFIG, 6.4, "submap_size"),
     ):
         with pytest.raises(ConfigError, match=named):
             map_in_submaps(
@@ -210,7 +220,7 @@ def test_the_command(exchanged: Path, tmp_path: Path) -> None:
     import shutil
 
     shutil.copytree(exchanged / "submaps", tmp_path / "submaps")
-    flags = ["--voxel-size", "0.1", "--evaluation.hold-out", "0", "--submap-size", "6.4", "--rounds", "1"]
+    flags = ["--voxel-size", "0.1", "--evaluation.hold-out", "0", "--submap-size", "12.8", "--rounds", "1"]
     command = [
         sys.executable,
         "-m",

@@ -70,8 +70,8 @@ def infer_submap(
         told = [(evidence, read_halo(before, other)) for other, (_, evidence) in result.halos.items()]
         report = replace(
             result.report,
-            moved=_share_moved([(result.belief, read_core(before)[1])]),
-            halo_moved=_share_moved([(now, then[1]) for now, then in told if then is not None]),
+            moved=share_moved([(result.belief, read_core(before)[1])]),
+            halo_moved=share_moved([(now, then[1]) for now, then in told if then is not None]),
         )
         result = replace(result, report=report)
     write_round(path, result)
@@ -155,7 +155,7 @@ def _spoken(m: PartialMap, job: Job, submap: int, common: dict[int, list[int]]) 
     return halos
 
 
-def _share_moved(pairs: list[tuple[LogOdds, LogOdds]]) -> float:
+def share_moved(pairs: list[tuple[LogOdds, LogOdds]]) -> float:
     """The share of voxels, over pairs of log-odds, whose probability differs by more than MOVED."""
     moved = sum(int((np.abs(probability(a) - probability(b)) > MOVED).sum()) for a, b in pairs)
     return moved / max(1, sum(a.size for a, _ in pairs))
