@@ -22,6 +22,8 @@ _PUBLIC = {
     "LogOddsMap": "taichi_mrf.maps.log_odds",
     "VisibilityMap": "taichi_mrf.maps.visibility",
     "load_map": "taichi_mrf.maps.create",
+    "ChunkedMap": "taichi_mrf.maps.chunked",
+    "take_part": "taichi_mrf.maps.chunked_part",
     "accuracy": "taichi_mrf.evaluation.accuracy",
     "UNKNOWN": "taichi_mrf.queries.points",
     "FREE": "taichi_mrf.queries.points",

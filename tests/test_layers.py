@@ -29,7 +29,7 @@ FLOORS = [
     {"inference", "queries", "datasets", "export", "viewer", "factor_graph", "alignment"},
     {"maps"},
     {"pipeline"},
-    {"evaluation", "calibration", "cluster"},
+    {"evaluation", "calibration", "cluster", "submaps"},
     {"live", "tune"},
     {"commands", "cli", "__main__"},
 ]

@@ -10,8 +10,9 @@ from taichi_mrf.config import RuntimeConfig
 from taichi_mrf.errors import ConfigError
 
 Name = Literal[
-    "table1", "table2", "table3", "fig7", "fig10", "stereo", "exact", "poses", "rays", "endless", "all"
-]
+    "table1", "table2", "table3", "fig7", "fig10", "stereo", "exact", "poses",
+    "rays", "endless", "submaps", "all",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,8 @@ class Eval:
     """table1, table2, table3, fig7 and fig10 of MRFMap (Shankar and Michael 2020), stereo of Schauwecker and
     Zell 2014, exact, which compares MRFMap with the factor graph that it approximates, poses, which disturbs
     poses and takes the error back, rays, which asks how many rays a voxel needs,
-    endless, which freezes what has left the view for an hour, or all."""
+    endless, which freezes what has left the view for an hour, submaps, which
+    maps the built-in corridor in parts and compares that with the map of a single machine, or all."""
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("runs/eval")
     """Folder for the results; it is made if need be."""

@@ -26,6 +26,7 @@ from taichi_mrf.evaluation.experiments.ledger import Ledger
 from taichi_mrf.evaluation.experiments.poses import run_poses
 from taichi_mrf.evaluation.experiments.rays import run_rays
 from taichi_mrf.evaluation.experiments.stereo import run_stereo
+from taichi_mrf.evaluation.experiments.submaps import run_submaps
 from taichi_mrf.evaluation.experiments.table1 import run_table1
 from taichi_mrf.evaluation.experiments.table2 import run_table2
 from taichi_mrf.evaluation.experiments.table3 import run_table3
@@ -45,14 +46,18 @@ EXPERIMENTS: dict[str, tuple[Run, tuple[float, ...]]] = {
     "poses": (run_poses, (0.05,)),
     "rays": (run_rays, (0.05, 0.02, 0.01)),
     "endless": (run_endless, (0.1,)),
+    "submaps": (run_submaps, (0.05,)),
 }
 """Name -> what runs it, and its own voxel sizes."""
+
+BUILT_IN_SCENES = {"submaps"}
+"""Experiments that need no data."""
 
 
 def run_eval(options: Eval) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
     console = Console()
-    if not options.data.is_dir():
+    if options.experiment not in BUILT_IN_SCENES and not options.data.is_dir():
         raise DatasetError(f"{options.data}: there is no such folder; --data names the one with the scenes")
     names = list(EXPERIMENTS) if options.experiment == "all" else [options.experiment]
     with (

@@ -11,7 +11,10 @@ from rich.console import Console
 from taichi_mrf import runtime
 from taichi_mrf.commands.export import Export
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.export.formats import export_map, writer_of
+from taichi_mrf.export.chunk_store import SUFFIX
+from taichi_mrf.export.formats import ExportedMap, export_map, writer_of
+from taichi_mrf.maps.chunked import ChunkedMap
+from taichi_mrf.maps.chunked_part import take_part
 from taichi_mrf.maps.create import load_map
 
 
@@ -28,14 +31,14 @@ def run_export(options: Export) -> int:
             raise ConfigError(f"{path}: the map itself would be overwritten")
     runtime.init(options.arch)
     console = Console()
-    m = load_map(options.map)
+    m = _opened(options)
     written: list[dict[str, Any]] = []
     for path in options.to:
         begin = time.perf_counter()
         files = export_map(m, path, options.options)
         seconds = round(time.perf_counter() - begin, 3)
         for file in files:
-            written.append({"file": str(file), "bytes": file.stat().st_size, "seconds": seconds})
+            written.append({"file": str(file), "bytes": _size(file), "seconds": seconds})
             if not options.json:
                 _tell(console, file, seconds)
     if options.json:
@@ -43,6 +46,21 @@ def run_export(options: Export) -> int:
     return 0
 
 
+def _opened(options: Export) -> ExportedMap:
+    """The map, or the part of a map in chunks that was asked for."""
+    if options.map.suffix == SUFFIX:
+        return take_part(ChunkedMap.open(options.map), options.lower, options.upper)
+    if options.lower is not None or options.upper is not None:
+        raise ConfigError(f"--lower and --upper take a part of a map in chunks; {options.map} is none")
+    return load_map(options.map)
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file, or of all files in a folder."""
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
 def _tell(console: Console, file: Path, seconds: float) -> None:
-    size = f"{file.stat().st_size / 1e6:.2f} MB, {seconds:.1f} s"
+    size = f"{_size(file) / 1e6:.2f} MB, {seconds:.1f} s"
     console.print(f"{file} ({size})", markup=False, highlight=False, soft_wrap=True)

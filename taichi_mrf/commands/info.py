@@ -71,8 +71,8 @@ def _backend_facts(arch: Arch) -> dict[str, Any]:
 
 def _source_facts(options: Info) -> dict[str, Any]:
     from taichi_mrf import runtime
-    from taichi_mrf.datasets import open_dataset, synthetic_room
-    from taichi_mrf.datasets.registry import bag_path, format_name
+    from taichi_mrf.datasets import open_dataset
+    from taichi_mrf.datasets.registry import bag_path, format_name, is_rendered
     from taichi_mrf.datasets.ros_summary import summarise as summarise_bag
     from taichi_mrf.datasets.summary import summarise
 
@@ -84,7 +84,7 @@ def _source_facts(options: Info) -> dict[str, Any]:
         facts["topics"] = [
             {"name": topic.name, "type": topic.type, "messages": topic.messages} for topic in bag.topics
         ]
-    if options.source.startswith(synthetic_room.NAME):
+    if is_rendered(options.source):
         runtime.init(options.arch)
     dataset = open_dataset(options.source, color=False, **options.reading.keywords())
     notes = list(dataset.notes)
@@ -113,8 +113,8 @@ def _print_backends(console: "Console", arch: Arch) -> None:
 
 def _print_source(console: "Console", source: str, arch: Arch, reading: SourceFlags) -> None:
     from taichi_mrf import runtime
-    from taichi_mrf.datasets import open_dataset, synthetic_room
-    from taichi_mrf.datasets.registry import bag_path, format_name
+    from taichi_mrf.datasets import open_dataset
+    from taichi_mrf.datasets.registry import bag_path, format_name, is_rendered
     from taichi_mrf.datasets.ros_summary import summarise as summarise_bag
     from taichi_mrf.errors import DatasetError
 
@@ -122,7 +122,7 @@ def _print_source(console: "Console", source: str, arch: Arch, reading: SourceFl
     if path is not None:
         bag = summarise_bag(path)
         _print_topics(console, bag)
-    if source.startswith(synthetic_room.NAME):
+    if is_rendered(source):
         runtime.init(arch)
     try:
         dataset = open_dataset(source, color=False, **reading.keywords())

@@ -61,6 +61,14 @@ class Map:
     """Map on the workers of this Dask scheduler, such as tcp://10.0.0.1:8786; 'local' starts Dask's own here,
     with a worker for each job."""
 
+    submap_size: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
+    """Cut a sequence that is too large for one machine into columns of this many metres, infer each as a task
+    of its own (see --jobs and --scheduler), and write the map in chunks, as map.zarr."""
+
+    rounds: Annotated[int, tyro.conf.arg(metavar="N")] = 3
+    """With --submap-size: let neighbouring submaps tell each other what they believe up to N times; no more
+    often than it changes anything."""
+
     pictures: bool = True
     """Draw the map from above, in perspective, and against the measured depth."""
 
@@ -86,6 +94,10 @@ class Map:
 
     def run(self) -> int:
         """Map, write everything, and print the report. Raises TaichiMRFError."""
+        if self.submap_size is not None:
+            from taichi_mrf.commands.map_submaps import run_submaps
+
+            return run_submaps(self, self.submap_size)
         from taichi_mrf.commands.map_many import run_many
         from taichi_mrf.commands.map_run import run_map
 

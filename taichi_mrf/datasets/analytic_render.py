@@ -24,9 +24,11 @@ def render(
     """
     depth_m = np.zeros(camera.shape, dtype=np.float32)
     shaded = np.zeros((*camera.shape, 3) if color else (1, 1, 3), dtype=np.float32)
+    # A colour picture needs all solids: those that are not in the picture throw shadows into it.
+    kept = slice(None) if color else _may_be_seen(scene.geometry, camera, T_world_camera)
     _cast(
-        scene.geometry,
-        scene.materials,
+        scene.geometry[kept],
+        scene.materials[kept],
         ti.Matrix(T_world_camera[:3, :3].tolist()),
         ti.Vector(T_world_camera[:3, 3].tolist()),
         ti.Vector([camera.fx, camera.fy, camera.cx, camera.cy]),
@@ -36,6 +38,22 @@ def render(
         shaded,
     )
     return depth_m, np.clip(np.round(255 * shaded), 0, 255).astype(np.uint8) if color else None
+
+
+def _may_be_seen(
+    geometry: NDArray[np.float32], camera: PinholeCamera, T_world_camera: Pose
+) -> NDArray[np.int64]:
+    """Which solids, by their balls, reach into the cone around the image; at least one, however."""
+    widest = float(np.arccos(1.0 / camera.largest_slant()))
+    to_center = geometry[:, 1:4] - T_world_camera[:3, 3]
+    distance = np.linalg.norm(to_center, axis=1)
+    radius = np.sqrt(geometry[:, 9])
+    outside = distance > radius
+    sine = np.where(outside, radius / np.maximum(distance, 1e-9), 1.0)
+    cosine = to_center @ T_world_camera[:3, 2] / np.maximum(distance, 1e-9)
+    near = np.arccos(np.clip(cosine, -1, 1)) <= widest + np.arcsin(sine) + 1e-3
+    kept = np.flatnonzero(near | ~outside)
+    return kept if len(kept) else np.zeros(1, np.int64)
 
 
 @ti.func

@@ -7,6 +7,7 @@ Everything here is NumPy; ``analytic_render`` takes pictures of it. World frame 
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -41,7 +42,7 @@ class Scene:
     solids: tuple[Solid, ...]
     light: Point
 
-    @property
+    @cached_property
     def geometry(self) -> NDArray[np.float32]:
         """(solids, 10) for the renderer: kind, centre x y z, half size x y z, cos yaw, sin yaw, squared
         radius of a ball around the solid (a thousandth too large, so that rounding cuts nothing off)."""
@@ -58,7 +59,7 @@ class Scene:
         ]
         return np.array(rows, dtype=np.float32)
 
-    @property
+    @cached_property
     def materials(self) -> NDArray[np.float32]:
         """(solids, 4) for the renderer: red, green, blue, checker edge."""
         return np.array([(*s.color, s.checker) for s in self.solids], dtype=np.float32)

@@ -23,6 +23,7 @@ from taichi_mrf.datasets import (
     seven_scenes,
     stereo_file,
     stereo_pairs,
+    synthetic_corridor,
     synthetic_room,
     tum_rgbd,
 )
@@ -60,6 +61,7 @@ FILES = ".bag, .mcap or .db3 (ROS), .npz (frames), .yaml (stereo pairs)"
 
 _BUILT_IN: dict[str, Callable[[str, ReadOptions], Dataset]] = {
     synthetic_room.NAME: synthetic_room.open_synthetic_room,
+    synthetic_corridor.NAME: synthetic_corridor.open_synthetic_corridor,
     mesh_sequence.NAME: mesh_sequence.open_mesh,
     realsense.NAME: realsense.open_realsense,
 }
@@ -121,6 +123,19 @@ def format_name(source: str | Path) -> str:
         readers = (ros_bag, frames_npz)
         return next((each.NAME for each in readers if each.recognises_file(path)), stereo_file.NAME)
     return str(source).partition("?")[0]
+
+
+def absolute_source(source: str) -> str:
+    """The same source for a process that works in another folder."""
+    path, query = _path_and_query(source)
+    if not path.exists():
+        return source
+    return f"{path.resolve()}?{query}" if query else str(path.resolve())
+
+
+def is_rendered(source: str) -> bool:
+    """Whether a source is a built-in scene, whose frames can be read only once Taichi runs."""
+    return source.partition("?")[0] in (synthetic_room.NAME, synthetic_corridor.NAME)
 
 
 def bag_path(source: str) -> Path | None:

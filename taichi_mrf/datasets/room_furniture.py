@@ -30,12 +30,12 @@ def room_scene() -> Scene:
     solids = [
         *_shell(),
         *_openings(),
-        *_dining_table(1.25, 0.85, yaw=0.3),
-        *_sofa(-2.5, -0.4),
-        *_coffee_table(-1.25, -0.35),
-        *_shelf(-1.3, 2.3),
-        *_sideboard(0.0, -2.22),
-        *_lamps_plant_and_pillar(),
+        *dining_table(1.25, 0.85, yaw=0.3),
+        *sofa(-2.5, -0.4),
+        *coffee_table(-1.25, -0.35),
+        *shelf(-1.3, 2.3),
+        *sideboard(0.0, -2.22),
+        *lamps_plant_and_pillar(),
     ]
     x, y, z = ROOM_IN_WORLD
     return Scene(translated(solids, ROOM_IN_WORLD), light=(x - 0.2, y - 0.3, z + 2.5))
@@ -52,7 +52,7 @@ def camera_pose(phase: float) -> Pose:
     return look_at(eye + ROOM_IN_WORLD, eye + ROOM_IN_WORLD + ahead)
 
 
-def _box(x: float, y: float, bottom: float, size: Point, color: Color, yaw: float = 0.0) -> Solid:
+def box(x: float, y: float, bottom: float, size: Point, color: Color, yaw: float = 0.0) -> Solid:
     half = (size[0] / 2, size[1] / 2, size[2] / 2)
     return Solid("box", (x, y, bottom + half[2]), half, yaw, color)
 
@@ -77,35 +77,35 @@ def _shell() -> list[Solid]:
     floor_half: Point = (outer[0] / 2, outer[1] / 2, WALL / 2)
     return [
         Solid("box", (0, 0, -WALL / 2), floor_half, color=(0.72, 0.56, 0.40), checker=0.5),
-        _box(0, 0, HEIGHT, (*outer, WALL), WHITE),
-        _box(-across[0], 0, 0, (WALL, outer[1], HEIGHT), PLASTER),
-        _box(across[0], 0, 0, (WALL, outer[1], HEIGHT), PLASTER),
-        _box(0, -across[1], 0, (outer[0], WALL, HEIGHT), (0.70, 0.76, 0.72)),
-        _box(0, across[1], 0, (outer[0], WALL, HEIGHT), PLASTER),
+        box(0, 0, HEIGHT, (*outer, WALL), WHITE),
+        box(-across[0], 0, 0, (WALL, outer[1], HEIGHT), PLASTER),
+        box(across[0], 0, 0, (WALL, outer[1], HEIGHT), PLASTER),
+        box(0, -across[1], 0, (outer[0], WALL, HEIGHT), (0.70, 0.76, 0.72)),
+        box(0, across[1], 0, (outer[0], WALL, HEIGHT), PLASTER),
     ]
 
 
 def _openings() -> list[Solid]:
     """Door and window (shut, so that the room stays closed) and a picture."""
     return [
-        _box(2.2, -2.47, 0, (0.92, 0.06, 2.05), DARK_WOOD),
+        box(2.2, -2.47, 0, (0.92, 0.06, 2.05), DARK_WOOD),
         _sphere(1.85, -2.40, 1.05, 0.035, METAL),
-        _box(2.98, -0.1, 0.95, (0.04, 1.7, 1.2), (0.62, 0.78, 0.92)),
-        _box(2.96, -0.1, 0.95, (0.06, 0.05, 1.2), WHITE),
-        _box(2.96, -0.1, 1.52, (0.06, 1.7, 0.05), WHITE),
-        _box(2.90, -0.1, 0.90, (0.20, 1.9, 0.05), WHITE),
-        _box(0.9, 2.48, 1.30, (1.2, 0.04, 0.8), DARK_WOOD),
-        _box(0.9, 2.465, 1.36, (1.08, 0.04, 0.68), (0.85, 0.62, 0.30)),
+        box(2.98, -0.1, 0.95, (0.04, 1.7, 1.2), (0.62, 0.78, 0.92)),
+        box(2.96, -0.1, 0.95, (0.06, 0.05, 1.2), WHITE),
+        box(2.96, -0.1, 1.52, (0.06, 1.7, 0.05), WHITE),
+        box(2.90, -0.1, 0.90, (0.20, 1.9, 0.05), WHITE),
+        box(0.9, 2.48, 1.30, (1.2, 0.04, 0.8), DARK_WOOD),
+        box(0.9, 2.465, 1.36, (1.08, 0.04, 0.68), (0.85, 0.62, 0.30)),
     ]
 
 
 def _legs(x: float, y: float, yaw: float, dx: float, dy: float, side: float, height: float) -> list[Solid]:
     places = [_turned(x, y, yaw, i * dx, j * dy) for i in (-1, 1) for j in (-1, 1)]
-    return [_box(*place, 0, (side, side, height), WOOD, yaw) for place in places]
+    return [box(*place, 0, (side, side, height), WOOD, yaw) for place in places]
 
 
-def _dining_table(x: float, y: float, yaw: float) -> list[Solid]:
-    solids = [_box(x, y, 0.72, (1.5, 0.85, 0.04), WOOD, yaw), *_legs(x, y, yaw, 0.68, 0.36, 0.06, 0.72)]
+def dining_table(x: float, y: float, yaw: float) -> list[Solid]:
+    solids = [box(x, y, 0.72, (1.5, 0.85, 0.04), WOOD, yaw), *_legs(x, y, yaw, 0.68, 0.36, 0.06, 0.72)]
     for dx, dy, turn in ((-0.38, -0.62, 0.1), (0.38, -0.64, -0.15), (-0.36, 0.62, 3.1), (0.4, 0.66, 3.3)):
         solids += _chair(*_turned(x, y, yaw, dx, dy), yaw + turn)
     vase = _turned(x, y, yaw, 0.1, 0.05)
@@ -117,70 +117,70 @@ def _dining_table(x: float, y: float, yaw: float) -> list[Solid]:
 def _chair(x: float, y: float, yaw: float) -> list[Solid]:
     back = _turned(x, y, yaw, 0.0, -0.19)
     return [
-        _box(x, y, 0.43, (0.42, 0.42, 0.04), CLOTH, yaw),
-        _box(*back, 0.47, (0.42, 0.035, 0.45), WOOD, yaw),
+        box(x, y, 0.43, (0.42, 0.42, 0.04), CLOTH, yaw),
+        box(*back, 0.47, (0.42, 0.035, 0.45), WOOD, yaw),
         *_legs(x, y, yaw, 0.18, 0.18, 0.04, 0.43),
     ]
 
 
-def _sofa(x: float, y: float) -> list[Solid]:
-    arms = [_box(x, y + side * 0.95, 0, (0.85, 0.18, 0.62), CLOTH) for side in (-1, 1)]
+def sofa(x: float, y: float) -> list[Solid]:
+    arms = [box(x, y + side * 0.95, 0, (0.85, 0.18, 0.62), CLOTH) for side in (-1, 1)]
     return [
-        _box(x, y, 0.05, (0.85, 1.9, 0.25), CLOTH),
-        _box(x + 0.10, y - 0.43, 0.30, (0.62, 0.83, 0.14), (0.30, 0.44, 0.62)),
-        _box(x + 0.10, y + 0.43, 0.30, (0.62, 0.83, 0.14), (0.30, 0.44, 0.62)),
-        _box(x - 0.33, y, 0.30, (0.20, 1.9, 0.52), CLOTH),
+        box(x, y, 0.05, (0.85, 1.9, 0.25), CLOTH),
+        box(x + 0.10, y - 0.43, 0.30, (0.62, 0.83, 0.14), (0.30, 0.44, 0.62)),
+        box(x + 0.10, y + 0.43, 0.30, (0.62, 0.83, 0.14), (0.30, 0.44, 0.62)),
+        box(x - 0.33, y, 0.30, (0.20, 1.9, 0.52), CLOTH),
         *arms,
-        _box(x - 0.12, y + 0.62, 0.44, (0.14, 0.42, 0.40), (0.86, 0.66, 0.28), yaw=0.25),
+        box(x - 0.12, y + 0.62, 0.44, (0.14, 0.42, 0.40), (0.86, 0.66, 0.28), yaw=0.25),
     ]
 
 
-def _coffee_table(x: float, y: float) -> list[Solid]:
+def coffee_table(x: float, y: float) -> list[Solid]:
     return [
         _cylinder(x, y, 0, 1.0, 0.012, (0.62, 0.28, 0.26)),
-        _box(x, y, 0.38, (0.60, 1.0, 0.04), DARK_WOOD),
+        box(x, y, 0.38, (0.60, 1.0, 0.04), DARK_WOOD),
         *_legs(x, y, 0.0, 0.25, 0.45, 0.05, 0.38),
-        _box(x + 0.05, y - 0.25, 0.42, (0.21, 0.29, 0.05), (0.75, 0.25, 0.22), yaw=0.4),
-        _box(x + 0.03, y - 0.24, 0.47, (0.18, 0.25, 0.03), (0.25, 0.35, 0.60), yaw=-0.2),
+        box(x + 0.05, y - 0.25, 0.42, (0.21, 0.29, 0.05), (0.75, 0.25, 0.22), yaw=0.4),
+        box(x + 0.03, y - 0.24, 0.47, (0.18, 0.25, 0.03), (0.25, 0.35, 0.60), yaw=-0.2),
         _sphere(x - 0.02, y + 0.25, 0.51, 0.09, (0.90, 0.58, 0.18)),
     ]
 
 
-def _shelf(x: float, y: float) -> list[Solid]:
+def shelf(x: float, y: float) -> list[Solid]:
     """A shelf of 1.6 x 0.36 x 2 m against the far wall; books of several heights, two boxes, a ball."""
-    solids = [_box(x + side * 0.79, y, 0, (0.03, 0.36, 2.0), WHITE) for side in (-1, 1)]
-    solids.append(_box(x, y + 0.17, 0, (1.6, 0.02, 2.0), WHITE))
+    solids = [box(x + side * 0.79, y, 0, (0.03, 0.36, 2.0), WHITE) for side in (-1, 1)]
+    solids.append(box(x, y + 0.17, 0, (1.6, 0.02, 2.0), WHITE))
     boards = (0.06, 0.52, 0.98, 1.44, 1.97)
-    solids += [_box(x, y, z, (1.55, 0.34, 0.03), WHITE) for z in boards]
+    solids += [box(x, y, z, (1.55, 0.34, 0.03), WHITE) for z in boards]
     colors: tuple[Color, ...] = (CLOTH, (0.72, 0.24, 0.20), LEAF, (0.85, 0.70, 0.35), DARK_WOOD)
     for shelf, (first, count) in enumerate(((-0.70, 0), (-0.70, 6), (-0.10, 7), (-0.70, 5))):
         for i in range(count):
             height = 0.24 + 0.025 * ((3 * i + 2 * shelf) % 5)
             place = first + 0.085 * i
             color = colors[(i + 2 * shelf) % len(colors)]
-            solids.append(_box(x + place, y + 0.02, boards[shelf] + 0.03, (0.07, 0.22, height), color))
+            solids.append(box(x + place, y + 0.02, boards[shelf] + 0.03, (0.07, 0.22, height), color))
     solids += [
-        _box(x - 0.40, y, 0.09, (0.55, 0.30, 0.32), (0.80, 0.72, 0.55)),
-        _box(x + 0.35, y, 0.09, (0.45, 0.28, 0.25), (0.50, 0.60, 0.45)),
-        _box(x - 0.45, y, 1.01, (0.30, 0.25, 0.22), (0.80, 0.72, 0.55), yaw=0.3),
+        box(x - 0.40, y, 0.09, (0.55, 0.30, 0.32), (0.80, 0.72, 0.55)),
+        box(x + 0.35, y, 0.09, (0.45, 0.28, 0.25), (0.50, 0.60, 0.45)),
+        box(x - 0.45, y, 1.01, (0.30, 0.25, 0.22), (0.80, 0.72, 0.55), yaw=0.3),
         _sphere(x + 0.40, y, 1.60, 0.13, (0.85, 0.45, 0.20)),
     ]
     return solids
 
 
-def _sideboard(x: float, y: float) -> list[Solid]:
+def sideboard(x: float, y: float) -> list[Solid]:
     """A low sideboard with a screen on it."""
     return [
-        _box(x, y, 0.08, (1.8, 0.45, 0.47), WOOD),
-        _box(x, y, 0, (1.7, 0.38, 0.08), DARK_WOOD),
-        _box(x, y - 0.02, 0.55, (0.40, 0.22, 0.03), METAL),
-        _box(x, y - 0.05, 0.58, (0.06, 0.05, 0.10), METAL),
-        _box(x, y - 0.03, 0.66, (1.15, 0.05, 0.66), (0.10, 0.10, 0.12)),
+        box(x, y, 0.08, (1.8, 0.45, 0.47), WOOD),
+        box(x, y, 0, (1.7, 0.38, 0.08), DARK_WOOD),
+        box(x, y - 0.02, 0.55, (0.40, 0.22, 0.03), METAL),
+        box(x, y - 0.05, 0.58, (0.06, 0.05, 0.10), METAL),
+        box(x, y - 0.03, 0.66, (1.15, 0.05, 0.66), (0.10, 0.10, 0.12)),
         _cylinder(x + 0.75, y, 0.55, 0.08, 0.30, (0.55, 0.62, 0.70)),
     ]
 
 
-def _lamps_plant_and_pillar() -> list[Solid]:
+def lamps_plant_and_pillar() -> list[Solid]:
     return [
         # floor lamp in the corner behind the sofa
         _cylinder(-2.55, 1.15, 0, 0.16, 0.03, METAL),

@@ -8,8 +8,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.config import Config
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.arrays import write_arrays
+from taichi_mrf.export.chunk_blocks import write_chunks
+from taichi_mrf.export.chunk_store import SUFFIX
 from taichi_mrf.export.level_map import level_map
 from taichi_mrf.export.map_server import grey_image, write_map_server
 from taichi_mrf.export.mesh_file import write_mesh
@@ -25,6 +28,9 @@ _DEFAULTS = ExportOptions()
 
 class ExportedMap(QueriedMap, Protocol):
     """What exports need of a map; every map of maps/protocol.py has it."""
+
+    @property
+    def config(self) -> Config: ...
 
     def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]: ...
 
@@ -103,6 +109,11 @@ def _arrays(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
     return [path]
 
 
+def _chunks(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
+    write_chunks(path, m, m.config)
+    return [path]
+
+
 def _page(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
     from taichi_mrf.export.page import write_page  # as above
 
@@ -121,4 +132,5 @@ _WRITERS: dict[str, Writer] = {
     ".yaml": _level_map,
     ".npz": _arrays,
     ".html": _page,
+    SUFFIX: _chunks,
 }

@@ -4,6 +4,8 @@ from pathlib import Path
 
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import Config, Method
+from taichi_mrf.errors import MapFileError
+from taichi_mrf.export.chunk_store import SUFFIX
 from taichi_mrf.maps.log_odds import LogOddsMap
 from taichi_mrf.maps.map_file import method_of, open_map_file
 from taichi_mrf.maps.mrf import MRFMap
@@ -20,6 +22,8 @@ def create_map(config: Config, camera: PinholeCamera) -> OccupancyMap:
 
 def load_map(path: str | Path) -> OccupancyMap:
     """A saved map, whatever its method. Raises MapFileError."""
+    if Path(path).is_dir() and Path(path).suffix == SUFFIX:
+        raise MapFileError(f"{path}: a map in chunks, which ChunkedMap.open reads")
     with open_map_file(Path(path)) as file:
         method = method_of(file)
     return _map_class(method).load(path)

@@ -23,11 +23,7 @@ def point_log_odds(
     Where no brick exists it is the prior if nobody has looked there, else ``seen_free``. A point that is
     not finite raises ConfigError.
     """
-    points_m = np.asarray(points, np.float64)
-    if points_m.ndim != 2 or points_m.shape[1] != 3:
-        raise ConfigError(f"points must be of shape (N, 3), not {points_m.shape}")
-    if not np.isfinite(points_m).all():
-        raise ConfigError("points hold a value that is not finite")
+    points_m = checked_points(points)
     if len(points_m) == 0:
         return np.zeros(0, np.float32)
     # A point beyond 32 bits is further away than any map reaches.
@@ -43,6 +39,16 @@ def point_log_odds(
     _gather(pool.belief, slots, numbers, without_brick, log_odds)
     runtime.settle()
     return log_odds
+
+
+def checked_points(points: ArrayLike) -> NDArray[np.float64]:
+    """Points as (N, 3) float64. Raises ConfigError for another shape or a value that is not finite."""
+    points_m = np.asarray(points, np.float64)
+    if points_m.ndim != 2 or points_m.shape[1] != 3:
+        raise ConfigError(f"points must be of shape (N, 3), not {points_m.shape}")
+    if not np.isfinite(points_m).all():
+        raise ConfigError("points hold a value that is not finite")
+    return points_m
 
 
 def classify(log_odds: NDArray[np.float32], prior_log_odds: float, min_evidence: float) -> NDArray[np.int8]:

@@ -1,0 +1,46 @@
+"""Bricks put together to chunks of 64^3 voxels, and a map in memory written to a store that way."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.config import Config
+from taichi_mrf.export.chunk_store import Chunk, ChunkStore, StoreHeader, new_store
+from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, known_bricks
+from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS
+
+
+def by_chunk(bricks: Bricks) -> Iterator[tuple[Chunk, NDArray[np.int64]]]:
+    """The chunks that bricks (n, 3) lie in, each with the rows of its bricks."""
+    chunks, owner = np.unique(bricks // CHUNK, axis=0, return_inverse=True)
+    order = np.argsort(owner.reshape(-1), kind="stable")
+    ends = np.cumsum(np.bincount(owner.reshape(-1), minlength=len(chunks)))
+    for number, (x, y, z) in enumerate(chunks.tolist()):
+        yield (x, y, z), order[ends[number - 1] if number else 0 : ends[number]]
+
+
+def chunk_block(
+    chunk: Chunk, bricks: Bricks, log_odds: NDArray[np.float32], prior_log_odds: float
+) -> NDArray[np.float32]:
+    """(64, 64, 64) log-odds of a chunk from those of its bricks, (n, 512); NaN elsewhere, and where they are
+    the prior's: nobody has said anything of those voxels."""
+    log_odds = np.where(log_odds == np.float32(prior_log_odds), np.float32(np.nan), log_odds)
+    block = np.full((CHUNK, BRICK, CHUNK, BRICK, CHUNK, BRICK), np.nan, np.float32)
+    x, y, z = (bricks - np.array(chunk) * CHUNK).T
+    block[x, :, y, :, z, :] = log_odds.reshape(-1, BRICK, BRICK, BRICK)
+    return block.reshape((CHUNK_VOXELS,) * 3)
+
+
+def write_chunks(path: str | Path, m: QueriedMap, config: Config) -> None:
+    """Write a map in memory, made with ``config``, to a store, chunk by chunk. Raises MapFileError,
+    TaichiMRFError without zarr."""
+    reader = BrickReader(m)
+    bricks = known_bricks(m)
+    with new_store(path) as folder:
+        header = StoreHeader.of(config, reader.pool.prior_log_odds, m.view.volume.min_evidence)
+        store = ChunkStore.create(folder, header, np.unique(bricks // CHUNK, axis=0))
+        for chunk, rows in by_chunk(bricks):
+            log_odds = reader.log_odds(bricks[rows])
+            store.write(chunk, chunk_block(chunk, bricks[rows], log_odds, header.prior_log_odds))

@@ -1,0 +1,89 @@
+"""What all tasks of a run read, in one JSON file of its folder: the source, the parameters and the plan."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from taichi_mrf.config import Config, to_yaml
+from taichi_mrf.config_text import differences
+from taichi_mrf.config_values import from_dict
+from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.errors import MapFileError
+from taichi_mrf.export.atomic import write_text
+from taichi_mrf.submaps.plan import Plan, Submap
+
+PLAN_FILE = "plan.json"
+
+FREE_TO_DIFFER = ("runtime.",)
+"""Parameters (or groups) that may differ from one part of a run to the next."""
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """Which frames are mapped: what ``open_dataset`` is given, and every ``every``-th frame, ``limit`` of
+    them at most."""
+
+    source: str
+    reading: dict[str, Any]
+    every: int = 1
+    limit: int | None = None
+
+    def open(self) -> Dataset:
+        """The recording. Raises DatasetError."""
+        return open_dataset(self.source, color=False, **self.reading)
+
+
+@dataclass(frozen=True)
+class Job:
+    """A sequence, how it is mapped, and how it is cut. ``skipped`` tells of each broken frame by name what is
+    wrong with it; ``centres_m`` are the cameras' places of all keyframes, by their index in the dataset."""
+
+    sequence: Sequence
+    config: Config
+    submap_size: float
+    plan: Plan
+    centres_m: dict[int, tuple[float, float, float]]
+    skipped: dict[str, str]
+
+    def write(self, folder: Path) -> None:
+        """Write the plan's file. Raises MapFileError."""
+        plan = {"chunks_across": self.plan.chunks_across, "submaps": [asdict(s) for s in self.plan.submaps]}
+        content = {
+            "sequence": asdict(self.sequence),
+            "config": to_yaml(self.config),
+            "submap_size": self.submap_size,
+            "centres_m": self.centres_m,
+            "skipped": self.skipped,
+            "plan": plan,
+        }
+        write_text(folder / PLAN_FILE, json.dumps(content) + "\n")
+
+    @staticmethod
+    def read(folder: Path) -> "Job":
+        """Read it back. Raises MapFileError."""
+        path = folder / PLAN_FILE
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            plan = content["plan"]
+            submaps = [Submap(tuple(s["cell"]), tuple(s["keyframes"])) for s in plan["submaps"]]
+            return Job(
+                Sequence(**content["sequence"]),
+                from_dict(Config, yaml.safe_load(content["config"]), str(path)),
+                content["submap_size"],
+                Plan(plan["chunks_across"], tuple(submaps)),
+                {int(index): tuple(centre) for index, centre in content["centres_m"].items()},
+                content["skipped"],
+            )
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise MapFileError(f"{path}: not a readable plan of submaps: {error}") from error
+
+    def differences(self, sequence: Sequence, config: Config, submap_size: float) -> list[str]:
+        """Names of what another run would do otherwise, so that its results would be others."""
+        # As JSON, in which a tuple is a list.
+        mine, other = (json.loads(json.dumps(asdict(each))) for each in (self.sequence, sequence))
+        found = [name for name in mine if mine[name] != other[name]]
+        found += [name for name in differences(self.config, config) if not name.startswith(FREE_TO_DIFFER)]
+        return found + (["submap_size"] if submap_size != self.submap_size else [])

@@ -1,0 +1,73 @@
+"""An MRFMap of some of a sequence's keyframes, which takes what the others say as given."""
+
+from collections.abc import Iterable
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf import runtime
+from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.config import Config
+from taichi_mrf.inference import sum_product
+from taichi_mrf.maps.mrf import MRFMap
+from taichi_mrf.queries.known_bricks import sorted_bricks
+
+Bricks = NDArray[np.int32]
+"""(n, 3) brick coordinates in the world."""
+
+
+class PartialMap(MRFMap):
+    """Rounds of exchange need two things more of a map: to be told what absent keyframes say, and to tell
+    what others should hear."""
+
+    @classmethod
+    def from_config(cls, config: Config, camera: PinholeCamera) -> "PartialMap":
+        """See MRFMap."""
+        m = super().from_config(config, camera)
+        assert isinstance(m, cls)
+        return m
+
+    def assume(self, bricks: Bricks, evidence: NDArray[np.float32]) -> None:
+        """Start inference in these bricks from these log-odds, (n, 512): the prior and what keyframes say
+        that are not here. Bricks that only those have measured a surface in come to exist."""
+        topology = self._book.topology
+        topology.check(bricks, self.voxel_size)
+        slots = topology.slots(bricks)
+        missing = slots < 0
+        if missing.any():
+            slots[missing] = self._book.create(bricks[missing])
+        self._pool.owners[slots] += 1
+        self._pool.write("evidence", slots, evidence)
+
+    def beliefs(self, bricks: Bricks, without: Iterable[int] = ()) -> NDArray[np.float32]:
+        """The log-odds in bricks that exist, (n, 3) -> (n, 512), less the messages of some keyframes, by id.
+        Nothing may have been added or moved since the last :meth:`infer`."""
+        slots = self._book.topology.slots(bricks)
+        snapshot = self._pool.snapshot()
+        for id in without:
+            keyframe = self._keyframes[id]
+            if keyframe.messages is not None and len(keyframe.visible.slots):
+                moved = ti.ndarray(ti.i32, len(keyframe.visible.slots))
+                moved.fill(0)
+                sum_product.withdraw(keyframe.visible.slots, snapshot.belief, keyframe.messages, moved)
+        with self._pool.showing(snapshot):
+            found = self._pool.read("belief", slots)
+        runtime.settle()  # before the snapshot is dropped
+        return found
+
+    def bricks(self) -> Bricks:
+        """All bricks that exist, ascending."""
+        return sorted_bricks(self._pool.bricks[self._pool.in_use])
+
+    def seen_bricks(self, keyframes: Iterable[int]) -> Bricks:
+        """The bricks that exist and that rays of any of these keyframes, by id, cross; ascending."""
+        found = [
+            k.footprint.window.bricks_of(k.visible.cells) for k in map(self._keyframes.get, keyframes) if k
+        ]
+        return sorted_bricks(np.concatenate([np.zeros((0, 3), np.int32), *found]))
+
+    def crossed_bricks(self) -> Bricks:
+        """The bricks that any ray crosses, whether they exist or not; ascending."""
+        found = [k.footprint.window.bricks_of(k.footprint.crossed) for k in self._keyframes.values()]
+        return sorted_bricks(np.concatenate([np.zeros((0, 3), np.int32), *found]))

@@ -1,0 +1,103 @@
+"""How a long sequence is cut into submaps: which space each owns, and which keyframes it needs.
+
+The plane is cut into square columns, aligned to chunks of 64^3 voxels and without end in z. A submap owns the
+bricks in its column, its core, and takes every keyframe that has a ray in there, with all of its rays: what
+is said of the core is said by all who have seen it. The rest of those rays lies in the cores of others.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.voxels.layout import CHUNK, CHUNK_VOXELS
+
+Cell = tuple[int, int]
+"""A column of the grid: its place along x and y."""
+
+
+@dataclass(frozen=True)
+class SeenKeyframe:
+    """A keyframe as far as the plan cares: its index in the dataset, where the camera was, in metres, and the
+    chunks (n, 3) that its rays cross."""
+
+    index: int
+    centre_m: tuple[float, float, float]
+    chunks: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Submap:
+    """One task: the column ``cell`` of the grid, and the dataset indices of the keyframes that see it."""
+
+    cell: Cell
+    keyframes: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All submaps of a sequence, in the order of their cells; a column is ``chunks_across`` chunks wide."""
+
+    chunks_across: int
+    submaps: tuple[Submap, ...]
+
+    @cached_property
+    def number_of_cell(self) -> dict[Cell, int]:
+        """The number of the submap that owns a column."""
+        return {submap.cell: number for number, submap in enumerate(self.submaps)}
+
+    def cells_of(self, bricks: NDArray[np.int32]) -> NDArray[np.int32]:
+        """The columns that bricks (n, 3) lie in, (n, 2)."""
+        return cells_of_chunks(bricks // CHUNK, self.chunks_across)
+
+    def is_core(self, number: int, bricks: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Whether a submap owns each of the bricks (n, 3), (n,)."""
+        return (self.cells_of(bricks) == self.submaps[number].cell).all(axis=1)
+
+    def neighbours(self, number: int) -> dict[int, tuple[int, ...]]:
+        """The submaps that have keyframes in common with this one, and the indices of these."""
+        own = set(self.submaps[number].keyframes)
+        common = {
+            other: tuple(sorted(own.intersection(submap.keyframes)))
+            for other, submap in enumerate(self.submaps)
+            if other != number
+        }
+        return {other: indices for other, indices in common.items() if indices}
+
+    @property
+    def overlap(self) -> float:
+        """How many submaps a keyframe belongs to on average."""
+        distinct = {index for submap in self.submaps for index in submap.keyframes}
+        return sum(len(submap.keyframes) for submap in self.submaps) / max(1, len(distinct))
+
+
+def cells_of_chunks(chunks: NDArray[np.int32], chunks_across: int) -> NDArray[np.int32]:
+    """The columns that chunks (n, 3) lie in, (n, 2)."""
+    return chunks[:, :2] // chunks_across
+
+
+def chunks_for(submap_size: float, voxel_size: float) -> int:
+    """How many chunks wide a column of at least ``submap_size`` metres is.
+
+    Raises ConfigError for a size that is not a positive number of metres.
+    """
+    if not (math.isfinite(submap_size) and submap_size > 0):
+        raise ConfigError(f"--submap-size must be a positive number of metres, not {submap_size}")
+    # A size that is a whole number of chunks up to rounding is that number.
+    return max(1, math.ceil(submap_size / (voxel_size * CHUNK_VOXELS) - 1e-9))
+
+
+def plan_submaps(keyframes: Sequence[SeenKeyframe], submap_size: float, voxel_size: float) -> Plan:
+    """Cut the space that keyframes see into columns of ``submap_size`` metres, or the next whole number of
+    chunks. Raises ConfigError for an impossible size."""
+    chunks_across = chunks_for(submap_size, voxel_size)
+    members: dict[Cell, list[int]] = {}
+    for keyframe in keyframes:
+        for x, y in np.unique(cells_of_chunks(keyframe.chunks, chunks_across), axis=0).tolist():
+            members.setdefault((x, y), []).append(keyframe.index)
+    submaps = [Submap(cell, tuple(sorted(indices))) for cell, indices in sorted(members.items())]
+    return Plan(chunks_across, tuple(submaps))

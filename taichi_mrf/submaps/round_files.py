@@ -1,0 +1,109 @@
+"""What a submap's task leaves behind in each round: one .npz file, for the next round and the merge."""
+
+import json
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.config_values import from_dict
+from taichi_mrf.errors import MapFileError
+from taichi_mrf.export.atomic import write_npz
+
+Bricks = NDArray[np.int32]
+LogOdds = NDArray[np.float32]
+Halo = tuple[Bricks, LogOdds]
+"""Bricks (n, 3) with log-odds of their voxels, (n, 512)."""
+
+
+@dataclass(frozen=True)
+class SubmapReport:
+    """How a task went. ``core_bricks`` belong to the submap; ``free_bricks`` do too, but have no voxels;
+    ``halo_bricks`` are those of others that it was told about. ``moved`` is the share of the core's voxels
+    whose probability has changed by more than 0.01 since the round before, and ``halo_moved`` the same of
+    what is told to others; None in the first round."""
+
+    submap: int
+    round: int
+    keyframes: int
+    rays: int
+    core_bricks: int
+    free_bricks: int
+    halo_bricks: int
+    seconds: float
+    inferring_seconds: float
+    map_mb: float
+    peak_memory_mb: float | None
+    moved: float | None = None
+    halo_moved: float | None = None
+
+
+@dataclass(frozen=True)
+class RoundResult:
+    """What a submap has found out: the beliefs in the bricks that it owns, the bricks that it owns and that
+    rays have crossed without a surface near, and what each neighbour is to be told."""
+
+    bricks: Bricks
+    belief: LogOdds
+    free_bricks: Bricks
+    halos: Mapping[int, Halo]
+    report: SubmapReport
+
+
+def round_path(folder: Path, round: int, submap: int) -> Path:
+    """The file of a submap and round."""
+    return folder / f"round-{round:03d}" / f"submap-{submap:05d}.npz"
+
+
+def write_round(path: Path, result: RoundResult) -> None:
+    """Write a result beside its place, then into it. Raises MapFileError."""
+    arrays: dict[str, NDArray] = {
+        "bricks": result.bricks,
+        "belief": result.belief,
+        "free_bricks": result.free_bricks,
+        "report": np.asarray(json.dumps(asdict(result.report))),
+    }
+    for other, (bricks, evidence) in result.halos.items():
+        arrays[f"halo_{other}_bricks"], arrays[f"halo_{other}_evidence"] = bricks, evidence
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_npz(path, arrays)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Mapping[str, NDArray]]:
+    """The arrays by name, each read when it is asked for. Raises MapFileError."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            yield file
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise MapFileError(f"{path}: not a readable round of a submap: {error}") from error
+
+
+def read_report(path: Path) -> SubmapReport:
+    """Only how the task went."""
+    with _opened(path) as file:
+        return from_dict(SubmapReport, json.loads(str(file["report"])), str(path))
+
+
+def read_halo(path: Path, listener: int) -> Halo | None:
+    """Only what a neighbour is told; None if that is nothing."""
+    with _opened(path) as file:
+        if f"halo_{listener}_bricks" not in file:
+            return None
+        return file[f"halo_{listener}_bricks"], file[f"halo_{listener}_evidence"]
+
+
+def read_places(path: Path) -> tuple[Bricks, Bricks]:
+    """Only where the core is: its bricks, and those without voxels."""
+    with _opened(path) as file:
+        return file["bricks"], file["free_bricks"]
+
+
+def read_core(path: Path) -> tuple[Bricks, LogOdds, Bricks]:
+    """The core: its bricks with their log-odds, and those without voxels."""
+    with _opened(path) as file:
+        return file["bricks"], file["belief"], file["free_bricks"]

@@ -1,0 +1,187 @@
+"""A long sequence in, one map in chunks out: survey, plan, rounds of inference and exchange, merge."""
+
+import json
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from taichi_mrf.cluster.runner import TaskRunner
+from taichi_mrf.config import Config
+from taichi_mrf.config_values import from_dict
+from taichi_mrf.errors import ConfigError, MapFileError
+from taichi_mrf.export.atomic import write_text
+from taichi_mrf.submaps.job import PLAN_FILE, Job, Sequence
+from taichi_mrf.submaps.merge import merge_submaps
+from taichi_mrf.submaps.plan import plan_submaps
+from taichi_mrf.submaps.round_files import SubmapReport
+from taichi_mrf.submaps.survey import find_keyframes
+from taichi_mrf.submaps.task import SubmapTask, infer_submap, is_idle
+
+SETTLED = 0.001
+"""No further round is made when no larger share of all voxels has moved in the last."""
+
+Progress = Callable[[str, int, int], None]
+"""Told what is being done, how much of it is done, and out of how much."""
+
+
+@dataclass(frozen=True)
+class RoundReport:
+    """A round: ``moved`` and ``halo_moved`` as in SubmapReport, over all submaps; ``seconds`` from its first
+    task's begin to its last one's end."""
+
+    round: int
+    seconds: float
+    moved: float | None
+    halo_moved: float | None
+    submaps: tuple[SubmapReport, ...]
+
+
+@dataclass
+class SubmapsResult:
+    """What :func:`map_in_submaps` made: the job, its rounds, and the ``seconds`` of each stage."""
+
+    job: Job
+    rounds: list[RoundReport] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def map_in_submaps(
+    sequence: Sequence,
+    config: Config,
+    submap_size: float,
+    folder: Path,
+    map_path: Path,
+    runner: TaskRunner,
+    *,
+    rounds: int,
+    settled: float = SETTLED,
+    resume: bool = False,
+    skip_bad_frames: bool = False,
+    infer: Callable[[SubmapTask], SubmapReport] = infer_submap,
+    progress: Progress = lambda what, done, total: None,
+) -> SubmapsResult:
+    """Map a sequence in columns of ``submap_size`` metres, and write the map in chunks to ``map_path``.
+
+    Every submap is inferred by itself, then up to ``rounds`` times again with what its neighbours have found
+    out meanwhile, until no more than ``settled`` of the voxels move. The tasks' files are kept in ``folder``,
+    which all workers must see; with ``resume`` what is there already is not done again. ``infer`` is what the
+    runner is given. Raises ConfigError for parameters that do not fit, or differ from those of the run to
+    resume, and what datasets, maps and the runner raise.
+    """
+    _check(config, rounds)
+    begin = time.perf_counter()
+    result = SubmapsResult(
+        _job(sequence, config, submap_size, folder, runner, resume, skip_bad_frames, progress)
+    )
+    result.seconds["planning"] = time.perf_counter() - begin
+    for round in range(rounds + 1):
+        report = _round(result.job, folder, round, runner, infer, progress)
+        result.rounds.append(report)
+        # A round needs no more than the one before it.
+        shutil.rmtree(folder / f"round-{round - 2:03d}", ignore_errors=True)
+        if report.moved is not None and report.moved <= settled:
+            break
+    result.seconds["inferring"] = sum(each.seconds for each in result.rounds)
+    begin = time.perf_counter()
+    progress("Merging", 0, 1)
+    merge_submaps(folder, result.job, result.rounds[-1].round, map_path)
+    result.seconds["merging"] = time.perf_counter() - begin
+    return result
+
+
+def _check(config: Config, rounds: int) -> None:
+    if config.method != "mrf":
+        raise ConfigError(f"submaps need the method mrf, not {config.method}")
+    if config.poses.refine:
+        raise ConfigError("poses.refine does not go with submaps: no task sees all keyframes")
+    if rounds < 0:
+        raise ConfigError(f"--rounds must not be negative, not {rounds}")
+
+
+def _job(
+    sequence: Sequence,
+    config: Config,
+    submap_size: float,
+    folder: Path,
+    runner: TaskRunner,
+    resume: bool,
+    skip_bad_frames: bool,
+    progress: Progress,
+) -> Job:
+    """The job of the run to go on with, or a new one."""
+    if resume and (folder / PLAN_FILE).exists():
+        job = Job.read(folder)
+        changed = job.differences(sequence, config, submap_size)
+        if changed:
+            raise ConfigError(
+                f"{folder / PLAN_FILE}: made with another {', '.join(changed)}; "
+                "--resume goes on with the same parameters"
+            )
+        return job
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    progress("Planning", 0, 1)
+    keyframes, skipped = find_keyframes(
+        sequence, config, runner, skip_bad_frames, lambda done, total: progress("Planning", done, total)
+    )
+    plan = plan_submaps(keyframes, submap_size, config.voxel_size)
+    job = Job(sequence, config, submap_size, plan, {k.index: k.centre_m for k in keyframes}, skipped)
+    job.write(folder)
+    return job
+
+
+def _round(
+    job: Job,
+    folder: Path,
+    round: int,
+    runner: TaskRunner,
+    infer: Callable[[SubmapTask], SubmapReport],
+    progress: Progress,
+) -> RoundReport:
+    """Carry out a round, or read what is known of it."""
+    path = folder / f"round-{round:03d}.json"
+    if path.exists():
+        return _read_round(path)
+    begin = time.perf_counter()
+    # The largest first, so that none of them is left for the end.
+    order = sorted(range(len(job.plan.submaps)), key=lambda n: -len(job.plan.submaps[n].keyframes))
+    done: list[int] = []
+    what = "Inferring" if round == 0 else f"Round {round}"
+    progress(what, 0, len(order))
+
+    def count(number: int, report: SubmapReport) -> None:
+        done.append(number)
+        progress(what, len(done), len(order))
+
+    tasks = [SubmapTask(str(folder.resolve()), number, round) for number in order]
+    idle = [task for task in tasks if is_idle(task)]
+    reports = [infer_submap(task) for task in idle]
+    for number, report in enumerate(reports):
+        count(number, report)
+    reports += runner.run(infer, [task for task in tasks if task not in idle], count)
+    reports.sort(key=lambda report: report.submap)
+    found = RoundReport(
+        round=round,
+        seconds=time.perf_counter() - begin,
+        moved=_mean(reports, "moved"),
+        halo_moved=_mean(reports, "halo_moved"),
+        submaps=tuple(reports),
+    )
+    write_text(path, json.dumps(asdict(found)) + "\n")
+    return found
+
+
+def _read_round(path: Path) -> RoundReport:
+    try:
+        return from_dict(RoundReport, json.loads(path.read_text(encoding="utf-8")), str(path))
+    except (OSError, ValueError) as error:
+        raise MapFileError(f"{path}: not a readable report of a round: {error}") from error
+
+
+def _mean(reports: list[SubmapReport], name: str) -> float | None:
+    """A share of the voxels of all submaps, each with the weight of its core."""
+    values = [(getattr(report, name), report.core_bricks) for report in reports]
+    known = [(value, weight) for value, weight in values if value is not None]
+    return sum(v * w for v, w in known) / max(1, sum(w for _, w in known)) if known else None

@@ -1,0 +1,161 @@
+"""One submap in one round: a function of the plan's file, the recording and the files of the round before.
+
+A task may run anywhere that sees those files, at any time, and again after it was killed: it writes one file,
+which is whole or not there.
+"""
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from taichi_mrf import runtime
+from taichi_mrf.inference.schedule import InferProgress
+from taichi_mrf.queries.points import probability
+from taichi_mrf.submaps.job import Job
+from taichi_mrf.submaps.partial_map import PartialMap
+from taichi_mrf.submaps.round_files import (
+    Bricks,
+    Halo,
+    LogOdds,
+    RoundResult,
+    SubmapReport,
+    read_core,
+    read_halo,
+    read_report,
+    round_path,
+    write_round,
+)
+from taichi_mrf.voxels.layout import grid_keys
+from taichi_mrf.voxels.memory import peak_memory_mb, reset_peak_memory
+
+MOVED = 0.01
+"""A probability that changes by more than this from one round to the next counts as moved."""
+
+
+@dataclass(frozen=True)
+class SubmapTask:
+    """Infer a submap of the plan in ``folder`` in a round, 0 being the one before any exchange."""
+
+    folder: str
+    submap: int
+    round: int
+
+    def __str__(self) -> str:
+        return f"submap {self.submap} in round {self.round}"
+
+
+def infer_submap(
+    task: SubmapTask, progress: Callable[[InferProgress], bool] = lambda step: True
+) -> SubmapReport:
+    """Infer a submap with what its neighbours said in the round before, and write what it has found out.
+
+    Nothing is done if that is written already. ``progress`` is called after each keyframe's sweep. Raises
+    MapFileError, DatasetError, CapacityError.
+    """
+    folder = Path(task.folder)
+    path = round_path(folder, task.round, task.submap)
+    if path.exists():
+        return read_report(path)
+    before = round_path(folder, task.round - 1, task.submap)
+    if is_idle(task):
+        report = replace(read_report(before), round=task.round, seconds=0.0, moved=0.0, halo_moved=0.0)
+        bricks, belief, free = read_core(before)
+        write_round(path, RoundResult(bricks, belief, free, {}, report))
+        return report
+    result = _inferred(task, Job.read(folder), progress)
+    if task.round > 0:
+        told = [(evidence, read_halo(before, other)) for other, (_, evidence) in result.halos.items()]
+        report = replace(
+            result.report,
+            moved=share_moved([(result.belief, read_core(before)[1])]),
+            halo_moved=share_moved([(now, then[1]) for now, then in told if then is not None]),
+        )
+        result = replace(result, report=report)
+    write_round(path, result)
+    return result.report
+
+
+def is_idle(task: SubmapTask) -> bool:
+    """Whether there is nothing to do but to repeat what the round before has found: rays only pass through
+    this column, and they are the same in every round."""
+    before = round_path(Path(task.folder), task.round - 1, task.submap)
+    return task.round > 0 and not read_report(before).core_bricks
+
+
+def _inferred(task: SubmapTask, job: Job, progress: Callable[[InferProgress], bool]) -> RoundResult:
+    begin = time.perf_counter()
+    settings = job.config.runtime
+    runtime.init(settings.arch, settings.threads, settings.debug)
+    reset_peak_memory()
+    m, id_of = _with_keyframes(job, task.submap)
+    core = _core(job, task.submap, m.bricks())
+    crossed = _core(job, task.submap, m.crossed_bricks())
+    free = crossed[~np.isin(grid_keys(crossed), grid_keys(core))]
+    heard, inferring = 0, 0.0
+    halos: dict[int, Halo] = {}
+    if len(core):
+        neighbours = job.plan.neighbours(task.submap)
+        heard = _listen(m, task, neighbours)
+        inferring = m.infer(progress=progress).seconds
+        halos = _spoken(m, job, task.submap, {n: [id_of[i] for i in c] for n, c in neighbours.items()})
+    belief, size = m.beliefs(core), m.statistics()
+    report = SubmapReport(
+        submap=task.submap,
+        round=task.round,
+        keyframes=size.keyframes,
+        rays=size.rays,
+        core_bricks=len(core),
+        free_bricks=len(free),
+        halo_bricks=heard,
+        seconds=round(time.perf_counter() - begin, 3),
+        inferring_seconds=round(inferring, 3),
+        map_mb=round(size.memory_mb, 3),
+        peak_memory_mb=peak_memory_mb(),
+    )
+    return RoundResult(core, belief, free, halos, report)
+
+
+def _core(job: Job, submap: int, bricks: Bricks) -> Bricks:
+    return bricks[job.plan.is_core(submap, bricks)]
+
+
+def _with_keyframes(job: Job, submap: int) -> tuple[PartialMap, dict[int, int]]:
+    """The submap's map, not yet inferred, and each keyframe's id in it by its index in the dataset."""
+    dataset = job.sequence.open()
+    m = PartialMap.from_config(job.config, dataset.camera)
+    id_of = {}
+    for index in job.plan.submaps[submap].keyframes:
+        frame = dataset.read(index)
+        id_of[index] = m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera, frame.name)
+    return m, id_of
+
+
+def _listen(m: PartialMap, task: SubmapTask, neighbours: Iterable[int]) -> int:
+    """Take in what neighbours said in the round before; returns of how many bricks."""
+    heard = 0
+    for other in neighbours if task.round > 0 else ():
+        halo = read_halo(round_path(Path(task.folder), task.round - 1, other), task.submap)
+        if halo is not None:
+            m.assume(*halo)
+            heard += len(halo[0])
+    return heard
+
+
+def _spoken(m: PartialMap, job: Job, submap: int, common: dict[int, list[int]]) -> dict[int, Halo]:
+    """What each neighbour is to be told of the core: what is believed there without the messages of the
+    keyframes (ids) that it has too, in the bricks that rays of those cross."""
+    halos = {}
+    for other, ids in common.items():
+        bricks = _core(job, submap, m.seen_bricks(ids))
+        if len(bricks):
+            halos[other] = bricks, m.beliefs(bricks, without=ids)
+    return halos
+
+
+def share_moved(pairs: list[tuple[LogOdds, LogOdds]]) -> float:
+    """The share of voxels, over pairs of log-odds, whose probability differs by more than MOVED."""
+    moved = sum(int((np.abs(probability(a) - probability(b)) > MOVED).sum()) for a, b in pairs)
+    return moved / max(1, sum(a.size for a, _ in pairs))
