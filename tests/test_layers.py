@@ -19,6 +19,7 @@ FLOORS = [
         "config_values",
         "camera",
         "frame",
+        "npz_file",
         "devices",
         "runtime",
         "voxels",

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
+from taichi_mrf.npz_file import MANIFEST, manifest_lines
 
 
 @contextmanager
@@ -48,8 +49,9 @@ def write_text(path: str | Path, text: str) -> None:
         temporary.write_bytes(text.encode("utf-8"))
 
 
-def write_npz(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays by name to a compressed file that ``numpy.load`` reads. Raises MapFileError.
+def write_npz(path: str | Path, arrays: Mapping[str, NDArray[Any]], manifest: bool = False) -> None:
+    """Write arrays by name to a compressed file that ``numpy.load`` reads, with a ``manifest`` of them
+    (NpzFile.check_manifest) if it is wanted. Raises MapFileError.
 
     The same arrays always give the same bytes. Compression level 1 instead of the 6 of
     ``numpy.savez_compressed``: for maps it is several times faster and the file hardly larger.
@@ -59,6 +61,12 @@ def write_npz(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
     ):
         for name, array in arrays.items():
-            # A member opened by name gets the date 1980-01-01, not today's.
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
+            _write_member(archive, name, array)
+        if manifest:
+            _write_member(archive, MANIFEST, np.array(manifest_lines(iter(archive.infolist()))))
+
+
+def _write_member(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> None:
+    # A member opened by name gets the date 1980-01-01, not today's.
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+        np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
