@@ -14,7 +14,7 @@ from typing import Any, Literal, TypeVar
 
 import yaml
 
-from taichi_mrf.errors import ConfigError
+from taichi_mrf.errors import ConfigError, said
 
 T = TypeVar("T")
 
@@ -55,7 +55,7 @@ def read_yaml(path: Path) -> Any:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: the 31st of February
-        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())[:300]}") from error
+        raise ConfigError(f"{path}: not valid YAML: {said(error)}") from error
 
 
 def from_dict(cls: type[T], values: Any, where: str) -> T:

@@ -38,3 +38,11 @@ class MapFileError(TaichiMRFError):
 
 class ViewerError(TaichiMRFError):
     """The page cannot be served, or viser is not the version that it is guarded against."""
+
+
+def said(error: BaseException) -> str:
+    """What an exception of another package says, in one line that is not too long to be read."""
+    return " ".join(str(error).split())[:_LONGEST] or type(error).__name__
+
+
+_LONGEST = 200

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.errors import CapacityError, TaichiMRFError
+from taichi_mrf.errors import CapacityError, TaichiMRFError, said
 from taichi_mrf.voxels.memory import check_memory
 
 MANIFEST = "manifest"
@@ -103,7 +103,7 @@ class NpzFile:
     def _member(self, name: str) -> Iterator[tuple[Any, Shape, bool, np.dtype]]:
         """A member's stream behind its header, and what that says."""
         if name not in self._members:
-            raise self._error(f"{self._path}: damaged or incomplete: {name} is missing")
+            raise self._problem(name, "is missing")
         try:
             with self._archive.open(self._members[name]) as stream:
                 shape, fortran, dtype = _read_header(stream)
@@ -114,7 +114,7 @@ class NpzFile:
             raise self._problem(name, f"cannot be read: {said(error)}") from error
 
     def _problem(self, name: str, problem: str) -> TaichiMRFError:
-        return self._error(f"{self._path}: damaged: {name} {problem}")
+        return self._error(f"{self._path}: {name} {problem}")
 
 
 @contextmanager
@@ -168,11 +168,6 @@ def read_npy(path: Path) -> NDArray[Any]:
             raise ValueError(f"it should hold {dtype} {shape}, which its {size} bytes are not")
         values = np.frombuffer(stream.read(), dtype) if _count(shape) * dtype.itemsize else np.empty(0, dtype)
     return values.reshape(shape, order="F" if fortran else "C")
-
-
-def said(error: BaseException) -> str:
-    """What an exception says, in one line that is not too long."""
-    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def _read_header(stream: Any) -> tuple[Shape, bool, np.dtype]:

@@ -24,7 +24,7 @@ LONGEST_LINE = 2000
 BY_NAME = {loader.name: loader for loader in LOADERS}
 
 
-class Failure(AssertionError):
+class FuzzError(AssertionError):
     """What must not come of a damaged file."""
 
 
@@ -49,7 +49,7 @@ def _good(name: str, root: Path) -> tuple[Path, bytes]:
 
 
 def run_case(name: str, seed: int, root: Path) -> Outcome:
-    """Damage one file of a copy of a loader's good input and read it. Raises Failure."""
+    """Damage one file of a copy of a loader's good input and read it. Raises FuzzError."""
     loader, draw = BY_NAME[name], random.Random(seed)
     place, content = _good(name, root)
     folder = root / "case"
@@ -70,11 +70,11 @@ def run_case(name: str, seed: int, root: Path) -> Outcome:
         _check_words(case, str(error), folder)
         return Outcome("refused", file.name, damage.__name__, str(error))
     except Exception as error:
-        raise Failure(f"{case}: {type(error).__name__}: {error}") from error
+        raise FuzzError(f"{case}: {type(error).__name__}: {error}") from error
     if found == content:
         return Outcome("same", file.name, damage.__name__)
     if loader.sealed and damage in BYTES:
-        raise Failure(f"{case}: something else was read")
+        raise FuzzError(f"{case}: something else was read")
     return Outcome("other", file.name, damage.__name__)
 
 
@@ -86,9 +86,9 @@ def _damages(draw: random.Random, file: Path) -> list[Damage]:
 
 def _check_words(case: str, said: str, folder: Path) -> None:
     if "\n" in said or len(said) > LONGEST_LINE:
-        raise Failure(f"{case}: not one line: {said[:300]!r}")
+        raise FuzzError(f"{case}: not one line: {said[:300]!r}")
     if str(folder) not in said:
-        raise Failure(f"{case}: names no file: {said}")
+        raise FuzzError(f"{case}: names no file: {said}")
 
 
 def loaders() -> list[Loader]:

@@ -1,7 +1,7 @@
 """Ways to damage a file, each drawn from a random generator and nothing else, so that a seed repeats it.
 
-Those of BYTES know nothing of the file. Those of TEXT and ZIP change what it says and leave its form whole, as
-a program does that has a defect, or means harm.
+Those of BYTES know nothing of the file. Those of TEXT and ZIP change what it says and leave its form whole,
+as a program does that has a defect, or means harm.
 """
 
 import io
@@ -12,6 +12,8 @@ import zlib
 from collections.abc import Callable
 
 import numpy as np
+
+from taichi_mrf.npz_file import MANIFEST, manifest_lines
 
 Damage = Callable[[random.Random, bytes], bytes]
 
@@ -69,7 +71,7 @@ def stretch_cut_out(draw: random.Random, data: bytes) -> bytes:
 
 def stretch_doubled(draw: random.Random, data: bytes) -> bytes:
     begin = draw.randrange(len(data))
-    end = begin + draw.choice((1, 16, 512))
+    end = min(begin + draw.choice((1, 16, 512)), len(data) - 1)  # the whole file twice may well be a file
     return data[:end] + data[begin:end] + data[end:]
 
 
@@ -167,9 +169,11 @@ def _npy(array: np.ndarray) -> bytes:
 
 
 def member_changed(draw: random.Random, data: bytes) -> bytes:
-    """One array is missing, of another type or shape, holds odd values, or claims what it does not hold."""
+    """One array is missing, of another type or shape, holds odd values, or claims what it does not hold;
+    where there is a manifest it mostly agrees."""
     members = members_of(data)
-    name = draw.choice([each for each in members if not each.startswith("manifest")])
+    sealed = members.pop(f"{MANIFEST}.npy", None)
+    name = draw.choice(list(members))
     array = np.lib.format.read_array(io.BytesIO(members[name]))
     choice = draw.randrange(9)
     if choice == 0:
@@ -207,7 +211,10 @@ def member_changed(draw: random.Random, data: bytes) -> bytes:
         members[name] = _npy(np.asarray(text.decode("utf-8", "replace").replace("\0", "")))
     else:
         members["unknown.npy"] = _npy(np.zeros(3))
-    return zip_of(members)
+    if sealed is not None and draw.random() < 0.8:
+        with zipfile.ZipFile(io.BytesIO(zip_of(members))) as archive:
+            sealed = _npy(np.array(manifest_lines(iter(archive.infolist()))))
+    return zip_of(members if sealed is None else {**members, f"{MANIFEST}.npy": sealed})
 
 
 ZIP: list[Damage] = [member_changed]

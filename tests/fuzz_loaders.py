@@ -1,8 +1,8 @@
 """Everything that reads a file, with a good input to damage: what tests/test_fuzz.py and tests/fuzz_soak.py
 share.
 
-A loader's ``read`` gives all that is in the input as bytes, so that what was read of a damaged one can be told
-from what was there before.
+A loader's ``read`` gives all that is in the input as bytes, so that what was read of a damaged one can be
+told from what was there before.
 """
 
 import gzip
@@ -13,16 +13,13 @@ from dataclasses import astuple, dataclass
 from functools import cache, partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 from datasets_recordings import (
     Content,
-    row_of,
     stamped_line,
     write_image,
     write_log,
     write_numbered,
-    write_rows,
     write_seven_scenes,
     write_tum,
 )
@@ -41,9 +38,9 @@ from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import Config, load
 from taichi_mrf.config_text import commented_yaml
 from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets.laser_scans import open_scans
 from taichi_mrf.datasets.mesh_scene import load_mesh
 from taichi_mrf.datasets.plan_image import read_floor_plan
-from taichi_mrf.datasets.scans import open_scans
 from taichi_mrf.errors import FrameError, TaichiMRFError
 from taichi_mrf.export.atomic import write_npz as write_arrays
 from taichi_mrf.export.octomap import write_bt, write_ot
@@ -57,7 +54,7 @@ from taichi_mrf.sensor.noise import PatchNoise, noise_from_config
 CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
 
 
-class FramesRefused(TaichiMRFError):
+class FramesRefusedError(TaichiMRFError):
     """Some frames are broken and named, the others could be read."""
 
 
@@ -79,8 +76,7 @@ def frames_of(dataset: Dataset) -> bytes:
         try:
             frame = dataset.read(index)
         except FrameError as error:
-            assert f"frame {name}: " in str(error)
-            refused.append(error)
+            refused.append((name, str(error)))
             continue
         assert frame.depth_m.shape == frame.camera.shape == dataset.camera.shape
         assert frame.depth_m.dtype == np.float32
@@ -90,8 +86,9 @@ def frames_of(dataset: Dataset) -> bytes:
         assert np.isfinite(frame.T_world_camera).all()
         parts = (frame.depth_m.tobytes(), frame.T_world_camera.tobytes(), frame.stamp, name)
         found.append((*parts, None if frame.color is None else frame.color.tobytes()))
+    assert all(f"frame {name}: " in said for name, said in refused)
     if refused:
-        raise FramesRefused(str(refused[0]))
+        raise FramesRefusedError(refused[0][1])
     return pickle.dumps((astuple(dataset.camera), dataset.dropped, found))
 
 

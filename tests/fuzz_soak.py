@@ -3,8 +3,8 @@
     python tests/fuzz_soak.py --minutes 10 --seed 0
 
 A process of its own reads; one that crashes, takes longer than HANG_S over a case, or more memory than
-MOST_MEMORY_GB on top of what it starts with, is a failure, and so is every error that is not this package's. Ends
-with status 1 if there was any; each is printed with the loader and the seed that repeat it.
+MOST_MEMORY_GB on top of what it starts with, is a failure, and so is every error that is not this package's.
+Ends with status 1 if there was any; each is printed with the loader and the seed that repeat it.
 """
 
 import argparse
@@ -29,7 +29,7 @@ OUTCOMES = ("refused", "same", "other", "failed")
 def work(pipe: Connection, folder: str) -> None:
     """Carry out the cases that come through the pipe, until it closes."""
     faulthandler.enable()
-    from fuzz_case import Failure, loaders, run_case
+    from fuzz_case import FuzzError, loaders, run_case
 
     from taichi_mrf import runtime
 
@@ -38,7 +38,7 @@ def work(pipe: Connection, folder: str) -> None:
     for loader in loaders():  # the good ones, so that no kernel is compiled when memory is short
         try:
             run_case(loader.name, 0, root)
-        except Failure as failure:
+        except FuzzError as failure:
             print(f"FAILED {failure}", flush=True)
     held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     most = held + int(MOST_MEMORY_GB * 1e9)
@@ -53,7 +53,7 @@ def work(pipe: Connection, folder: str) -> None:
         try:
             outcome = run_case(name, seed, root)
             pipe.send((outcome.kind, outcome.said, time.monotonic() - begin))
-        except Failure as failure:
+        except FuzzError as failure:
             pipe.send(("failed", str(failure), time.monotonic() - begin))
 
 

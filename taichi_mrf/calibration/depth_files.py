@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.images import read_depth
-from taichi_mrf.errors import DatasetError
-from taichi_mrf.npz_file import open_npz, read_npy, said
+from taichi_mrf.errors import DatasetError, said
+from taichi_mrf.npz_file import open_npz, read_npy
 
 FORMATS = (".png", ".npy", ".npz")
 STACK_NAME = "depth_m"

@@ -21,7 +21,8 @@ class Map:
     """Map a recorded or built-in sequence.
 
     Flags take precedence over the file of --config, and that over the defaults. Ctrl-C keeps what is
-    mapped (exit status 130). Example: taichi-mrf map walk.bag --out runs/walk --voxel-size 0.02
+    mapped (exit status 130), and so does memory that runs out (3).
+    Example: taichi-mrf map walk.bag --out runs/walk --voxel-size 0.02
     """
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
@@ -46,6 +47,10 @@ class Map:
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Go on with the map in DIR, with its parameters, after the last frame that is in it."""
 
+    keep_every: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 30.0
+    """Save the keyframes so far at most so often, for --resume to go on with after a crash; at least so
+    seldom that it takes no more than a twentieth of the time."""
+
     refine_poses: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Align each new keyframe with those before it, and all with each other at the end; the same as
     --poses.refine."""
@@ -67,6 +72,8 @@ class Map:
             value = getattr(self, name)
             if isinstance(value, int) and value < 1:
                 raise ConfigError(f"--{name} must be at least 1, not {value}")
+        if not self.keep_every >= 0:
+            raise ConfigError(f"--keep-every must be a number of seconds, not {self.keep_every}")
 
     def parameters(self) -> Config:
         """The parameters with what flags of their own say."""

@@ -1,38 +1,36 @@
 """What ``taichi-mrf map`` does: map a sequence, check the map, write the files, print the report."""
 
-import json
+import sys
 import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
 from taichi_mrf import runtime
 from taichi_mrf.commands.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.commands.map import CONFIG_FILE, Map
+from taichi_mrf.commands.map_keep import MAP_FILE, REPORT_FILE, Keeper, resumed_map, skipped_before
 from taichi_mrf.commands.output import output_folder
 from taichi_mrf.commands.progress import ProgressBar
-from taichi_mrf.commands.report import print_report, report_json, run_report
-from taichi_mrf.config import Config, load, with_absolute_tables
-from taichi_mrf.config_text import commented_yaml, differences
+from taichi_mrf.commands.report import print_report, report_json, run_report, unfinished_report
+from taichi_mrf.config import Config, with_absolute_tables
+from taichi_mrf.config_text import commented_yaml
 from taichi_mrf.datasets import Dataset, open_dataset
-from taichi_mrf.errors import ConfigError, FrameError, MapFileError
+from taichi_mrf.errors import FrameError
 from taichi_mrf.evaluation.held_out import HeldOutCheck, check_held_out
 from taichi_mrf.evaluation.pictures import write_pictures
 from taichi_mrf.export.atomic import write_text
 from taichi_mrf.export.ply import write_voxels
 from taichi_mrf.frame import Frame
-from taichi_mrf.maps.create import load_map
-from taichi_mrf.maps.protocol import OccupancyMap
 from taichi_mrf.pipeline import MappingResult, map_sequence
 
-MAP_FILE, VOXEL_FILE, REPORT_FILE = "map.npz", "voxels.ply", "report.json"
+VOXEL_FILE = "voxels.ply"
 
-MAY_CHANGE = ("inference.sweeps", "inference.tolerance", "runtime.")
-"""Parameters (or groups) that may differ from those of the run that --resume goes on with."""
+DID_NOT_FIT = 3
+"""Exit status of a run for which memory was not enough: what did fit is kept."""
 
 LOOK_AT_PICTURES = "Look at the .png files, or open"
 OPEN_VOXELS = "voxels.ply in MeshLab, CloudCompare or Blender."
@@ -51,7 +49,8 @@ def run_map(options: Map) -> int:
     ):
         start = time.perf_counter()
         runtime.init(settings.runtime.arch, settings.runtime.threads, settings.runtime.debug)
-        previous = _resumed_map(options.out, settings) if options.resume else None
+        previous = resumed_map(options.out, settings) if options.resume else None
+        skipped = skipped_before(options.out) if options.resume else {}
         dataset = open_dataset(options.source, color=False, **options.reading.keywords())
         opening = time.perf_counter() - start
         with ProgressBar(console) as progress, _collected_warnings() as warned:
@@ -64,6 +63,12 @@ def run_map(options: Map) -> int:
                 skip_bad_frames=options.skip_bad_frames,
                 should_stop=request,
                 resume_from=previous,
+                keep=Keeper(
+                    options.out,
+                    settings,
+                    options.keep_every,
+                    lambda result: report_json(unfinished_report(result, dataset, options.source, skipped)),
+                ),
             )
             result.seconds = {"opening": opening, **result.seconds}
             check = _check(result, dataset, progress)
@@ -72,35 +77,16 @@ def run_map(options: Map) -> int:
                 written += _write_pictures(options.out, result, dataset, progress)
         report = run_report(result, dataset, options.source, check)
         report["notes"] += [str(warning.message) for warning in warned]
-        if options.resume:
-            report["skipped_frames"] = _skipped_before(options.out) | report["skipped_frames"]
+        report["skipped_frames"] = skipped | report["skipped_frames"]
         write_text(options.out / REPORT_FILE, report_json(report))
         if options.json:
             print(report_json(report), end="")
-            return _exit_status(request)
+            return _exit_status(request, result)
         print_report(console, report, [*written, options.out / REPORT_FILE])
         look = LOOK_AT_PICTURES if options.pictures else "Open"
         live = f"taichi-mrf live {options.out / MAP_FILE} {LIVE_VIEW}"
         console.print(f"{look} {OPEN_VOXELS} {live}", highlight=False, markup=False)
-    return _exit_status(request)
-
-
-def _resumed_map(folder: Path, settings: Config) -> OccupancyMap | None:
-    """The map of the run to go on with; None if that run was stopped before it wrote one."""
-    if not (folder / MAP_FILE).exists():
-        return None
-    if (folder / CONFIG_FILE).exists():
-        changed = [
-            name
-            for name in differences(load(folder / CONFIG_FILE), settings)
-            if not name.startswith(MAY_CHANGE)
-        ]
-        if changed:
-            raise ConfigError(
-                f"{folder / CONFIG_FILE}: made with another {', '.join(changed)}; "
-                "--resume goes on with the same parameters"
-            )
-    return load_map(folder / MAP_FILE)
+    return _exit_status(request, result)
 
 
 @contextmanager
@@ -167,18 +153,13 @@ def _readable(dataset: Dataset, indices: list[int]) -> list[Frame]:
     return frames
 
 
-def _skipped_before(folder: Path) -> dict[str, str]:
-    """The broken frames that the run before has met and this one does not read again."""
-    path = folder / REPORT_FILE
-    if not path.exists():
-        return {}
-    try:
-        report: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        return dict(report.get("skipped_frames", {}))
-    except (OSError, ValueError) as error:
-        raise MapFileError(f"{path}: cannot be read: {error}") from error
-
-
-def _exit_status(request: StopRequest) -> int:
-    """0, or what a shell expects of a program that was stopped by a signal."""
-    return 0 if request.signal is None else 128 + request.signal
+def _exit_status(request: StopRequest, result: MappingResult) -> int:
+    """0, or what a shell expects of a program that was stopped by a signal, or, after one line that says so,
+    DID_NOT_FIT."""
+    if request.signal is not None:
+        return 128 + request.signal
+    if result.full is None:
+        return 0
+    kept = f"the map of {len(result.map.keyframes)} keyframes is kept; --resume with more memory goes on"
+    print(f"taichi-mrf: {result.full}; {kept}", file=sys.stderr)
+    return DID_NOT_FIT

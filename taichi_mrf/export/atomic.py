@@ -4,7 +4,9 @@ A reader, or a run that is resumed after a crash or a full disk, meets the old f
 never half of one.
 """
 
+import contextlib
 import os
+import re
 import secrets
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -29,7 +31,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     points to is replaced. An OSError is raised as a MapFileError that names ``path`` and the reason.
     """
     target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
+    temporary = target.with_name(f".{target.stem}.part-{os.getpid()}-{secrets.token_hex(4)}{target.suffix}")
     try:
         try:
             yield temporary
@@ -41,6 +43,33 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
             raise
     except OSError as error:
         raise MapFileError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files that processes have left in a folder which were killed while they wrote.
+
+    Those of a process that lives stay, and those that cannot be removed.
+    """
+    for path in folder.iterdir():
+        match = _LEFTOVER.search(path.name)
+        if match and not _lives(int(match[1])):
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+
+_LEFTOVER = re.compile(r"^\..*\.part-(\d+)-[0-9a-f]{8}(\.\w+)?$")
+
+
+def _lives(pid: int) -> bool:
+    if os.name == "nt":  # there a signal ends a process, and a file that is open cannot be removed anyway
+        return False
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # it is another user's
+        return True
+    return True
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import Config, Method, to_yaml
 from taichi_mrf.config_values import from_dict
-from taichi_mrf.errors import CapacityError, MapFileError, TaichiMRFError
-from taichi_mrf.npz_file import NpzFile, open_npz, said
+from taichi_mrf.errors import CapacityError, MapFileError, TaichiMRFError, said
+from taichi_mrf.npz_file import NpzFile, open_npz
 from taichi_mrf.poses import Pose, as_pose
 from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
 from taichi_mrf.voxels.layout import VOXELS

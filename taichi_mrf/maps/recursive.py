@@ -269,7 +269,7 @@ class RecursiveMap(ABC, Generic[FootprintT]):
 
     def save(self, path: str | Path) -> None:
         """Write the map to one .npz file, beside it first and then into place. Raises MapFileError."""
-        slots = self._pool.in_use
+        slots = self._pool.in_order
         keyframes = [
             StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera)
             for k in self._keyframes.values()

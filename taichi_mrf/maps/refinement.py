@@ -5,7 +5,7 @@ alignment/joint.py moves all of them at once, because one after the other they w
 what has added up on the way.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ from taichi_mrf.alignment.likelihood import log_likelihood, map_of_others
 from taichi_mrf.alignment.oriented_points import OrientedPoints, oriented_points
 from taichi_mrf.config import PoseConfig
 from taichi_mrf.maps.mrf import MRFMap
+from taichi_mrf.maps.protocol import MappedKeyframe
 from taichi_mrf.poses import Pose, inverse, tangent_norms
 
 LOSS = 0.1
@@ -56,6 +57,18 @@ class PoseRefiner:
         """Take note of where a keyframe was recorded that was placed in an earlier run."""
         id = next(id for id, keyframe in self._map.keyframes.items() if keyframe.name == name)
         self._recorded[id] = T_recorded
+
+    def repeat(self, keyframes: Iterable[MappedKeyframe]) -> None:
+        """Place keyframes that an earlier run has refined where it left them, and let each speak as it did
+        then: what is known to those after them is what it was, to the last bit."""
+        for k in keyframes:
+            id = self._map.add_keyframe(k.depth_m, k.T_world_camera, k.camera, k.name)
+            self._map.infer(keyframes=[id], sweeps=1)
+
+    def forget(self, keyframe: int) -> None:
+        """Take out a keyframe that could not be placed."""
+        self._recorded.pop(keyframe, None)
+        self._map.remove_keyframe(keyframe)
 
     def place(self, keyframe: int) -> None:
         """Align a new keyframe, which stands where it was recorded, with those before it; then let it speak.

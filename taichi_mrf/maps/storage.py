@@ -39,7 +39,7 @@ def contents_of(
 ) -> MapContents:
     """What is to be stored of a map; ``keyframes`` are those that can still be moved."""
     pool = book.pool
-    slots = pool.in_use
+    slots = pool.in_order
     live = np.zeros(pool.capacity, np.int32)
     for keyframe in keyframes:
         live[book.topology.slots(keyframe.footprint.window.bricks_of(keyframe.footprint.surface))] += 1

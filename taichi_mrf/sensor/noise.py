@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import SensorConfig
-from taichi_mrf.errors import ConfigError
-from taichi_mrf.npz_file import open_npz, read_npy, said
+from taichi_mrf.errors import ConfigError, said
+from taichi_mrf.npz_file import open_npz, read_npy
 
 TERMS = 5
 """Coefficients of a polynomial in the kernels: up to degree 4, padded with zeros."""
@@ -129,7 +129,11 @@ def noise_from_config(config: SensorConfig, camera: PinholeCamera) -> NoiseModel
         sigma = _load_table(config.sigma_table, "sensor.sigma_table")
     if config.bias_table is not None:
         bias = _load_table(config.bias_table, "sensor.bias_table")
-    return PatchNoise(sigma, bias, config.patch, camera)
+    try:
+        return PatchNoise(sigma, bias, config.patch, camera)
+    except ConfigError as error:
+        files = [file for file in (config.sigma_table, config.bias_table) if file is not None]
+        raise ConfigError(f"{' and '.join(files)}: {error}") from error
 
 
 def evaluate(coefficients: NDArray[np.floating], depth_m: ArrayLike) -> NDArray[np.float64]:
@@ -171,7 +175,7 @@ def _padded(coefficients: NDArray[np.float64], name: str) -> NDArray[np.float64]
         raise ConfigError(f"{name} must be of shape (patches, degree + 1), not {coefficients.shape}")
     if coefficients.shape[1] > TERMS:
         raise ConfigError(f"{name} has degree {coefficients.shape[1] - 1}; the highest is {TERMS - 1}")
-    if not np.isfinite(coefficients).all():
+    if not (np.abs(coefficients) <= np.finfo(np.float32).max).all():  # which is what kernels take
         raise ConfigError(f"{name} holds a value that is not finite")
     return np.pad(coefficients, ((0, 0), (0, TERMS - coefficients.shape[1])))
 
