@@ -21,7 +21,7 @@ import trimesh
 from taichi_mrf.config import load
 from taichi_mrf.maps.map_file import open_map_file, read_header
 
-SOURCE = "synthetic:room?frames=16&width=80&height=60"
+SOURCE = "synthetic:room?frames=10&width=80&height=60"
 OPTIONS = ("--voxel-size", "0.1", "--runtime.arch", "cpu", "--no-pictures", "--keep-every", "0")
 SAME = ("map.npz", "voxels.ply", "config.yaml")
 LONGEST_DELAY_S = 0.03

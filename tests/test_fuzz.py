@@ -20,7 +20,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", [loader.name for loader in LOADERS])
-@settings(max_examples=12, derandomize=True, database=None)
+@settings(max_examples=8, derandomize=True, database=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_damaged_file_is_refused_or_read_rightly(name: str, seed: int, root: Path) -> None:
     run_case(name, seed, root)

@@ -7,6 +7,7 @@ files are whole, none of them calls the map finished that is not, and --resume f
 
 import json
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -43,14 +44,18 @@ class Keeper:
         self._last, self._cost = time.perf_counter(), 0.0
 
     def __call__(self, result: MappingResult) -> None:
-        """Save what there is, if it is time. Raises MapFileError."""
+        """Save what there is, if it is time. What cannot be written is warned of: the run goes on, and there
+        may be room for the files at its end."""
         begin = time.perf_counter()
         if begin - self._last < max(self._every_s, self._cost / MOST_OF_THE_TIME):
             return
         with result.timed("keeping"):
-            write_text(self._folder / REPORT_FILE, self._report_text(result))
-            write_text(self._folder / CONFIG_FILE, commented_yaml(self._settings))
-            result.map.save(self._folder / MAP_FILE)
+            try:
+                write_text(self._folder / REPORT_FILE, self._report_text(result))
+                write_text(self._folder / CONFIG_FILE, commented_yaml(self._settings))
+                result.map.save(self._folder / MAP_FILE)
+            except MapFileError as error:
+                warnings.warn(f"nothing could be kept on the way: {error}", stacklevel=2)
         self._last = time.perf_counter()
         self._cost = self._last - begin
 

@@ -13,7 +13,7 @@ from taichi_mrf import runtime
 from taichi_mrf.commands.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.commands.map import CONFIG_FILE, Map
 from taichi_mrf.commands.map_keep import MAP_FILE, REPORT_FILE, Keeper, resumed_map, skipped_before
-from taichi_mrf.commands.output import output_folder
+from taichi_mrf.commands.output import DID_NOT_FIT, output_folder
 from taichi_mrf.commands.progress import ProgressBar
 from taichi_mrf.commands.report import print_report, report_json, run_report, unfinished_report
 from taichi_mrf.config import Config, with_absolute_tables
@@ -28,9 +28,6 @@ from taichi_mrf.frame import Frame
 from taichi_mrf.pipeline import MappingResult, map_sequence
 
 VOXEL_FILE = "voxels.ply"
-
-DID_NOT_FIT = 3
-"""Exit status of a run for which memory was not enough: what did fit is kept."""
 
 LOOK_AT_PICTURES = "Look at the .png files, or open"
 OPEN_VOXELS = "voxels.ply in MeshLab, CloudCompare or Blender."

@@ -7,6 +7,9 @@ from pathlib import Path
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.export.atomic import atomic_path, remove_leftovers
 
+DID_NOT_FIT = 3
+"""Exit status of a run for which memory was not enough: what did fit is mapped and kept."""
+
 
 @contextmanager
 def output_folder(folder: Path) -> Iterator[None]:
