@@ -74,6 +74,13 @@ def from_dict(cls: type[T], values: Any, where: str) -> T:
         if key not in hints:
             raise unknown_key(key, hints, where)
         arguments[key] = _convert(value, hints[key], f"{where}: {key}")
+    missing = [
+        field.name
+        for field in dataclasses.fields(cls)  # type: ignore[arg-type]
+        if field.name not in arguments and field.default is field.default_factory is dataclasses.MISSING
+    ]
+    if missing:
+        raise ConfigError(f"{where}: {', '.join(missing)} missing")
     try:
         return cls(**arguments)
     except ConfigError as error:

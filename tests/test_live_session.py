@@ -195,7 +195,7 @@ def test_a_full_map_pauses_with_a_notice(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_run_that_nobody_watches_ends_when_the_map_is_full() -> None:
-    volume = VolumeConfig(memory_limit_gb=3e-3)
+    volume = VolumeConfig(memory_limit_gb=8.5e-4)
     link = FakeLink()
     session = session_of(link, config=dataclasses.replace(CONFIG, volume=volume))
     session.state.policy = Policy(leave_when_done=True)

@@ -63,6 +63,8 @@ def _bytes(path: Path) -> bytes:
         raise DatasetError(f"{path}: the image is missing") from None
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:  # a zero byte in its name
+        raise DatasetError(f"{path}: is no name of a file: {error}") from error
 
 
 def _decode(data: bytes, where: str, flags: int) -> NDArray:
