@@ -87,13 +87,13 @@ class MRFMap:
         lister = RayLister(self.voxel_size, inference)
         whereabouts = Whereabouts()
         parts = (self.sensor, inference, self.config.volume)
-        self._placing = Placing(self._book, lister, *parts, whereabouts)
+        self._keyframes: dict[int, Keyframe] = {}
+        self._placing = Placing(self._book, lister, *parts, whereabouts, self._keyframes)
         self._sweeper = Sweeper(self.voxel_size, self.sensor, inference, self.config.volume)
         kept = (self._placing.look_again, self._placing.refresh)
         self._renewal = Renewal(self._pool, self._sweeper, whereabouts, *kept)
         self.view = View(self._pool, self.voxel_size, self.config.volume)
         self._aligner = Aligner(self.view, self.sensor.max_depth)
-        self._keyframes: dict[int, Keyframe] = {}
         self._frozen: dict[int, str] = {}
         self._next_id = 0
         self._messages_lost = False  # a loaded map has beliefs, but no messages
@@ -344,7 +344,9 @@ class MRFMap:
             m._frozen = dict(contents.frozen)
             for stored in header.keyframes:
                 image = m._upload(stored.depth_m, stored.camera)
-                m._keyframes[stored.id] = m._placing.place(stored.id, stored.name, image, stored.T_world_camera)
+                m._keyframes[stored.id] = m._placing.place(
+                    stored.id, stored.name, image, stored.T_world_camera
+                )
         if len(bricks):
             m._pool.write("belief", slots, contents.belief)
             if contents.evidence is not None:
