@@ -45,13 +45,15 @@ class Placing:
         parts = (voxel_size, self.sensor, self.inference, self.volume)
         footprint = find_footprint(image, rays, T_world_camera, *parts, scouts=SCOUTS)
         others = [keyframe for keyframe in self.keyframes.values() if keyframe.id != id]
-        check_room(others, footprint, self.book.pool, self.inference.message_precision)
+        begins = unknown_begins(rays)
+        image_bytes = 4 * (image.depth.shape[0] + begins.shape[0]) + rays.nbytes
+        check_room(others, footprint, image_bytes, self.book.pool, self.inference.message_precision)
         camera_brick = np.floor(T_world_camera[:3, 3] / (voxel_size * BRICK))
         self.book.topology.anchor(np.clip(camera_brick, -(2**30), 2**30).astype(np.int32))
         self.book.claim(footprint)
         self.whereabouts.put(id, footprint.window)
         visible = self.book.visible(footprint)
-        return Keyframe(id, name, image, rays, T_world_camera, footprint, visible, unknown_begins(rays))
+        return Keyframe(id, name, image, rays, T_world_camera, footprint, visible, begins)
 
     def take_out(self, keyframe: Keyframe) -> None:
         """Undo :meth:`place`, and withdraw the keyframe's messages."""

@@ -10,7 +10,9 @@ from taichi_mrf.voxels.memory import check_memory
 from taichi_mrf.voxels.pool import BrickPool
 
 
-def check_room(others: Collection[Keyframe], added: Footprint, pool: BrickPool, precision: str) -> None:
+def check_room(
+    others: Collection[Keyframe], added: Footprint, image_bytes: int, pool: BrickPool, precision: str
+) -> None:
     """Raise CapacityError if the map with one more keyframe, all of them with their messages, is over the
     pool's limit, or if the messages that are still to come are more than there is memory for.
 
@@ -22,6 +24,7 @@ def check_room(others: Collection[Keyframe], added: Footprint, pool: BrickPool, 
     sizes.append((len(added.surface) * bytes_per_brick, True))
     what = f"a map of {len(sizes)} keyframes with their messages"
     if pool.memory_limit_gb > 0:
-        held = len(pool.in_use) * VOXELS * pool.bytes_per_voxel + sum(k.image_bytes for k in others)
-        check_memory(held + sum(messages for messages, _ in sizes), what, pool.memory_limit_gb)
-    check_memory(sum(messages for messages, are_to_come in sizes if are_to_come), what)
+        voxels = len(pool.in_use) * VOXELS * pool.bytes_per_voxel
+        images = image_bytes + sum(k.image_bytes for k in others)
+        check_memory(voxels + images + sum(size for size, _ in sizes), what, pool.memory_limit_gb)
+    check_memory(sum(size for size, is_to_come in sizes if is_to_come), what)
