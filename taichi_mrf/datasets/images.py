@@ -124,8 +124,9 @@ def _png_content_damage(data: bytes, packed: bytes) -> str | None:
             pending = unpacker.unconsumed_tail
     except zlib.error:
         return "the image is damaged (its pixels cannot be unpacked)"
-    if held < wanted:
-        return f"the image is cut short: {width} x {height} pixels are more than it holds"
+    if held != wanted:
+        than = "cut short: its pixels are fewer" if held < wanted else "damaged: its pixels are more"
+        return f"the image is {than} than {width} x {height}"
     return None
 
 
