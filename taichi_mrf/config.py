@@ -247,7 +247,7 @@ class VolumeConfig:
     keyframe. 256 at 2 cm are 41 m and take 128 MB."""
 
     memory_limit_gb: float = 0.0
-    """Most memory for the map in GB; 0 means what the machine has free."""
+    """Most memory for the map in GB: its voxels, images and messages; 0 means what the machine has free."""
 
     min_evidence: float = 0.1
     """A voxel whose log-odds lie nearer than this to the prior counts as unknown."""

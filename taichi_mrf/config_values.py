@@ -6,6 +6,7 @@ does not fit is a ConfigError that says where it stands and, for a name, which o
 
 import dataclasses
 import difflib
+import reprlib
 import types
 import typing
 from pathlib import Path
@@ -13,9 +14,11 @@ from typing import Any, Literal, TypeVar
 
 import yaml
 
-from taichi_mrf.errors import ConfigError
+from taichi_mrf.errors import ConfigError, said
 
 T = TypeVar("T")
+
+_LARGEST_INTEGER = 2**63 - 1
 
 
 def unknown_key(key: object, known: typing.Iterable[str], where: str) -> ConfigError:
@@ -35,14 +38,24 @@ def overridden(config: T, overrides: dict[str, Any], where: str) -> T:
     return dataclasses.replace(config, **overrides)  # type: ignore[type-var]
 
 
+def shown(value: Any) -> str:
+    """A value as an error shows it, which is not all of it if it is large: YAML writes in a line what would
+    fill a book."""
+    return _SHORT.repr(value)
+
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 100
+
+
 def read_yaml(path: Path) -> Any:
     """The plain values of a YAML file. Raises ConfigError, which names the file."""
     try:
         return yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: the 31st of February
+        raise ConfigError(f"{path}: not valid YAML: {said(error)}") from error
 
 
 def from_dict(cls: type[T], values: Any, where: str) -> T:
@@ -61,6 +74,13 @@ def from_dict(cls: type[T], values: Any, where: str) -> T:
         if key not in hints:
             raise unknown_key(key, hints, where)
         arguments[key] = _convert(value, hints[key], f"{where}: {key}")
+    missing = [
+        field.name
+        for field in dataclasses.fields(cls)  # type: ignore[arg-type]
+        if field.name not in arguments and field.default is field.default_factory is dataclasses.MISSING
+    ]
+    if missing:
+        raise ConfigError(f"{where}: {', '.join(missing)} missing")
     try:
         return cls(**arguments)
     except ConfigError as error:
@@ -78,11 +98,11 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
         return _convert(value, next(a for a in arguments if a is not type(None)), where)
     if origin is Literal:
         if value not in arguments:
-            raise ConfigError(f"{where} must be one of {', '.join(map(str, arguments))}, not {value!r}")
+            raise ConfigError(f"{where} must be one of {', '.join(map(str, arguments))}, not {shown(value)}")
         return value
     if origin is tuple:
         if not isinstance(value, list | tuple):
-            raise ConfigError(f"{where} must be a list, not {value!r}")
+            raise ConfigError(f"{where} must be a list, not {shown(value)}")
         if arguments[-1] is not Ellipsis and len(value) != len(arguments):
             raise ConfigError(f"{where} must have {len(arguments)} entries, not {len(value)}")
         return tuple(_convert(v, arguments[0], where) for v in value)
@@ -90,10 +110,12 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
         try:
             value = float(value)
         except ValueError:
-            raise ConfigError(f"{where} must be a number, not {value!r}") from None
+            raise ConfigError(f"{where} must be a number, not {shown(value)}") from None
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) > _LARGEST_INTEGER:
+        raise ConfigError(f"{where} must be a number of a sensible size, not {shown(value)}")
     accepted = (int, float) if hint is float else hint
     if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
-        raise ConfigError(f"{where} must be of type {hint.__name__}, not {value!r}")
+        raise ConfigError(f"{where} must be of type {hint.__name__}, not {shown(value)}")
     return float(value) if hint is float else value
 
 

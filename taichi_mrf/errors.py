@@ -53,3 +53,11 @@ class ClusterError(TaichiMRFError):
     def __init__(self, text: str, lost: dict[int, str] | None = None) -> None:
         super().__init__(text)
         self.lost = lost or {}
+
+
+def said(error: BaseException) -> str:
+    """What an exception of another package says, in one line that is not too long to be read."""
+    return " ".join(str(error).split())[:_LONGEST] or type(error).__name__
+
+
+_LONGEST = 200

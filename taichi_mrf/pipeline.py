@@ -9,10 +9,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from taichi_mrf.config import Config
 from taichi_mrf.datasets import Dataset
-from taichi_mrf.errors import DatasetError, FrameError, LostFrameError
+from taichi_mrf.errors import CapacityError, DatasetError, FrameError, LostFrameError
 from taichi_mrf.frame import Frame
+from taichi_mrf.inference.keyframe import checked_depth
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.keyframes import KeyframeSelector
 from taichi_mrf.maps.create import create_map
@@ -86,7 +89,8 @@ class MappingResult:
     indices of the frames that were kept out, ``seconds`` the time of each stage. ``interrupted`` is true
     if the run was told to stop before its end; the map holds everything up to there. ``poses`` are, if they
     were refined, the recorded and the refined pose of every keyframe; ``track`` says, if poses were not
-    recorded but found, where each frame was taken.
+    recorded but found, where each frame was taken. ``full`` names the frame that did not fit into memory,
+    and says why; the map holds those before it.
     """
 
     map: OccupancyMap
@@ -99,6 +103,7 @@ class MappingResult:
     interrupted: bool = False
     poses: list[PoseChange] = field(default_factory=list)
     track: Track | None = None
+    full: str | None = None
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -120,6 +125,7 @@ def map_sequence(
     skip_bad_frames: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
     resume_from: OccupancyMap | None = None,
+    keep: Callable[[MappingResult], None] = lambda result: None,
 ) -> MappingResult:
     """Map the frames 0, ``every``, 2 ``every``, ... of a dataset, ``limit`` of them at most.
 
@@ -129,18 +135,25 @@ def map_sequence(
     ``should_stop`` is asked between keyframes. A run that it ends makes one sweep over the keyframes there
     are if it has not yet, so that the map is usable. ``resume_from`` is the map of such a run, of this
     dataset: its keyframes are kept and the frames after the last of them are added, which ends in the map
-    of an undisturbed run.
+    of an undisturbed run. ``keep`` is called after each keyframe, and may save what there is for such a run.
+    A frame for which there is no memory ends the adding: the map of those before it is inferred.
 
     Raises FrameError for a broken frame unless ``skip_bad_frames``, DatasetError if no frame became a
     keyframe or the map to resume is of another recording, ConfigError if poses are to be refined
     or tracked in a map that cannot, and what the map raises.
     """
-    start = create_map(config, dataset.camera) if resume_from is None else resume_from
-    result = MappingResult(start)
     indices = range(0, len(dataset), every)[:limit]
+    result = MappingResult(create_map(config, dataset.camera) if resume_from is None else resume_from)
+    if resume_from is not None:
+        check_same_frames(resume_from, dataset, indices)
+        if config.poses.refine:
+            result.map = create_map(config, dataset.camera)
     refiner = refiner_of(result.map, config.poses)
+    if refiner is not None and resume_from is not None:
+        refiner.repeat(resume_from.keyframes.values())
     tracker = tracker_of(result.map, config.poses) if dataset.tracked else None
-    _add_keyframes(result, dataset, indices, config, listener, skip_bad_frames, should_stop, refiner, tracker)
+    parts = (config, listener, skip_bad_frames, should_stop, refiner, tracker, keep)
+    _add_keyframes(result, dataset, indices, *parts)
     if not result.map.keyframes:
         raise DatasetError(_why_empty(dataset, result))
     if refiner is not None:
@@ -159,13 +172,11 @@ def _add_keyframes(
     should_stop: Callable[[], bool],
     refiner: PoseRefiner | None,
     tracker: Tracker | None,
+    keep: Callable[[MappingResult], None],
 ) -> None:
     """Allocate every selected frame, without inference but for what ``refiner`` needs."""
     names = dataset.frame_names
     mapped = {keyframe.name: (id, keyframe) for id, keyframe in result.map.keyframes.items()}
-    foreign = mapped.keys() - set(names)
-    if foreign:
-        raise DatasetError(f"the map to resume has a keyframe '{min(foreign)}', which {dataset.name} has not")
     selector = KeyframeSelector(config.keyframes if tracker is None else keyframe_steps(config.keyframes))
     # A camera's images cannot be read again, and its poses are not known before they are tracked.
     hold_out = 0 if tracker is not None and dataset.endless else config.evaluation.hold_out
@@ -174,12 +185,14 @@ def _add_keyframes(
     for index in indices:
         if names[index] in mapped:
             id, keyframe = mapped[names[index]]
+            T_world_camera = keyframe.T_world_camera
             if tracker is not None:
                 tracker.resume(id)
             if refiner is not None:
-                tracked = tracker is not None
-                refiner.know(id, keyframe.T_world_camera if tracked else dataset.read(index).T_world_camera)
-            selector.accept(keyframe.T_world_camera)
+                if tracker is None:
+                    T_world_camera = dataset.read(index).T_world_camera
+                refiner.know(id, T_world_camera)
+            selector.accept(T_world_camera)
             last_mapped = index
 
     for number, index in enumerate(indices, start=1):
@@ -212,17 +225,50 @@ def _add_keyframes(
         elif not (frame.depth_m > 0).any():
             listener(FramePassed(*place, reason="holds no measurement"))
         else:
-            with result.timed("adding"):
-                added = result.map.add_keyframe(
-                    frame.depth_m, frame.T_world_camera, frame.camera, name=frame.name
-                )
-            if refiner is not None:
-                with result.timed("refining"):
-                    refiner.place(added)
+            try:
+                added = _add(result, frame, refiner)
+            except CapacityError as error:
+                if not result.map.keyframes:
+                    raise
+                result.full = f"frame {frame.name} does not fit: {error}"
+                return
             if tracker is not None and result.track is not None:
                 result.track.frames[index] = tracker.took(added)
             selector.accept(frame.T_world_camera)
             listener(KeyframeAdded(*place, added, result.map.keyframes[added].rays))
+            keep(result)
+
+
+def _add(result: MappingResult, frame: Frame, refiner: PoseRefiner | None) -> int:
+    """Add a frame as a keyframe; returns its number. What is raised leaves the map without it."""
+    with result.timed("adding"):
+        keyframe = result.map.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera, name=frame.name)
+    if refiner is not None:
+        with result.timed("refining"):
+            try:
+                refiner.place(keyframe)
+            except CapacityError:
+                refiner.forget(keyframe)
+                raise
+    return keyframe
+
+
+def check_same_frames(m: OccupancyMap, dataset: Dataset, indices: range) -> None:
+    """Refuse to go on with a map of another recording: each of its keyframes must be a frame of this one, and
+    the last of them must hold the same depth. Raises DatasetError."""
+    names = dataset.frame_names
+    mapped = {keyframe.name: keyframe for keyframe in m.keyframes.values()}
+    foreign = mapped.keys() - set(names)
+    if foreign:
+        raise DatasetError(f"the map to resume has a keyframe '{min(foreign)}', which {dataset.name} has not")
+    last = next((index for index in reversed(indices) if names[index] in mapped), None)
+    if last is not None and not dataset.endless:  # a camera's images cannot be read again
+        recorded, known = dataset.read(last), mapped[names[last]]
+        depth_m = checked_depth(recorded.depth_m, recorded.camera, m.config.sensor.min_depth)
+        if known.camera != recorded.camera or not np.array_equal(depth_m, known.depth_m):
+            raise DatasetError(
+                f"the map to resume is of another recording than {dataset.name}: frame {names[last]} differs"
+            )
 
 
 def _refine(
@@ -255,8 +301,12 @@ def _infer(result: MappingResult, listener: Listener, should_stop: Callable[[], 
         first_is_done = step.sweep > 1 or step.keyframe == step.keyframes
         return not (result.interrupted and first_is_done)
 
-    with result.timed("inferring"):
-        report = result.map.infer(sweeps=1 if result.interrupted else None, progress=progress)
+    try:
+        with result.timed("inferring"):
+            report = result.map.infer(sweeps=1 if result.interrupted else None, progress=progress)
+    except CapacityError as error:
+        result.full = f"inference does not fit: {error}"
+        return
     result.sweeps, result.residual = report.sweeps, report.residual
 
 

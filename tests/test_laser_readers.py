@@ -205,7 +205,7 @@ BROKEN_ARRAYS = {
         "holds no scans",
     ),
     "zero beams": ({"range_m": np.zeros((2, 0))}, "(scans, beams)"),
-    "objects": ({"range_m": np.array([[{}]], dtype=object)}, "not an npz file that is whole"),
+    "objects": ({"range_m": np.array([[{}]], dtype=object)}, "range_m cannot be read"),
 }
 
 

@@ -20,6 +20,7 @@ FLOORS = [
         "camera",
         "frame",
         "libraries",
+        "npz_file",
         "devices",
         "runtime",
         "voxels",

@@ -1,5 +1,6 @@
 """A live session against a viewer that is only a list: what is published, and what becomes of requests."""
 
+import dataclasses
 from pathlib import Path
 
 import live_scene
@@ -23,7 +24,7 @@ from live_scene import (
     source,
 )
 
-from taichi_mrf.config import Config
+from taichi_mrf.config import Config, VolumeConfig
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.live.open_source import open_source
@@ -186,9 +187,25 @@ def test_a_full_map_pauses_with_a_notice(monkeypatch: pytest.MonkeyPatch) -> Non
     link = FakeLink()
     session = session_of(link)
     session.run(lambda: link.waits > 0)
-    assert link.errors() == ["the map would not fit"]
+    name = small_room.frames()[2].name
+    assert link.errors() == [f"frame {name} does not fit: the map would not fit"]
     assert last_status(link).paused
     assert marginals(session.state.mapper.map) == marginals(built(range(2)))
+    assert session.state.full in link.errors()
+
+
+def test_a_run_that_nobody_watches_ends_when_the_map_is_full() -> None:
+    volume = VolumeConfig(memory_limit_gb=1.4e-3)
+    link = FakeLink()
+    session = session_of(link, room(10), dataclasses.replace(CONFIG, volume=volume))
+    session.state.policy = Policy(leave_when_done=True)
+    session.run(lambda: link.waits > 3)
+    mapped = session.state.mapper.map
+    count = len(mapped.keyframes)
+    assert 0 < count < 10
+    assert f"frame {small_room.frames()[count].name} does not fit" in str(session.state.full)
+    assert not session.state.mapper.unsettled
+    assert marginals(mapped) == marginals(built(range(count)))
 
 
 @pytest.mark.parametrize(

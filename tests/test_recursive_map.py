@@ -12,12 +12,14 @@ from hypothesis import strategies as st
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import Config, Method, SensorConfig, VisibilityConfig
 from taichi_mrf.errors import KeyframeError, MapFileError
+from taichi_mrf.export.atomic import write_npz
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.maps.create import create_map, load_map
 from taichi_mrf.maps.log_odds import LogOddsMap
 from taichi_mrf.maps.mrf import MRFMap
 from taichi_mrf.maps.recursive import RecursiveMap
 from taichi_mrf.maps.visibility import VisibilityMap
+from taichi_mrf.npz_file import MANIFEST
 from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN
 
 pytestmark = pytest.mark.usefixtures("one_backend")
@@ -294,28 +296,28 @@ def test_an_older_map_that_names_no_method_is_an_mrf_map(tmp_path: Path) -> None
     path = tmp_path / "map.npz"
     MRFMap(0.1).save(path)
     with np.load(path) as file:
-        arrays = {name: file[name] for name in file.files if name != "method"}
-    np.savez(path, **arrays)
+        arrays = {name: file[name] for name in file.files if name not in ("method", MANIFEST)}
+    np.savez(path, **{**arrays, "format": np.asarray(1)})
     assert isinstance(load_map(path), MRFMap)
 
 
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("belief", None, "lacks.*belief"),
-        ("belief", np.zeros((1, 512), np.float32), "do not match"),
+        ("belief", None, "belief is missing"),
+        ("belief", np.zeros((1, 512), np.float32), r"belief is float32 \(1, 512\), where \(\d+, 512\)"),
         ("method", np.asarray("magic"), "does not know"),
-        ("format", np.asarray(99), "format 99"),
+        ("format", np.asarray(99), "format 99, by a newer version; this version reads formats 1 to 2"),
     ],
 )
 def test_a_damaged_map_is_refused(tmp_path: Path, name: str, value: np.ndarray | None, message: str) -> None:
     path = tmp_path / "map.npz"
     build("log_odds", [0]).save(path)
     with np.load(path) as file:
-        arrays = {each: file[each] for each in file.files if each != name}
+        arrays = {each: file[each] for each in file.files if each not in (name, MANIFEST)}
     if value is not None:
         arrays[name] = value
-    np.savez(path, **arrays)
+    write_npz(path, arrays, manifest=True)
     with pytest.raises(MapFileError, match=message) as caught:
         load_map(path)
     assert str(path) in str(caught.value)

@@ -5,7 +5,6 @@ images of a stack are called by their number, 0000, 0001, ...; those of a stack 
 file's name in front. Whole numbers are steps of a metre, floating-point numbers are metres.
 """
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.images import read_depth
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, said
+from taichi_mrf.npz_file import open_npz, read_npy
 
 FORMATS = (".png", ".npy", ".npz")
 STACK_NAME = "depth_m"
@@ -101,20 +101,18 @@ class DepthFiles:
 
 def _load(path: Path) -> NDArray:
     try:
-        content = np.load(path, allow_pickle=False)
-        if isinstance(content, np.ndarray):
-            array = content
-        else:
-            with content:
-                names = content.files
-                name = STACK_NAME if STACK_NAME in names else names[0] if len(names) == 1 else None
-                if name is None:
-                    raise DatasetError(
-                        f"{path}: holds no array '{STACK_NAME}' but {', '.join(names) or 'nothing'}"
-                    )
-                array = content[name]
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise DatasetError(f"{path}: cannot be read as an array: {error}") from error
+        array = read_npy(path)
+    except (OSError, ValueError) as error:
+        if path.suffix != ".npz":
+            raise DatasetError(f"{path}: cannot be read as an array: {said(error)}") from error
+        with open_npz(path, DatasetError, "an array that can be read") as file:
+            names = file.names
+            name = STACK_NAME if STACK_NAME in names else names[0] if len(names) == 1 else None
+            if name is None:
+                raise DatasetError(
+                    f"{path}: holds no array '{STACK_NAME}' but {', '.join(names) or 'nothing'}"
+                ) from None
+            array = file[name]
     if not np.issubdtype(array.dtype, np.integer) and not np.issubdtype(array.dtype, np.floating):
         raise DatasetError(f"{path}: holds no numbers")
     if array.ndim == 2 or array.ndim == 3:

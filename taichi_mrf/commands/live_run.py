@@ -10,7 +10,7 @@ from rich.console import Console
 
 from taichi_mrf.commands.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.commands.live import Live
-from taichi_mrf.commands.output import output_folder
+from taichi_mrf.commands.output import DID_NOT_FIT, output_folder
 from taichi_mrf.commands.serving import Say, let_the_page_go_first, tell_address, warn_of_host
 from taichi_mrf.config import with_absolute_tables
 from taichi_mrf.errors import TaichiMRFError
@@ -65,7 +65,12 @@ def run_live(options: Live) -> int:
                 say(f"wrote {path}")
     if problem is not None:
         raise TaichiMRFError(problem)
-    return 0 if request.signal is None else 128 + request.signal
+    if request.signal is not None:
+        return 128 + request.signal
+    if session.state.full is not None:
+        print(f"taichi-mrf: {session.state.full}; what did fit is mapped", file=sys.stderr)
+        return DID_NOT_FIT
+    return 0
 
 
 class _Page:

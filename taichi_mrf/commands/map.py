@@ -25,8 +25,8 @@ class Map:
     """Map recorded or built-in sequences.
 
     Flags take precedence over the file of --config, and that over the defaults. Ctrl-C keeps what is
-    mapped (exit status 130). Examples: taichi-mrf map walk.bag --out runs/walk --voxel-size 0.02 and
-    taichi-mrf map scans/* --out runs --jobs 4
+    mapped (exit status 130), and so does memory that runs out (3). Examples:
+    taichi-mrf map walk.bag --out runs/walk --voxel-size 0.02 and taichi-mrf map scans/* --out runs --jobs 4
     """
 
     sources: Annotated[tuple[str, ...], tyro.conf.Positional, _SOURCES]
@@ -52,6 +52,10 @@ class Map:
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Go on with the map in DIR, with its parameters, after the last frame that is in it. Of several
     sources, those that are finished are left alone."""
+
+    keep_every: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 30.0
+    """Save the keyframes so far at most so often, for --resume to go on with after a crash; at least so
+    seldom that it takes no more than a twentieth of the time."""
 
     jobs: Annotated[int, tyro.conf.arg(metavar="N")] = 1
     """Map so many of several sources at a time, each in a process of its own. They share the cores, and have
@@ -91,6 +95,8 @@ class Map:
                 raise ConfigError(f"--{name} must be at least 1, not {value}")
         if self.sources is not tyro.MISSING and not self.sources:
             raise ConfigError("map needs a SOURCE")
+        if not self.keep_every >= 0:
+            raise ConfigError(f"--keep-every must be a number of seconds, not {self.keep_every}")
 
     def run(self) -> int:
         """Map, write everything, and print the report. Raises TaichiMRFError."""

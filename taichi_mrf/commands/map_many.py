@@ -12,8 +12,9 @@ import taichi_mrf
 from taichi_mrf.cluster.choose import open_runner
 from taichi_mrf.commands.interrupt import StopRequest, interrupt_on_signals
 from taichi_mrf.commands.map import CONFIG_FILE, Map
+from taichi_mrf.commands.map_keep import REPORT_FILE
 from taichi_mrf.commands.map_process import Outcome, finished_before, map_in_process
-from taichi_mrf.commands.map_run import REPORT_FILE, MapTask, exit_status, map_task, print_run
+from taichi_mrf.commands.map_run import MapTask, exit_status, map_task, print_run
 from taichi_mrf.commands.map_summary import (
     Row,
     accuracy_text,

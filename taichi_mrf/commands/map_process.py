@@ -11,12 +11,12 @@ from rich.console import Console
 
 from taichi_mrf.commands.interrupt import stop_on_signals
 from taichi_mrf.commands.map import CONFIG_FILE
-from taichi_mrf.commands.map_run import MAP_FILE, REPORT_FILE, VOXEL_FILE, MapTask, map_to_folder
+from taichi_mrf.commands.map_keep import MAP_FILE, REPORT_FILE
+from taichi_mrf.commands.map_run import VOXEL_FILE, MapTask, map_to_folder
 from taichi_mrf.commands.progress import ProgressBar
 from taichi_mrf.config import load
 from taichi_mrf.config_text import differences
 from taichi_mrf.errors import MapFileError, TaichiMRFError
-from taichi_mrf.export.atomic import remove_leftovers
 
 Status = Literal["mapped", "finished before", "stopped", "failed", "not done"]
 
@@ -42,11 +42,12 @@ def map_in_process(task: MapTask) -> Outcome:
             finished = finished_before(task)
             if finished is not None:
                 return finished
-            remove_leftovers(task.out)
             map_to_folder(task, silent, request)
             report = _report_in(task.out)
         except Exception as error:
             return Outcome("stopped") if request() else Outcome("failed", error=_one_line(error))
+    if report and report.get("did_not_fit"):
+        return Outcome("failed", report, report["did_not_fit"])
     return Outcome("stopped" if report and report["interrupted"] else "mapped", report)
 
 

@@ -1,6 +1,6 @@
 """What ``taichi-mrf map`` does: map a sequence, check the map, write the files, print the report."""
 
-import json
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -14,30 +14,25 @@ from rich.console import Console
 from taichi_mrf import runtime
 from taichi_mrf.commands.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.commands.map import CONFIG_FILE, Map
-from taichi_mrf.commands.output import output_folder
+from taichi_mrf.commands.map_keep import MAP_FILE, REPORT_FILE, Keeper, resumed_map, skipped_before
+from taichi_mrf.commands.output import DID_NOT_FIT, output_folder
 from taichi_mrf.commands.progress import ProgressBar
-from taichi_mrf.commands.report import print_report, report_json, run_report
-from taichi_mrf.config import Config, load, with_absolute_tables
-from taichi_mrf.config_text import commented_yaml, differences
+from taichi_mrf.commands.report import print_report, report_json, run_report, unfinished_report
+from taichi_mrf.config import Config, with_absolute_tables
+from taichi_mrf.config_text import commented_yaml
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.reposed import reposed
 from taichi_mrf.datasets.source_flags import SourceFlags
-from taichi_mrf.errors import ConfigError, FrameError, MapFileError
+from taichi_mrf.errors import FrameError
 from taichi_mrf.evaluation.held_out import HeldOutCheck, check_held_out
 from taichi_mrf.evaluation.pictures import write_pictures
 from taichi_mrf.export.atomic import write_text
 from taichi_mrf.export.ply import write_voxels
 from taichi_mrf.export.trajectory import write_trajectory
 from taichi_mrf.frame import Frame
-from taichi_mrf.maps.create import load_map
-from taichi_mrf.maps.protocol import OccupancyMap
 from taichi_mrf.pipeline import MappingResult, map_sequence
 
-MAP_FILE, VOXEL_FILE, REPORT_FILE = "map.npz", "voxels.ply", "report.json"
-TRAJECTORY_FILE = "trajectory.txt"
-
-MAY_CHANGE = ("inference.sweeps", "inference.tolerance", "runtime.")
-"""Parameters (or groups) that may differ from those of the run that --resume goes on with."""
+VOXEL_FILE, TRAJECTORY_FILE = "voxels.ply", "trajectory.txt"
 
 LOOK_AT_PICTURES = "Look at the .png files, or open"
 OPEN_VOXELS = "voxels.ply in MeshLab, CloudCompare or Blender."
@@ -65,6 +60,7 @@ class MapTask:
     resume: bool = False
     pictures: bool = True
     track_poses: bool = False
+    keep_every: float = Map.keep_every
 
     def __str__(self) -> str:
         return self.source
@@ -89,6 +85,7 @@ def map_task(options: Map, source: str, out: Path) -> MapTask:
         options.resume,
         options.pictures,
         options.poses.track_poses,
+        options.keep_every,
     )
 
 
@@ -100,7 +97,10 @@ def run_map(options: Map) -> int:
         with ProgressBar(console) as progress:
             report, written = map_to_folder(task, progress, request)
         print_run(console, options, report, written)
-    return exit_status(request)
+    if report["did_not_fit"] is not None and request.signal is None:
+        kept = f"the map of {report['keyframes']} keyframes is kept; --resume with more memory goes on"
+        print(f"taichi-mrf: {report['did_not_fit']}; {kept}", file=sys.stderr)
+    return exit_status(request, report["did_not_fit"])
 
 
 def print_run(console: Console, options: Map, report: dict[str, Any], written: list[Path]) -> None:
@@ -125,9 +125,15 @@ def map_to_folder(
         start = time.perf_counter()
         settings = task.settings
         runtime.init(settings.runtime.arch, settings.runtime.threads, settings.runtime.debug)
-        previous = _resumed_map(task.out, settings) if task.resume else None
+        previous = resumed_map(task.out, settings) if task.resume else None
+        skipped = skipped_before(task.out) if task.resume else {}
         dataset = open_dataset(task.source, color=False, track=task.track_poses, **task.reading.keywords())
         opening = time.perf_counter() - start
+
+        def report_so_far(result: MappingResult) -> str:
+            report = unfinished_report(result, dataset, task.source, skipped)
+            return report_json(report | task.choice())
+
         with _collected_warnings() as warned:
             result = map_sequence(
                 dataset,
@@ -138,6 +144,7 @@ def map_to_folder(
                 skip_bad_frames=task.skip_bad_frames,
                 should_stop=should_stop,
                 resume_from=previous,
+                keep=Keeper(task.out, settings, task.keep_every, report_so_far),
             )
             result.seconds = {"opening": opening, **result.seconds}
             posed = dataset if result.track is None else reposed(dataset, result.track.poses(result.map))
@@ -147,29 +154,10 @@ def map_to_folder(
                 written += _write_pictures(task.out, result, posed, progress)
         report = run_report(result, dataset, task.source, check)
         report["notes"] += [str(warning.message) for warning in warned]
-        if task.resume:
-            report["skipped_frames"] = _skipped_before(task.out) | report["skipped_frames"]
+        report["skipped_frames"] = skipped | report["skipped_frames"]
         report |= task.choice()
         write_text(task.out / REPORT_FILE, report_json(report))
     return report, [*written, task.out / REPORT_FILE]
-
-
-def _resumed_map(folder: Path, settings: Config) -> OccupancyMap | None:
-    """The map of the run to go on with; None if that run was stopped before it wrote one."""
-    if not (folder / MAP_FILE).exists():
-        return None
-    if (folder / CONFIG_FILE).exists():
-        changed = [
-            name
-            for name in differences(load(folder / CONFIG_FILE), settings)
-            if not name.startswith(MAY_CHANGE)
-        ]
-        if changed:
-            raise ConfigError(
-                f"{folder / CONFIG_FILE}: made with another {', '.join(changed)}; "
-                "--resume goes on with the same parameters"
-            )
-    return load_map(folder / MAP_FILE)
 
 
 @contextmanager
@@ -240,18 +228,8 @@ def _readable(dataset: Dataset, indices: list[int]) -> list[Frame]:
     return frames
 
 
-def _skipped_before(folder: Path) -> dict[str, str]:
-    """The broken frames that the run before has met and this one does not read again."""
-    path = folder / REPORT_FILE
-    if not path.exists():
-        return {}
-    try:
-        report: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        return dict(report.get("skipped_frames", {}))
-    except (OSError, ValueError) as error:
-        raise MapFileError(f"{path}: cannot be read: {error}") from error
-
-
-def exit_status(request: StopRequest) -> int:
-    """0, or what a shell expects of a program that was stopped by a signal."""
-    return 0 if request.signal is None else 128 + request.signal
+def exit_status(request: StopRequest, did_not_fit: str | None = None) -> int:
+    """0, or what a shell expects of a program that was stopped by a signal, or DID_NOT_FIT."""
+    if request.signal is not None:
+        return 128 + request.signal
+    return 0 if did_not_fit is None else DID_NOT_FIT

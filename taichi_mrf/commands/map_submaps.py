@@ -10,7 +10,8 @@ import taichi_mrf
 from taichi_mrf.cluster.choose import open_runner
 from taichi_mrf.commands.interrupt import interrupt_on_signals
 from taichi_mrf.commands.map import CONFIG_FILE, Map
-from taichi_mrf.commands.map_run import REPORT_FILE, exit_status
+from taichi_mrf.commands.map_keep import REPORT_FILE
+from taichi_mrf.commands.map_run import exit_status
 from taichi_mrf.commands.output import output_folder
 from taichi_mrf.commands.progress import ProgressBar
 from taichi_mrf.commands.report import report_json

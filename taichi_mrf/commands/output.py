@@ -5,12 +5,16 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from taichi_mrf.errors import MapFileError
-from taichi_mrf.export.atomic import atomic_path
+from taichi_mrf.export.atomic import atomic_path, remove_leftovers
+
+DID_NOT_FIT = 3
+"""Exit status of a run for which memory was not enough: what did fit is mapped and kept."""
 
 
 @contextmanager
 def output_folder(folder: Path) -> Iterator[None]:
-    """Make a folder and try to write to it; on leaving, remove what was made here if it is still empty.
+    """Make a folder and try to write to it, remove what a killed run has left half written; on leaving,
+    remove what was made here if it is still empty.
 
     Raises MapFileError, which names the folder, if it cannot be made or written to.
     """
@@ -21,6 +25,7 @@ def output_folder(folder: Path) -> Iterator[None]:
         except OSError as error:
             raise MapFileError(f"{folder}: cannot be made: {error.strerror or error}") from error
         _try_writing(folder)
+        remove_leftovers(folder)
         yield
     finally:
         for each in made:

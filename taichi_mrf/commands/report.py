@@ -25,7 +25,8 @@ _TRACKED_NOTE = "Accuracy is that of the held-out frames where tracking found th
 def run_report(
     result: MappingResult, dataset: Dataset, source: str, check: HeldOutCheck | None
 ) -> dict[str, Any]:
-    """The facts of a run as plain values, lengths in metres; ``accuracy`` is None without held-out frames."""
+    """The facts of a run as plain values, lengths in metres; ``accuracy`` is None without held-out frames,
+    and ``did_not_fit`` None unless there was too little memory."""
     statistics = result.map.statistics()
     choice = runtime.choice()
     return {
@@ -34,7 +35,8 @@ def run_report(
         "version": taichi_mrf.__version__,
         "backend": choice.name if choice else None,
         "device": choice.device if choice else None,
-        "interrupted": result.interrupted,
+        "interrupted": result.interrupted or result.full is not None,
+        "did_not_fit": result.full,
         "frames": result.frames,
         "keyframes": len(result.map.keyframes),
         "rays": sum(keyframe.rays for keyframe in result.map.keyframes.values()),
@@ -57,6 +59,15 @@ def run_report(
 
 def _tracking(track: Track) -> dict[str, int]:
     return {"frames": len(track.frames), "lost": track.lost, "unsure": track.unsure}
+
+
+def unfinished_report(
+    result: MappingResult, dataset: Dataset, source: str, skipped: dict[str, str]
+) -> dict[str, Any]:
+    """The facts of a run that goes on, for whoever finds its files after a crash; ``skipped`` are the broken
+    frames that the run before has met."""
+    report = run_report(result, dataset, source, None)
+    return {**report, "interrupted": True, "skipped_frames": skipped | report["skipped_frames"]}
 
 
 def _pose_report(change: PoseChange) -> dict[str, Any]:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.scans import LaserScans, problem_of_scan, skipped_note
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, said
 
 NO_RETURN_M = 49.5
 """A scanner that saw nothing reports its greatest range, about 50 m or 81.9 m. Indoors, where such logs come
@@ -59,7 +59,9 @@ def read_carmen_log(path: Path, *, skip_bad_scans: bool = False) -> LaserScans:
                     raise DatasetError(problem) from None
                 problems.append(problem)
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-        problem = f"{path}: the compressed log is truncated or damaged after {len(scans)} scans: {error}"
+        problem = (
+            f"{path}: the compressed log is truncated or damaged after {len(scans)} scans: {said(error)}"
+        )
         if not skip_bad_scans:
             raise DatasetError(problem) from error
         problems.append(problem)
@@ -125,7 +127,7 @@ def _count(words: list[str], at: int, what: str) -> int:
     if at >= len(words):
         raise _BadLineError(f"{words[0]} ends before the number of its {what}; the log may be truncated")
     if not words[at].isdecimal() or (what == "ranges" and int(words[at]) == 0):
-        raise _BadLineError(f"{words[0]} has '{words[at]}' as the number of its {what}")
+        raise _BadLineError(f"{words[0]} has '{words[at][:40]}' as the number of its {what}")
     return int(words[at])
 
 
@@ -144,7 +146,7 @@ def _numbers(words: list[str], at: int, count: int, what: str) -> NDArray[np.flo
     try:
         return np.array(words[at : at + count], dtype=np.float64)
     except ValueError as error:
-        raise _BadLineError(f"not a number among the {what}: {error}") from None
+        raise _BadLineError(f"not a number among the {what}: {said(error)}") from None
 
 
 def _checked(scan: _Scan, before: list[_Scan]) -> _Scan:

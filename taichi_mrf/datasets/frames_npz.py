@@ -8,11 +8,10 @@ so may poses that are to be found (``ReadOptions.track``). Without the N, a file
 
 import math
 import zipfile
-import zlib
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +20,13 @@ from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.datasets.base import Dataset, ReadOptions, start_pose
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeError
 from taichi_mrf.frame import Frame
+from taichi_mrf.npz_file import NpzFile, open_npz
 from taichi_mrf.poses import as_pose
 
 NAME = "npz"
 LOOKS_FOR = "*.npz with depth_m, T_world_camera and K"
 DEPTH, POSE, MATRIX, STAMP, COLOR, SCALE = "depth_m", "T_world_camera", "K", "stamp", "color", "depth_scale"
 FRAMES_PER_SECOND = 30.0
-
-_BROKEN = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error)
-"""What reading a damaged npz file raises."""
 
 
 @dataclass(frozen=True)
@@ -85,10 +82,16 @@ class FramesNpz(Dataset):
         if self._loaded is None or self._loaded[0] != part.path:
             with _opened(part.path) as file:
                 count = len(part.poses)
-                depth = _array(part.path, file, DEPTH).reshape(count, *self.camera.shape)
+                depth = _numbers(file, part.path, DEPTH)
+                if depth.shape[-2:] != self.camera.shape:
+                    raise DatasetError(
+                        f"{part.path}: {DEPTH} is {depth.shape}, the camera has "
+                        f"{self.camera.width} x {self.camera.height} pixels"
+                    )
+                depth = depth.reshape(count, *self.camera.shape)
                 color = None
                 if self.color and COLOR in file:
-                    color = _array(part.path, file, COLOR).reshape(count, *self.camera.shape, 3)
+                    color = file[COLOR].reshape(count, *self.camera.shape, 3)
             self._loaded = part.path, depth, color
         return self._loaded[1], self._loaded[2]
 
@@ -105,8 +108,8 @@ def recognises_file(path: Path) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             return {f"{DEPTH}.npy", f"{POSE}.npy"} & set(archive.namelist()) != set()
-    except (OSError, zipfile.BadZipFile):
-        return False
+    except Exception:  # zipfile raises whatever its parsing stumbles over; opening the file says what it is
+        return path.suffix == ".npz"
 
 
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
@@ -130,25 +133,25 @@ def _open(name: str, paths: Sequence[Path], options: ReadOptions) -> FramesNpz:
 
 def _read_part(path: Path, options: ReadOptions) -> Part:
     with _opened(path) as file:
-        shape, dtype = _header(path, file, DEPTH)
+        shape, dtype = file.header(DEPTH)
         if len(shape) not in (2, 3) or dtype.kind not in "fu":
             raise DatasetError(f"{path}: {DEPTH} is {dtype} {shape}; expected (N, H, W) of floats or uint16")
         height, width = shape[-2:]
         count = shape[0] if len(shape) == 3 else 1
         unposed = options.track and POSE not in file
-        poses = np.tile(start_pose(), (count, 1, 1)) if unposed else _array(path, file, POSE)
+        poses = np.tile(start_pose(), (count, 1, 1)) if unposed else _numbers(file, path, POSE)
         if poses.size != count * math.prod(poses.shape[-2:]) or poses.shape[-2:] not in (
             (4, 4),
             (3, 4),
         ):
             raise DatasetError(f"{path}: {POSE} is {poses.shape}; expected ({count}, 4, 4)")
         stamps = (
-            _array(path, file, STAMP).reshape(-1) if STAMP in file else np.arange(count) / FRAMES_PER_SECOND
+            _numbers(file, path, STAMP).reshape(-1) if STAMP in file else np.arange(count) / FRAMES_PER_SECOND
         )
         if stamps.shape != (count,):
             raise DatasetError(f"{path}: {STAMP} is {stamps.shape}; expected ({count},)")
         if COLOR in file:
-            found, kind = _header(path, file, COLOR)
+            found, kind = file.header(COLOR)
             if found != (*shape, 3) or kind != np.uint8:
                 raise DatasetError(f"{path}: {COLOR} is {kind} {found}; expected uint8 {(*shape, 3)}")
         return Part(
@@ -160,14 +163,14 @@ def _read_part(path: Path, options: ReadOptions) -> Part:
         )
 
 
-def _camera(path: Path, file: Any, width: int, height: int, options: ReadOptions) -> PinholeCamera:
+def _camera(path: Path, file: NpzFile, width: int, height: int, options: ReadOptions) -> PinholeCamera:
     if options.camera is not None:
         return options.camera
     names = ("fx", "fy", "cx", "cy")
     if options.intrinsics is not None:
         intrinsics = options.intrinsics
     elif MATRIX in file:
-        K = _array(path, file, MATRIX)
+        K = _numbers(file, path, MATRIX)
         if K.shape != (3, 3):
             raise DatasetError(f"{path}: {MATRIX} is {K.shape}; expected (3, 3)")
         intrinsics = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
@@ -177,7 +180,7 @@ def _camera(path: Path, file: Any, width: int, height: int, options: ReadOptions
             raise DatasetError(
                 f"{path}: needs {MATRIX} (3, 3), or fx, fy, cx, cy; {', '.join(missing)} missing"
             )
-        fx, fy, cx, cy = (float(_array(path, file, name)) for name in names)
+        fx, fy, cx, cy = (_number(file, path, name) for name in names)
         intrinsics = (fx, fy, cx, cy)
     try:
         return PinholeCamera(width, height, *intrinsics)
@@ -185,11 +188,11 @@ def _camera(path: Path, file: Any, width: int, height: int, options: ReadOptions
         raise DatasetError(f"{path}: {error}") from error
 
 
-def _steps_per_metre(path: Path, file: Any, dtype: np.dtype, options: ReadOptions) -> float:
+def _steps_per_metre(path: Path, file: NpzFile, dtype: np.dtype, options: ReadOptions) -> float:
     if options.depth_scale is not None:
         return options.depth_scale
     if SCALE in file:
-        scale = float(_array(path, file, SCALE))
+        scale = _number(file, path, SCALE)
         if not 0 < scale < float("inf"):
             raise DatasetError(f"{path}: {SCALE} must be a positive number of steps per metre, not {scale:g}")
         return scale
@@ -198,35 +201,20 @@ def _steps_per_metre(path: Path, file: Any, dtype: np.dtype, options: ReadOption
     return 1.0
 
 
-def _opened(path: Path) -> Any:
-    try:
-        return np.load(path, allow_pickle=False)
-    except _BROKEN as error:
-        raise DatasetError(f"{path}: cannot be read: {error}") from error
+def _opened(path: Path) -> AbstractContextManager[NpzFile]:
+    return open_npz(path, DatasetError, "an npz file that can be read")
 
 
-def _array(path: Path, file: Any, name: str) -> NDArray:
-    if name not in file:
-        raise DatasetError(f"{path}: {name} is missing")
-    try:
-        return np.asarray(file[name])
-    except _BROKEN as error:
-        raise DatasetError(f"{path}: {name} cannot be read: {error}") from error
+def _numbers(file: NpzFile, path: Path, name: str) -> NDArray:
+    """An array of real numbers, whatever their kind."""
+    found = file[name]
+    if found.dtype.kind not in "fiu":
+        raise DatasetError(f"{path}: {name} is {found.dtype}, which are no numbers")
+    return found
 
 
-def _header(path: Path, file: Any, name: str) -> tuple[tuple[int, ...], np.dtype]:
-    """An array's shape and type, without reading its values."""
-    if name not in file:
-        raise DatasetError(f"{path}: {name} is missing")
-    try:
-        with file.zip.open(f"{name}.npy") as stream:
-            version = np.lib.format.read_magic(stream)
-            read = (
-                np.lib.format.read_array_header_1_0
-                if version == (1, 0)
-                else np.lib.format.read_array_header_2_0
-            )
-            shape, _, dtype = read(stream)
-    except _BROKEN as error:
-        raise DatasetError(f"{path}: {name} cannot be read: {error}") from error
-    return tuple(shape), dtype
+def _number(file: NpzFile, path: Path, name: str) -> float:
+    found = _numbers(file, path, name)
+    if found.size != 1:
+        raise DatasetError(f"{path}: {name} is {found.shape}; expected one number")
+    return float(found.reshape(-1)[0])

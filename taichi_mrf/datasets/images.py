@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.npz_file import DEFLATE_RATIO
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
@@ -29,6 +30,11 @@ def read_depth(path: Path, steps_per_metre: float, sentinel: int | None = None) 
 def read_color(path: Path) -> NDArray[np.uint8]:
     """An (H, W, 3) uint8 RGB image. Raises DatasetError, whose text names the file."""
     return cv2.cvtColor(_decode(_bytes(path), str(path), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+
+
+def read_grey(path: Path) -> NDArray[np.uint8]:
+    """An (H, W) uint8 grey image. Raises DatasetError, whose text names the file."""
+    return _decode(_bytes(path), str(path), cv2.IMREAD_GRAYSCALE)
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -57,6 +63,8 @@ def _bytes(path: Path) -> bytes:
         raise DatasetError(f"{path}: the image is missing") from None
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:  # a zero byte in its name
+        raise DatasetError(f"{path}: is no name of a file: {error}") from error
 
 
 def _decode(data: bytes, where: str, flags: int) -> NDArray:
@@ -65,7 +73,7 @@ def _decode(data: bytes, where: str, flags: int) -> NDArray:
         raise DatasetError(f"{where}: {problem}")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    except cv2.error:
+    except (cv2.error, MemoryError):
         image = None
     if image is None:
         raise DatasetError(f"{where}: not a readable image{'' if data else ' (the file is empty)'}")
@@ -76,18 +84,53 @@ def _png_damage(data: bytes) -> str | None:
     """What is wrong with the chunks of a PNG, if anything.
 
     Checked here since libpng writes to stderr past every logger, and since some builds of OpenCV hand
-    out the upper part of a cut image with zeros below, which would pass for missing depth.
+    out the upper part of a cut image with zeros below, which would pass for missing depth. For what is
+    packed, the memory that the header claims is not taken before it is known to be filled.
     """
-    position = len(PNG_SIGNATURE)
-    while position + 12 <= len(data):
+    position, packed = len(PNG_SIGNATURE), []
+    while position + _CHUNK_BYTES <= len(data):
         length, kind = struct.unpack_from(">I4s", data, position)
-        end = position + 12 + length
+        end = position + _CHUNK_BYTES + length
         if end > len(data):
             break
         (checksum,) = struct.unpack_from(">I", data, end - 4)
         if zlib.crc32(memoryview(data)[position + 4 : end - 4]) != checksum:
             return "the image is damaged (wrong checksum)"
+        if (kind == b"IHDR") != (position == len(PNG_SIGNATURE)) or (kind == b"IHDR" and length != 13):
+            return "the image is damaged (its header is not where it should be)"
+        if kind == b"IDAT":
+            packed.append(data[position + 8 : end - 4])
         if kind == b"IEND":
-            return None
+            return _png_content_damage(data, b"".join(packed))
         position = end
     return "the image is cut short"
+
+
+def _png_content_damage(data: bytes, packed: bytes) -> str | None:
+    """What is wrong with the pixels of a PNG whose chunks are whole, if anything."""
+    width, height, depth, color, method, row_filter, interlaced = struct.unpack_from(">IIBBBBB", data, 16)
+    samples = _SAMPLES.get(color)
+    if samples is None or depth not in (1, 2, 4, 8, 16) or method or row_filter or not width * height:
+        return (
+            f"the image is damaged (a header of {width} x {height} pixels of the kind {color}, {depth} bit)"
+        )
+    wanted = height * (1 + (width * samples * depth + 7) // 8)
+    if interlaced:  # written row by row by every depth camera; the passes of others OpenCV checks
+        return None if wanted <= DEFLATE_RATIO * (len(packed) + 1) else "the image is cut short"
+    unpacker, held, pending = zlib.decompressobj(), 0, packed
+    try:
+        while pending and not unpacker.eof and held <= wanted:
+            held += len(unpacker.decompress(pending, _PIECE))
+            pending = unpacker.unconsumed_tail
+    except zlib.error:
+        return "the image is damaged (its pixels cannot be unpacked)"
+    if held != wanted:
+        than = "cut short: its pixels are fewer" if held < wanted else "damaged: its pixels are more"
+        return f"the image is {than} than {width} x {height}"
+    return None
+
+
+_CHUNK_BYTES = 12
+_PIECE = 1 << 20
+_SAMPLES = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
+"""Samples of a pixel by a PNG's type of colour."""

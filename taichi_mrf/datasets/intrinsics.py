@@ -12,7 +12,7 @@ from taichi_mrf.config_values import from_dict
 from taichi_mrf.datasets.base import ReadOptions
 from taichi_mrf.datasets.images import image_size
 from taichi_mrf.datasets.open3d_json import read_intrinsics
-from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.errors import ConfigError, DatasetError, said
 
 PRIMESENSE = PinholeCamera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
 """What drivers of PrimeSense cameras (Kinect 1, Xtion) assume, and ROS with them."""
@@ -77,7 +77,7 @@ def read_camera(path: Path, default: PinholeCamera, depth_files: Iterable[Path])
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:
-        raise DatasetError(f"{path}: holds something that is not a number: {error}") from error
+        raise DatasetError(f"{path}: holds something that is not a number: {said(error)}") from error
     raise DatasetError(
         f"{path}: holds {len(numbers)} numbers; expected width height fx fy cx cy, or a 3 x 3 or 4 x 4 matrix"
     )
@@ -93,8 +93,8 @@ def _camera_from_numbers(numbers: list[float]) -> PinholeCamera:
 def _camera_from_yaml(text: str, path: Path) -> PinholeCamera:
     try:
         values = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise DatasetError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: the 31st of February
+        raise DatasetError(f"{path}: not valid YAML: {said(error)}") from error
     wanted = [field.name for field in fields(PinholeCamera)]
     if isinstance(values, dict):
         for name in wanted:

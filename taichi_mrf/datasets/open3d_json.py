@@ -13,7 +13,7 @@ import numpy as np
 
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory
-from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError
+from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError, said
 from taichi_mrf.poses import as_pose, inverse
 
 _LISTS = {"PinholeCameraTrajectory": "parameters", "PoseGraph": "nodes"}
@@ -49,10 +49,10 @@ def read_trajectory_json(path: Path) -> tuple[Trajectory, PinholeCamera | None]:
 
 def _pose(path: Path, index: int, entry: Any) -> RecordedPose:
     source = f"{path} entry {index}"
-    name = "pose" if "pose" in entry else "extrinsic"
     try:
+        name = "pose" if "pose" in entry else "extrinsic"
         matrix = np.array(entry[name], np.float64).reshape(4, 4).T
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise DatasetError(f"{source}: needs the 16 numbers of a pose or an extrinsic") from None
     if name == "extrinsic":
         try:
@@ -69,7 +69,7 @@ def _camera(path: Path, values: Any) -> PinholeCamera:
         return PinholeCamera(width, height, fx, fy, cx, cy)
     except ConfigError as error:
         raise DatasetError(f"{path}: {error}") from error
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise DatasetError(
             f"{path}: an intrinsic needs width, height and the 9 numbers of intrinsic_matrix"
         ) from None
@@ -80,5 +80,5 @@ def _values(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise DatasetError(f"{path}: not valid JSON: {error}") from error
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(f"{path}: not valid JSON: {said(error)}") from error

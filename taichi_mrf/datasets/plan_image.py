@@ -4,10 +4,10 @@ import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.images import read_grey
 from taichi_mrf.errors import DatasetError
 
 _DARK = 128
@@ -68,13 +68,7 @@ def read_floor_plan(path: str | Path, size_x_y: tuple[float, float]) -> FloorPla
     """
     if not all(math.isfinite(side) and side > 0 for side in size_x_y):
         raise DatasetError(f"{path}: the size of a floor plan must be two positive numbers, not {size_x_y}")
-    try:
-        image = cv2.imdecode(np.frombuffer(Path(path).read_bytes(), dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
-    except (OSError, cv2.error) as error:
-        reason = getattr(error, "strerror", None) or "not an image"
-        raise DatasetError(f"{path}: the floor plan cannot be read: {reason}") from error
-    if image is None:
-        raise DatasetError(f"{path}: the floor plan is not an image that can be read")
+    image = read_grey(Path(path))
     height, width = image.shape
     return FloorPlan(
         wall=image < _DARK,

@@ -82,7 +82,7 @@ def _read_parameters(path: Path) -> tuple[PinholeCamera, float]:
         raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
     except ConfigError as error:
         raise DatasetError(f"{path}: {error}") from error
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError):
         raise DatasetError(f"{path}: camera needs the numbers w, h, fx, fy, cx, cy and scale") from None
     if not 0 < scale < float("inf"):
         raise DatasetError(f"{path}: scale must be a positive number of steps per metre, not {scale:g}")

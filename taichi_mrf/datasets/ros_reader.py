@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from taichi_mrf.datasets.ros_messages import header_ns
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.libraries import library
 
 SUFFIXES = (".bag", ".mcap", ".db3")
@@ -57,7 +57,7 @@ class RosReader:
             self._reader.open()
         except Exception as error:  # the library raises whatever its parsing stumbles over
             raise DatasetError(
-                f"{path}: cannot be read as a bag, it may be cut short: {_said(error)}"
+                f"{path}: cannot be read as a bag, it may be cut short: {said(error)}"
             ) from error
         self._open = True
         self._connections: dict[str, list[Any]] = {}
@@ -105,7 +105,7 @@ class RosReader:
             for connection, recorded_ns, data in found:
                 yield recorded_ns, self._reader.deserialize(data, connection.msgtype)
         except Exception as error:  # as on opening
-            raise DatasetError(f"{self.path}: topic {topic}: cannot be read: {_said(error)}") from error
+            raise DatasetError(f"{self.path}: topic {topic}: cannot be read: {said(error)}") from error
 
 
 def is_bag(path: Path) -> bool:
@@ -115,11 +115,6 @@ def is_bag(path: Path) -> bool:
 
 def _library(name: str) -> Any:
     return library(name, "bags need", "ros", DatasetError)
-
-
-def _said(error: BaseException) -> str:
-    """What an exception says, in one line."""
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 def _stamp(message: Any, recorded_ns: int) -> float:

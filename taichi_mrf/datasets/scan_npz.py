@@ -1,7 +1,5 @@
 """Scans in one npz file: range_m (N, B), angle_rad (B,), pose_x_y_theta (N, 3) and hit (N, B)."""
 
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +8,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.scans import LaserScans, problem_of_scan, skipped_note
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.npz_file import open_npz
 
 FILE_NAME = "scans.npz"
 """What the file is called where a folder is given."""
@@ -54,18 +53,12 @@ def read_scan_npz(path: Path, *, skip_bad_scans: bool = False) -> LaserScans:
 def _arrays(path: Path) -> dict[str, NDArray[Any]]:
     """The file's arrays, of the right shapes."""
     arrays: dict[str, NDArray[Any]] = {}
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            for name in ("range_m", "angle_rad", "pose_x_y_theta", "hit"):
-                if name not in file:
-                    raise DatasetError(
-                        f"{path}: holds no array '{name}', only {', '.join(file) or 'nothing'}"
-                    )
-                arrays[name] = file[name]
-    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, AttributeError, TypeError) as error:
-        raise DatasetError(
-            f"{path}: not an npz file that is whole: {' '.join(str(error).split())}"
-        ) from error
+    with open_npz(path, DatasetError, "an npz file that is whole") as file:
+        for name in ("range_m", "angle_rad", "pose_x_y_theta", "hit"):
+            if name not in file:
+                held = ", ".join(file.names) or "nothing"
+                raise DatasetError(f"{path}: holds no array '{name}', only {held}")
+            arrays[name] = file[name]
     for name, array in arrays.items():
         if not (np.issubdtype(array.dtype, np.number) or array.dtype == np.bool_) or np.iscomplexobj(array):
             raise DatasetError(f"{path}: {name} holds {array.dtype}, not numbers")

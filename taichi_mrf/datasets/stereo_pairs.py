@@ -211,5 +211,5 @@ def read_times(path: Path) -> list[float]:
 def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:  # ValueError: no text, or a zero byte in the name
         raise DatasetError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error

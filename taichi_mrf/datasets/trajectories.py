@@ -158,7 +158,7 @@ def _read_numbers(path: Path) -> list[Line]:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError:
+    except ValueError:  # also a zero byte in the file's name
         raise DatasetError(f"{path}: not a text file") from None
     lines = []
     for number, line in enumerate(text.splitlines(), start=1):

@@ -4,6 +4,7 @@ A reader, or a run that is resumed after a crash or a full disk, meets the old f
 never half of one.
 """
 
+import contextlib
 import os
 import re
 import secrets
@@ -17,9 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
-
-_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}(\.[^.]+)?")
-"""What :func:`atomic_path` calls a file that is not whole yet."""
+from taichi_mrf.npz_file import MANIFEST, manifest_lines
 
 
 @contextmanager
@@ -32,7 +31,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     points to is replaced. An OSError is raised as a MapFileError that names ``path`` and the reason.
     """
     target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
+    temporary = target.with_name(f".{target.stem}.part-{os.getpid()}-{secrets.token_hex(4)}{target.suffix}")
     try:
         try:
             yield temporary
@@ -47,11 +46,30 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files that killed processes have left in a folder, if there is one. Only for a
-    folder that nobody else writes to."""
-    for path in folder.glob(".*"):
-        if _TEMPORARY.fullmatch(path.name) and path.is_file():
-            path.unlink(missing_ok=True)
+    """Remove the temporary files that killed processes have left in a folder, if there is one.
+
+    Those of a process that lives stay, and those that cannot be removed.
+    """
+    for path in folder.iterdir() if folder.is_dir() else ():
+        match = _LEFTOVER.search(path.name)
+        if match and not _lives(int(match[1])):
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+
+_LEFTOVER = re.compile(r"^\..*\.part-(\d+)-[0-9a-f]{8}(\.\w+)?$")
+
+
+def _lives(pid: int) -> bool:
+    if os.name == "nt":  # there a signal ends a process, and a file that is open cannot be removed anyway
+        return False
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # it is another user's
+        return True
+    return True
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -60,8 +78,9 @@ def write_text(path: str | Path, text: str) -> None:
         temporary.write_bytes(text.encode("utf-8"))
 
 
-def write_npz(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays by name to a compressed file that ``numpy.load`` reads. Raises MapFileError.
+def write_npz(path: str | Path, arrays: Mapping[str, NDArray[Any]], manifest: bool = False) -> None:
+    """Write arrays by name to a compressed file that ``numpy.load`` reads, with a ``manifest`` of them
+    (NpzFile.check_manifest) if it is wanted. Raises MapFileError.
 
     The same arrays always give the same bytes. Compression level 1 instead of the 6 of
     ``numpy.savez_compressed``: for maps it is several times faster and the file hardly larger.
@@ -71,6 +90,12 @@ def write_npz(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> None:
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
     ):
         for name, array in arrays.items():
-            # A member opened by name gets the date 1980-01-01, not today's.
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
+            _write_member(archive, name, array)
+        if manifest:
+            _write_member(archive, MANIFEST, np.array(manifest_lines(iter(archive.infolist()))))
+
+
+def _write_member(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> None:
+    # A member opened by name gets the date 1980-01-01, not today's.
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+        np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)

@@ -39,12 +39,13 @@ _BYTES_PER_VOXEL = 10
 @dataclass(frozen=True)
 class OctomapLeaves:
     """The leaves of a tree: ``code`` (n,) int64 and ``level`` (n,) int8 as in octree.Nodes, ``log_odds`` (n,)
-    float32; ``voxel_size`` in metres."""
+    float32; ``voxel_size`` in metres; ``source`` the file."""
 
     code: NDArray[np.int64]
     level: NDArray[np.int8]
     log_odds: NDArray[np.float32]
     voxel_size: float
+    source: str
 
     @property
     def voxels(self) -> int:
@@ -61,7 +62,7 @@ class OctomapLeaves:
         whole_level = self.level[~small].astype(np.int64) - BRICK_LEVEL
         count = len(partly) + int((8**whole_level).sum())
         what = f"{count * VOXELS / 1e6:.3g} million voxels, in {len(self.code):,} leaves of OctoMap's,"
-        check_memory(float(count) * VOXELS * _BYTES_PER_VOXEL, what)
+        check_memory(float(count) * VOXELS * _BYTES_PER_VOXEL, f"{self.source}: {what}")
         values = np.zeros((count, VOXELS), np.float32)
         for level in range(BRICK_LEVEL):
             rows = np.flatnonzero(self.level == level)
@@ -95,7 +96,7 @@ def read_octomap(path: str | Path) -> OctomapLeaves:
         raise MapFileError(f"{path}: a resolution of {voxel_size} m makes no sense")
     kind = header.get("id", "OcTree")
     if not binary and kind not in _NODE_BYTES:
-        raise MapFileError(f"{path}: a tree of the kind {kind}; those that can be read are {_KINDS}")
+        raise MapFileError(f"{path}: a tree of the kind {kind[:40]}; those that can be read are {_KINDS}")
     try:
         if size == 0:
             leaves: _Leaves = [], [], np.zeros(0, np.float32)
@@ -106,7 +107,9 @@ def read_octomap(path: str | Path) -> OctomapLeaves:
     except IndexError as error:
         raise MapFileError(f"{path}: damaged: its nodes make no tree, or end too early") from error
     codes, levels, values = leaves
-    return OctomapLeaves(np.array(codes, np.int64), np.array(levels, np.int8), values, voxel_size)
+    if not np.isfinite(values).all():
+        raise MapFileError(f"{path}: damaged: a node's value is not finite")
+    return OctomapLeaves(np.array(codes, np.int64), np.array(levels, np.int8), values, voxel_size, str(path))
 
 
 _KINDS = ", ".join(_NODE_BYTES)

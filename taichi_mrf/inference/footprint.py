@@ -93,6 +93,7 @@ def window_around(
     window = Window.covering(lower_m, upper_m, voxel_size)
     if window.cells >= 2**31:
         raise CapacityError(f"a view at a voxel size of {voxel_size:g} m has {window.cells:.3g} bricks")
+    check_memory(4.0 * window.cells, f"the bricks around a view at a voxel size of {voxel_size:g} m")
     return window
 
 

@@ -50,7 +50,8 @@ class Run:
     ``stepping`` says that one more keyframe is to be taken whatever the pace, ``ended`` that the run is over,
     ``current`` is the frame that was read last. ``waiting`` are the requests that have not been carried out.
     ``tracker`` finds the poses of a tracked source, and ``track`` remembers them for ``policy.out``.
-    ``version`` changes with the map that is shown and with the current camera.
+    ``version`` changes with the map that is shown and with the current camera. ``full`` says why the last
+    frame found no room in the map, None if it did.
     """
 
     def __init__(self, source: Source, link: Link, policy: Policy) -> None:
@@ -58,6 +59,7 @@ class Run:
         self.source, self.link, self.policy = source, link, policy
         self.waiting: deque[Request] = deque()
         self.ended, self.version = False, 0
+        self.full: str | None = None
         self.replay: Replay | None = None
         self.begin(first_id=0)
 
@@ -75,7 +77,7 @@ class Run:
         self.replay = replay
         self.progress = Progress()
         self.current: Frame | None = None
-        self.stepping = False
+        self.stepping, self.full = False, None
         self.greet()
 
     def greet(self) -> None:
@@ -156,6 +158,7 @@ class Run:
         """Tell the viewer that something went wrong; a map that is full also pauses the replay."""
         self.send(Notice(" ".join(str(error).split()) or type(error).__name__, "error"))
         if isinstance(error, CapacityError) and self.replay is not None:
+            self.full = str(error)
             self.replay.pause()
             self.stepping = False
 
@@ -183,8 +186,10 @@ class Run:
 
     @property
     def is_done(self) -> bool:
-        """Whether all frames are in the map, and it is the one that they give."""
-        return not (self.has_frames_left or self.mapper.unsettled or self.mapper.unaligned)
+        """Whether all frames are in the map, or as many as there is room for, and it is the one that they
+        give."""
+        frames_left = self.has_frames_left and self.full is None
+        return not (frames_left or self.mapper.unsettled or self.mapper.unaligned)
 
     @property
     def idle_activity(self) -> str:

@@ -16,6 +16,7 @@ One thread does all of it, one piece after the other, because Taichi has one own
 from collections import deque
 from collections.abc import Callable
 
+from taichi_mrf.errors import CapacityError
 from taichi_mrf.frame import Frame
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.keyframes import KeyframeSelector
@@ -136,7 +137,11 @@ class Session:
 
     def _take_in(self, frame: Frame) -> None:
         state = self.state
-        entry = state.mapper.take_in(frame)
+        try:
+            entry = state.mapper.take_in(frame)
+        except CapacityError as error:
+            raise CapacityError(f"frame {frame.name} does not fit: {error}") from error
+        state.full = None
         state.tracked_keyframe(entry)
         self._selector.accept(frame.T_world_camera)
         state.progress.keyframe_taken()

@@ -20,13 +20,14 @@ def create_map(config: Config, camera: PinholeCamera) -> OccupancyMap:
     return _map_class(config.method).from_config(config, camera)
 
 
-def load_map(path: str | Path) -> OccupancyMap:
-    """A saved map, whatever its method. Raises MapFileError."""
+def load_map(path: str | Path, memory_limit_gb: float | None = None) -> OccupancyMap:
+    """A saved map, whatever its method; ``memory_limit_gb`` takes the place of its own. Raises MapFileError,
+    or CapacityError if there is no room for it."""
     if Path(path).is_dir() and Path(path).suffix == SUFFIX:
         raise MapFileError(f"{path}: a map in chunks, which ChunkedMap.open reads")
     with open_map_file(Path(path)) as file:
         method = method_of(file)
-    return _map_class(method).load(path)
+    return _map_class(method).load(path, memory_limit_gb)
 
 
 def _map_class(method: Method) -> MapClass:

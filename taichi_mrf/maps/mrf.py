@@ -34,7 +34,7 @@ from taichi_mrf.inference.sweep import Sweeper, unknown_begins
 from taichi_mrf.inference.whereabouts import Whereabouts
 from taichi_mrf.maps.brick_book import BrickBook
 from taichi_mrf.maps.checkpoint import Checkpoint, go_back, take_checkpoint
-from taichi_mrf.maps.map_file import MapHeader, StoredKeyframe
+from taichi_mrf.maps.map_file import MapHeader, StoredKeyframe, naming
 from taichi_mrf.maps.placing import Placing
 from taichi_mrf.maps.statistics import MapStatistics, measure
 from taichi_mrf.maps.storage import contents_of, read_contents, write_contents
@@ -88,13 +88,13 @@ class MRFMap:
         lister = RayLister(self.voxel_size, inference)
         whereabouts = Whereabouts()
         parts = (self.sensor, inference, self.config.volume)
-        self._placing = Placing(self._book, lister, *parts, whereabouts)
+        self._keyframes: dict[int, Keyframe] = {}
+        self._placing = Placing(self._book, lister, *parts, whereabouts, self._keyframes)
         self._sweeper = Sweeper(self.voxel_size, self.sensor, inference, self.config.volume)
         kept = (self._placing.look_again, self._placing.refresh)
         self._renewal = Renewal(self._pool, self._sweeper, whereabouts, *kept)
         self.view = View(self._pool, self.voxel_size, self.config.volume)
         self.aligner = Aligner(self.view, KeyframeSurfels(self.voxel_size, max_depth))
-        self._keyframes: dict[int, Keyframe] = {}
         self._frozen: dict[int, str] = {}
         self._next_id = 0
         self._messages_lost = False  # a loaded map has beliefs, but no messages
@@ -330,23 +330,26 @@ class MRFMap:
         write_contents(Path(path), contents_of(header, self._book, keyframes, self._frozen))
 
     @classmethod
-    def load(cls, path: str | Path) -> "MRFMap":
-        """Read a map that can be queried at once and extended. Raises MapFileError."""
+    def load(cls, path: str | Path, memory_limit_gb: float | None = None) -> "MRFMap":
+        """Read a map that can be queried at once and extended; ``memory_limit_gb`` takes the place of its
+        own. Raises MapFileError, or CapacityError if there is no room for it."""
         contents = read_contents(Path(path))
-        header = contents.header
-        m = cls._with(header.config, header.noise)
-        if len(contents.bricks):
-            m._book.topology.anchor(contents.bricks[len(contents.bricks) // 2])
-            m._book.topology.check(contents.bricks, m.voxel_size)
-            slots = m._book.create(contents.bricks)
-            m._pool.owners[slots] = contents.frozen_owners
-        m._book.see_for_good(contents.frozen_crossed)
-        m._frozen = dict(contents.frozen)
-        for stored in header.keyframes:
-            image = m._upload(stored.depth_m, stored.camera)
-            T_world_camera = as_pose(stored.T_world_camera)
-            m._keyframes[stored.id] = m._placing.place(stored.id, stored.name, image, T_world_camera)
-        if len(contents.bricks):
+        header, bricks = contents.header, contents.bricks
+        with naming(Path(path)):
+            m = cls._with(header.limited_to(memory_limit_gb), header.noise)
+            if len(bricks):
+                m._book.topology.anchor(bricks[len(bricks) // 2])
+                m._book.topology.check(bricks, m.voxel_size)
+                slots = m._book.create(bricks)
+                m._pool.owners[slots] = contents.frozen_owners
+            m._book.see_for_good(contents.frozen_crossed)
+            m._frozen = dict(contents.frozen)
+            for stored in header.keyframes:
+                image = m._upload(stored.depth_m, stored.camera)
+                m._keyframes[stored.id] = m._placing.place(
+                    stored.id, stored.name, image, stored.T_world_camera
+                )
+        if len(bricks):
             m._pool.write("belief", slots, contents.belief)
             if contents.evidence is not None:
                 m._pool.write("evidence", slots, contents.evidence)

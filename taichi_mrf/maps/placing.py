@@ -1,5 +1,6 @@
 """Keyframes in and out of a map: which bricks they need and see, and their messages in step with that."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,7 @@ from taichi_mrf.inference.ray_list import RayLister
 from taichi_mrf.inference.sweep import unknown_begins
 from taichi_mrf.inference.whereabouts import Whereabouts
 from taichi_mrf.maps.brick_book import BrickBook
+from taichi_mrf.maps.room import check_room
 from taichi_mrf.poses import Pose
 from taichi_mrf.voxels.layout import BRICK
 
@@ -33,6 +35,8 @@ class Placing:
     inference: InferenceConfig
     volume: VolumeConfig
     whereabouts: Whereabouts
+    keyframes: Mapping[int, Keyframe]
+    """Those that the map has, as it goes on."""
 
     def place(self, id: int, name: str, image: DepthImage, T_world_camera: Pose) -> Keyframe:
         """Find out which bricks a keyframe needs and sees, and claim them. Raises CapacityError if there is
@@ -40,12 +44,16 @@ class Placing:
         rays, voxel_size = self.lister.rays_of(image), self.book.voxel_size
         parts = (voxel_size, self.sensor, self.inference, self.volume)
         footprint = find_footprint(image, rays, T_world_camera, *parts, scouts=SCOUTS)
+        others = [keyframe for keyframe in self.keyframes.values() if keyframe.id != id]
+        begins = unknown_begins(rays)
+        image_bytes = 4 * (image.depth.shape[0] + begins.shape[0]) + rays.nbytes
+        check_room(others, footprint, image_bytes, self.book.pool, self.inference.message_precision)
         camera_brick = np.floor(T_world_camera[:3, 3] / (voxel_size * BRICK))
         self.book.topology.anchor(np.clip(camera_brick, -(2**30), 2**30).astype(np.int32))
         self.book.claim(footprint)
         self.whereabouts.put(id, footprint.window)
         visible = self.book.visible(footprint)
-        return Keyframe(id, name, image, rays, T_world_camera, footprint, visible, unknown_begins(rays))
+        return Keyframe(id, name, image, rays, T_world_camera, footprint, visible, begins)
 
     def take_out(self, keyframe: Keyframe) -> None:
         """Undo :meth:`place`, and withdraw the keyframe's messages."""

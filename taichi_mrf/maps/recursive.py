@@ -27,7 +27,7 @@ from taichi_mrf.inference.keyframe import DepthImage, Footprint, checked_depth
 from taichi_mrf.inference.recursive_update import LEAST_LOG_ODDS, UNKNOWN_LOG_ODDS
 from taichi_mrf.inference.schedule import InferProgress, InferReport, Progress
 from taichi_mrf.maps.brick_book import BrickBook
-from taichi_mrf.maps.map_file import MapHeader, StoredKeyframe
+from taichi_mrf.maps.map_file import MapHeader, StoredKeyframe, naming
 from taichi_mrf.maps.recursive_storage import RecursiveContents, read_recursive, write_recursive
 from taichi_mrf.maps.statistics import MapStatistics, measure
 from taichi_mrf.poses import Pose, as_pose
@@ -269,7 +269,7 @@ class RecursiveMap(ABC, Generic[FootprintT]):
 
     def save(self, path: str | Path) -> None:
         """Write the map to one .npz file, beside it first and then into place. Raises MapFileError."""
-        slots = self._pool.in_use
+        slots = self._pool.in_order
         keyframes = [
             StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera)
             for k in self._keyframes.values()
@@ -279,20 +279,21 @@ class RecursiveMap(ABC, Generic[FootprintT]):
         write_recursive(Path(path), RecursiveContents(header, self._pool.bricks[slots], belief, self._stale))
 
     @classmethod
-    def load(cls: type[MapT], path: str | Path) -> MapT:
-        """Read a map that can be queried at once and extended. Raises MapFileError, also for a map of
-        another method."""
+    def load(cls: type[MapT], path: str | Path, memory_limit_gb: float | None = None) -> MapT:
+        """Read a map that can be queried at once and extended; ``memory_limit_gb`` takes the place of its
+        own. Raises MapFileError, also for a map of another method, or CapacityError if there is no room."""
         contents = read_recursive(Path(path), cls.METHOD)
         header, bricks = contents.header, contents.bricks
-        m = cls._create(header.config, header.noise)
-        if len(bricks):
-            m._book.topology.anchor(bricks[len(bricks) // 2])
-            m._book.topology.check(bricks, m.voxel_size)
-            slots = m._book.create(bricks)
-            m._pool.owners[slots] = 1
-            m._pool.write("belief", slots, contents.belief)
+        with naming(Path(path)):
+            m = cls._create(header.limited_to(memory_limit_gb), header.noise)
+            if len(bricks):
+                m._book.topology.anchor(bricks[len(bricks) // 2])
+                m._book.topology.check(bricks, m.voxel_size)
+                slots = m._book.create(bricks)
+                m._pool.owners[slots] = 1
+                m._pool.write("belief", slots, contents.belief)
         for k in header.keyframes:
-            m._keyframes[k.id] = ScanRecord(k.id, k.name, k.depth_m, as_pose(k.T_world_camera), k.camera)
+            m._keyframes[k.id] = ScanRecord(k.id, k.name, k.depth_m, k.T_world_camera, k.camera)
         m._next_id, m._stale = header.next_id, contents.stale
         return m
 

@@ -11,10 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.config import Method
-from taichi_mrf.errors import MapFileError
 from taichi_mrf.export.atomic import write_npz
-from taichi_mrf.maps.map_file import MapHeader, open_map_file, read_header
-from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.maps.map_file import MapHeader, open_map_file, read_bricks, read_header
 
 
 @dataclass(frozen=True)
@@ -36,16 +34,12 @@ def write_recursive(path: Path, contents: RecursiveContents) -> None:
         "belief": contents.belief,
         "stale": np.asarray(contents.stale),
     }
-    write_npz(path, arrays)
+    write_npz(path, arrays, manifest=True)
 
 
 def read_recursive(path: Path, method: Method) -> RecursiveContents:
     """Read a map of a method back. Raises MapFileError naming the file and what is wrong with it."""
     with open_map_file(path, method) as file:
-        contents = RecursiveContents(
-            read_header(path, file), file["bricks"], file["belief"], bool(file["stale"])
+        return RecursiveContents(
+            read_header(path, file), *read_bricks(path, file), stale=file.scalar("stale", "b")
         )
-    n = len(contents.bricks)
-    if contents.belief.shape != (n, VOXELS) or contents.bricks.shape != (n, 3):
-        raise MapFileError(f"{path}: damaged: its bricks and their voxels do not match")
-    return contents

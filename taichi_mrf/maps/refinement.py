@@ -5,7 +5,7 @@ alignment/joint.py moves all of them at once, because one after the other they w
 what has added up on the way.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from taichi_mrf.alignment.oriented_points import OrientedPoints, oriented_points
 from taichi_mrf.config import PoseConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.maps.mrf import MRFMap
-from taichi_mrf.maps.protocol import OccupancyMap
+from taichi_mrf.maps.protocol import MappedKeyframe, OccupancyMap
 from taichi_mrf.poses import Pose, inverse, tangent_norms
 
 LOSS = 0.1
@@ -57,6 +57,18 @@ class PoseRefiner:
     def know(self, keyframe: int, T_recorded: Pose) -> None:
         """Take note of where a keyframe was recorded that is placed already."""
         self._recorded[keyframe] = T_recorded
+
+    def repeat(self, keyframes: Iterable[MappedKeyframe]) -> None:
+        """Place keyframes that an earlier run has refined where it left them, and let each speak as it did
+        then: what is known to those after them is what it was, to the last bit."""
+        for k in keyframes:
+            id = self._map.add_keyframe(k.depth_m, k.T_world_camera, k.camera, k.name)
+            self._map.infer(keyframes=[id], sweeps=1)
+
+    def forget(self, keyframe: int) -> None:
+        """Take out a keyframe that could not be placed."""
+        self._recorded.pop(keyframe, None)
+        self._map.remove_keyframe(keyframe)
 
     def place(self, keyframe: int) -> None:
         """Align a new keyframe, which stands where it was recorded, with those before it; then let it speak.

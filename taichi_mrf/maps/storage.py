@@ -16,7 +16,7 @@ from taichi_mrf.errors import MapFileError
 from taichi_mrf.export.atomic import write_npz
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.maps.brick_book import BrickBook
-from taichi_mrf.maps.map_file import MapHeader, open_map_file, read_header
+from taichi_mrf.maps.map_file import MapHeader, open_map_file, read_bricks, read_header
 from taichi_mrf.voxels.layout import VOXELS
 
 
@@ -39,7 +39,7 @@ def contents_of(
 ) -> MapContents:
     """What is to be stored of a map; ``keyframes`` are those that can still be moved."""
     pool = book.pool
-    slots = pool.in_use
+    slots = pool.in_order
     live = np.zeros(pool.capacity, np.int32)
     for keyframe in keyframes:
         live[book.topology.slots(keyframe.footprint.window.bricks_of(keyframe.footprint.surface))] += 1
@@ -67,27 +67,25 @@ def write_contents(path: Path, contents: MapContents) -> None:
     }
     if contents.evidence is not None:
         arrays["evidence"] = contents.evidence
-    write_npz(path, arrays)
+    write_npz(path, arrays, manifest=True)
 
 
 def read_contents(path: Path) -> MapContents:
     """Read a map back. Raises MapFileError naming the file and what is wrong with it."""
     with open_map_file(path, "mrf") as file:
-        frozen = zip(file["frozen_ids"].tolist(), file["frozen_names"].tolist(), strict=True)
+        header = read_header(path, file)
+        bricks, belief = read_bricks(path, file)
+        n = len(bricks)
+        frozen_ids = file.array("frozen_ids", "i", (None,)).tolist()
         contents = MapContents(
-            read_header(path, file),
-            file["bricks"],
-            file["belief"],
-            file.get("evidence"),
-            file["frozen_owners"],
-            file["frozen_crossed"],
-            dict(frozen),
+            header,
+            bricks,
+            belief,
+            file.array("evidence", "f", (n, VOXELS)) if "evidence" in file else None,
+            file.array("frozen_owners", "i", (n,)).astype(np.int32),
+            file.array("frozen_crossed", "i", (None, 3)).astype(np.int32),
+            dict(zip(frozen_ids, file.array("frozen_names", "U", (len(frozen_ids),)).tolist(), strict=True)),
         )
-    n = len(contents.bricks)
-    shapes = [contents.belief.shape == (n, VOXELS), contents.bricks.shape == (n, 3)]
-    shapes += [contents.frozen_owners.shape == (n,)]
-    if contents.evidence is not None:
-        shapes.append(contents.evidence.shape == (n, VOXELS))
-    if not all(shapes):
-        raise MapFileError(f"{path}: damaged: its bricks and their voxels do not match")
+    if (contents.frozen_owners < 0).any():
+        raise MapFileError(f"{path}: damaged: frozen_owners holds a negative number")
     return contents

@@ -17,13 +17,13 @@ from taichi_mrf.voxels.types import F32, F32Array, I32Array
 def extract_voxels(
     pool: BrickPool, voxel_size: float, min_probability: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Centres (N, 3) in metres and marginals (N,), in the order of the pool.
+    """Centres (N, 3) in metres and marginals (N,), in the order of the bricks' coordinates.
 
     Raises ConfigError for a probability outside [0, 1].
     """
     if not 0 <= min_probability <= 1:
         raise ConfigError(f"min_probability must lie between 0 and 1, not {min_probability}")
-    slots = pool.in_use
+    slots = pool.in_order
     if min_probability in (0.0, 1.0):
         threshold = math.copysign(1e30, min_probability - 0.5)
     else:

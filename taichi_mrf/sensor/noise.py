@@ -6,7 +6,6 @@ patch of pixels (MRFMap, section IV-C).
 """
 
 import warnings
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import SensorConfig
-from taichi_mrf.errors import ConfigError
+from taichi_mrf.errors import ConfigError, said
+from taichi_mrf.npz_file import open_npz, read_npy
 
 TERMS = 5
 """Coefficients of a polynomial in the kernels: up to degree 4, padded with zeros."""
@@ -95,15 +95,14 @@ class PatchNoise:
         """Read the ``noise.npz`` that ``taichi-mrf calibrate`` writes: ``sigma``, ``bias``, ``patch``, and
         ``camera`` (width, height, fx, fy, cx, cy). Raises ConfigError, which names the file.
         """
+        with open_npz(Path(path), ConfigError, "a noise table that can be read") as file:
+            width, height, *intrinsics = file.array("camera", "fiu", (6,)).tolist()
+            sigma, bias = (file.array(name, "fiu", (None, None)) for name in ("sigma", "bias"))
+            patch = file.scalar("patch", "iu")
         try:
-            with np.load(path, allow_pickle=False) as file:
-                width, height, *intrinsics = file["camera"].tolist()
-                camera = PinholeCamera(round(width), round(height), *intrinsics)
-                return cls(file["sigma"], file["bias"], int(file["patch"]), camera)
+            return cls(sigma, bias, patch, PinholeCamera(round(width), round(height), *intrinsics))
         except ConfigError as error:
             raise ConfigError(f"{path}: {error}") from error
-        except (OSError, ValueError, EOFError, TypeError, KeyError, zipfile.BadZipFile) as error:
-            raise ConfigError(f"{path}: cannot be read as a noise table: {error}") from error
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What :meth:`load` reads, by name."""
@@ -130,7 +129,11 @@ def noise_from_config(config: SensorConfig, camera: PinholeCamera) -> NoiseModel
         sigma = np.repeat(sigma, patches, axis=0)
     if config.bias_table is None:
         bias = np.repeat(bias, patches, axis=0)
-    return PatchNoise(sigma, bias, config.patch, camera)
+    try:
+        return PatchNoise(sigma, bias, config.patch, camera)
+    except ConfigError as error:
+        files = [file for file in (config.sigma_table, config.bias_table) if file is not None]
+        raise ConfigError(f"{' and '.join(files)}: {error}") from error
 
 
 def patch_coefficients(config: SensorConfig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -183,16 +186,16 @@ def _padded(coefficients: NDArray[np.float64], name: str) -> NDArray[np.float64]
         raise ConfigError(f"{name} must be of shape (patches, degree + 1), not {coefficients.shape}")
     if coefficients.shape[1] > TERMS:
         raise ConfigError(f"{name} has degree {coefficients.shape[1] - 1}; the highest is {TERMS - 1}")
-    if not np.isfinite(coefficients).all():
+    if not (np.abs(coefficients) <= np.finfo(np.float32).max).all():  # which is what kernels take
         raise ConfigError(f"{name} holds a value that is not finite")
     return np.pad(coefficients, ((0, 0), (0, TERMS - coefficients.shape[1])))
 
 
 def _load_table(path: str, field: str) -> NDArray[np.float64]:
     try:
-        table = np.load(Path(path), allow_pickle=False)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ConfigError(f"{field}: {path} cannot be read as a .npy table: {error}") from error
-    if not isinstance(table, np.ndarray) or not np.issubdtype(table.dtype, np.number):
+        table = read_npy(Path(path))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{field}: {path} cannot be read as a .npy table: {said(error)}") from error
+    if table.dtype.kind not in "fiu":
         raise ConfigError(f"{field}: {path} holds no table of numbers")
     return table.astype(np.float64)

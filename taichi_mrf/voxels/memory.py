@@ -9,7 +9,13 @@ from taichi_mrf.errors import CapacityError
 
 
 def available_bytes() -> int | None:
-    """Free memory of the machine in bytes, None where it cannot be asked."""
+    """Memory in bytes that this process can still take, None where it cannot be asked: what the machine has
+    free, or less in a container or under ``ulimit -v``."""
+    known = [each for each in (_of_machine(), _of_container(), _of_process()) if each is not None]
+    return min(known) if known else None
+
+
+def _of_machine() -> int | None:
     try:
         with open("/proc/meminfo", encoding="ascii") as lines:
             for line in lines:
@@ -20,6 +26,45 @@ def available_bytes() -> int | None:
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_AVPHYS_PAGES")
     except (ValueError, OSError, AttributeError):
+        return None
+
+
+def _of_container() -> int | None:
+    """What the control group of this process (cgroup v2) has left."""
+    try:
+        groups = Path("/proc/self/cgroup").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    own = next((line.removeprefix("0::/") for line in groups if line.startswith("0::/")), None)
+    return None if own is None else left_in_group(Path("/sys/fs/cgroup") / own)
+
+
+def left_in_group(folder: Path) -> int | None:
+    """Bytes that a control group has left, by the files in its folder; None without a limit. Its page cache
+    counts as free."""
+    try:
+        limit = (folder / "memory.max").read_text(encoding="ascii").strip()
+        if limit == "max":
+            return None
+        used = int((folder / "memory.current").read_text(encoding="ascii"))
+        lines = (folder / "memory.stat").read_text(encoding="ascii").splitlines()
+        cache = int(dict(line.split() for line in lines).get("inactive_file", 0))
+        return max(0, int(limit) - used + cache)
+    except (OSError, ValueError):
+        return None
+
+
+def _of_process() -> int | None:
+    """What is left of the address space that a process may have, if that is limited."""
+    try:
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit == resource.RLIM_INFINITY:
+            return None
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+        return max(0, limit - pages * resource.getpagesize())
+    except (ImportError, OSError, ValueError):
         return None
 
 

@@ -1,0 +1,26 @@
+"""Damaged input of every kind: one line that names it, or what can rightly be read of it; never a crash.
+
+tests/fuzz_soak.py does the same for as long as it is told to.
+"""
+
+from pathlib import Path
+
+import pytest
+from fuzz_case import run_case
+from fuzz_loaders import LOADERS
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+pytestmark = pytest.mark.usefixtures("backend")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("fuzz")
+
+
+@pytest.mark.parametrize("name", [loader.name for loader in LOADERS])
+@settings(max_examples=8, derandomize=True, database=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_damaged_file_is_refused_or_read_rightly(name: str, seed: int, root: Path) -> None:
+    run_case(name, seed, root)
