@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.inference.keyframe import Footprint, VisibleBricks
+from taichi_mrf.voxels.layout import grid_keys
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology
 
@@ -27,6 +28,7 @@ class BrickBook:
         self.version = 0
         self._changes: deque[Bricks] = deque(maxlen=REMEMBERED)
         self.frozen_crossed: Bricks = np.zeros((0, 3), np.int32)
+        self._frozen_keys = np.zeros(0, np.int64)
 
     def claim(self, footprint: Footprint) -> None:
         """Allocate the bricks that a keyframe needs, and count it as an owner and as a looker.
@@ -72,11 +74,19 @@ class BrickBook:
         self.see_for_good(crossed)
 
     def see_for_good(self, bricks: Bricks) -> None:
-        """Count bricks as crossed by what is frozen."""
-        together = np.unique(np.concatenate([self.frozen_crossed, bricks]), axis=0)
-        self.topology.add_crossings(self.frozen_crossed, -1)
-        self.frozen_crossed = np.ascontiguousarray(together, np.int32)
-        self.topology.add_crossings(self.frozen_crossed, 1)
+        """Count bricks (n, 3), each given once, as crossed by what is frozen."""
+        keys = grid_keys(bricks)
+        order = np.argsort(keys)
+        keys, bricks = keys[order], bricks[order]
+        # Kept in order, so that a keyframe that is frozen costs what it sees and not what all before it saw.
+        place = np.searchsorted(self._frozen_keys, keys)
+        known = np.zeros(len(keys), bool)
+        inside = place < len(self._frozen_keys)
+        known[inside] = self._frozen_keys[place[inside]] == keys[inside]
+        place, keys, bricks = place[~known], keys[~known], bricks[~known]
+        self._frozen_keys = np.insert(self._frozen_keys, place, keys)
+        self.frozen_crossed = np.insert(self.frozen_crossed, place, bricks, axis=0)
+        self.topology.add_crossings(np.ascontiguousarray(bricks, np.int32), 1)
 
     def start_over(self) -> None:
         """Note that all bricks may have come or gone."""

@@ -39,7 +39,8 @@ def row_name(contender: str, reading: str) -> str:
 
 
 def mrf(name: str = "MRFMap", **parameters: Any) -> Contender:
-    """MRFMap with the sensor's noise and otherwise its defaults."""
+    """MRFMap with the sensor's noise, as in the paper a ray for each pixel, and otherwise its defaults."""
+    parameters = {"ray_density": 0.0} | parameters
 
     def make(scene: Scene, voxel_size: float) -> OccupancyMap:
         return MRFMap(voxel_size, scene.noise, volume=scene.volume, max_depth=scene.max_depth, **parameters)
