@@ -119,7 +119,8 @@ def growth_table(rows: Sequence[Growth], title: str) -> Table:
     """One row for each voxel size and kind: straight lines, and what they say of a thousand keyframes."""
     table = Table(title=f"New keyframes beside old ones: {title}", title_justify="left")
     table.add_column("")
-    for name in ("without re-inference, ms", "whole cost (mean), ms", "processors' time, ms", "memory, MB"):
+    table.add_column("old ones")
+    for name in ("alone, ms", "whole (mean), ms", "processors, ms", "memory, MB"):
         table.add_column(name, justify="right")
     figures: list[tuple[Callable[[Lap], float], float]] = [
         (lambda lap: lap.alone.wall, 1e3),
@@ -129,8 +130,11 @@ def growth_table(rows: Sequence[Growth], title: str) -> Table:
     ]
     for row in rows:
         texts = [_line(row.line(figure), scale) for figure, scale in figures]
-        table.add_row(f"{row.voxel_size * 100:g} cm, old ones {row.kind}", *texts)
-    table.caption = "At no old keyframe + for each old keyframe (± standard error)."
+        table.add_row(f"{row.voxel_size * 100:g} cm", row.kind, *texts)
+    table.caption = (
+        "At no old keyframe + for each old keyframe (± standard error). Alone: without re-inference of others; "
+        "processors: their time for the whole."
+    )
     table.caption_justify = "left"
     return table
 
