@@ -4,7 +4,7 @@
 
 Runs the tests that use a backend, then measures, on frames of 640 x 480 of the built-in room, made on the
 fly: a new keyframe with three sweeps at 2 and 1 cm (kernels by Taichi's profiler, and wall time), the share
-of the memory's bandwidth that its kernels achieve, full inference of 100 keyframes at 1 cm, the times that the
+of the memory's bandwidth that its kernels achieve, full inference of 100 keyframes at 1 cm, how often the
 host waits for the device, and OctoMap on one CPU core. Each part is a process of its own with a time of its
 own: a part that fails or takes too long is named, and the others still run. ``--arch cpu --quick`` shows in a
 minute or two that the script works, and nothing else.

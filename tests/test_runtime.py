@@ -39,7 +39,7 @@ def machine_without_taichi(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     started: list[str] = []
     monkeypatch.setattr(runtime, "_chosen", None)
     monkeypatch.setattr(runtime, "_already_running", lambda: None)
-    monkeypatch.setattr(runtime, "_start", lambda name, software, threads, debug: started.append(name))
+    monkeypatch.setattr(runtime, "_start", lambda name, *_: started.append(name))
     return started
 
 

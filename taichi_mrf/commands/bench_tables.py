@@ -80,7 +80,7 @@ def _kernel_table(row: Profile, title: str, memory: str) -> Table:
         table.add_row(kernel.stage, kernel.name, calls, f"{kernel.seconds * 1e3:.3f}", *_floor(kernel, row))
     table.caption_justify = "left"
     table.caption = (
-        "MB: the least that has to be read and written; floor: what that takes; share: of the time taken. "
+        "MB: the least to be read and written; floor: what that takes; share: of the time taken. "
         f"A keyframe, mean of {row.keyframes}: {work.rays:,.0f} rays, {work.crossed:,.0f} bricks crossed, "
         f"{work.visible:,.0f} visible, {work.voxel_steps:,.0f} voxel steps at "
         f"{row.step_seconds * 1e9:.1f} ns; {memory}."
