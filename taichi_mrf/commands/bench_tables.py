@@ -132,7 +132,7 @@ def growth_table(rows: Sequence[Growth], title: str) -> Table:
         texts = [_line(row.line(figure), scale) for figure, scale in figures]
         table.add_row(f"{row.voxel_size * 100:g} cm", row.kind, *texts)
     table.caption = (
-        "At no old keyframe + for each old keyframe (± standard error). Alone: without re-inference of others; "
+        "At no old keyframe + for each old one (± standard error). Alone: without re-inference of others; "
         "processors: their time for the whole."
     )
     table.caption_justify = "left"
