@@ -4,6 +4,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -52,7 +53,9 @@ class _Run:
         self.configs = [dataclasses.replace(options.settings, voxel_size=size) for size in sizes]
         choice = runtime.choice()
         self.device = f"{choice.name}, {choice.device}" if choice else ""
-        self.title = f"{options.source}, {count} keyframes, on {self.device}"
+        path = Path(options.source)
+        name = path.resolve().name if path.exists() else options.source
+        self.title = f"{name}, {count} keyframes, on {self.device}"
 
     def each_size(self, what: str = "") -> Iterator[tuple[Config, Callable[[int], None]]]:
         """Each voxel size's parameters, and what is to be told the number of frames done."""

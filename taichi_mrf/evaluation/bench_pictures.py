@@ -29,6 +29,8 @@ KIND_COLORS = {"unseen": "#4477aa", "seen": "#ee6677"}
 KIND_NAMES = {"unseen": "old keyframes that it does not see", "seen": "old keyframes that it sees"}
 TARGET_NAMES = "target without re-inference", "target of all three"
 KERNELS_DRAWN = 8
+SHORTEST_MS = 0.01
+"""Where the logarithmic scale of kernels begins."""
 _DPI = 120
 
 
@@ -73,13 +75,19 @@ def draw_profiles(rows: Sequence[Profile], title: str) -> "Figure":
     for axes, row in zip(panels, rows, strict=True):
         shown = row.kernels[:KERNELS_DRAWN][::-1]
         place = np.arange(len(shown))
-        taken = [max(kernel.seconds * 1e3, 1e-4) for kernel in shown]
+        taken = [kernel.seconds * 1e3 for kernel in shown]
         floors = [(kernel.floor_bytes or 0.0) / row.bytes_per_second * 1e3 for kernel in shown]
-        colors = [STAGE_COLORS[kernel.stage] for kernel in shown]
-        axes.barh(place, taken, 0.75, color=colors, label="time")
+        for stage in row.wall:
+            width = [ms if kernel.stage == stage else 0.0 for ms, kernel in zip(taken, shown, strict=True)]
+            axes.barh(place, width, 0.75, color=STAGE_COLORS[stage], label=STAGE_NAMES[stage])
         axes.barh(place, floors, 0.35, color=TARGET_COLOR, label="least that its bytes could take")
         axes.set_yticks(place, [kernel.name for kernel in shown])
-        axes.set(xscale="log", xlabel="ms a keyframe", title=f"{row.voxel_size * 100:g} cm")
+        axes.set(
+            xscale="log",
+            xlim=(SHORTEST_MS, 2 * max(taken)),
+            xlabel="ms a keyframe, logarithmic",
+            title=f"{row.voxel_size * 100:g} cm",
+        )
         axes.spines[["top", "right"]].set_visible(False)
     _legend_below(figure, panels)
     return figure
