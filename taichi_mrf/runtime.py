@@ -59,12 +59,13 @@ _chosen: Backend | None = None
 _log = logging.getLogger(__name__)
 
 
-def init(arch: str = "auto", threads: int = 0, debug: bool = False) -> str:
+def init(arch: str = "auto", threads: int = 0, debug: bool = False, profile: bool = False) -> str:
     """Start Taichi and return the backend's name; :func:`choice` and the log tell the rest.
 
     ``arch`` is "cuda", "vulkan", "cpu", or "auto" for the first of these that there is. A software
     Vulkan device is taken only for arch="vulkan". ``threads`` limits the CPU backend (0 = all cores),
-    ``debug`` checks array bounds. Once Taichi runs, "auto" or the same arch change nothing.
+    ``debug`` checks array bounds, ``profile`` lets Taichi time each kernel (evaluation/profile.py). Once
+    Taichi runs, "auto" or the same arch change nothing.
 
     Raises BackendError if the wanted backend is not to be had or another one already runs; there is no
     fallback from a backend that was asked for.
@@ -74,7 +75,7 @@ def init(arch: str = "auto", threads: int = 0, debug: bool = False) -> str:
         raise BackendError(f"unknown backend '{arch}'; known are auto, {', '.join(BACKENDS)}")
     _chosen = _chosen or _already_running()
     if _chosen is None:
-        _chosen = _started(arch, threads, debug)
+        _chosen = _started(arch, threads, debug, profile)
         _log.info("Taichi runs on %s (%s), %s", _chosen.name, _chosen.device, _chosen.reason)
         for name, why in _chosen.rejected.items():
             _log.info("Taichi does not run on %s: %s", name, why)
@@ -133,13 +134,13 @@ def versions() -> dict[str, str]:
     }
 
 
-def _started(arch: str, threads: int, debug: bool) -> Backend:
+def _started(arch: str, threads: int, debug: bool, profile: bool) -> Backend:
     """Start the wanted backend, or for "auto" the first that starts."""
     rejected: dict[str, str] = {}
     for name in BACKENDS if arch == "auto" else (arch,):
         try:
             device, software = _device(name, allow_software=arch == "vulkan")
-            _start(name, software, threads, debug)
+            _start(name, software, threads, debug, profile)
         except BackendError as error:
             if arch != "auto":
                 raise BackendError(f"{name} cannot be used: {error}") from error
@@ -160,10 +161,11 @@ def _device(name: str, allow_software: bool) -> tuple[str, bool]:
     return f"{platform.machine()}, {os.cpu_count()} cores", False
 
 
-def _start(name: str, software: bool, threads: int, debug: bool) -> None:
+def _start(name: str, software: bool, threads: int, debug: bool, profile: bool) -> None:
     """Start Taichi on one backend, quietly. Raises BackendError if Taichi cannot."""
     ti = _quiet_taichi()
     options: dict[str, Any] = {"cpu_max_num_threads": threads} if threads else {}
+    options["kernel_profiler"] = profile
     if software:
         options["default_gpu_block_dim"] = SOFTWARE_BLOCK
     arch = getattr(ti, name)

@@ -39,7 +39,7 @@ def machine_without_taichi(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     started: list[str] = []
     monkeypatch.setattr(runtime, "_chosen", None)
     monkeypatch.setattr(runtime, "_already_running", lambda: None)
-    monkeypatch.setattr(runtime, "_start", lambda name, software, threads, debug: started.append(name))
+    monkeypatch.setattr(runtime, "_start", lambda name, *_: started.append(name))
     return started
 
 
@@ -94,7 +94,7 @@ def test_auto_goes_on_when_a_backend_does_not_start(
 ) -> None:
     has(monkeypatch, "GPU", [])
 
-    def start(name: str, software: bool, threads: int, debug: bool) -> None:
+    def start(name: str, software: bool, threads: int, debug: bool, profile: bool) -> None:
         if name == "cuda":
             raise BackendError("Taichi does not start on it: out of memory")
 

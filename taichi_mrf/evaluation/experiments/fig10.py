@@ -94,9 +94,8 @@ def _time_images(scene: Scene, voxel_size: float, count: int) -> dict:
         m.infer(keyframes=[k])
         ti.sync()
         new.append(added + time.perf_counter() - start)
-        octomap.append(
-            insert(Frame(view.measured_m, view.T_world_camera, scene.camera, float(index), view.name))
-        )
+        frame = Frame(view.measured_m, view.T_world_camera, scene.camera, float(index), view.name)
+        octomap.append(insert(frame).wall)
     return {"all keyframes": full, "new keyframe": new, "OctoMap": octomap}
 
 

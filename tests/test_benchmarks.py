@@ -1,0 +1,53 @@
+"""The scripts in benchmarks/ work, on next to nothing: what they measure here is not looked at."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+def run(script: Path, *flags: str) -> str:
+    done = subprocess.run([sys.executable, str(script), *flags], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.skipif(
+    not any(shutil.which(name) for name in ("c++", "g++", "clang++")), reason="there is no C++ compiler here"
+)
+def test_the_walk_in_cpp_comes_to_the_sums_of_the_kernel(repository: Path, tmp_path: Path) -> None:
+    out = tmp_path / "walk.json"
+    run(
+        repository / "benchmarks" / "walk.py",
+        "--rays",
+        "2000",
+        "--bricks",
+        "8",
+        "--threads",
+        "2",
+        "--json",
+        str(out),
+    )
+    (row,) = json.loads(out.read_text(encoding="utf-8"))
+    assert row["agreement"] > 0.9999
+    assert abs(row["steps"] - row["cpp_steps"]) < 0.001 * row["steps"]
+    assert row["taichi_ns"] > 0
+    assert row["cpp_ns"] > 0
+
+
+def test_the_gpu_script_runs_through_on_a_cpu_and_says_so(repository: Path, tmp_path: Path) -> None:
+    out = tmp_path / "gpu.json"
+    text = run(repository / "benchmarks" / "gpu.py", "--arch", "cpu", "--quick", "--json", str(out))
+    assert "This is no CUDA device" in text
+    assert "device: cpu" in text
+    report = json.loads(out.read_text(encoding="utf-8"))
+    for part in ("tests", "kernels", "wall", "octomap"):
+        assert "problem" not in report[part], report[part]
+    coarse, fine = report["wall"]["rows"]
+    assert "full_seconds" in fine
+    assert "full_seconds" not in coarse
+    assert fine["launches_in_a_sweep"] >= fine["waits_in_a_sweep"] > 0
+    assert all(row["kernel_seconds"] > 0 and row["bandwidth_share"] > 0 for row in report["kernels"]["rows"])
