@@ -51,7 +51,6 @@ COLUMNS = (
     "keyframes",
     "submaps",
     "core-days",
-    "cores for a day",
     "GB a task",
     "store (GB)",
 )
