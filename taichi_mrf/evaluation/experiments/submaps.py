@@ -1,8 +1,9 @@
 """Maps larger than one machine: the built-in corridor in submaps against the map of a single machine."""
 
+import math
 import shutil
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from taichi_mrf.cluster.local import LocalProcesses
@@ -18,8 +19,9 @@ from taichi_mrf.evaluation.experiments.tables import Entry, Table, write_table
 from taichi_mrf.maps.chunked import ChunkedMap
 from taichi_mrf.maps.mrf import MRFMap
 from taichi_mrf.pipeline import map_sequence
-from taichi_mrf.submaps.job import Sequence
-from taichi_mrf.submaps.rounds import SubmapsResult, map_in_submaps
+from taichi_mrf.submaps.job import Job, Sequence
+from taichi_mrf.submaps.plan import Plan, Submap
+from taichi_mrf.submaps.rounds import SETTLED, SubmapsResult, map_in_submaps
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
 FRAMES, ROOMS, ROUNDS, JOBS = 520, 12, 2, 2
@@ -28,6 +30,7 @@ SUBMAP_M = 6.4
 FULL_WIDTH, FULL_HEIGHT, FULL_FRAMES = 640, 480, 8
 """A few frames of a real camera's size, for what a keyframe costs."""
 
+APART = "no overlap"
 BYTES_PER_VOXEL = 8.0
 """Of belief and evidence in a task's memory; messages count as the keyframes'."""
 
@@ -36,6 +39,7 @@ NOTES = (
     "surfaces and of those of which the single map knows something; same state: also of seen-free space",
     "round 0 is before any exchange; both maps make the same number of sweeps, the submaps in each round; in "
     "round 1 a worker is killed in the middle of a task",
+    "no overlap: each keyframe only in the submap where its camera was, to show what the comparison can see",
 )
 
 
@@ -76,7 +80,8 @@ def measure(experiment: Experiment, voxel_size: float, frames: int) -> Result:
     shutil.rmtree(folder, ignore_errors=True)
     tasks, path = folder / "submaps", folder / "map.zarr"
     tasks.mkdir(parents=True)
-    runner, rounds = LocalProcesses(JOBS), []
+    runner = LocalProcesses(JOBS)
+    rounds: list[Result] = []
     for round in range(ROUNDS + 1):
         experiment.report(f"{voxel_size * 100:g} cm, round {round}", round, ROUNDS + 1)
         # Each call goes on where the last one has ended, as --resume does.
@@ -84,9 +89,14 @@ def measure(experiment: Experiment, voxel_size: float, frames: int) -> Result:
             sequence, config, SUBMAP_M, tasks, path, runner,
             rounds=round, settled=-1.0, resume=True, infer=infer_or_be_killed,
         )  # fmt: skip
-        last = result.rounds[-1]
-        found = {"round": round, "seconds": last.seconds, "moved": last.moved, "halo_moved": last.halo_moved}
-        rounds.append(found | asdict(compare(single, ChunkedMap.open(path))))
+        rounds.append(_compared(str(round), single, result, path))
+    apart = folder / "apart"
+    apart.mkdir()
+    without_overlap(result.job).write(apart)
+    parts = map_in_submaps(
+        sequence, config, SUBMAP_M, apart, folder / "apart.zarr", runner, rounds=0, resume=True
+    )
+    rounds.append(_compared(APART, single, parts, folder / "apart.zarr"))
     killed = KilledOnce(tasks).note
     return {
         "rounds": rounds,
@@ -102,6 +112,30 @@ def measure(experiment: Experiment, voxel_size: float, frames: int) -> Result:
         "sweeps": config.inference.sweeps,
         "cost": asdict(_cost(config, result, single, path)),
     }
+
+
+def without_overlap(job: Job) -> Job:
+    """The same job, but for each keyframe being in the submap alone where its camera was: what cutting a
+    sequence into pieces would be."""
+    side = job.plan.chunks_across * CHUNK_VOXELS * job.config.voxel_size
+    home = {i: (math.floor(x / side), math.floor(y / side)) for i, (x, y, _) in job.centres_m.items()}
+    submaps = [
+        Submap(submap.cell, tuple(i for i in submap.keyframes if home[i] == submap.cell))
+        for submap in job.plan.submaps
+    ]
+    return replace(job, plan=Plan(job.plan.chunks_across, tuple(s for s in submaps if s.keyframes)))
+
+
+def _compared(name: str, single: MRFMap, result: SubmapsResult, path: Path) -> Result:
+    last = result.rounds[-1]
+    found = {"round": name, "seconds": last.seconds, "moved": last.moved, "halo_moved": last.halo_moved}
+    return found | asdict(compare(single, ChunkedMap.open(path)))
+
+
+def _settled_after(result: SubmapsResult) -> int:
+    """How many times all submaps are inferred when they stop as soon as they have settled."""
+    still = (r.round for r in result.rounds if r.moved is not None and r.moved <= SETTLED)
+    return next(still, len(result.rounds) - 1) + 1
 
 
 def _cost(config: Config, result: SubmapsResult, single: MRFMap, path: Path) -> MeasuredCost:
@@ -126,7 +160,7 @@ def _cost(config: Config, result: SubmapsResult, single: MRFMap, path: Path) -> 
         seconds=seconds,
         keyframe_mb=keyframe_bytes / 1e6,
         overlap=result.job.plan.overlap,
-        rounds=len(result.rounds),
+        rounds=_settled_after(result),
         submap_m=result.job.plan.chunks_across * CHUNK_VOXELS * config.voxel_size,
         keyframes_per_m2=len(result.job.centres_m) / area,
         voxels_per_m2=size.voxels / area,
