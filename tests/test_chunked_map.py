@@ -24,13 +24,13 @@ from taichi_mrf.queries.box import read_box
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
 zarr = pytest.importorskip("zarr", reason="maps in chunks need the extra store")
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = pytest.mark.usefixtures("one_backend")
 
 METHODS = ["mrf", "log_odds"]
 
 
 @pytest.fixture(scope="module")
-def stores(backend: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def stores(one_backend: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("stores")
     for method in METHODS:
         export_map(room_map(method), folder / f"{method}.zarr")

@@ -19,7 +19,7 @@ from taichi_mrf.export.formats import export_map, extensions
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.maps.mrf import MRFMap
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = pytest.mark.usefixtures("one_backend")
 resource = pytest.importorskip("resource", reason="file-size limits are a POSIX feature")
 
 LEVEL = ExportOptions(z_min=-0.5, z_max=0.5)

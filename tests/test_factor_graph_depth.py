@@ -74,6 +74,7 @@ def test_sum_product_on_a_tree_of_rays_is_exact(
     np.testing.assert_allclose(found[untouched], prior, atol=1e-5)
 
 
+@pytest.mark.usefixtures("one_backend")
 @settings(max_examples=20, suppress_health_check=[HealthCheck.filter_too_much])
 @given(
     seed=seeds, depths=st.tuples(shallow, shallow, shallow), sigma=st.floats(0.25, 0.6),
@@ -108,6 +109,7 @@ def test_energies_are_those_of_the_joint_distribution_and_bounds_bound_them(
         assert found.dual <= energies.min() + rounding
 
 
+@pytest.mark.usefixtures("one_backend")
 @settings(max_examples=8, suppress_health_check=[HealthCheck.filter_too_much])
 @given(seed=seeds, depths=st.lists(shallow, min_size=3, max_size=5), method=st.sampled_from(["sum", "max"]))
 def test_with_one_ray_in_each_keyframe_the_map_is_the_graphs(

@@ -95,6 +95,7 @@ def test_the_best_labelling_of_a_tree_is_found(seed: int, number: int, sensor: s
     assert found.energy == pytest.approx(least, abs=1e-2)
 
 
+@pytest.mark.usefixtures("one_backend")
 @settings(max_examples=80)
 @given(seed=SEEDS, number=st.integers(1, 12), sensor=SENSORS, method=st.sampled_from(["dd", "dd-block"]))
 def test_the_dual_never_exceeds_the_least_energy(seed: int, number: int, sensor: str, method: str) -> None:
@@ -116,6 +117,7 @@ def test_the_dual_never_exceeds_the_least_energy(seed: int, number: int, sensor:
         assert found.energy == pytest.approx(exact.energies.min(), abs=1e-2)
 
 
+@pytest.mark.usefixtures("one_backend")
 @settings(max_examples=40)
 @given(seed=SEEDS, number=st.integers(1, 12), sensor=SENSORS)
 def test_the_dual_is_a_bound_when_slaves_are_charged_the_whole_step(
@@ -129,6 +131,7 @@ def test_the_dual_is_a_bound_when_slaves_are_charged_the_whole_step(
     assert found.dual <= exact.energies.min() + 1e-3 * number
 
 
+@pytest.mark.usefixtures("one_backend")
 @settings(max_examples=20)
 @given(seed=SEEDS, number=st.integers(2, 10))
 def test_block_ascent_never_lowers_the_bound(seed: int, number: int) -> None:
@@ -187,6 +190,7 @@ def test_every_method_is_judged_by_the_same_energy(seed: int, number: int, senso
         assert (found.marginals[~graph.connected] == 0.5).all()
 
 
+@pytest.mark.usefixtures("one_backend")
 @pytest.mark.parametrize("method", ["mh", "mh-heat"])
 @pytest.mark.parametrize("sensor", ["piecewise", "gaussian"])
 def test_metropolis_hastings_visits_labellings_as_often_as_they_are_probable(
@@ -238,6 +242,7 @@ for method in METHODS:
 """
 
 
+@pytest.mark.usefixtures("one_backend")
 def test_results_do_not_depend_on_the_number_of_threads() -> None:
     """A process has one number of threads, so each is a process of its own."""
     one, two = (
@@ -277,6 +282,7 @@ def test_a_progress_call_that_returns_false_ends_it_and_keeps_what_is_there() ->
     assert found.energy == min(step.energy for step in steps)
 
 
+@pytest.mark.usefixtures("one_backend")
 def test_on_a_room_message_passing_ends_lower_than_the_inverse_model_and_than_sampling() -> None:
     graph = build_graph(room_beams(12, 180), 0.2)
     energies = {

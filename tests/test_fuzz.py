@@ -11,7 +11,7 @@ from fuzz_loaders import LOADERS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = pytest.mark.usefixtures("one_backend")
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ from taichi_mrf.maps.mrf import MRFMap
 from taichi_mrf.pipeline import KeyframeAdded, MappingResult, map_sequence
 from taichi_mrf.voxels.memory import left_in_group
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = pytest.mark.usefixtures("one_backend")
 
 
 @pytest.fixture(scope="module")

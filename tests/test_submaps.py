@@ -80,7 +80,7 @@ def partial(chosen: list[int]) -> PartialMap:
     return m
 
 
-def test_evidence_of_absent_keyframes_counts_as_frozen_ones_do(backend: str) -> None:
+def test_evidence_of_absent_keyframes_counts_as_frozen_ones_do(one_backend: str) -> None:
     together = partial([0, 1, 2])
     together.infer()
     for id in (0, 1):
@@ -96,7 +96,7 @@ def test_evidence_of_absent_keyframes_counts_as_frozen_ones_do(backend: str) -> 
     np.testing.assert_array_equal(alone.beliefs(bricks), together.beliefs(bricks))
 
 
-def test_what_is_told_leaves_out_what_the_listener_knows(backend: str) -> None:
+def test_what_is_told_leaves_out_what_the_listener_knows(one_backend: str) -> None:
     m = partial([0, 1, 2])
     m.infer()
     told = m.beliefs(m.bricks(), without=[1])
