@@ -141,9 +141,9 @@ def patch_coefficients(config: SensorConfig) -> tuple[NDArray[np.float64], NDArr
     is in force, or one for the whole image. Raises ConfigError naming field and file."""
     sigma, bias = np.asarray([config.sigma], np.float64), np.asarray([config.bias], np.float64)
     if config.sigma_table is not None:
-        sigma = _padded(_load_table(config.sigma_table, "sensor.sigma_table"), "sigma")
+        sigma = _load_table(config.sigma_table, "sensor.sigma_table")
     if config.bias_table is not None:
-        bias = _padded(_load_table(config.bias_table, "sensor.bias_table"), "bias")
+        bias = _load_table(config.bias_table, "sensor.bias_table")
     return sigma, bias
 
 
@@ -198,4 +198,7 @@ def _load_table(path: str, field: str) -> NDArray[np.float64]:
         raise ConfigError(f"{field}: {path} cannot be read as a .npy table: {said(error)}") from error
     if table.dtype.kind not in "fiu":
         raise ConfigError(f"{field}: {path} holds no table of numbers")
-    return table.astype(np.float64)
+    try:
+        return _padded(table.astype(np.float64), field.removeprefix("sensor.").removesuffix("_table"))
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
