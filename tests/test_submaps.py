@@ -1,8 +1,10 @@
 """Submaps: every brick has one owner, what is told is what should be, and the merged map is the map."""
 
+import io
 import json
 import subprocess
 import sys
+import zipfile
 from functools import cache
 from pathlib import Path
 
@@ -16,7 +18,7 @@ from taichi_mrf.cluster.local import LocalProcesses
 from taichi_mrf.cluster.runner import InProcess
 from taichi_mrf.config import Config, EvaluationConfig, PoseConfig
 from taichi_mrf.datasets.source_flags import SourceFlags
-from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.errors import ConfigError, DatasetError, MapFileError
 from taichi_mrf.evaluation.experiments.submap_costs import MeasuredCost, Place, need
 from taichi_mrf.evaluation.experiments.submap_equality import KilledOnce, compare, infer_or_be_killed
 from taichi_mrf.maps.chunked import ChunkedMap
@@ -25,6 +27,7 @@ from taichi_mrf.pipeline import map_sequence
 from taichi_mrf.submaps.job import Job, Sequence
 from taichi_mrf.submaps.partial_map import PartialMap
 from taichi_mrf.submaps.plan import SeenKeyframe, chunks_for, plan_submaps
+from taichi_mrf.submaps.round_files import read_core, read_report, round_path
 from taichi_mrf.submaps.rounds import SubmapsResult, map_in_submaps
 from taichi_mrf.submaps.task import share_moved
 from taichi_mrf.voxels.layout import CHUNK
@@ -157,6 +160,25 @@ def test_nothing_is_done_twice(exchanged: Path) -> None:
     assert result.rounds[0].moved is None
     assert result.rounds[1].moved is not None
     assert result.rounds[1].moved < 0.01
+
+
+def test_a_damaged_round_is_named(exchanged: Path, tmp_path: Path) -> None:
+    whole = round_path(exchanged / "submaps", 1, 0)
+    content = whole.read_bytes()
+    assert read_report(whole).submap == 0
+    for name, damaged in (("short", content[: len(content) // 2]), ("flipped", flipped(content, "belief"))):
+        path = tmp_path / name
+        path.write_bytes(damaged)
+        with pytest.raises(MapFileError, match=name):
+            read_core(path)
+
+
+def flipped(content: bytes, member: str) -> bytes:
+    """A zip file with one bit of a member's values another."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        info = archive.getinfo(f"{member}.npy")
+    place = info.header_offset + info.compress_size // 2 + 60
+    return content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :]
 
 
 def test_what_moved_is_a_share_of_probabilities() -> None:

@@ -1,7 +1,6 @@
 """What a submap's task leaves behind in each round: one .npz file, for the next round and the merge."""
 
 import json
-import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -11,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.config_values import from_dict
-from taichi_mrf.errors import MapFileError
+from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.export.atomic import write_npz
+from taichi_mrf.npz_file import NpzFile, open_npz
+from taichi_mrf.voxels.layout import VOXELS
 
 Bricks = NDArray[np.int32]
 LogOdds = NDArray[np.float32]
@@ -74,19 +75,28 @@ def write_round(path: Path, result: RoundResult) -> None:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Mapping[str, NDArray]]:
+def _opened(path: Path) -> Iterator[NpzFile]:
     """The arrays by name, each read when it is asked for. Raises MapFileError."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            yield file
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise MapFileError(f"{path}: not a readable round of a submap: {error}") from error
+    with open_npz(path, MapFileError, "a round of a submap that can be read") as file:
+        yield file
+
+
+def _bricks(file: NpzFile, name: str) -> Bricks:
+    return file.array(name, "i", (None, 3))
+
+
+def _halo(file: NpzFile, bricks: str, log_odds: str) -> Halo:
+    where = _bricks(file, bricks)
+    return where, file.array(log_odds, "f", (len(where), VOXELS))
 
 
 def read_report(path: Path) -> SubmapReport:
     """Only how the task went."""
     with _opened(path) as file:
-        return from_dict(SubmapReport, json.loads(str(file["report"])), str(path))
+        try:
+            return from_dict(SubmapReport, json.loads(file.scalar("report", "U")), str(path))
+        except (ValueError, TypeError, ConfigError) as error:
+            raise MapFileError(f"{path}: damaged: its report cannot be read: {error}") from error
 
 
 def read_halo(path: Path, listener: int) -> Halo | None:
@@ -94,16 +104,16 @@ def read_halo(path: Path, listener: int) -> Halo | None:
     with _opened(path) as file:
         if f"halo_{listener}_bricks" not in file:
             return None
-        return file[f"halo_{listener}_bricks"], file[f"halo_{listener}_evidence"]
+        return _halo(file, f"halo_{listener}_bricks", f"halo_{listener}_evidence")
 
 
 def read_places(path: Path) -> tuple[Bricks, Bricks]:
     """Only where the core is: its bricks, and those without voxels."""
     with _opened(path) as file:
-        return file["bricks"], file["free_bricks"]
+        return _bricks(file, "bricks"), _bricks(file, "free_bricks")
 
 
 def read_core(path: Path) -> tuple[Bricks, LogOdds, Bricks]:
     """The core: its bricks with their log-odds, and those without voxels."""
     with _opened(path) as file:
-        return file["bricks"], file["belief"], file["free_bricks"]
+        return *_halo(file, "bricks", "belief"), _bricks(file, "free_bricks")
