@@ -99,21 +99,24 @@ def read_octomap(path: str | Path) -> OctomapLeaves:
         raise MapFileError(f"{path}: a tree of the kind {kind[:40]}; those that can be read are {_KINDS}")
     try:
         if size == 0:
-            leaves: _Leaves = [], [], np.zeros(0, np.float32)
+            leaves: _Leaves = 0, [], [], np.zeros(0, np.float32)
         elif binary:
             leaves = _binary_leaves(data)
         else:
             leaves = _full_leaves(data, _NODE_BYTES[kind])
     except IndexError as error:
         raise MapFileError(f"{path}: damaged: its nodes make no tree, or end too early") from error
-    codes, levels, values = leaves
+    nodes, codes, levels, values = leaves
+    if nodes != size:  # which OctoMap's own reader refuses too
+        raise MapFileError(f"{path}: damaged: it has {nodes:,} nodes, where its header says {size:,}")
     if not np.isfinite(values).all():
         raise MapFileError(f"{path}: damaged: a node's value is not finite")
     return OctomapLeaves(np.array(codes, np.int64), np.array(levels, np.int8), values, voxel_size, str(path))
 
 
 _KINDS = ", ".join(_NODE_BYTES)
-_Leaves = tuple[list[int], list[int], NDArray[np.float32]]
+_Leaves = tuple[int, list[int], list[int], NDArray[np.float32]]
+"""How many nodes there are, with the inner ones; the leaves' codes, levels and log-odds."""
 
 _BITS = [[child for child in range(7, -1, -1) if mask >> child & 1] for mask in range(256)]
 """The children in a mask, the last one first: they are put on a stack."""
@@ -137,12 +140,13 @@ def _full_leaves(data: bytes, node_bytes: int) -> _Leaves:
     """Raises IndexError if the nodes make no tree."""
     count = len(data) // node_bytes
     table = np.frombuffer(data, np.uint8, count * node_bytes).reshape(count, node_bytes)
-    rows, codes, levels = [], [], []
+    rows, codes, levels, nodes = [], [], [], 0
     stack = [(0, DEPTH)]
     for row, mask in enumerate(table[:, -1].tobytes()):
         if not stack:
             break  # a line's end after the last node
         code, level = stack.pop()
+        nodes += 1
         if mask == 0:
             rows.append(row)
             codes.append(code)
@@ -152,16 +156,18 @@ def _full_leaves(data: bytes, node_bytes: int) -> _Leaves:
         stack += [(code | child << 3 * below, below) for child in _BITS[mask]]
     if stack:
         raise IndexError
-    return codes, levels, np.ascontiguousarray(table[rows, :4]).view("<f4").reshape(-1).astype(np.float32)
+    values = np.ascontiguousarray(table[rows, :4]).view("<f4").reshape(-1).astype(np.float32)
+    return nodes, codes, levels, values
 
 
 def _binary_leaves(data: bytes) -> _Leaves:
     """Raises IndexError if the nodes make no tree."""
     words = iter(np.frombuffer(data, "<u2", len(data) // 2).tolist())
-    codes, levels, occupied = [], [], []
+    codes, levels, occupied, inner = [], [], [], 0
     stack = [(0, DEPTH)]
     while stack:
         code, level = stack.pop()
+        inner += 1
         word = next(words, None)
         if word is None:
             raise IndexError
@@ -179,7 +185,7 @@ def _binary_leaves(data: bytes) -> _Leaves:
                 occupied.append(kind == OCCUPIED_LEAF)
     limits = np.array([FREE_PROBABILITY, OCCUPIED_PROBABILITY])
     log_odds = np.log(limits / (1 - limits)).astype(np.float32)
-    return codes, levels, log_odds[np.array(occupied, np.int64)]
+    return inner + len(codes), codes, levels, log_odds[np.array(occupied, np.int64)]
 
 
 def _below(level: int) -> int:

@@ -198,7 +198,4 @@ def _load_table(path: str, field: str) -> NDArray[np.float64]:
         raise ConfigError(f"{field}: {path} cannot be read as a .npy table: {said(error)}") from error
     if table.dtype.kind not in "fiu":
         raise ConfigError(f"{field}: {path} holds no table of numbers")
-    try:
-        return _padded(table.astype(np.float64), field.removeprefix("sensor.").removesuffix("_table"))
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from error
+    return _padded(table.astype(np.float64), f"{field}: {path}")
