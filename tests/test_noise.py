@@ -262,14 +262,26 @@ def words(path: Path) -> None:
     np.save(path, np.array([["a", "b"]]))
 
 
+def not_finite(path: Path) -> None:
+    np.save(path, np.full((12, 3), np.nan))
+
+
+def too_high_a_degree(path: Path) -> None:
+    np.save(path, np.ones((12, 6)))
+
+
 def absent(path: Path) -> None:
     """No file at all."""
 
 
 @pytest.mark.parametrize("field", ["sigma_table", "bias_table"])
 @pytest.mark.parametrize(
-    "make", [text_file, empty_file, cut_short, broken_archive, archive, objects, words, absent, Path.mkdir]
-)
+    "make",
+    [
+        text_file, empty_file, cut_short, broken_archive, archive, objects, words, not_finite, too_high_a_degree,
+        absent, Path.mkdir,
+    ],
+)  # fmt: skip
 def test_an_unreadable_table_is_named_with_its_field(
     tmp_path: Path, make: Callable[[Path], None], field: str
 ) -> None:
