@@ -278,8 +278,8 @@ def absent(path: Path) -> None:
 @pytest.mark.parametrize(
     "make",
     [
-        text_file, empty_file, cut_short, broken_archive, archive, objects, words, not_finite, too_high_a_degree,
-        absent, Path.mkdir,
+        text_file, empty_file, cut_short, broken_archive, archive, objects, words, not_finite,
+        too_high_a_degree, absent, Path.mkdir,
     ],
 )  # fmt: skip
 def test_an_unreadable_table_is_named_with_its_field(

@@ -102,7 +102,7 @@ class PatchNoise:
         try:
             return cls(sigma, bias, patch, PinholeCamera(round(width), round(height), *intrinsics))
         except ConfigError as error:
-            raise ConfigError(f"{field}: {path}: {error}") from error
+            raise ConfigError(f"{path}: {error}") from error
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What :meth:`load` reads, by name."""
