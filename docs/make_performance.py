@@ -1,0 +1,55 @@
+"""Makes the pictures of docs/performance.md, which are measurements: run it on an idle machine.
+
+    python docs/make_performance.py ../shared/data                          # all, most of an hour
+    python docs/make_performance.py ../shared/data performance_stages.png   # these
+
+The figures of each go into runs/performance, from where the tables of the page are taken.
+"""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+IMAGES, OUT = REPOSITORY / "docs" / "images", REPOSITORY / "runs" / "performance"
+KITCHEN = "seven_scenes_redkitchen"
+LAPS = "synthetic:room?frames=160&width=160&height=120"
+
+BENCHES: dict[str, list[str]] = {
+    "performance_stages.png": ["bench", KITCHEN],
+    "performance_kernels.png": ["bench", KITCHEN, "--profile"],
+    "performance_growth.png": ["bench", LAPS, "--frames", "160", "--voxel-sizes", "0.05", "--growth"],
+}
+"""What ``taichi-mrf bench --plot`` draws, and its arguments."""
+
+CURVE = "performance_rays.png"
+"""What ``taichi-mrf eval rays`` draws."""
+
+
+def main() -> None:
+    """Make what the arguments name, or everything."""
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
+    data, wanted = Path(sys.argv[1]), sys.argv[2:] or [*BENCHES, CURVE]
+    strange = sorted(set(wanted) - {*BENCHES, CURVE})
+    if strange:
+        sys.exit(f"no such picture: {', '.join(strange)}; there are {', '.join([*BENCHES, CURVE])}")
+    OUT.mkdir(parents=True, exist_ok=True)
+    for name in wanted:
+        if name == CURVE:
+            program("eval", "rays", "--data", str(data), "--out", str(OUT))
+            shutil.copyfile(OUT / "rays_curve.png", IMAGES / name)
+        else:
+            arguments = [str(data / KITCHEN) if each == KITCHEN else each for each in BENCHES[name]]
+            figures = OUT / Path(name).with_suffix(".json").name
+            program(*arguments, "--plot", str(IMAGES / name), "--json", str(figures))
+
+
+def program(*arguments: str) -> None:
+    """Run taichi-mrf; what it prints is for the user."""
+    subprocess.run([sys.executable, "-m", "taichi_mrf", *arguments], check=True)
+
+
+if __name__ == "__main__":
+    main()
