@@ -3,8 +3,8 @@ those that use a backend.
 
     python tests/backends.py [options of pytest]
 
-The runs go on side by side, because one alone seldom keeps two cores busy. Each one's output is printed in
-one piece: the CPU's as it comes, the others' when that is done.
+The CPU's tests go in two halves, and all runs side by side, because one alone seldom keeps two cores busy. Each
+one's output is printed in one piece: that of the first half as it comes, the others' when that is done.
 """
 
 import subprocess
@@ -14,6 +14,8 @@ from contextlib import ExitStack
 from typing import IO
 
 from taichi_mrf import runtime
+
+HALVES = ("1/2", "2/2")
 
 Run = tuple[str, subprocess.Popen[bytes], IO[bytes]]
 
@@ -26,25 +28,25 @@ def main() -> int:
         return 1
     first, *others = found
     command = [sys.executable, "-m", "pytest", *sys.argv[1:], "--arch"]
+    beside = {arch: [*command, arch] for arch in others}
+    beside |= {f"{first}, part {part}": [*command, first, "--part", part] for part in HALVES[1:]}
     with ExitStack() as files:
         runs = []
-        for arch in others:
+        for name, its_command in beside.items():
             output = files.enter_context(tempfile.TemporaryFile())
-            process = subprocess.Popen([*command, arch], stdout=output, stderr=subprocess.STDOUT)
-            runs.append((arch, process, output))
-        return _finish(first, [*command, first], runs)
+            process = subprocess.Popen(its_command, stdout=output, stderr=subprocess.STDOUT)
+            runs.append((name, process, output))
+        return _finish(f"{first}, part {HALVES[0]}", [*command, first, "--part", HALVES[0]], runs)
 
 
 def _finish(first: str, command: list[str], runs: list[Run]) -> int:
-    """Run the first backend's tests here, then wait for the others and print what they said."""
-    others = [arch for arch, _, _ in runs]
-    print(f"== pytest on {first}; beside it: {', '.join(others) or 'nothing'}", flush=True)
+    """Run one command here, then wait for the others and print what they said."""
+    print(f"== pytest on {first}; beside it: {'; '.join(name for name, _, _ in runs)}", flush=True)
     status = subprocess.run(command, check=False).returncode
-    for arch, process, output in runs:
-        status = status or process.wait()
-        process.wait()
+    for name, process, output in runs:
+        status = process.wait() or status
         output.seek(0)
-        print(f"== pytest on {arch}", flush=True)
+        print(f"== pytest on {name}", flush=True)
         sys.stdout.buffer.write(output.read())
         sys.stdout.flush()
     return status

@@ -30,8 +30,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--arch", choices=runtime.BACKENDS, default="cpu", help="the Taichi backend to test (default: cpu)"
     )
 
+    parser.addoption("--part", default="1/1", help="1/2 or 2/2: every second test file (default: all)")
+
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    _take_a_part(config, items)
     if config.getoption("--arch") == "cpu":
         return
     used = [item for item in items if _is_for_every_backend(item)]
@@ -40,6 +43,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if config.getoption("--arch") == "vulkan":
         for item in items:
             _take_fewer_examples(item)
+
+
+def _take_a_part(config: pytest.Config, items: list[pytest.Item]) -> None:
+    part, parts = (int(number) for number in config.getoption("--part").split("/"))
+    files = sorted({item.path for item in items})
+    mine = set(files[part - 1 :: parts])
+    config.hook.pytest_deselected(items=[item for item in items if item.path not in mine])
+    items[:] = [item for item in items if item.path in mine]
 
 
 def _is_for_every_backend(item: pytest.Item) -> bool:
