@@ -3,8 +3,8 @@ those that use a backend.
 
     python tests/backends.py [options of pytest]
 
-The CPU's tests go in two halves, and all runs side by side, because one alone seldom keeps two cores busy. Each
-one's output is printed in one piece: that of the first half as it comes, the others' when that is done.
+The CPU's tests go in two halves, and all runs side by side, because one alone seldom keeps two cores busy.
+Each one's output is printed in one piece: that of the first half as it comes, the others' when that is done.
 """
 
 import subprocess

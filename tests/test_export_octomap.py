@@ -268,6 +268,9 @@ BINARY = HEADER.replace(b"OcTree file", b"OcTree binary file")
         (HEADER + b"\0\0\0\0\x01" * 40, "make no tree"),
         (BINARY + b"\x03", "end too early"),
         (BINARY + b"\x03\0" * 40, "make no tree"),
+        (HEADER + b"\0\0\0\0\0", "it has 1 nodes, where its header says 2"),
+        (BINARY + b"\x05\0", "it has 3 nodes, where its header says 2"),
+        (HEADER + b"\0\0\0\0\x01\0\0\xc0\x7f\0", "a node's value is not finite"),
     ],
 )
 def test_files_that_cannot_be_read(tmp_path: Path, content: bytes, problem: str) -> None:

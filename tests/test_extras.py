@@ -26,9 +26,11 @@ POSES = "0 0 0 0 0 0 0 1\n1 0.1 0 0 0 0 0 1\n"
 COMMANDS = {
     "auto": ("optuna", ["tune", ROOM, "--auto", "2", "--no-viewer", "--out", "out"]),
     "bench": ("pyoctomap", ["eval", "fig10", "--data", "data", "--out", "out", "--voxel-sizes", "0.2"]),
+    "cluster": ("distributed", ["map", ROOM, "--scheduler", "local", "--out", "out"]),
     "mesh": ("embreex.rtcore_scene", ["map", "mesh:corner.obj?poses=poses.txt", "--out", "out"]),
     "realsense": ("pyrealsense2", ["map", "realsense:", "--out", "out"]),
     "ros": ("rosbags.highlevel", ["map", "drive.bag", "--out", "out"]),
+    "store": ("zarr", ["map", ROOM, "--submap-size", "5", "--out", "out"]),
 }
 """Extra -> a module of it, and a command that cannot do without."""
 

@@ -38,7 +38,7 @@ class DaskTasks:
     """
 
     def __init__(self, scheduler: str = LOCAL, jobs: int = 1) -> None:
-        self._distributed = library("distributed", "tasks on a cluster", "cluster")
+        self._distributed = library("distributed", "tasks on a cluster need", "cluster")
         self.scheduler, self.jobs = scheduler, jobs
         self._open = contextlib.ExitStack()
         self._client: Any = None
@@ -113,7 +113,7 @@ class DaskTasks:
         return client
 
     def _own_cluster(self) -> Any:
-        dask = library("dask", "tasks on a cluster", "cluster")
+        dask = library("dask", "tasks on a cluster need", "cluster")
         self._open.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": ATTEMPTS - 1}))
         return self._distributed.LocalCluster(
             n_workers=self.jobs,

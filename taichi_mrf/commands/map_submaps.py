@@ -37,7 +37,7 @@ def run_submaps(options: Map, submap_size: float) -> int:
         raise ConfigError("--submap-size takes one SOURCE")
     if options.poses.track_poses:
         raise ConfigError("--track-poses does not go with --submap-size: no task sees all keyframes")
-    library("zarr", "maps in chunks", "store")  # said before the work, not after it
+    library("zarr", "maps in chunks need", "store")  # said before the work, not after it
     settings = with_absolute_tables(options.poses.parameters(options.settings), Path.cwd())
     source = absolute_source(options.sources[0])
     sequence = Sequence(source, options.reading.keywords(), options.every, options.limit)

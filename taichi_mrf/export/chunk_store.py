@@ -75,7 +75,7 @@ class ChunkStore:
 
         Raises MapFileError if it cannot be written, TaichiMRFError without zarr.
         """
-        zarr = library("zarr", "maps in chunks", "store")
+        zarr = library("zarr", "maps in chunks need", "store")
         path = Path(path)
         lowest, highest = (
             (chunks.min(axis=0), chunks.max(axis=0)) if len(chunks) else (np.zeros(3), np.zeros(3))
@@ -99,7 +99,7 @@ class ChunkStore:
     @classmethod
     def open(cls, path: str | Path) -> "ChunkStore":
         """A store that there is. Raises MapFileError, naming what is wrong, TaichiMRFError without zarr."""
-        zarr = library("zarr", "maps in chunks", "store")
+        zarr = library("zarr", "maps in chunks need", "store")
         path = Path(path)
         if not path.is_dir():
             raise MapFileError(f"{path}: there is no such folder")
