@@ -152,3 +152,11 @@ def test_a_stopped_renewal_is_taken_up_again() -> None:
     assert report.sweeps == 2
     assert m.renew(tolerance=0.05).complete
     assert all(k.messages is not None for k in m.keyframes.values())
+
+
+def test_a_call_that_tolerates_much_does_not_make_others_forgotten() -> None:
+    m, twin = MRFMap(small_room.VOXEL_SIZE), MRFMap(small_room.VOXEL_SIZE)
+    for i in ROOM:
+        m.renew([small_room.add(m, small_room.frames()[i])], tolerance=1e9)
+        twin.infer(sweeps=1, keyframes=[small_room.add(twin, small_room.frames()[i])])
+    assert m.renew().sweeps == twin.renew().sweeps > 0

@@ -56,9 +56,11 @@ class Renewal:
         whereabouts: Whereabouts,
         look_again: Callable[[Keyframe], object],
         refresh: Callable[[Keyframe], object],
+        usual: float,
     ) -> None:
-        """``look_again`` brings the list of a keyframe's bricks up to date, ``refresh`` its messages too."""
-        self.pool, self.sweeper, self.whereabouts = pool, sweeper, whereabouts
+        """``look_again`` brings the list of a keyframe's bricks up to date, ``refresh`` its messages too;
+        ``usual`` is the tolerance above which a keyframe waits even if a call tolerates more."""
+        self.pool, self.sweeper, self.whereabouts, self.usual = pool, sweeper, whereabouts, usual
         self.look_again, self.refresh = look_again, refresh
         self._waiting: set[int] = set()
 
@@ -105,11 +107,11 @@ class Renewal:
         return InferReport(time.perf_counter() - begin, largest, swept, rays, largest <= tolerance)
 
     def _shares(self, keyframes: Mapping[int, Keyframe], tolerance: float) -> dict[int, float]:
-        """How much of what the waiting keyframes were told is out of date; the others wait no longer."""
+        """How much of what the waiting keyframes were told is out of date, if it is too much; those that
+        nobody would sweep wait no longer."""
         shares = {}
         for id in self._waiting & keyframes.keys():
             self.look_again(keyframes[id])
             shares[id] = moved_share(keyframes[id], self.pool)
-        shares = {id: share for id, share in shares.items() if share > tolerance}
-        self._waiting = set(shares)
-        return shares
+        self._waiting = {id for id, share in shares.items() if share > min(tolerance, self.usual)}
+        return {id: share for id, share in shares.items() if share > tolerance}

@@ -92,7 +92,7 @@ class MRFMap:
         self._placing = Placing(self._book, lister, *parts, whereabouts, self._keyframes)
         self._sweeper = Sweeper(self.voxel_size, self.sensor, inference, self.config.volume)
         kept = (self._placing.look_again, self._placing.refresh)
-        self._renewal = Renewal(self._pool, self._sweeper, whereabouts, *kept)
+        self._renewal = Renewal(self._pool, self._sweeper, whereabouts, *kept, inference.renew_tolerance)
         self.view = View(self._pool, self.voxel_size, self.config.volume)
         self.aligner = Aligner(self.view, KeyframeSurfels(self.voxel_size, max_depth))
         self._frozen: dict[int, str] = {}
