@@ -135,7 +135,8 @@ def test_what_is_finished_is_kept(tmp_path: Path, single: dict[str, dict[str, An
     written = (tmp_path / NAMES[0] / "report.json").stat().st_mtime_ns
 
     (tmp_path / NAMES[1]).mkdir(exist_ok=True)
-    (tmp_path / NAMES[1] / ".map.0123abcd.npz").touch()  # as if it had been killed while it wrote
+    leftover = f".map.part-{program.pid}-0123abcd.npz"
+    (tmp_path / NAMES[1] / leftover).touch()  # as if it had been killed while it wrote
     # Without --voxel-size: the parameters are those of the run that is resumed.
     done = taichi_mrf(*SOURCES[:2], "--out", tmp_path, "--resume", "--no-pictures")
     assert done.returncode == 0, done.stderr
