@@ -126,7 +126,7 @@ def test_memory_copies_at_some_speed() -> None:
     assert "8 MB" in found.how
 
 
-@pytest.mark.usefixtures("backend")
+@pytest.mark.usefixtures("one_backend")
 def test_laps_at_places_of_their_own_see_nothing_of_each_other() -> None:
     frames = small_room.frames()[:4]
     coarse = Config(voxel_size=0.16)

@@ -43,12 +43,17 @@ def full_disk() -> Iterator[None]:
 def refused(write: Callable[[], object], folder: Path) -> None:
     """Write on a disk that takes files first, so that the old ones must stay, and then does not."""
     write()
-    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    before = contents(folder)
     with full_disk(), pytest.raises(MapFileError, match="cannot be written: ") as caught:
         write()
     assert str(folder) in str(caught.value)
     assert "\n" not in str(caught.value)
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert contents(folder) == before
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    """The bytes of all files in a folder and in those below."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize("extension", extensions())

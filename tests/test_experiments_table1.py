@@ -124,7 +124,8 @@ def test_mrfmap_scores_what_the_judge_says(tables: list[Table], scenes: list[Sce
     scene = scenes[0]
     found: list[dict[str, float]] = []
     for fold in range(FOLDS):
-        m = MRFMap(size, scene.noise, volume=scene.volume, max_depth=scene.max_depth)
+        every_pixel = {"volume": scene.volume, "max_depth": scene.max_depth, "ray_density": 0.0}
+        m = MRFMap(size, scene.noise, **every_pixel)
         found.append(figures_by_hand(mapped(m, scene, fold), scene, fold, m.view))
     row = row_of(tables[0], f"{size * 100:g} cm", "MRFMap")
     for figure, heading in COLUMNS.items():

@@ -119,8 +119,14 @@ def test_objects_are_refused_without_a_trace(tmp_path: Path) -> None:
 
 
 def test_leftovers_of_killed_processes_are_removed_and_nothing_else(tmp_path: Path) -> None:
-    kept = ["map.npz", ".hidden", ".map.npz", ".a.0123456.npz"]
-    for name in (*kept, ".map.0123abcd.npz", ".voxels.00000000.ply", ".LICENSE.ffffffff"):
+    kept = ["map.npz", ".hidden", ".map.npz", ".a.part-1-012345.npz"]
+    dead = 2**30  # no system numbers its processes so high
+    left = [
+        f".map.part-{dead}-0123abcd.npz",
+        f".voxels.part-{dead}-00000000.ply",
+        f".LICENSE.part-{dead}-ffffffff",
+    ]
+    for name in (*kept, *left):
         (tmp_path / name).touch()
     remove_leftovers(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == set(kept)
