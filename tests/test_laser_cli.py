@@ -267,7 +267,7 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, capsys: pytest.Captur
         ((SMALL, "--cell-size", "-1"), ("cell_size",)),
         ((SMALL, "--truth", plan), ("--truth-size",)),
         ((SMALL, "--truth", plan, "--truth-size", "16"), ("--truth-size", "'16'")),
-        ((SMALL, "--truth", config, "--truth-size", "1,1"), ("laser.yaml", "not an image")),
+        ((SMALL, "--truth", config, "--truth-size", "1,1"), ("laser.yaml", "not a readable image")),
         ((SMALL, "--config", config), ("laser.yaml", "cell_sise", "did you mean 'cell_size'")),
         ((SMALL, "--every", "0"), ("--every",)),
         ((SMALL, "--steps", "20,big"), ("--steps", "'20,big'")),

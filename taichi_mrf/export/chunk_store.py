@@ -148,6 +148,8 @@ def new_store(path: str | Path) -> Iterator[Path]:
     Raises MapFileError if something other than a map in chunks stands there, or if it cannot be written.
     """
     path = Path(path)
+    if not path.parent.is_dir():  # zarr would make it, as no other format does
+        raise MapFileError(f"{path}: cannot be written: No such file or directory")
     if path.exists() and not _is_store(path):
         raise MapFileError(f"{path}: exists, and is no map in chunks; it is left alone")
     temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
