@@ -15,7 +15,7 @@ from taichi_mrf.errors import ConfigError
 from taichi_mrf.libraries import library
 from taichi_mrf.queries.box import voxel_box, voxels_of_box
 from taichi_mrf.queries.known_bricks import QueriedMap
-from taichi_mrf.queries.points import FREE, OCCUPIED
+from taichi_mrf.queries.points import FREE, OCCUPIED, checked_points
 from taichi_mrf.voxels.memory import check_memory
 
 _BYTES_PER_VOXEL = 40
@@ -46,7 +46,7 @@ class DistanceField:
 
     def distance_and_gradient(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Both at once. Raises ConfigError for a point outside the box."""
-        at = as_points(points) / self.voxel_size - np.array(self.lowest) - 0.5
+        at = checked_points(points) / self.voxel_size - np.array(self.lowest) - 0.5
         last = np.array(self.values.shape) - 1
         if ((at < -0.5) | (at > last + 0.5)).any():
             raise ConfigError("a point lies outside the box of the distance field")
@@ -106,19 +106,9 @@ def distances(
     Works out the field in the box around all points: for many queries of one place make a
     :func:`distance_field` once. Raises what that raises.
     """
-    points_m = as_points(points)
+    points_m = checked_points(points)
     if not len(points_m):
         return np.zeros(0), np.zeros((0, 3))
     middle = 0.5 * m.voxel_size
     lower, upper = points_m.min(axis=0) - middle, points_m.max(axis=0) + middle
     return distance_field(m, lower, upper, max_distance, unknown).distance_and_gradient(points_m)
-
-
-def as_points(points: ArrayLike) -> NDArray[np.float64]:
-    """(N, 3) float64. Raises ConfigError for another shape and values that are not finite."""
-    points_m = np.asarray(points, np.float64)
-    if points_m.ndim != 2 or points_m.shape[1] != 3:
-        raise ConfigError(f"points must be of shape (N, 3), not {points_m.shape}")
-    if not np.isfinite(points_m).all():
-        raise ConfigError("points hold a value that is not finite")
-    return points_m
