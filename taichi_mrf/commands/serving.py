@@ -33,12 +33,12 @@ def let_the_page_go_first() -> None:
 
 
 def tell_address(where: Listening, what: str, wanted_port: int, open_browser: bool, say: Say) -> None:
-    """Say where the page is, and that another port was taken than the wanted one (0: any); open a browser if
-    asked."""
+    """Say that another port was taken than the wanted one (0: any), if so, and then where the page is, which
+    is what a reader waits for; open a browser if asked."""
     host = f"[{where.host}]" if ":" in where.host else where.host
     address = f"http://{host}:{where.port}"
-    say(f"{what} is at {address}  (Ctrl-C ends it)")
     if wanted_port not in (0, where.port):
         say(f"Port {wanted_port} is busy, so the page took {where.port}.")
+    say(f"{what} is at {address}  (Ctrl-C ends it)")
     if open_browser:
         webbrowser.open(address)
