@@ -11,6 +11,7 @@ from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.poses import Pose
 from taichi_mrf.queries.view import View
+from taichi_mrf.voxels.strips import strip_length
 
 STRIDE = 4
 """Every how many-th pixel, both ways, is asked."""
@@ -28,7 +29,7 @@ def map_of_others(view: View, keyframe: Keyframe) -> Iterator[None]:
     cavity = view.pool.snapshot()
     if keyframe.messages is not None and len(keyframe.visible.slots):
         moved = ti.ndarray(ti.i32, len(keyframe.visible.slots))
-        sum_product.withdraw(keyframe.visible.slots, cavity.belief, keyframe.messages, moved)
+        sum_product.withdraw(keyframe.visible.slots, cavity.belief, keyframe.messages, moved, strip_length())
     with view.pool.showing(cavity):
         yield
     runtime.settle()  # before the snapshot is dropped

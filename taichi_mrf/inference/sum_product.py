@@ -37,6 +37,7 @@ from taichi_mrf.sensor.forward import (
     surface_likelihood,
 )
 from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.strips import strip_begin
 from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
 from taichi_mrf.voxels.types import (
     F32,
@@ -80,17 +81,19 @@ class ForwardPass(Struct):
 @ti.kernel
 def cavity(
     slots: I32Array, belief: F32Array, messages: AnyArray, lowest: F32, highest: F32,
-    log_free: F32Array, sums: I64Array,
+    log_free: F32Array, sums: I64Array, strip: Template,
 ):  # fmt: skip
     """Eq. 6: what a voxel tells this keyframe's rays is all that it knows but from them.
 
     Writes log(1 - m) for each voxel, its log-odds bounded by ``lowest`` and ``highest``, and empties the
-    sums.
+    sums. ``strip``: voxels an iteration (voxels/strips.py), here and below.
     """
-    for i in range(slots.shape[0] * VOXELS):
-        log_odds = belief[slots[i // VOXELS] * VOXELS + i % VOXELS] - ti.cast(messages[i], ti.f32)
-        log_free[i] = -softplus(ti.max(lowest, ti.min(highest, log_odds)))
-        sums[i] = 0
+    for part in range(slots.shape[0] * (VOXELS // strip)):
+        i, j = strip_begin(part, slots, strip)
+        for k in range(strip):
+            log_odds = belief[j + k] - ti.cast(messages[i + k], ti.f32)
+            log_free[i + k] = -softplus(ti.max(lowest, ti.min(highest, log_odds)))
+            sums[i + k] = 0
 
 
 @ti.kernel
@@ -226,28 +229,31 @@ def empty_message(before: F32, behind: F32, free: F32, floor: F32) -> F32:
 @ti.kernel
 def finish(
     slots: I32Array, belief: F32Array, messages: AnyArray, sums: I64Array, scale: F32,
-    clamp: F32, damping: F32, min_length: F32, moved: I32Array, log_average: Template,
+    clamp: F32, damping: F32, min_length: F32, moved: I32Array, log_average: Template, strip: Template,
 ):  # fmt: skip
     """Renew a keyframe's messages with the rays' averages (eq. 7), and the beliefs with them (eq. 8).
 
     ``moved`` counts, for each brick, the voxels whose marginal changed by more than MOVED.
     """
-    for i in range(slots.shape[0] * VOXELS):
-        if length_sum(sums[i], scale) > min_length:
-            mean = mean_message(sums[i])
-            log_odds = clamp * (2.0 * mean - 1.0)
-            if not ti.static(log_average):
-                log_odds = ti.log(ti.max(mean, TINY) / ti.max(1.0 - mean, TINY))
-                log_odds = ti.max(-clamp, ti.min(clamp, log_odds))
-            old = ti.cast(messages[i], ti.f32)
-            messages[i] = old + (1.0 - damping) * (log_odds - old)
-            # The belief takes what was stored, not what was meant, so that it stays the sum of messages.
-            change = ti.cast(messages[i], ti.f32) - old
-            j = slots[i // VOXELS] * VOXELS + i % VOXELS
-            before = belief[j]
-            belief[j] = before + change
-            if _moves(before, change):
-                moved[i // VOXELS] += 1
+    for part in range(slots.shape[0] * (VOXELS // strip)):
+        i, j = strip_begin(part, slots, strip)
+        count = 0
+        for k in range(strip):
+            if length_sum(sums[i + k], scale) > min_length:
+                mean = mean_message(sums[i + k])
+                log_odds = clamp * (2.0 * mean - 1.0)
+                if not ti.static(log_average):
+                    log_odds = ti.log(ti.max(mean, TINY) / ti.max(1.0 - mean, TINY))
+                    log_odds = ti.max(-clamp, ti.min(clamp, log_odds))
+                old = ti.cast(messages[i + k], ti.f32)
+                messages[i + k] = old + (1.0 - damping) * (log_odds - old)
+                # The belief takes what was stored, not what was meant, so that it stays the sum of messages.
+                change = ti.cast(messages[i + k], ti.f32) - old
+                before = belief[j + k]
+                belief[j + k] = before + change
+                count += _moves(before, change)
+        if count > 0:
+            moved[i // VOXELS] += count
 
 
 @ti.func
@@ -260,18 +266,23 @@ def _moves(log_odds: F32, change: F32) -> I32:
 
 
 @ti.kernel
-def withdraw(slots: I32Array, belief: F32Array, messages: AnyArray, moved: I32Array):
+def withdraw(slots: I32Array, belief: F32Array, messages: AnyArray, moved: I32Array, strip: Template):
     """Take a keyframe's messages out of the beliefs; ``moved`` counts as in :func:`finish`."""
-    for i in range(slots.shape[0] * VOXELS):
-        j = slots[i // VOXELS] * VOXELS + i % VOXELS
-        message = ti.cast(messages[i], ti.f32)
-        if _moves(belief[j], -message):
-            moved[i // VOXELS] += 1
-        belief[j] -= message
+    for part in range(slots.shape[0] * (VOXELS // strip)):
+        i, j = strip_begin(part, slots, strip)
+        count = 0
+        for k in range(strip):
+            message = ti.cast(messages[i + k], ti.f32)
+            count += _moves(belief[j + k], -message)
+            belief[j + k] -= message
+        if count > 0:
+            moved[i // VOXELS] += count
 
 
 @ti.kernel
-def fold(slots: I32Array, evidence: F32Array, messages: AnyArray):
+def fold(slots: I32Array, evidence: F32Array, messages: AnyArray, strip: Template):
     """Add a keyframe's messages to what inference starts from (freezing)."""
-    for i in range(slots.shape[0] * VOXELS):
-        evidence[slots[i // VOXELS] * VOXELS + i % VOXELS] += ti.cast(messages[i], ti.f32)
+    for part in range(slots.shape[0] * (VOXELS // strip)):
+        i, j = strip_begin(part, slots, strip)
+        for k in range(strip):
+            evidence[j + k] += ti.cast(messages[i + k], ti.f32)

@@ -15,6 +15,7 @@ from taichi_mrf.inference.keyframe import Keyframe, RayList
 from taichi_mrf.sensor.forward import AUTO, CENTRE, SEGMENT
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.strips import strip_length
 from taichi_mrf.voxels.traversal import FAR
 from taichi_mrf.voxels.vectors import vec4_array
 from taichi_mrf.voxels.window import WindowIndex
@@ -124,7 +125,7 @@ class Sweeper:
         sum_product.cavity(
             visible.slots, pool.belief, messages,
             least_log_odds(config, pool.prior_log_odds), config.cavity_clamp,
-            self.log_free, self.sums,
+            self.log_free, self.sums, strip_length(),
         )  # fmt: skip
 
         # Eqs. 4, 11, 13 and 14: what the rays make of that and of their measurements.
@@ -149,6 +150,7 @@ class Sweeper:
         sum_product.finish(
             visible.slots, pool.belief, messages, self.sums, scale,
             config.message_clamp, config.damping, config.min_length, self.moved, log_average,
+            strip_length(),
         )  # fmt: skip
         pool.revision += 1
         moved = self.moved.to_numpy()[:n]

@@ -20,6 +20,7 @@ from taichi_mrf.maps.brick_book import BrickBook
 from taichi_mrf.maps.room import check_room
 from taichi_mrf.poses import Pose
 from taichi_mrf.voxels.layout import BRICK
+from taichi_mrf.voxels.strips import strip_length
 
 SCOUTS = 4
 """Of so many neighbouring rays one is followed through free space to find the bricks that they cross."""
@@ -63,7 +64,7 @@ class Placing:
             if len(slots):
                 moved = ti.ndarray(ti.i32, len(slots))
                 moved.fill(0)
-                sum_product.withdraw(slots, pool.belief, messages, moved)
+                sum_product.withdraw(slots, pool.belief, messages, moved, strip_length())
                 pool.revision += 1
                 pool.stir(slots, moved.to_numpy())
                 pool.touch(slots)
@@ -75,7 +76,7 @@ class Placing:
         """Add a keyframe's messages to what inference starts from, and keep its bricks for good."""
         pool, messages = self.book.pool, self.refresh(keyframe)
         if len(keyframe.visible.slots):
-            sum_product.fold(keyframe.visible.slots, pool.keep_evidence(), messages)
+            sum_product.fold(keyframe.visible.slots, pool.keep_evidence(), messages, strip_length())
         self.book.freeze(keyframe.footprint)
         self.whereabouts.drop(keyframe.id)
         pool.touch(keyframe.visible.slots)

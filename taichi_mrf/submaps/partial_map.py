@@ -12,6 +12,7 @@ from taichi_mrf.config import Config
 from taichi_mrf.inference import sum_product
 from taichi_mrf.maps.mrf import MRFMap
 from taichi_mrf.queries.known_bricks import sorted_bricks
+from taichi_mrf.voxels.strips import strip_length
 
 Bricks = NDArray[np.int32]
 """(n, 3) brick coordinates in the world."""
@@ -50,7 +51,9 @@ class PartialMap(MRFMap):
             if keyframe.messages is not None and len(keyframe.visible.slots):
                 moved = ti.ndarray(ti.i32, len(keyframe.visible.slots))
                 moved.fill(0)
-                sum_product.withdraw(keyframe.visible.slots, snapshot.belief, keyframe.messages, moved)
+                sum_product.withdraw(
+                    keyframe.visible.slots, snapshot.belief, keyframe.messages, moved, strip_length()
+                )
         with self._pool.showing(snapshot):
             found = self._pool.read("belief", slots)
         runtime.settle()  # before the snapshot is dropped

@@ -18,7 +18,8 @@ from taichi_mrf import runtime
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.memory import check_memory
-from taichi_mrf.voxels.types import F32, I32, F32Array, I32Array
+from taichi_mrf.voxels.strips import strip_begin, strip_length
+from taichi_mrf.voxels.types import F32, I32, F32Array, I32Array, Template
 
 GROWTH = 1.2
 """A full pool grows by this factor: little enough that the slack does not show in the bytes a voxel."""
@@ -92,9 +93,9 @@ class BrickPool:
         self.stirred[slots] = 0
         self._stirring[slots] = True
         self.touch(slots)
-        _fill_bricks(self.belief, slots, self.prior_log_odds)
+        _fill_bricks(self.belief, slots, self.prior_log_odds, strip_length())
         if self.evidence is not None:
-            _fill_bricks(self.evidence, slots, self.prior_log_odds)
+            _fill_bricks(self.evidence, slots, self.prior_log_odds, strip_length())
         return slots
 
     def release(self, slots: NDArray[np.int32]) -> None:
@@ -169,7 +170,7 @@ class BrickPool:
         """The voxels of some bricks, (n, 512), from the channel "belief" or "evidence"."""
         out = np.zeros(len(slots) * VOXELS, np.float32)
         if len(slots):
-            _read_bricks(getattr(self, channel), slots, out)
+            _read_bricks(getattr(self, channel), slots, out, strip_length())
         return out.reshape(-1, VOXELS)
 
     def write(self, channel: str, slots: NDArray[np.int32], values: NDArray[np.float32]) -> None:
@@ -178,7 +179,8 @@ class BrickPool:
         if channel == "evidence":
             self.keep_evidence()
         self.touch(slots)
-        _write_bricks(getattr(self, channel), slots, np.ascontiguousarray(values, np.float32).reshape(-1))
+        flat = np.ascontiguousarray(values, np.float32).reshape(-1)
+        _write_bricks(getattr(self, channel), slots, flat, strip_length())
 
     def _affordable(self) -> int:
         """Bricks that the memory limit, if there is one, has room for."""
@@ -215,30 +217,37 @@ class BrickPool:
 
 def _grown(old: "ti.Ndarray", old_capacity: int, capacity: int) -> "ti.Ndarray":
     new = ti.ndarray(ti.f32, capacity * VOXELS)
-    _copy(old, new, old_capacity * VOXELS)
+    _copy(old, new, old_capacity, strip_length())
     runtime.settle()
     return new
 
 
 @ti.kernel
-def _copy(source: F32Array, target: F32Array, n: I32):
-    for i in range(n):
-        target[i] = source[i]
+def _copy(source: F32Array, target: F32Array, bricks: I32, strip: Template):
+    for part in range(bricks * (VOXELS // strip)):
+        for k in range(strip):
+            target[part * strip + k] = source[part * strip + k]
 
 
 @ti.kernel
-def _fill_bricks(channel: F32Array, slots: I32Array, value: F32):
-    for i in range(slots.shape[0] * VOXELS):
-        channel[slots[i // VOXELS] * VOXELS + i % VOXELS] = value
+def _fill_bricks(channel: F32Array, slots: I32Array, value: F32, strip: Template):
+    for part in range(slots.shape[0] * (VOXELS // strip)):
+        _, j = strip_begin(part, slots, strip)
+        for k in range(strip):
+            channel[j + k] = value
 
 
 @ti.kernel
-def _read_bricks(channel: F32Array, slots: I32Array, out: F32Array):
-    for i in range(slots.shape[0] * VOXELS):
-        out[i] = channel[slots[i // VOXELS] * VOXELS + i % VOXELS]
+def _read_bricks(channel: F32Array, slots: I32Array, out: F32Array, strip: Template):
+    for part in range(slots.shape[0] * (VOXELS // strip)):
+        i, j = strip_begin(part, slots, strip)
+        for k in range(strip):
+            out[i + k] = channel[j + k]
 
 
 @ti.kernel
-def _write_bricks(channel: F32Array, slots: I32Array, values: F32Array):
-    for i in range(slots.shape[0] * VOXELS):
-        channel[slots[i // VOXELS] * VOXELS + i % VOXELS] = values[i]
+def _write_bricks(channel: F32Array, slots: I32Array, values: F32Array, strip: Template):
+    for part in range(slots.shape[0] * (VOXELS // strip)):
+        i, j = strip_begin(part, slots, strip)
+        for k in range(strip):
+            channel[j + k] = values[i + k]
