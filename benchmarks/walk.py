@@ -157,7 +157,7 @@ def time_taichi(problem: Path, threads: int) -> None:
             np.ones((bricks // 8) ** 3, np.int32), np.arange(bricks**3, dtype=np.int32),
             log_free, sums, float(data["scale"]), CLAMP,
             trace_voxel, trace, longest, steps, workers.number, workers.run, workers.spread,
-            CENTRE, True, True, False, 0,
+            CENTRE, True, True, False, False, 0,
         )  # fmt: skip
         ti.sync()
         if attempt > 0:

@@ -71,7 +71,7 @@ class InferenceConfig:
     tolerance: float = 0.0
     """Stop before the last sweep when no more than this share of the voxels moved by over 0.01."""
 
-    renew_tolerance: float = 0.2
+    renew_tolerance: float = 0.35
     """While frames come, a keyframe is swept again once others have moved more than this share of the
     marginals that it sees by over 0.01 each. It does not touch full inference."""
 

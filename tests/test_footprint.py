@@ -82,7 +82,7 @@ class Rays:
 
 
 def rays_of(image: DepthImage, T: Pose, window: Window, max_depth: float, noise: Noise = NOISE) -> Rays:
-    measured = image.depth.to_numpy().astype(np.float64)
+    measured = image.to_numpy().reshape(-1).astype(np.float64)
     seen = measured > 0
     directions = image.camera.rays().reshape(-1, 3)[seen] @ T[:3, :3].T / window.voxel_size
     sigmas = INFERENCE.end_sigmas
@@ -306,7 +306,7 @@ def test_longest_bounds_the_voxels_on_every_ray(pose: str, bounded: bool) -> Non
 
 def ray_ends(image: DepthImage, T: Pose, noise_of: dict[Noise, NDArray], max_depth: float) -> NDArray:
     """World points at which the rays end, (n, 3); ``noise_of`` tells each noise's pixels."""
-    measured = image.depth.to_numpy().astype(np.float64)
+    measured = image.to_numpy().reshape(-1).astype(np.float64)
     end = np.zeros(len(measured))
     for noise, pixels in noise_of.items():
         end[pixels] = noise.depth_of_deviation(measured[pixels], -INFERENCE.end_sigmas)

@@ -4,6 +4,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
+import small_room
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from oracles import inference as reference
@@ -11,6 +12,7 @@ from oracles.forward import Noise
 
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import InferenceConfig
+from taichi_mrf.evaluation.launches import count_launches
 from taichi_mrf.inference.prior import prior_probability
 from taichi_mrf.inference.schedule import content_key
 from taichi_mrf.maps.mrf import MRFMap
@@ -81,7 +83,7 @@ def well_cut(rays: list[reference.Ray], longest: int) -> bool:
 @settings(max_examples=60)
 @given(
     seed=seeds, depth=shallow, sigma=wide, prior=priors, bias=st.floats(-0.05, 0.05),
-    method=st.sampled_from(["sum-product", "max-product"]),
+    method=st.sampled_from(["sum-product", "max-product"]), retrace=st.booleans(),
 )  # fmt: skip
 def test_one_ray_equals_enumeration(
     seed: int,
@@ -90,6 +92,7 @@ def test_one_ray_equals_enumeration(
     prior: float,
     bias: float,
     method: Literal["sum-product", "max-product"],
+    retrace: bool,
 ) -> None:
     rng = np.random.default_rng(seed)
     T = random_pose(rng)
@@ -97,6 +100,7 @@ def test_one_ray_equals_enumeration(
     rays = reference.cast(image(depth), T, ONE_PIXEL, VOXEL, sensor, config, max_depth=0.75)
     assume(well_cut(rays, 12))
     m = MRFMap(VOXEL, PolynomialNoise((sigma,), (bias,)), inference=config, max_depth=0.75)
+    m._sweeper.retrace = retrace
     m.add_keyframe(image(depth), T, ONE_PIXEL)
     m.infer(sweeps=2, method=method)
     exact = reference.enumerate_marginals(rays, prior, config.outlier_floor, method == "max-product")
@@ -245,3 +249,30 @@ def test_float16_messages_move_beliefs_a_little() -> None:
     voxels = sorted(allocated(maps["float32"]))
     difference = np.abs(marginals(maps["float16"], voxels) - marginals(maps["float32"], voxels))
     assert 0 < difference.max() < 0.01
+
+
+@pytest.mark.parametrize("average", ["log_odds", "probability"])
+def test_rays_followed_twice_say_what_their_trace_says(average: Literal["log_odds", "probability"]) -> None:
+    marginals = []
+    for retrace in (False, True):
+        m = MRFMap(small_room.VOXEL_SIZE, inference=InferenceConfig(average=average))
+        m._sweeper.retrace = retrace
+        for frame in small_room.frames()[:4]:
+            small_room.add(m, frame)
+        m.infer()
+        marginals.append(m.voxels(0.0)[1])
+    # Differences of sums in float32 are not the sums of the rest.
+    apart = np.abs(marginals[1] - marginals[0])
+    assert 0 < apart.max() < 0.02
+    assert np.quantile(apart, 0.999) < 1e-3
+
+
+def test_the_host_waits_for_no_step_of_a_sweep(backend: str) -> None:
+    if backend == "cpu":
+        pytest.skip("on a CPU arrays of the host are handed to kernels as they are, and nobody waits")
+    m = small_room.build([0, 1])
+    with count_launches() as launches:
+        m.infer(sweeps=1)
+    # Each keyframe's order, and what has moved in the end.
+    assert launches.waits == 2 * len(m.keyframes)
+    assert launches.number > 6 * len(m.keyframes)

@@ -61,7 +61,8 @@ FLOORS: Mapping[str, Mapping[str, Floor]] = {
         "cavity": lambda w: (
             (4 + w.message_bytes + 4 + 8) * w.voxels
         ),  # belief, message in; log_free, sums out
-        "_scatter": lambda w: 2 * 12 * w.visible,  # cells and slots in, index out; and once more to clear it
+        "_enter": lambda w: 12 * w.visible,  # cells and their order in, index out
+        "_take_out": lambda w: 8 * w.visible,  # cells in, index out
         "send_messages": lambda w: 12 * w.rays + (4 + 8 + 8) * w.met + w.trace_bytes,
         "finish": lambda w: 8 * w.voxels + (2 * w.message_bytes + 8) * w.met,
         "ndarray_to_ext_arr": lambda w: 8 * w.visible,  # how many moved

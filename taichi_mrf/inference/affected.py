@@ -98,7 +98,9 @@ class Renewal:
             keyframe = keyframes[id]
             self.refresh(keyframe)
             self.pool.touch(keyframe.visible.slots)
-            if self.sweeper.sweep(keyframe, self.pool) is None:
+            if self.sweeper.sweep(keyframe, self.pool):
+                self.sweeper.take_moved(keyframe, self.pool)
+            else:
                 keyframe.heard = np.zeros(0, np.int64)  # it sees no brick, so there is nothing to say
             rays, swept = rays + keyframe.rays, swept + 1
             if progress is not None and not progress(InferProgress(1, 1, swept, swept, keyframe.rays)):

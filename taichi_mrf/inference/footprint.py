@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.config import InferenceConfig, SensorConfig, VolumeConfig
 from taichi_mrf.errors import CapacityError
-from taichi_mrf.inference.keyframe import DepthImage, Footprint, RayList
+from taichi_mrf.inference.keyframe import TILE, DepthImage, Footprint, RayList
 from taichi_mrf.inference.ray_list import block_of
 from taichi_mrf.inference.rays import pixel_direction
 from taichi_mrf.poses import Pose
@@ -36,8 +36,6 @@ from taichi_mrf.voxels.types import (
 from taichi_mrf.voxels.window import Window
 
 CROSSED, SURFACE = 1, 2
-TILE = 32
-"""Pixels along each side of the tiles from whose corners an image's extent in space is worked out."""
 
 
 def find_footprint(
@@ -112,11 +110,8 @@ def visible_box(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Two corners, in metres, of an upright box around the camera and the ends of all its rays."""
     camera = image.camera
-    depth = image.depth.to_numpy().reshape(camera.shape)
-    rows, columns = -(-camera.height // TILE), -(-camera.width // TILE)
-    padded = np.zeros((rows * TILE, columns * TILE), np.float32)
-    padded[: camera.height, : camera.width] = depth
-    farthest = padded.reshape(rows, TILE, columns, TILE).max(axis=(1, 3)).astype(np.float64)
+    farthest = image.farthest.astype(np.float64)
+    rows, columns = farthest.shape
     # Generous: the end of a ray is never further than depth_of_deviation() lets it be, and no patch of
     # the table is worse than the worst.
     values = np.abs(evaluate(image.noise_table.coefficients[:, :, None], farthest.reshape(1, 1, -1)))

@@ -10,6 +10,7 @@ from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.poses import Pose
 from taichi_mrf.sensor.noise import NoiseModel, NoiseTable
+from taichi_mrf.voxels.resident import Resident, on_host, resident
 from taichi_mrf.voxels.window import Window
 
 Cells = NDArray[np.int32]
@@ -29,43 +30,62 @@ def checked_depth(depth_m: ArrayLike, camera: PinholeCamera, min_depth: float) -
         )
     if not np.issubdtype(depth.dtype, np.floating):
         raise KeyframeError(f"a depth image must be floating-point metres, not {depth.dtype}")
-    valid = np.isfinite(depth) & (depth >= min_depth) & (depth > 0)
-    return np.where(valid, depth, 0.0).astype(np.float32)
+    # NaN is never larger than anything.
+    valid = (depth >= min_depth) & (depth > 0) & (depth < np.inf)
+    return np.where(valid, depth.astype(np.float32, copy=False), np.float32(0.0))
+
+
+TILE = 32
+"""Pixels along each side of the tiles by which depths are summed up, and in whose order rays are listed:
+those of a tile cross the same bricks. A tile is also the largest block of pixels with one ray."""
 
 
 @dataclass
 class DepthImage:
     """A depth image where kernels can reach it, with its camera and the camera's noise.
 
-    ``depth`` is (H * W) float32 axial depth in metres, 0 where there is no measurement.
+    ``depth`` is (H * W) float32 axial depth in metres, 0 where there is no measurement; ``farthest`` the
+    largest in each tile (rows, columns).
     """
 
-    depth: ti.Ndarray
+    depth: Resident
     camera: PinholeCamera
-    noise: ti.Ndarray
+    noise: Resident
     noise_table: NoiseTable
     rays: int
+    farthest: NDArray[np.float32]
 
     @staticmethod
     def upload(depth_m: NDArray[np.float32], camera: PinholeCamera, noise: NoiseModel) -> "DepthImage":
-        """Put :func:`checked_depth` (H, W) on the device. Raises ConfigError if the noise model does not
-        fit the camera."""
+        """Put :func:`checked_depth` (H, W), which nobody may change from now on, where kernels can reach it.
+        Raises ConfigError if the noise model does not fit the camera."""
         table = noise.table(camera)
-        depth = ti.ndarray(ti.f32, depth_m.size)
-        depth.from_numpy(depth_m.reshape(-1))
-        coefficients = ti.ndarray(ti.f32, table.coefficients.shape)
-        coefficients.from_numpy(table.coefficients)
-        return DepthImage(depth, camera, coefficients, table, int((depth_m > 0).sum()))
+        depth, coefficients = resident(depth_m.reshape(-1)), resident(table.coefficients)
+        return DepthImage(
+            depth, camera, coefficients, table, int(np.count_nonzero(depth_m)), _farthest(depth_m)
+        )
 
     def to_numpy(self) -> NDArray[np.float32]:
         """(H, W) axial depth in metres, 0 where there is no measurement."""
-        return self.depth.to_numpy().reshape(self.camera.shape)
+        return np.array(on_host(self.depth)).reshape(self.camera.shape)
 
     @property
     def intrinsics(self) -> ti.Vector:
         """(fx, fy, cx, cy) as a kernel argument."""
         c = self.camera
         return ti.Vector([c.fx, c.fy, c.cx, c.cy], ti.f32)
+
+
+def _farthest(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The largest of (H, W) depths in each tile, (rows, columns)."""
+    height, width = depth_m.shape
+    rows, columns = -(-height // TILE), -(-width // TILE)
+    padded = depth_m
+    if (height, width) != (rows * TILE, columns * TILE):
+        padded = np.zeros((rows * TILE, columns * TILE), np.float32)
+        padded[:height, :width] = depth_m
+    # Whole rows first, which is what memory is fast at.
+    return padded.reshape(rows, TILE, -1).max(axis=1).reshape(rows, columns, TILE).max(axis=2)
 
 
 @dataclass(frozen=True)
@@ -102,18 +122,38 @@ class Footprint:
     longest: int
 
 
+@dataclass(frozen=True)
+class BrickArrays:
+    """A list of visible bricks where kernels can reach it without the host: cells and slots, and a count for
+    each brick of the voxels that moved in the last sweep. (n) int32 each."""
+
+    cells: Resident
+    slots: Resident
+    moved: Resident
+
+
 @dataclass
 class VisibleBricks:
     """The bricks of the map that a keyframe's rays cross, in the order of its messages.
 
     ``cells`` in the keyframe's window (ascending), ``slots`` in the pool, ``identity`` to tell whether
     that is still the same brick, and ``version`` of the map's set of bricks at which this was true.
+    ``arrays`` and the ``scale`` of the accumulators are made when a sweep first needs them.
     """
 
     cells: Cells
     slots: NDArray[np.int32]
     identity: NDArray[np.int64]
     version: int
+    arrays: BrickArrays | None = None
+    scale: float = 0.0
+
+    def on_device(self) -> BrickArrays:
+        """The list on the device; it must not be empty."""
+        if self.arrays is None:
+            moved = np.zeros_like(self.slots)
+            self.arrays = BrickArrays(resident(self.cells), resident(self.slots), resident(moved))
+        return self.arrays
 
 
 @dataclass

@@ -13,13 +13,9 @@ import taichi as ti
 
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import InferenceConfig
-from taichi_mrf.inference.keyframe import DepthImage, RayList
+from taichi_mrf.inference.keyframe import TILE, DepthImage, RayList
 from taichi_mrf.sensor.forward import pixel_noise, sigma_at
 from taichi_mrf.voxels.types import F32, I32, F32Array, F32Array3, I32Array, Struct, Template
-
-TILE = 32
-"""Pixels along each side of the tiles in whose order the rays are listed, and of the largest block: the rays
-of a tile cross the same bricks."""
 
 LEVELS = 10
 """A block of level n has 2^n pixels: the odd levels put two blocks side by side, the even ones two above each
@@ -113,14 +109,17 @@ def _merge(asked: Template, u: I32, v: I32, n: I32, noise: Template, patch: I32,
     b = a + (wide // 2 if n % 2 == 1 else high // 2 * asked.width)
     if level[a] == n - 1 and level[b] == n - 1:
         near, far = ti.min(nearest[a], nearest[b]), ti.max(farthest[a], farthest[b])
-        sigma = sigma_at(pixel_noise(noise, patch, columns, u + wide // 2, v + high // 2), near)
-        fits = wide * high * near * near <= asked.stride_metres * asked.stride_metres
-        if fits and far - near <= ti.max(asked.agree_m, asked.agree_sigmas * sigma):
-            nearest[a] = near
-            farthest[a] = far
-            mean[a] = 0.5 * (mean[a] + mean[b])
-            level[a] = n
-            level[b] = -1
+        if wide * high * near * near <= asked.stride_metres * asked.stride_metres:
+            agree = far - near <= asked.agree_m
+            if not agree:  # the noise need not be looked up for most
+                sigma = sigma_at(pixel_noise(noise, patch, columns, u + wide // 2, v + high // 2), near)
+                agree = far - near <= asked.agree_sigmas * sigma
+            if agree:
+                nearest[a] = near
+                farthest[a] = far
+                mean[a] = 0.5 * (mean[a] + mean[b])
+                level[a] = n
+                level[b] = -1
 
 
 @ti.kernel

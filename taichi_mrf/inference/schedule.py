@@ -16,6 +16,7 @@ from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.resident import on_host
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ def content_key(keyframe: Keyframe) -> bytes:
     """What a keyframe holds, as bytes to sort by: measurement, pose and camera, but not its number."""
     digest = hashlib.blake2b(keyframe.T_world_camera.tobytes(), digest_size=16)
     digest.update(repr(keyframe.camera).encode())
-    digest.update(keyframe.image.depth.to_numpy().tobytes())
+    digest.update(on_host(keyframe.image.depth).tobytes())
     return digest.digest()
 
 
@@ -70,17 +71,21 @@ def run_sweeps(
     residual, rays, done, complete = 0.0, 0, 0, True
     for sweep in range(1, sweeps + 1):
         moved = seen = 0
+        swept: list[Keyframe] = []
         for number, keyframe in enumerate(keyframes, start=1):
-            changed = None if _has_converged(keyframe, pool, damping) else sweeper.sweep(keyframe, pool)
-            if changed is not None:
-                moved += int(changed.sum())
-                seen += len(changed) * VOXELS
+            if not _has_converged(keyframe, pool, damping) and sweeper.sweep(keyframe, pool):
+                swept.append(keyframe)
             rays += keyframe.rays
             if progress is not None and not progress(
                 InferProgress(sweep, sweeps, number, len(keyframes), keyframe.rays)
             ):
                 complete = False
                 break
+        # Only now does the host ask, and wait for, what came of it.
+        for keyframe in swept:
+            changed = sweeper.take_moved(keyframe, pool)
+            moved += int(changed.sum())
+            seen += len(changed) * VOXELS
         residual, done = moved / max(seen, 1), sweep
         if not complete or residual <= tolerance > 0:
             break

@@ -107,12 +107,13 @@ def send_messages(
     trace_voxel: I32Array, trace: Vec4Array, longest: I32, steps: I32Array,
     workers: I32, run: I32, spread: I32,
     likelihood: Template, segment_lengths: Template, log_average: Template, maximise: Template,
-    block_dim: Template,
+    retrace: Template, block_dim: Template,
 ):  # fmt: skip
     """Follow the rays of a keyframe there and back, and sum up what they tell each voxel.
 
     A worker follows one ray after the other and writes each ray's steps into its own part of the trace,
     so that the way back need not be walked again. ``longest`` is never less than a ray has voxels.
+    With ``retrace``, which cannot ``maximise``, each ray is followed a second time and leaves no trace.
     ``steps`` receives each worker's number of voxels crossed.
     ``begins`` holds the depth at which each ray meets its first brick: learnt by the sweep that does not
     know it yet, and where later sweeps start. Rays are dealt out in runs of ``run`` neighbours; one that
@@ -151,7 +152,8 @@ def send_messages(
                 )  # fmt: skip
                 walk_voxels(
                     ray, begin, end, shape, chunks, bricks, _see_voxel, ahead,
-                    (log_free, trace_voxel, trace, voxel_size, likelihood, segment_lengths, maximise, floor),
+                    (log_free, voxel_size, likelihood, segment_lengths,
+                     trace_voxel, trace, maximise, retrace, floor),
                 )  # fmt: skip
 
                 if begins_known == 0:
@@ -165,50 +167,107 @@ def send_messages(
                 behind = cost(behind, floor + TINY) if ti.static(maximise) else ahead.visibility * behind
 
                 # Backward: eqs. 13 and 14 for each voxel, from the far end.
-                for step in range(ahead.voxels):
-                    j = ahead.trace + ahead.voxels - 1 - step
-                    message = 0.0
-                    if ti.static(maximise):
-                        message = best_message(trace[j], behind, clamp, log_average)
-                    else:
-                        free, here_density, before = trace[j][1], trace[j][2], trace[j][3]
-                        occupied = occupied_message(before, here_density, floor)
-                        empty = empty_message(before, behind, free, floor)
-                        message = occupied / (occupied + empty)
-                        if ti.static(log_average):
-                            message = clamped_log_odds(occupied, empty, clamp, largest)
-                        behind += (1.0 - free) * here_density
-                    weight = ti.cast(wide * high, ti.f32)
-                    if ti.static(segment_lengths):
-                        weight *= trace[j][0]
-                    add_message(sums, trace_voxel[j], weight, message, scale)
+                pixels = ti.cast(wide * high, ti.f32)
+                if ti.static(retrace):
+                    # From the near end again: what lies behind a voxel is what neither it nor those before
+                    # it explain.
+                    total = ahead.explained + behind
+                    again = ForwardPass(
+                        measured, here, ahead.support, ahead.voxels_per_depth, 1.0, 0.0, end, 0, 0
+                    )  # fmt: skip
+                    if ahead.voxels > 0:
+                        walk_voxels(
+                            ray, ahead.first, end, shape, chunks, bricks, _tell_voxel, again,
+                            (log_free, voxel_size, likelihood, segment_lengths,
+                             sums, total, pixels, scale, floor, clamp, largest, log_average),
+                        )  # fmt: skip
+                else:
+                    for step in range(ahead.voxels):
+                        j = ahead.trace + ahead.voxels - 1 - step
+                        message = 0.0
+                        if ti.static(maximise):
+                            message = best_message(trace[j], behind, clamp, log_average)
+                        else:
+                            free, density, before = trace[j][1], trace[j][2], trace[j][3]
+                            message = _message(
+                                before, density, behind, free, floor, clamp, largest, log_average
+                            )
+                            behind += (1.0 - free) * density
+                        weight = pixels
+                        if ti.static(segment_lengths):
+                            weight *= trace[j][0]
+                        add_message(sums, trace_voxel[j], weight, message, scale)
+
+
+@ti.func
+def _crossing(way: Template, context: Template, voxel: I32, near: F32, far: F32) -> Vec3:
+    """How long a ray is in a voxel, the log-chance that the voxel lets it pass, and the density of its
+    measurement if not; ``near`` and ``far`` bound the ray's segment in it, in axial depth."""
+    length = (far - near) * way.voxels_per_depth
+    log_free = context[0][voxel]
+    if ti.static(context[3]):
+        log_free *= length
+    density = 0.0
+    if far > way.support:
+        density = surface_likelihood(way.measured, near, far, way.noise, context[1], context[2])
+    return Vec3(length, log_free, density)
 
 
 @ti.func
 def _see_voxel(ahead: Template, context: Template, voxel: I32, near: F32, far: F32):
-    """One voxel of the forward pass; ``near`` and ``far`` bound the ray's segment in it, in axial depth."""
-    length = (far - near) * ahead.voxels_per_depth
-    log_free = context[0][voxel]
-    if ti.static(context[5]):
-        log_free *= length
-    density = 0.0
-    if far > ahead.support:
-        density = surface_likelihood(ahead.measured, near, far, ahead.noise, context[3], context[4])
+    """One voxel of the forward pass."""
+    met = _crossing(ahead, context, voxel, near, far)
     if ahead.voxels == 0:
         ahead.first = near
     j = ahead.trace + ahead.voxels
-    context[1][j] = voxel
+    if ti.static(not context[7]):
+        context[4][j] = voxel
     if ti.static(context[6]):
-        context[2][j] = see_best(ahead.explained, length, log_free, density, context[7] + TINY)
+        context[5][j] = see_best(ahead.explained, met[0], met[1], met[2], context[8] + TINY)
     else:
         # Eq. 4, and eq. 11: the voxel is seen, it is occupied, and it explains the measurement.
-        free = exp_of_negative(log_free)
-        density *= ahead.visibility
-        context[2][j] = Vec4(length, free, density, ahead.explained)
+        free = exp_of_negative(met[1])
+        density = met[2] * ahead.visibility
+        if ti.static(not context[7]):
+            context[5][j] = Vec4(met[0], free, density, ahead.explained)
         ahead.explained += (1.0 - free) * density
         ahead.visibility *= free
     ahead.voxels += 1
     return 1
+
+
+@ti.func
+def _tell_voxel(again: Template, context: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of the second way along a ray (``retrace``)."""
+    met = _crossing(again, context, voxel, near, far)
+    free = exp_of_negative(met[1])
+    density = met[2] * again.visibility
+    before = again.explained
+    again.explained += (1.0 - free) * density
+    again.visibility *= free
+    behind = ti.max(0.0, context[5] - again.explained)
+    weight = context[6]
+    if ti.static(context[3]):
+        weight *= met[0]
+    message = _message(
+        before, density, behind, free, context[8], context[9], context[10], context[11]
+    )  # fmt: skip
+    add_message(context[4], voxel, weight, message, context[7])
+    return 1
+
+
+@ti.func
+def _message(
+    before: F32, here: F32, behind: F32, free: F32, floor: F32, clamp: F32, largest: F32,
+    log_average: Template,
+) -> F32:  # fmt: skip
+    """What a ray tells a voxel, in [0, 1] for the accumulators."""
+    occupied = occupied_message(before, here, floor)
+    empty = empty_message(before, behind, free, floor)
+    message = occupied / (occupied + empty)
+    if ti.static(log_average):
+        message = clamped_log_odds(occupied, empty, clamp, largest)
+    return message
 
 
 @ti.func

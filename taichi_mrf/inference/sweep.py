@@ -15,6 +15,7 @@ from taichi_mrf.inference.keyframe import Keyframe, RayList
 from taichi_mrf.sensor.forward import AUTO, CENTRE, SEGMENT
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.resident import on_host
 from taichi_mrf.voxels.strips import strip_length
 from taichi_mrf.voxels.traversal import FAR
 from taichi_mrf.voxels.vectors import vec4_array
@@ -24,6 +25,11 @@ LIKELIHOODS = {"auto": AUTO, "segment": SEGMENT, "centre": CENTRE}
 
 TRACE_BYTES = 20
 """What one step of a ray leaves in the trace."""
+
+
+RETRACE = False
+"""Whether rays are followed a second time on their way back, or their trace is replayed. Max-product always
+replays. docs/performance.md has what was measured."""
 
 
 @dataclass(frozen=True)
@@ -75,17 +81,18 @@ class Sweeper:
         self.index = WindowIndex()
         self.log_free = ti.ndarray(ti.f32, VOXELS)
         self.sums = ti.ndarray(ti.i64, VOXELS)
-        self.moved = ti.ndarray(ti.i32, 1)
+        self.order = ti.ndarray(ti.i32, 1)
         self.trace_voxel = ti.ndarray(ti.i32, 1)
         self.trace = vec4_array(1)
         self.steps = ti.ndarray(ti.i32, 1)
+        self.retrace = RETRACE
 
     @property
     def nbytes(self) -> int:
         """Bytes of the scratch."""
         return (
             self.log_free.shape[0] * 12
-            + self.moved.shape[0] * 4
+            + self.order.shape[0] * 4
             + self.trace_voxel.shape[0] * TRACE_BYTES
             + self.index.bricks.shape[0] * 4
         )
@@ -95,41 +102,35 @@ class Sweeper:
         """Voxels that the rays of the last sweep crossed, each ray's counted."""
         return int(self.steps.to_numpy().sum(dtype=np.int64))
 
-    def sweep(self, keyframe: Keyframe, pool: BrickPool) -> NDArray[np.int32] | None:
+    def sweep(self, keyframe: Keyframe, pool: BrickPool) -> bool:
         """Send one keyframe's messages anew. ``keyframe.messages`` must fit ``keyframe.visible``.
 
-        Returns how many voxels of each visible brick moved, or None if it sees no brick.
+        False if it sees no brick. The host does not wait for the device: what has moved, :meth:`take_moved`
+        asks, before the next sweep over the same keyframe.
         """
         config, image, rays = self.inference, keyframe.image, keyframe.ray_list
         visible, footprint = keyframe.visible, keyframe.footprint
         n = len(visible.slots)
         if n == 0:
-            return None
+            return False
         messages = keyframe.messages
         workers = workers_for(runtime.active() or "cpu", runtime.is_software(), footprint.longest)
         self._reserve(n, workers.number * footprint.longest, workers.number)
         window = footprint.window
         centre, to_voxels = window.rays_of(keyframe.T_world_camera)
         box_lower, box_upper = window.clip_box(self.volume.lower, self.volume.upper)
-        scale = finest_scale(
-            image.camera,
-            image.rays,
-            keyframe.T_world_camera,
-            window,
-            window.bricks_of(visible.cells),
-            rays.widest,
-        )
+        bricks, scale, strip = visible.on_device(), self._scale(keyframe), strip_length()
         log_average = config.average == "log_odds"
 
         # Eq. 6: what all others believe of each voxel.
         sum_product.cavity(
-            visible.slots, pool.belief, messages,
+            bricks.slots, pool.belief, messages,
             least_log_odds(config, pool.prior_log_odds), config.cavity_clamp,
-            self.log_free, self.sums, strip_length(),
+            self.log_free, self.sums, strip,
         )  # fmt: skip
 
         # Eqs. 4, 11, 13 and 14: what the rays make of that and of their measurements.
-        self.index.fill(window, visible.cells, np.arange(n, dtype=np.int32))
+        self.index.fill(window, bricks.cells, self.order)
         sum_product.send_messages(
             rays.blocks, rays.depth, rays.number, keyframe.begins, int(keyframe.begins_known),
             image.camera.width, image.intrinsics, centre, to_voxels,
@@ -140,32 +141,55 @@ class Sweeper:
             self.trace_voxel, self.trace, footprint.longest, self.steps,
             workers.number, workers.run, workers.spread,
             LIKELIHOODS[config.likelihood], config.segment_lengths, log_average,
-            config.method == "max-product", workers.block,
+            config.method == "max-product", self.retrace and config.method != "max-product", workers.block,
         )  # fmt: skip
         keyframe.begins_known = True
-        self.index.clear(window, visible.cells)
+        self.index.clear(window, bricks.cells)
 
         # Eqs. 7 and 8: the average over rays is the keyframe's new message, and changes the beliefs.
-        self.moved.fill(0)
+        bricks.moved.fill(0)  # a NumPy array's method or a Taichi array's
         sum_product.finish(
-            visible.slots, pool.belief, messages, self.sums, scale,
-            config.message_clamp, config.damping, config.min_length, self.moved, log_average,
-            strip_length(),
+            bricks.slots, pool.belief, messages, self.sums, scale,
+            config.message_clamp, config.damping, config.min_length, bricks.moved, log_average, strip,
         )  # fmt: skip
         pool.revision += 1
-        moved = self.moved.to_numpy()[:n]
+        keyframe.revision = pool.revision
+        return True
+
+    def take_moved(self, keyframe: Keyframe, pool: BrickPool) -> NDArray[np.int32]:
+        """How many voxels of each visible brick moved in the keyframe's last sweep, (n,); the pool counts
+        them as stirred, and the keyframe as heard. Keyframes are asked in the order of their sweeps."""
+        visible = keyframe.visible
+        moved = np.array(on_host(visible.on_device().moved))
         pool.stir(visible.slots, moved)
-        keyframe.revision, keyframe.heard = pool.revision, pool.stirred[visible.slots]
+        keyframe.heard = pool.stirred[visible.slots]
         return moved
 
+    def _scale(self, keyframe: Keyframe) -> float:
+        """The accumulators' scale, which follows from where the keyframe stands and from its bricks."""
+        visible, image, window = keyframe.visible, keyframe.image, keyframe.footprint.window
+        if visible.scale == 0.0:
+            visible.scale = finest_scale(
+                image.camera,
+                image.rays,
+                keyframe.T_world_camera,
+                window,
+                window.bricks_of(visible.cells),
+                keyframe.ray_list.widest,
+            )
+        return visible.scale
+
     def _reserve(self, bricks: int, steps: int, workers: int) -> None:
-        runtime.settle()
-        if bricks > self.moved.shape[0]:
+        grow = bricks > self.order.shape[0], steps > self.trace_voxel.shape[0], workers != self.steps.shape[0]
+        if any(grow):
+            runtime.settle()  # before the old scratch is dropped
+        if grow[0]:
             self.log_free = ti.ndarray(ti.f32, bricks * VOXELS)
             self.sums = ti.ndarray(ti.i64, bricks * VOXELS)
-            self.moved = ti.ndarray(ti.i32, bricks)
-        if steps > self.trace_voxel.shape[0]:
+            self.order = ti.ndarray(ti.i32, bricks)
+            self.order.from_numpy(np.arange(bricks, dtype=np.int32))
+        if grow[1]:
             self.trace_voxel = ti.ndarray(ti.i32, steps)
             self.trace = vec4_array(steps)
-        if workers != self.steps.shape[0]:
+        if grow[2]:
             self.steps = ti.ndarray(ti.i32, workers)

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import sys
+import time
 from pathlib import Path
 
 from taichi_mrf.errors import CapacityError
@@ -94,10 +95,38 @@ def check_memory(wanted_bytes: float, what: str, limit_gb: float = 0.0) -> None:
 
     ``limit_gb`` of 0 means nine tenths of what the machine has free.
     """
-    free = available_bytes()
+    if limit_gb <= 0 and _allowance.covers(wanted_bytes):
+        return
+    free = available_bytes() if limit_gb <= 0 else None
     limit = limit_gb * 1e9 if limit_gb > 0 else (0.9 * free if free is not None else None)
     if limit is not None and wanted_bytes > limit:
         raise CapacityError(
             f"{what} would take {wanted_bytes / 1e9:.3g} GB of memory and {limit / 1e9:.3g} GB are to be "
             "had; choose larger voxels, a smaller volume or a smaller sensor.max_depth"
         )
+    if free is not None:
+        _allowance.renew(free)
+
+
+class _Allowance:
+    """A small part of what was free a moment ago, which may be taken without asking again: a keyframe asks
+    several times, and the system takes longer to answer than most of what is asked for takes to fill."""
+
+    SHARE, SECONDS = 1 / 16, 1.0
+
+    def __init__(self) -> None:
+        self._bytes_left = self._until = 0.0
+
+    def renew(self, free: int) -> None:
+        """Begin anew, knowing what is free now."""
+        self._bytes_left, self._until = self.SHARE * free, time.monotonic() + self.SECONDS
+
+    def covers(self, wanted_bytes: float) -> bool:
+        """Take so many bytes of it, if there are so many."""
+        if wanted_bytes > self._bytes_left or time.monotonic() > self._until:
+            return False
+        self._bytes_left -= wanted_bytes
+        return True
+
+
+_allowance = _Allowance()

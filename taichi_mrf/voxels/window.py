@@ -17,6 +17,7 @@ from taichi_mrf.poses import Pose
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS
 from taichi_mrf.voxels.memory import check_memory
 from taichi_mrf.voxels.numbering import flat
+from taichi_mrf.voxels.resident import Resident
 from taichi_mrf.voxels.types import I32, I32Array, IVec3
 
 Vector = NDArray[np.float64]
@@ -104,21 +105,34 @@ class WindowIndex:
         self.chunks = ti.ndarray(ti.i32, max(1, cells // VOXELS))
         self.chunks.fill(0)
 
-    def fill(self, window: Window, cells: NDArray[np.int32], slots: NDArray[np.int32]) -> None:
-        """Enter bricks: ``slots[i]`` at cell ``cells[i]`` of the window."""
+    def fill(self, window: Window, cells: Resident, slots: Resident) -> None:
+        """Enter bricks: ``slots[i]`` at cell ``cells[i]`` of the window. NumPy or Taichi arrays (n); there
+        may be more slots than cells."""
         if window.cells > self.bricks.shape[0]:
             self._reset(window.cells)
-        _scatter(window.shape_vector, cells, slots, 1, self.bricks, self.chunks)
+        _enter(window.shape_vector, cells, slots, self.bricks, self.chunks)
 
-    def clear(self, window: Window, cells: NDArray[np.int32]) -> None:
+    def clear(self, window: Window, cells: Resident) -> None:
         """Take the same bricks out again, which costs less than filling the whole index."""
-        _scatter(window.shape_vector, cells, np.full(len(cells), -1, np.int32), 0, self.bricks, self.chunks)
+        _take_out(window.shape_vector, cells, self.bricks, self.chunks)
 
 
 @ti.kernel
-def _scatter(shape: IVec3, cells: I32Array, slots: I32Array, mark: I32, bricks: I32Array, chunks: I32Array):
+def _enter(shape: IVec3, cells: I32Array, slots: I32Array, bricks: I32Array, chunks: I32Array):
     for i in range(cells.shape[0]):
-        cell = cells[i]
-        bricks[cell] = slots[i]
-        brick = IVec3(cell // (shape[1] * shape[2]), cell // shape[2] % shape[1], cell % shape[2])
-        chunks[flat(brick // CHUNK, shape // CHUNK)] = mark
+        bricks[cells[i]] = slots[i]
+        chunks[_chunk_of(cells[i], shape)] = 1
+
+
+@ti.kernel
+def _take_out(shape: IVec3, cells: I32Array, bricks: I32Array, chunks: I32Array):
+    for i in range(cells.shape[0]):
+        bricks[cells[i]] = -1
+        chunks[_chunk_of(cells[i], shape)] = 0
+
+
+@ti.func
+def _chunk_of(cell: I32, shape: IVec3) -> I32:
+    """The number of the chunk that holds a window's cell."""
+    brick = IVec3(cell // (shape[1] * shape[2]), cell // shape[2] % shape[1], cell % shape[2])
+    return flat(brick // CHUNK, shape // CHUNK)
