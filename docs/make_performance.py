@@ -1,6 +1,6 @@
 """Makes the pictures of docs/performance.md, which are measurements: run it on an idle machine.
 
-    python docs/make_performance.py ../shared/data                          # all, most of an hour
+    python docs/make_performance.py ../shared/data                          # all, half an hour
     python docs/make_performance.py ../shared/data performance_stages.png   # these
 
 The figures of each go into runs/performance, from where the tables of the page are taken.
@@ -23,23 +23,28 @@ BENCHES: dict[str, list[str]] = {
 }
 """What ``taichi-mrf bench --plot`` draws, and its arguments."""
 
-CURVE = "performance_rays.png"
-"""What ``taichi-mrf eval rays`` draws."""
+EVALUATIONS: dict[str, tuple[list[str], str]] = {
+    "performance_rays.png": (["rays"], "rays_curve.png"),
+    "performance_endless.png": (["endless", "--voxel-sizes", "0.1"], "endless_100mm.png"),
+}
+"""What ``taichi-mrf eval`` draws: its arguments, and its name for the picture."""
 
 
 def main() -> None:
     """Make what the arguments name, or everything."""
     if len(sys.argv) < 2:
         sys.exit(__doc__)
-    data, wanted = Path(sys.argv[1]), sys.argv[2:] or [*BENCHES, CURVE]
-    strange = sorted(set(wanted) - {*BENCHES, CURVE})
+    known = [*BENCHES, *EVALUATIONS]
+    data, wanted = Path(sys.argv[1]), sys.argv[2:] or known
+    strange = sorted(set(wanted) - set(known))
     if strange:
-        sys.exit(f"no such picture: {', '.join(strange)}; there are {', '.join([*BENCHES, CURVE])}")
+        sys.exit(f"no such picture: {', '.join(strange)}; there are {', '.join(known)}")
     OUT.mkdir(parents=True, exist_ok=True)
     for name in wanted:
-        if name == CURVE:
-            program("eval", "rays", "--data", str(data), "--out", str(OUT))
-            shutil.copyfile(OUT / "rays_curve.png", IMAGES / name)
+        if name in EVALUATIONS:
+            arguments, drawn = EVALUATIONS[name]
+            program("eval", *arguments, "--data", str(data), "--out", str(OUT))
+            shutil.copyfile(OUT / drawn, IMAGES / name)
         else:
             arguments = [str(data / KITCHEN) if each == KITCHEN else each for each in BENCHES[name]]
             figures = OUT / Path(name).with_suffix(".json").name
