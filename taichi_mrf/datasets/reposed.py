@@ -1,30 +1,20 @@
 """The frames of another dataset at poses that were found for them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.derived import Derived
 from taichi_mrf.errors import LostFrameError
 from taichi_mrf.frame import Frame
 from taichi_mrf.poses import Pose
 
 
 @dataclass
-class Reposed(Dataset):
+class Reposed(Derived):
     """The frames of ``source``, each (by index) at its pose of ``poses``, (4, 4) T_world_camera."""
 
-    source: Dataset = field(kw_only=True)
     poses: Mapping[int, Pose] = field(kw_only=True)
-
-    @property
-    def endless(self) -> bool:
-        """Whether the source is."""
-        return self.source.endless
-
-    @property
-    def frame_names(self) -> Sequence[str]:
-        """The source's."""
-        return self.source.frame_names
 
     def read(self, index: int) -> Frame:
         """The source's frame. Raises LostFrameError if it has no pose, and what the source raises."""

@@ -15,31 +15,21 @@ from numpy.typing import NDArray
 
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.derived import Derived
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 from taichi_mrf.frame import Frame
 
 
 @dataclass
-class Resampled(Dataset):
+class Resampled(Derived):
     """The frames of ``source``, each pixel of them picked from the recorded image.
 
     ``rows`` and ``columns`` (H, W) int64 say which pixel each of this camera's pixels takes, -1 where its ray
     did not meet the recorded image, which is no measurement.
     """
 
-    source: Dataset = field(kw_only=True)
     rows: NDArray[np.int64] = field(kw_only=True)
     columns: NDArray[np.int64] = field(kw_only=True)
-
-    @property
-    def endless(self) -> bool:
-        """Whether the source is."""
-        return self.source.endless
-
-    @property
-    def frame_names(self) -> Sequence[str]:
-        """The source's."""
-        return self.source.frame_names
 
     def read(self, index: int) -> Frame:
         """Read the source's frame and pick its pixels. Raises what the source raises."""

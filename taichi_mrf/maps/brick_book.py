@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.inference.keyframe import Footprint, VisibleBricks
-from taichi_mrf.voxels.layout import grid_keys
+from taichi_mrf.voxels.layout import BRICK, grid_keys
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology
 
@@ -44,6 +44,22 @@ class BrickBook:
             slots[missing] = self.create(surface[missing])
         self.pool.owners[slots] += 1
         self.topology.add_crossings(crossed, 1)
+
+    def anchor_at(self, position_m: NDArray[np.float64]) -> None:
+        """Let the map lie around a position (3,) in the world, unless it already lies somewhere."""
+        brick = np.floor(position_m / (self.voxel_size * BRICK))
+        self.topology.anchor(np.clip(brick, -(2**30), 2**30).astype(np.int32))
+
+    def restore(self, bricks: Bricks, owners: NDArray[np.int32] | int) -> NDArray[np.int32]:
+        """The bricks of a saved map (n, 3), at least one, with so many owners each; returns their slots.
+
+        Raises CapacityError if there is no room for them.
+        """
+        self.topology.anchor(bricks[len(bricks) // 2])
+        self.topology.check(bricks, self.voxel_size)
+        slots = self.create(bricks)
+        self.pool.owners[slots] = owners
+        return slots
 
     def create(self, bricks: Bricks) -> NDArray[np.int32]:
         """New bricks (n, 3) at the prior, owned by nobody yet; returns their slots."""

@@ -338,10 +338,7 @@ class MRFMap:
         with naming(Path(path)):
             m = cls._with(header.limited_to(memory_limit_gb), header.noise)
             if len(bricks):
-                m._book.topology.anchor(bricks[len(bricks) // 2])
-                m._book.topology.check(bricks, m.voxel_size)
-                slots = m._book.create(bricks)
-                m._pool.owners[slots] = contents.frozen_owners
+                slots = m._book.restore(bricks, contents.frozen_owners)
             m._book.see_for_good(contents.frozen_crossed)
             m._frozen = dict(contents.frozen)
             for stored in header.keyframes:

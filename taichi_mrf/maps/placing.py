@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
 import taichi as ti
 
 from taichi_mrf import runtime
@@ -19,7 +18,6 @@ from taichi_mrf.inference.whereabouts import Whereabouts
 from taichi_mrf.maps.brick_book import BrickBook
 from taichi_mrf.maps.room import check_room
 from taichi_mrf.poses import Pose
-from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.strips import strip_length
 
 SCOUTS = 4
@@ -49,8 +47,7 @@ class Placing:
         begins = unknown_begins(rays)
         image_bytes = 4 * (image.depth.shape[0] + begins.shape[0]) + rays.nbytes
         check_room(others, footprint, image_bytes, self.book.pool, self.inference.message_precision)
-        camera_brick = np.floor(T_world_camera[:3, 3] / (voxel_size * BRICK))
-        self.book.topology.anchor(np.clip(camera_brick, -(2**30), 2**30).astype(np.int32))
+        self.book.anchor_at(T_world_camera[:3, 3])
         self.book.claim(footprint)
         self.whereabouts.put(id, footprint.window)
         visible = self.book.visible(footprint)

@@ -37,7 +37,7 @@ from taichi_mrf.queries.points import classify, point_log_odds, probability
 from taichi_mrf.queries.profile import RayProfile
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config, warn_of_bad_sigma
-from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import create_topology, recycle
 from taichi_mrf.voxels.window import Window
@@ -287,11 +287,7 @@ class RecursiveMap(ABC, Generic[FootprintT]):
         with naming(Path(path)):
             m = cls._create(header.limited_to(memory_limit_gb), header.noise)
             if len(bricks):
-                m._book.topology.anchor(bricks[len(bricks) // 2])
-                m._book.topology.check(bricks, m.voxel_size)
-                slots = m._book.create(bricks)
-                m._pool.owners[slots] = 1
-                m._pool.write("belief", slots, contents.belief)
+                m._pool.write("belief", m._book.restore(bricks, 1), contents.belief)
         for k in header.keyframes:
             m._keyframes[k.id] = ScanRecord(k.id, k.name, k.depth_m, k.T_world_camera, k.camera)
         m._next_id, m._stale = header.next_id, contents.stale
@@ -310,8 +306,7 @@ class RecursiveMap(ABC, Generic[FootprintT]):
         """Allocate what a scan's rays cross and integrate it; what is raised leaves the map as it was."""
         image = DepthImage.upload(record.depth_m, record.camera, self.noise)
         footprint = self._reach(image, record.T_world_camera)
-        camera_brick = np.floor(record.T_world_camera[:3, 3] / (self.voxel_size * BRICK))
-        self._book.topology.anchor(np.clip(camera_brick, -(2**30), 2**30).astype(np.int32))
+        self._book.anchor_at(record.T_world_camera[:3, 3])
         self._book.claim(footprint)
         slots = self._book.visible(footprint).slots
         if len(slots):
