@@ -36,6 +36,7 @@ from taichi_mrf.maps.brick_book import BrickBook
 from taichi_mrf.maps.checkpoint import Checkpoint, go_back, take_checkpoint
 from taichi_mrf.maps.map_file import MapHeader, StoredKeyframe, naming
 from taichi_mrf.maps.placing import Placing
+from taichi_mrf.maps.room import Room
 from taichi_mrf.maps.statistics import MapStatistics, measure
 from taichi_mrf.maps.storage import contents_of, read_contents, write_contents
 from taichi_mrf.poses import as_pose
@@ -89,7 +90,8 @@ class MRFMap:
         whereabouts = Whereabouts()
         parts = (self.sensor, inference, self.config.volume)
         self._keyframes: dict[int, Keyframe] = {}
-        self._placing = Placing(self._book, lister, *parts, whereabouts, self._keyframes)
+        room = Room(self._pool, inference.message_precision)
+        self._placing = Placing(self._book, lister, *parts, whereabouts, room)
         self._sweeper = Sweeper(self.voxel_size, self.sensor, inference, self.config.volume)
         kept = (self._placing.look_again, self._placing.refresh)
         self._renewal = Renewal(self._pool, self._sweeper, whereabouts, *kept, inference.renew_tolerance)

@@ -1,6 +1,5 @@
 """Keyframes in and out of a map: which bricks they need and see, and their messages in step with that."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import taichi as ti
@@ -16,7 +15,7 @@ from taichi_mrf.inference.ray_list import RayLister
 from taichi_mrf.inference.sweep import unknown_begins
 from taichi_mrf.inference.whereabouts import Whereabouts
 from taichi_mrf.maps.brick_book import BrickBook
-from taichi_mrf.maps.room import check_room
+from taichi_mrf.maps.room import Room
 from taichi_mrf.poses import Pose
 from taichi_mrf.voxels.strips import strip_length
 
@@ -34,8 +33,7 @@ class Placing:
     inference: InferenceConfig
     volume: VolumeConfig
     whereabouts: Whereabouts
-    keyframes: Mapping[int, Keyframe]
-    """Those that the map has, as it goes on."""
+    room: Room
 
     def place(self, id: int, name: str, image: DepthImage, T_world_camera: Pose) -> Keyframe:
         """Find out which bricks a keyframe needs and sees, and claim them. Raises CapacityError if there is
@@ -43,15 +41,16 @@ class Placing:
         rays, voxel_size = self.lister.rays_of(image), self.book.voxel_size
         parts = (voxel_size, self.sensor, self.inference, self.volume)
         footprint = find_footprint(image, rays, T_world_camera, *parts, scouts=SCOUTS)
-        others = [keyframe for keyframe in self.keyframes.values() if keyframe.id != id]
         begins = unknown_begins(rays)
         image_bytes = 4 * (image.depth.shape[0] + begins.shape[0]) + rays.nbytes
-        check_room(others, footprint, image_bytes, self.book.pool, self.inference.message_precision)
+        self.room.check(footprint, image_bytes)
         self.book.anchor_at(T_world_camera[:3, 3])
         self.book.claim(footprint)
         self.whereabouts.put(id, footprint.window)
         visible = self.book.visible(footprint)
-        return Keyframe(id, name, image, rays, T_world_camera, footprint, visible, begins)
+        keyframe = Keyframe(id, name, image, rays, T_world_camera, footprint, visible, begins)
+        self.room.take(keyframe)
+        return keyframe
 
     def take_out(self, keyframe: Keyframe) -> None:
         """Undo :meth:`place`, and withdraw the keyframe's messages."""
@@ -67,6 +66,7 @@ class Placing:
                 pool.touch(slots)
         self.book.disclaim(keyframe.footprint)
         self.whereabouts.drop(keyframe.id)
+        self.room.give_back(keyframe.id)
         runtime.settle()  # before its arrays are dropped
 
     def freeze(self, keyframe: Keyframe) -> None:
@@ -76,6 +76,7 @@ class Placing:
             sum_product.fold(keyframe.visible.slots, pool.keep_evidence(), messages, strip_length())
         self.book.freeze(keyframe.footprint)
         self.whereabouts.drop(keyframe.id)
+        self.room.give_back(keyframe.id)
         pool.touch(keyframe.visible.slots)
         runtime.settle()  # before its arrays are dropped
 
@@ -96,6 +97,7 @@ class Placing:
             keyframe.begins_known = False
         if old_messages is None or keyframe.visible is not old:
             keyframe.messages = new_messages(keyframe.visible, self.inference.message_precision)
+            self.room.has_spoken(keyframe.id)
             keyframe.revision = -1
             if old_messages is not None:
                 carry_over(old, old_messages, keyframe.visible, keyframe.messages)
