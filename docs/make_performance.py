@@ -14,12 +14,12 @@ from pathlib import Path
 REPOSITORY = Path(__file__).resolve().parent.parent
 IMAGES, OUT = REPOSITORY / "docs" / "images", REPOSITORY / "runs" / "performance"
 KITCHEN = "seven_scenes_redkitchen"
-LAPS = "synthetic:room?frames=160&width=160&height=120"
+LAPS = "synthetic:room?frames=480&width=160&height=120"
 
 BENCHES: dict[str, list[str]] = {
     "performance_stages.png": ["bench", KITCHEN],
     "performance_kernels.png": ["bench", KITCHEN, "--profile"],
-    "performance_growth.png": ["bench", LAPS, "--frames", "160", "--voxel-sizes", "0.05", "--growth"],
+    "performance_growth.png": ["bench", LAPS, "--frames", "480", "--voxel-sizes", "0.05", "--growth"],
 }
 """What ``taichi-mrf bench --plot`` draws, and its arguments."""
 
