@@ -46,13 +46,16 @@ def test_the_sums_are_those_of_the_keyframes_whatever_has_happened() -> None:
 
 
 def test_a_keyframe_that_does_not_fit_is_not_counted() -> None:
-    m = MRFMap(small_room.VOXEL_SIZE, volume=VolumeConfig(memory_limit_gb=0.004))
-    added = 0
-    with pytest.raises(CapacityError, match="keyframes with their messages|voxels"):
-        for frame in small_room.frames():
-            small_room.add(m, frame)
-            added += 1
-    assert 0 < added == len(m.keyframes) == len(m._placing.room._shares)
+    probe = MRFMap(small_room.VOXEL_SIZE)
+    small_room.add(probe, small_room.frames()[0])
+    needed = (
+        len(probe._pool.in_use) * VOXELS * 4 + probe._placing.room._messages + probe._placing.room._images
+    )
+    m = MRFMap(small_room.VOXEL_SIZE, volume=VolumeConfig(memory_limit_gb=1.1 * needed / 1e9))
+    small_room.add(m, small_room.frames()[0])
+    with pytest.raises(CapacityError):
+        small_room.add(m, small_room.frames()[5])
+    assert len(m.keyframes) == len(m._placing.room._shares) == 1
 
 
 def test_a_move_that_does_not_fit_leaves_the_keyframe_counted() -> None:

@@ -125,9 +125,11 @@ def _table(points: Sequence[_Point]) -> Table:
 
 
 def rays_figure(points: Sequence[_Point]) -> "Figure":
-    """Points lost against time, one panel for each voxel size; a line for each scene and choice."""
+    """Accuracy against time, one panel for each voxel size; a line for each scene and choice."""
     sizes = sorted({p.voxel_size for p in points}, reverse=True)
     scenes = sorted({p.scene for p in points})
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+
     figure = new_figure(5.0 * len(sizes), 4.4)
     for axes, size in zip(figure.subplots(1, len(sizes), squeeze=False)[0], sizes, strict=True):
         for color, scene in enumerate(scenes):
@@ -140,6 +142,9 @@ def rays_figure(points: Sequence[_Point]) -> "Figure":
                     [p.seconds for p in line], accuracy, style, color=f"C{color}", label=f"{scene}, {kind}"
                 )
         axes.set(xscale="log", xlabel="s a keyframe, three sweeps", title=f"{size * 100:g} cm")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.grid(alpha=0.3)
     figure.axes[0].set_ylabel("pixels within 5 cm")
     figure.legend(
