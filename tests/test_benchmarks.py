@@ -51,3 +51,10 @@ def test_the_gpu_script_runs_through_on_a_cpu_and_says_so(repository: Path, tmp_
     assert "full_seconds" not in coarse
     assert fine["launches_in_a_sweep"] >= fine["waits_in_a_sweep"] > 0
     assert all(row["kernel_seconds"] > 0 and row["bandwidth_share"] > 0 for row in report["kernels"]["rows"])
+
+
+def test_first_scores_come_before_full_ones(repository: Path) -> None:
+    source = "synthetic:room?frames=6&width=64&height=48"
+    script = repository / "benchmarks" / "first_scores.py"
+    said = run(script, source, "--voxel-size", "0.2", "--tries", "1")
+    assert "4 frames of 64 x 48 mapped at 20 cm, 2 judged" in said
