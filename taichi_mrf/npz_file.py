@@ -5,6 +5,7 @@ numpy.load notices a wrong checksum only where a member is read to its end, take
 claims before it looks for the values, and lets through whatever its parsers stumble over.
 """
 
+import sys
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -85,6 +86,8 @@ class NpzFile:
             )
         if found.dtype.kind == "f" and not np.isfinite(found).all():
             raise self._problem(name, "holds a value that is not finite")
+        if found.dtype.kind == "U" and not _is_text(found):
+            raise self._problem(name, "holds a character that there is not")
         return found
 
     def scalar(self, name: str, kinds: str) -> Any:
@@ -140,6 +143,14 @@ def open_npz(path: Path, error: ErrorType, what: str) -> Iterator[NpzFile]:
             raise
         except MemoryError as problem:
             raise error(f"{path}: does not fit into memory") from problem
+
+
+def _is_text(array: NDArray[np.str_]) -> bool:
+    """Whether every character is one of Unicode's; Python ends in a SystemError over others."""
+    if array.dtype.itemsize == 0:
+        return True
+    codes = np.ascontiguousarray(array).reshape(-1).view(np.dtype("u4").newbyteorder(array.dtype.byteorder))
+    return not (codes > sys.maxunicode).any()
 
 
 def _compare_names(archive: zipfile.ZipFile) -> None:

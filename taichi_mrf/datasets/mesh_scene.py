@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.libraries import library
 from taichi_mrf.poses import Pose
 
@@ -77,8 +77,7 @@ def load_mesh(path: Path) -> TriangleMesh:
         # A cloud of points has no faces at all.
         triangles = np.array(getattr(loaded, "faces", ()), np.int32).reshape(-1, 3)
     except Exception as error:  # trimesh's readers raise whatever their parsing stumbles over
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise DatasetError(f"{path}: cannot be read as a mesh: {reason}") from error
+        raise DatasetError(f"{path}: cannot be read as a mesh: {said(error)}") from error
     if len(triangles) == 0:
         raise DatasetError(f"{path}: holds no triangles")
     if triangles.min() < 0 or triangles.max() >= len(vertices):
