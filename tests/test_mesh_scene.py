@@ -203,6 +203,7 @@ def test_meshes_that_are_none(files: tuple[Path, Path], tmp_path: Path) -> None:
         "nonsense.ply": (b"this is no mesh", "cannot be read as a mesh"),
         "cut.ply": (files[0].read_bytes()[:250], "cannot be read as a mesh"),
         "mesh.unknown": (b"", "cannot be read as a mesh"),
+        "word.ply": (PLY_OF_ONE_TRIANGLE.replace(b"3 0 1 2", b"[" * 5000), "cannot be read as a mesh"),
         "empty.obj": (b"", ""),
         "points.obj": (b"v 0 0 0\nv 1 0 0\n", ""),
         "nan.off": (b"OFF\n3 1 0\n0 0 0\nnan 0 0\n0 1 0\n3 0 1 2\n", "not finite"),
@@ -215,6 +216,7 @@ def test_meshes_that_are_none(files: tuple[Path, Path], tmp_path: Path) -> None:
         text = refused(f"mesh:{path}{query}")
         assert text.startswith(str(path))
         assert problem in text
+        assert len(text) < 1000
 
 
 def test_points_without_triangles(tmp_path: Path) -> None:

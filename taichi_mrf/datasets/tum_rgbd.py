@@ -22,6 +22,8 @@ LOOKS_FOR = "depth.txt and groundtruth.txt"
 STEPS_PER_METRE = 5000.0
 LARGEST_GAP = 0.02
 """Seconds between a depth image and its pose if nothing else is said."""
+LONGEST_NAME = 255
+"""Characters; no file system that is in use has longer names."""
 DEPTH_LIST, COLOR_LIST, POSES = "depth.txt", "rgb.txt", "groundtruth.txt"
 
 CAMERAS = {
@@ -121,6 +123,8 @@ def _read_list(path: Path) -> list[tuple[float, Path]]:
             raise DatasetError(f"{path} line {number}: expected a stamp and a file name") from None
         if not math.isfinite(stamp):
             raise DatasetError(f"{path} line {number}: the stamp is not finite")
+        if len(file.name) > LONGEST_NAME:
+            raise DatasetError(f"{path} line {number}: no file has a name of {len(file.name)} characters")
         entries.append((stamp, file))
     if not entries:
         raise DatasetError(f"{path}: lists no image")
