@@ -24,3 +24,16 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_damaged_file_is_refused_or_read_rightly(name: str, seed: int, root: Path) -> None:
     run_case(name, seed, root)
+
+
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [
+        ("map, MRFMap", 20682),  # a character beyond Unicode
+        ("TUM RGB-D", 21517),  # a file name of thousands of characters
+        ("mesh PLY", 20692),  # a word of thousands of characters, which the reader of meshes repeats
+        ("ROS 1 bag", 21833),  # an index that points to another topic's message
+    ],
+)
+def test_what_once_went_wrong_is_refused(name: str, seed: int, root: Path) -> None:
+    assert run_case(name, seed, root).kind == "refused"

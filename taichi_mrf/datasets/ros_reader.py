@@ -103,6 +103,8 @@ class RosReader:
         try:
             found = self._reader.messages(self._connections[topic], start=start, stop=stop)
             for connection, recorded_ns, data in found:
+                if connection.msgtype != self.topics[topic].type:  # in a damaged file
+                    raise ValueError(f"holds a {connection.msgtype}")
                 yield recorded_ns, self._reader.deserialize(data, connection.msgtype)
         except Exception as error:  # as on opening
             raise DatasetError(f"{self.path}: topic {topic}: cannot be read: {said(error)}") from error
