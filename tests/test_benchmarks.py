@@ -49,7 +49,8 @@ def test_the_gpu_script_runs_through_on_a_cpu_and_says_so(repository: Path, tmp_
     coarse, fine = report["wall"]["rows"]
     assert "full_seconds" in fine
     assert "full_seconds" not in coarse
-    assert fine["launches_in_a_sweep"] >= fine["waits_in_a_sweep"] > 0
+    assert fine["launches_in_a_sweep"] > 0
+    assert fine["waits_in_a_sweep"] == 0  # on a CPU
     assert all(row["kernel_seconds"] > 0 and row["bandwidth_share"] > 0 for row in report["kernels"]["rows"])
 
 

@@ -31,6 +31,8 @@ def test_a_damaged_file_is_refused_or_read_rightly(name: str, seed: int, root: P
     [
         ("map, MRFMap", 20682),  # a character beyond Unicode
         ("TUM RGB-D", 21517),  # a file name of thousands of characters
+        ("TUM RGB-D", 22406),  # a folder's
+        ("MCAP", 22624),  # a word for a number in the metadata
         ("mesh PLY", 20692),  # a word of thousands of characters, which the reader of meshes repeats
         ("ROS 1 bag", 21833),  # an index that points to another topic's message
     ],

@@ -40,7 +40,8 @@ class Entry:
 
 
 class RosReader:
-    """An open bag. ``topics`` are those by name; messages are objects with the fields of their type."""
+    """An open bag. ``topics`` are those by name, ``duration`` the seconds from the first message to the last;
+    messages are objects with the fields of their type."""
 
     def __init__(self, path: Path) -> None:
         """Open a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag.
@@ -55,23 +56,19 @@ class RosReader:
             types = typesys.get_typestore(typesys.Stores.LATEST)
             self._reader = highlevel.AnyReader([path], default_typestore=types)
             self._reader.open()
+            self._connections: dict[str, list[Any]] = {}
+            for connection in self._reader.connections:
+                self._connections.setdefault(connection.topic, []).append(connection)
+            self.topics = {
+                name: Topic(name, each[0].msgtype, sum(connection.msgcount for connection in each))
+                for name, each in sorted(self._connections.items())
+            }
+            self.duration = max(0, self._reader.duration) / _NANOSECONDS if self.topics else 0.0
         except Exception as error:  # the library raises whatever its parsing stumbles over
             raise DatasetError(
                 f"{path}: cannot be read as a bag, it may be cut short: {said(error)}"
             ) from error
         self._open = True
-        self._connections: dict[str, list[Any]] = {}
-        for connection in self._reader.connections:
-            self._connections.setdefault(connection.topic, []).append(connection)
-        self.topics = {
-            name: Topic(name, each[0].msgtype, sum(connection.msgcount for connection in each))
-            for name, each in sorted(self._connections.items())
-        }
-
-    @property
-    def duration(self) -> float:
-        """Seconds from the first message to the last."""
-        return max(0, self._reader.duration) / _NANOSECONDS if self.topics else 0.0
 
     def close(self) -> None:
         """Let the file go."""

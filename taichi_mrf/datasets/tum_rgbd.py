@@ -123,8 +123,9 @@ def _read_list(path: Path) -> list[tuple[float, Path]]:
             raise DatasetError(f"{path} line {number}: expected a stamp and a file name") from None
         if not math.isfinite(stamp):
             raise DatasetError(f"{path} line {number}: the stamp is not finite")
-        if len(file.name) > LONGEST_NAME:
-            raise DatasetError(f"{path} line {number}: no file has a name of {len(file.name)} characters")
+        longest = max(len(part) for part in file.parts)
+        if longest > LONGEST_NAME:
+            raise DatasetError(f"{path} line {number}: no file has a name of {longest} characters")
         entries.append((stamp, file))
     if not entries:
         raise DatasetError(f"{path}: lists no image")
