@@ -26,7 +26,7 @@ ROOM = ("synthetic:room", "--voxel-size", "0.05", "--speed", "0.2")
 
 WIDTH, HEIGHT = 1240, 700
 CLIP_WIDTH = 640
-COLORS = 96
+COLORS = 80
 CAMERA_COLOR = (230, 0, 126)
 """Of the camera and its way: too few pixels to get a place among the colours of the clip by themselves."""
 
