@@ -99,8 +99,8 @@ class NpzFile:
         wanted = sorted(self.array(MANIFEST, "U", (None,)).tolist())
         found = sorted(manifest_lines(i for name, i in self._members.items() if name != MANIFEST))
         if wanted != found:
-            odd = min(set(wanted) ^ set(found), default="a name given twice").split()[0]
-            raise self._error(f"{self._path}: damaged: {odd} is not what was saved")
+            odd = min(set(wanted) ^ set(found), default="").split()
+            raise self._error(f"{self._path}: damaged: {odd[0] if odd else MANIFEST} is not what was saved")
 
     @contextmanager
     def _member(self, name: str) -> Iterator[tuple[Any, Shape, bool, np.dtype]]:

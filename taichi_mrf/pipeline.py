@@ -287,7 +287,10 @@ def _refine(
 
     with result.timed("refining"):
         if not result.interrupted:
-            refiner.rounds(progress)
+            try:
+                refiner.rounds(progress)
+            except CapacityError as error:
+                result.full = result.full or f"aligning the keyframes does not fit: {error}"
     result.poses = refiner.changes()
 
 

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from taichi_mrf.inference.affected import moved_share
+from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.inference.whereabouts import Whereabouts
 from taichi_mrf.maps.mrf import MRFMap
 from taichi_mrf.voxels.window import Window
@@ -154,8 +155,31 @@ def test_a_stopped_renewal_is_taken_up_again() -> None:
     assert all(k.messages is not None for k in m.keyframes.values())
 
 
+def test_a_keyframe_that_is_named_twice_is_swept_once() -> None:
+    m, twin = (MRFMap(small_room.VOXEL_SIZE) for _ in range(2))
+    ids = [[small_room.add(each, small_room.frames()[i]) for i in ROOM[:3]] for each in (m, twin)]
+    m.infer(keyframes=[ids[0][0], ids[0][1], ids[0][0]], sweeps=1)
+    twin.infer(keyframes=ids[1][:2], sweeps=1)
+    np.testing.assert_array_equal(m._pool.stirred, twin._pool.stirred)
+
+
+def test_what_moved_counts_even_if_progress_raises() -> None:
+    m = MRFMap(small_room.VOXEL_SIZE)
+    ids = [small_room.add(m, small_room.frames()[i]) for i in ROOM[:3]]
+
+    def progress(step: InferProgress) -> bool:
+        if step.keyframe == 2:
+            raise RuntimeError("enough")
+        return True
+
+    with pytest.raises(RuntimeError, match="enough"):
+        m.infer(keyframes=ids, sweeps=1, progress=progress)
+    assert m._pool.stirred.sum() > 0
+    assert [m.keyframes[id].heard is not None for id in ids] == [True, True, False]
+
+
 def test_a_call_that_tolerates_much_does_not_make_others_forgotten() -> None:
-    m, twin = MRFMap(small_room.VOXEL_SIZE), MRFMap(small_room.VOXEL_SIZE)
+    m, twin = (MRFMap(small_room.VOXEL_SIZE, renew_tolerance=0.2) for _ in range(2))
     for i in ROOM:
         m.renew([small_room.add(m, small_room.frames()[i])], tolerance=1e9)
         twin.infer(sweeps=1, keyframes=[small_room.add(twin, small_room.frames()[i])])

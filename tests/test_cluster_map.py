@@ -17,6 +17,8 @@ import pytest
 from cluster_dask import dask_cluster
 
 from taichi_mrf.cli import main
+from taichi_mrf.commands.map_process import Outcome
+from taichi_mrf.commands.map_summary import summary_line, summary_row
 
 SOURCES = tuple(f"synthetic:room?frames={frames}&width=80&height=60" for frames in (3, 4, 5))
 NAMES = tuple(f"synthetic_room_frames_{frames}_width_80_height_60" for frames in (3, 4, 5))
@@ -168,6 +170,24 @@ def test_a_sequence_that_fails_is_named_and_the_others_are_finished(tmp_path: Pa
     picture = cv2.imread(str(out / "summary.png"))
     left, right = np.array_split(picture, 2, axis=1)
     assert colors(left) < 0.01 < 0.2 < colors(right)  # a line of text beside a map
+
+
+def test_a_resumed_batch_with_other_parameters_is_refused_and_forgets_nothing(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("voxel_size: 0.1\n")
+    done = taichi_mrf(*SOURCES[:2], "--out", tmp_path, "--resume", "--voxel-size", "0.2")
+    assert done.returncode == 2
+    assert "config.yaml: made with another voxel_size" in done.stderr
+    assert (tmp_path / "config.yaml").read_text() == "voxel_size: 0.1\n"
+
+
+def test_a_sequence_that_did_not_fit_says_so_in_the_summary() -> None:
+    report = {
+        "frames": 9, "keyframes": 4, "voxel_size": 0.1, "voxels": 512, "map_memory_mb": 1.0,
+        "peak_memory_mb": None, "accuracy": None, "seconds": {"adding": 2.0},
+    }  # fmt: skip
+    row = summary_row("a", "a.bag", Outcome("failed", report, "frame 5 does not fit"))
+    assert (row.error, row.keyframes) == ("frame 5 does not fit", 4)
+    assert summary_line(row).endswith("2.0 s: frame 5 does not fit")
 
 
 def colors(picture: np.ndarray) -> float:

@@ -127,7 +127,7 @@ def test_tum_with_poses_of_another_day(tmp_path: Path) -> None:
     ("name", "lines", "problem"),
     [
         ("depth.txt", "# nothing", "lists no image"),
-        ("depth.txt", "1.0 " + "[" * 5000, "line 1: no file has a name of 5000 characters"),
+        ("depth.txt", "1.0 " + "/".join(["d", "[" * 5000, "e"]), "line 1: no file has a name of 5000 bytes"),
         ("depth.txt", "1.0 depth/1.png\nyesterday depth/2.png", "line 2"),
         ("depth.txt", "1.0 depth/1.png\n2.0", "line 2"),
         ("depth.txt", "nan depth/1.png", "line 1"),

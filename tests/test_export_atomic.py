@@ -128,6 +128,9 @@ def test_leftovers_of_killed_processes_are_removed_and_nothing_else(tmp_path: Pa
     ]
     for name in (*kept, *left):
         (tmp_path / name).touch()
+    half = tmp_path / f".map.part-{dead}-89abcdef.zarr"
+    half.mkdir()
+    (half / "zarr.json").touch()
     remove_leftovers(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == set(kept)
     remove_leftovers(tmp_path / "not there")

@@ -142,3 +142,13 @@ def test_rays_of_a_tile_stand_together() -> None:
 def test_an_image_without_a_measurement_has_no_ray() -> None:
     rays = listed(np.zeros((5, 7), np.float32), ray_density=4.0)
     assert (rays.number, rays.widest) == (0, 1)
+
+
+def test_only_finite_positive_depths_are_measurements() -> None:
+    values = [1.5, 0.0, -1.0, np.nan, np.inf, -np.inf, 0.05, 1e39, -1e300]
+    for kind in (np.float64, np.float32):
+        with np.errstate(over="ignore"):
+            depth = np.array([values]).astype(kind)
+        clean = checked_depth(depth, camera_of(len(values), 1), 0.1)
+        assert clean.dtype == np.float32
+        np.testing.assert_array_equal(clean, [[1.5] + [0.0] * 8])

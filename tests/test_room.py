@@ -53,6 +53,36 @@ def test_a_keyframe_that_does_not_fit_is_not_counted() -> None:
     assert len(m.keyframes) == len(m._placing.room._shares) == 1
 
 
+def test_a_full_inference_that_is_given_up_makes_keyframes_silent_again() -> None:
+    m = MRFMap(small_room.VOXEL_SIZE)
+    for i in range(3):
+        small_room.add(m, small_room.frames()[i])
+    bricks = {id: len(k.visible.slots) for id, k in m.keyframes.items()}
+    checkpoint = m.checkpoint()
+    m.infer(progress=lambda step: False)
+    assert m._placing.room._to_come == 0
+    m.restore(checkpoint)
+    assert_counts_all(m, bricks)
+    assert m._placing.room._to_come > 0
+
+
+def test_a_keyframe_that_cannot_be_moved_stays_although_the_map_is_over_its_limit() -> None:
+    m = MRFMap(small_room.VOXEL_SIZE)
+    ids = [small_room.add(m, small_room.frames()[i]) for i in range(3)]
+    m.infer()
+    before = m.occupancy(small_room.probes())
+    m._pool.memory_limit_gb = 1e-6
+    T = m.keyframes[ids[1]].T_world_camera.copy()
+    T[0, 3] += 0.1
+    with pytest.raises(CapacityError):
+        m.move_keyframe(ids[1], T)
+    m._pool.memory_limit_gb = 0.0
+    m.infer()
+    np.testing.assert_array_equal(m.occupancy(small_room.probes()), before)
+    m.remove_keyframe(ids[1])
+    assert len(m.keyframes) == len(m._placing.room._shares) == 2
+
+
 def test_a_move_that_does_not_fit_leaves_the_keyframe_counted() -> None:
     m = MRFMap(small_room.VOXEL_SIZE)
     id = small_room.add(m, small_room.frames()[0])

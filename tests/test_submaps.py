@@ -2,9 +2,11 @@
 
 import io
 import json
+import shutil
 import subprocess
 import sys
 import zipfile
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -16,7 +18,7 @@ from small_room import VOXEL_SIZE, add, frames
 
 from taichi_mrf.cluster.local import LocalProcesses
 from taichi_mrf.cluster.runner import InProcess
-from taichi_mrf.config import Config, EvaluationConfig, PoseConfig
+from taichi_mrf.config import Config, EvaluationConfig, PoseConfig, RuntimeConfig, VolumeConfig
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError, DatasetError, MapFileError
 from taichi_mrf.evaluation.experiments.submap_costs import MeasuredCost, Place, need
@@ -219,6 +221,46 @@ def test_what_cannot_be_cut_is_refused(tmp_path: Path) -> None:
         )  # fmt: skip
 
 
+def test_a_folder_that_is_not_ours_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "submaps").mkdir()
+    (tmp_path / "submaps" / "thesis.tex").write_text("years of work")
+    with pytest.raises(MapFileError, match=r"submaps: holds thesis\.tex"):
+        mapped(tmp_path, 0)
+    assert (tmp_path / "submaps" / "thesis.tex").read_text() == "years of work"
+
+
+def test_a_damaged_plan_is_named(exchanged: Path, tmp_path: Path) -> None:
+    plan = json.loads((exchanged / "submaps" / "plan.json").read_text())
+    for name, value in (("config", "[1"), ("centres_m", []), ("plan", {"submaps": 3}), ("sequence", "walk")):
+        (tmp_path / "plan.json").write_text(json.dumps({**plan, name: value}))
+        with pytest.raises(MapFileError, match=r"plan\.json: not a readable plan"):
+            Job.read(tmp_path)
+
+
+def test_fewer_rounds_than_there_were_are_refused(exchanged: Path, tmp_path: Path) -> None:
+    shutil.copytree(exchanged / "submaps", tmp_path / "submaps")
+    shutil.rmtree(tmp_path / "submaps" / "round-000")  # as round 2 does when it is through
+    with pytest.raises(ConfigError, match="needs more --rounds"):
+        mapped(tmp_path, 0, resume=True)
+
+
+def test_memory_and_backend_may_be_others_when_a_run_is_resumed(exchanged: Path, tmp_path: Path) -> None:
+    shutil.copytree(exchanged / "submaps", tmp_path / "submaps")
+    config = replace(CONFIG, volume=VolumeConfig(memory_limit_gb=2.0), runtime=RuntimeConfig(threads=1))
+    map_in_submaps(
+        SEQUENCE, config, SUBMAP_M, tmp_path / "submaps", tmp_path / "map.zarr", InProcess(),
+        rounds=1, resume=True,
+    )  # fmt: skip
+    assert Job.read(tmp_path / "submaps").config == config  # which is what tasks read
+
+
+def test_a_store_without_its_list_of_chunks_is_named(exchanged: Path, tmp_path: Path) -> None:
+    shutil.copytree(exchanged / "map.zarr", tmp_path / "map.zarr")
+    shutil.rmtree(tmp_path / "map.zarr" / "chunks")
+    with pytest.raises(MapFileError, match=r"map\.zarr: damaged: its list of chunks"):
+        ChunkedMap.open(tmp_path / "map.zarr")
+
+
 class _Blind:
     """A runner whose survey finds nothing."""
 
@@ -239,8 +281,6 @@ def test_a_killed_worker_changes_nothing(exchanged: Path, tmp_path: Path) -> Non
 
 def test_the_command(exchanged: Path, tmp_path: Path) -> None:
     """On what is there already: the command resumes, merges, draws and reports."""
-    import shutil
-
     shutil.copytree(exchanged / "submaps", tmp_path / "submaps")
     flags = ["--voxel-size", "0.1", "--evaluation.hold-out", "0", "--submap-size", "12.8", "--rounds", "1"]
     command = [

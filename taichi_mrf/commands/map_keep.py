@@ -66,7 +66,7 @@ def resumed_map(folder: Path, settings: Config) -> OccupancyMap | None:
     if not (folder / MAP_FILE).exists():
         return None
     if (folder / CONFIG_FILE).exists():
-        _refuse_changes(folder / CONFIG_FILE, differences(load(folder / CONFIG_FILE), settings))
+        refuse_changes(folder / CONFIG_FILE, differences(load(folder / CONFIG_FILE), settings))
     m = load_map(folder / MAP_FILE, settings.volume.memory_limit_gb)
     # A map knows only what it needs, and of a sensor's noise only the numbers.
     known = (
@@ -77,13 +77,15 @@ def resumed_map(folder: Path, settings: Config) -> OccupancyMap | None:
         "volume.",
         _SECTION[m.config.method],
     )
-    _refuse_changes(
+    refuse_changes(
         folder / MAP_FILE, [name for name in differences(m.config, settings) if name.startswith(known)]
     )
     return m
 
 
-def _refuse_changes(path: Path, names: list[str]) -> None:
+def refuse_changes(path: Path, names: list[str]) -> None:
+    """Raise ConfigError if among the ``names`` of the parameters that a resumed run would change there is one
+    that its map depends on; ``path`` has those that it began with."""
     changed = [name for name in names if not name.startswith(MAY_CHANGE)]
     if changed:
         raise ConfigError(

@@ -12,7 +12,7 @@ import taichi_mrf
 from taichi_mrf.cluster.choose import open_runner
 from taichi_mrf.commands.interrupt import StopRequest, interrupt_on_signals
 from taichi_mrf.commands.map import CONFIG_FILE, Map
-from taichi_mrf.commands.map_keep import REPORT_FILE
+from taichi_mrf.commands.map_keep import REPORT_FILE, refuse_changes
 from taichi_mrf.commands.map_process import Outcome, finished_before, map_in_process
 from taichi_mrf.commands.map_run import MapTask, exit_status, map_task, print_run
 from taichi_mrf.commands.map_summary import (
@@ -24,10 +24,11 @@ from taichi_mrf.commands.map_summary import (
     summary_line,
     summary_row,
 )
-from taichi_mrf.commands.output import output_folder
+from taichi_mrf.commands.output import DID_NOT_FIT, output_folder
 from taichi_mrf.commands.progress import TransientBar
 from taichi_mrf.commands.source_names import folder_names
-from taichi_mrf.config_text import commented_yaml
+from taichi_mrf.config import load
+from taichi_mrf.config_text import commented_yaml, differences
 from taichi_mrf.errors import ClusterError, TaichiMRFError
 from taichi_mrf.evaluation.contact_sheet import Tile, write_contact_sheet
 from taichi_mrf.export.atomic import write_text
@@ -76,12 +77,20 @@ def run_many(options: Map) -> int:
             _tell_all(batch, console, time.perf_counter() - start)
     if request():
         return exit_status(request)
-    failed = [row for row in batch.rows() if row.status == "failed"]
+    failed = [row for row in batch.rows() if row.status not in ("mapped", "finished before")]
     if failed:
-        first = failed[0].error if single else f"{failed[0].name}: {failed[0].error}"
+        if single and _did_not_fit(batch.outcomes.get(0)):  # of which its report has told
+            return DID_NOT_FIT
+        problem = failed[0].error or failed[0].status
+        first = problem if single else f"{failed[0].name}: {problem}"
         others = "" if single else f"{len(failed)} of {len(tasks)} sequences failed, the first: "
         raise TaichiMRFError(f"{others}{first}")
     return 0
+
+
+def _did_not_fit(outcome: Outcome | None) -> bool:
+    """Whether there is a map of as much as there was memory for."""
+    return outcome is not None and outcome.report is not None and bool(outcome.report.get("did_not_fit"))
 
 
 def _map_all(batch: _Batch, console: Console, request: StopRequest) -> None:
@@ -117,7 +126,10 @@ def _waiting(batch: _Batch, done: Callable[[int, Outcome], None]) -> list[int]:
     """Who has to be mapped: all, or on resume those that are not finished. Whoever does not resume wants new
     results, and an old report must not pass for a finished run."""
     if len(batch.tasks) > 1:
-        write_text(batch.options.out / CONFIG_FILE, commented_yaml(batch.tasks[0].settings))
+        path, settings = batch.options.out / CONFIG_FILE, batch.tasks[0].settings
+        if batch.options.resume and path.is_file():
+            refuse_changes(path, differences(load(path), settings))
+        write_text(path, commented_yaml(settings))
     waiting = []
     for number, task in enumerate(batch.tasks):
         if not batch.options.resume:

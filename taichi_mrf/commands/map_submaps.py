@@ -45,6 +45,9 @@ def run_submaps(options: Map, submap_size: float) -> int:
         output_folder(options.out),
         interrupt_on_signals(lambda text: console.print(f"[yellow]{text}[/]")) as request,
     ):
+        if not options.resume:  # which takes its parameters from here
+            (options.out / REPORT_FILE).unlink(missing_ok=True)
+            write_text(options.out / CONFIG_FILE, commented_yaml(settings))
         try:
             with (
                 ProgressBar(console) as progress,
@@ -76,12 +79,13 @@ def _write(options: Map, result: SubmapsResult) -> list[Path]:
     out = options.out
     write_text(out / CONFIG_FILE, commented_yaml(result.job.config))
     written = [out / MAP_FOLDER, out / CONFIG_FILE]
+    write_text(out / REPORT_FILE, report_json(submaps_report(result)))
+    written.append(out / REPORT_FILE)
     if options.pictures:
         m = ChunkedMap.open(out / MAP_FOLDER)
         write_submap_picture(out / PICTURE_FILE, m, result.job.plan, list(result.job.centres_m.values()))
         written.append(out / PICTURE_FILE)
-    write_text(out / REPORT_FILE, report_json(submaps_report(result)))
-    return [*written, out / REPORT_FILE]
+    return written
 
 
 def submaps_report(result: SubmapsResult) -> dict[str, Any]:

@@ -46,7 +46,8 @@ def summary_row(name: str, source: str, outcome: Outcome) -> Row:
         return Row(name, source, outcome.status, error=outcome.error)
     accuracy = report["accuracy"] or {}
     known = {key: report[key] for key in _FROM_REPORT} | {key: accuracy.get(key) for key in _FROM_ACCURACY}
-    return Row(name, source, outcome.status, round(sum(report["seconds"].values()), 3), **known)
+    seconds = round(sum(report["seconds"].values()), 3)
+    return Row(name, source, outcome.status, seconds, error=outcome.error, **known)
 
 
 def summary_json(rows: Sequence[Row], facts: dict[str, Any]) -> str:
@@ -69,7 +70,7 @@ def summary_line(row: Row) -> str:
         return f"{row.name}: {row.status}" + (f": {row.error}" if row.error else "")
     return (
         f"{row.name}: {row.status}, {row.keyframes} keyframes, {row.voxels:,} voxels, {accuracy_text(row)}, "
-        f"{row.seconds:.1f} s"
+        f"{row.seconds:.1f} s" + (f": {row.error}" if row.error else "")
     )
 
 

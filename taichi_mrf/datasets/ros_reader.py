@@ -4,6 +4,7 @@ It needs no ROS, and comes with the extra ``ros``. Whatever it says about a file
 one DatasetError here; the rest of the package sees topics by name and messages as objects with their fields.
 """
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -65,6 +66,8 @@ class RosReader:
             }
             self.duration = max(0, self._reader.duration) / _NANOSECONDS if self.topics else 0.0
         except Exception as error:  # the library raises whatever its parsing stumbles over
+            with contextlib.suppress(Exception):
+                self._reader.close()
             raise DatasetError(
                 f"{path}: cannot be read as a bag, it may be cut short: {said(error)}"
             ) from error

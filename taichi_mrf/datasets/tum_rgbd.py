@@ -7,6 +7,7 @@ and counted.
 """
 
 import math
+import os
 from pathlib import Path
 
 from taichi_mrf.camera import PinholeCamera
@@ -23,7 +24,7 @@ STEPS_PER_METRE = 5000.0
 LARGEST_GAP = 0.02
 """Seconds between a depth image and its pose if nothing else is said."""
 LONGEST_NAME = 255
-"""Characters; no file system that is in use has longer names."""
+"""Bytes; no file system that is in use has longer names."""
 DEPTH_LIST, COLOR_LIST, POSES = "depth.txt", "rgb.txt", "groundtruth.txt"
 
 CAMERAS = {
@@ -123,9 +124,9 @@ def _read_list(path: Path) -> list[tuple[float, Path]]:
             raise DatasetError(f"{path} line {number}: expected a stamp and a file name") from None
         if not math.isfinite(stamp):
             raise DatasetError(f"{path} line {number}: the stamp is not finite")
-        longest = max(len(part) for part in file.parts)
+        longest = max((len(os.fsencode(part)) for part in file.parts), default=0)
         if longest > LONGEST_NAME:
-            raise DatasetError(f"{path} line {number}: no file has a name of {longest} characters")
+            raise DatasetError(f"{path} line {number}: no file has a name of {longest} bytes")
         entries.append((stamp, file))
     if not entries:
         raise DatasetError(f"{path}: lists no image")

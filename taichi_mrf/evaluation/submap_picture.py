@@ -35,6 +35,8 @@ def write_submap_picture(
     likeliest = _likeliest(m, lower, upper)
     pixel = (upper - lower)[:2] / likeliest.shape
     known = np.argwhere(~np.isnan(likeliest))
+    if not len(known):  # nothing at the cameras' height
+        known = np.array([(0, 0), np.array(likeliest.shape) - 1])
     low, high = (
         lower[:2] + pixel * known.min(axis=0) - MARGIN_M,
         lower[:2] + pixel * known.max(axis=0) + MARGIN_M,

@@ -8,6 +8,7 @@ import contextlib
 import os
 import re
 import secrets
+import shutil
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -31,7 +32,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     points to is replaced. An OSError is raised as a MapFileError that names ``path`` and the reason.
     """
     target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{target.stem}.part-{os.getpid()}-{secrets.token_hex(4)}{target.suffix}")
+    temporary = temporary_name(target)
     try:
         try:
             yield temporary
@@ -45,8 +46,13 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise MapFileError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
+def temporary_name(target: Path) -> Path:
+    """A new name beside ``target`` that says whose it is, for :func:`remove_leftovers`."""
+    return target.with_name(f".{target.stem}.part-{os.getpid()}-{secrets.token_hex(4)}{target.suffix}")
+
+
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files that killed processes have left in a folder, if there is one.
+    """Remove the temporary files and folders that killed processes have left in a folder, if there is one.
 
     Those of a process that lives stay, and those that cannot be removed.
     """
@@ -54,7 +60,10 @@ def remove_leftovers(folder: Path) -> None:
         match = _LEFTOVER.search(path.name)
         if match and not _lives(int(match[1])):
             with contextlib.suppress(OSError):
-                path.unlink()
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink()
 
 
 _LEFTOVER = re.compile(r"^\..*\.part-(\d+)-[0-9a-f]{8}(\.\w+)?$")

@@ -8,7 +8,6 @@ corner of the array's first voxel.
 """
 
 import os
-import secrets
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -21,7 +20,8 @@ from numpy.typing import NDArray
 
 import taichi_mrf
 from taichi_mrf.config import Config, to_yaml
-from taichi_mrf.errors import MapFileError
+from taichi_mrf.errors import MapFileError, said
+from taichi_mrf.export.atomic import temporary_name
 from taichi_mrf.libraries import library
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
@@ -119,8 +119,13 @@ class ChunkStore:
 
     @property
     def chunks(self) -> NDArray[np.int32]:
-        """The chunks (n, 3) in which something is known."""
-        return np.asarray(self._group[CHUNKS][:], np.int32)
+        """The chunks (n, 3) in which something is known. Raises MapFileError."""
+        try:
+            return np.asarray(self._group[CHUNKS][:], np.int32).reshape(-1, 3)
+        except (KeyError, OSError, ValueError, TypeError, IndexError, RuntimeError) as error:
+            raise MapFileError(
+                f"{self.path}: damaged: its list of chunks cannot be read: {said(error)}"
+            ) from error
 
     def write(self, chunk: Sequence[int], log_odds: NDArray[np.float32]) -> None:
         """Write one chunk, (64, 64, 64) log-odds, NaN for unknown. Raises MapFileError."""
@@ -133,8 +138,8 @@ class ChunkStore:
         """One of :attr:`chunks`, (64, 64, 64). Raises MapFileError."""
         try:
             return np.asarray(self._array.blocks[self._place(chunk)], np.float32)
-        except (OSError, ValueError, RuntimeError) as error:
-            raise MapFileError(f"{self.path}: chunk {tuple(chunk)} cannot be read: {error}") from error
+        except (OSError, ValueError, RuntimeError, IndexError) as error:
+            raise MapFileError(f"{self.path}: chunk {tuple(chunk)} cannot be read: {said(error)}") from error
 
     def _place(self, chunk: Sequence[int]) -> Chunk:
         x, y, z = (np.array(chunk, np.int64) - self._lowest).tolist()
@@ -152,17 +157,25 @@ def new_store(path: str | Path) -> Iterator[Path]:
         raise MapFileError(f"{path}: cannot be written: No such file or directory")
     if path.exists() and not _is_store(path):
         raise MapFileError(f"{path}: exists, and is no map in chunks; it is left alone")
-    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
+    temporary, old = temporary_name(path), temporary_name(path)
     try:
         yield temporary
+        # A folder cannot take another one's place: for a moment there is none, but never half of one.
         if path.exists():
-            shutil.rmtree(path)
-        os.replace(temporary, path)
+            os.replace(path, old)
+        try:
+            os.replace(temporary, path)
+        except BaseException:
+            if old.exists():
+                os.replace(old, path)
+            raise
     except OSError as error:
         raise MapFileError(f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        for folder in (temporary, old):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _is_store(path: Path) -> bool:
-    return (path / "zarr.json").is_file() and "taichi_mrf_map" in (path / "zarr.json").read_text("utf-8")
+    header = path / "zarr.json"
+    return header.is_file() and "taichi_mrf_map" in header.read_text("utf-8", "replace")

@@ -30,9 +30,11 @@ def checked_depth(depth_m: ArrayLike, camera: PinholeCamera, min_depth: float) -
         )
     if not np.issubdtype(depth.dtype, np.floating):
         raise KeyframeError(f"a depth image must be floating-point metres, not {depth.dtype}")
+    with np.errstate(over="ignore"):
+        measured = depth.astype(np.float32, copy=False)
     # NaN is never larger than anything.
-    valid = (depth >= min_depth) & (depth > 0) & (depth < np.inf)
-    return np.where(valid, depth.astype(np.float32, copy=False), np.float32(0.0))
+    valid = (depth >= min_depth) & (measured > 0) & (measured < np.inf)
+    return np.where(valid, measured, np.float32(0.0))
 
 
 TILE = 32

@@ -72,20 +72,22 @@ def run_sweeps(
     for sweep in range(1, sweeps + 1):
         moved = seen = 0
         swept: list[Keyframe] = []
-        for number, keyframe in enumerate(keyframes, start=1):
-            if not _has_converged(keyframe, pool, damping) and sweeper.sweep(keyframe, pool):
-                swept.append(keyframe)
-            rays += keyframe.rays
-            if progress is not None and not progress(
-                InferProgress(sweep, sweeps, number, len(keyframes), keyframe.rays)
-            ):
-                complete = False
-                break
-        # Only now does the host ask, and wait for, what came of it.
-        for keyframe in swept:
-            changed = sweeper.take_moved(keyframe, pool)
-            moved += int(changed.sum())
-            seen += len(changed) * VOXELS
+        try:
+            for number, keyframe in enumerate(keyframes, start=1):
+                if not _has_converged(keyframe, pool, damping) and sweeper.sweep(keyframe, pool):
+                    swept.append(keyframe)
+                rays += keyframe.rays
+                if progress is not None and not progress(
+                    InferProgress(sweep, sweeps, number, len(keyframes), keyframe.rays)
+                ):
+                    complete = False
+                    break
+        finally:  # the beliefs have changed, even if ``progress`` raised
+            # Only now does the host ask, and wait for, what came of it.
+            for keyframe in swept:
+                changed = sweeper.take_moved(keyframe, pool)
+                moved += int(changed.sum())
+                seen += len(changed) * VOXELS
         residual, done = moved / max(seen, 1), sweep
         if not complete or residual <= tolerance > 0:
             break

@@ -85,6 +85,7 @@ class Sweeper:
         self.trace_voxel = ti.ndarray(ti.i32, 1)
         self.trace = vec4_array(1)
         self.steps = ti.ndarray(ti.i32, 1)
+        self._workers = 0  # of the last sweep
         self.retrace = RETRACE
 
     @property
@@ -100,7 +101,7 @@ class Sweeper:
     @property
     def voxel_steps(self) -> int:
         """Voxels that the rays of the last sweep crossed, each ray's counted."""
-        return int(self.steps.to_numpy().sum(dtype=np.int64))
+        return int(self.steps.to_numpy()[: self._workers].sum(dtype=np.int64))
 
     def sweep(self, keyframe: Keyframe, pool: BrickPool) -> bool:
         """Send one keyframe's messages anew. ``keyframe.messages`` must fit ``keyframe.visible``.
@@ -180,7 +181,7 @@ class Sweeper:
         return visible.scale
 
     def _reserve(self, bricks: int, steps: int, workers: int) -> None:
-        grow = bricks > self.order.shape[0], steps > self.trace_voxel.shape[0], workers != self.steps.shape[0]
+        grow = bricks > self.order.shape[0], steps > self.trace_voxel.shape[0], workers > self.steps.shape[0]
         if any(grow):
             runtime.settle()  # before the old scratch is dropped
         if grow[0]:
@@ -193,3 +194,4 @@ class Sweeper:
             self.trace = vec4_array(steps)
         if grow[2]:
             self.steps = ti.ndarray(ti.i32, workers)
+        self._workers = workers

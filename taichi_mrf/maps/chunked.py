@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config import Config
 from taichi_mrf.config_values import from_dict
-from taichi_mrf.errors import ConfigError
+from taichi_mrf.errors import ConfigError, MapFileError, said
 from taichi_mrf.export.chunk_store import CHUNK_BYTES, Chunk, ChunkStore
 from taichi_mrf.queries.box import BoxOfVoxels, voxels_of_box
 from taichi_mrf.queries.points import checked_points, classify, probability
@@ -19,6 +19,15 @@ from taichi_mrf.voxels.memory import check_memory
 
 _BYTES_PER_VOXEL = 9
 """Log-odds, states, and what is made of them."""
+
+
+def _config_of(store: ChunkStore) -> Config:
+    try:
+        return from_dict(Config, yaml.safe_load(store.header.config), str(store.path))
+    except (yaml.YAMLError, ValueError, AttributeError, RecursionError) as error:
+        raise MapFileError(
+            f"{store.path}: damaged: its configuration cannot be read: {said(error)}"
+        ) from error
 
 
 class ChunkedMap:
@@ -31,7 +40,7 @@ class ChunkedMap:
             raise ConfigError(f"cache_mb must be at least {CHUNK_BYTES / 1e6:.3g}, not {cache_mb}")
         self.store, self.header = store, store.header
         self.voxel_size = store.header.voxel_size
-        self.config: Config = from_dict(Config, yaml.safe_load(store.header.config), str(store.path))
+        self.config = _config_of(store)
         self.prior = float(probability(np.array([store.header.prior_log_odds], np.float32))[0])
         self.chunks = store.chunks
         self._most = int(cache_mb * 1e6) // CHUNK_BYTES

@@ -147,13 +147,13 @@ class MRFMap:
     def move_keyframe(self, id: int, T_world_camera: ArrayLike) -> None:
         """Give a keyframe another pose, as a SLAM back-end does; its messages begin anew."""
         keyframe = self._find(id)
-        T, before = as_pose(T_world_camera), keyframe.T_world_camera
+        T = as_pose(T_world_camera)
         self._restore_messages()
         self._placing.take_out(keyframe)
         try:
             self._keyframes[id] = self._placing.place(id, keyframe.name, keyframe.image, T)
         except Exception:
-            self._keyframes[id] = self._placing.place(id, keyframe.name, keyframe.image, before)
+            self._keyframes[id] = self._placing.put_back(keyframe)
             raise
 
     def refine_pose(
@@ -220,7 +220,7 @@ class MRFMap:
                 self._placing.refresh(keyframe)
             self._messages_lost = False
         else:
-            chosen = [self._find(id) for id in keyframes]
+            chosen = [self._find(id) for id in dict.fromkeys(keyframes)]
             self._restore_messages()
             for keyframe in chosen:
                 self._placing.refresh(keyframe)
@@ -265,6 +265,7 @@ class MRFMap:
         self._pool.restart()
         for keyframe in self._keyframes.values():
             keyframe.messages = None
+        self._placing.count_silent(self._keyframes.values())
         self._pool.write("belief", self._pool.in_use, log_odds.reshape(-1, VOXELS).astype(np.float32))
         self._pool.touch(self._pool.in_use)
         self._messages_lost = bool(self._keyframes)
@@ -277,6 +278,7 @@ class MRFMap:
         """Go back to a checkpoint, since which only :meth:`infer` was called."""
         go_back(checkpoint, self._pool, self._keyframes.values())
         self._messages_lost = checkpoint.messages_lost
+        self._placing.count_silent(self._keyframes.values())
 
     def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
         """How many keyframes say something of each voxel of some bricks of the pool, (n,) -> (n, 512); all

@@ -1,5 +1,6 @@
 """Keyframes in and out of a map: which bricks they need and see, and their messages in step with that."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import taichi as ti
@@ -9,7 +10,7 @@ from taichi_mrf.config import InferenceConfig, SensorConfig, VolumeConfig
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.affected import heard_of
 from taichi_mrf.inference.footprint import find_footprint
-from taichi_mrf.inference.keyframe import DepthImage, Keyframe
+from taichi_mrf.inference.keyframe import DepthImage, Footprint, Keyframe, RayList
 from taichi_mrf.inference.messages import carry_over, new_messages
 from taichi_mrf.inference.ray_list import RayLister
 from taichi_mrf.inference.sweep import unknown_begins
@@ -41,13 +42,23 @@ class Placing:
         rays, voxel_size = self.lister.rays_of(image), self.book.voxel_size
         parts = (voxel_size, self.sensor, self.inference, self.volume)
         footprint = find_footprint(image, rays, T_world_camera, *parts, scouts=SCOUTS)
-        begins = unknown_begins(rays)
-        image_bytes = 4 * (image.depth.shape[0] + begins.shape[0]) + rays.nbytes
-        self.room.check(footprint, image_bytes)
+        self.room.check(footprint, 4 * (image.depth.shape[0] + rays.blocks.shape[0]) + rays.nbytes)
         self.book.anchor_at(T_world_camera[:3, 3])
+        return self._claimed(id, name, image, rays, T_world_camera, footprint)
+
+    def put_back(self, keyframe: Keyframe) -> Keyframe:
+        """Place a keyframe again, without messages, where it has just been taken out: what it needs is free,
+        and nobody is asked for room."""
+        parts = (keyframe.image, keyframe.ray_list, keyframe.T_world_camera, keyframe.footprint)
+        return self._claimed(keyframe.id, keyframe.name, *parts)
+
+    def _claimed(
+        self, id: int, name: str, image: DepthImage, rays: RayList, T_world_camera: Pose, footprint: Footprint
+    ) -> Keyframe:
+        """A keyframe whose bricks have been claimed, and that is counted."""
         self.book.claim(footprint)
         self.whereabouts.put(id, footprint.window)
-        visible = self.book.visible(footprint)
+        visible, begins = self.book.visible(footprint), unknown_begins(rays)
         keyframe = Keyframe(id, name, image, rays, T_world_camera, footprint, visible, begins)
         self.room.take(keyframe)
         return keyframe
@@ -79,6 +90,12 @@ class Placing:
         self.room.give_back(keyframe.id)
         pool.touch(keyframe.visible.slots)
         runtime.settle()  # before its arrays are dropped
+
+    def count_silent(self, keyframes: Iterable[Keyframe]) -> None:
+        """Note which of them have lost their messages, for which there must be room again."""
+        for keyframe in keyframes:
+            if keyframe.messages is None:
+                self.room.has_fallen_silent(keyframe.id)
 
     def look_again(self, keyframe: Keyframe) -> None:
         """Find out what a keyframe sees now, and leave its messages as they are."""

@@ -29,7 +29,7 @@ class Room:
         self._pool = pool
         self._bytes_per_brick = VOXELS * (2 if precision == "float16" else 4)
         self._shares: dict[int, _Share] = {}
-        self._silent: set[int] = set()  # those that have never had messages
+        self._silent: set[int] = set()  # those that have no messages
         self._messages = self._images = self._to_come = 0
 
     def check(self, added: Footprint, image_bytes: int) -> None:
@@ -50,15 +50,20 @@ class Room:
         """Count a keyframe that has no messages yet."""
         share = _Share(len(keyframe.visible.slots) * self._bytes_per_brick, keyframe.image_bytes)
         self._shares[keyframe.id] = share
-        self._silent.add(keyframe.id)
         self._messages, self._images = self._messages + share.messages, self._images + share.image
-        self._to_come += share.messages
+        self.has_fallen_silent(keyframe.id)
 
     def has_spoken(self, id: int) -> None:
         """Note that the memory for a keyframe's messages has been taken."""
         if id in self._silent:
             self._silent.remove(id)
             self._to_come -= self._shares[id].messages
+
+    def has_fallen_silent(self, id: int) -> None:
+        """Note that a keyframe has no messages, and will want them."""
+        if id not in self._silent:
+            self._silent.add(id)
+            self._to_come += self._shares[id].messages
 
     def give_back(self, id: int) -> None:
         """Count a keyframe no more."""

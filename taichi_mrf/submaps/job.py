@@ -11,13 +11,13 @@ from taichi_mrf.config import Config, to_yaml
 from taichi_mrf.config_text import differences
 from taichi_mrf.config_values import from_dict
 from taichi_mrf.datasets import Dataset, open_dataset
-from taichi_mrf.errors import MapFileError
+from taichi_mrf.errors import MapFileError, said
 from taichi_mrf.export.atomic import write_text
 from taichi_mrf.submaps.plan import Plan, Submap
 
 PLAN_FILE = "plan.json"
 
-FREE_TO_DIFFER = ("runtime.",)
+FREE_TO_DIFFER = ("runtime.", "volume.memory_limit_gb")
 """Parameters (or groups) that may differ from one part of a run to the next."""
 
 
@@ -77,8 +77,8 @@ class Job:
                 {int(index): tuple(centre) for index, centre in content["centres_m"].items()},
                 content["skipped"],
             )
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise MapFileError(f"{path}: not a readable plan of submaps: {error}") from error
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, yaml.YAMLError) as error:
+            raise MapFileError(f"{path}: not a readable plan of submaps: {said(error)}") from error
 
     def differences(self, sequence: Sequence, config: Config, submap_size: float) -> list[str]:
         """Names of what another run would do otherwise, so that its results would be others."""

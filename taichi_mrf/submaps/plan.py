@@ -8,7 +8,6 @@ is said of the core is said by all who have seen it. The rest of those rays lies
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,11 +43,6 @@ class Plan:
 
     chunks_across: int
     submaps: tuple[Submap, ...]
-
-    @cached_property
-    def number_of_cell(self) -> dict[Cell, int]:
-        """The number of the submap that owns a column."""
-        return {submap.cell: number for number, submap in enumerate(self.submaps)}
 
     def cells_of(self, bricks: NDArray[np.int32]) -> NDArray[np.int32]:
         """The columns that bricks (n, 3) lie in, (n, 2)."""

@@ -70,7 +70,10 @@ def write_round(path: Path, result: RoundResult) -> None:
     }
     for other, (bricks, evidence) in result.halos.items():
         arrays[f"halo_{other}_bricks"], arrays[f"halo_{other}_evidence"] = bricks, evidence
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise MapFileError(f"{path.parent}: cannot be made: {error.strerror or error}") from error
     write_npz(path, arrays)
 
 

@@ -4,7 +4,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from taichi_mrf.cluster.runner import TaskRunner
@@ -29,7 +29,7 @@ Progress = Callable[[str, int, int], None]
 @dataclass(frozen=True)
 class RoundReport:
     """A round: ``moved`` and ``halo_moved`` as in SubmapReport, over all submaps; ``seconds`` from its first
-    task's begin to its last one's end."""
+    task's begin to its last one's end, of a round that was resumed only of its last part."""
 
     round: int
     seconds: float
@@ -83,10 +83,15 @@ def map_in_submaps(
         shutil.rmtree(folder / f"round-{round - 2:03d}", ignore_errors=True)
         if report.moved is not None and report.moved <= settled:
             break
+    last = result.rounds[-1].round
+    if not (folder / f"round-{last:03d}").is_dir():
+        raise ConfigError(
+            f"{folder}: is past round {last}, whose files are gone; --resume needs more --rounds"
+        )
     result.seconds["inferring"] = sum(each.seconds for each in result.rounds)
     begin = time.perf_counter()
     progress("Merging", 0, 1)
-    merge_submaps(folder, result.job, result.rounds[-1].round, map_path)
+    merge_submaps(folder, result.job, last, map_path)
     result.seconds["merging"] = time.perf_counter() - begin
     return result
 
@@ -119,9 +124,11 @@ def _job(
                 f"{folder / PLAN_FILE}: made with another {', '.join(changed)}; "
                 "--resume goes on with the same parameters"
             )
+        if job.config != config:  # in what makes no other map
+            job = replace(job, config=config)
+            job.write(folder)
         return job
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
+    _empty(folder)
     progress("Planning", 0, 1)
     keyframes, skipped = find_keyframes(
         sequence, config, runner, skip_bad_frames, lambda done, total: progress("Planning", done, total)
@@ -130,6 +137,21 @@ def _job(
     job = Job(sequence, config, submap_size, plan, {k.index: k.centre_m for k in keyframes}, skipped)
     job.write(folder)
     return job
+
+
+def _empty(folder: Path) -> None:
+    """Make way for the files of a new run. Raises MapFileError if the folder holds what no run writes."""
+    ours = (PLAN_FILE, "round-", ".")
+    foreign = [p.name for p in folder.iterdir() if not p.name.startswith(ours)] if folder.is_dir() else []
+    if foreign:
+        raise MapFileError(
+            f"{folder}: holds {min(foreign)}, which no run in submaps writes; it is left alone"
+        )
+    try:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise MapFileError(f"{folder}: cannot be made: {error.strerror or error}") from error
 
 
 def _round(
@@ -156,8 +178,8 @@ def _round(
         progress(what, len(done), len(order))
 
     tasks = [SubmapTask(str(folder.resolve()), number, round) for number in order]
-    idle = [task for task in tasks if is_idle(task)]
-    reports = [infer_submap(task) for task in idle]
+    idle = {task for task in tasks if is_idle(task)}
+    reports = [infer_submap(task) for task in tasks if task in idle]
     for number, report in enumerate(reports):
         count(number, report)
     reports += runner.run(infer, [task for task in tasks if task not in idle], count)

@@ -36,13 +36,14 @@ class SurveyTask:
 
 @dataclass(frozen=True)
 class SurveyedFrame:
-    """A frame's pose and the chunks (n, 3) that its rays cross, none if it holds no measurement; or the
-    ``problem`` that it is broken."""
+    """A frame's pose, the chunks (n, 3) that its rays cross, and whether it holds any measurement, be it one
+    that no ray is cast for; or the ``problem`` that it is broken."""
 
     index: int
     name: str
     T_world_camera: Pose | None
     chunks: NDArray[np.int32]
+    measured: bool = False
     problem: str | None = None
 
 
@@ -58,14 +59,15 @@ def survey_frames(task: SurveyTask) -> list[SurveyedFrame]:
         try:
             frame = dataset.read(index)
         except FrameError as error:
-            found.append(SurveyedFrame(index, name, None, nowhere, str(error)))
+            found.append(SurveyedFrame(index, name, None, nowhere, problem=str(error)))
             continue
         T_world_camera, chunks = as_pose(frame.T_world_camera), nowhere
-        if (frame.depth_m > 0).any():
+        measured = bool((frame.depth_m > 0).any())
+        if measured:
             id = m.add_keyframe(frame.depth_m, T_world_camera, frame.camera, name)
             chunks = np.unique(m.crossed_bricks() // CHUNK, axis=0)
             m.remove_keyframe(id)
-        found.append(SurveyedFrame(index, name, T_world_camera, chunks))
+        found.append(SurveyedFrame(index, name, T_world_camera, chunks, measured))
     return found
 
 
@@ -112,8 +114,9 @@ def _chosen(
             if not skip_bad_frames:
                 raise FrameError(str(frame.problem))
             skipped[frame.name] = str(frame.problem)
-        elif selector.wants(frame.T_world_camera) and len(frame.chunks):
+        elif frame.measured and selector.wants(frame.T_world_camera):
             selector.accept(frame.T_world_camera)
-            x, y, z = frame.T_world_camera[:3, 3].tolist()
-            keyframes.append(SeenKeyframe(frame.index, (x, y, z), frame.chunks))
+            if len(frame.chunks):  # else it is a keyframe that says nothing
+                x, y, z = frame.T_world_camera[:3, 3].tolist()
+                keyframes.append(SeenKeyframe(frame.index, (x, y, z), frame.chunks))
     return keyframes, skipped

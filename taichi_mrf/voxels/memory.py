@@ -105,7 +105,7 @@ def check_memory(wanted_bytes: float, what: str, limit_gb: float = 0.0) -> None:
             "had; choose larger voxels, a smaller volume or a smaller sensor.max_depth"
         )
     if free is not None:
-        _allowance.renew(free)
+        _allowance.renew(max(0.0, 0.9 * free - wanted_bytes))
 
 
 class _Allowance:
@@ -117,8 +117,8 @@ class _Allowance:
     def __init__(self) -> None:
         self._bytes_left = self._until = 0.0
 
-    def renew(self, free: int) -> None:
-        """Begin anew, knowing what is free now."""
+    def renew(self, free: float) -> None:
+        """Begin anew, knowing how many bytes are free now."""
         self._bytes_left, self._until = self.SHARE * free, time.monotonic() + self.SECONDS
 
     def covers(self, wanted_bytes: float) -> bool:
