@@ -103,12 +103,15 @@ class DaskTasks:
         if self._client is not None:
             return self._client
         where: Any = self.scheduler
-        if self.scheduler == LOCAL:
-            where = self._open.enter_context(self._own_cluster())
         try:
+            if self.scheduler == LOCAL:
+                where = self._open.enter_context(self._own_cluster())
             client = self._distributed.Client(where, timeout=CONNECT_SECONDS, set_as_default=False)
-        except (OSError, ValueError) as error:
-            raise ClusterError(f"no Dask scheduler answers at {self.scheduler}: {error}") from error
+        except BaseException as error:
+            self.close()  # nobody else would: the context has not begun
+            if isinstance(error, (OSError, ValueError)):
+                raise ClusterError(f"no Dask scheduler answers at {self.scheduler}: {error}") from error
+            raise
         self._client = self._open.enter_context(client)
         return client
 

@@ -46,9 +46,12 @@ class LocalProcesses:
                 free.put(worker)
 
         threads = ThreadPoolExecutor(jobs)
-        futures = {threads.submit(answer, task): index for index, task in enumerate(tasks)}
-        waiting = set(futures)
+        futures: dict[Future[bytes], int] = {}
+        waiting: set[Future[bytes]] = set()
         try:
+            for index, task in enumerate(tasks):
+                futures[threads.submit(answer, task)] = index
+            waiting.update(futures)
             return gather(tasks, _as_they_finish(futures, waiting), done)
         except BaseException:
             processes.stop()
