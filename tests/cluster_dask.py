@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from live_program import DEADLINE_S
+
 TESTS = Path(__file__).resolve().parent
 
 
@@ -23,7 +25,10 @@ class DaskCluster:
 
 @contextmanager
 def dask_cluster(folder: Path, workers: int) -> Iterator[DaskCluster]:
-    """Start them in ``folder``; workers take one task at a time, and nobody starts a killed one again."""
+    """Start them in ``folder``; workers take one task at a time, and nobody starts a killed one again. All
+    workers are there when the block begins."""
+    from distributed import Client
+
     paths = os.pathsep.join([str(TESTS.parent), str(TESTS)])
     environment = {**os.environ, "PYTHONPATH": paths}
     where = folder / "scheduler.json"
@@ -47,6 +52,8 @@ def dask_cluster(folder: Path, workers: int) -> Iterator[DaskCluster]:
         for _ in range(workers):
             cluster.workers.append(start("worker", cluster.address, *loopback, *one_task))
         processes += cluster.workers
+        with Client(cluster.address, timeout=DEADLINE_S, set_as_default=False) as client:
+            client.wait_for_workers(workers, timeout=DEADLINE_S)
         yield cluster
     finally:
         for process in reversed(processes):

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import trimesh
+from live_program import DEADLINE_S
 
 ROOM = "synthetic:room?frames=6&width=80&height=60"
 FLAGS = ("--voxel-size", "0.1", "--runtime.arch", "cpu", "--port", "0")
@@ -22,8 +23,17 @@ FILES = {"map.npz", "voxels.ply", "config.yaml"}
 linux_only = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs the list in /proc")
 
 
-def command(*arguments: str | Path) -> list[str]:
-    return [sys.executable, "-m", "taichi_mrf", *map(str, arguments)]
+PROGRAM = ("-m", "taichi_mrf")
+EVER_YOUNG = (
+    "-c",
+    "import sys; from taichi_mrf.commands import live_run; live_run.SHORTEST_LIFE_SECONDS = 1e9; "
+    "from taichi_mrf.cli import main; sys.exit(main(sys.argv[1:]))",
+)
+"""The program, for which no viewer has lived long enough to be started again, however slow the machine."""
+
+
+def command(*arguments: str | Path, start: tuple[str, str] = PROGRAM) -> list[str]:
+    return [sys.executable, *start, *map(str, arguments)]
 
 
 def live(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -61,7 +71,7 @@ class Running:
 
     def wait(self) -> tuple[int, str]:
         """Exit status, and what was said on stderr."""
-        output, errors = self.process.communicate()
+        output, errors = self.process.communicate(timeout=DEADLINE_S)
         self.said.append(output)
         return self.process.returncode, errors
 
@@ -83,10 +93,10 @@ def wait_for_end(pid: int) -> None:
 
 
 @contextmanager
-def running(*arguments: str | Path) -> Iterator[Running]:
+def running(*arguments: str | Path, start: tuple[str, str] = PROGRAM) -> Iterator[Running]:
     """A live run that goes on until it is told to end, in a process group of its own."""
     with subprocess.Popen(
-        command("live", *arguments),
+        command("live", *arguments, start=start),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -145,7 +155,7 @@ def test_a_mapper_that_is_killed_takes_its_viewer_with_it() -> None:
 
 @linux_only
 def test_a_viewer_that_is_killed_at_once_ends_the_run_but_not_its_map(tmp_path: Path) -> None:
-    with running(ROOM, "--out", tmp_path, *FLAGS) as run:
+    with running(ROOM, "--out", tmp_path, *FLAGS, start=EVER_YOUNG) as run:
         os.kill(run.viewer(), signal.SIGKILL)
         status, errors = run.wait()
     assert status == 2

@@ -167,7 +167,8 @@ def heard(link: ViewerLink, count: int) -> list:
     return found
 
 
-def test_a_viewer_says_where_it_is_gets_updates_and_ends_when_told() -> None:
+def test_a_viewer_says_where_it_is_gets_updates_and_ends_when_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("taichi_mrf.live.link.GOODBYE_SECONDS", 60.0)  # as long as a busy machine needs
     link = ViewerLink("127.0.0.1", 1234, stand_in_viewers.echo)
     try:
         assert heard(link, 1) == [Listening("127.0.0.1", 1234)]
@@ -185,6 +186,8 @@ def test_a_viewer_that_reads_nothing_holds_nobody_up_and_is_ended_by_force() -> 
         for number in range(50):
             link.send(bricks(dict.fromkeys(range(100), number)))  # far more than a pipe holds
         process = link._process
+    process.join(60.0)
+    link._sender.join(60.0)
     assert not process.is_alive()
     assert not link._sender.is_alive()
 

@@ -65,7 +65,7 @@ def old_program(saved: Path) -> Iterator[LiveProgram]:
 def test_a_signal_ends_it_and_keeps_what_is_mapped(
     number: signal.Signals, old_program: LiveProgram, browser: "Browser", tmp_path: Path
 ) -> None:
-    options = (*COARSE, "--speed", "0.1", "--out", tmp_path)
+    options = (*COARSE, "--speed", "0.01", "--out", tmp_path)  # so slow that it is never over
     with LiveProgram(ROOM, *options, port=old_program.port) as program:
         assert program.port != old_program.port
         assert f"Port {old_program.port} is busy, so the page took {program.port}." in program.said
@@ -112,10 +112,12 @@ def test_a_broken_frame_is_told_of_and_mapping_goes_on(browser: "Browser", tmp_p
 
 
 def test_a_slider_is_answered_while_the_map_is_inferred(browser: "Browser") -> None:
+    options = ("--voxel-size", "0.02", "--runtime.arch", "cpu", "--speed", "0.01")
     with (
-        LiveProgram("synthetic:room?frames=8", "--voxel-size", "0.02", "--runtime.arch", "cpu") as program,
+        LiveProgram("synthetic:room?frames=8", *options) as program,
         LivePage(browser, program.address, width=800, height=600) as page,
     ):
+        page.select("Speed", "as fast as it goes")
         page.until(lambda seen: seen.activity.startswith("sweeping") and seen.agrees, "inference")
         answers = slider_answers(page, 4)
         page.screenshot("inferring")

@@ -36,7 +36,10 @@ def page() -> Iterator[LivePage]:
 
 def rests(page: LivePage, number: int) -> Seen:
     """Wait until a try has its scores and its map; returns what is then to be seen."""
-    return page.until(lambda seen: seen.settled and shown_try(page) == number, f"try {number} at rest")
+    return page.until(
+        lambda seen: seen.settled and shown_try(page) == number and "first look" not in page.text(),
+        f"try {number} at rest",
+    )
 
 
 def shown_try(page: LivePage) -> int | None:
@@ -72,9 +75,12 @@ def test_the_page_begins_with_the_scores_of_the_parameters_in_force(page: LivePa
 def test_a_slider_brings_a_new_score_and_another_map(page: LivePage) -> None:
     before, likelihood = page.look(), score(page, "log-likelihood")
     page.slide("Surface density (per m)", 5.0)
-    after = rests(page, 1)
+    rests(page, 1)
     assert score(page, "log-likelihood") != likelihood
-    assert (after.voxels, after.colors) != (before.voxels, before.colors)
+    page.until(
+        lambda seen: seen.settled and (seen.voxels, seen.colors) != (before.voxels, before.colors),
+        "another map",
+    )
     assert len(page.page.locator("svg circle").all()) >= 5
     page.screenshot("tune_after_a_slider")
 
