@@ -55,8 +55,9 @@ def voxels(saved: Path) -> int:
 @pytest.fixture(scope="module")
 def old_program(saved: Path) -> Iterator[LiveProgram]:
     """The saved map, shown for the whole time of these tests, because a viewer must have lived for a while to
-    be started again."""
-    with LiveProgram(saved) as program:
+    be started again. Its port is none of those that the system gives away, or another program could be given
+    it while nobody listens."""
+    with LiveProgram(saved, port=20000 + os.getpid() % 10000) as program:
         program.started = time.monotonic()
         yield program
 
