@@ -53,12 +53,8 @@ def uploaded(
     depth_m: NDArray[np.float64], noise: NoiseModel | None = None, camera: PinholeCamera = CAMERA
 ) -> DepthImage:
     """An image as a map holds it; 0 is no measurement."""
-    table = (noise or PolynomialNoise(NOISE.sigma, NOISE.bias)).table(camera)
-    depth = ti.ndarray(ti.f32, depth_m.size)
-    depth.from_numpy(depth_m.reshape(-1).astype(np.float32))
-    coefficients = ti.ndarray(ti.f32, table.coefficients.shape)
-    coefficients.from_numpy(table.coefficients)
-    return DepthImage(depth, camera, coefficients, table, int((depth_m > 0).sum()))
+    noise = noise or PolynomialNoise(NOISE.sigma, NOISE.bias)
+    return DepthImage.upload(depth_m.astype(np.float32), camera, noise)
 
 
 def scene(seed: int) -> NDArray[np.float64]:

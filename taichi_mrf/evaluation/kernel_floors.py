@@ -49,7 +49,6 @@ FLOORS: Mapping[str, Mapping[str, Floor]] = {
         "ext_arr_to_ndarray": lambda w: 8 * w.pixels,  # the depth image, to the device
         "_choose": lambda w: 20 * w.pixels,  # depth in; nearest, farthest, mean, level out
         "_write_down": lambda w: 4 * w.pixels + 12 * w.rays,  # levels and means in, the list out
-        "ndarray_to_ext_arr": lambda w: 8 * w.pixels,  # the depth image, back to the host
         "_mark": lambda w: 8 * w.rays + 4 * w.crossed,  # the list in, marks out
         "read": lambda w: 20 * (w.surface + w.crossed),  # coordinates and the tree in, slots out
         "_fill_bricks": lambda w: (4 + 4 * VOXELS) * w.created,
@@ -69,3 +68,6 @@ FLOORS: Mapping[str, Mapping[str, Floor]] = {
     },
 }
 """By stage and by the kernel's name."""
+
+COPIES = ("ext_arr_to_ndarray", "ndarray_to_ext_arr")
+"""Those that bring arrays to the device and back: there are none on a CPU (voxels/resident.py)."""
