@@ -1,5 +1,6 @@
 """``taichi-mrf tune`` as a command: the search without a page, its files, and one line for bad input."""
 
+import os
 import re
 import subprocess
 import sys
@@ -9,7 +10,7 @@ import pytest
 from live_program import wait_for
 from tune_program import TuneProgram
 
-from taichi_mrf import config
+from taichi_mrf import cli, config
 
 ROOM = "synthetic:room?frames=9&width=80&height=60"
 FLAGS = ("--voxel-size", "0.1", "--stride", "1", "--runtime.arch", "cpu")
@@ -78,3 +79,11 @@ def test_bad_input_gets_one_line(arguments: list[str], said: str) -> None:
     assert done.stderr.startswith("taichi-mrf: ")
     assert said in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.skipif(not hasattr(os, "getpriority"), reason="Windows has no such priorities")
+def test_without_a_page_nothing_has_to_go_first(capsys: pytest.CaptureFixture[str]) -> None:
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    assert cli.main(["tune", ROOM, "--no-viewer", "--auto", "1", "--search", "inference.swep"]) == 2
+    assert "--search inference.swep" in capsys.readouterr().err
+    assert os.getpriority(os.PRIO_PROCESS, 0) == before

@@ -13,6 +13,7 @@ from taichi_mrf.commands.tune import FRAMES_BY_HAND, FRAMES_TO_SEARCH, Tune
 from taichi_mrf.config import with_absolute_tables
 from taichi_mrf.errors import TaichiMRFError
 from taichi_mrf.export.atomic import write_text
+from taichi_mrf.live.link import ViewerLink
 from taichi_mrf.tune.link import NoPage, start_page
 from taichi_mrf.viewer.tune_messages import FrameChoice
 
@@ -34,10 +35,7 @@ def run_tune(options: Tune) -> int:
         if options.out is not None:
             stack.enter_context(output_folder(options.out))
         request = stack.enter_context(stop_on_signals(say))
-        if options.viewer:
-            warn_of_host(options.host, options.port, "use it", say)
-        link = stack.enter_context(start_page(options.host, options.port)) if options.viewer else NoPage()
-        let_the_page_go_first()
+        link = _page(options, say, stack) if options.viewer else NoPage()
         # Imported late: the page starts meanwhile, in a process of its own.
         from taichi_mrf import runtime
         from taichi_mrf.datasets import open_dataset
@@ -78,6 +76,14 @@ def run_tune(options: Tune) -> int:
     if lost is not None and not request():
         raise TaichiMRFError(lost)
     return 0 if request.signal is None else 128 + request.signal
+
+
+def _page(options: Tune, say: Say, stack: ExitStack) -> ViewerLink:
+    """Start the page, which may compute before the tries do."""
+    warn_of_host(options.host, options.port, "use it", say)
+    link = stack.enter_context(start_page(options.host, options.port))
+    let_the_page_go_first()
+    return link
 
 
 def _finish(session: "TuneSession", options: Tune, say: Say) -> None:
