@@ -4,14 +4,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
-import taichi as ti
 
 from taichi_mrf import runtime
-from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.inference.messages import withdraw_messages
 from taichi_mrf.poses import Pose
 from taichi_mrf.queries.view import View
-from taichi_mrf.voxels.strips import strip_length
 
 STRIDE = 4
 """Every how many-th pixel, both ways, is asked."""
@@ -27,9 +25,8 @@ def map_of_others(view: View, keyframe: Keyframe) -> Iterator[None]:
     The messages of ``keyframe``, if it has any, must fit its visible bricks, and those be up to date.
     """
     cavity = view.pool.snapshot()
-    if keyframe.messages is not None and len(keyframe.visible.slots):
-        moved = ti.ndarray(ti.i32, len(keyframe.visible.slots))
-        sum_product.withdraw(keyframe.visible.slots, cavity.belief, keyframe.messages, moved, strip_length())
+    if keyframe.messages is not None:
+        withdraw_messages(keyframe.visible, keyframe.messages, cavity.belief)
     with view.pool.showing(cavity):
         yield
     runtime.settle()  # before the snapshot is dropped

@@ -7,6 +7,7 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf import runtime
+from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.keyframe import VisibleBricks
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
@@ -29,6 +30,20 @@ def carry_over(
     if (place >= 0).any():
         _copy_bricks(place, old_messages, messages, strip_length())
     runtime.settle()  # before the old ones are dropped
+
+
+def withdraw_messages(
+    visible: VisibleBricks, messages: "ti.Ndarray", belief: "ti.Ndarray"
+) -> NDArray[np.int32]:
+    """Take a keyframe's messages out of the beliefs, those of the map or of a snapshot; returns how many
+    voxels of each visible brick that moved, (n,)."""
+    n = len(visible.slots)
+    if n == 0:
+        return np.zeros(0, np.int32)
+    moved = ti.ndarray(ti.i32, n)
+    moved.fill(0)
+    sum_product.withdraw(visible.slots, belief, messages, moved, strip_length())
+    return moved.to_numpy()
 
 
 def places_of(old: VisibleBricks, visible: VisibleBricks) -> NDArray[np.int32]:

@@ -11,7 +11,7 @@ from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.affected import heard_of
 from taichi_mrf.inference.footprint import find_footprint
 from taichi_mrf.inference.keyframe import DepthImage, Footprint, Keyframe, RayList
-from taichi_mrf.inference.messages import carry_over, new_messages
+from taichi_mrf.inference.messages import carry_over, new_messages, withdraw_messages
 from taichi_mrf.inference.ray_list import RayLister
 from taichi_mrf.inference.sweep import unknown_begins
 from taichi_mrf.inference.whereabouts import Whereabouts
@@ -69,11 +69,8 @@ class Placing:
         if keyframe.messages is not None:
             messages, slots = self.refresh(keyframe), keyframe.visible.slots
             if len(slots):
-                moved = ti.ndarray(ti.i32, len(slots))
-                moved.fill(0)
-                sum_product.withdraw(slots, pool.belief, messages, moved, strip_length())
+                pool.stir(slots, withdraw_messages(keyframe.visible, messages, pool.belief))
                 pool.revision += 1
-                pool.stir(slots, moved.to_numpy())
                 pool.touch(slots)
         self.book.disclaim(keyframe.footprint)
         self.whereabouts.drop(keyframe.id)

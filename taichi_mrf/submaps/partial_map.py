@@ -3,16 +3,14 @@
 from collections.abc import Iterable
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf import runtime
 from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.config import Config
-from taichi_mrf.inference import sum_product
+from taichi_mrf.inference.messages import withdraw_messages
 from taichi_mrf.maps.mrf import MRFMap
 from taichi_mrf.queries.known_bricks import sorted_bricks
-from taichi_mrf.voxels.strips import strip_length
 
 Bricks = NDArray[np.int32]
 """(n, 3) brick coordinates in the world."""
@@ -48,12 +46,8 @@ class PartialMap(MRFMap):
         snapshot = self._pool.snapshot()
         for id in without:
             keyframe = self._keyframes[id]
-            if keyframe.messages is not None and len(keyframe.visible.slots):
-                moved = ti.ndarray(ti.i32, len(keyframe.visible.slots))
-                moved.fill(0)
-                sum_product.withdraw(
-                    keyframe.visible.slots, snapshot.belief, keyframe.messages, moved, strip_length()
-                )
+            if keyframe.messages is not None:
+                withdraw_messages(keyframe.visible, keyframe.messages, snapshot.belief)
         with self._pool.showing(snapshot):
             found = self._pool.read("belief", slots)
         runtime.settle()  # before the snapshot is dropped
