@@ -1,5 +1,6 @@
 """The index of bricks: sparse and dense kinds do what a dictionary would do, within their bounds."""
 
+import gc
 from collections import defaultdict
 
 import numpy as np
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
+from taichi_mrf.maps.mrf import MRFMap
 from taichi_mrf.voxels.layout import BRICK, CHUNK
 from taichi_mrf.voxels.topology import DenseTopology, SparseTopology, Topology, create_topology, recycle
 
@@ -236,6 +238,18 @@ def test_more_maps_than_layers_are_an_error(backend: str) -> None:
     kept: list[SparseTopology] = []
     with pytest.raises(CapacityError, match="64 maps already"):
         kept.extend(SparseTopology() for _ in range(65))
+
+
+def test_maps_that_nobody_can_reach_do_not_count(backend: str) -> None:
+    """Those in cycles, as the traceback of an exception makes them, until the collector comes by."""
+    gc.collect()
+    gc.disable()
+    try:
+        for _ in range(65):
+            cycle: list[object] = [MRFMap(voxel_size=0.1)]
+            cycle.append(cycle)
+    finally:
+        gc.enable()
 
 
 def test_each_backend_gets_its_kind(backend: str) -> None:

@@ -10,6 +10,7 @@ Beside its slot each brick has a number of crossings: how many keyframes' rays p
 without a slot that has been crossed is seen-free space, one that has not is unknown.
 """
 
+import gc
 import weakref
 from typing import ClassVar, Protocol
 
@@ -55,8 +56,11 @@ class Topology(Protocol):
 
 
 def create_topology(arch: str, dense_bricks: int) -> Topology:
-    """An empty index for a backend; ``dense_bricks`` bounds it where it has to be dense."""
+    """An empty index for a backend; ``dense_bricks`` bounds it where it has to be dense. Raises CapacityError
+    if the process has too many maps."""
     key = dense_bricks if arch == "vulkan" else 0
+    if not _spare.get(key) and SparseTopology.all_taken():
+        gc.collect()  # nobody may reach those maps any more: the traceback of an old exception holds its map
     if _spare.get(key):
         topology = _spare[key].pop()
         topology.clear()
@@ -174,6 +178,11 @@ class SparseTopology:
         self.layer = self._tree.unused.pop(0)
         weakref.finalize(self, self._tree.unused.append, self.layer)
         self.clear()  # whoever had the layer before has left it as it was
+
+    @classmethod
+    def all_taken(cls) -> bool:
+        """Whether no layer is left for another map."""
+        return cls.tree is not None and not cls.tree.unused
 
     def anchor(self, brick: Bricks) -> None:
         """A sparse index spans the same space wherever the map begins."""
