@@ -2,7 +2,7 @@
 
 import sys
 
-from taichi_mrf.cli import main
+from taichi_mrf.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main(["map", *sys.argv[1:]]))

@@ -14,12 +14,12 @@ from typing import Annotated
 
 import tyro
 
-from taichi_mrf import runtime
-from taichi_mrf.config import Config
+from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.system import runtime
 from taichi_mrf.tune.trial import run_trial
 from taichi_mrf.tune.working_set import coarse_stride, read_working_set
-from taichi_mrf.viewer.tune_messages import FrameChoice
+from taichi_mrf.viewer.tune.messages import FrameChoice
 
 
 @dataclass(frozen=True)

@@ -129,9 +129,9 @@ def tests(options: Options) -> dict[str, Any]:
 
 def kernels(options: Options) -> dict[str, Any]:
     """Kernel times of a keyframe at each voxel size, by Taichi's profiler."""
-    from taichi_mrf.config import Config
-    from taichi_mrf.evaluation.profile import profile_mapping
-    from taichi_mrf.voxels.bandwidth import copy_bandwidth
+    from taichi_mrf.config.schema import Config
+    from taichi_mrf.experiments.speed.bandwidth import copy_bandwidth
+    from taichi_mrf.experiments.speed.profile import profile_mapping
 
     device = _start(options, profile=options.arch != "vulkan")
     bandwidth = copy_bandwidth(1 << 24 if options.quick else 0)
@@ -153,10 +153,10 @@ def kernels(options: Options) -> dict[str, Any]:
 
 def wall(options: Options) -> dict[str, Any]:
     """Wall time of a keyframe with three sweeps, and of full inference at the finest voxel size."""
-    from taichi_mrf.config import Config
-    from taichi_mrf.evaluation.keyframe_cost import Seconds, live_stages, timed, warm_up
-    from taichi_mrf.evaluation.launches import count_launches
-    from taichi_mrf.maps.mrf import MRFMap
+    from taichi_mrf.config.schema import Config
+    from taichi_mrf.experiments.speed.keyframe_cost import Seconds, live_stages, timed, warm_up
+    from taichi_mrf.experiments.speed.launches import count_launches
+    from taichi_mrf.methods.mrf.map import MRFMap
 
     device = _start(options)
     frames = _frames(options, options.keyframes)
@@ -194,7 +194,7 @@ def _sweep_again(m: Any, keyframe: Any) -> None:
 
 def _ways_back(m: Any) -> dict[str, float]:
     """Seconds of one sweep over all keyframes, by how rays find their way back (sum_product.py)."""
-    from taichi_mrf.evaluation.keyframe_cost import timed
+    from taichi_mrf.experiments.speed.keyframe_cost import timed
 
     seconds = {}
     for name, retrace in (("replayed", False), ("followed twice", True)):
@@ -207,8 +207,8 @@ def _ways_back(m: Any) -> dict[str, float]:
 
 def octomap(options: Options) -> dict[str, Any]:
     """OctoMap on one CPU core, a ray for each pixel, at the finest voxel size."""
-    from taichi_mrf.evaluation.bench import octomap_available, octomap_inserter
-    from taichi_mrf.evaluation.keyframe_cost import Seconds
+    from taichi_mrf.experiments.speed.bench import octomap_available, octomap_inserter
+    from taichi_mrf.experiments.speed.keyframe_cost import Seconds
 
     if not octomap_available():
         return {"missing": "pip install 'taichi-mrf[bench]' brings OctoMap"}
@@ -219,7 +219,7 @@ def octomap(options: Options) -> dict[str, Any]:
 
 
 def _start(options: Options, profile: bool = False) -> str:
-    from taichi_mrf import runtime
+    from taichi_mrf.system import runtime
 
     runtime.init(options.arch, profile=profile)
     choice = runtime.choice()

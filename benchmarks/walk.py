@@ -123,12 +123,12 @@ def time_taichi(problem: Path, threads: int) -> None:
     """Run Taichi's kernel, leave its sums beside the problem, and print seconds and steps."""
     import taichi as ti
 
-    from taichi_mrf import runtime
     from taichi_mrf.inference import sum_product
     from taichi_mrf.inference.ray_list import BITS
     from taichi_mrf.inference.sweep import workers_for
+    from taichi_mrf.kernels.vectors import vec4_array
     from taichi_mrf.sensor.forward import CENTRE
-    from taichi_mrf.voxels.vectors import vec4_array
+    from taichi_mrf.system import runtime
 
     runtime.init("cpu", threads)
     data = np.load(problem.with_suffix(".npz"))

@@ -13,8 +13,8 @@ import numpy as np
 
 import taichi_mrf
 from taichi_mrf.datasets import Dataset, open_dataset
-from taichi_mrf.datasets.tum_rgbd import COLOR_LIST, DEPTH_LIST, POSES, STEPS_PER_METRE
-from taichi_mrf.poses import Pose
+from taichi_mrf.datasets.formats.tum_rgbd import COLOR_LIST, DEPTH_LIST, POSES, STEPS_PER_METRE
+from taichi_mrf.geometry.poses import Pose
 
 SOURCE = "synthetic:room?frames=12&width=320&height=240&noise=kinect&seed=0"
 LARGEST = 1_000_000

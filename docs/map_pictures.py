@@ -14,16 +14,16 @@ import yaml
 from PIL import Image
 
 import taichi_mrf
-from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.evaluation.figures import color_bar, draw_way, new_figure
-from taichi_mrf.evaluation.surfaces import seen_surfaces, up_direction
-from taichi_mrf.evaluation.viewpoint import faces_viewer, overview_pose
+from taichi_mrf.evaluation.pictures.figures import color_bar, draw_way, new_figure
+from taichi_mrf.evaluation.pictures.surfaces import seen_surfaces, up_direction
+from taichi_mrf.evaluation.pictures.viewpoint import faces_viewer, overview_pose
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.queries.box import map_extent
 from taichi_mrf.queries.distance import distance_field
 from taichi_mrf.queries.frontiers import find_frontiers
 from taichi_mrf.queries.slices import slice_map
+from taichi_mrf.sensor.camera import PinholeCamera
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -102,7 +102,7 @@ def mesh(run: Path) -> Image.Image:
     import trimesh
     from matplotlib.colors import ListedColormap
 
-    from taichi_mrf.export.colors import LOWEST, viridis
+    from taichi_mrf.voxels.colors import LOWEST, viridis
 
     m = taichi_mrf.load_map(run / "map.npz")
     with tempfile.TemporaryDirectory() as folder:

@@ -11,8 +11,8 @@ from typing import Any
 
 from mkdocs.structure.files import File, Files
 
-from taichi_mrf.config import Config
-from taichi_mrf.config_text import field_help
+from taichi_mrf.config.schema import Config
+from taichi_mrf.config.text import field_help
 from taichi_mrf.factor_graph.config import LaserConfig
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -10,7 +10,7 @@ the map has found grows faster than with views taken in their order.
 import numpy as np
 
 import taichi_mrf as tm
-from taichi_mrf.frame import Frame
+from taichi_mrf.sensor.frame import Frame
 
 VIEWS = 5
 

@@ -14,16 +14,16 @@ __version__ = "0.1.0"
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 
 _PUBLIC = {
-    "init": "taichi_mrf.runtime",
-    "PinholeCamera": "taichi_mrf.camera",
+    "init": "taichi_mrf.system.runtime",
+    "PinholeCamera": "taichi_mrf.sensor.camera",
     "PolynomialNoise": "taichi_mrf.sensor.noise",
     "PatchNoise": "taichi_mrf.sensor.noise",
-    "MRFMap": "taichi_mrf.maps.mrf",
-    "LogOddsMap": "taichi_mrf.maps.log_odds",
-    "VisibilityMap": "taichi_mrf.maps.visibility",
-    "load_map": "taichi_mrf.maps.create",
-    "ChunkedMap": "taichi_mrf.maps.chunked",
-    "take_part": "taichi_mrf.maps.chunked_part",
+    "MRFMap": "taichi_mrf.methods.mrf.map",
+    "LogOddsMap": "taichi_mrf.methods.log_odds.map",
+    "VisibilityMap": "taichi_mrf.methods.visibility.map",
+    "load_map": "taichi_mrf.methods.registry",
+    "ChunkedMap": "taichi_mrf.methods.chunked",
+    "take_part": "taichi_mrf.methods.chunked_part",
     "accuracy": "taichi_mrf.evaluation.accuracy",
     "UNKNOWN": "taichi_mrf.queries.points",
     "FREE": "taichi_mrf.queries.points",
@@ -37,9 +37,9 @@ _PUBLIC = {
     "compare_maps": "taichi_mrf.queries.change",
     "export_map": "taichi_mrf.export.formats",
     "ExportOptions": "taichi_mrf.export.options",
-    "Frame": "taichi_mrf.frame",
+    "Frame": "taichi_mrf.sensor.frame",
     "open_dataset": "taichi_mrf.datasets",
-    "Config": "taichi_mrf.config",
+    "Config": "taichi_mrf.config.schema",
     "TaichiMRFError": "taichi_mrf.errors",
 }
 

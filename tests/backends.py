@@ -13,7 +13,7 @@ import tempfile
 from contextlib import ExitStack
 from typing import IO
 
-from taichi_mrf import runtime
+from taichi_mrf.system import runtime
 
 HALVES = ("1/2", "2/2")
 

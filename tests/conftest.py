@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-from taichi_mrf import runtime
 from taichi_mrf.errors import BackendError
+from taichi_mrf.system import runtime
 
 SETTINGS_OF_A_TEST = "_hypothesis_internal_use_settings"
 """Where hypothesis keeps what @settings said; it has no public way to ask."""

@@ -1,6 +1,6 @@
 """Damaged input of every kind: one line that names it, or what can rightly be read of it; never a crash.
 
-tests/fuzz_soak.py does the same for as long as it is told to.
+tests/support/fuzz_soak.py does the same for as long as it is told to.
 """
 
 from pathlib import Path

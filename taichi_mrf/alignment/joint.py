@@ -21,8 +21,8 @@ from taichi_mrf.alignment.recorded import Recorded
 from taichi_mrf.alignment.se3 import adjoint, moved
 from taichi_mrf.alignment.surfel_grid import SurfelGrid
 from taichi_mrf.alignment.surfels import surfels_of
-from taichi_mrf.config import PoseConfig
-from taichi_mrf.poses import Pose, inverse
+from taichi_mrf.config.schema import PoseConfig
+from taichi_mrf.geometry.poses import Pose, inverse
 
 CELLS_M = (0.12, 0.06)
 """Widths of the surfels' cells in metres, from coarse to fine."""

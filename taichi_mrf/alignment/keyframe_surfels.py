@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from taichi_mrf.alignment.oriented_points import oriented_points
 from taichi_mrf.alignment.surfels import Surfels, merged, surfels_of
+from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import Keyframe
-from taichi_mrf.poses import Pose
 
 
 class KeyframeSurfels:

@@ -12,7 +12,7 @@ from taichi_mrf.alignment.point_to_plane import PointToPlane
 from taichi_mrf.alignment.recorded import Recorded
 from taichi_mrf.alignment.surfel_grid import SurfelGrid
 from taichi_mrf.alignment.surfels import Surfels
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
 
 COARSEST_M = 0.08
 """Width in metres that the first level's cells have at least. Further than 1.5 cells nothing is found."""

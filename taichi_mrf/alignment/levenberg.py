@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from taichi_mrf.alignment.point_to_plane import NormalEquations, PointToPlane
 from taichi_mrf.alignment.recorded import Recorded
 from taichi_mrf.alignment.se3 import moved
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
 
 MOST_STEPS = 12
 """Steps at one level, tried ones included."""

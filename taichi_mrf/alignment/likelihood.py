@@ -5,11 +5,11 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from taichi_mrf import runtime
+from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import withdraw_messages
-from taichi_mrf.poses import Pose
 from taichi_mrf.queries.view import View
+from taichi_mrf.system import runtime
 
 STRIDE = 4
 """Every how many-th pixel, both ways, is asked."""

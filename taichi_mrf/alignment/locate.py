@@ -12,9 +12,9 @@ from taichi_mrf.alignment.oriented_points import OrientedPoints, oriented_points
 from taichi_mrf.alignment.point_to_plane import LARGEST_COST, NormalEquations
 from taichi_mrf.alignment.recorded import Recorded
 from taichi_mrf.alignment.surfel_grid import SurfelGrid
-from taichi_mrf.config import PoseConfig
+from taichi_mrf.config.schema import PoseConfig
+from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.inference.keyframe import DepthImage, Keyframe
-from taichi_mrf.poses import Pose, tangent_norms
 
 LEAST_AGREEMENT = 0.5
 """Share of the points with a surface near them that must lie on it, or the image was taken elsewhere."""

@@ -6,11 +6,11 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf import runtime
 from taichi_mrf.inference.keyframe import DepthImage
-from taichi_mrf.inference.rays import pixel_direction
+from taichi_mrf.kernels.types import I32, F32Array, F32Array2, F32Array3, Vec3, Vec4
 from taichi_mrf.sensor.forward import depth_of_deviation, pixel_noise, sigma_at
-from taichi_mrf.voxels.types import I32, F32Array, F32Array2, F32Array3, Vec3, Vec4
+from taichi_mrf.sensor.rays import pixel_direction
+from taichi_mrf.system import runtime
 
 STRIDE = 2
 """Pixels between points along both axes of the image."""

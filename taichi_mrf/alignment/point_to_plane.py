@@ -16,15 +16,15 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf import runtime
 from taichi_mrf.alignment.oriented_points import OrientedPoints
 from taichi_mrf.alignment.recorded import SURFACE_SIGMA_M
 from taichi_mrf.alignment.surfel_grid import SurfelGrid
 from taichi_mrf.alignment.surfels import ROUGHNESS
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, IVec3, Mat3, Template, Vec3
+from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat, voxel_number
-from taichi_mrf.voxels.types import F32, I32, F32Array, F32Array2, I32Array, IVec3, Mat3, Template, Vec3
 
 TUKEY = 4.685
 """Sigmas beyond which a residual says nothing (95% efficiency for normal errors)."""

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.alignment.se3 import twist
-from taichi_mrf.config import PoseConfig
-from taichi_mrf.poses import Pose, inverse
+from taichi_mrf.config.schema import PoseConfig
+from taichi_mrf.geometry.poses import Pose, inverse
 
 SURFACE_SIGMA_M = 0.001
 """What the alignment of two surfaces is worth, in metres."""

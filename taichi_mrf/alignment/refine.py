@@ -12,9 +12,9 @@ from taichi_mrf.alignment.likelihood import log_likelihood, map_of_others
 from taichi_mrf.alignment.oriented_points import oriented_points
 from taichi_mrf.alignment.point_to_plane import NormalEquations
 from taichi_mrf.alignment.recorded import Recorded
-from taichi_mrf.config import PoseConfig
+from taichi_mrf.config.schema import PoseConfig
+from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.inference.keyframe import Keyframe
-from taichi_mrf.poses import Pose, tangent_norms
 from taichi_mrf.queries.view import View
 
 IN_PLACE = 0.01

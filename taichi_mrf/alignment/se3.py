@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
 
 _SMALL = 1e-2
 """Radians below which a series is more precise than the closed form."""

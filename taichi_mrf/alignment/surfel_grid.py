@@ -3,8 +3,8 @@
 import numpy as np
 import taichi as ti
 
-from taichi_mrf import runtime
 from taichi_mrf.alignment.surfels import Surfels
+from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.window import Window, WindowIndex
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.alignment.oriented_points import OrientedPoints
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
 
 _HALF = 1 << 20
 """Cells are numbered from minus this along each axis, three times 21 bits in one int64."""

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from taichi_mrf.calibration.chessboard import BoardView, find_board
 from taichi_mrf.calibration.options import BoardConfig
-from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.datasets.images import read_color
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.sensor.camera import PinholeCamera
 
 FORMATS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 

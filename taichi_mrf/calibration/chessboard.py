@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.calibration.options import BoardConfig
-from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.camera import PinholeCamera
 
 _PRECISELY = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
 _LARGEST_WINDOW, _LEAST_WINDOW = 11, 2

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.images import read_depth
 from taichi_mrf.errors import DatasetError, said
-from taichi_mrf.npz_file import open_npz, read_npy
+from taichi_mrf.system.npz_file import open_npz, read_npy
 
 FORMATS = (".png", ".npy", ".npz")
 STACK_NAME = "depth_m"

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.calibration.coverage import Coverage
-from taichi_mrf.evaluation.figures import new_figure
+from taichi_mrf.evaluation.pictures.figures import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import DatasetError
-from taichi_mrf.poses import Pose, inverse
+from taichi_mrf.geometry.poses import Pose, inverse
 
 _LARGEST_RATIO = 0.999
 """Of the second to the first singular value: above it rotations hardly differ (by some 3 degrees)."""

@@ -7,8 +7,8 @@ from taichi_mrf.calibration.fit import LearntNoise, learn
 from taichi_mrf.calibration.options import CalibrationConfig
 from taichi_mrf.calibration.pairs import PairSource
 from taichi_mrf.calibration.samples import Cells, ErrorHistograms, Moments
-from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.sensor.camera import PinholeCamera
 
 
 @dataclass(frozen=True)

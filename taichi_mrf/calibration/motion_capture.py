@@ -16,9 +16,9 @@ from taichi_mrf.calibration.hand_eye import hand_eye
 from taichi_mrf.calibration.options import BoardConfig, MotionCaptureConfig
 from taichi_mrf.calibration.pose_stream import rotations
 from taichi_mrf.calibration.time_lag import BodyPair, estimate_lag
-from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.errors import ConfigError, DatasetError
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.camera import PinholeCamera
 
 _PARAMETERS = 13
 """Six for where each body's markers sit, one for the lag."""

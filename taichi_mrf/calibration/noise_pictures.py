@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from taichi_mrf.calibration.coverage import Coverage
 from taichi_mrf.calibration.fit import LearntNoise
 from taichi_mrf.calibration.frustum_picture import image_extent, within_image
-from taichi_mrf.evaluation.figures import new_figure
+from taichi_mrf.evaluation.pictures.figures import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

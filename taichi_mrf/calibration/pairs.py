@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from taichi_mrf.calibration.chessboard import board_depth
 from taichi_mrf.calibration.depth_files import DepthFiles
 from taichi_mrf.calibration.options import BoardConfig
-from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.errors import DatasetError
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.camera import PinholeCamera
 
 
 @dataclass(frozen=True)

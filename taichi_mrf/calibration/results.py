@@ -10,7 +10,7 @@ from taichi_mrf.calibration.coverage import Coverage
 from taichi_mrf.calibration.fit import LearntNoise
 from taichi_mrf.calibration.frustum_picture import frustum_picture
 from taichi_mrf.calibration.noise_pictures import curves_picture, maps_picture
-from taichi_mrf.export.atomic import atomic_path, write_npz, write_text
+from taichi_mrf.system.atomic import atomic_path, write_npz, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

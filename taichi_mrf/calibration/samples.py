@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.calibration.options import CalibrationConfig
 from taichi_mrf.calibration.pairs import DepthPair
-from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import LEAST_SIGMA_M
 
 HISTOGRAM_BINS = 128

@@ -19,7 +19,7 @@ from taichi_mrf.cluster.processes import ProcessDiedError, TaskProcesses
 from taichi_mrf.cluster.runner import ATTEMPTS, R, T, TaskLostError, gather, nothing
 from taichi_mrf.cluster.share import environment_of, threads_for
 from taichi_mrf.errors import ClusterError
-from taichi_mrf.libraries import library
+from taichi_mrf.system.libraries import library
 
 LOCAL = "local"
 """In place of a scheduler's address: a cluster of Dask's own on this machine."""

@@ -2,7 +2,7 @@
 
 import os
 
-from taichi_mrf import devices
+from taichi_mrf.system import devices
 
 VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"
 THREADS = ("TI_CPU_MAX_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")

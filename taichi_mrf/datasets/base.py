@@ -5,10 +5,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.errors import ConfigError, DatasetError
-from taichi_mrf.frame import Frame
-from taichi_mrf.poses import Pose, look_at
+from taichi_mrf.geometry.poses import Pose, look_at
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.frame import Frame
 
 DISTORTION_COUNTS = (4, 5, 8)
 """How many distortion coefficients a lens may have; OpenCV's other models are not for depth cameras."""
@@ -92,7 +92,7 @@ class Dataset(ABC):
     depth images that have no pose near enough in time. ``distortion`` are OpenCV's coefficients of the images
     as they were recorded, where the recording knows them: :func:`open_dataset` undoes them. If it is
     ``tracked``, the poses of its frames say nothing but where the first was taken: who maps them finds the
-    others (maps/tracking.py). A frame that cannot be read does not stop the others: :meth:`read` raises
+    others (mapping/tracking.py). A frame that cannot be read does not stop the others: :meth:`read` raises
     FrameError for it and the next one can be read.
     """
 

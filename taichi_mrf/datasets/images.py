@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import DatasetError
-from taichi_mrf.npz_file import DEFLATE_RATIO
+from taichi_mrf.system.npz_file import DEFLATE_RATIO
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.config_values import from_dict
+from taichi_mrf.config.values import from_dict
 from taichi_mrf.datasets.base import ReadOptions
+from taichi_mrf.datasets.formats.open3d_json import read_intrinsics
 from taichi_mrf.datasets.images import image_size
-from taichi_mrf.datasets.open3d_json import read_intrinsics
 from taichi_mrf.errors import ConfigError, DatasetError, said
+from taichi_mrf.sensor.camera import PinholeCamera
 
 PRIMESENSE = PinholeCamera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
 """What drivers of PrimeSense cameras (Kinect 1, Xtion) assume, and ROS with them."""

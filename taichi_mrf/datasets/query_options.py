@@ -4,7 +4,7 @@ from typing import TypeVar, get_type_hints
 
 import yaml
 
-from taichi_mrf.config_values import from_dict
+from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import ConfigError, DatasetError
 
 T = TypeVar("T")

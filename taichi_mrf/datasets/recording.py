@@ -10,8 +10,8 @@ from pathlib import Path
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.images import read_color, read_depth
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
-from taichi_mrf.frame import Frame
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.frame import Frame
 
 
 @dataclass(frozen=True)

@@ -11,25 +11,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.datasets import (
-    frames_npz,
-    mesh_sequence,
-    numbered_depth,
-    realsense,
-    replica,
-    ros_bag,
-    scannet,
-    seven_scenes,
-    stereo_file,
-    stereo_pairs,
-    synthetic_corridor,
-    synthetic_room,
-    tum_rgbd,
-)
 from taichi_mrf.datasets.base import Dataset, ReadOptions
+from taichi_mrf.datasets.formats import frames_npz, numbered_depth, replica, scannet, seven_scenes, tum_rgbd
+from taichi_mrf.datasets.realsense import device as realsense
 from taichi_mrf.datasets.resampled import resampled
+from taichi_mrf.datasets.ros import bag as ros_bag
+from taichi_mrf.datasets.stereo import kitti_pairs as stereo_pairs
+from taichi_mrf.datasets.stereo import rig_file as stereo_file
+from taichi_mrf.datasets.synthetic import corridor as synthetic_corridor
+from taichi_mrf.datasets.synthetic import mesh_sequence
+from taichi_mrf.datasets.synthetic import room as synthetic_room
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.sensor.camera import PinholeCamera
 
 
 class FolderFormat(Protocol):

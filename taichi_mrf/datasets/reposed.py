@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.derived import Derived
 from taichi_mrf.errors import LostFrameError
-from taichi_mrf.frame import Frame
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.frame import Frame
 
 
 @dataclass

@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.derived import Derived
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
-from taichi_mrf.frame import Frame
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.frame import Frame
 
 
 @dataclass

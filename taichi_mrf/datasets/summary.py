@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.sensor.camera import PinholeCamera
 
 LOOKED_AT = 8
 """Frames, evenly spread, that a summary reads."""

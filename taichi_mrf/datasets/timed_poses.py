@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.trajectories import pose_from_quaternion, read_trajectory
 from taichi_mrf.errors import DatasetError, KeyframeError
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
 
 INTERPOLATION_GAP = 0.1
 """Seconds that a neighbouring pose may be away from an image if nothing else is said: poses at 5 Hz and

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import DatasetError, KeyframeError
-from taichi_mrf.poses import Pose, as_pose
+from taichi_mrf.geometry.poses import Pose, as_pose
 
 Layout = Literal["stamped", "rows", "log"]
 Line = tuple[int, list[float]]

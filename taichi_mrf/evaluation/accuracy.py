@@ -15,13 +15,13 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.config import SensorConfig
+from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.errors import ConfigError, FrameError
 from taichi_mrf.evaluation.depth_error import DepthError, depth_error
-from taichi_mrf.poses import as_pose
+from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.queries.survey import SurfaceSurvey
 from taichi_mrf.queries.view import View
+from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel, NoiseTable, PolynomialNoise
 
 Tolerance = Literal["voxel", "1.5sigma", "5cm", "sensor"]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import FrameError
 from taichi_mrf.evaluation.depth_error import DepthError, pooled_depth_error
-from taichi_mrf.maps.protocol import OccupancyMap
+from taichi_mrf.methods.protocol import OccupancyMap
 
 
 @dataclass(frozen=True)

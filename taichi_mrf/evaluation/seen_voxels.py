@@ -9,16 +9,16 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf import runtime
-from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.errors import FrameError
-from taichi_mrf.inference.rays import pixel_direction
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Mat3, Struct, Template, Vec3, Vec4
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.rays import pixel_direction
+from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK, CHUNK
 from taichi_mrf.voxels.marks import WORDS, Marks, mark, no_marks, voxel_in_window
 from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels, within
-from taichi_mrf.voxels.types import F32, I32, F32Array, I32Array, IVec3, Mat3, Struct, Template, Vec3, Vec4
 from taichi_mrf.voxels.window import Window
 
 SLACK = 0.01

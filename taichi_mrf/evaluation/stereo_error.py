@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.images import read_color
+from taichi_mrf.datasets.stereo.matching import StereoMatching, left_right_consistent, stereo_disparity
 from taichi_mrf.errors import FrameError
-from taichi_mrf.sensor.stereo import StereoMatching, left_right_consistent, stereo_disparity
 
 INLIER_PX = 3.0
 """A match that is off by this many pixels or more is an outlier (as in the KITTI stereo benchmark)."""

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.export.atomic import write_npz
 from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, seen_free_bricks
 from taichi_mrf.queries.points import UNKNOWN, probability
+from taichi_mrf.system.atomic import write_npz
+from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
-from taichi_mrf.voxels.memory import check_memory
 
 _BYTES_PER_VOXEL = 40
 

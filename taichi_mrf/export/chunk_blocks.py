@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config import Config
+from taichi_mrf.config.schema import Config
 from taichi_mrf.export.chunk_store import Chunk, ChunkStore, StoreHeader, new_store
 from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, known_bricks
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS

@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import taichi_mrf
-from taichi_mrf.config import Config, to_yaml
+from taichi_mrf.config.schema import Config, to_yaml
 from taichi_mrf.errors import MapFileError, said
-from taichi_mrf.export.atomic import temporary_name
-from taichi_mrf.libraries import library
+from taichi_mrf.system.atomic import temporary_name
+from taichi_mrf.system.libraries import library
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
 FORMAT = 1

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config import Config
+from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.arrays import write_arrays
 from taichi_mrf.export.chunk_blocks import write_chunks
@@ -27,7 +27,7 @@ _DEFAULTS = ExportOptions()
 
 
 class ExportedMap(QueriedMap, Protocol):
-    """What exports need of a map; every map of maps/protocol.py has it."""
+    """What exports need of a map; every map of methods/protocol.py has it."""
 
     @property
     def config(self) -> Config: ...

@@ -6,7 +6,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from taichi_mrf.export.atomic import atomic_path, write_text
+from taichi_mrf.system.atomic import atomic_path, write_text
 
 OCCUPIED_GREY, FREE_GREY, UNKNOWN_GREY = 0, 254, 205
 OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.export.atomic import atomic_path
-from taichi_mrf.export.colors import LOWEST
 from taichi_mrf.export.ply import write_surface
 from taichi_mrf.export.surface import Surface
-from taichi_mrf.libraries import library
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.system.atomic import atomic_path
+from taichi_mrf.system.libraries import library
+from taichi_mrf.voxels.colors import LOWEST
 
 
 def write_mesh(

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.export.atomic import atomic_path
 from taichi_mrf.export.octree import Nodes, octree_of
 from taichi_mrf.queries.known_bricks import QueriedMap
+from taichi_mrf.system.atomic import atomic_path
 
 FULL_HEADER, BINARY_HEADER = "# Octomap OcTree file", "# Octomap OcTree binary file"
 """First lines, by which OctoMap knows its files."""

@@ -23,8 +23,8 @@ from taichi_mrf.export.octree import (
     voxels_in_z_order,
 )
 from taichi_mrf.queries.known_bricks import Bricks
+from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import VOXELS
-from taichi_mrf.voxels.memory import check_memory
 
 FREE_PROBABILITY, OCCUPIED_PROBABILITY = 0.1192, 0.971
 """What OctoMap gives the leaves of a ``.bt``: the limits at which it clamps."""

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, seen_free_bricks
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN
+from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
-from taichi_mrf.voxels.memory import check_memory
 
 DEPTH = 16
 """Levels between the root and a voxel, in every tree of OctoMap's."""

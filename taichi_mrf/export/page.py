@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.export.atomic import write_text
 from taichi_mrf.export.upright import up_of_map
 from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap
-from taichi_mrf.viewer.eye import Eye
-from taichi_mrf.viewer.look import look_of
+from taichi_mrf.system.atomic import write_text
+from taichi_mrf.viewer.live.options import ViewOptions
 from taichi_mrf.viewer.messages import pack_log_odds
-from taichi_mrf.viewer.options import ViewOptions
-from taichi_mrf.viewer.server import start_server
-from taichi_mrf.viewer.voxel_layer import VoxelLayer
+from taichi_mrf.viewer.scene.look import look_of
+from taichi_mrf.viewer.scene.viewpoint import Eye
+from taichi_mrf.viewer.scene.voxel_layer import VoxelLayer
+from taichi_mrf.viewer.transport.server import start_server
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 
 _NOT_SHOWN = np.float32(-60)

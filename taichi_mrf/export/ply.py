@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.export.atomic import atomic_path
-from taichi_mrf.export.colors import LOWEST, marginal_colors
+from taichi_mrf.system.atomic import atomic_path
+from taichi_mrf.voxels.colors import LOWEST, marginal_colors
 
 _PLACE = [(name, "<f4") for name in ("x", "y", "z")]
 _COLOR = [(name, "u1") for name in ("red", "green", "blue")]

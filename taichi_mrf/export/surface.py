@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.export.colors import marginal_colors
-from taichi_mrf.libraries import library
 from taichi_mrf.queries.box import BoxOfVoxels, voxel_box
 from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, sorted_bricks
+from taichi_mrf.system.libraries import library
+from taichi_mrf.voxels.colors import marginal_colors
 from taichi_mrf.voxels.layout import CHUNK, CHUNK_VOXELS
 
 _ON_GRID = 2e-5

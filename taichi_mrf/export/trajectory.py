@@ -4,8 +4,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from taichi_mrf.datasets.timed_poses import quaternion
-from taichi_mrf.export.atomic import write_text
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.system.atomic import write_text
 
 HEADER = "# stamp tx ty tz qx qy qz qw (T_world_camera, metres; camera axes x right, y down, z forward)"
 

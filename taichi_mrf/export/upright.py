@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.queries.known_bricks import QueriedMap
-from taichi_mrf.viewer.look import Up, up_of, up_vector
+from taichi_mrf.viewer.scene.look import Up, up_of, up_vector
 
 _Z_UP: Up = (2, 1)
 

@@ -27,17 +27,7 @@ from taichi_mrf.factor_graph.potentials import (
 )
 from taichi_mrf.factor_graph.workers import Workers, share_begin
 from taichi_mrf.inference.first_occupied import NEVER, message, next_ahead, next_behind
-from taichi_mrf.voxels.types import (
-    F32,
-    I32,
-    F32Array,
-    F32Array2,
-    I32Array,
-    I64Array,
-    IVec3,
-    Template,
-    Vec5,
-)
+from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, I64Array, IVec3, Template, Vec5
 
 FINE = 2.0**20
 """Beliefs are counted in integers of 1 / FINE: exact to 1e-6, and a million beams fit 64 bits."""

@@ -32,7 +32,7 @@ from taichi_mrf.factor_graph.potentials import (
 )
 from taichi_mrf.factor_graph.workers import Workers, share_begin
 from taichi_mrf.inference.first_occupied import left_alone, message, next_ahead, next_behind
-from taichi_mrf.voxels.types import I32, F32Array2, I32Array, I64Array, IVec3, Template, Vec5
+from taichi_mrf.kernels.types import I32, F32Array2, I32Array, I64Array, IVec3, Template, Vec5
 
 NEVER = 2**29
 """Stands for an infinite cost, in units; far above every energy, and its double still fits 32 bits."""

@@ -19,27 +19,16 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf.config import InferenceConfig, SensorConfig, VolumeConfig
+from taichi_mrf.config.schema import InferenceConfig, SensorConfig, VolumeConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.factor_graph.beams import BrickCells
 from taichi_mrf.factor_graph.graph import FactorGraph, check_capacity
 from taichi_mrf.factor_graph.kernels import count_degrees
 from taichi_mrf.inference.keyframe import Keyframe
-from taichi_mrf.inference.log_odds import softplus
-from taichi_mrf.inference.rays import pixel_direction
 from taichi_mrf.inference.sum_product import TINY
 from taichi_mrf.inference.sweep import LIKELIHOODS
-from taichi_mrf.sensor.forward import (
-    SUPPORT,
-    PixelNoise,
-    beyond_likelihood,
-    depth_of_deviation,
-    pixel_noise,
-    surface_likelihood,
-)
-from taichi_mrf.voxels.pool import BrickPool
-from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
-from taichi_mrf.voxels.types import (
+from taichi_mrf.kernels.log_odds import softplus
+from taichi_mrf.kernels.types import (
     F32,
     I32,
     AnyArray,
@@ -54,6 +43,17 @@ from taichi_mrf.voxels.types import (
     Vec3,
     Vec4,
 )
+from taichi_mrf.sensor.forward import (
+    SUPPORT,
+    PixelNoise,
+    beyond_likelihood,
+    depth_of_deviation,
+    pixel_noise,
+    surface_likelihood,
+)
+from taichi_mrf.sensor.rays import pixel_direction
+from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
 from taichi_mrf.voxels.window import WindowIndex
 
 

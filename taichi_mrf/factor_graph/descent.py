@@ -12,7 +12,7 @@ from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.flips import SPREAD, find_firsts, flip, flip_change
 from taichi_mrf.factor_graph.graph import FactorGraph
 from taichi_mrf.factor_graph.potentials import model_kind, sensor_vector, tables
-from taichi_mrf.voxels.types import I32, AnyArray, F32Array2, I32Array, IVec3, Template, Vec5
+from taichi_mrf.kernels.types import I32, AnyArray, F32Array2, I32Array, IVec3, Template, Vec5
 
 
 @ti.kernel

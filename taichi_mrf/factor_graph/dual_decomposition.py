@@ -38,7 +38,7 @@ from taichi_mrf.factor_graph.potentials import (
     tables,
 )
 from taichi_mrf.inference.first_occupied import left_alone, next_behind
-from taichi_mrf.voxels.types import I32, F32Array2, I32Array, I64Array, IVec3, Template, Vec5
+from taichi_mrf.kernels.types import I32, F32Array2, I32Array, I64Array, IVec3, Template, Vec5
 
 
 @ti.func

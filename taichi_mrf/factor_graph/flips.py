@@ -9,7 +9,7 @@ along the beam. Several labellings may be kept at once, one behind the other: a 
 import taichi as ti
 
 from taichi_mrf.factor_graph.potentials import beam_of, energy_of, to_units
-from taichi_mrf.voxels.types import I32, I32Array, IVec3, Template, Vec5
+from taichi_mrf.kernels.types import I32, I32Array, IVec3, Template, Vec5
 
 SPREAD = 512
 """Taichi gives a CPU thread no fewer iterations of a loop at a time: one long task stands for that many."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.factor_graph.beams import Beams, BrickCells, Grid
 from taichi_mrf.factor_graph.kernels import count_cells, count_degrees, write_beams_of_cells, write_cells
-from taichi_mrf.voxels.memory import available_bytes
+from taichi_mrf.system.memory import available_bytes
 
 EDGE_BYTES = 4 + 6 + 4
 """A cell's number; a beam's number and step in the cell's list; a message."""

@@ -7,7 +7,7 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.graph import FactorGraph
-from taichi_mrf.voxels.types import I32Array
+from taichi_mrf.kernels.types import I32Array
 
 
 @ti.kernel

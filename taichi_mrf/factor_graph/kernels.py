@@ -2,9 +2,9 @@
 
 import taichi as ti
 
+from taichi_mrf.kernels.types import F32, AnyArray, F32Array2, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.traversal import advance, enter, leave_at, make_ray, within
-from taichi_mrf.voxels.types import F32, AnyArray, F32Array2, I32Array, IVec3, Struct, Template, Vec3
 
 
 @ti.dataclass

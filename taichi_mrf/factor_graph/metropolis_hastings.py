@@ -23,7 +23,7 @@ from taichi_mrf.factor_graph.potentials import (
     tables,
 )
 from taichi_mrf.factor_graph.random_numbers import random_bits, uniform
-from taichi_mrf.voxels.types import I32, AnyArray, F32Array2, I32Array, I64Array, IVec3, Template, Vec5
+from taichi_mrf.kernels.types import I32, AnyArray, F32Array2, I32Array, I64Array, IVec3, Template, Vec5
 
 PROPOSAL, ACCEPTANCE = 0, 1
 """What a random number is for."""

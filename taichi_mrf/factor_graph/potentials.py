@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.graph import FactorGraph
-from taichi_mrf.voxels.types import (
+from taichi_mrf.kernels.types import (
     F32,
     I32,
     F32Array2,

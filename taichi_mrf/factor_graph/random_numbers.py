@@ -2,7 +2,7 @@
 
 import taichi as ti
 
-from taichi_mrf.voxels.types import F32, Template
+from taichi_mrf.kernels.types import F32, Template
 
 
 @ti.func

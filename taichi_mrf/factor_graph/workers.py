@@ -2,9 +2,9 @@
 
 import taichi as ti
 
-from taichi_mrf import runtime
 from taichi_mrf.factor_graph.graph import FactorGraph
-from taichi_mrf.voxels.types import I32
+from taichi_mrf.kernels.types import I32
+from taichi_mrf.system import runtime
 
 SCRATCH_BYTES = 256 << 20
 """Most scratch on a GPU."""

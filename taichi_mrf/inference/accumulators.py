@@ -12,10 +12,10 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.kernels.types import F32, I32, Template
+from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.voxels.layout import BRICK
-from taichi_mrf.voxels.types import F32, I32, Template
 from taichi_mrf.voxels.window import Window
 
 LONGEST = math.sqrt(3.0)

@@ -24,8 +24,8 @@ and integers (of 1 / UNITS) do not overflow. Minimising, the functions take eith
 
 import taichi as ti
 
-from taichi_mrf.inference.log_odds import softplus
-from taichi_mrf.voxels.types import Template
+from taichi_mrf.kernels.log_odds import softplus
+from taichi_mrf.kernels.types import Template
 
 NEVER = 1e9
 """Stands for the infinite cost of 'one of no cells is occupied'."""

@@ -8,19 +8,12 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf.config import InferenceConfig, SensorConfig, VolumeConfig
+from taichi_mrf.config.schema import InferenceConfig, SensorConfig, VolumeConfig
 from taichi_mrf.errors import CapacityError
+from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import TILE, DepthImage, Footprint, RayList
 from taichi_mrf.inference.ray_list import block_of
-from taichi_mrf.inference.rays import pixel_direction
-from taichi_mrf.poses import Pose
-from taichi_mrf.sensor.forward import depth_of_deviation, pixel_noise
-from taichi_mrf.sensor.noise import LEAST_SIGMA_M, evaluate
-from taichi_mrf.voxels.layout import BRICK, VOXELS
-from taichi_mrf.voxels.memory import check_memory
-from taichi_mrf.voxels.numbering import flat
-from taichi_mrf.voxels.traversal import clip, make_ray, walk_bricks
-from taichi_mrf.voxels.types import (
+from taichi_mrf.kernels.types import (
     F32,
     I32,
     F32Array,
@@ -33,6 +26,13 @@ from taichi_mrf.voxels.types import (
     Vec3,
     Vec4,
 )
+from taichi_mrf.sensor.forward import depth_of_deviation, pixel_noise
+from taichi_mrf.sensor.noise import LEAST_SIGMA_M, evaluate
+from taichi_mrf.sensor.rays import pixel_direction
+from taichi_mrf.system.memory import check_memory
+from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.numbering import flat
+from taichi_mrf.voxels.traversal import clip, make_ray, walk_bricks
 from taichi_mrf.voxels.window import Window
 
 CROSSED, SURFACE = 1, 2

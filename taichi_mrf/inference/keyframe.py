@@ -6,11 +6,11 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.errors import KeyframeError
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.kernels.resident import Resident, on_host, resident
+from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel, NoiseTable
-from taichi_mrf.voxels.resident import Resident, on_host, resident
 from taichi_mrf.voxels.window import Window
 
 Cells = NDArray[np.int32]

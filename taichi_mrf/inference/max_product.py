@@ -10,8 +10,8 @@ one back. A voxel that the ray crosses for the length l is free with probability
 import taichi as ti
 
 from taichi_mrf.inference.first_occupied import message, next_ahead, next_behind
-from taichi_mrf.inference.log_odds import log_of_rest, logistic
-from taichi_mrf.voxels.types import F32, Template, Vec4
+from taichi_mrf.kernels.log_odds import log_of_rest, logistic
+from taichi_mrf.kernels.types import F32, Template, Vec4
 
 
 @ti.func

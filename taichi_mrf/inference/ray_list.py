@@ -11,11 +11,11 @@ import math
 import numpy as np
 import taichi as ti
 
-from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.config import InferenceConfig
+from taichi_mrf.config.schema import InferenceConfig
 from taichi_mrf.inference.keyframe import TILE, DepthImage, RayList
+from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array3, I32Array, Struct, Template
+from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.forward import pixel_noise, sigma_at
-from taichi_mrf.voxels.types import F32, I32, F32Array, F32Array3, I32Array, Struct, Template
 
 LEVELS = 10
 """A block of level n has 2^n pixels: the odd levels put two blocks side by side, the even ones two above each

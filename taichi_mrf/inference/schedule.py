@@ -11,12 +11,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from taichi_mrf import runtime
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.sweep import Sweeper
+from taichi_mrf.kernels.resident import on_host
+from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
-from taichi_mrf.voxels.resident import on_host
 
 
 @dataclass(frozen=True)

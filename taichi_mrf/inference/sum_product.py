@@ -24,22 +24,11 @@ import taichi as ti
 
 from taichi_mrf.inference.accumulators import add_message, length_sum, mean_message
 from taichi_mrf.inference.first_occupied import NEVER
-from taichi_mrf.inference.log_odds import clamped_log_odds, exp_of_negative, logistic, softplus
 from taichi_mrf.inference.max_product import best_message, cost, see_best
 from taichi_mrf.inference.ray_list import block_of
-from taichi_mrf.inference.rays import deals, dealt_ray, pixel_direction
-from taichi_mrf.sensor.forward import (
-    SUPPORT,
-    PixelNoise,
-    beyond_likelihood,
-    depth_of_deviation,
-    pixel_noise,
-    surface_likelihood,
-)
-from taichi_mrf.voxels.layout import VOXELS
-from taichi_mrf.voxels.strips import strip_begin
-from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
-from taichi_mrf.voxels.types import (
+from taichi_mrf.kernels.log_odds import clamped_log_odds, exp_of_negative, logistic, softplus
+from taichi_mrf.kernels.strips import strip_begin
+from taichi_mrf.kernels.types import (
     F32,
     I32,
     AnyArray,
@@ -55,6 +44,17 @@ from taichi_mrf.voxels.types import (
     Vec4,
     Vec4Array,
 )
+from taichi_mrf.sensor.forward import (
+    SUPPORT,
+    PixelNoise,
+    beyond_likelihood,
+    depth_of_deviation,
+    pixel_noise,
+    surface_likelihood,
+)
+from taichi_mrf.sensor.rays import deals, dealt_ray, pixel_direction
+from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
 
 TINY = 1e-30
 """Keeps a ray that explains nothing, without an outlier floor, from dividing zero by zero."""
@@ -86,7 +86,7 @@ def cavity(
     """Eq. 6: what a voxel tells this keyframe's rays is all that it knows but from them.
 
     Writes log(1 - m) for each voxel, its log-odds bounded by ``lowest`` and ``highest``, and empties the
-    sums. ``strip``: voxels an iteration (voxels/strips.py), here and below.
+    sums. ``strip``: voxels an iteration (kernels/strips.py), here and below.
     """
     for part in range(slots.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, slots, strip)

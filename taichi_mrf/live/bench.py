@@ -15,16 +15,16 @@ import websockets
 from websockets.asyncio.client import connect
 from websockets.typing import Origin, Subprotocol
 
-from taichi_mrf.config import Config
+from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import TaichiMRFError
-from taichi_mrf.frame import Frame
 from taichi_mrf.live.publish import Publisher
-from taichi_mrf.maps.create import create_map
-from taichi_mrf.viewer.look import up_of
-from taichi_mrf.viewer.map_scene import MapScene
+from taichi_mrf.methods.registry import create_map
+from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.viewer.live.options import ViewOptions
 from taichi_mrf.viewer.messages import Bricks, Hello
-from taichi_mrf.viewer.options import ViewOptions
-from taichi_mrf.viewer.server import start_server
+from taichi_mrf.viewer.scene.look import up_of
+from taichi_mrf.viewer.scene.map_scene import MapScene
+from taichi_mrf.viewer.transport.server import start_server
 
 _QUIET_S = 0.3
 """A client that has got nothing for so long has got everything."""

@@ -4,7 +4,7 @@ import dataclasses
 import time
 
 from taichi_mrf.inference.schedule import Progress
-from taichi_mrf.live.beside import Beside
+from taichi_mrf.live.baseline_overlay import Beside
 from taichi_mrf.live.pictures import view_images
 from taichi_mrf.live.run import Run
 from taichi_mrf.viewer.messages import Notice, Watch

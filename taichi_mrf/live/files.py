@@ -4,13 +4,13 @@ import tempfile
 from pathlib import Path
 from typing import Literal
 
-from taichi_mrf.config import Config
-from taichi_mrf.config_text import commented_yaml
-from taichi_mrf.export.atomic import write_text
+from taichi_mrf.config.schema import Config
+from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.export.ply import write_voxels
 from taichi_mrf.export.trajectory import write_trajectory
-from taichi_mrf.maps.protocol import OccupancyMap
-from taichi_mrf.maps.tracking import Track
+from taichi_mrf.mapping.tracking import Track
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.system.atomic import write_text
 
 MAP_FILE, VOXEL_FILE, CONFIG_FILE = "map.npz", "voxels.ply", "config.yaml"
 TRAJECTORY_FILE = "trajectory.txt"

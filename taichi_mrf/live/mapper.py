@@ -10,20 +10,20 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config import PoseConfig
+from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.errors import KeyframeError
-from taichi_mrf.frame import Frame
+from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.inference.schedule import InferProgress
+from taichi_mrf.live.live_keyframes import Entry, Roster
 from taichi_mrf.live.pictures import thumbnail
 from taichi_mrf.live.publish import Publisher
 from taichi_mrf.live.ray_answers import Seer
-from taichi_mrf.live.roster import Entry, Roster
-from taichi_mrf.maps.freezing import surplus
-from taichi_mrf.maps.mrf import MRFMap
-from taichi_mrf.maps.protocol import MappedKeyframe, OccupancyMap
-from taichi_mrf.maps.recursive import RecursiveMap
-from taichi_mrf.maps.refinement import refiner_of
-from taichi_mrf.poses import Pose, as_pose
+from taichi_mrf.mapping.freezing import surplus
+from taichi_mrf.mapping.refinement import refiner_of
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap
+from taichi_mrf.methods.recursive import RecursiveMap
+from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.viewer import messages
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 

@@ -4,14 +4,15 @@ import dataclasses
 from functools import partial
 from pathlib import Path
 
-from taichi_mrf import runtime
-from taichi_mrf.config import Config
-from taichi_mrf.datasets import frames_npz, open_dataset
+from taichi_mrf.config.schema import Config
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.formats import frames_npz
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.live.replay import Replay
 from taichi_mrf.live.run import Source
-from taichi_mrf.maps.create import create_map, load_map
-from taichi_mrf.maps.map_file import open_map_file, read_header
+from taichi_mrf.methods.map_file import open_map_file, read_header
+from taichi_mrf.methods.registry import create_map, load_map
+from taichi_mrf.system import runtime
 
 
 def open_source(

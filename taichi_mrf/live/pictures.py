@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.errors import FrameError
 from taichi_mrf.evaluation.accuracy import NO_ANSWER, NOT_JUDGED, RIGHT, WRONG, judge_view
-from taichi_mrf.maps.protocol import OccupancyMap
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.viewer.messages import Images
 
 THUMBNAIL_WIDTH = 160

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.live.replay import Replay
-from taichi_mrf.maps.statistics import MapStatistics
+from taichi_mrf.methods.statistics import MapStatistics
 from taichi_mrf.viewer.messages import Status
 
 RATE_SECONDS = 5.0

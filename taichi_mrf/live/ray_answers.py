@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.errors import KeyframeError
-from taichi_mrf.maps.protocol import OccupancyMap
-from taichi_mrf.poses import Pose, inverse
+from taichi_mrf.geometry.poses import Pose, inverse
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import LEAST_SIGMA_M, NoiseTable, evaluate
 from taichi_mrf.viewer.messages import RayAnswer
 

@@ -7,9 +7,9 @@ import numpy as np
 
 from taichi_mrf.live.extras import Extras
 from taichi_mrf.live.files import file_content
+from taichi_mrf.live.live_keyframes import Entry
 from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.live.ray_answers import pixel_answer, point_answer
-from taichi_mrf.live.roster import Entry
 from taichi_mrf.live.run import Run
 from taichi_mrf.viewer.messages import (
     File,

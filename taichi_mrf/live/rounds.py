@@ -8,12 +8,12 @@ that makes the keyframes' depth less likely is taken back, and so is one that is
 import time
 from collections.abc import Callable, Mapping
 
+from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.schedule import InferProgress
+from taichi_mrf.live.live_keyframes import Entry
 from taichi_mrf.live.mapper import Mapper
-from taichi_mrf.live.roster import Entry
-from taichi_mrf.maps.mrf import MRFMap
-from taichi_mrf.maps.refinement import PoseRefiner, has_settled, is_worse
-from taichi_mrf.poses import Pose
+from taichi_mrf.mapping.refinement import PoseRefiner, has_settled, is_worse
+from taichi_mrf.methods.mrf.map import MRFMap
 
 GoOn = Callable[[str, float], bool]
 """Told what is being done and how much of that is; says whether to go on."""

@@ -5,17 +5,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from taichi_mrf import runtime
-from taichi_mrf.config import Config, to_yaml
+from taichi_mrf.config.schema import Config, to_yaml
 from taichi_mrf.errors import CapacityError, LostFrameError
-from taichi_mrf.frame import Frame
 from taichi_mrf.live.link import Link
+from taichi_mrf.live.live_keyframes import Entry
 from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.live.progress import Progress
 from taichi_mrf.live.replay import Replay
-from taichi_mrf.live.roster import Entry
-from taichi_mrf.maps.protocol import OccupancyMap
-from taichi_mrf.maps.tracking import Track, tracker_of
+from taichi_mrf.mapping.tracking import Track, tracker_of
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.system import runtime
 from taichi_mrf.viewer.messages import CurrentCamera, Hello, Keyframe, Notice, Request, Update
 
 WAY_BACK = "bring the camera back to where it was then, or to where it started"

@@ -17,18 +17,18 @@ from collections import deque
 from collections.abc import Callable
 
 from taichi_mrf.errors import CapacityError
-from taichi_mrf.frame import Frame
 from taichi_mrf.inference.schedule import InferProgress
-from taichi_mrf.keyframes import KeyframeSelector
 from taichi_mrf.live.extras import Extras
 from taichi_mrf.live.link import Link
+from taichi_mrf.live.live_keyframes import Entry
 from taichi_mrf.live.progress import sweeping
 from taichi_mrf.live.replay import BrokenFrame, Replay
 from taichi_mrf.live.requests import EDITS, Requests, goes_on
-from taichi_mrf.live.roster import Entry
 from taichi_mrf.live.rounds import Rounds
 from taichi_mrf.live.run import Policy, Run, Source
-from taichi_mrf.maps.tracking import keyframe_steps
+from taichi_mrf.mapping.keyframe_selector import KeyframeSelector
+from taichi_mrf.mapping.tracking import keyframe_steps
+from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.viewer.messages import Listening, Notice, Request
 
 WAIT_SECONDS = 0.25

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, bricks_between, known_bricks
 from taichi_mrf.queries.points import probability
+from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK
-from taichi_mrf.voxels.memory import check_memory
 
 _BYTES_PER_VOXEL = 13
 """Log-odds as they are read, the same in the order of the box, the states, and what is made of them."""

@@ -7,13 +7,13 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf import runtime
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.queries.ray_space import RaySpace
+from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
-from taichi_mrf.voxels.types import F32, I32, F32Array, F32Array2, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.voxels.window import Window
 
 Unknown = Literal["free", "stop", "hit"]

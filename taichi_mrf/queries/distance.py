@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.libraries import library
 from taichi_mrf.queries.box import voxel_box, voxels_of_box
 from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.queries.points import FREE, OCCUPIED, checked_points
-from taichi_mrf.voxels.memory import check_memory
+from taichi_mrf.system.libraries import library
+from taichi_mrf.system.memory import check_memory
 
 _BYTES_PER_VOXEL = 40
 """What SciPy's transform takes at its peak."""

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.libraries import library
 from taichi_mrf.queries.box import voxel_box
 from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, known_bricks, sorted_bricks
 from taichi_mrf.queries.points import FREE, UNKNOWN
+from taichi_mrf.system.libraries import library
 from taichi_mrf.voxels.layout import CHUNK, CHUNK_VOXELS, grid_keys
 
 _HALF_OF_NEIGHBOURS = np.stack(np.unravel_index(np.arange(14, 27), (3, 3, 3)), axis=1) - 1

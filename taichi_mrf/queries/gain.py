@@ -16,18 +16,18 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf import runtime
-from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.inference.log_odds import exp_of_negative, logistic
-from taichi_mrf.inference.rays import pixel_direction
-from taichi_mrf.poses import Pose, as_pose
+from taichi_mrf.geometry.poses import Pose, as_pose
+from taichi_mrf.kernels.log_odds import exp_of_negative, logistic
+from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Mat3, Struct, Template, Vec3, Vec4
 from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.queries.occlusion import occlusion, stopped_share
 from taichi_mrf.queries.ray_space import RaySpace
 from taichi_mrf.queries.survey import OPAQUE
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.rays import pixel_direction
+from taichi_mrf.system import runtime
 from taichi_mrf.voxels.traversal import FAR, clip, make_ray, walk_voxels
-from taichi_mrf.voxels.types import F32, I32, F32Array, I32Array, IVec3, Mat3, Struct, Template, Vec3, Vec4
 
 _THINNEST = 1e-6
 """Below this thickness a voxel dims nothing, and the integral of the visibility is the length."""

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.queries.points import FREE, classify
 from taichi_mrf.queries.view import View
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, grid_keys
@@ -31,7 +31,7 @@ class Placed(Protocol):
 
 
 class QueriedMap(Protocol):
-    """What queries over space need of a map; every map of maps/protocol.py has it."""
+    """What queries over space need of a map; every map of methods/protocol.py has it."""
 
     voxel_size: float
     view: View

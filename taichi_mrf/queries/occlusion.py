@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from taichi_mrf.inference.log_odds import softplus
+from taichi_mrf.kernels.log_odds import softplus
+from taichi_mrf.kernels.types import F32
 from taichi_mrf.voxels.traversal import FAR
-from taichi_mrf.voxels.types import F32
 
 
 @dataclass(frozen=True)

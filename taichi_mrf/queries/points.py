@@ -4,12 +4,12 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf import runtime
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.kernels.types import F32Array, I32Array
+from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology
-from taichi_mrf.voxels.types import F32Array, I32Array
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 """What a place can be. Free is seen to be empty; unknown was never seen or nothing was learnt of it."""

@@ -6,10 +6,10 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf.inference.log_odds import logistic
+from taichi_mrf.kernels.log_odds import logistic
+from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.queries.occlusion import occlusion
 from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
-from taichi_mrf.voxels.types import F32, I32, F32Array, I32Array, IVec3, Struct, Template, Vec3
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from contextlib import contextmanager
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf import runtime
 from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, seen_free_bricks
+from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK, VOXELS, grid_keys
 from taichi_mrf.voxels.window import Window
 

@@ -11,12 +11,8 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf.inference.log_odds import exp_of_negative
-from taichi_mrf.inference.rays import pixel_direction
-from taichi_mrf.queries.occlusion import occlusion, stopped_share
-from taichi_mrf.sensor.forward import SEGMENT, PixelNoise, pixel_noise, surface_likelihood
-from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
-from taichi_mrf.voxels.types import (
+from taichi_mrf.kernels.log_odds import exp_of_negative
+from taichi_mrf.kernels.types import (
     F32,
     I32,
     F32Array,
@@ -30,6 +26,10 @@ from taichi_mrf.voxels.types import (
     Vec4,
     Vec5,
 )
+from taichi_mrf.queries.occlusion import occlusion, stopped_share
+from taichi_mrf.sensor.forward import SEGMENT, PixelNoise, pixel_noise, surface_likelihood
+from taichi_mrf.sensor.rays import pixel_direction
+from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
 
 OPAQUE = 1e-3
 """A ray that has lost this much of its visibility meets nothing more."""

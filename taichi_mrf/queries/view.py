@@ -6,15 +6,15 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf import runtime
-from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.config import VolumeConfig
+from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.queries.profile import RayProfile, profile_ray
 from taichi_mrf.queries.survey import SurfaceSurvey, survey_rays
+from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import NoiseTable
+from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.traversal import FAR

@@ -1,0 +1,4 @@
+"""The sensor: cameras, noise, the likelihood of a measurement, simulated noise.
+
+Uses `voxels` and the packages below it.
+"""

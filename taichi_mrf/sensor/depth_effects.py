@@ -6,7 +6,7 @@ All functions take clean axial depth in metres, (H, W) float64, where 0 means th
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.camera import PinholeCamera
+from taichi_mrf.sensor.camera import PinholeCamera
 
 Image = NDArray[np.float64]
 

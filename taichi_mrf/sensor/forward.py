@@ -6,8 +6,8 @@ what noise is learnt in. Functions for Taichi kernels; each is tested against a 
 
 import taichi as ti
 
+from taichi_mrf.kernels.types import F32, I32, Struct, Template, Vec5
 from taichi_mrf.sensor.noise import LEAST_SIGMA_M, TERMS
-from taichi_mrf.voxels.types import F32, I32, Struct, Template, Vec5
 
 AUTO, SEGMENT, CENTRE = 0, 1, 2
 """How a segment of the ray stands for its surface: see InferenceConfig.likelihood."""

@@ -14,10 +14,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.config import SensorConfig
+from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.errors import ConfigError, said
-from taichi_mrf.npz_file import open_npz, read_npy
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system.npz_file import open_npz, read_npy
 
 TERMS = 5
 """Coefficients of a polynomial in the kernels: up to degree 4, padded with zeros."""

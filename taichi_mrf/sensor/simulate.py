@@ -12,8 +12,8 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
-from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.errors import FrameError
+from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.depth_effects import at_a_jump, in_disparity_steps, incidence, sampled_beside
 from taichi_mrf.sensor.noise import NoiseModel
 

@@ -7,13 +7,13 @@ from typing import Any
 
 import yaml
 
-from taichi_mrf.config import Config, to_yaml
-from taichi_mrf.config_text import differences
-from taichi_mrf.config_values import from_dict
+from taichi_mrf.config.schema import Config, to_yaml
+from taichi_mrf.config.text import differences
+from taichi_mrf.config.values import from_dict
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.errors import MapFileError, said
-from taichi_mrf.export.atomic import write_text
 from taichi_mrf.submaps.plan import Plan, Submap
+from taichi_mrf.system.atomic import write_text
 
 PLAN_FILE = "plan.json"
 

@@ -5,12 +5,12 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf import runtime
-from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.config import Config
+from taichi_mrf.config.schema import Config
 from taichi_mrf.inference.messages import withdraw_messages
-from taichi_mrf.maps.mrf import MRFMap
+from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.queries.known_bricks import sorted_bricks
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system import runtime
 
 Bricks = NDArray[np.int32]
 """(n, 3) brick coordinates in the world."""

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config_values import from_dict
+from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import ConfigError, MapFileError
-from taichi_mrf.export.atomic import write_npz
-from taichi_mrf.npz_file import NpzFile, open_npz
+from taichi_mrf.system.atomic import write_npz
+from taichi_mrf.system.npz_file import NpzFile, open_npz
 from taichi_mrf.voxels.layout import VOXELS
 
 Bricks = NDArray[np.int32]

@@ -8,16 +8,16 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from taichi_mrf.cluster.runner import TaskRunner
-from taichi_mrf.config import Config
-from taichi_mrf.config_values import from_dict
+from taichi_mrf.config.schema import Config
+from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import ConfigError, MapFileError
-from taichi_mrf.export.atomic import write_text
 from taichi_mrf.submaps.job import PLAN_FILE, Job, Sequence
 from taichi_mrf.submaps.merge import merge_submaps
 from taichi_mrf.submaps.plan import plan_submaps
 from taichi_mrf.submaps.round_files import SubmapReport
 from taichi_mrf.submaps.survey import find_keyframes
 from taichi_mrf.submaps.task import SubmapTask, infer_submap, is_idle
+from taichi_mrf.system.atomic import write_text
 
 SETTLED = 0.001
 """No further round is made when no larger share of all voxels has moved in the last."""

@@ -6,16 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf import runtime
 from taichi_mrf.cluster.runner import TaskRunner
-from taichi_mrf.config import Config
+from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import DatasetError, FrameError
-from taichi_mrf.keyframes import KeyframeSelector
-from taichi_mrf.pipeline import is_held_out
-from taichi_mrf.poses import Pose, as_pose
+from taichi_mrf.geometry.poses import Pose, as_pose
+from taichi_mrf.mapping.keyframe_selector import KeyframeSelector
+from taichi_mrf.mapping.pipeline import is_held_out
 from taichi_mrf.submaps.job import Sequence
 from taichi_mrf.submaps.partial_map import PartialMap
 from taichi_mrf.submaps.plan import SeenKeyframe
+from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import CHUNK
 
 FRAMES_AT_ONCE = 128

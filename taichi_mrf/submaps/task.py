@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf import runtime
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.queries.points import probability
 from taichi_mrf.submaps.job import Job
@@ -28,8 +27,9 @@ from taichi_mrf.submaps.round_files import (
     round_path,
     write_round,
 )
+from taichi_mrf.system import runtime
+from taichi_mrf.system.memory import peak_memory_mb, reset_peak_memory
 from taichi_mrf.voxels.layout import grid_keys
-from taichi_mrf.voxels.memory import peak_memory_mb, reset_peak_memory
 
 MOVED = 0.01
 """A probability that changes by more than this from one round to the next counts as moved."""

@@ -1,0 +1,4 @@
+"""Tuning parameters: trials, their scores, the search.
+
+Uses `mapping`, `evaluation` and `viewer`.
+"""

@@ -15,28 +15,10 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf import runtime
-from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.evaluation.accuracy import OUTLIERS
-from taichi_mrf.inference.log_odds import exp_of_negative
-from taichi_mrf.inference.rays import pixel_direction
-from taichi_mrf.poses import Pose
-from taichi_mrf.queries.occlusion import occlusion, stopped_share
-from taichi_mrf.queries.survey import OPAQUE
-from taichi_mrf.queries.view import View
-from taichi_mrf.sensor.forward import (
-    SUPPORT,
-    PixelNoise,
-    normal_density,
-    normal_tail,
-    pixel_noise,
-    polynomial,
-    sigma_at,
-)
-from taichi_mrf.sensor.noise import NoiseTable
-from taichi_mrf.voxels.layout import BRICK
-from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
-from taichi_mrf.voxels.types import (
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.kernels.log_odds import exp_of_negative
+from taichi_mrf.kernels.types import (
     F32,
     I32,
     F32Array,
@@ -50,6 +32,24 @@ from taichi_mrf.voxels.types import (
     Vec4,
     Vec5,
 )
+from taichi_mrf.queries.occlusion import occlusion, stopped_share
+from taichi_mrf.queries.survey import OPAQUE
+from taichi_mrf.queries.view import View
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.forward import (
+    SUPPORT,
+    PixelNoise,
+    normal_density,
+    normal_tail,
+    pixel_noise,
+    polynomial,
+    sigma_at,
+)
+from taichi_mrf.sensor.noise import NoiseTable
+from taichi_mrf.sensor.rays import pixel_direction
+from taichi_mrf.system import runtime
+from taichi_mrf.voxels.layout import BRICK
+from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
 from taichi_mrf.voxels.window import Window
 
 LEVELS = np.linspace(0.05, 0.95, 19)

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from taichi_mrf.export.atomic import write_text
+from taichi_mrf.system.atomic import write_text
 from taichi_mrf.tune.history import History
 
 TABLE_FILE = "tries.csv"

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.evaluation.accuracy import RIGHT, JudgedView
-from taichi_mrf.frame import Frame
 from taichi_mrf.live.pictures import ACCURACY_COLORS, IMAGE_WIDTH, depth_colors
+from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.tune.history import History
-from taichi_mrf.viewer.tune_messages import HeldOutView
+from taichi_mrf.viewer.tune.messages import HeldOutView
 
 BETTER, WORSE, SAME = (0, 114, 178), (213, 94, 0), (225, 225, 225)
 """Colours of a pixel that is right only now, that was right only before, and of any other."""

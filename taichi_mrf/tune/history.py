@@ -6,11 +6,11 @@ import io
 from dataclasses import dataclass
 from typing import Any
 
-from taichi_mrf.config import Config
-from taichi_mrf.config_text import commented_yaml, differences
+from taichi_mrf.config.schema import Config
+from taichi_mrf.config.text import commented_yaml, differences
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.viewer.tune_messages import By, Tried
-from taichi_mrf.viewer.tune_scores import Scores, figures, scores_in_words
+from taichi_mrf.viewer.tune.messages import By, Tried
+from taichi_mrf.viewer.tune.scores import Scores, figures, scores_in_words
 
 
 @dataclass

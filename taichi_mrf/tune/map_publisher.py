@@ -1,9 +1,9 @@
 """The map of the try that is looked at, on its way to the page: what has changed from the map before."""
 
-from taichi_mrf import runtime
 from taichi_mrf.live.link import Link
 from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.live.outbox import merged
+from taichi_mrf.system import runtime
 from taichi_mrf.tune.trial import Trial
 from taichi_mrf.viewer.messages import Hello
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Hashable
 
 from taichi_mrf.live.outbox import Outbox, Waiting, WaitingBricks
 from taichi_mrf.viewer.messages import Hello, Keyframe, Update
-from taichi_mrf.viewer.tune_messages import Activity, Chosen, HeldOutView, Pinned, Residuals, Tried, Tuning
+from taichi_mrf.viewer.tune.messages import Activity, Chosen, HeldOutView, Pinned, Residuals, Tried, Tuning
 
 LATEST_ONLY = (Tuning, Activity, Pinned, Chosen, Residuals, HeldOutView)
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from taichi_mrf.evaluation.accuracy import JudgedView
-from taichi_mrf.viewer.tune_messages import Residuals
+from taichi_mrf.viewer.tune.messages import Residuals
 
 MOST_POINTS = 1500
 BINS = 12

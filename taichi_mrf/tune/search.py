@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin
 
-from taichi_mrf.config import Config
+from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.libraries import library
+from taichi_mrf.system.libraries import library
 from taichi_mrf.viewer.ranges import Range
-from taichi_mrf.viewer.tune_knobs import KNOBS, Knob
+from taichi_mrf.viewer.tune.knobs import KNOBS, Knob
 
 SIGMA_SCALE = "sensor.sigma_scale"
 """No parameter of its own: all coefficients of sensor.sigma times this."""

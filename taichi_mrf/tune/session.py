@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from taichi_mrf import runtime
-from taichi_mrf.config import Config
+from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import ConfigError, TaichiMRFError
 from taichi_mrf.live.link import Link
+from taichi_mrf.system import runtime
 from taichi_mrf.tune.files import csv_file, yaml_file
 from taichi_mrf.tune.held_out_pictures import HeldOutPictures
 from taichi_mrf.tune.history import Attempt, History
@@ -25,7 +25,7 @@ from taichi_mrf.tune.trial import Trial, run_trial
 from taichi_mrf.tune.verdict import Judged, contenders, judge_unseen
 from taichi_mrf.tune.working_set import WorkingSet, coarse_stride, read_working_set
 from taichi_mrf.viewer.messages import File, Listening, Notice, Quit, Request
-from taichi_mrf.viewer.tune_messages import (
+from taichi_mrf.viewer.tune.messages import (
     Activity,
     By,
     ChooseFrames,

@@ -8,17 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config import Config
+from taichi_mrf.config.schema import Config
 from taichi_mrf.evaluation.accuracy import JudgedView, judge_view
 from taichi_mrf.evaluation.depth_error import pooled_depth_error
-from taichi_mrf.frame import Frame
-from taichi_mrf.keyframes import KeyframeSelector
-from taichi_mrf.maps.create import create_map
-from taichi_mrf.maps.protocol import OccupancyMap
+from taichi_mrf.mapping.keyframe_selector import KeyframeSelector
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.methods.registry import create_map
+from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.tune.depth_intervals import interval_error, probability_below
 from taichi_mrf.tune.voxel_truth import VoxelTruth
 from taichi_mrf.tune.working_set import WorkingSet, thinned
-from taichi_mrf.viewer.tune_scores import Scores
+from taichi_mrf.viewer.tune.scores import Scores
 
 INTERVAL_PIXELS = 5_000
 """Measurements of a view that the calibration of depths is worked out from."""

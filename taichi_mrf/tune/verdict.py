@@ -5,10 +5,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from taichi_mrf.config import Config
+from taichi_mrf.config.schema import Config
 from taichi_mrf.tune.trial import GoOn, run_trial
 from taichi_mrf.tune.working_set import WorkingSet
-from taichi_mrf.viewer.tune_scores import KINDS, Scores
+from taichi_mrf.viewer.tune.scores import KINDS, Scores
 
 SHIPPED, STARTED, FOUND = "shipped defaults", "where the search began", "found"
 

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.datasets import Dataset
-from taichi_mrf.datasets.mesh_scene import TriangleMesh
-from taichi_mrf.evaluation.ground_truth import OccupancyTruth, occupancy_truth
+from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh
 from taichi_mrf.evaluation.occupancy_scores import reliability_bins
-from taichi_mrf.maps.protocol import OccupancyMap
-from taichi_mrf.poses import Pose
+from taichi_mrf.evaluation.occupancy_truth import OccupancyTruth, occupancy_truth
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.sensor.camera import PinholeCamera
 
 MOST_VOXELS = 2_000_000
 """So many voxels are asked for; of more, every second, third, ... one."""
@@ -69,9 +69,9 @@ def truth_of(dataset: Dataset, indices: Sequence[int]) -> VoxelTruth | None:
 
 def _mesh_of(dataset: Dataset) -> TriangleMesh | None:
     # Imported late: most sequences are recorded, and have nothing of the kind.
-    from taichi_mrf.datasets.analytic_mesh import scene_mesh
-    from taichi_mrf.datasets.mesh_sequence import MeshSequence
-    from taichi_mrf.datasets.synthetic_room import SyntheticRoom
+    from taichi_mrf.datasets.synthetic.analytic_mesh import scene_mesh
+    from taichi_mrf.datasets.synthetic.mesh_sequence import MeshSequence
+    from taichi_mrf.datasets.synthetic.room import SyntheticRoom
 
     if isinstance(dataset, SyntheticRoom):
         return scene_mesh(dataset.scene)

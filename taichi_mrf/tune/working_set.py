@@ -9,13 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taichi_mrf.camera import PinholeCamera
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
-from taichi_mrf.frame import Frame
-from taichi_mrf.pipeline import is_held_out
+from taichi_mrf.mapping.pipeline import is_held_out
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.tune.voxel_truth import VoxelTruth, truth_of
-from taichi_mrf.viewer.tune_messages import FrameChoice
+from taichi_mrf.viewer.tune.messages import FrameChoice
 
 LARGEST_STRIDE = 10
 """Frames that are further apart in a recording may not see each other's surfaces any more."""

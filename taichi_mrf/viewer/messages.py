@@ -11,9 +11,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.camera import PinholeCamera
-from taichi_mrf.poses import Pose
-from taichi_mrf.viewer.tune_messages import TuneRequest, TuneUpdate
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.viewer.tune.messages import TuneRequest, TuneUpdate
 
 LOG_ODDS_STEP = 1 / 512
 """Log-odds travel as int16 multiples of this, rounded down, so that their sign, and with it the threshold

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import viser
 
-from taichi_mrf.config_text import field_help
+from taichi_mrf.config.text import field_help
 from taichi_mrf.viewer.ranges import Range
 
 T = TypeVar("T")

@@ -11,10 +11,10 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
+from taichi_mrf.kernels.types import I32, I32Array, IVec3
+from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
-from taichi_mrf.voxels.memory import check_memory
 from taichi_mrf.voxels.numbering import flat, voxel_number
-from taichi_mrf.voxels.types import I32, I32Array, IVec3
 from taichi_mrf.voxels.window import Window
 
 WORD = 32

@@ -2,8 +2,8 @@
 
 import taichi as ti
 
+from taichi_mrf.kernels.types import I32, IVec3
 from taichi_mrf.voxels.layout import BRICK
-from taichi_mrf.voxels.types import I32, IVec3
 
 
 @ti.func

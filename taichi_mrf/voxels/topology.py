@@ -19,9 +19,9 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
+from taichi_mrf.kernels.types import I32, AnyArray, I32Array, IVec3, IVec4, Template
 from taichi_mrf.voxels.layout import BRICK, CHUNK
 from taichi_mrf.voxels.numbering import flat
-from taichi_mrf.voxels.types import I32, AnyArray, I32Array, IVec3, IVec4, Template
 
 Bricks = NDArray[np.int32]
 """(n, 3) brick coordinates in the world."""

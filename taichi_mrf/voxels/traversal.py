@@ -11,9 +11,9 @@ origin + t * direction; what t means (axial depth or range) is up to whoever mad
 
 import taichi as ti
 
+from taichi_mrf.kernels.types import F32, I32, IVec3, Struct, Template, Vec3
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS
 from taichi_mrf.voxels.numbering import flat, voxel_number
-from taichi_mrf.voxels.types import F32, I32, IVec3, Struct, Template, Vec3
 
 FAR = 1e30
 """Stands for 1 / 0 and 'never': finite, because Taichi's fast maths may not keep infinities apart."""

@@ -12,13 +12,13 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf import runtime
-from taichi_mrf.poses import Pose
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.kernels.resident import Resident
+from taichi_mrf.kernels.types import I32, I32Array, IVec3
+from taichi_mrf.system import runtime
+from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS
-from taichi_mrf.voxels.memory import check_memory
 from taichi_mrf.voxels.numbering import flat
-from taichi_mrf.voxels.resident import Resident
-from taichi_mrf.voxels.types import I32, I32Array, IVec3
 
 Vector = NDArray[np.float64]
 

@@ -1,0 +1,70 @@
+"""``taichi-mrf bench``: how long each stage takes here, and how long OctoMap takes for the same."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from taichi_mrf.config.schema import Config
+from taichi_mrf.errors import ConfigError
+
+MODES = ("viewer", "profile", "growth")
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Time what a new keyframe costs a live map, at several voxel sizes, beside OctoMap on the same frames.
+
+    The first frames fill the map; medians are of the last ten (of a quarter, if there are fewer than 40).
+    Example: taichi-mrf bench recording/ --voxel-sizes 0.05 0.02 --plot stages.png
+    """
+
+    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = "synthetic:room"
+    """A folder, whose format is recognised, or a built-in sequence."""
+
+    voxel_sizes: tuple[float, ...] = (0.05, 0.02, 0.01)
+    """Voxel sizes in metres."""
+
+    frames: int = 40
+    """How many frames to map, from the first on."""
+
+    octomap: bool = True
+    """Insert the same frames into OctoMap, where the extra 'bench' is installed."""
+
+    profile: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Say instead where the time goes: every kernel beside the least that its bytes could take, and the
+    host's functions."""
+
+    growth: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Measure instead how a new keyframe's cost and the memory grow with old keyframes that it sees, and with
+    those that it does not: the frames in eight laps, at one place and at places 100 m apart."""
+
+    viewer: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Measure instead what each keyframe costs the live view: time on the server and bytes to a browser."""
+
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write all figures to this file as well."""
+
+    plot: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Draw the figures to this file (.png, .svg or .pdf)."""
+
+    settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
+    """Parameters; the voxel size among them is not used."""
+
+    def __post_init__(self) -> None:
+        if self.frames < 1:
+            raise ConfigError(f"--frames must be at least 1, not {self.frames}")
+        chosen = [f"--{mode}" for mode in MODES if getattr(self, mode)]
+        if len(chosen) > 1:
+            raise ConfigError(f"{' and '.join(chosen)} do not go together")
+        if self.plot is not None and self.viewer:
+            raise ConfigError("--plot has nothing to draw of --viewer")
+        if self.plot is not None and self.plot.suffix not in (".png", ".svg", ".pdf"):
+            raise ConfigError(f"--plot {self.plot}: the file must end in .png, .svg or .pdf")
+
+    def run(self) -> int:
+        """Measure, print and write. Raises TaichiMRFError."""
+        from taichi_mrf.cli.bench_run import run_bench
+
+        return run_bench(self)

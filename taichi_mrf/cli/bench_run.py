@@ -1,0 +1,121 @@
+"""The work of ``taichi-mrf bench``: read the frames, measure what was asked for, print, write and draw."""
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.progress import Progress, TaskID
+from rich.table import Table
+
+from taichi_mrf.cli.bench import Bench
+from taichi_mrf.cli.bench_tables import bench_table, growth_table, profile_tables, viewer_table
+from taichi_mrf.config.schema import Config
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.experiments.speed.bandwidth import copy_bandwidth
+from taichi_mrf.experiments.speed.bench import STEADY_FRAMES, BenchRow, bench_mapping, octomap_available
+from taichi_mrf.experiments.speed.bench_pictures import draw_growth, draw_profiles, draw_stages, write_figure
+from taichi_mrf.experiments.speed.growth import Growth, measure_growth
+from taichi_mrf.experiments.speed.profile import Profile, profile_mapping
+from taichi_mrf.live.bench import bench_viewer
+from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.system import runtime
+from taichi_mrf.system.atomic import write_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Measured = tuple[list[Table], list[dict[str, Any]], "Callable[[], Figure] | None"]
+"""What was measured: tables to print, figures to write, and what draws them, if they can be drawn."""
+
+
+class _Run:
+    """One run of the command: its frames, and the bar that shows how far it is."""
+
+    def __init__(self, options: Bench, console: Console, progress: Progress) -> None:
+        self.options, self.console, self.progress = options, console, progress
+        dataset = open_dataset(options.source, color=False)
+        count = min(options.frames, len(dataset))
+        reading = progress.add_task("reading", total=count)
+        self.frames: list[Frame] = []
+        for i in range(count):
+            self.frames.append(dataset.read(i))
+            progress.advance(reading)
+        sizes = options.voxel_sizes
+        self.configs = [dataclasses.replace(options.settings, voxel_size=size) for size in sizes]
+        choice = runtime.choice()
+        self.device = f"{choice.name}, {choice.device}" if choice else ""
+        path = Path(options.source)
+        name = path.resolve().name if path.exists() else options.source
+        self.title = f"{name}, {count} keyframes, on {self.device}"
+
+    def each_size(self, what: str = "") -> Iterator[tuple[Config, Callable[[int], None]]]:
+        """Each voxel size's parameters, and what is to be told the number of frames done."""
+        for config in self.configs:
+            task = self.progress.add_task(f"{config.voxel_size:g} m{what}", total=len(self.frames))
+            yield config, partial(_advance, self.progress, task)
+
+    def stages(self) -> Measured:
+        with_octomap = self.options.octomap and octomap_available()
+        if self.options.octomap and not with_octomap:
+            line = "OctoMap is left out: pip install 'taichi-mrf[bench]' brings it."
+            self.console.print(line, markup=False)
+        rows: list[BenchRow] = []
+        for config, advance in self.each_size():
+            rows.append(bench_mapping(self.frames, config, with_octomap, advance))
+        draw = partial(draw_stages, rows, self.title)
+        return [bench_table(rows, self.title)], [row.to_json() for row in rows], draw
+
+    def profile(self) -> Measured:
+        bandwidth = copy_bandwidth()
+        measured = max(1, min(STEADY_FRAMES, len(self.frames) // 4))
+        rows: list[Profile] = []
+        for config, advance in self.each_size():
+            rate = bandwidth.bytes_per_second
+            rows.append(profile_mapping(self.frames, config, rate, measured, advance))
+        tables = profile_tables(rows, self.title, bandwidth)
+        figures = [row.to_json() | {"bandwidth": bandwidth.how} for row in rows]
+        return tables, figures, partial(draw_profiles, rows, self.title)
+
+    def growth(self) -> Measured:
+        rows: list[Growth] = []
+        for kind in ("unseen", "seen"):
+            for config, advance in self.each_size(f", {kind}"):
+                rows.append(measure_growth(self.frames, config, kind, advance))
+        rows.sort(key=lambda row: -row.voxel_size)
+        draw = partial(draw_growth, rows, self.title)
+        return [growth_table(rows, self.title)], [row.to_json() for row in rows], draw
+
+    def viewer(self) -> Measured:
+        rows = [bench_viewer(self.frames, config, advance) for config, advance in self.each_size()]
+        figures = [
+            {"voxel_size": config.voxel_size, "keyframes": [dataclasses.asdict(each) for each in row]}
+            for config, row in zip(self.configs, rows, strict=True)
+        ]
+        return [viewer_table(self.options.voxel_sizes, rows, self.title)], figures, None
+
+
+def run_bench(options: Bench) -> int:
+    """Measure, print, write and draw; always 0. Raises TaichiMRFError."""
+    console = Console()
+    wanted = options.settings.runtime
+    runtime.init(wanted.arch, wanted.threads, wanted.debug, options.profile)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        run = _Run(options, console, progress)
+        mode = next((name for name in ("viewer", "profile", "growth") if getattr(options, name)), "stages")
+        tables, figures, draw = getattr(run, mode)()
+    for table in tables:
+        console.print(table)
+    if options.json is not None:
+        report = {"device": run.device, "source": options.source, "measured": mode, "rows": figures}
+        write_text(options.json, json.dumps(report, indent=2) + "\n")
+    if options.plot is not None and draw is not None:
+        write_figure(draw(), options.plot)
+    return 0
+
+
+def _advance(progress: Progress, task: TaskID, done: int) -> None:
+    progress.update(task, completed=done)

@@ -1,0 +1,185 @@
+"""``taichi-mrf info``: the backend that would be used, and what else there is; or what is in a source of
+frames."""
+
+import json
+import shlex
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from taichi_mrf.config.schema import Arch
+from taichi_mrf.datasets.source_flags import SourceFlags
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from taichi_mrf.datasets import Dataset
+    from taichi_mrf.datasets.ros.summary import BagSummary
+
+
+@dataclass(frozen=True)
+class Info:
+    """Show the backend that runs here and why, what each backend can do, and versions; or, with SOURCE, what
+    is in a recording and how to map it.
+
+    Example: taichi-mrf info walk.bag
+    """
+
+    source: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
+    """A recording, as map takes it. Of a bag, all topics are listed too."""
+
+    arch: Arch = "auto"
+    """Backend to start."""
+
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the facts as JSON instead of tables."""
+
+    reading: Annotated[SourceFlags, tyro.conf.arg(name="")] = field(default_factory=SourceFlags)
+    """How SOURCE is read."""
+
+    def run(self) -> int:
+        """Print the tables. Raises BackendError, DatasetError."""
+        from rich.console import Console
+
+        console = Console(soft_wrap=False)
+        if self.json:
+            facts = _backend_facts(self.arch) if self.source is None else _source_facts(self)
+            print(json.dumps(facts, indent=2))
+        elif self.source is None:
+            _print_backends(console, self.arch)
+        else:
+            _print_source(console, self.source, self.arch, self.reading)
+        return 0
+
+
+def _backend_facts(arch: Arch) -> dict[str, Any]:
+    from taichi_mrf.system import runtime
+
+    runtime.init(arch)
+    choice = runtime.choice()
+    assert choice is not None
+    return {
+        "backend": choice.name,
+        "device": choice.device,
+        "backends": {
+            status.name: {"device": status.device, "problem": status.problem} for status in runtime.backends()
+        },
+        "versions": runtime.versions(),
+    }
+
+
+def _source_facts(options: Info) -> dict[str, Any]:
+    from taichi_mrf.datasets import open_dataset
+    from taichi_mrf.datasets.registry import bag_path, format_name, is_rendered
+    from taichi_mrf.datasets.ros.summary import summarise as summarise_bag
+    from taichi_mrf.datasets.summary import summarise
+    from taichi_mrf.system import runtime
+
+    assert options.source is not None
+    facts: dict[str, Any] = {"source": options.source}
+    path = bag_path(options.source)
+    if path is not None:
+        bag = summarise_bag(path)
+        facts["topics"] = [
+            {"name": topic.name, "type": topic.type, "messages": topic.messages} for topic in bag.topics
+        ]
+    if is_rendered(options.source):
+        runtime.init(options.arch)
+    dataset = open_dataset(options.source, color=False, **options.reading.keywords())
+    notes = list(dataset.notes)
+    return facts | {"format": format_name(options.source)} | asdict(summarise(dataset)) | {"notes": notes}
+
+
+def _print_backends(console: "Console", arch: Arch) -> None:
+    from rich.table import Table
+
+    from taichi_mrf.system import runtime
+
+    runtime.init(arch)
+    choice = runtime.choice()
+    assert choice is not None
+    table = Table("backend", "here", "can do", title="Backends", title_justify="left")
+    for status in runtime.backends():
+        here = status.device if status.problem is None else f"no: {status.problem}"
+        table.add_row(status.name, here, status.ability)
+    console.print(f"Runs on [bold]{choice.name}[/]: {choice.device}, {choice.reason}.")
+    for name, why in choice.rejected.items():
+        console.print(f"Not on {name}: {why}.")
+    console.print(table)
+    for name, version in runtime.versions().items():
+        console.print(f"{name} {version}", highlight=False)
+
+
+def _print_source(console: "Console", source: str, arch: Arch, reading: SourceFlags) -> None:
+    from taichi_mrf.datasets import open_dataset
+    from taichi_mrf.datasets.registry import bag_path, format_name, is_rendered
+    from taichi_mrf.datasets.ros.summary import summarise as summarise_bag
+    from taichi_mrf.errors import DatasetError
+    from taichi_mrf.system import runtime
+
+    path = bag_path(source)
+    if path is not None:
+        bag = summarise_bag(path)
+        _print_topics(console, bag)
+    if is_rendered(source):
+        runtime.init(arch)
+    try:
+        dataset = open_dataset(source, color=False, **reading.keywords())
+    except DatasetError as error:
+        if path is None:
+            raise
+        _say(console, f"To be mapped it needs more: {error}")
+        for name in bag.sources:
+            _say(console, f"taichi-mrf map {shlex.quote(name)}{bag.flags} --out DIR")
+    else:
+        _print_frames(console, format_name(source), dataset)
+        if path is not None:
+            _say(console, f"taichi-mrf map {shlex.quote(source)} --out DIR")
+
+
+def _print_topics(console: "Console", bag: "BagSummary") -> None:
+    from rich.table import Table
+
+    table = Table(title=f"Topics in {bag.duration:.1f} s", title_justify="left")
+    for heading in ("topic", "type", "messages", "Hz", "holds"):
+        table.add_column(heading, overflow="fold")
+    for topic in bag.topics:
+        rate = bag.rate(topic)
+        hz = "" if rate is None else f"{rate:.1f}"
+        table.add_row(topic.name, topic.type, str(topic.messages), hz, bag.remarks.get(topic.name, ""))
+    console.print(table)
+    for transform in bag.transforms:
+        _say(console, f"tf {transform}")
+
+
+def _print_frames(console: "Console", format_name: str, dataset: "Dataset") -> None:
+    from rich.table import Table
+
+    from taichi_mrf.datasets.summary import summarise
+
+    found, camera = summarise(dataset), dataset.camera
+    table = Table(show_header=False, title=dataset.name, title_justify="left")
+    table.add_column(style="bold")
+    table.add_column()
+    table.add_row("format", format_name)
+    table.add_row("frames", "without end" if found.frames is None else str(found.frames))
+    intrinsics = f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g}"
+    table.add_row("camera", f"{camera.width} x {camera.height}, {intrinsics}")
+    if found.seconds is not None:
+        table.add_row("time", f"{found.seconds:.1f} s")
+    if found.depth_range is not None:
+        low, high = found.depth_range
+        table.add_row(
+            "depth", f"{low:.2f} to {high:.2f} m (1 to 99 %), in {found.measured:.0%} of the pixels"
+        )
+    if found.centre_range is not None:
+        axes = (f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in zip("xyz", *found.centre_range, strict=True))
+        table.add_row("way", f"{', '.join(axes)} m")
+    console.print(table)
+    for note in [*dataset.notes, *([found.problem] if found.problem else [])]:
+        _say(console, f"Note: {note}")
+
+
+def _say(console: "Console", text: str) -> None:
+    console.print(text, markup=False, highlight=False, soft_wrap=True)

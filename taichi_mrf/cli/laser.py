@@ -1,0 +1,139 @@
+"""``taichi-mrf laser``: scans of a 2D laser scanner in, a floor map out."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Literal, get_args
+
+import tyro
+
+from taichi_mrf.config.schema import RuntimeConfig
+from taichi_mrf.config.values import from_dict, read_yaml
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.factor_graph.config import LaserConfig, Method
+
+
+@dataclass(frozen=True)
+class Laser:
+    """Map 2D laser scans with known poses by inference on a factor graph whose factors are whole beams.
+
+    Flags take precedence over the file of --config, and that over the defaults. Ctrl-C ends the method that
+    runs, and keeps the map that it has by then (exit status 130). Example: taichi-mrf laser walk.log.gz --out
+    runs/floor --cell-size 0.05
+    """
+
+    scans: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCANS")]
+    """A CARMEN log (plain or gzip), an npz file of scans or the folder that holds it, or the built-in
+    synthetic:floor-plan."""
+
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
+    """Folder for the results; it is made if need be."""
+
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
+    """A YAML file of parameters, such as the config.yaml of an earlier run."""
+
+    compare: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Run every method, and draw their energies against time and their maps side by side."""
+
+    steps: Annotated[str | None, tyro.conf.arg(metavar="A,B,..")] = None
+    """Run dual decomposition with each of these first steps, and draw their energies against time."""
+
+    truth: Annotated[Path | None, tyro.conf.arg(metavar="IMAGE")] = None
+    """Floor plan to judge the map by, dark where there is a wall, centred on the scans' origin."""
+
+    truth_size: Annotated[str | None, tyro.conf.arg(metavar="W,H")] = None
+    """Width and height of the floor plan's image in metres."""
+
+    every: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Use every N-th scan only."""
+
+    limit: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Use no more than N scans."""
+
+    skip_bad_scans: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Leave broken scans out and count them in the report, instead of stopping at the first."""
+
+    no_returns: Literal["auto", "free", "ignore"] = "auto"
+    """What a beam that did not come back says: that its way is free, or nothing (ignore). auto ignores those
+    of CARMEN logs, most of which met glass or something dark, and believes the others."""
+
+    memory_limit_gb: float = 0.0
+    """Most memory for the factor graph in GB; 0 means what the machine has free."""
+
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the report as JSON, and nothing else, on stdout."""
+
+    settings: Annotated[LaserConfig, tyro.conf.arg(name="")] = field(default_factory=LaserConfig)
+    """Parameters."""
+
+    runtime: RuntimeConfig = field(default_factory=RuntimeConfig)
+    """Where the kernels run."""
+
+    def __post_init__(self) -> None:
+        for name in ("every", "limit"):
+            value = getattr(self, name)
+            if isinstance(value, int) and value < 1:
+                raise ConfigError(f"--{name} must be at least 1, not {value}")
+        if not 0 <= self.memory_limit_gb < math.inf:
+            raise ConfigError(f"--memory-limit-gb must be 0 or a positive number, not {self.memory_limit_gb}")
+        if (self.truth is None) != (self.truth_size is None):
+            raise ConfigError("--truth and --truth-size go together: the image, and how many metres it spans")
+        if self.truth_size is not None:
+            self.truth_size_x_y()
+        if self.compare and self.steps is not None:
+            raise ConfigError("--compare and --steps are two different comparisons: give one of them")
+        self.runs()
+
+    def truth_size_x_y(self) -> tuple[float, float]:
+        """The floor plan's width and height in metres. Raises ConfigError if the text is not two numbers."""
+        try:
+            width, height = map(float, (self.truth_size or "").split(","))
+        except ValueError:
+            width = height = math.nan
+        if not (0 < width < math.inf and 0 < height < math.inf):
+            raise ConfigError(f"--truth-size must be W,H in metres, such as 16,16, not {self.truth_size!r}")
+        return width, height
+
+    def runs(self) -> dict[str, LaserConfig]:
+        """What is to be run, by name: one method, all of them, or the steps. Raises ConfigError."""
+        if self.compare:
+            return {name: replace(self.settings, method=name) for name in get_args(Method)}
+        if self.steps is None:
+            return {self.settings.method: self.settings}
+        runs = {}
+        for text in self.steps.split(","):
+            try:
+                step = float(text)
+            except ValueError:
+                raise ConfigError(
+                    f"--steps must be numbers with commas between them, such as 20,50,100, not {self.steps!r}"
+                ) from None
+            runs[f"dd-step-{step:g}"] = replace(self.settings, method="dd", step=step)
+        return runs
+
+    def run(self) -> int:
+        """Map, write everything, and print the report. Raises TaichiMRFError."""
+        from taichi_mrf.cli.laser_run import run_laser
+
+        return run_laser(self)
+
+
+@dataclass(frozen=True)
+class _Files:
+    """The flag that says which file the other flags change."""
+
+    config: Path | None = None
+
+
+def laser_settings(arguments: Sequence[str]) -> LaserConfig:
+    """The parameters before any flag: those of --config. Raises ConfigError if that file cannot be read."""
+    if {"-h", "--help"} & set(arguments):
+        return LaserConfig()
+    files, _ = tyro.cli(_Files, args=list(arguments), return_unknown_args=True, add_help=False)
+    return LaserConfig() if files.config is None else load_laser_config(files.config)
+
+
+def load_laser_config(path: Path) -> LaserConfig:
+    """Read a YAML file of parameters. Raises ConfigError."""
+    return from_dict(LaserConfig, read_yaml(path), str(path))

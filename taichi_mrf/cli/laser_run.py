@@ -1,0 +1,200 @@
+"""What ``taichi-mrf laser`` does: read scans, build the graph, solve it, judge, write, print."""
+
+import dataclasses
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeElapsedColumn
+
+from taichi_mrf.cli.interrupt import StopRequest, stop_on_signals
+from taichi_mrf.cli.laser import Laser
+from taichi_mrf.cli.laser_files import Outcome, write_comparison, write_energies, write_outcome
+from taichi_mrf.cli.laser_report import comparison_table, laser_report
+from taichi_mrf.cli.output import output_folder
+from taichi_mrf.cli.print_table import print_table
+from taichi_mrf.cli.progress import TransientBar
+from taichi_mrf.cli.report import report_json
+from taichi_mrf.config.text import commented_yaml
+from taichi_mrf.datasets.laser.beams import beams_of
+from taichi_mrf.datasets.laser.plan_image import read_floor_plan
+from taichi_mrf.datasets.laser.readers import open_scans
+from taichi_mrf.datasets.laser.scans import LaserScans
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.evaluation.laser.floor_plan_frame import Registration, register
+from taichi_mrf.evaluation.laser.floor_plan_scores import floor_plan_scores, true_cells
+from taichi_mrf.evaluation.laser.laser_map import LaserMap
+from taichi_mrf.experiments.tables import write_table
+from taichi_mrf.factor_graph.beams import Grid
+from taichi_mrf.factor_graph.graph import FactorGraph, build_graph
+from taichi_mrf.factor_graph.solve import Solution, Step, solve
+from taichi_mrf.system import runtime
+from taichi_mrf.system.atomic import write_text
+
+CONFIG_FILE, REPORT_FILE = "config.yaml", "report.json"
+
+_NO_RETURN_IS_FREE = {"auto": None, "free": True, "ignore": False}
+"""What --no-returns says about a beam that did not come back; None is what the scans' reader knows."""
+
+
+def run_laser(options: Laser) -> int:
+    """Carry out the command; returns the exit status. Raises TaichiMRFError."""
+    console = Console(stderr=options.json)
+    with (
+        output_folder(options.out),
+        stop_on_signals(lambda text: console.print(f"[yellow]{text}[/]")) as request,
+    ):
+        seconds: dict[str, float] = {}
+        with _timed(seconds, "reading"):
+            scans = _some(open_scans(options.scans, skip_bad_scans=options.skip_bad_scans), options)
+            registration = _floor_plan(options, scans)
+            beams = beams_of(scans, options.settings.max_range, _NO_RETURN_IS_FREE[options.no_returns])
+            if len(beams) == 0:
+                raise DatasetError(f"{options.scans}: no beam of the {len(scans)} scans says anything")
+        with _timed(seconds, "graph"):
+            runtime.init(options.runtime.arch, options.runtime.threads, options.runtime.debug)
+            graph = build_graph(beams, options.settings.cell_size, options.memory_limit_gb)
+        with _timed(seconds, "inference"), _EnergyBar(console, options.settings.iterations) as bar:
+            outcomes = _solve_all(options, graph, scans, registration, bar, request)
+        with _timed(seconds, "writing"):
+            written = _write(options, scans, outcomes, registration)
+        interrupted = request()
+        report = laser_report(options.scans, scans, graph, outcomes, registration, seconds, interrupted)
+        write_text(options.out / REPORT_FILE, report_json(report))
+        status = 0 if request.signal is None else 128 + request.signal
+        if options.json:
+            print(report_json(report), end="")
+            return status
+        print_table(console, comparison_table(scans.name, outcomes))
+        console.print(
+            f"{graph.beams:,} beams, {graph.edges:,} edges, {report['cells_seen']:,} cells of "
+            f"{graph.grid.cell_size} m, {report['graph_memory_mb']:.0f} MB",
+            highlight=False,
+        )
+        for note in report["notes"]:
+            console.print(f"Note: {note}", markup=False, highlight=False, soft_wrap=True)
+        if interrupted:
+            console.print("Stopped before the end.", style="yellow")
+        for path in [*written, options.out / REPORT_FILE]:
+            console.print(str(path), markup=False, highlight=False, soft_wrap=True)
+    return status
+
+
+def _some(scans: LaserScans, options: Laser) -> LaserScans:
+    """The scans that --every and --limit leave."""
+    chosen = slice(None, None if options.limit is None else options.limit * options.every, options.every)
+    return dataclasses.replace(
+        scans,
+        range_m=scans.range_m[chosen],
+        pose_x_y_theta=scans.pose_x_y_theta[chosen],
+        hit=scans.hit[chosen],
+    )
+
+
+def _floor_plan(options: Laser, scans: LaserScans) -> Registration | None:
+    """The floor plan that was given, or that comes with the scans, where it fits them."""
+    if options.truth is not None:
+        return register(read_floor_plan(options.truth, options.truth_size_x_y()), scans)
+    return None if scans.floor_plan is None else register(scans.floor_plan, scans)
+
+
+def _solve_all(
+    options: Laser,
+    graph: FactorGraph,
+    scans: LaserScans,
+    registration: Registration | None,
+    bar: "_EnergyBar",
+    request: StopRequest,
+) -> dict[str, Outcome]:
+    """Each run's outcome, until the run is to stop: that of the first is kept in any case."""
+    outcomes: dict[str, Outcome] = {}
+    for name, settings in options.runs().items():
+        if outcomes and request():
+            break
+        bar.begin(name)
+
+        def listen(step: Step) -> bool:
+            bar.show(step)
+            return not request()
+
+        solution = solve(graph, settings, listen)
+        laser_map = _laser_map(graph, solution)
+        scores = None
+        if registration is not None:
+            truth = true_cells(registration.plan, laser_map, scans.pose_x_y_theta[:, :2])
+            scores = floor_plan_scores(laser_map, truth)
+        outcomes[name] = Outcome(solution, laser_map, scores)
+    return outcomes
+
+
+def _laser_map(graph: FactorGraph, solution: Solution) -> LaserMap:
+    grid = graph.grid
+    assert isinstance(grid, Grid)
+    marginals = solution.marginals
+    return LaserMap(
+        occupied=grid.image(solution.labels) > 0,
+        seen=grid.image(graph.connected),
+        marginals=None if marginals is None else np.ascontiguousarray(grid.image(marginals)),
+        cell_size=grid.cell_size,
+        lower_cell=(grid.lower[0], grid.lower[1]),
+    )
+
+
+def _write(
+    options: Laser, scans: LaserScans, outcomes: dict[str, Outcome], registration: Registration | None
+) -> list[Path]:
+    """The maps first: they are what the time went into."""
+    way = scans.pose_x_y_theta[:, :2]
+    written = []
+    several = len(options.runs()) > 1
+    for name, outcome in outcomes.items():
+        folder = options.out / name if several else options.out
+        folder.mkdir(exist_ok=True)
+        written += write_outcome(folder, scans.name, name, outcome, way)
+    if several:
+        written += write_energies(options.out, scans.name, outcomes)
+        maps = {name: outcome.map for name, outcome in outcomes.items()}
+        plan = None if registration is None else registration.plan
+        written += write_comparison(options.out, maps, way, plan)
+        written += write_table(options.out, comparison_table(scans.name, outcomes))
+    write_text(options.out / CONFIG_FILE, commented_yaml(options.settings))
+    return [*written, options.out / CONFIG_FILE]
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    seconds[stage] = time.perf_counter() - start
+
+
+class _EnergyBar(TransientBar):
+    """A bar of the method that runs, with its energy; silent where the output is not a terminal."""
+
+    def __init__(self, console: Console, iterations: int) -> None:
+        super().__init__(
+            console,
+            TextColumn("{task.description:12}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[energy]}"),
+            TimeElapsedColumn(),
+        )
+        self._iterations = iterations
+        self._task: TaskID | None = None
+
+    def begin(self, method: str) -> None:
+        """Take the bar of the method before away."""
+        if self._task is not None:
+            self._progress.remove_task(self._task)
+        self._task = self._progress.add_task(method, total=self._iterations, energy="")
+
+    def show(self, step: Step) -> None:
+        """Move the bar."""
+        assert self._task is not None
+        dual = "" if step.dual is None else f", bound {step.dual:,.0f}"
+        done = min(step.iteration + 1, self._iterations)  # the descent at the end is a step more
+        self._progress.update(self._task, completed=done, energy=f"energy {step.energy:,.0f}{dual}")

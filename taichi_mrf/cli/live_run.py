@@ -1,0 +1,115 @@
+"""What ``taichi-mrf live`` does: start the page, map, and leave the files when it ends."""
+
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+from rich.console import Console
+
+from taichi_mrf.cli.interrupt import StopRequest, stop_on_signals
+from taichi_mrf.cli.live import Live
+from taichi_mrf.cli.output import DID_NOT_FIT, output_folder
+from taichi_mrf.cli.serving import Say, let_the_page_go_first, tell_address, warn_of_host
+from taichi_mrf.config.schema import with_absolute_tables
+from taichi_mrf.errors import TaichiMRFError
+from taichi_mrf.live.link import ViewerLink
+from taichi_mrf.viewer.messages import Listening
+
+SHORTEST_LIFE_SECONDS = 30.0
+"""A viewer that ends sooner than this is not started once more."""
+
+
+def run_live(options: Live) -> int:
+    """Carry out the command; returns the exit status. Raises TaichiMRFError."""
+    console = Console()
+
+    def say(text: str) -> None:
+        console.print(text, highlight=False, soft_wrap=True, markup=False)
+
+    settings = with_absolute_tables(options.poses.parameters(options.settings), Path.cwd())
+    with ExitStack() as stack:
+        if options.out is not None:
+            stack.enter_context(output_folder(options.out))
+        request = stack.enter_context(stop_on_signals(say))
+        warn_of_host(options.host, options.port, "watch and change the map", say)
+        page = _Page(options, say, stack)
+        let_the_page_go_first()
+        # Imported late: the page starts meanwhile, in a process of its own.
+        from taichi_mrf.live.files import write_all
+        from taichi_mrf.live.open_source import open_source
+        from taichi_mrf.live.run import Policy
+        from taichi_mrf.live.session import Session
+
+        source, notes = open_source(
+            options.source,
+            settings,
+            every=options.every,
+            limit=options.limit,
+            speed=options.speed,
+            loop=options.loop,
+            reading=options.reading,
+            track=options.poses.track_poses,
+        )
+        for note in notes:
+            say(note)
+        policy = Policy(options.keep_live, options.out, options.exit_when_done)
+        session = Session(source, page.link, policy, page.listening)
+        problem = _run(session.run, session.reconnect, page, request)
+        if options.out is not None:
+            track = session.state.track if source.tracked else None
+            if track is not None:
+                say(f"tracking: {len(track.frames)} frames found, {track.lost} lost")
+            for path in write_all(session.state.mapper.map, source.config, options.out, track):
+                say(f"wrote {path}")
+    if problem is not None:
+        raise TaichiMRFError(problem)
+    if request.signal is not None:
+        return 128 + request.signal
+    if session.state.full is not None:
+        print(f"taichi-mrf: {session.state.full}; what did fit is mapped", file=sys.stderr)
+        return DID_NOT_FIT
+    return 0
+
+
+class _Page:
+    """The viewer of the moment, and what is told of it on the terminal."""
+
+    def __init__(self, options: Live, say: Say, stack: ExitStack) -> None:
+        self._options, self._say, self._stack = options, say, stack
+        self._wanted_port = options.port
+        self.start()
+
+    def start(self) -> None:
+        """Start a viewer; it is closed with the stack."""
+        self.has_listened, self.started = False, time.monotonic()
+        self.link = self._stack.enter_context(ViewerLink(self._options.host, self._wanted_port))
+
+    def listening(self, where: Listening) -> None:
+        """Tell the user where the page is."""
+        wants_browser = self._options.open and not self.has_listened
+        tell_address(where, "The map", self._wanted_port, wants_browser, self._say)
+        self.has_listened, self._wanted_port = True, where.port
+
+
+def _run(
+    run: Callable[[StopRequest], None],
+    reconnect: Callable[[ViewerLink], None],
+    page: _Page,
+    request: StopRequest,
+) -> str | None:
+    """Map to the end; a viewer that was killed is started once more. Returns what has ended the run, if that
+    was not meant to be."""
+    while True:
+        run(request)
+        lost = page.link.lost
+        if lost is None or request():
+            return None
+        lives_long = time.monotonic() - page.started > SHORTEST_LIFE_SECONDS
+        if not (page.has_listened and lives_long):
+            return lost
+        print(f"taichi-mrf: {lost}; starting another", file=sys.stderr)
+        page.link.close()
+        page.start()
+        reconnect(page.link)

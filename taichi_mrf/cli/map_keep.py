@@ -1,0 +1,105 @@
+"""What a run of ``taichi-mrf map`` keeps on its way, so that a killed one can be resumed, and what it goes on
+with.
+
+The report goes first and says that the run is not finished, the map last: whatever the moment of a kill, the
+files are whole, none of them calls the map finished that is not, and --resume finds a map of its parameters.
+"""
+
+import json
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from taichi_mrf.cli.map import CONFIG_FILE
+from taichi_mrf.config.schema import Config, load
+from taichi_mrf.config.text import commented_yaml, differences
+from taichi_mrf.errors import ConfigError, MapFileError, said
+from taichi_mrf.mapping.pipeline import MappingResult
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.methods.registry import load_map
+from taichi_mrf.system.atomic import write_text
+
+MAP_FILE, REPORT_FILE = "map.npz", "report.json"
+
+MAY_CHANGE = ("inference.sweeps", "inference.tolerance", "runtime.", "volume.memory_limit_gb")
+"""Parameters (or groups) that may differ from those of the run that --resume goes on with."""
+
+MOST_OF_THE_TIME = 0.05
+"""Share of a run's time that saving the map on the way may take."""
+
+_SECTION = {"mrf": "inference.", "log_odds": "log_odds.", "visibility": "visibility."}
+
+
+class Keeper:
+    """Saves the map of a run when it is called and enough time has gone by: ``every_s`` seconds, and so long
+    that saving takes no more than its share. ``report_text`` is the report of an unfinished run."""
+
+    def __init__(
+        self, folder: Path, settings: Config, every_s: float, report_text: Callable[[MappingResult], str]
+    ) -> None:
+        self._folder, self._settings, self._every_s = folder, settings, every_s
+        self._report_text = report_text
+        self._last, self._cost = time.perf_counter(), 0.0
+
+    def __call__(self, result: MappingResult) -> None:
+        """Save what there is, if it is time. What cannot be written is warned of: the run goes on, and there
+        may be room for the files at its end."""
+        begin = time.perf_counter()
+        if begin - self._last < max(self._every_s, self._cost / MOST_OF_THE_TIME):
+            return
+        with result.timed("keeping"):
+            try:
+                write_text(self._folder / REPORT_FILE, self._report_text(result))
+                write_text(self._folder / CONFIG_FILE, commented_yaml(self._settings))
+                result.map.save(self._folder / MAP_FILE)
+            except MapFileError as error:
+                warnings.warn(f"nothing could be kept on the way: {error}", stacklevel=2)
+        self._last = time.perf_counter()
+        self._cost = self._last - begin
+
+
+def resumed_map(folder: Path, settings: Config) -> OccupancyMap | None:
+    """The map of the run to go on with; None if that run was stopped before it wrote one. Raises ConfigError
+    for other parameters than those, MapFileError for a map that cannot be read."""
+    if not (folder / MAP_FILE).exists():
+        return None
+    if (folder / CONFIG_FILE).exists():
+        refuse_changes(folder / CONFIG_FILE, differences(load(folder / CONFIG_FILE), settings))
+    m = load_map(folder / MAP_FILE, settings.volume.memory_limit_gb)
+    # A map knows only what it needs, and of a sensor's noise only the numbers.
+    known = (
+        "voxel_size",
+        "method",
+        "sensor.min_depth",
+        "sensor.max_depth",
+        "volume.",
+        _SECTION[m.config.method],
+    )
+    refuse_changes(
+        folder / MAP_FILE, [name for name in differences(m.config, settings) if name.startswith(known)]
+    )
+    return m
+
+
+def refuse_changes(path: Path, names: list[str]) -> None:
+    """Raise ConfigError if among the ``names`` of the parameters that a resumed run would change there is one
+    that its map depends on; ``path`` has those that it began with."""
+    changed = [name for name in names if not name.startswith(MAY_CHANGE)]
+    if changed:
+        raise ConfigError(
+            f"{path}: made with another {', '.join(changed)}; --resume goes on with the same parameters"
+        )
+
+
+def skipped_before(folder: Path) -> dict[str, str]:
+    """The broken frames that the run before has met and this one does not read again. Raises MapFileError."""
+    path = folder / REPORT_FILE
+    if not path.exists():
+        return {}
+    try:
+        report: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        return {str(name): str(problem) for name, problem in report.get("skipped_frames", {}).items()}
+    except (OSError, ValueError, AttributeError, RecursionError) as error:
+        raise MapFileError(f"{path}: cannot be read: {said(error)}") from error

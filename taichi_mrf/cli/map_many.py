@@ -1,0 +1,184 @@
+"""What ``taichi-mrf map`` does with several sources, or on a cluster: a task for each, and a summary."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+
+import taichi_mrf
+from taichi_mrf.cli.interrupt import StopRequest, interrupt_on_signals
+from taichi_mrf.cli.map import CONFIG_FILE, Map
+from taichi_mrf.cli.map_keep import REPORT_FILE, refuse_changes
+from taichi_mrf.cli.map_process import Outcome, finished_before, map_in_process
+from taichi_mrf.cli.map_run import MapTask, exit_status, map_task, print_run
+from taichi_mrf.cli.map_summary import (
+    Row,
+    accuracy_text,
+    print_summary,
+    summary_csv,
+    summary_json,
+    summary_line,
+    summary_row,
+)
+from taichi_mrf.cli.output import DID_NOT_FIT, output_folder
+from taichi_mrf.cli.progress import TransientBar
+from taichi_mrf.cli.source_names import folder_names
+from taichi_mrf.cluster.choose import open_runner
+from taichi_mrf.config.schema import load
+from taichi_mrf.config.text import commented_yaml, differences
+from taichi_mrf.errors import ClusterError, TaichiMRFError
+from taichi_mrf.evaluation.pictures.contact_sheet import Tile, write_contact_sheet
+from taichi_mrf.system.atomic import write_text
+
+SUMMARY_JSON, SUMMARY_CSV, SUMMARY_PICTURE = "summary.json", "summary.csv", "summary.png"
+_TOP_VIEW = "top_view.png"
+
+
+@dataclass
+class _Batch:
+    """The tasks of a command and what has become of them, by the task's index."""
+
+    options: Map
+    names: list[str]
+    tasks: list[MapTask]
+    outcomes: dict[int, Outcome] = field(default_factory=dict)
+
+    def rows(self) -> list[Row]:
+        """A row for each sequence, in the order in which they were named."""
+        return [self.row(number) for number in range(len(self.tasks))]
+
+    def row(self, number: int) -> Row:
+        """The row of one sequence."""
+        outcome = self.outcomes.get(number, Outcome("not done"))
+        return summary_row(self.names[number], self.tasks[number].source, outcome)
+
+
+def run_many(options: Map) -> int:
+    """Carry out the command; returns the exit status. Raises TaichiMRFError, also after everything is written
+    if a sequence has failed."""
+    console = Console(stderr=options.json)
+    start = time.perf_counter()
+    names = folder_names(options.sources)
+    single = len(names) == 1
+    folders = [options.out] if single else [options.out / name for name in names]
+    tasks = [map_task(options, *each) for each in zip(options.sources, folders, strict=True)]
+    batch = _Batch(options, names, tasks)
+    with (
+        output_folder(options.out),
+        interrupt_on_signals(lambda text: console.print(f"[yellow]{text}[/]")) as request,
+    ):
+        _map_all(batch, console, request)
+        if single and 0 in batch.outcomes:
+            _tell_single(batch, console)
+        elif not single:
+            _tell_all(batch, console, time.perf_counter() - start)
+    if request():
+        return exit_status(request)
+    failed = [row for row in batch.rows() if row.status not in ("mapped", "finished before")]
+    if failed:
+        if single and _did_not_fit(batch.outcomes.get(0)):  # of which its report has told
+            return DID_NOT_FIT
+        problem = failed[0].error or failed[0].status
+        first = problem if single else f"{failed[0].name}: {problem}"
+        others = "" if single else f"{len(failed)} of {len(tasks)} sequences failed, the first: "
+        raise TaichiMRFError(f"{others}{first}")
+    return 0
+
+
+def _did_not_fit(outcome: Outcome | None) -> bool:
+    """Whether there is a map of as much as there was memory for."""
+    return outcome is not None and outcome.report is not None and bool(outcome.report.get("did_not_fit"))
+
+
+def _map_all(batch: _Batch, console: Console, request: StopRequest) -> None:
+    """Fill in the outcomes, as far as nobody asks to stop."""
+    count = len(batch.tasks)
+    columns = (TextColumn("Mapping"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with TransientBar(console, *columns) as bar:
+
+        def done(number: int, outcome: Outcome) -> None:
+            batch.outcomes[number] = outcome
+            bar.count(len(batch.outcomes), count)
+            line = f"[{len(batch.outcomes)}/{count}] {summary_line(batch.row(number))}"
+            console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+        bar.count(0, count)
+        waiting: list[int] = []
+        try:
+            with open_runner(batch.options.jobs, batch.options.scheduler) as runner:
+                waiting = _waiting(batch, done)
+                tasks = [batch.tasks[number] for number in waiting]
+                runner.run(map_in_process, tasks, lambda index, outcome: done(waiting[index], outcome))
+        except KeyboardInterrupt:
+            if request.aborted or not request():
+                raise
+        except ClusterError as error:
+            if not error.lost:
+                raise
+            for index, what in error.lost.items():
+                done(waiting[index], Outcome("failed", error=what))
+
+
+def _waiting(batch: _Batch, done: Callable[[int, Outcome], None]) -> list[int]:
+    """Who has to be mapped: all, or on resume those that are not finished. Whoever does not resume wants new
+    results, and an old report must not pass for a finished run."""
+    if len(batch.tasks) > 1:
+        path, settings = batch.options.out / CONFIG_FILE, batch.tasks[0].settings
+        if batch.options.resume and path.is_file():
+            refuse_changes(path, differences(load(path), settings))
+        write_text(path, commented_yaml(settings))
+    waiting = []
+    for number, task in enumerate(batch.tasks):
+        if not batch.options.resume:
+            (task.out / REPORT_FILE).unlink(missing_ok=True)
+        outcome = finished_before(task)
+        if outcome is None:
+            waiting.append(number)
+        else:
+            done(number, outcome)
+    return waiting
+
+
+def _tell_single(batch: _Batch, console: Console) -> None:
+    outcome, out = batch.outcomes[0], batch.options.out
+    if outcome.report is not None:
+        written = sorted(path for path in out.iterdir() if path.is_file() and not path.name.startswith("."))
+        print_run(console, batch.options, outcome.report, written)
+
+
+def _tell_all(batch: _Batch, console: Console, seconds: float) -> None:
+    """Write and print the summary."""
+    options, rows = batch.options, batch.rows()
+    facts = {
+        "version": taichi_mrf.__version__,
+        "jobs": options.jobs,
+        "scheduler": options.scheduler,
+        "seconds": round(seconds, 3),
+    }
+    text = summary_json(rows, facts)
+    written = [options.out / SUMMARY_JSON, options.out / SUMMARY_CSV]
+    write_text(written[0], text)
+    write_text(written[1], summary_csv(rows))
+    if options.pictures:
+        written.append(options.out / SUMMARY_PICTURE)
+        write_contact_sheet(written[-1], _tiles(rows, [task.out for task in batch.tasks]))
+    if options.json:
+        print(text, end="")
+        return
+    print_summary(console, rows)
+    if any(row.status in ("stopped", "not done") for row in rows):
+        console.print("[yellow]Stopped before the end; --resume goes on from here.[/]")
+    for path in written:
+        console.print(str(path), markup=False, highlight=False, soft_wrap=True)
+
+
+def _tiles(rows: Sequence[Row], folders: Sequence[Path]) -> list[Tile]:
+    return [
+        Tile(row.name, row.status, None, row.error or "")
+        if row.seconds is None
+        else Tile(row.name, f"{accuracy_text(row)}, {row.seconds:.1f} s", folder / _TOP_VIEW)
+        for row, folder in zip(rows, folders, strict=True)
+    ]

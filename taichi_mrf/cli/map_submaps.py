@@ -1,0 +1,153 @@
+"""What ``taichi-mrf map --submap-size`` does: a long sequence in submaps, and one map in chunks out."""
+
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+import taichi_mrf
+from taichi_mrf.cli.interrupt import interrupt_on_signals
+from taichi_mrf.cli.map import CONFIG_FILE, Map
+from taichi_mrf.cli.map_keep import REPORT_FILE
+from taichi_mrf.cli.map_run import exit_status
+from taichi_mrf.cli.output import output_folder
+from taichi_mrf.cli.progress import ProgressBar
+from taichi_mrf.cli.report import report_json
+from taichi_mrf.cluster.choose import open_runner
+from taichi_mrf.config.schema import with_absolute_tables
+from taichi_mrf.config.text import commented_yaml
+from taichi_mrf.datasets.registry import absolute_source
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.evaluation.pictures.submap_picture import write_submap_picture
+from taichi_mrf.methods.chunked import ChunkedMap
+from taichi_mrf.submaps.job import Sequence
+from taichi_mrf.submaps.rounds import SubmapsResult, map_in_submaps
+from taichi_mrf.system.atomic import write_text
+from taichi_mrf.system.libraries import library
+from taichi_mrf.voxels.layout import VOXELS
+
+TASK_FOLDER, MAP_FOLDER, PICTURE_FILE = "submaps", "map.zarr", "submaps.png"
+
+
+def run_submaps(options: Map, submap_size: float) -> int:
+    """Carry out the command; returns the exit status. Raises TaichiMRFError."""
+    console = Console(stderr=options.json)
+    if len(options.sources) != 1:
+        raise ConfigError("--submap-size takes one SOURCE")
+    if options.poses.track_poses:
+        raise ConfigError("--track-poses does not go with --submap-size: no task sees all keyframes")
+    library("zarr", "maps in chunks need", "store")  # said before the work, not after it
+    settings = with_absolute_tables(options.poses.parameters(options.settings), Path.cwd())
+    source = absolute_source(options.sources[0])
+    sequence = Sequence(source, options.reading.keywords(), options.every, options.limit)
+    with (
+        output_folder(options.out),
+        interrupt_on_signals(lambda text: console.print(f"[yellow]{text}[/]")) as request,
+    ):
+        if not options.resume:  # which takes its parameters from here
+            (options.out / REPORT_FILE).unlink(missing_ok=True)
+            write_text(options.out / CONFIG_FILE, commented_yaml(settings))
+        try:
+            with (
+                ProgressBar(console) as progress,
+                open_runner(options.jobs, options.scheduler) as runner,
+            ):
+                result = map_in_submaps(
+                    sequence,
+                    settings,
+                    submap_size,
+                    options.out / TASK_FOLDER,
+                    options.out / MAP_FOLDER,
+                    runner,
+                    rounds=options.rounds,
+                    resume=options.resume,
+                    skip_bad_frames=options.skip_bad_frames,
+                    progress=progress.advance,
+                )
+        except KeyboardInterrupt:
+            if request.aborted or not request():
+                raise
+            console.print("[yellow]Stopped before the end; --resume goes on from here.[/]")
+            return exit_status(request)
+        _tell(console, options, result, _write(options, result))
+    return exit_status(request)
+
+
+def _write(options: Map, result: SubmapsResult) -> list[Path]:
+    """What lies beside the map; returns the names of all."""
+    out = options.out
+    write_text(out / CONFIG_FILE, commented_yaml(result.job.config))
+    written = [out / MAP_FOLDER, out / CONFIG_FILE]
+    write_text(out / REPORT_FILE, report_json(submaps_report(result)))
+    written.append(out / REPORT_FILE)
+    if options.pictures:
+        m = ChunkedMap.open(out / MAP_FOLDER)
+        write_submap_picture(out / PICTURE_FILE, m, result.job.plan, list(result.job.centres_m.values()))
+        written.append(out / PICTURE_FILE)
+    return written
+
+
+def submaps_report(result: SubmapsResult) -> dict[str, Any]:
+    """The facts of a run as plain values, lengths in metres."""
+    job, last = result.job, result.rounds[-1]
+    bricks = sum(each.core_bricks for each in last.submaps)
+    return {
+        "source": job.sequence.source,
+        "method": job.config.method,
+        "version": taichi_mrf.__version__,
+        "keyframes": len(job.centres_m),
+        "voxel_size": job.config.voxel_size,
+        "bricks": bricks,
+        "voxels": bricks * VOXELS,
+        "submap_size": job.submap_size,
+        "submaps": len(job.plan.submaps),
+        "overlap": job.plan.overlap,
+        "sweeps": job.config.inference.sweeps,
+        "rounds": [
+            {"round": each.round, "seconds": each.seconds, "moved": each.moved, "halo_moved": each.halo_moved}
+            for each in result.rounds
+        ],
+        "largest_task": {
+            "keyframes": max(each.keyframes for each in last.submaps),
+            "map_memory_mb": max(each.map_mb for each in last.submaps),
+            "peak_memory_mb": max(each.peak_memory_mb or 0.0 for each in last.submaps),
+        },
+        "seconds": {stage: round(seconds, 3) for stage, seconds in result.seconds.items()},
+        "every": job.sequence.every,
+        "limit": job.sequence.limit,
+        "skipped_frames": job.skipped,
+    }
+
+
+def _tell(console: Console, options: Map, result: SubmapsResult, written: list[Path]) -> None:
+    report = submaps_report(result)
+    if options.json:
+        print(report_json(report), end="")
+        return
+    largest, moved = report["largest_task"], result.rounds[-1].moved
+    seconds = ", ".join(f"{stage} {value:.1f}" for stage, value in report["seconds"].items())
+    table = Table(show_header=False, title=f"Map of {report['source']}", title_justify="left")
+    table.add_column(style="bold")
+    table.add_column()
+    table.add_row("keyframes", f"{report['keyframes']}, each in {report['overlap']:.2f} submaps")
+    table.add_row(
+        "submaps", f"{report['submaps']}, the largest with {largest['keyframes']} keyframes and "
+        f"{largest['map_memory_mb']:.0f} MB",
+    )  # fmt: skip
+    table.add_row("voxels", f"{report['voxels']:,} of {report['voxel_size']} m")
+    table.add_row(
+        "rounds", f"{len(result.rounds) - 1} of exchange"
+        + ("" if moved is None else f"; {moved:.3%} of the voxels moved in the last"),
+    )  # fmt: skip
+    table.add_row("seconds", seconds)
+    console.print(table)
+    for problem in report["skipped_frames"].values():
+        console.print(f"Skipped: {problem}", markup=False, soft_wrap=True)
+    for path in written:
+        console.print(str(path), markup=False, highlight=False, soft_wrap=True)
+    console.print(
+        f"taichi-mrf export {options.out / MAP_FOLDER} --to part.ply --lower X Y Z --upper X Y Z "
+        "takes a box out of it for other programs.",
+        markup=False, highlight=False, soft_wrap=True,
+    )  # fmt: skip

@@ -1,0 +1,118 @@
+"""What ``taichi-mrf tune`` does: start the page, try parameters, and leave the files when it ends."""
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from taichi_mrf.cli.interrupt import stop_on_signals
+from taichi_mrf.cli.output import output_folder
+from taichi_mrf.cli.serving import Say, let_the_page_go_first, tell_address, warn_of_host
+from taichi_mrf.cli.tune import FRAMES_BY_HAND, FRAMES_TO_SEARCH, Tune
+from taichi_mrf.config.schema import with_absolute_tables
+from taichi_mrf.errors import TaichiMRFError
+from taichi_mrf.live.link import ViewerLink
+from taichi_mrf.system.atomic import write_text
+from taichi_mrf.tune.link import NoPage, start_page
+from taichi_mrf.viewer.tune.messages import FrameChoice
+
+if TYPE_CHECKING:
+    from taichi_mrf.tune.history import Attempt
+    from taichi_mrf.tune.search import Search
+    from taichi_mrf.tune.session import TuneSession
+
+
+def run_tune(options: Tune) -> int:
+    """Carry out the command; returns the exit status. Raises TaichiMRFError."""
+    console = Console()
+
+    def say(text: str) -> None:
+        console.print(text, highlight=False, soft_wrap=True, markup=False)
+
+    settings = with_absolute_tables(options.settings, Path.cwd())
+    with ExitStack() as stack:
+        if options.out is not None:
+            stack.enter_context(output_folder(options.out))
+        request = stack.enter_context(stop_on_signals(say))
+        link = _page(options, say, stack) if options.viewer else NoPage()
+        # Imported late: the page starts meanwhile, in a process of its own.
+        from taichi_mrf.datasets import open_dataset
+        from taichi_mrf.errors import DatasetError
+        from taichi_mrf.system import runtime
+        from taichi_mrf.tune.search import DEFAULT_SEARCH, Search
+        from taichi_mrf.tune.session import Policy, TuneSession
+
+        search = None
+        if options.auto is not None:
+            search = Search(settings, options.names or DEFAULT_SEARCH, options.auto, options.seed)
+        runtime.init(settings.runtime.arch, settings.runtime.threads, settings.runtime.debug)
+        dataset = open_dataset(options.source, color=False, **options.reading.keywords())
+        if dataset.tracked:
+            raise DatasetError(f"{options.source}: tune needs poses: map it, and give poses=trajectory.txt")
+        told: set[int] = set()
+        count = options.frames or (FRAMES_TO_SEARCH if search else FRAMES_BY_HAND)
+        session = TuneSession(
+            dataset,
+            settings,
+            FrameChoice(options.first, options.stride, count, options.hold_out),
+            link,
+            Policy(options.out, options.search_stride, leave_when_done=not options.viewer),
+            search=search,
+            listening=lambda where: tell_address(where, "The page", options.port, options.open, say),
+            tried=lambda attempt: _tell_try(attempt, session.search, told, say),
+        )
+        for note in dataset.notes:
+            say(note)
+        frames = session.frames
+        say(
+            f"{len(frames.training)} frames of {frames.source} make the map, {len(frames.held_out)} score it"
+            + (f", {len(frames.unseen)} are kept back for the end" if frames.unseen else "")
+            + f" (from frame {frames.choice.first} on, {frames.choice.stride} apart)"
+        )
+        session.run(request)
+        _finish(session, options, say)
+        lost = link.lost
+    if lost is not None and not request():
+        raise TaichiMRFError(lost)
+    return 0 if request.signal is None else 128 + request.signal
+
+
+def _page(options: Tune, say: Say, stack: ExitStack) -> ViewerLink:
+    """Start the page, which may compute before the tries do."""
+    warn_of_host(options.host, options.port, "use it", say)
+    link = stack.enter_context(start_page(options.host, options.port))
+    let_the_page_go_first()
+    return link
+
+
+def _finish(session: "TuneSession", options: Tune, say: Say) -> None:
+    """Print what the search was worth, and leave the files."""
+    from taichi_mrf.tune.files import BEST_FILE, TABLE_FILE
+    from taichi_mrf.tune.verdict import verdict_lines
+
+    verdict = verdict_lines(session.verdict, len(session.frames.unseen)) if session.verdict else []
+    for line in verdict:
+        say(line)
+    if options.out is None or not session.history.attempts:
+        return
+    write_text(options.out / TABLE_FILE, session.history.to_csv())
+    say(f"wrote {options.out / TABLE_FILE}")
+    best = session.search.best if session.search is not None else None
+    attempt = next((each for each in session.history.attempts if each.config == best), None)
+    if attempt is not None:
+        write_text(options.out / BEST_FILE, session.history.to_yaml(attempt.number, tuple(verdict)))
+        say(f"wrote {options.out / BEST_FILE}")
+
+
+def _tell_try(attempt: "Attempt", search: "Search | None", told: set[int], say: Say) -> None:
+    """One line for each try of the search, once; tries by hand are on the page."""
+    if attempt.by != "search" or search is None or attempt.number in told:
+        return
+    told.add(attempt.number)
+    scores = attempt.scores
+    best = " *" if attempt.config == search.best else ""
+    say(
+        f"try {attempt.number:3}  log-likelihood {scores.log_likelihood:+.3f}  "
+        f"right {scores.accuracy_sigma:.1%}  median {1000 * scores.median_abs_m:.1f} mm{best}"
+    )

@@ -1,0 +1,1 @@
+"""Readers of recordings in folders and files, one small file a format."""

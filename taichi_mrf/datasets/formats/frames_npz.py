@@ -1,0 +1,220 @@
+"""Frames in NumPy's npz: one file, or a folder of files that are taken in the order of their names.
+
+``depth_m`` (N, H, W) float is axial depth in metres, 0 or NaN where there is none, or uint16 with
+``depth_scale``, its steps per metre; ``T_world_camera`` is (N, 4, 4) or (N, 3, 4); ``K`` (3, 3), or ``fx``,
+``fy``, ``cx``, ``cy``. ``stamp`` (N,) in seconds and ``color`` (N, H, W, 3) uint8 RGB may be left out, and
+so may poses that are to be found (``ReadOptions.track``). Without the N, a file is one frame.
+"""
+
+import math
+import zipfile
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.datasets.base import Dataset, ReadOptions, start_pose
+from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeError
+from taichi_mrf.geometry.poses import as_pose
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.system.npz_file import NpzFile, open_npz
+
+NAME = "npz"
+LOOKS_FOR = "*.npz with depth_m, T_world_camera and K"
+DEPTH, POSE, MATRIX, STAMP, COLOR, SCALE = "depth_m", "T_world_camera", "K", "stamp", "color", "depth_scale"
+FRAMES_PER_SECOND = 30.0
+
+
+@dataclass(frozen=True)
+class Part:
+    """One file's frames: their poses (N, 4, 4), stamps (N,), the camera, and the depth's steps per metre."""
+
+    path: Path
+    poses: NDArray[np.float64]
+    stamps: NDArray[np.float64]
+    camera: PinholeCamera
+    steps_per_metre: float
+
+
+@dataclass
+class FramesNpz(Dataset):
+    """The frames of one or more files. The images of the file that was read last are kept in memory."""
+
+    parts: Sequence[Part] = field(kw_only=True)
+    color: bool = True
+    _loaded: tuple[Path, NDArray, NDArray | None] | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        self._places = [(part, i) for part in self.parts for i in range(len(part.poses))]
+        self._names = [
+            f"{part.path.stem}-{i:06d}" if len(part.poses) > 1 else part.path.stem for part, i in self._places
+        ]
+
+    @property
+    def frame_names(self) -> Sequence[str]:
+        """The file's name, with the frame's number in it if it holds several."""
+        return self._names
+
+    def read(self, index: int) -> Frame:
+        """Read one frame. Raises FrameError, which names frame, file and field, for images that are damaged,
+        and for a pose that is none; IndexError outside 0 to len - 1."""
+        if not 0 <= index < len(self._places):
+            raise IndexError(f"{self.name} has {len(self._places)} frames, there is no frame {index}")
+        part, i = self._places[index]
+        name = self._names[index]
+        try:
+            T_world_camera = as_pose(part.poses[i])
+            depth, color = self._images(part)
+        except KeyframeError as error:
+            raise FrameError(f"frame {name}: {part.path}: {POSE}: {error}") from error
+        except DatasetError as error:
+            raise FrameError(f"frame {name}: {error}") from error
+        depth_m = depth[i].astype(np.float32) / np.float32(part.steps_per_metre)
+        depth_m[~np.isfinite(depth_m) | (depth_m < 0)] = 0.0
+        image = None if color is None else color[i]
+        return Frame(depth_m, T_world_camera, self.camera, float(part.stamps[i]), name, image)
+
+    def _images(self, part: Part) -> tuple[NDArray, NDArray | None]:
+        if self._loaded is None or self._loaded[0] != part.path:
+            with _opened(part.path) as file:
+                count = len(part.poses)
+                depth = _numbers(file, part.path, DEPTH)
+                if depth.shape[-2:] != self.camera.shape:
+                    raise DatasetError(
+                        f"{part.path}: {DEPTH} is {depth.shape}, the camera has "
+                        f"{self.camera.width} x {self.camera.height} pixels"
+                    )
+                depth = depth.reshape(count, *self.camera.shape)
+                color = None
+                if self.color and COLOR in file:
+                    color = file[COLOR].reshape(count, *self.camera.shape, 3)
+            self._loaded = part.path, depth, color
+        return self._loaded[1], self._loaded[2]
+
+
+def recognises(folder: Path) -> bool:
+    """Whether the first npz file of a folder holds frames."""
+    return recognises_file(next(iter(sorted(folder.glob("*.npz"))), folder))
+
+
+def recognises_file(path: Path) -> bool:
+    """Whether a file is an npz file of frames, and not a map or something else."""
+    if path.suffix != ".npz" or not path.is_file():
+        return False
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {f"{DEPTH}.npy", f"{POSE}.npy"} & set(archive.namelist()) != set()
+    except Exception:  # zipfile raises whatever its parsing stumbles over; opening the file says what it is
+        return path.suffix == ".npz"
+
+
+def open_folder(folder: Path, options: ReadOptions) -> Dataset:
+    """Open all files of a folder as one sequence."""
+    return _open(folder.name, sorted(folder.glob("*.npz")), options)
+
+
+def open_file(path: Path, options: ReadOptions) -> Dataset:
+    """Open one file. Raises DatasetError, whose text names the file and the field."""
+    return _open(path.stem, [path], options)
+
+
+def _open(name: str, paths: Sequence[Path], options: ReadOptions) -> FramesNpz:
+    parts = [_read_part(path, options) for path in paths]
+    camera = options.camera or parts[0].camera
+    for part in parts:
+        if part.camera != parts[0].camera:
+            raise DatasetError(f"{part.path}: has another camera than {parts[0].path.name}")
+    return FramesNpz(name, camera, parts=parts, color=options.color)
+
+
+def _read_part(path: Path, options: ReadOptions) -> Part:
+    with _opened(path) as file:
+        shape, dtype = file.header(DEPTH)
+        if len(shape) not in (2, 3) or dtype.kind not in "fu":
+            raise DatasetError(f"{path}: {DEPTH} is {dtype} {shape}; expected (N, H, W) of floats or uint16")
+        height, width = shape[-2:]
+        count = shape[0] if len(shape) == 3 else 1
+        unposed = options.track and POSE not in file
+        poses = np.tile(start_pose(), (count, 1, 1)) if unposed else _numbers(file, path, POSE)
+        if poses.size != count * math.prod(poses.shape[-2:]) or poses.shape[-2:] not in (
+            (4, 4),
+            (3, 4),
+        ):
+            raise DatasetError(f"{path}: {POSE} is {poses.shape}; expected ({count}, 4, 4)")
+        stamps = (
+            _numbers(file, path, STAMP).reshape(-1) if STAMP in file else np.arange(count) / FRAMES_PER_SECOND
+        )
+        if stamps.shape != (count,):
+            raise DatasetError(f"{path}: {STAMP} is {stamps.shape}; expected ({count},)")
+        if COLOR in file:
+            found, kind = file.header(COLOR)
+            if found != (*shape, 3) or kind != np.uint8:
+                raise DatasetError(f"{path}: {COLOR} is {kind} {found}; expected uint8 {(*shape, 3)}")
+        return Part(
+            path,
+            poses.reshape(count, *poses.shape[-2:]).astype(np.float64),
+            stamps.astype(np.float64),
+            _camera(path, file, width, height, options),
+            _steps_per_metre(path, file, dtype, options),
+        )
+
+
+def _camera(path: Path, file: NpzFile, width: int, height: int, options: ReadOptions) -> PinholeCamera:
+    if options.camera is not None:
+        return options.camera
+    names = ("fx", "fy", "cx", "cy")
+    if options.intrinsics is not None:
+        intrinsics = options.intrinsics
+    elif MATRIX in file:
+        K = _numbers(file, path, MATRIX)
+        if K.shape != (3, 3):
+            raise DatasetError(f"{path}: {MATRIX} is {K.shape}; expected (3, 3)")
+        intrinsics = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+    else:
+        missing = [name for name in names if name not in file]
+        if missing:
+            raise DatasetError(
+                f"{path}: needs {MATRIX} (3, 3), or fx, fy, cx, cy; {', '.join(missing)} missing"
+            )
+        fx, fy, cx, cy = (_number(file, path, name) for name in names)
+        intrinsics = (fx, fy, cx, cy)
+    try:
+        return PinholeCamera(width, height, *intrinsics)
+    except ConfigError as error:
+        raise DatasetError(f"{path}: {error}") from error
+
+
+def _steps_per_metre(path: Path, file: NpzFile, dtype: np.dtype, options: ReadOptions) -> float:
+    if options.depth_scale is not None:
+        return options.depth_scale
+    if SCALE in file:
+        scale = _number(file, path, SCALE)
+        if not 0 < scale < float("inf"):
+            raise DatasetError(f"{path}: {SCALE} must be a positive number of steps per metre, not {scale:g}")
+        return scale
+    if dtype.kind == "u":
+        raise DatasetError(f"{path}: {DEPTH} is {dtype} and needs {SCALE}, its steps per metre")
+    return 1.0
+
+
+def _opened(path: Path) -> AbstractContextManager[NpzFile]:
+    return open_npz(path, DatasetError, "an npz file that can be read")
+
+
+def _numbers(file: NpzFile, path: Path, name: str) -> NDArray:
+    """An array of real numbers, whatever their kind."""
+    found = file[name]
+    if found.dtype.kind not in "fiu":
+        raise DatasetError(f"{path}: {name} is {found.dtype}, which are no numbers")
+    return found
+
+
+def _number(file: NpzFile, path: Path, name: str) -> float:
+    found = _numbers(file, path, name)
+    if found.size != 1:
+        raise DatasetError(f"{path}: {name} is {found.shape}; expected one number")
+    return float(found.reshape(-1)[0])

@@ -1,0 +1,151 @@
+"""ICL-NUIM, Redwood and their like: numbered depth PNGs and one file with the trajectory.
+
+The images lie in the folder itself or in ``depth/`` (colour in ``rgb/``, ``color/`` or ``image/``). What the
+trajectory's layout says of the recording:
+
+- stamped (``*.freiburg``; Handa et al., ICRA 2014): the stamp is the image's number; ICL-NUIM's camera, 5000
+  steps a metre. ICL-NUIM's world and camera have y up and are left-handed (its fy is -480); both are
+  mirrored here. The published trajectories start at image 1; what lies outside them is dropped and counted.
+- ``.log`` (Choi et al., CVPR 2015) and Open3D's ``.json``: Redwood's camera, 525 525 319.5 239.5, or the one
+  that the trajectory holds; 1000 steps a metre.
+- rows of 3 x 4 matrices: 5000 steps a metre, ICL-NUIM's camera where the folder's name holds ``icl``, else
+  Redwood's.
+
+A camera file in the folder or the caller's word wins over all of these; what was assumed is in the notes.
+"""
+
+import re
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from taichi_mrf.datasets.base import Dataset, ReadOptions
+from taichi_mrf.datasets.formats.open3d_json import is_trajectory_json, read_trajectory_json
+from taichi_mrf.datasets.intrinsics import PRIMESENSE, find_camera
+from taichi_mrf.datasets.recording import RecordedFrame, Recording
+from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory, is_trajectory, read_trajectory
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.camera import PinholeCamera
+
+NAME = "ICL-NUIM / Redwood"
+LOOKS_FOR = "NNNN.png (here or in depth/) and a trajectory (.log, .json, .freiburg or rows of matrices)"
+ICL_NUIM = PinholeCamera(width=640, height=480, fx=481.2, fy=480.0, cx=319.5, cy=239.5)
+FRAMES_PER_SECOND = 30.0
+COLOR_FOLDERS = ("rgb", "color", "image")
+
+_IMAGE = re.compile(r"(\d+)(-\d+)?\.png")  # Redwood's own scans append a stamp in microseconds
+_MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+def recognises(folder: Path) -> bool:
+    """Whether there are numbered PNGs. That there is no trajectory is then said on opening."""
+    return bool(_numbered_images(folder))
+
+
+def open_folder(folder: Path, options: ReadOptions) -> Dataset:
+    """List the images in the order of their numbers, each with its pose of the trajectory."""
+    images = _numbered_images(folder)
+    trajectory, recorded = _find_trajectory(folder)
+    poses, notes = _poses_by_number(list(images), trajectory)
+    left_handed = trajectory.path.suffix == ".freiburg"
+    if left_handed:
+        notes.append(f"{trajectory.path.name}: mirrored in y, out of ICL-NUIM's left-handed world")
+    frames = [
+        _frame(folder, number, path, trajectory, poses[number], left_handed)
+        for number, path in images.items()
+        if number in poses
+    ]
+    if not frames:
+        raise DatasetError(f"{trajectory.path}: has a pose for none of the {len(images)} images in {folder}")
+    redwood = trajectory.layout == "log" or (trajectory.layout == "rows" and "icl" not in folder.name.lower())
+    default, name = (PRIMESENSE, "Redwood") if redwood else (ICL_NUIM, "ICL-NUIM")
+    camera, assumed = find_camera(
+        folder, options, recorded or default, name, (frame.depth_file for frame in frames)
+    )
+    if recorded is not None and camera == recorded:
+        assumed = []
+    return Recording(
+        name=folder.name,
+        camera=camera,
+        notes=assumed + notes,
+        dropped=len(images) - len(frames),
+        frames=frames,
+        steps_per_metre=options.depth_scale or (1000.0 if trajectory.layout == "log" else 5000.0),
+        color=options.color,
+    )
+
+
+def _numbered_images(folder: Path) -> dict[int, Path]:
+    """Number -> depth image, ascending."""
+    for place in (folder / "depth", folder):
+        if place.is_dir():
+            found = [(m, path) for path in place.iterdir() if (m := _IMAGE.fullmatch(path.name))]
+            if found:
+                return dict(sorted((int(match[1]), path) for match, path in found))
+    return {}
+
+
+def _find_trajectory(folder: Path) -> tuple[Trajectory, PinholeCamera | None]:
+    """The only trajectory of a recording, and the camera that it holds, if it does."""
+    suffixes = (".txt", ".log", ".freiburg")
+    candidates = [
+        path
+        for path in sorted(folder.iterdir())
+        if (path.suffix in suffixes and is_trajectory(path))
+        or (path.suffix == ".json" and is_trajectory_json(path))
+    ]
+    if not candidates:
+        raise DatasetError(f"{folder}: numbered images without a trajectory; looked for {LOOKS_FOR}")
+    if len(candidates) > 1:
+        names = ", ".join(path.name for path in candidates)
+        raise DatasetError(f"{folder}: holds several trajectories, {names}: keep one")
+    if candidates[0].suffix == ".json":
+        return read_trajectory_json(candidates[0])
+    return read_trajectory(candidates[0]), None
+
+
+def _poses_by_number(
+    numbers: list[int], trajectory: Trajectory
+) -> tuple[dict[int, RecordedPose | None], list[str]]:
+    """The pose of each image number, None where one is missing, and what a report should say of it.
+
+    Numbers outside a stamped trajectory are left out. Poses without stamps go with the images in their
+    order if there are as many, else by number.
+    """
+    poses, name = trajectory.poses, trajectory.path.name
+    by_key = {pose.key: pose for pose in poses}
+    if trajectory.layout == "stamped":
+        first_key, last_key = min(by_key), max(by_key)
+        inside = [number for number in numbers if first_key <= number <= last_key]
+        dropped = len(numbers) - len(inside)
+        note = f"{dropped} of {len(numbers)} images dropped: outside the trajectory in {name}"
+        return {number: by_key.get(number) for number in inside}, [note] if dropped else []
+    if len(poses) == len(numbers):
+        return dict(zip(numbers, poses, strict=True)), []
+    # With poses for all numbers, images were taken out of the recording; with fewer, the poses end early.
+    first = 0 if numbers[-1] <= max(by_key) else numbers[0]
+    note = f"{len(numbers)} images but {len(poses)} poses in {name}: took pose 0 for image {first}, and so on"
+    return {number: by_key.get(number - first) for number in numbers}, [note]
+
+
+def _frame(
+    folder: Path, number: int, path: Path, trajectory: Trajectory, pose: RecordedPose | None, mirror: bool
+) -> RecordedFrame:
+    colors = (folder / place / f"{path.stem}{end}" for place in COLOR_FOLDERS for end in (".png", ".jpg"))
+    return RecordedFrame(
+        name=path.stem,
+        stamp=number / FRAMES_PER_SECOND,
+        depth_file=path,
+        read_pose=partial(_read_pose, trajectory.path, pose, mirror),
+        pose_source=str(trajectory.path) if pose is None else pose.source,
+        color_file=next((color for color in colors if color.is_file()), None),
+    )
+
+
+def _read_pose(path: Path, pose: RecordedPose | None, mirror: bool) -> Pose:
+    if pose is None:
+        raise DatasetError(f"{path}: has no pose for this image")
+    T_world_camera = pose.T_world_camera()
+    return _MIRROR_Y @ T_world_camera @ _MIRROR_Y if mirror else T_world_camera

@@ -1,0 +1,84 @@
+"""The JSON files of Open3D: a camera's intrinsics, and trajectories of cameras.
+
+Open3D writes matrices column by column. A PinholeCameraTrajectory holds for each image its intrinsics and its
+``extrinsic``, which takes the world to the camera; a PoseGraph holds for each node its ``pose``, which takes
+the camera to the world.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory
+from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError, said
+from taichi_mrf.geometry.poses import as_pose, inverse
+from taichi_mrf.sensor.camera import PinholeCamera
+
+_LISTS = {"PinholeCameraTrajectory": "parameters", "PoseGraph": "nodes"}
+
+
+def read_intrinsics(path: Path) -> PinholeCamera:
+    """The camera of a PinholeCameraIntrinsic file. Raises DatasetError, whose text names the file."""
+    return _camera(path, _values(path))
+
+
+def is_trajectory_json(path: Path) -> bool:
+    """Whether a file is JSON and says that it is one of the two kinds of trajectory."""
+    try:
+        return _values(path).get("class_name") in _LISTS
+    except (DatasetError, AttributeError):
+        return False
+
+
+def read_trajectory_json(path: Path) -> tuple[Trajectory, PinholeCamera | None]:
+    """The poses of a trajectory, counted from 0, and its first image's camera if it holds one.
+
+    Raises DatasetError, whose text names the file and the entry, if a matrix is missing or has not 16
+    numbers, or if there is no entry.
+    """
+    values = _values(path)
+    entries = values.get(_LISTS[values["class_name"]])
+    if not isinstance(entries, list) or not entries:
+        raise DatasetError(f"{path}: holds no pose")
+    poses = [_pose(path, index, entry) for index, entry in enumerate(entries)]
+    camera = _camera(path, entries[0]["intrinsic"]) if "intrinsic" in entries[0] else None
+    return Trajectory(path, "log", tuple(poses)), camera
+
+
+def _pose(path: Path, index: int, entry: Any) -> RecordedPose:
+    source = f"{path} entry {index}"
+    try:
+        name = "pose" if "pose" in entry else "extrinsic"
+        matrix = np.array(entry[name], np.float64).reshape(4, 4).T
+    except (KeyError, TypeError, ValueError, OverflowError):
+        raise DatasetError(f"{source}: needs the 16 numbers of a pose or an extrinsic") from None
+    if name == "extrinsic":
+        try:
+            matrix = inverse(as_pose(matrix))
+        except KeyframeError:
+            matrix = np.full((4, 4), np.nan)  # named when its frame is read
+    return RecordedPose(index, matrix, source)
+
+
+def _camera(path: Path, values: Any) -> PinholeCamera:
+    try:
+        width, height = int(values["width"]), int(values["height"])
+        fx, _, _, _, fy, _, cx, cy, _ = map(float, values["intrinsic_matrix"])
+        return PinholeCamera(width, height, fx, fy, cx, cy)
+    except ConfigError as error:
+        raise DatasetError(f"{path}: {error}") from error
+    except (KeyError, TypeError, ValueError, OverflowError):
+        raise DatasetError(
+            f"{path}: an intrinsic needs width, height and the 9 numbers of intrinsic_matrix"
+        ) from None
+
+
+def _values(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(f"{path}: not valid JSON: {said(error)}") from error

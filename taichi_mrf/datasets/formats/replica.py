@@ -1,0 +1,89 @@
+"""Replica (Straub et al., 2019) as rendered for NICE-SLAM (Zhu et al., CVPR 2022) and its followers.
+
+``results/depthNNNNNN.png`` and ``results/frameNNNNNN.jpg``; ``traj.txt`` holds for each image T_world_camera
+as a 4 x 4 matrix in a line; ``cam_params.json``, beside them or in the folder above, has the camera and the
+steps of the depth images per metre.
+"""
+
+import json
+import re
+from pathlib import Path
+
+from taichi_mrf.datasets.base import Dataset, ReadOptions
+from taichi_mrf.datasets.intrinsics import find_camera
+from taichi_mrf.datasets.recording import RecordedFrame, Recording
+from taichi_mrf.datasets.trajectories import RecordedPose, read_trajectory
+from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.sensor.camera import PinholeCamera
+
+NAME = "Replica (NICE-SLAM)"
+LOOKS_FOR = "results/depthNNNNNN.png and traj.txt"
+CAMERA = PinholeCamera(width=1200, height=680, fx=600.0, fy=600.0, cx=599.5, cy=339.5)
+STEPS_PER_METRE = 6553.5
+PARAMETERS, POSES = "cam_params.json", "traj.txt"
+FRAMES_PER_SECOND = 30.0
+
+_DEPTH = re.compile(r"depth(\d+)\.png")
+
+
+def recognises(folder: Path) -> bool:
+    """Whether there are depth images of such names. That poses are missing is said on opening."""
+    results = folder / "results"
+    return results.is_dir() and any(_DEPTH.fullmatch(path.name) for path in results.iterdir())
+
+
+def open_folder(folder: Path, options: ReadOptions) -> Dataset:
+    """List the images in the order of their numbers, the n-th with the n-th pose."""
+    numbers = {int(m[1]): p for p in (folder / "results").iterdir() if (m := _DEPTH.fullmatch(p.name))}
+    images = [numbers[number] for number in sorted(numbers)]
+    if not (folder / POSES).is_file():
+        raise DatasetError(f"{folder / POSES}: is missing")
+    trajectory = read_trajectory(folder / POSES)
+    if trajectory.layout != "rows" or len(trajectory.poses) != len(images):
+        raise DatasetError(
+            f"{folder / POSES}: expected a 4 x 4 matrix in each of {len(images)} lines, one for each depth "
+            f"image, found {len(trajectory.poses)} poses"
+        )
+    parameters = next((p for p in (folder / PARAMETERS, folder.parent / PARAMETERS) if p.is_file()), None)
+    recorded, steps = (CAMERA, STEPS_PER_METRE) if parameters is None else _read_parameters(parameters)
+    camera, notes = find_camera(folder, options, recorded, NAME, iter(images))
+    if parameters is not None and camera == recorded:
+        notes = []
+    return Recording(
+        name=folder.name,
+        camera=camera,
+        notes=notes,
+        frames=[_frame(path, pose) for path, pose in zip(images, trajectory.poses, strict=True)],
+        steps_per_metre=options.depth_scale or steps,
+        color=options.color,
+    )
+
+
+def _frame(path: Path, pose: RecordedPose) -> RecordedFrame:
+    number = path.stem.removeprefix("depth")
+    colors = (path.with_name(f"frame{number}{suffix}") for suffix in (".jpg", ".png"))
+    return RecordedFrame(
+        name=path.stem,
+        stamp=int(number) / FRAMES_PER_SECOND,
+        depth_file=path,
+        read_pose=pose.T_world_camera,
+        pose_source=pose.source,
+        color_file=next((color for color in colors if color.is_file()), None),
+    )
+
+
+def _read_parameters(path: Path) -> tuple[PinholeCamera, float]:
+    """The camera and the steps per metre of cam_params.json."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))["camera"]
+        intrinsics = (float(values[name]) for name in ("fx", "fy", "cx", "cy"))
+        camera, scale = PinholeCamera(int(values["w"]), int(values["h"]), *intrinsics), float(values["scale"])
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
+    except ConfigError as error:
+        raise DatasetError(f"{path}: {error}") from error
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError):
+        raise DatasetError(f"{path}: camera needs the numbers w, h, fx, fy, cx, cy and scale") from None
+    if not 0 < scale < float("inf"):
+        raise DatasetError(f"{path}: scale must be a positive number of steps per metre, not {scale:g}")
+    return camera, scale

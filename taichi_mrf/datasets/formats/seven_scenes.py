@@ -1,0 +1,64 @@
+"""7-Scenes (Shotton et al., CVPR 2013): frame-NNNNNN.depth.png, .color.png or .jpg, .pose.txt.
+
+Depth is 16-bit millimetres, 0 and 65535 mean none; a pose file holds T_world_camera as a 4 x 4 matrix.
+The depth camera has no published calibration; 585 585 320 240 is what the data set's page gives. Colour
+is not registered to depth there.
+"""
+
+import re
+from functools import partial
+from pathlib import Path
+
+from taichi_mrf.datasets.base import Dataset, ReadOptions
+from taichi_mrf.datasets.intrinsics import find_camera
+from taichi_mrf.datasets.recording import RecordedFrame, Recording
+from taichi_mrf.datasets.trajectories import read_matrix_file
+from taichi_mrf.sensor.camera import PinholeCamera
+
+NAME = "7-Scenes"
+LOOKS_FOR = "frame-NNNNNN.depth.png and frame-NNNNNN.pose.txt"
+CAMERA = PinholeCamera(width=640, height=480, fx=585.0, fy=585.0, cx=320.0, cy=240.0)
+STEPS_PER_METRE = 1000.0
+NO_DEPTH = 65535
+FRAMES_PER_SECOND = 30.0
+
+_FILE = re.compile(r"(frame-(\d+))\.(depth\.png|pose\.txt)")
+
+
+def recognises(folder: Path) -> bool:
+    """Whether the folder holds at least one depth image or pose with such a name."""
+    return any(_FILE.fullmatch(path.name) for path in folder.iterdir())
+
+
+def open_folder(folder: Path, options: ReadOptions) -> Dataset:
+    """List the frames in the order of their numbers. A frame that has only one of its two files is
+    listed, and named in an error when it is read."""
+    numbers: dict[str, int] = {}
+    for path in folder.iterdir():
+        match = _FILE.fullmatch(path.name)
+        if match:
+            numbers[match[1]] = int(match[2])
+    frames = [_frame(folder, name, numbers[name]) for name in sorted(numbers, key=lambda n: (numbers[n], n))]
+    camera, notes = find_camera(folder, options, CAMERA, NAME, (frame.depth_file for frame in frames))
+    return Recording(
+        name=folder.name,
+        camera=camera,
+        notes=notes,
+        frames=frames,
+        steps_per_metre=options.depth_scale or STEPS_PER_METRE,
+        sentinel=NO_DEPTH,
+        color=options.color,
+    )
+
+
+def _frame(folder: Path, name: str, number: int) -> RecordedFrame:
+    pose_file = folder / f"{name}.pose.txt"
+    colors = (folder / f"{name}.color.{suffix}" for suffix in ("png", "jpg"))
+    return RecordedFrame(
+        name=name,
+        stamp=number / FRAMES_PER_SECOND,
+        depth_file=folder / f"{name}.depth.png",
+        read_pose=partial(read_matrix_file, pose_file),
+        pose_source=str(pose_file),
+        color_file=next((path for path in colors if path.is_file()), None),
+    )

@@ -1,0 +1,133 @@
+"""TUM RGB-D (Sturm et al., IROS 2012): depth.txt and groundtruth.txt, rgb.txt where there is colour.
+
+depth.txt and rgb.txt hold ``stamp file`` lines, groundtruth.txt ``stamp tx ty tz qx qy qz qw``, which is
+T_world_camera of the colour camera, to which the depth images are registered. Depth is 16-bit, 5000 steps
+a metre. A depth image gets the pose nearest in time, if that is near enough; those without one are dropped
+and counted.
+"""
+
+import math
+import os
+from pathlib import Path
+
+from taichi_mrf.datasets.association import associate
+from taichi_mrf.datasets.base import Dataset, ReadOptions
+from taichi_mrf.datasets.intrinsics import PRIMESENSE, find_camera
+from taichi_mrf.datasets.recording import RecordedFrame, Recording
+from taichi_mrf.datasets.trajectories import RecordedPose, read_trajectory
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.sensor.camera import PinholeCamera
+
+NAME = "TUM RGB-D"
+LOOKS_FOR = "depth.txt and groundtruth.txt"
+STEPS_PER_METRE = 5000.0
+LARGEST_GAP = 0.02
+"""Seconds between a depth image and its pose if nothing else is said."""
+LONGEST_NAME = 255
+"""Bytes; no file system that is in use has longer names."""
+DEPTH_LIST, COLOR_LIST, POSES = "depth.txt", "rgb.txt", "groundtruth.txt"
+
+CAMERAS = {
+    "freiburg1": PinholeCamera(width=640, height=480, fx=517.3, fy=516.5, cx=318.6, cy=255.3),
+    "freiburg2": PinholeCamera(width=640, height=480, fx=520.9, fy=521.0, cx=325.1, cy=249.7),
+    "freiburg3": PinholeCamera(width=640, height=480, fx=535.4, fy=539.2, cx=320.1, cy=247.6),
+}
+"""The data set's calibrations of its three cameras, recognised by the folder's name."""
+
+
+def recognises(folder: Path) -> bool:
+    """Whether the folder has the list of depth images. That poses are missing is then said on opening."""
+    return (folder / DEPTH_LIST).is_file()
+
+
+def open_folder(folder: Path, options: ReadOptions) -> Dataset:
+    """List the depth images that have a pose within the largest gap, by their stamps."""
+    if not (folder / POSES).is_file():
+        raise DatasetError(f"{folder / POSES}: is missing; {DEPTH_LIST} lies beside it without poses")
+    depth = _read_list(folder / DEPTH_LIST)
+    trajectory = read_trajectory(folder / POSES)
+    if trajectory.layout != "stamped":
+        raise DatasetError(f"{trajectory.path}: expected lines of stamp tx ty tz qx qy qz qw")
+    gap = LARGEST_GAP if options.max_time_gap is None else options.max_time_gap
+    stamps = [stamp for stamp, _ in depth]
+    partners = associate(stamps, [pose.key for pose in trajectory.poses], gap)
+    matched = [
+        (stamp, path, trajectory.poses[partner])
+        for (stamp, path), partner in zip(depth, partners, strict=True)
+        if partner is not None
+    ]
+    if not matched:
+        first, last = trajectory.poses[0].key, trajectory.poses[-1].key
+        raise DatasetError(
+            f"{folder}: none of {len(depth)} depth images ({stamps[0]:.3f} to {stamps[-1]:.3f} s) has a pose "
+            f"within {gap:g} s ({POSES}: {first:.3f} to {last:.3f} s)"
+        )
+    colors = _colors(folder, [stamp for stamp, _, _ in matched], options, gap)
+    frames = [_frame(*parts, color) for parts, color in zip(matched, colors, strict=True)]
+    default, default_name = _default_camera(folder)
+    camera, notes = find_camera(folder, options, default, default_name, (f.depth_file for f in frames))
+    dropped = len(depth) - len(frames)
+    if dropped:
+        notes.append(f"{dropped} of {len(depth)} depth images dropped: no pose of their own within {gap:g} s")
+    return Recording(
+        name=folder.name,
+        camera=camera,
+        notes=notes,
+        dropped=dropped,
+        frames=frames,
+        steps_per_metre=options.depth_scale or STEPS_PER_METRE,
+        color=options.color,
+    )
+
+
+def _frame(stamp: float, depth_file: Path, pose: RecordedPose, color_file: Path | None) -> RecordedFrame:
+    return RecordedFrame(
+        name=depth_file.stem,
+        stamp=stamp,
+        depth_file=depth_file,
+        read_pose=pose.T_world_camera,
+        pose_source=pose.source,
+        color_file=color_file,
+    )
+
+
+def _colors(folder: Path, stamps: list[float], options: ReadOptions, gap: float) -> list[Path | None]:
+    path = folder / COLOR_LIST
+    if not (options.color and path.is_file()):
+        return [None] * len(stamps)
+    color = _read_list(path)
+    partners = associate(stamps, [stamp for stamp, _ in color], gap)
+    return [None if partner is None else color[partner][1] for partner in partners]
+
+
+def _default_camera(folder: Path) -> tuple[PinholeCamera, str]:
+    for name, camera in CAMERAS.items():
+        if name in folder.name:
+            return camera, f"{NAME} {name}"
+    return PRIMESENSE, "ROS for a Kinect"
+
+
+def _read_list(path: Path) -> list[tuple[float, Path]]:
+    """``stamp file`` lines, sorted by stamp; the files are relative to the list's folder."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    entries = []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        words = line.split(maxsplit=1)
+        try:
+            stamp, file = float(words[0]), path.parent / words[1].strip()
+        except (ValueError, IndexError):
+            raise DatasetError(f"{path} line {number}: expected a stamp and a file name") from None
+        if not math.isfinite(stamp):
+            raise DatasetError(f"{path} line {number}: the stamp is not finite")
+        longest = max((len(os.fsencode(part)) for part in file.parts), default=0)
+        if longest > LONGEST_NAME:
+            raise DatasetError(f"{path} line {number}: no file has a name of {longest} bytes")
+        entries.append((stamp, file))
+    if not entries:
+        raise DatasetError(f"{path}: lists no image")
+    return sorted(entries)

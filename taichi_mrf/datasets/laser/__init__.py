@@ -1,0 +1,1 @@
+"""2D laser scans and the floor plans that they are judged by."""

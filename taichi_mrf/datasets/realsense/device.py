@@ -1,0 +1,212 @@
+"""``realsense:``: depth images from an Intel RealSense camera that is plugged in, or from a recording of one.
+
+``realsense:width=848&height=480&fps=30`` is a camera, as long as it is plugged in; ``realsense:FILE`` is what
+its library has recorded (realsense_file.py). ``?poses=FILE`` gives the poses of the depth camera in TUM's
+layout, by the stamps of its images; ``?poses=track`` leaves them to be found by whoever maps the frames.
+Without either the camera is taken to stand still: its pose is one and the same for all frames, at the origin,
+level, looking along x.
+"""
+
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+
+from taichi_mrf.datasets.base import TRACK, Dataset, ReadOptions, start_pose
+from taichi_mrf.datasets.query_options import parse_options
+from taichi_mrf.datasets.realsense.recorded import Player, RealSenseFile
+from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
+from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.system.libraries import library
+
+NAME = "realsense:"
+
+TIMEOUT_MS = 500
+"""A camera that sends nothing for so long has missed an image; it is lost after MISSES in a row."""
+
+MISSES = 4
+
+STANDS_STILL = (
+    "the camera is taken to stand still: ?poses=FILE gives the poses of one that moves, or ?poses=track"
+)
+ENDLESS = "frames come without end: --keep-live N bounds the memory, --keyframes.* thins them out"
+
+
+@dataclass(frozen=True)
+class RealSenseOptions:
+    """What the camera is asked for; it must offer this very depth stream."""
+
+    width: int = 640
+    """Columns of the images."""
+
+    height: int = 480
+    """Rows of the images."""
+
+    fps: int = 30
+    """Images in a second."""
+
+    poses: str = ""
+    """A file of the camera's poses: stamp tx ty tz qx qy qz qw; or track, to find them from the images."""
+
+
+class _EndlessNames(Sequence[str]):
+    """Names of frames that are counted as they come."""
+
+    def __len__(self) -> int:
+        return 2**31 - 1
+
+    @overload
+    def __getitem__(self, index: int) -> str: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[str]: ...
+    def __getitem__(self, index: int | slice) -> str | list[str]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        return f"realsense-{index:06d}"
+
+
+@dataclass
+class RealSense(Dataset):
+    """A RealSense camera. ``pipeline`` is pyrealsense2's, started; ``depth_scale`` is metres a step."""
+
+    pipeline: Any = None
+    depth_scale: float = 0.001
+    trajectory: TimedPoses | None = None
+    largest_gap: float = INTERPOLATION_GAP
+    T_world_camera: Pose = field(default_factory=start_pose)
+    misses: int = 0
+
+    @property
+    def endless(self) -> bool:
+        """A camera never ends."""
+        return True
+
+    @property
+    def frame_names(self) -> Sequence[str]:
+        """Names without end."""
+        return _EndlessNames()
+
+    def read(self, index: int) -> Frame:
+        """The camera's next image, whatever the index. Raises FrameError if none comes in time, DatasetError
+        if that has happened several times in a row."""
+        name = self.frame_names[index]
+        try:
+            image = self.pipeline.wait_for_frames(TIMEOUT_MS).get_depth_frame()
+            steps = np.asanyarray(image.get_data())
+        except RuntimeError as error:
+            self.misses += 1
+            if self.misses >= MISSES:
+                raise DatasetError(f"{NAME} the camera is lost: {error}") from error
+            raise FrameError(f"{name}: no image from the camera: {error}") from error
+        self.misses = 0
+        if steps.shape != self.camera.shape:
+            raise FrameError(f"{name}: the image has the shape {steps.shape}, not {self.camera.shape}")
+        depth_m = (steps * np.float32(self.depth_scale)).astype(np.float32)
+        stamp = image.get_timestamp() / 1000.0
+        return Frame(depth_m, self._pose(name, stamp), self.camera, stamp, name)
+
+    def _pose(self, name: str, stamp: float) -> Pose:
+        if self.trajectory is None:
+            return self.T_world_camera
+        pose = self.trajectory.at(stamp, self.largest_gap)
+        if pose is None:
+            raise FrameError(f"{name}: no poses within {self.largest_gap:g} s of its stamp {stamp:.3f} s")
+        return pose
+
+
+def open_realsense(text: str, options: ReadOptions) -> Dataset:
+    """Start the first RealSense camera that is found, or open a recording: ``FILE?option=value&...``, where
+    either may be missing.
+
+    Raises DatasetError, whose text says what to install or what the camera's library says, for a wrong
+    option, and for a depth scale, which the camera knows itself.
+    """
+    file, wanted = _file_and_options(text)
+    if options.depth_scale is not None:
+        raise DatasetError(f"{NAME} has no depth_scale, the camera knows its own")
+    tracked = options.track or wanted.poses == TRACK
+    trajectory = read_timed_poses(Path(wanted.poses)) if wanted.poses and not tracked else None
+    rs = library("pyrealsense2", f"{NAME} needs", "realsense", DatasetError)
+    gap = INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
+    source: RealSense | RealSenseFile
+    if file:
+        source = _open_recording(rs, Path(file), trajectory, gap, options)
+    else:
+        source = _open_camera(rs, wanted, trajectory, gap, options)
+    source.tracked = tracked
+    if not tracked and trajectory is None:
+        source.notes.insert(0, STANDS_STILL)
+    return source
+
+
+def _file_and_options(text: str) -> tuple[str, RealSenseOptions]:
+    """What follows the colon, as a file's name and options; options alone may do without the question
+    mark."""
+    file, mark, query = text.partition("?")
+    if not mark and "=" in text and not Path(text).exists():
+        file, query = "", text
+    return file, parse_options(RealSenseOptions, query, f"{NAME}{file}")
+
+
+def _open_camera(
+    rs: Any, wanted: RealSenseOptions, trajectory: TimedPoses | None, gap: float, options: ReadOptions
+) -> RealSense:
+    pipeline, config = rs.pipeline(), rs.config()
+    config.enable_stream(rs.stream.depth, wanted.width, wanted.height, rs.format.z16, wanted.fps)
+    try:
+        profile = pipeline.start(config)
+    except RuntimeError as error:
+        raise DatasetError(f"{NAME} cannot be started: {error}") from error
+    stream = profile.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
+    camera = PinholeCamera(stream.width, stream.height, stream.fx, stream.fy, stream.ppx, stream.ppy)
+    source = RealSense(
+        NAME,
+        options.camera or camera,
+        notes=[ENDLESS],
+        pipeline=pipeline,
+        depth_scale=float(profile.get_device().first_depth_sensor().get_depth_scale()),
+        trajectory=trajectory,
+        largest_gap=gap,
+    )
+    weakref.finalize(source, pipeline.stop)
+    return source
+
+
+def _open_recording(
+    rs: Any, path: Path, trajectory: TimedPoses | None, gap: float, options: ReadOptions
+) -> RealSenseFile:
+    if not path.is_file():
+        raise DatasetError(f"{NAME}{path}: there is no such file")
+    player = Player(rs, path)
+    images = [listed for listed, _ in player.images()]
+    if not images:
+        raise DatasetError(f"{path}: holds no depth images")
+    still = start_pose()
+    poses = [still if trajectory is None else trajectory.at(each.stamp, gap) for each in images]
+    posed = [(each, pose) for each, pose in zip(images, poses, strict=True) if pose is not None]
+    if not posed:
+        raise DatasetError(
+            f"{path}: none of its {len(images)} depth images ({images[0].stamp:.3f} to "
+            f"{images[-1].stamp:.3f} s) has poses within {gap:g} s on both sides"
+        )
+    dropped = len(images) - len(posed)
+    notes = []
+    if dropped:
+        notes.append(f"{dropped} of {len(images)} images dropped: no poses within {gap:g} s on both sides")
+    source = RealSenseFile(
+        path.stem,
+        options.camera or player.camera,
+        notes=notes,
+        dropped=dropped,
+        player=player,
+        listed=[each for each, _ in posed],
+        poses=[pose for _, pose in posed],
+    )
+    weakref.finalize(source, player.close)
+    return source

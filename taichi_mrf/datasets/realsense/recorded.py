@@ -1,0 +1,119 @@
+"""A recording of Intel's RealSense library, played by that library: ``realsense:FILE?poses=FILE``, or
+``?poses=track``.
+
+The file is played once when it is opened, for the numbers and stamps of its depth images, and again as they
+are read: a recording can only be played forwards, so frames are best read in their order.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.frame import Frame
+
+END_MS = 500
+"""A recording that gives nothing for so long has ended: it is read from the disk as fast as it is asked
+for."""
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A depth image of a recording: the number that the camera gave it, and its stamp in seconds."""
+
+    number: int
+    stamp: float
+
+
+class Player:
+    """A recording in play. ``camera`` is its depth camera, ``depth_scale`` metres a step of its images."""
+
+    def __init__(self, rs: Any, path: Path) -> None:
+        """Open the file with the library ``rs`` (pyrealsense2). Raises DatasetError, which names the file."""
+        self._rs, self._path = rs, path
+        self._pipeline: Any = None
+        self._start()
+
+    def images(self) -> Iterator[tuple[Listed, Any]]:
+        """The depth images that are still to come."""
+        while True:
+            try:
+                image = self._pipeline.wait_for_frames(END_MS).get_depth_frame()
+            except RuntimeError:
+                return
+            yield Listed(image.get_frame_number(), image.get_timestamp() / 1000.0), image
+
+    def rewind(self) -> None:
+        """Begin anew."""
+        self.close()
+        self._start()
+
+    def close(self) -> None:
+        """Let the file go."""
+        if self._pipeline is not None:
+            self._pipeline.stop()
+            self._pipeline = None
+
+    def _start(self) -> None:
+        rs = self._rs
+        pipeline, config = rs.pipeline(), rs.config()
+        try:
+            config.enable_device_from_file(str(self._path), repeat_playback=False)
+            config.enable_stream(rs.stream.depth)
+            # Before the start: in real time images are dropped, often the first one.
+            resolved = config.resolve(rs.pipeline_wrapper(pipeline))
+            resolved.get_device().as_playback().set_real_time(False)
+            profile = pipeline.start(config)
+            stream = profile.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
+            self.depth_scale = float(profile.get_device().first_depth_sensor().get_depth_scale())
+        except RuntimeError as error:
+            raise DatasetError(f"{self._path}: cannot be played: {' '.join(str(error).split())}") from error
+        self.camera = PinholeCamera(stream.width, stream.height, stream.fx, stream.fy, stream.ppx, stream.ppy)
+        self._pipeline = pipeline
+
+
+@dataclass
+class RealSenseFile(Dataset):
+    """The depth images of a recording, ``listed`` with their ``poses``."""
+
+    player: Player = field(kw_only=True)
+    listed: Sequence[Listed] = field(kw_only=True)
+    poses: Sequence[Pose] = field(kw_only=True)
+
+    def __post_init__(self) -> None:
+        self._names = [f"realsense-{each.number:06d}" for each in self.listed]
+        self.player.rewind()
+        self._coming = self.player.images()
+        self._last = -1
+        """The index of the frame that was read last; the player stands behind it."""
+
+    @property
+    def frame_names(self) -> Sequence[str]:
+        """The numbers that the camera gave its images."""
+        return self._names
+
+    def read(self, index: int) -> Frame:
+        """Play on to an image, from the beginning if it has been passed. Raises FrameError, which names the
+        frame, if it does not come again or has another size; IndexError outside 0 to len - 1."""
+        if not 0 <= index < len(self.listed):
+            raise IndexError(f"{self.name} has {len(self.listed)} frames, there is no frame {index}")
+        name, wanted = self._names[index], self.listed[index]
+        if index <= self._last:
+            self.player.rewind()
+            self._coming = self.player.images()
+        self._last = index
+        image = next((image for found, image in self._coming if found.number == wanted.number), None)
+        if image is None:
+            self._last = len(self.listed)  # all have been passed
+            raise FrameError(f"frame {name}: {self.name}: the image does not come a second time")
+        steps = np.asanyarray(image.get_data())
+        if steps.shape != self.camera.shape:
+            raise FrameError(f"frame {name}: the image has the shape {steps.shape}, not {self.camera.shape}")
+        depth_m = (steps * np.float32(self.player.depth_scale)).astype(np.float32)
+        return Frame(depth_m, self.poses[index], self.camera, wanted.stamp, name)

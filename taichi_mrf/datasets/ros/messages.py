@@ -1,0 +1,160 @@
+"""What the messages of depth cameras and trackers mean: images to metres, CameraInfo to a camera, poses.
+
+ROS calls depth images by their encodings: 16UC1 (and mono16, as RealSense writes it) are millimetres, 32FC1
+metres (REP 118). A CompressedImage of the transport ``compressedDepth`` is a PNG behind 12 bytes: an integer
+that names the compression and two floats, with which a 32FC1 image's inverse depths were made whole numbers.
+"""
+
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.datasets.base import DISTORTION_COUNTS
+from taichi_mrf.datasets.images import PNG_SIGNATURE, decode_16_bit
+from taichi_mrf.datasets.trajectories import pose_from_quaternion
+from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.camera import PinholeCamera
+
+IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+ODOMETRY = "nav_msgs/msg/Odometry"
+POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
+POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+TRANSFORM_STAMPED = "geometry_msgs/msg/TransformStamped"
+POSES = (ODOMETRY, POSE_STAMPED, POSE_WITH_COVARIANCE, TRANSFORM_STAMPED)
+TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+
+MILLIMETRES = ("16UC1", "mono16")
+METRES = "32FC1"
+PNG = "png"
+"""What a CompressedImage may call 16-bit images that are PNG files as they are: millimetres."""
+
+ENCODINGS = f"{MILLIMETRES[0]} (millimetres), {METRES} (metres), or compressedDepth of the two as PNG"
+STEPS_PER_METRE = 1000.0
+
+_HEADER_BYTES = 12
+_LENS_MODELS = ("plumb_bob", "rational_polynomial", "", "none")
+
+
+def encoding(message: Any) -> str:
+    """What an Image or a CompressedImage says of its content, such as ``16UC1; compressedDepth``."""
+    return str(message.format if hasattr(message, "format") else message.encoding)
+
+
+def check_depth(encoding: str) -> None:
+    """Raises DatasetError, which does not name the topic, if an image of this encoding is no depth."""
+    kind = encoding.split(";")[0].strip()
+    if kind not in (*MILLIMETRES, METRES, PNG):
+        raise DatasetError(f"encoding {encoding!r} is no depth; known are {ENCODINGS}")
+
+
+def depth_image(message: Any, depth_scale: float | None) -> NDArray[np.float32]:
+    """Axial depth in metres, (H, W) float32, of an Image or a CompressedImage; 0 means no measurement.
+
+    ``depth_scale`` (steps per metre) takes the place of the encoding's own. Raises DatasetError, which does
+    not name the topic, for a wrong encoding and for data that do not fit it.
+    """
+    values, steps = _compressed(message) if hasattr(message, "format") else _raw(message)
+    depth_m = values.astype(np.float32) / np.float32(depth_scale or steps)
+    depth_m[~np.isfinite(depth_m) | (depth_m < 0)] = 0.0
+    return depth_m
+
+
+def _raw(message: Any) -> tuple[NDArray, float]:
+    """The values of an Image, (H, W), and how many of their steps are a metre."""
+    kinds = {**dict.fromkeys(MILLIMETRES, ("u2", STEPS_PER_METRE)), METRES: ("f4", 1.0)}
+    if message.encoding not in kinds:
+        raise DatasetError(f"encoding {message.encoding!r} is no depth; known are {ENCODINGS}")
+    kind, steps = kinds[message.encoding]
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    dtype = np.dtype(f"{'>' if message.is_bigendian else '<'}{kind}")
+    data = np.asarray(message.data, np.uint8)
+    if step < width * dtype.itemsize or len(data) < height * step:
+        raise DatasetError(
+            f"{len(data)} bytes are too few for {width} x {height} pixels of {message.encoding}"
+        )
+    rows = data[: height * step].reshape(height, step)[:, : width * dtype.itemsize]
+    return np.ascontiguousarray(rows).view(dtype), steps
+
+
+def _compressed(message: Any) -> tuple[NDArray, float]:
+    """The same of a CompressedImage."""
+    data = bytes(message.data)
+    kind = message.format.split(";")[0].strip()
+    start = data.find(PNG_SIGNATURE, 0, _HEADER_BYTES + len(PNG_SIGNATURE))
+    if start not in (0, _HEADER_BYTES) or kind not in (*MILLIMETRES, METRES, PNG):
+        raise DatasetError(f"format {message.format!r} is no depth as PNG; known are {ENCODINGS}")
+    steps = decode_16_bit(data[start:], message.format)
+    if kind != METRES:
+        return steps, STEPS_PER_METRE
+    if start == 0:
+        raise DatasetError(f"format {message.format!r} lacks the header with the scale of its inverse depths")
+    _, scale, offset = struct.unpack_from("<iff", data)
+    inverse = steps.astype(np.float32) - np.float32(offset)
+    depth_m = np.zeros(steps.shape, np.float32)
+    np.divide(np.float32(scale), inverse, out=depth_m, where=(steps > 0) & (inverse > 0))
+    return depth_m, 1.0
+
+
+def camera_of(info: Any, rectified: bool) -> tuple[PinholeCamera, tuple[float, ...]]:
+    """The camera of a CameraInfo and its OpenCV distortion coefficients, () if it has none.
+
+    Images that are ``rectified`` are those of the projection P, and have no distortion left. Raises
+    DatasetError, which does not name the topic, if it is not calibrated, or has a lens model that is not
+    OpenCV's.
+    """
+    K, D, P = (_field(info, name) for name in "kdp")
+    matrix = P.reshape(3, 4)[:, :3] if rectified and P.any() else K.reshape(3, 3)
+    if matrix[0, 0] == 0:
+        raise DatasetError("is not calibrated (K is zero): --camera fx,fy,cx,cy says what it would")
+    try:
+        camera = PinholeCamera(
+            int(info.width), int(info.height), *(float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        )
+    except ConfigError as error:
+        raise DatasetError(str(error)) from error
+    if rectified or not D.any():
+        return camera, ()
+    if info.distortion_model not in _LENS_MODELS or len(D) not in DISTORTION_COUNTS:
+        raise DatasetError(
+            f"distortion model {info.distortion_model!r} with {len(D)} coefficients is not known: "
+            "--undistort 0,0,0,0 takes the images as they are"
+        )
+    return camera, tuple(float(k) for k in D)
+
+
+def _field(message: Any, name: str) -> NDArray[np.float64]:
+    """An array of a CameraInfo, whose names ROS 1 writes in capitals."""
+    values = getattr(message, name) if hasattr(message, name) else getattr(message, name.upper())
+    return np.asarray(values, np.float64)
+
+
+def pose_of(message: Any) -> Pose:
+    """T_parent_child, (4, 4), of a message of one of the types POSES. Raises KeyframeError if it is no
+    pose."""
+    if hasattr(message, "transform"):
+        return _pose(message.transform.translation, message.transform.rotation)
+    pose = message.pose
+    while hasattr(pose, "pose"):  # inside a PoseWithCovariance
+        pose = pose.pose
+    return _pose(pose.position, pose.orientation)
+
+
+def _pose(position: Any, orientation: Any) -> Pose:
+    q = orientation
+    return pose_from_quaternion(
+        np.array([position.x, position.y, position.z, q.x, q.y, q.z, q.w], np.float64)
+    )
+
+
+def frame_name(text: str) -> str:
+    """A frame's name without the slash that old recordings put before it."""
+    return text.lstrip("/")
+
+
+def header_ns(header: Any) -> int:
+    """The stamp of a std_msgs/Header in nanoseconds."""
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)

@@ -1,0 +1,188 @@
+"""Where a bag's camera was at a time: from a topic of poses, from the tree of frames, or from a file beside
+the bag.
+
+- A topic of poses tells where a **body** is in the frame of its header: Odometry names the body, the other
+  types do not. From there to the camera's optical frame it goes by the tree's transforms, where there are
+  any.
+- The tree alone tells it if the camera's frame hangs in it by something that moves.
+- A file of poses in TUM's layout tells where the camera is, by the stamps of the bag's images.
+- Nothing tells it, and whoever maps the images is to find it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from taichi_mrf.datasets.base import TRACK, start_pose
+from taichi_mrf.datasets.ros import messages
+from taichi_mrf.datasets.ros.messages import frame_name
+from taichi_mrf.datasets.ros.reader import RosReader
+from taichi_mrf.datasets.ros.topics import FROM_TF, DepthTopic, choose, pose_topics, read_tree
+from taichi_mrf.datasets.ros.transform_tree import TransformTree
+from taichi_mrf.datasets.timed_poses import TimedPoses, read_timed_poses
+from taichi_mrf.errors import DatasetError, KeyframeError
+from taichi_mrf.geometry.poses import Pose, as_pose
+
+NO_POSES = (
+    "{path}: holds no poses (no Odometry, PoseStamped or tf of a moving {frame}); ?poses=FILE takes them "
+    "from lines of stamp tx ty tz qx qy qz qw, as a tracker or SLAM writes them, and ?poses=track finds them "
+    "from the images"
+)
+
+
+@dataclass(frozen=True)
+class PoseChoice:
+    """How a user chooses among what a bag offers; empty texts leave it to the bag."""
+
+    pose: str = ""
+    """The topic of poses, or tf."""
+
+    poses: str = ""
+    """A file of the camera's poses in TUM's layout, in place of any topic; or track, to find them from the
+    images."""
+
+    frame: str = ""
+    """The fixed frame that the map is made in."""
+
+    body: str = ""
+    """The frame that the poses of a topic are of."""
+
+    optical: str = ""
+    """The camera's frame (x right, y down, z forward)."""
+
+
+@dataclass
+class BagPoses:
+    """``at(stamp, largest_gap)`` is T_fixed_camera, (4, 4), or None; ``source`` says what was asked and the
+    span of time that it knows."""
+
+    at: Callable[[float, float], Pose | None]
+    source: str
+    notes: list[str] = field(default_factory=list)
+
+
+def pose_candidates(reader: RosReader, tree: TransformTree, optical: str) -> list[str]:
+    """What the option ``pose`` may be: topics, and ``tf`` if the camera's frame moves in the tree."""
+    root = tree.ancestors(optical)[-1]
+    return [*pose_topics(reader), *([FROM_TF] if tree.moves(root, optical) else [])]
+
+
+def find_poses(reader: RosReader, depth: DepthTopic, choice: PoseChoice) -> BagPoses:
+    """The camera's poses as the user chose, else from the only place where the bag holds them.
+
+    Raises DatasetError, whose text names the file and lists the candidates or the frames, if there are none
+    or several, or if frames that were named do not hang together.
+    """
+    if choice.poses == TRACK:
+        return BagPoses(lambda stamp, largest_gap: start_pose(), "found from the images")
+    if choice.poses:
+        timed = read_timed_poses(Path(choice.poses))
+        return BagPoses(timed.at, f"{choice.poses}: {_span(timed)}")
+    tree = read_tree(reader)
+    optical = choice.optical or depth.frame
+    candidates = pose_candidates(reader, tree, optical)
+    if not candidates and not choice.pose:
+        raise DatasetError(NO_POSES.format(path=reader.path, frame=optical or "camera frame"))
+    if choice.pose == FROM_TF or (not choice.pose and candidates == [FROM_TF]):
+        return _from_tree(reader, tree, optical, choice)
+    name = choose(reader, "pose", choice.pose, candidates, "topics of poses")
+    return _from_topic(reader, name, tree, optical, choice)
+
+
+def _from_tree(reader: RosReader, tree: TransformTree, optical: str, choice: PoseChoice) -> BagPoses:
+    if optical not in tree.frames:
+        raise _unknown_frame(reader, tree, optical)
+    fixed = choice.frame or tree.ancestors(optical)[-1]
+    _must_connect(reader, tree, fixed, optical)
+    note = f"poses in {fixed} from tf, of {optical}"
+    moving = [edge.stamps for edge in tree.between(fixed, optical) if isinstance(edge, TimedPoses)]
+    first, last = (max(s[0] for s in moving), min(s[-1] for s in moving)) if moving else (0.0, float("inf"))
+    span = f"{first:.3f} to {last:.3f} s"
+    return BagPoses(
+        lambda stamp, gap: tree.lookup(fixed, optical, stamp, gap),
+        f"tf from {fixed} to {optical}: {span}",
+        [note],
+    )
+
+
+def _from_topic(
+    reader: RosReader, name: str, tree: TransformTree, optical: str, choice: PoseChoice
+) -> BagPoses:
+    timed, parent, child, notes = _read_poses(reader, name)
+    if choice.body:
+        _must_connect(reader, tree, choice.body, optical)
+    body, body_note = _body(tree, optical, choice.body or child)
+    fixed = choice.frame or parent
+    if choice.frame:
+        _must_connect(reader, tree, fixed, parent)
+    notes.append(f"poses in {fixed or 'an unnamed frame'} from {name}{body_note}")
+
+    def at(stamp: float, largest_gap: float) -> Pose | None:
+        T_parent_body = timed.at(stamp, largest_gap)
+        T_fixed_parent = tree.lookup(fixed, parent, stamp, largest_gap)
+        T_body_optical = tree.lookup(body, optical, stamp, largest_gap)
+        if T_parent_body is None or T_fixed_parent is None or T_body_optical is None:
+            return None
+        return T_fixed_parent @ T_parent_body @ T_body_optical
+
+    return BagPoses(at, f"{name}: {_span(timed)}", notes)
+
+
+def _read_poses(reader: RosReader, name: str) -> tuple[TimedPoses, str, str, list[str]]:
+    """A topic's poses, the frame that they are in, the frame that they are of (empty if unsaid), and
+    notes."""
+    topic = reader.topics[name]
+    if topic.type not in messages.POSES:
+        raise DatasetError(
+            f"{reader.path}: topic {name} is of type {topic.type}; poses are {', '.join(messages.POSES)}"
+        )
+    stamps, poses, parent, child, broken = [], [], "", "", 0
+    for entry, message in reader.messages(name):
+        try:
+            poses.append(as_pose(messages.pose_of(message)))
+        except KeyframeError:
+            broken += 1
+            continue
+        stamps.append(entry.stamp)
+        parent = parent or frame_name(message.header.frame_id)
+        child = child or frame_name(getattr(message, "child_frame_id", ""))
+    if not poses:
+        raise DatasetError(f"{reader.path}: topic {name}: none of its {broken} messages is a pose")
+    notes = [f"{broken} messages of {name} left out: not finite, or no rotation"] if broken else []
+    return TimedPoses(stamps, poses), parent, child, notes
+
+
+def _body(tree: TransformTree, optical: str, named: str) -> tuple[str, str]:
+    """The frame that a topic's poses are of, so that it is connected to the camera's, and what to say of
+    it."""
+    if not named:
+        body = tree.body(optical)
+        if body == optical:
+            return (
+                optical,
+                f", taken to be of the camera ({optical}) itself: the bag says nothing of its mounting",
+            )
+        return body, f", taken to be of {body}, which has {optical} fixed to it (?body=FRAME says otherwise)"
+    if named != optical and not tree.connects(named, optical):
+        return optical, (
+            f", of {named}, taken to be of the camera itself: "
+            f"no transform from {named} to {optical} is in the bag"
+        )
+    return named, f", of {named}" + (f", from there to {optical} by tf" if named != optical else "")
+
+
+def _must_connect(reader: RosReader, tree: TransformTree, a: str, b: str) -> None:
+    for frame in (a, b):
+        if a != b and frame not in tree.frames:
+            raise _unknown_frame(reader, tree, frame)
+    if not tree.connects(a, b):
+        raise DatasetError(f"{reader.path}: tf has no way from {a} to {b}")
+
+
+def _unknown_frame(reader: RosReader, tree: TransformTree, frame: str) -> DatasetError:
+    known = ", ".join(tree.frames) or "none"
+    return DatasetError(f"{reader.path}: tf has no frame '{frame}'; its frames: {known}")
+
+
+def _span(timed: TimedPoses) -> str:
+    return f"{timed.stamps[0]:.3f} to {timed.stamps[-1]:.3f} s"

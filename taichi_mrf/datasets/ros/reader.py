@@ -1,0 +1,125 @@
+"""A ROS 1 bag, a ROS 2 bag or an MCAP file as topics and messages, read with the library ``rosbags``.
+
+It needs no ROS, and comes with the extra ``ros``. Whatever it says about a file that it cannot read becomes
+one DatasetError here; the rest of the package sees topics by name and messages as objects with their fields.
+"""
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from taichi_mrf.datasets.ros.messages import header_ns
+from taichi_mrf.errors import DatasetError, said
+from taichi_mrf.system.libraries import library
+
+SUFFIXES = (".bag", ".mcap", ".db3")
+METADATA = "metadata.yaml"
+"""A folder with this file is a ROS 2 bag."""
+
+_NANOSECONDS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a bag: its message type as ROS 2 writes it, such as sensor_msgs/msg/Image."""
+
+    name: str
+    type: str
+    messages: int
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Where a message is: recorded at ``recorded_ns``, the ``ordinal``-th of its topic (from 0) then."""
+
+    recorded_ns: int
+    ordinal: int
+    stamp: float
+    """The header's stamp in seconds, or the time of recording where there is no header or its stamp is 0."""
+
+
+class RosReader:
+    """An open bag. ``topics`` are those by name, ``duration`` the seconds from the first message to the last;
+    messages are objects with the fields of their type."""
+
+    def __init__(self, path: Path) -> None:
+        """Open a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag.
+
+        Raises DatasetError, whose text names the file, if it is cut short, damaged or of a kind that is not
+        known, and if rosbags is not installed.
+        """
+        self.path = path
+        highlevel, typesys = _library("rosbags.highlevel"), _library("rosbags.typesys")
+        try:
+            # Before ROS Iron, bags hold no definitions of their messages; those read here never changed.
+            types = typesys.get_typestore(typesys.Stores.LATEST)
+            self._reader = highlevel.AnyReader([path], default_typestore=types)
+            self._reader.open()
+            self._connections: dict[str, list[Any]] = {}
+            for connection in self._reader.connections:
+                self._connections.setdefault(connection.topic, []).append(connection)
+            self.topics = {
+                name: Topic(name, each[0].msgtype, sum(connection.msgcount for connection in each))
+                for name, each in sorted(self._connections.items())
+            }
+            self.duration = max(0, self._reader.duration) / _NANOSECONDS if self.topics else 0.0
+        except Exception as error:  # the library raises whatever its parsing stumbles over
+            with contextlib.suppress(Exception):
+                self._reader.close()
+            raise DatasetError(
+                f"{path}: cannot be read as a bag, it may be cut short: {said(error)}"
+            ) from error
+        self._open = True
+
+    def close(self) -> None:
+        """Let the file go."""
+        if self._open:
+            self._open = False
+            self._reader.close()
+
+    def messages(self, topic: str) -> Iterator[tuple[Entry, Any]]:
+        """All messages of a topic in the order of recording. Raises DatasetError, naming file and topic."""
+        previous, ordinal = None, 0
+        for recorded_ns, message in self._read(topic, None, None):
+            ordinal = ordinal + 1 if recorded_ns == previous else 0
+            previous = recorded_ns
+            yield Entry(recorded_ns, ordinal, _stamp(message, recorded_ns)), message
+
+    def first(self, topic: str) -> Any | None:
+        """The first message of a topic, None if there is none."""
+        return next((message for _, message in self.messages(topic)), None)
+
+    def read(self, topic: str, entry: Entry) -> Any:
+        """One message again. Raises DatasetError, which names file and topic."""
+        found = self._read(topic, entry.recorded_ns, entry.recorded_ns + 1)
+        for ordinal, (_, message) in enumerate(found):
+            if ordinal == entry.ordinal:
+                return message
+        raise DatasetError(f"{self.path}: topic {topic}: a message is gone")
+
+    def _read(self, topic: str, start: int | None, stop: int | None) -> Iterator[tuple[int, Any]]:
+        try:
+            found = self._reader.messages(self._connections[topic], start=start, stop=stop)
+            for connection, recorded_ns, data in found:
+                if connection.msgtype != self.topics[topic].type:  # in a damaged file
+                    raise ValueError(f"holds a {connection.msgtype}")
+                yield recorded_ns, self._reader.deserialize(data, connection.msgtype)
+        except Exception as error:  # as on opening
+            raise DatasetError(f"{self.path}: topic {topic}: cannot be read: {said(error)}") from error
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path looks like a bag: a file by its name, a folder by its metadata."""
+    return path.suffix in SUFFIXES if path.is_file() else (path / METADATA).is_file()
+
+
+def _library(name: str) -> Any:
+    return library(name, "bags need", "ros", DatasetError)
+
+
+def _stamp(message: Any, recorded_ns: int) -> float:
+    header = getattr(message, "header", None)
+    ns = header_ns(header) if header is not None else 0
+    return (ns or recorded_ns) / _NANOSECONDS

@@ -1,0 +1,81 @@
+"""What is in a bag, for a person who wants to map it: topics, frames, and how to say which of them are
+meant."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from taichi_mrf.datasets.ros.bag import REALSENSE
+from taichi_mrf.datasets.ros.poses import pose_candidates
+from taichi_mrf.datasets.ros.reader import RosReader, Topic
+from taichi_mrf.datasets.ros.topics import DepthTopic, depth_topics, read_tree
+from taichi_mrf.datasets.ros.transform_tree import TransformTree
+from taichi_mrf.datasets.timed_poses import TimedPoses
+from taichi_mrf.errors import DatasetError
+
+
+@dataclass(frozen=True)
+class BagSummary:
+    """The contents of a bag.
+
+    ``remarks`` say of topics, by name, what they hold beside their type. ``transforms`` are the tree's edges
+    in words. ``sources`` are what to call the bag so that it can be mapped, with ``flags`` to add; the first
+    needs the least to be filled in.
+    """
+
+    topics: Sequence[Topic]
+    remarks: dict[str, str]
+    duration: float
+    transforms: Sequence[str]
+    sources: Sequence[str]
+    flags: str
+
+    def rate(self, topic: Topic) -> float | None:
+        """Messages of a topic in a second, None if there are too few."""
+        return (topic.messages - 1) / self.duration if topic.messages > 1 and self.duration > 0 else None
+
+
+def summarise(path: Path) -> BagSummary:
+    """Look into a bag. Raises DatasetError, whose text names the file, if it cannot be read."""
+    reader = RosReader(path)
+    try:
+        topics = list(reader.topics.values())
+        if any(topic.name.startswith(REALSENSE) for topic in topics):
+            return BagSummary(topics, {}, reader.duration, [], [f"realsense:{path}?poses=FILE"], "")
+        depth, tree = depth_topics(reader), read_tree(reader)
+        remarks = {each.name: f"depth, {each.encoding}, frame {each.frame or 'unnamed'}" for each in depth}
+        return BagSummary(
+            topics,
+            remarks,
+            reader.duration,
+            _transforms(tree),
+            _sources(reader, tree, depth),
+            "" if all(each.info for each in depth) else " --camera fx,fy,cx,cy",
+        )
+    finally:
+        reader.close()
+
+
+def _transforms(tree: TransformTree) -> list[str]:
+    words = []
+    for child, (parent, edge) in sorted(tree.edges.items()):
+        moving = f"moving, {len(edge)} times" if isinstance(edge, TimedPoses) else "fixed"
+        words.append(f"{parent} -> {child} ({moving})")
+    return words
+
+
+def _sources(reader: RosReader, tree: TransformTree, depth: Sequence[DepthTopic]) -> list[str]:
+    """A name for each pair of a depth topic and something that tells where its camera was; only what the bag
+    leaves open is in it."""
+    sources = []
+    for topic in depth:
+        try:
+            poses = [f"pose={name}" for name in pose_candidates(reader, tree, topic.frame)]
+        except DatasetError:  # frames that hang on each other in a circle
+            poses = []
+        for pose in poses or ["poses=FILE"]:
+            options = [f"depth={topic.name}"] if len(depth) > 1 else []
+            options += [f"info={topic.info[0]}"] if len(topic.info) > 1 else []
+            options += [pose] if len(poses) != 1 else []
+            sources.append(f"{reader.path}?{'&'.join(options)}" if options else str(reader.path))
+    return sources

@@ -1,0 +1,136 @@
+"""What a bag offers to a mapper: depth topics, cameras, pose topics and the tree of frames; and the choice of
+them.
+
+Where there is one candidate it is taken, where there are several the user must say which one, and the error
+lists them in the words in which they are chosen.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from taichi_mrf.datasets.ros import messages
+from taichi_mrf.datasets.ros.messages import frame_name
+from taichi_mrf.datasets.ros.reader import RosReader
+from taichi_mrf.datasets.ros.transform_tree import Edge, TransformTree
+from taichi_mrf.datasets.timed_poses import TimedPoses
+from taichi_mrf.errors import DatasetError, KeyframeError
+from taichi_mrf.geometry.poses import Pose, as_pose
+
+FROM_TF = "tf"
+"""What the option ``pose`` calls poses out of the tree of frames."""
+
+
+@dataclass(frozen=True)
+class DepthTopic:
+    """A topic of depth images: their encoding, their camera's frame, and the CameraInfo topics that may be
+    its."""
+
+    name: str
+    encoding: str
+    frame: str
+    info: tuple[str, ...]
+
+    @property
+    def rectified(self) -> bool:
+        """Whether its images are those of an ideal camera: REP 104 calls such topics image_rect..."""
+        return any(part.startswith("image_rect") for part in self.name.split("/"))
+
+
+def depth_topics(reader: RosReader) -> list[DepthTopic]:
+    """The topics whose first message is a depth image. mono16 is one if the topic calls itself depth:
+    infrared images are mono16 too."""
+    images = (messages.IMAGE, messages.COMPRESSED_IMAGE)
+    names = [topic.name for topic in reader.topics.values() if topic.type in images and topic.messages]
+    found = [described(reader, name) for name in names]
+    return [
+        topic
+        for topic in found
+        if topic.encoding in ("16UC1", messages.METRES)
+        or "compressedDepth" in topic.encoding
+        or (topic.encoding == "mono16" and "depth" in topic.name.lower())
+    ]
+
+
+def described(reader: RosReader, name: str) -> DepthTopic:
+    """A topic of images as its first message shows it. Raises DatasetError, which names file and topic, if it
+    has other messages or none."""
+    topic = reader.topics[name]
+    if topic.type not in (messages.IMAGE, messages.COMPRESSED_IMAGE):
+        raise DatasetError(f"{reader.path}: topic {name} is of type {topic.type}, not {messages.IMAGE}")
+    message = reader.first(name)
+    if message is None:
+        raise DatasetError(f"{reader.path}: topic {name} holds no message")
+    frame = frame_name(message.header.frame_id)
+    return DepthTopic(name, messages.encoding(message), frame, _camera_topics(reader, name))
+
+
+def _camera_topics(reader: RosReader, depth: str) -> tuple[str, ...]:
+    """The CameraInfo topics that share the longest beginning of their names with a depth topic's: one in most
+    bags, since drivers put camera_info beside the image."""
+    names = [t.name for t in reader.topics.values() if t.type == messages.CAMERA_INFO and t.messages]
+    shared = {name: _shared_parts(name, depth) for name in names}
+    most = max(shared.values(), default=0)
+    return tuple(name for name in names if shared[name] == most)
+
+
+def _shared_parts(a: str, b: str) -> int:
+    pairs = zip(a.strip("/").split("/"), b.strip("/").split("/"), strict=False)
+    return next((i for i, (x, y) in enumerate(pairs) if x != y), min(a.count("/"), b.count("/")))
+
+
+def pose_topics(reader: RosReader) -> list[str]:
+    """The topics whose messages are poses of one body."""
+    return [t.name for t in reader.topics.values() if t.type in messages.POSES and t.messages]
+
+
+def choose(reader: RosReader, option: str, wanted: str, candidates: Sequence[str], what: str) -> str:
+    """The topic that the user named, or the only candidate.
+
+    Raises DatasetError, whose text names the file and lists the candidates, if the bag has no topic of that
+    name, if there are several candidates and none was named, or none at all.
+    """
+    path = reader.path
+    if wanted:
+        name = wanted if wanted in reader.topics else f"/{wanted}"
+        if name in candidates or name in reader.topics:
+            return name
+        known = ", ".join(candidates) or "none"
+        raise DatasetError(f"{path}: there is no topic {wanted}; {what}: {known}")
+    if len(candidates) == 1:
+        return candidates[0]
+    if not candidates:
+        topics = (
+            ", ".join(f"{t.name} ({t.type.rpartition('/')[2]})" for t in reader.topics.values()) or "none"
+        )
+        raise DatasetError(f"{path}: holds no {what}; its topics: {topics}")
+    choices = ", ".join(f"{option}={name}" for name in candidates)
+    raise DatasetError(f"{path}: holds several {what}: choose one with ?{choices.replace(', ', ' or ?')}")
+
+
+def read_tree(reader: RosReader) -> TransformTree:
+    """All transforms of a bag's tf topics. What is on a topic called tf_static is fixed, the last word
+    counting."""
+    fixed: dict[str, tuple[str, Pose]] = {}
+    moving: dict[str, tuple[str, list[float], list[Pose]]] = {}
+    for topic in reader.topics.values():
+        if topic.type not in messages.TF:
+            continue
+        for entry, message in reader.messages(topic.name):
+            for transform in message.transforms:
+                parent, child = frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)
+                try:
+                    T_parent_child = as_pose(messages.pose_of(transform))
+                except KeyframeError:
+                    continue  # an uninitialised transform; where it is needed there is a gap
+                if topic.name.endswith("tf_static"):
+                    fixed[child] = parent, T_parent_child
+                    continue
+                first_parent, stamps, poses = moving.setdefault(child, (parent, [], []))
+                if parent != first_parent:
+                    continue  # two publishers disagree; a frame has one parent
+                stamps.append(messages.header_ns(transform.header) / 1e9 or entry.stamp)
+                poses.append(T_parent_child)
+    edges: dict[str, tuple[str, Edge]] = {
+        child: (parent, TimedPoses(stamps, poses)) for child, (parent, stamps, poses) in moving.items()
+    }
+    return TransformTree(edges | fixed)

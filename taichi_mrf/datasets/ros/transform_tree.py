@@ -1,0 +1,83 @@
+"""A tree of coordinate frames, as ROS keeps it: each frame hangs on its parent by a fixed or a moving
+transform."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from taichi_mrf.datasets.timed_poses import TimedPoses
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.geometry.poses import Pose, inverse
+
+Edge = Pose | TimedPoses
+"""T_parent_child, (4, 4), or such poses with stamps."""
+
+
+class TransformTree:
+    """Frames and the transforms between them. ``edges`` maps a frame to its parent and T_parent_frame."""
+
+    def __init__(self, edges: Mapping[str, tuple[str, Edge]]) -> None:
+        self.edges = dict(edges)
+
+    @property
+    def frames(self) -> list[str]:
+        """All frames by name."""
+        return sorted({*self.edges, *(parent for parent, _ in self.edges.values())})
+
+    def ancestors(self, frame: str) -> list[str]:
+        """The frame, its parent, its parent's parent, ... up to the root. Raises DatasetError for a
+        circle."""
+        path = [frame]
+        while path[-1] in self.edges:
+            parent = self.edges[path[-1]][0]
+            if parent in path:
+                raise DatasetError(f"tf: the frames {', '.join(path)} hang on each other in a circle")
+            path.append(parent)
+        return path
+
+    def connects(self, a: str, b: str) -> bool:
+        """Whether there is a way from one frame to the other."""
+        return a == b or self.ancestors(a)[-1] == self.ancestors(b)[-1]
+
+    def moves(self, a: str, b: str) -> bool:
+        """Whether a transform on the way from one connected frame to the other changes with time."""
+        return any(isinstance(edge, TimedPoses) for edge in self.between(a, b))
+
+    def between(self, a: str, b: str) -> list[Edge]:
+        """The transforms on the way from one connected frame to the other."""
+        up, down = self._sides(a, b)
+        return [self.edges[frame][1] for frame in (*up, *down)]
+
+    def body(self, frame: str) -> str:
+        """The highest frame that the frame is fixed to: that of the vehicle that carries a camera."""
+        for child in self.ancestors(frame):
+            if child not in self.edges or isinstance(self.edges[child][1], TimedPoses):
+                return child
+        return frame
+
+    def lookup(self, target: str, source: str, stamp: float, largest_gap: float) -> Pose | None:
+        """T_target_source, (4, 4), at a time in seconds; None where a moving transform on the way has no pose
+        near enough in time on both sides (:meth:`TimedPoses.at`). The frames must be connected."""
+        up, down = self._sides(target, source)
+        T_top_target = self._chain(up, stamp, largest_gap)
+        T_top_source = self._chain(down, stamp, largest_gap)
+        if T_top_target is None or T_top_source is None:
+            return None
+        return inverse(T_top_target) @ T_top_source
+
+    def _sides(self, a: str, b: str) -> tuple[list[str], list[str]]:
+        """The frames from each of two up to below the first that both hang on, so that nothing above it is
+        asked for."""
+        of_a, of_b = self.ancestors(a), self.ancestors(b)
+        common = next(frame for frame in of_a if frame in of_b)
+        return of_a[: of_a.index(common)], of_b[: of_b.index(common)]
+
+    def _chain(self, frames: list[str], stamp: float, largest_gap: float) -> Pose | None:
+        T = np.eye(4)
+        for frame in frames:
+            edge = self.edges[frame][1]
+            step = edge.at(stamp, largest_gap) if isinstance(edge, TimedPoses) else edge
+            if step is None:
+                return None
+            T = step @ T
+        return T

@@ -1,0 +1,1 @@
+"""Rectified stereo pairs: calibration, matching, recordings."""

@@ -1,0 +1,1 @@
+"""Rendered sequences: the built-in room and corridor, and triangle meshes."""

@@ -1,0 +1,147 @@
+"""``mesh:FILE?poses=FILE``: a triangle mesh seen from recorded poses, with the truth and a simulated sensor.
+
+More options follow after ``&``, as in ``mesh:house.ply?poses=T_world_camera.txt&noise=kinect&seed=1``; the
+fields of :class:`MeshOptions` are all there are. The poses take the mesh's frame for the world; their file
+is in any layout that recordings use (trajectories.py). Paths are relative to the working folder.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.datasets.base import Dataset, ReadOptions
+from taichi_mrf.datasets.intrinsics import PRIMESENSE
+from taichi_mrf.datasets.query_options import parse_options
+from taichi_mrf.datasets.synthetic.mesh_scene import MeshScene, load_mesh
+from taichi_mrf.datasets.trajectories import Trajectory, read_trajectory
+from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeError
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.simulate import KINECT_1, KINECT_1_LATERAL, simulate
+
+NAME = "mesh:"
+FRAMES_PER_SECOND = 30.0
+"""Sets the stamps of poses that were recorded without any."""
+
+SENSORS = {"kinect": KINECT_1, "kinect-lateral": KINECT_1_LATERAL}
+
+
+@dataclass(frozen=True)
+class MeshOptions:
+    """What the name of a mesh may be followed by."""
+
+    poses: str = ""
+    """The file of poses T_world_camera, one for each frame."""
+
+    noise: Literal["none", "kinect", "kinect-lateral"] = "none"
+    """What the depth images suffer: nothing, the axial noise of a Kinect 1, or its lateral noise too."""
+
+    seed: int = 0
+    """Starts the random numbers of the noise; a frame's noise depends on this and its index alone."""
+
+    width: int = PRIMESENSE.width
+    """Columns of the images."""
+
+    height: int = PRIMESENSE.height
+    """Rows of the images."""
+
+    fx: float | None = None
+    """Focal length across, in pixels; left out, the field of view across is that of a Kinect 1."""
+
+    fy: float | None = None
+    """Focal length down, in pixels; left out, that across."""
+
+    cx: float | None = None
+    """Column of the principal point; left out, the middle of the image."""
+
+    cy: float | None = None
+    """Row of the principal point; left out, the middle of the image."""
+
+    def __post_init__(self) -> None:
+        if not self.poses:
+            raise ConfigError("needs ?poses=FILE, the camera's poses T_world_camera")
+        for name, least in (("width", 8), ("height", 8), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"{name} must be at least {least}, not {getattr(self, name)}")
+        self.camera()
+
+    def camera(self) -> PinholeCamera:
+        """The camera that these options describe. Raises ConfigError if it is none."""
+        fx = PRIMESENSE.fx * self.width / PRIMESENSE.width if self.fx is None else self.fx
+        return PinholeCamera(
+            self.width,
+            self.height,
+            fx,
+            fx if self.fy is None else self.fy,
+            (self.width - 1) / 2 if self.cx is None else self.cx,
+            (self.height - 1) / 2 if self.cy is None else self.cy,
+        )
+
+
+@dataclass
+class MeshSequence(Dataset):
+    """A mesh as a sequence of frames, rendered when asked for, with the truth beside it."""
+
+    scene: MeshScene = field(kw_only=True)
+    trajectory: Trajectory = field(kw_only=True)
+    options: MeshOptions = field(kw_only=True)
+
+    @cached_property
+    def frame_names(self) -> Sequence[str]:
+        """What reports call the frames, in their order."""
+        return [f"{self.name}-{index:04d}" for index in range(len(self.trajectory.poses))]
+
+    def pose(self, index: int) -> Pose:
+        """T_world_camera of a frame, (4, 4). Raises FrameError if what was recorded is no pose."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"{self.name} has {len(self)} frames, there is no frame {index}")
+        recorded = self.trajectory.poses[index]
+        try:
+            return recorded.T_world_camera()
+        except KeyframeError as error:
+            raise FrameError(f"frame {self.frame_names[index]}: {recorded.source}: {error}") from error
+
+    def clean_depth(self, index: int) -> NDArray[np.float32]:
+        """True axial depth of a frame, (H, W) float32 in metres, 0 where the ray meets no triangle."""
+        return self.scene.render_depth(self.camera, self.pose(index))
+
+    def read(self, index: int) -> Frame:
+        """Render one frame, with the noise that the options ask for. Raises FrameError as :meth:`pose`."""
+        depth_m = self.clean_depth(index)
+        if self.options.noise != "none":
+            sensor = SENSORS[self.options.noise]
+            depth_m = simulate(depth_m, self.camera, sensor, seed=(self.options.seed, index))
+        stamped = self.trajectory.layout == "stamped"
+        stamp = self.trajectory.poses[index].key if stamped else index / FRAMES_PER_SECOND
+        return Frame(depth_m, self.pose(index), self.camera, stamp, self.frame_names[index])
+
+
+def open_mesh(source: str, options: ReadOptions) -> MeshSequence:
+    """Open ``FILE?poses=FILE&...``, what follows ``mesh:`` in a source's name.
+
+    Raises DatasetError, whose text names the file or the option, for a mesh or a file of poses that cannot
+    be read, for a wrong option, for a depth scale, which rendered depth does not have, and if the
+    libraries that meshes need are not installed.
+    """
+    file, _, query = source.partition("?")
+    name = f"{NAME}{file}"
+    if not file:
+        raise DatasetError(f"{NAME} needs a file: {NAME}FILE?poses=FILE")
+    if options.depth_scale is not None:
+        raise DatasetError(f"{name}: has no depth_scale, its depth is in metres")
+    chosen = parse_options(MeshOptions, query, name)
+    scene = MeshScene(load_mesh(Path(file)))
+    trajectory = read_trajectory(Path(chosen.poses))
+    return MeshSequence(
+        Path(file).stem,
+        options.camera or chosen.camera(),
+        scene=scene,
+        trajectory=trajectory,
+        options=chosen,
+    )

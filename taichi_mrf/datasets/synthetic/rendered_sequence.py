@@ -1,0 +1,124 @@
+"""A sequence of pictures of an analytic scene: what the built-in synthetic sequences have in common."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.intrinsics import PRIMESENSE
+from taichi_mrf.datasets.synthetic.analytic_scene import Scene
+from taichi_mrf.errors import BackendError, ConfigError
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.simulate import KINECT_1, simulate
+from taichi_mrf.system import runtime
+
+FRAMES_PER_SECOND = 5.0
+"""Sets the stamps only."""
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """What the name of every built-in scene may be followed by."""
+
+    frames: int = 32
+    """Views, evenly spread over the camera's way."""
+
+    width: int = 320
+    """Columns of the images; the field of view across is always that of a Kinect 1."""
+
+    height: int = 240
+    """Rows of the images."""
+
+    noise: Literal["kinect", "none"] = "kinect"
+    """What the depth images suffer: the noise of a Kinect 1, or nothing."""
+
+    seed: int = 0
+    """Starts the random numbers of the noise; a frame's noise depends on this and its index alone."""
+
+    def __post_init__(self) -> None:
+        self.require(frames=1, width=8, height=8, seed=0)
+
+    def require(self, **least: int) -> None:
+        """Raise ConfigError for the first of these fields that is less than its least value."""
+        for name, value in least.items():
+            if getattr(self, name) < value:
+                raise ConfigError(f"{name} must be at least {value}, not {getattr(self, name)}")
+
+    def camera(self) -> PinholeCamera:
+        """The Kinect 1's field of view on this many pixels, which are square."""
+        focal = PRIMESENSE.fx * self.width / PRIMESENSE.width
+        return PinholeCamera(
+            self.width, self.height, focal, focal, cx=(self.width - 1) / 2, cy=(self.height - 1) / 2
+        )
+
+
+@dataclass
+class RenderedSequence(Dataset):
+    """Pictures of a scene, with the truth beside them.
+
+    Reading a frame needs Taichi to run (:func:`taichi_mrf.init`), else BackendError.
+    """
+
+    options: RenderOptions = RenderOptions()
+    color: bool = True
+
+    @property
+    @abstractmethod
+    def scene(self) -> Scene:
+        """The solids, in the world frame."""
+
+    @abstractmethod
+    def pose_at(self, index: int) -> Pose:
+        """T_world_camera of a frame that there is, (4, 4)."""
+
+    def lit_scene(self, T_world_camera: Pose) -> Scene:
+        """The scene with the lamp that a colour picture from there is taken by."""
+        return self.scene
+
+    @cached_property
+    def frame_names(self) -> Sequence[str]:
+        """What reports call the frames, in their order."""
+        place = self.name.partition(":")[2]
+        return [f"{place}-{index:04d}" for index in range(self.options.frames)]
+
+    def pose(self, index: int) -> Pose:
+        """T_world_camera of a frame, (4, 4). Raises IndexError if there is no such frame."""
+        if not 0 <= index < self.options.frames:
+            raise IndexError(f"{self.name} has {self.options.frames} frames, there is no frame {index}")
+        return self.pose_at(index)
+
+    def clean_depth(self, index: int) -> NDArray[np.float32]:
+        """True axial depth of a frame, (H, W) float32 in metres."""
+        return self._render(self.pose(index), color=False)[0]
+
+    def signed_distance(self, points: ArrayLike) -> NDArray[np.float64]:
+        """True distance, (N,) in metres, of points (N, 3) to the nearest surface; negative in a solid."""
+        return self.scene.signed_distance(points)
+
+    def read(self, index: int) -> Frame:
+        """Render one frame, with the noise that the options ask for."""
+        T_world_camera = self.pose(index)
+        depth_m, color = self._render(T_world_camera, self.color)
+        if self.options.noise == "kinect":
+            depth_m = simulate(depth_m, self.camera, KINECT_1, seed=(self.options.seed, index))
+        name, stamp = self.frame_names[index], index / FRAMES_PER_SECOND
+        return Frame(depth_m, T_world_camera, self.camera, stamp, name, color)
+
+    def _render(
+        self, T_world_camera: Pose, color: bool
+    ) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
+        if runtime.active() is None:
+            raise BackendError(f"{self.name} is rendered with Taichi: call taichi_mrf.init() first")
+        # Imported late: a wrong option, or the list of frames, should not wait for Taichi to load.
+        from taichi_mrf.datasets.synthetic.analytic_render import render
+
+        return render(
+            self.lit_scene(T_world_camera) if color else self.scene, self.camera, T_world_camera, color
+        )

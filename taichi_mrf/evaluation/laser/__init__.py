@@ -1,0 +1,1 @@
+"""Scores of 2D floor maps against a floor plan."""

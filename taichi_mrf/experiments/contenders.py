@@ -1,0 +1,78 @@
+"""Who is judged: each mapping method, and every reading of its maps that gives it a fair chance."""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from taichi_mrf.config.schema import to_yaml
+from taichi_mrf.experiments.scenes import Scene
+from taichi_mrf.methods.log_odds.map import LogOddsMap
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.methods.visibility.map import VisibilityMap
+from taichi_mrf.voxels.traversal import FAR
+
+BOTH: dict[str, dict[str, float]] = {"all leaves": {"empty_below": -FAR}, "occupied leaves": {}}
+"""Readings of a recursive map: as the metric has it, every known voxel dims a ray; and as such maps are used,
+those that are more likely free than occupied let it through."""
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A method with fixed parameters. ``make`` gives an empty map for a scene and a voxel size; ``readings``
+    are names and what each changes of the map's Occlusion."""
+
+    name: str
+    make: Callable[[Scene, float], OccupancyMap]
+    readings: dict[str, dict[str, float]] = field(default_factory=lambda: {"": {}})
+
+    def signature(self, scene: Scene, voxel_size: float) -> str:
+        """A short text that changes with any parameter of its maps."""
+        parameters = to_yaml(self.make(scene, voxel_size).config)
+        return hashlib.sha256(parameters.encode()).hexdigest()[:12]
+
+
+def row_name(contender: str, reading: str) -> str:
+    """What a contender's row is called."""
+    return f"{contender}, {reading}" if reading else contender
+
+
+def mrf(name: str = "MRFMap", **parameters: Any) -> Contender:
+    """MRFMap with the sensor's noise, as in the paper a ray for each pixel, and otherwise its defaults."""
+    parameters = {"ray_density": 0.0} | parameters
+
+    def make(scene: Scene, voxel_size: float) -> OccupancyMap:
+        return MRFMap(voxel_size, scene.noise, volume=scene.volume, max_depth=scene.max_depth, **parameters)
+
+    return Contender(name, make)
+
+
+def log_odds(name: str, **parameters: Any) -> Contender:
+    """Independent log-odds, read with and without the voxels that are more likely free."""
+
+    def make(scene: Scene, voxel_size: float) -> OccupancyMap:
+        return LogOddsMap(
+            voxel_size, scene.noise, volume=scene.volume, max_depth=scene.max_depth, **parameters
+        )
+
+    return Contender(name, make, BOTH)
+
+
+def visibility(name: str = "visibility map") -> Contender:
+    """Schauwecker & Zell with their Table I and the scene's own sigma in place of lambda z^2."""
+
+    def make(scene: Scene, voxel_size: float) -> OccupancyMap:
+        return VisibilityMap(voxel_size, scene.noise, volume=scene.volume, max_depth=scene.max_depth)
+
+    return Contender(name, make, BOTH)
+
+
+def standard_contenders() -> Sequence[Contender]:
+    """All that need no tuning."""
+    return [
+        mrf(),
+        log_odds("OctoMap-style"),
+        log_odds("OctoMap-style, bias removed", correct_bias=True),
+        visibility(),
+    ]

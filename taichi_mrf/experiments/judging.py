@@ -1,0 +1,75 @@
+"""From a map and the views that it has not seen to figures, the same for every contender."""
+
+import time
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from taichi_mrf.evaluation.accuracy import TOLERANCES, judge_view
+from taichi_mrf.experiments.contenders import Contender
+from taichi_mrf.experiments.ledger import Result
+from taichi_mrf.experiments.scenes import Scene, SceneView
+from taichi_mrf.methods.protocol import OccupancyMap
+
+Figures = dict[str, Any]
+
+
+def build(
+    contender: Contender, scene: Scene, voxel_size: float, keyframes: Sequence[int]
+) -> tuple[OccupancyMap, float]:
+    """A map of some of a scene's views, inferred, and the seconds that took."""
+    start = time.perf_counter()
+    m = contender.make(scene, voxel_size)
+    for index in keyframes:
+        view = scene.views[index]
+        m.add_keyframe(view.measured_m, view.T_world_camera, scene.camera, view.name)
+    m.infer()
+    return m, time.perf_counter() - start
+
+
+def judge_all(
+    m: OccupancyMap, build_seconds: float, contender: Contender, scene: Scene, judged: Iterable[int]
+) -> Result:
+    """Figures of some views: ``readings`` -> reading -> view's name -> figures, and what they cost."""
+    start = time.perf_counter()
+    by_reading: dict[str, dict[str, Figures]] = {reading: {} for reading in contender.readings}
+    views = [scene.views[i] for i in judged]
+    for reading, changes in contender.readings.items():
+        for view in views:
+            by_reading[reading][view.name] = _figures(m, scene, view, changes)
+    seconds = time.perf_counter() - start
+    return {
+        "readings": by_reading,
+        "build_seconds": build_seconds,
+        "judge_seconds": seconds / max(1, len(views) * len(contender.readings)),
+        "bricks": m.statistics().bricks,
+    }
+
+
+def build_and_judge(
+    contender: Contender, scene: Scene, voxel_size: float, keyframes: Sequence[int], judged: Iterable[int]
+) -> Result:
+    """One fold: a map of some views, judged on others."""
+    m, seconds = build(contender, scene, voxel_size, keyframes)
+    return judge_all(m, seconds, contender, scene, judged)
+
+
+def _figures(m: OccupancyMap, scene: Scene, view: SceneView, changes: dict[str, float]) -> Figures:
+    judged = judge_view(
+        m, view.true_m, view.T_world_camera, scene.camera,
+        measured_m=view.measured_m, noise=scene.noise, mask=view.judged,
+        view=m.view.with_occlusion(**changes) if changes else m.view,
+    )  # fmt: skip
+    scores = {name: judged.accuracy(name) for name in TOLERANCES}
+    error = judged.depth_error()
+    return {name: score.score for name, score in scores.items()} | {
+        "unanswered": scores["5cm"].unanswered,
+        "see_through": float(np.mean(judged.survey.visibility[judged.judged] > 0.5)),
+        "median_abs": error.median_abs,
+        "median": error.median,
+        "rms": error.rms,
+        "expected_median_abs": judged.expected_depth_error().median_abs,
+        "log_likelihood": judged.log_likelihood(),
+        "pixels": int(judged.judged.sum()),
+    }

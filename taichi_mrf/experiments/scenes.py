@@ -1,0 +1,176 @@
+"""The scenes that maps are judged on: what a sensor measured, and what is known of the truth.
+
+Where depth is clean it is what a perfect sensor would measure, and the noise is simulated here, so that
+the truth stays known. Folders are laid out as data/README.md says.
+"""
+
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.config.schema import KeyframeConfig, VolumeConfig
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.errors import DatasetError, TaichiMRFError
+from taichi_mrf.geometry.poses import Pose, as_pose
+from taichi_mrf.mapping.keyframe_selector import KeyframeSelector
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
+from taichi_mrf.sensor.simulate import KINECT_1_LATERAL, simulate, simulate_model
+
+COFFIN_VOLUME = ((-2.0, -2.0, 0.0), (2.0, 2.0, 3.0))
+"""The walls, floor and boxes of MRFMap's Table I lie in this box; a view sees floor beyond it."""
+
+COFFIN_MARGIN = 0.4
+"""The map may reach this far out of the volume, so that noise in front of a wall and behind it is mapped."""
+
+EDGE = 0.01
+"""A surface counts as in the volume up to this far outside (metres): walls stand on its faces."""
+
+_UNREADABLE = (OSError, ValueError, EOFError, zipfile.BadZipFile)
+"""What NumPy raises for a file that is missing or damaged."""
+
+COFFIN_SEED = 100
+"""View i of noise seed s is drawn with COFFIN_SEED + 1000 s + i."""
+
+
+@dataclass(frozen=True)
+class SceneView:
+    """One view. ``measured_m`` and ``true_m`` are (H, W) axial depth in metres, 0 for none; in a recording
+    what was measured is all that is known of the truth. ``judged`` (H, W): pixels that count."""
+
+    name: str
+    T_world_camera: Pose
+    measured_m: NDArray[np.float32]
+    true_m: NDArray[np.float32]
+    judged: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Views of one place by one camera, the noise of its sensor, and where the map may be."""
+
+    name: str
+    camera: PinholeCamera
+    noise: NoiseModel
+    volume: VolumeConfig
+    max_depth: float
+    views: Sequence[SceneView]
+
+
+def coffin_scene(data: Path, seed: int = 0) -> Scene:
+    """MRFMap's Table I: 12 views of a room with a box, measured with the learnt noise of a RealSense D435.
+
+    Raises DatasetError if a file of ``data``/coffin_world is missing or does not hold what it should.
+    """
+    folder = data / "coffin_world"
+    camera, clean, poses = _clean_views(folder / "clean_depth.npz")
+    noise = _learnt_noise(folder, camera)
+    lower, upper = (np.asarray(corner) for corner in COFFIN_VOLUME)
+    views = []
+    for index, (depth, T_world_camera) in enumerate(zip(clean, poses, strict=True)):
+        true = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
+        measured = simulate_model(true, camera, noise, seed=COFFIN_SEED + 1000 * seed + index)
+        inside = _inside(true, camera, T_world_camera, lower - EDGE, upper + EDGE)
+        views.append(SceneView(f"view {index:02d}", T_world_camera, measured, true, inside))
+    box = (tuple((lower - COFFIN_MARGIN).tolist()), tuple((upper + COFFIN_MARGIN).tolist()))
+    volume = VolumeConfig(lower=box[0], upper=box[1])
+    return Scene("coffin_world", camera, noise, volume, 20.0, views)
+
+
+def house_scene(data: Path, seed: int = 0, limit: int | None = None) -> Scene:
+    """In the manner of MRFMap's Table II: clean views of a living room, with the noise of a Kinect 1."""
+    dataset = open_dataset(data / "house_livingroom", color=False)
+    views = []
+    for index in range(len(dataset))[:limit]:
+        frame = dataset.read(index)
+        measured = simulate(frame.depth_m, frame.camera, KINECT_1_LATERAL, seed=(seed, index))
+        views.append(SceneView(frame.name, frame.T_world_camera, measured, frame.depth_m, frame.depth_m > 0))
+    noise = PolynomialNoise(KINECT_1_LATERAL.sigma, KINECT_1_LATERAL.bias)
+    return Scene("house_livingroom", dataset.camera, noise, VolumeConfig(), 10.0, views)
+
+
+def kitchen_scene(data: Path, limit: int | None = None) -> Scene:
+    """In the manner of MRFMap's Table III: a real recording, for which the measured depth must do."""
+    dataset = open_dataset(data / "seven_scenes_redkitchen", color=False)
+    views = []
+    for index in range(len(dataset))[:limit]:
+        frame = dataset.read(index)
+        depth = frame.depth_m
+        views.append(SceneView(frame.name, frame.T_world_camera, depth, depth, depth > 0))
+    noise = PolynomialNoise(KINECT_1_LATERAL.sigma, KINECT_1_LATERAL.bias)
+    return Scene("seven_scenes_redkitchen", dataset.camera, noise, VolumeConfig(), 10.0, views)
+
+
+def keyframes_of(scene: Scene, rotation: float, translation: float) -> list[int]:
+    """Indices of the views that the geometric heuristic of section V makes keyframes."""
+    selector = KeyframeSelector(KeyframeConfig(rotation=rotation, translation=translation))
+    chosen = []
+    for index, view in enumerate(scene.views):
+        if selector.wants(view.T_world_camera):
+            selector.accept(view.T_world_camera)
+            chosen.append(index)
+    return chosen
+
+
+def _clean_views(path: Path) -> tuple[PinholeCamera, NDArray[np.floating], list[Pose]]:
+    """Camera, axial depth (n, H, W) in metres and T_world_camera of Table I's views."""
+    try:
+        with np.load(path) as file:
+            clean, matrices, K = file["depth_m"], file["T_world_camera"], file["K"]
+    except KeyError as error:
+        raise DatasetError(f"{path}: {error.args[0]}") from error
+    except _UNREADABLE as error:
+        raise DatasetError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+    if clean.ndim != 3 or matrices.shape != (len(clean), 4, 4) or K.shape != (3, 3):
+        raise DatasetError(
+            f"{path}: depth_m {clean.shape}, T_world_camera {matrices.shape} and K {K.shape} do not go "
+            "together: (n, H, W), (n, 4, 4) and (3, 3) are expected"
+        )
+    height, width = clean.shape[1:]
+    try:
+        camera = PinholeCamera(width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+        return camera, clean, [as_pose(matrix) for matrix in matrices]
+    except TaichiMRFError as error:
+        raise DatasetError(f"{path}: {error}") from error
+
+
+def _learnt_noise(folder: Path, camera: PinholeCamera) -> PatchNoise:
+    """The noise of Table I's sensor, in whatever square patches its tables divide the image."""
+    tables = []
+    for name in ("stddev", "bias"):
+        path = folder / f"realsense_{name}_poly5x.npy"
+        try:
+            tables.append(np.load(path))
+        except _UNREADABLE as error:
+            raise DatasetError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+    sigma, bias = tables
+    rows = sigma.shape[0] if sigma.ndim else 0
+    for patch in range(1, max(camera.width, camera.height) + 1):
+        if -(-camera.width // patch) * -(-camera.height // patch) == rows:
+            break
+    else:
+        raise DatasetError(
+            f"{folder / 'realsense_stddev_poly5x.npy'}: no square patch divides {camera.width} x "
+            f"{camera.height} pixels into {rows}"
+        )
+    try:
+        return PatchNoise(sigma, bias, patch, camera)
+    except TaichiMRFError as error:
+        raise DatasetError(f"{folder}/realsense_*_poly5x.npy: {error}") from error
+
+
+def _inside(
+    depth_m: NDArray[np.float32],
+    camera: PinholeCamera,
+    T_world_camera: Pose,
+    lower: NDArray[np.float64],
+    upper: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Pixels with a depth whose surface lies in a box, (H, W)."""
+    points = camera.rays() * depth_m[..., None].astype(np.float64)
+    points = points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    return (depth_m > 0) & ((points >= lower) & (points <= upper)).all(axis=-1)

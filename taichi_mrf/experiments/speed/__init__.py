@@ -1,0 +1,1 @@
+"""Measurements of speed: the benchmark, the profiler, floors given by memory bandwidth."""

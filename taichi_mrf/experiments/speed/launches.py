@@ -1,0 +1,54 @@
+"""Kernel launches, watched from outside: how often the host waits for the device, and how long each takes.
+
+On a device with a memory of its own, the launch of a kernel that is handed a NumPy array waits until that has
+been copied there and back; reading an array back is such a launch too. On a CPU nobody waits for a copy.
+"""
+
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import taichi as ti
+from taichi.lang.kernel_impl import Kernel
+
+from taichi_mrf.system import runtime
+
+
+@dataclass
+class Launches:
+    """``number`` of launches, and those that the host has to ``wait`` for, because a NumPy array goes in or
+    comes out; ``seconds`` of each launch by the kernel's name, if they are timed."""
+
+    number: int = 0
+    waits: int = 0
+    seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+
+
+@contextmanager
+def count_launches(timed: bool = False) -> Iterator[Launches]:
+    """Watch all launches while the block runs. ``timed`` waits for each kernel, so as to time it."""
+    launches = Launches()
+    launch = Kernel.launch_kernel
+    apart = runtime.active() != "cpu"
+
+    def watched(self: Any, compiled: Any, *arguments: Any) -> Any:
+        launches.number += 1
+        launches.waits += apart and any(isinstance(argument, np.ndarray) for argument in arguments)
+        if not timed:
+            return launch(self, compiled, *arguments)
+        ti.sync()
+        begin = time.perf_counter()
+        result = launch(self, compiled, *arguments)
+        ti.sync()
+        launches.seconds[self.func.__name__].append(time.perf_counter() - begin)
+        return result
+
+    Kernel.launch_kernel = watched
+    try:
+        yield launches
+    finally:
+        Kernel.launch_kernel = launch

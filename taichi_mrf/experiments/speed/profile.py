@@ -1,0 +1,229 @@
+"""Where a new keyframe's time goes: every kernel by Taichi's own profiler, and the host by Python's.
+
+Taichi has to be started with ``runtime.init(profile=True)``. On Vulkan, where its profiler does not work with
+so many kernels, launches are timed instead (launches.py), which has a launch's own cost in it. Profiling
+slows the host down: what a keyframe costs is for bench.py to say, this says what of it is due to what.
+"""
+
+import cProfile
+import pstats
+import re
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+import taichi_mrf
+from taichi_mrf.config.schema import Config
+from taichi_mrf.experiments.speed.kernel_floors import FLOORS, Work
+from taichi_mrf.experiments.speed.keyframe_cost import live_stages, timed, warm_up
+from taichi_mrf.experiments.speed.launches import count_launches
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.system import runtime
+
+PACKAGE = str(Path(taichi_mrf.__file__).parent)
+TAICHI = str(Path(ti.__file__).parent)
+WATCH = count_launches.__wrapped__.__code__.co_filename  # type: ignore[attr-defined]
+IN_TAICHI = "Taichi: launches, arguments, copies"
+RAYS = "send_messages"
+
+
+@dataclass(frozen=True)
+class KernelCost:
+    """A kernel's calls, seconds and least bytes (None: not known) for one keyframe."""
+
+    stage: str
+    name: str
+    calls: float
+    seconds: float
+    floor_bytes: float | None
+
+
+@dataclass(frozen=True)
+class HostCost:
+    """Calls and seconds of a function for one keyframe: its own, and those of libraries that it calls."""
+
+    stage: str
+    function: str
+    calls: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Profile:
+    """One voxel size; means over ``keyframes`` new ones. ``waits`` are the times that the host waits for the
+    device, ``wall`` seconds by stage, both for one keyframe."""
+
+    voxel_size: float
+    keyframes: int
+    bytes_per_second: float
+    work: Work
+    wall: dict[str, float]
+    waits: dict[str, float]
+    kernels: list[KernelCost]
+    host: list[HostCost]
+
+    @property
+    def step_seconds(self) -> float:
+        """Seconds of the ray kernel for each voxel step."""
+        seconds = sum(k.seconds for k in self.kernels if k.name == RAYS)
+        return seconds / max(self.work.voxel_steps, 1.0)
+
+    def to_json(self) -> dict[str, Any]:
+        """All figures under their names."""
+        return asdict(self) | {"step_seconds": self.step_seconds}
+
+
+def profile_mapping(
+    frames: Sequence[Frame],
+    config: Config,
+    bytes_per_second: float,
+    measured: int,
+    progress: Callable[[int], object] | None = None,
+) -> Profile:
+    """Map frames as a live run does, and profile the last ``measured`` of them: adding each, and its own
+    sweep. Others are swept again meanwhile, unprofiled: their kernels are the same."""
+    warm_up(MRFMap.from_config(config, frames[0].camera), frames)
+    m = MRFMap.from_config(config, frames[0].camera)
+    kernels: dict[tuple[str, str], list[float]] = defaultdict(list)
+    host: dict[tuple[str, str], list[float]] = defaultdict(lambda: [0.0, 0.0])
+    wall: dict[str, float] = defaultdict(float)
+    waits: dict[str, float] = defaultdict(float)
+    work = []
+    for number, frame in enumerate(frames, start=1):
+        bricks = len(m.view.pool.in_use)
+        for name, stage in live_stages(m, frame).items():
+            if number <= len(frames) - measured or name not in FLOORS:
+                stage()
+                continue
+            _profile_stage(name, stage, kernels, host, wall, waits)
+            if name == "own_sweep":
+                work.append(_work_of(m, len(m.view.pool.in_use) - bricks))
+        if progress is not None:
+            progress(number)
+    return _summary(config.voxel_size, bytes_per_second, work, kernels, host, wall, waits)
+
+
+def _profile_stage(
+    name: str,
+    stage: Callable[[], object],
+    kernels: dict[tuple[str, str], list[float]],
+    host: dict[tuple[str, str], list[float]],
+    wall: dict[str, float],
+    waits: dict[str, float],
+) -> None:
+    by_taichi = runtime.active() != "vulkan"
+    watch = cProfile.Profile()
+    if by_taichi:
+        ti.profiler.clear_kernel_profiler_info()
+    with count_launches(timed=not by_taichi) as launches:
+        wall[name] += timed(lambda: watch.runcall(stage)).wall
+    waits[name] += launches.waits
+    seconds = kernel_seconds() if by_taichi else launches.seconds
+    for kernel, times in seconds.items():
+        kernels[name, kernel] += times
+    inside = sum(sum(times) for times in seconds.values())
+    for function, (calls, spent) in host_seconds(watch).items():
+        host[name, function][0] += calls
+        host[name, function][1] += spent - (inside if function == IN_TAICHI else 0.0)
+
+
+def kernel_seconds() -> dict[str, list[float]]:
+    """Seconds of each launch, by the kernel's name, since Taichi's profiler was last cleared."""
+    program = ti.lang.impl.get_runtime().prog
+    program.sync_kernel_profiler()
+    program.update_kernel_profiler()
+    seconds: dict[str, list[float]] = defaultdict(list)
+    for record in program.get_kernel_profiler_records():
+        # name_c12_0_kernel_1_range_for, or name_c12_0_0_t00: a kernel's loops are tasks of their own.
+        name, _, task = re.sub(r"_c\d+_\d+_", " ", record.name, count=1).partition(" ")
+        if not task.endswith("serial"):
+            seconds[name].append(record.kernel_time * 1e-3)
+    return seconds
+
+
+def host_seconds(watch: cProfile.Profile) -> dict[str, tuple[int, float]]:
+    """Calls and seconds of each function of this package, with what it spends in NumPy and the like; all that
+    is spent in Taichi, kernels included, is one entry."""
+    found: dict[str, tuple[int, float]] = defaultdict(lambda: (0, 0.0))
+
+    def note(function: str, calls: int, seconds: float) -> None:
+        before = found[function]
+        found[function] = before[0] + calls, before[1] + seconds
+
+    for (file, _, name), (_, calls, own, _, callers) in pstats.Stats(watch).stats.items():  # type: ignore[attr-defined]
+        if _is_ours(file):
+            note(_title(file, name), calls, own)
+            continue
+        for (caller_file, _, caller), (_, inner_calls, _, cumulative) in callers.items():
+            if _is_ours(caller_file):
+                if file.startswith((TAICHI, WATCH)):
+                    note(IN_TAICHI, inner_calls, cumulative)
+                else:
+                    note(_title(caller_file, caller), 0, cumulative)
+    return dict(found)
+
+
+def _is_ours(file: str) -> bool:
+    return file.startswith(PACKAGE) and file != WATCH
+
+
+def _title(file: str, function: str) -> str:
+    return f"{Path(file).relative_to(PACKAGE).with_suffix('').as_posix()}: {function}"
+
+
+def _work_of(m: MRFMap, created: int) -> Work:
+    """What the newest keyframe, which has just been swept, has given to do."""
+    k = m.keyframes[max(m.keyframes)]
+    spoken = 0 if k.messages is None else int(np.count_nonzero(k.messages.to_numpy()))
+    return Work(
+        pixels=k.camera.width * k.camera.height,
+        rays=k.ray_list.number,
+        crossed=len(k.footprint.crossed),
+        surface=len(k.footprint.surface),
+        created=created,
+        visible=len(k.visible.slots),
+        met=spoken,
+        voxel_steps=m.last_voxel_steps,
+        message_bytes=2 if m.config.inference.message_precision == "float16" else 4,
+        trace_in_cache=runtime.active() == "cpu" or runtime.is_software(),
+    )
+
+
+def _summary(
+    voxel_size: float,
+    bytes_per_second: float,
+    works: list[Work],
+    kernels: dict[tuple[str, str], list[float]],
+    host: dict[tuple[str, str], list[float]],
+    wall: dict[str, float],
+    waits: dict[str, float],
+) -> Profile:
+    """Means over keyframes, most expensive first."""
+    n = len(works)
+    names = [name for name in asdict(works[0]) if name != "trace_in_cache"]
+    means = {name: sum(getattr(work, name) for work in works) / n for name in names}
+    work = Work(**means, trace_in_cache=works[0].trace_in_cache)
+    kernel_costs = []
+    for (stage, name), times in kernels.items():
+        floor = FLOORS[stage].get(name)
+        least = None if floor is None else floor(work)
+        kernel_costs.append(KernelCost(stage, name, len(times) / n, sum(times) / n, least))
+    host_costs = [
+        HostCost(stage, name, calls / n, spent / n) for (stage, name), (calls, spent) in host.items()
+    ]
+    return Profile(
+        voxel_size=voxel_size,
+        keyframes=n,
+        bytes_per_second=bytes_per_second,
+        work=work,
+        wall={stage: seconds / n for stage, seconds in wall.items()},
+        waits={stage: count / n for stage, count in waits.items()},
+        kernels=sorted(kernel_costs, key=lambda cost: -cost.seconds),
+        host=sorted(host_costs, key=lambda cost: -cost.seconds),
+    )

@@ -1,0 +1,156 @@
+"""Artefacts: occupied voxels that views which the map has not seen look through.
+
+Each ray of a held-out depth image that meets an occupied voxel says one of two things of it. If the voxel
+lies wholly more than 3 sigma in front of what was measured, the ray has **passed** it; if the measurement
+lies within 3 sigma of the ray's way through it, the ray **confirms** it. What lies behind the measurement
+is not judged. A voxel of which at least LEAST_RAYS rays say something is judged, and it is an artefact if
+a clear majority of them has passed it. Held-out stereo errs too, and a voxel may hold a surface in one
+corner only, so no single ray decides.
+
+A map could avoid all artefacts by being empty, hence its **coverage**: the share of the held-out
+measurements that have an occupied voxel on their ray within 3 sigma and one voxel size. Both depend on the
+probability from which a voxel counts as occupied, and maps are compared at equal coverage.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf.experiments.scenes import Scene, SceneView
+from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Mat3, Struct, Template, Vec3, Vec4
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.sensor.rays import pixel_direction
+from taichi_mrf.system import runtime
+from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
+from taichi_mrf.voxels.window import Window, WindowIndex
+
+SIGMAS = 3.0
+"""How far from a measurement, in its sigma, its surface may be."""
+
+LEAST_RAYS = 10
+"""Rays that must say something of a voxel before it is judged."""
+
+MAJORITY = 0.75
+"""Share of these rays from which on they are a clear majority."""
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """What held-out rays say of a map's voxels.
+
+    ``centres`` (N, 3) metres, ``probability`` (N,), and how many rays ``passed`` and ``confirmed`` each,
+    (N,) int32. ``met`` (M,) is for each held-out measurement the highest probability of the voxels near
+    it, -1 where there is none.
+    """
+
+    centres: NDArray[np.float64]
+    probability: NDArray[np.float32]
+    passed: NDArray[np.int32]
+    confirmed: NDArray[np.int32]
+    met: NDArray[np.float32]
+
+    @property
+    def judged(self) -> NDArray[np.bool_]:
+        """Voxels of which enough rays say something, (N,)."""
+        return self.passed + self.confirmed >= LEAST_RAYS
+
+    def artefacts(self, majority: float = MAJORITY) -> NDArray[np.bool_]:
+        """Judged voxels that at least this share of the rays has passed, (N,)."""
+        return self.judged & (self.passed >= majority * (self.passed + self.confirmed))
+
+    def coverage(self, occupied_from: float) -> float:
+        """Share of the measurements near a voxel of at least this probability; NaN if there are none."""
+        return float(np.mean(self.met >= occupied_from)) if len(self.met) else float("nan")
+
+
+def sightings(
+    m: OccupancyMap, scene: Scene, views: Sequence[SceneView], least_probability: float
+) -> Sightings:
+    """Follow all rays of ``views`` through the voxels of a map of at least this probability.
+
+    Measurements beyond the scene's ``max_depth`` pass voxels like all others, but need no cover.
+    """
+    centres, probability = m.voxels(least_probability)
+    voxels = np.floor(centres / m.voxel_size).astype(np.int32)
+    bricks, brick_of = np.unique(voxels // BRICK, axis=0, return_inverse=True)
+    number = np.ravel_multi_index(tuple((voxels % BRICK).T), (BRICK,) * 3)
+    place = brick_of.reshape(-1) * VOXELS + number
+    of_voxels = np.full(max(1, len(bricks)) * VOXELS, -1.0, np.float32)
+    of_voxels[place] = probability
+    probabilities = ti.ndarray(ti.f32, len(of_voxels))
+    probabilities.from_numpy(of_voxels)
+    passed, confirmed = (ti.ndarray(ti.i32, len(of_voxels)) for _ in range(2))
+    passed.fill(0)
+    confirmed.fill(0)
+
+    corners = bricks if len(bricks) else np.zeros((1, 3), np.int32)
+    edge = m.voxel_size * BRICK
+    window = Window.covering(
+        (corners.min(axis=0) + 0.25) * edge, (corners.max(axis=0) + 0.75) * edge, m.voxel_size
+    )
+    index = WindowIndex()
+    index.fill(window, window.cells_of(bricks), np.arange(len(bricks), dtype=np.int32))
+    table, camera = scene.noise.table(scene.camera), scene.camera
+    intrinsics = ti.Vector([camera.fx, camera.fy, camera.cx, camera.cy], ti.f32)
+    met = []
+    for view in views:
+        depth = np.ascontiguousarray(view.measured_m, np.float32)
+        reach = (SIGMAS * table.at_pixels(depth)[0]).astype(np.float32)
+        best = np.full(depth.size, -1.0, np.float32)
+        _look(
+            depth.reshape(-1), reach.reshape(-1), camera.width, intrinsics,
+            *window.rays_of(view.T_world_camera), window.shape_vector, *window.clip_box(None, None),
+            index.chunks, index.bricks, probabilities, passed, confirmed, best,
+        )  # fmt: skip
+        met.append(best[(depth > 0).reshape(-1) & (depth <= scene.max_depth).reshape(-1)])
+    near = np.concatenate(met) if met else np.zeros(0, np.float32)
+    found = Sightings(centres, probability, passed.to_numpy()[place], confirmed.to_numpy()[place], near)
+    runtime.settle()  # before the arrays are dropped
+    return found
+
+
+@ti.dataclass
+class _Sight(Struct):
+    near: F32  # axial depths between which the measured surface lies
+    far: F32
+    covers: F32  # depth from which a voxel covers the measurement
+    best: F32  # highest probability of a voxel that does
+
+
+@ti.func
+def _see(sight: Template, context: Template, voxel: I32, t: F32, t_leave: F32):
+    probability = context[0][voxel]
+    if probability >= 0.0:
+        if t_leave < sight.near:
+            ti.atomic_add(context[1][voxel], 1)
+        elif t < sight.far:
+            ti.atomic_add(context[2][voxel], 1)
+        if t_leave >= sight.covers:
+            sight.best = ti.max(sight.best, probability)
+    return 1
+
+
+@ti.kernel
+def _look(
+    depth: F32Array, reach: F32Array, width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
+    shape: IVec3, lower: Vec3, upper: Vec3, chunks: I32Array, bricks: I32Array,
+    probabilities: F32Array, passed: I32Array, confirmed: I32Array, best: F32Array,
+):  # fmt: skip
+    for pixel in range(depth.shape[0]):
+        measured = depth[pixel]
+        sight = _Sight(measured - reach[pixel], measured + reach[pixel], 0.0, -1.0)
+        if measured > 0.0:
+            direction = to_voxels @ pixel_direction(pixel % width, pixel // width, intrinsics)
+            one_voxel = 1.0 / direction.norm()
+            sight.covers = sight.near - one_voxel
+            ray = make_ray(centre, direction)
+            begin, end = 0.0, sight.far + one_voxel
+            clip(ray, begin, end, lower, upper)
+            walk_voxels(
+                ray, begin, end, shape, chunks, bricks, _see, sight, (probabilities, passed, confirmed)
+            )
+        best[pixel] = sight.best  # always: on Vulkan what a kernel does not write comes back undefined

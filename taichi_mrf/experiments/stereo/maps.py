@@ -1,0 +1,188 @@
+"""Maps of stereo depth in the manner of Schauwecker & Zell's section IV: artefacts, growth, time, memory."""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from taichi_mrf.experiments.folds import Experiment
+from taichi_mrf.experiments.ledger import Result
+from taichi_mrf.experiments.scenes import Scene
+from taichi_mrf.experiments.speed.bench import octomap_available
+from taichi_mrf.experiments.stereo.artefact_curve import curve, curve_figure, threshold_for
+from taichi_mrf.experiments.stereo.artefact_tables import COVERAGES, artefact_table, majority_table
+from taichi_mrf.experiments.stereo.artefacts import sightings
+from taichi_mrf.experiments.stereo.growth import corridor_scene, grow, growth_figure, growth_rows
+from taichi_mrf.experiments.stereo.scaling import (
+    OCTOMAP,
+    STRIDES,
+    measured_methods,
+    scaling_figure,
+    time_mapping,
+    time_octomap,
+)
+from taichi_mrf.experiments.stereo.street import (
+    Row,
+    mrf_of_street,
+    octomap_style,
+    rows,
+    street_scene,
+    thinned,
+    visibility,
+    visibility_at_once,
+)
+from taichi_mrf.experiments.stereo.street_plan import plan, plan_figure
+from taichi_mrf.experiments.tables import Entry, Table, write_table
+from taichi_mrf.system.atomic import atomic_path
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PICTURE_COVERAGE = 0.8
+"""What the maps in the picture cover at least, if they can."""
+
+DRAWN = ("OctoMap-style, Table I", "visibility map, at once", "MRFMap")
+
+GROWTH_UPDATES: Mapping[float, int] = {0.1: 140, 0.2: 100, 0.4: 60}
+"""Voxel size -> how often one image is integrated."""
+
+GROWTH_EVERY = 2
+GROWTH_ON_STREET = (0.2, 0.4)
+SCALING_SIZES = (0.1, 0.2, 0.4)
+SCALING_VIEWS = 3
+
+
+def run_stereo(experiment: Experiment) -> tuple[list[Table], list[Path]]:
+    """All tables and pictures. Raises DatasetError or ConfigError if there is no recording to map."""
+    whole = street_scene(experiment.data, experiment.limit)
+    half = thinned(whole, 2)
+    tables: list[Table] = []
+    paths: list[Path] = []
+    for voxel_size in experiment.voxel_sizes:
+        some_tables, figures = _artefacts(experiment, half, voxel_size)
+        tables += some_tables
+        paths += _save(experiment, figures)
+    for table, figure in (_growth(experiment, half), _scaling(experiment, whole)):
+        tables.append(table)
+        paths += _save(experiment, {table.name + "_curves": figure})
+    return tables, [*(path for table in tables for path in write_table(experiment.out, table)), *paths]
+
+
+def _save(experiment: Experiment, figures: "Mapping[str, Figure]") -> list[Path]:
+    paths = []
+    for name, figure in figures.items():
+        paths.append(experiment.out / f"{name}.png")
+        with atomic_path(paths[-1]) as temporary:
+            figure.savefig(temporary, dpi=130)
+    return paths
+
+
+def _artefacts(
+    experiment: Experiment, scene: Scene, voxel_size: float
+) -> "tuple[list[Table], Mapping[str, Figure]]":
+    """Every map against the views that it has not seen."""
+    results: dict[str, Result] = {}
+    everyone = rows()
+    for number, row in enumerate(everyone):
+        experiment.report(f"{row.name}, {voxel_size:g} m", number, len(everyone))
+        results[row.name] = experiment.ledger.result(
+            f"{scene.name} | {len(scene.views)} pairs | {row.name} "
+            f"({row.contender.signature(scene, voxel_size)}) | {voxel_size:g} m",
+            lambda r=row: _map_and_judge(r, scene, voxel_size),  # type: ignore[misc]
+        )
+    suffix = "" if len(experiment.voxel_sizes) == 1 else f"_{voxel_size * 1000:g}mm"
+    tables = [
+        artefact_table(f"stereo{suffix}", results, scene, voxel_size),
+        majority_table(f"stereo_majority{suffix}", results),
+    ]
+    curves = {name: result["curve"] for name, result in results.items()}
+    plans = {name: results[name]["plan"] for name in DRAWN}
+    return tables, {
+        f"stereo_artefacts{suffix}": curve_figure(curves, COVERAGES),
+        f"stereo_plan{suffix}": plan_figure(plans, scene, voxel_size),
+    }
+
+
+def _map_and_judge(row: Row, scene: Scene, voxel_size: float) -> Result:
+    start = time.perf_counter()
+    m = row.build(scene, voxel_size)
+    seconds = time.perf_counter() - start
+    seen = sightings(m, scene, scene.views[1::2], row.least_probability)
+    swept = curve(seen, row.least_probability)
+    threshold = swept["threshold"][threshold_for(swept, PICTURE_COVERAGE)]
+    return {
+        "curve": swept,
+        "plan": plan(seen, scene, voxel_size, threshold),
+        "build_seconds": seconds,
+        "keyframes": len(m.keyframes),
+    }
+
+
+def _growth(experiment: Experiment, street: Scene) -> "tuple[Table, Figure]":
+    """Fig. 5a."""
+    corridor = corridor_scene(street.noise)
+    panels: dict[str, dict[str, Result]] = {}
+    for title, scene, sizes in (
+        ("corridor", corridor, tuple(GROWTH_UPDATES)),
+        (f"pair {street.views[0].name}", street, GROWTH_ON_STREET),
+    ):
+        panels[title] = {}
+        for size in sizes:
+            for contender, updates in ((visibility(), GROWTH_UPDATES[size]), (octomap_style(), 1)):
+                experiment.report(f"growth, {title}, {size:g} m", len(panels[title]), 2 * len(sizes))
+                panels[title][f"{contender.name}, {size:g} m"] = experiment.ledger.result(
+                    f"{scene.name} | growth of {title} | {contender.name} "
+                    f"({contender.signature(scene, size)}) | {size:g} m | {updates} updates",
+                    lambda c=contender, s=scene, v=size, u=updates: grow(c, s, v, u, GROWTH_EVERY),  # type: ignore[misc]
+                )
+    distances = (5.0, 10.0, 15.0)
+    columns = [
+        "scene",
+        "map",
+        "m after 1",
+        *(f"updates to {d:g} m" for d in distances),
+        "updates",
+        "m after all",
+    ]
+    notes = [
+        "Distance of the farthest voxel with P(O) > 0.5 when one image is integrated again and again,",
+        f"looked at after every {GROWTH_EVERY} updates. The paper: about 65 updates to 10 m at 0.2 m.",
+    ]
+    table = Table("stereo_fig5a", "Fig. 5a: growth", columns, growth_rows(panels, distances), notes, 1)
+    return table, growth_figure(panels)
+
+
+def _scaling(experiment: Experiment, whole: Scene) -> "tuple[Table, Figure]":
+    """Figs. 5b and 5c."""
+    contenders = [octomap_style(), visibility_at_once(), mrf_of_street()]
+    methods = measured_methods(contenders)
+    by_name = {each.name: each for each in contenders}
+    results: dict[tuple[float, int, str], Result] = {}
+    total = len(SCALING_SIZES) * len(STRIDES) * len(methods)
+    for size in SCALING_SIZES:
+        for stride in STRIDES:
+            scene = thinned(whole, stride)
+            for method in methods:
+                experiment.report(f"timing {method}, {size:g} m", len(results), total)
+                results[size, stride, method] = experiment.ledger.result(
+                    f"{scene.name} | {len(scene.views)} pairs | time of {method} | {size:g} m | 1/{stride}",
+                    lambda s=scene, v=size, n=method: (
+                        time_octomap(s, v, SCALING_VIEWS)  # type: ignore[misc]
+                        if n == OCTOMAP
+                        else time_mapping(by_name[n], s, v, SCALING_VIEWS)
+                    ),
+                )
+    lines: list[list[Entry]] = [
+        [f"{size:g} m, {STRIDES[stride]}", method, r["seconds"], r["mb"], round(r["voxels"] / 1000)]
+        for (size, stride, method), r in results.items()
+    ]
+    pairs = len(whole.views[: 2 * SCALING_VIEWS : 2])
+    notes = [
+        f"Medians over {pairs} pairs; after them, MB of voxels and messages, and thousands of known voxels.",
+        "OctoMap's are nodes, which stand for many equal voxels; it runs on one thread.",
+    ]
+    if not octomap_available():
+        notes.append("OctoMap is not installed: pip install 'taichi-mrf[bench]' brings it.")
+    columns = ["voxels, resolution", "map", "seconds", "MB", "1000 known"]
+    table = Table("stereo_fig5bc", "Figs. 5b, 5c: time and memory", columns, lines, notes, 3)
+    return table, scaling_figure(results, methods)

@@ -1,0 +1,1 @@
+"""Experiments on maps larger than one machine."""

@@ -1,0 +1,4 @@
+"""Rigid transforms.
+
+Uses `system` only.
+"""

@@ -1,0 +1,119 @@
+"""Incremental inference: which keyframes to sweep again when others have changed what they are told.
+
+A keyframe's messages follow from what all others believe of the voxels that it sees. The pool counts, brick
+by brick, how often marginals have moved; a keyframe knows the count at its own last sweep. The difference
+says how much of what it was told is out of date, and the keyframe with the largest share goes first.
+Keyframes that no moved brick lies near are not even looked at: a new one costs no more in a large map.
+"""
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
+from taichi_mrf.inference.keyframe_bounds import Whereabouts
+from taichi_mrf.inference.messages import places_of
+from taichi_mrf.inference.schedule import InferProgress, InferReport, Progress
+from taichi_mrf.inference.sweep import Sweeper
+from taichi_mrf.system import runtime
+from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.pool import BrickPool
+
+
+def moved_share(keyframe: Keyframe, pool: BrickPool) -> float:
+    """The share of the voxels seen by a keyframe whose marginals have moved since its last sweep; 1 if it was
+    never swept. A marginal counts each time that it moves by over 0.01, a brick as its voxels at most."""
+    visible = keyframe.visible if keyframe.coming is None else keyframe.coming
+    heard = heard_of(keyframe, visible)
+    if heard is None or keyframe.messages is None:
+        return 1.0
+    if len(heard) == 0:
+        return 0.0
+    moved = np.minimum(pool.stirred[visible.slots] - heard, VOXELS)
+    return float(moved.sum()) / (len(moved) * VOXELS)
+
+
+def heard_of(keyframe: Keyframe, visible: VisibleBricks) -> NDArray[np.int64] | None:
+    """``heard`` of a keyframe for a newer list of its bricks: nothing of one that was not on the old, all of
+    which then counts as moved."""
+    if visible is keyframe.visible or keyframe.heard is None:
+        return keyframe.heard
+    place = places_of(keyframe.visible, visible)
+    heard = np.full(len(place), -VOXELS, np.int64)
+    heard[place >= 0] = keyframe.heard[place[place >= 0]]
+    return heard
+
+
+class Renewal:
+    """Sweeps the most affected keyframes until none is affected by more than the tolerance."""
+
+    def __init__(
+        self,
+        pool: BrickPool,
+        sweeper: Sweeper,
+        whereabouts: Whereabouts,
+        look_again: Callable[[Keyframe], object],
+        refresh: Callable[[Keyframe], object],
+        usual: float,
+    ) -> None:
+        """``look_again`` brings the list of a keyframe's bricks up to date, ``refresh`` its messages too;
+        ``usual`` is the tolerance above which a keyframe waits even if a call tolerates more."""
+        self.pool, self.sweeper, self.whereabouts, self.usual = pool, sweeper, whereabouts, usual
+        self.look_again, self.refresh = look_again, refresh
+        self._waiting: set[int] = set()
+
+    def run(
+        self,
+        keyframes: Mapping[int, Keyframe],
+        first: Iterable[int],
+        tolerance: float,
+        seconds: float | None,
+        progress: Progress | None = None,
+    ) -> InferReport:
+        """Sweep ``first``, in their order, then whoever is affected most, until nobody is by more than
+        ``tolerance`` or the time is over; what is left waits for the next call.
+
+        ``residual`` of the report is the largest share that is left; ``complete`` is False if it is more than
+        the tolerance.
+        """
+        begin = time.perf_counter()
+        rays = swept = 0
+        queue = list(first)
+        largest = 0.0
+        while True:
+            self._waiting |= self.whereabouts.near(self.pool.take_stirred())
+            if queue:
+                id = queue.pop(0)
+            else:
+                shares = self._shares(keyframes, tolerance)
+                if not shares:
+                    largest = 0.0
+                    break
+                id = max(shares, key=lambda each: (shares[each], -each))
+                largest = shares[id]
+                if seconds is not None and time.perf_counter() - begin >= seconds:
+                    break
+            keyframe = keyframes[id]
+            self.refresh(keyframe)
+            self.pool.touch(keyframe.visible.slots)
+            if self.sweeper.sweep(keyframe, self.pool):
+                self.sweeper.take_moved(keyframe, self.pool)
+            else:
+                keyframe.heard = np.zeros(0, np.int64)  # it sees no brick, so there is nothing to say
+            rays, swept = rays + keyframe.rays, swept + 1
+            if progress is not None and not progress(InferProgress(1, 1, swept, swept, keyframe.rays)):
+                break
+        runtime.settle()
+        return InferReport(time.perf_counter() - begin, largest, swept, rays, largest <= tolerance)
+
+    def _shares(self, keyframes: Mapping[int, Keyframe], tolerance: float) -> dict[int, float]:
+        """How much of what the waiting keyframes were told is out of date, if it is too much; those that
+        nobody would sweep wait no longer."""
+        shares = {}
+        for id in self._waiting & keyframes.keys():
+            self.look_again(keyframes[id])
+            shares[id] = moved_share(keyframes[id], self.pool)
+        self._waiting = {id for id, share in shares.items() if share > min(tolerance, self.usual)}
+        return {id: share for id, share in shares.items() if share > tolerance}

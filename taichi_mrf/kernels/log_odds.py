@@ -1,0 +1,54 @@
+"""Probabilities and their logarithms, kept precise near 0 and 1 and cheap where most voxels are."""
+
+import taichi as ti
+
+from taichi_mrf.kernels.types import F32
+
+
+@ti.func
+def logistic(x: F32) -> F32:
+    """Log-odds to probability."""
+    return 1.0 / (1.0 + ti.exp(-x))
+
+
+@ti.func
+def softplus(x: F32) -> F32:
+    """log(1 + e^x) without losing the digits of a small e^x: minus the log of being free."""
+    grown = ti.exp(-ti.abs(x))
+    tail = grown * (1.0 - grown * (0.5 - grown * (1.0 / 3.0)))
+    if grown >= 1e-2:
+        tail = ti.log(1.0 + grown)
+    return ti.max(x, 0.0) + tail
+
+
+@ti.func
+def exp_of_negative(x: F32) -> F32:
+    """e^x for x <= 0, by its series near 0: most voxels on a ray's way are nearly free."""
+    value = 1.0 + x * (1.0 + x * (0.5 + x * (1.0 / 6.0)))
+    if x <= -0.05:
+        value = ti.exp(x)
+    return value
+
+
+@ti.func
+def log_of_rest(x: F32) -> F32:
+    """log(1 - e^x) for x < 0, with all digits where e^x is nearly 1."""
+    small = -x
+    rest = small * (1.0 - small * (0.5 - small * (1.0 / 6.0)))
+    if small >= 0.05:
+        rest = 1.0 - ti.exp(x)
+    return ti.log(ti.max(rest, 1e-30))
+
+
+@ti.func
+def clamped_log_odds(occupied: F32, empty: F32, clamp: F32, largest: F32) -> F32:
+    """log(occupied / empty), clamped, and moved from [-clamp, clamp] to [0, 1] for the accumulators.
+
+    ``largest`` is e^clamp: most messages lie beyond the clamp, where no logarithm need be taken.
+    """
+    message = 1.0
+    if occupied * largest <= empty:
+        message = 0.0
+    elif occupied < empty * largest:
+        message = 0.5 + 0.5 * ti.log(occupied / empty) / clamp
+    return message

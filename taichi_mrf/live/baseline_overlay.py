@@ -1,0 +1,82 @@
+"""OctoMap's way with the same keyframes, shown beside the map on demand."""
+
+import numpy as np
+
+from taichi_mrf.config.schema import Config
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.inference.schedule import Progress
+from taichi_mrf.live.mapper import Mapper
+from taichi_mrf.live.publish import Publisher
+from taichi_mrf.methods.log_odds.map import LogOddsMap
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.sensor.noise import NoiseModel
+from taichi_mrf.viewer.messages import Bricks
+
+LEAST_LOG_ODDS = 0.0
+"""Bricks without any voxel more likely occupied than not are not sent: in this map every brick that a ray
+crosses exists, seven in ten of them free at 2 cm, and a voxel seen to be free never falls below 0.12."""
+
+
+class Beside:
+    """A LogOddsMap that follows a mapper's keyframes, one piece of work at a time."""
+
+    def __init__(self, config: Config, noise: NoiseModel) -> None:
+        """An empty map with a configuration's parameters."""
+        self.map: OccupancyMap = LogOddsMap(
+            config.voxel_size,
+            noise,
+            log_odds=config.log_odds,
+            volume=config.volume,
+            min_depth=config.sensor.min_depth,
+            max_depth=config.sensor.max_depth,
+        )
+        self._publisher = Publisher(
+            "beside",
+            self.map.view.pool,
+            self.map.seen_by,
+            prior_is_unknown=True,
+            least_log_odds=LEAST_LOG_ODDS,
+        )
+        self._places: dict[int, tuple[int, Pose]] = {}
+        """The viewer's number of a keyframe -> its number and pose here."""
+        self._stale = False
+
+    def catch_up(self, mapper: Mapper, progress: Progress) -> bool:
+        """Do one piece of the work that is left: add a keyframe, or integrate all anew after some have gone
+        or moved, which ``progress`` can stop. Returns whether there was any.
+
+        A frozen keyframe that is in this map stays in it; one that was frozen before cannot be added.
+        """
+        entries = mapper.roster.entries
+        for id, (here, pose) in list(self._places.items()):
+            entry = entries.get(id)
+            if entry is None or entry.state == "off":
+                self.map.remove_keyframe(here)
+                del self._places[id]
+                self._stale = True
+            elif not np.array_equal(entry.T_world_camera, pose):
+                self.map.move_keyframe(here, entry.T_world_camera)
+                self._places[id] = here, entry.T_world_camera
+                self._stale = True
+        if self._stale:
+            self._stale = not self.map.infer(progress=progress).complete
+            return True
+        for entry in mapper.roster.with_state("on"):
+            if entry.id not in self._places:
+                depth_m = mapper.seer(entry).depth_m
+                here = self.map.add_keyframe(depth_m, entry.T_world_camera, entry.camera, entry.name)
+                self._places[entry.id] = here, entry.T_world_camera
+                return True
+        return False
+
+    def changes(self) -> Bricks | None:
+        """What the viewer has not been told yet; nothing while the map is being made anew."""
+        return None if self._stale else self._publisher.changes()
+
+    def start_over(self) -> None:
+        """A new viewer has been told nothing."""
+        self._publisher.start_over()
+
+    def everything_gone(self) -> Bricks:
+        """What takes this map away from the viewer."""
+        return self._publisher.everything_gone()

@@ -1,0 +1,65 @@
+"""The keyframes as the viewer knows them: by numbers that stay the same when one is switched off and on."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.errors import KeyframeError
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.methods.protocol import PosedDepth
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.viewer.messages import KeyframeState
+
+
+@dataclass
+class Entry:
+    """One keyframe. ``map_id`` is its number in the map while it is on; ``depth_m`` (H, W) is its depth image
+    in metres, 0 for no measurement, while it is off. A frozen one has neither any more.
+
+    ``T_recorded`` is where it was recorded and ``T_home`` where alignment has placed it, which is the same if
+    poses are not refined; a user may have put it elsewhere (``moved_by_hand``).
+    """
+
+    id: int
+    name: str
+    T_world_camera: Pose
+    camera: PinholeCamera
+    rays: int
+    picture: NDArray[np.uint8]
+    map_id: int | None
+    state: KeyframeState = "on"
+    depth_m: NDArray[np.float32] | None = None
+    moved_by_hand: bool = False
+
+    def __post_init__(self) -> None:
+        self.T_recorded = self.T_home = self.T_world_camera
+
+
+@dataclass
+class Roster:
+    """All keyframes of a run by number, in the order in which they came. A number is never given twice."""
+
+    entries: dict[int, Entry] = field(default_factory=dict)
+    next_id: int = 0
+
+    def add(self, frame: PosedDepth, rays: int, picture: NDArray[np.uint8], map_id: int) -> Entry:
+        """Enter a keyframe that the map has just taken in."""
+        entry = Entry(self.next_id, frame.name, frame.T_world_camera, frame.camera, rays, picture, map_id)
+        self.entries[entry.id] = entry
+        self.next_id += 1
+        return entry
+
+    def find(self, id: int) -> Entry:
+        """A keyframe by the viewer's number. Raises KeyframeError."""
+        if id not in self.entries:
+            raise KeyframeError(f"there is no keyframe {id}")
+        return self.entries[id]
+
+    def with_state(self, state: KeyframeState) -> list[Entry]:
+        """Those that are on, off or frozen, the oldest first."""
+        return [entry for entry in self.entries.values() if entry.state == state]
+
+    def clear(self) -> None:
+        """Forget all of them, but not which numbers were given."""
+        self.entries.clear()

@@ -1,0 +1,34 @@
+"""Which frames become keyframes: those that were taken from somewhere new (MRFMap, section V)."""
+
+from taichi_mrf.config.schema import KeyframeConfig
+from taichi_mrf.geometry.poses import Pose, tangent_norms
+
+
+class KeyframeSelector:
+    """Selects a frame when the tangent norm of its rotation or of its translation is larger than a threshold.
+
+    The norm is taken against the last keyframe, as in the paper, or against every earlier one, in which
+    case a frame must be far from all of them. With both thresholds at 0 every frame is a keyframe; with
+    one of them at 0 only the other counts.
+    """
+
+    def __init__(self, config: KeyframeConfig) -> None:
+        self._config = config
+        self._accepted: list[Pose] = []
+
+    def wants(self, T_world_camera: Pose) -> bool:
+        """Whether a frame with this pose, (4, 4), should become a keyframe. Remembers nothing."""
+        if self._config.rotation == 0 and self._config.translation == 0:
+            return True
+        compared = self._accepted if self._config.against == "all" else self._accepted[-1:]
+        return all(self._is_far(T_world_keyframe, T_world_camera) for T_world_keyframe in compared)
+
+    def accept(self, T_world_camera: Pose) -> None:
+        """Remember the pose of a frame that has become a keyframe."""
+        self._accepted.append(T_world_camera)
+
+    def _is_far(self, T_world_keyframe: Pose, T_world_camera: Pose) -> bool:
+        rotation, translation = tangent_norms(T_world_keyframe, T_world_camera)
+        turned = self._config.rotation > 0 and rotation > self._config.rotation
+        moved = self._config.translation > 0 and translation > self._config.translation
+        return turned or moved

@@ -1,0 +1,160 @@
+"""A finished map that is read from disk by chunks of 64^3 voxels and never held in memory as a whole."""
+
+from collections import OrderedDict
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf.config.schema import Config
+from taichi_mrf.config.values import from_dict
+from taichi_mrf.errors import ConfigError, MapFileError, said
+from taichi_mrf.export.chunk_store import CHUNK_BYTES, Chunk, ChunkStore
+from taichi_mrf.queries.box import BoxOfVoxels, voxels_of_box
+from taichi_mrf.queries.points import checked_points, classify, probability
+from taichi_mrf.system.memory import check_memory
+from taichi_mrf.voxels.layout import CHUNK_VOXELS
+
+_BYTES_PER_VOXEL = 9
+"""Log-odds, states, and what is made of them."""
+
+
+def _config_of(store: ChunkStore) -> Config:
+    try:
+        return from_dict(Config, yaml.safe_load(store.header.config), str(store.path))
+    except (yaml.YAMLError, ValueError, AttributeError, RecursionError) as error:
+        raise MapFileError(
+            f"{store.path}: damaged: its configuration cannot be read: {said(error)}"
+        ) from error
+
+
+class ChunkedMap:
+    """Answers queries from a store of :class:`ChunkStore`. The chunks used last are kept, up to ``cache_mb``
+    MB (10^6 bytes); memory beside that grows with the answers alone."""
+
+    def __init__(self, store: ChunkStore, cache_mb: float = 256.0) -> None:
+        """Raises ConfigError for a cache that holds no chunk."""
+        if not cache_mb * 1e6 >= CHUNK_BYTES:
+            raise ConfigError(f"cache_mb must be at least {CHUNK_BYTES / 1e6:.3g}, not {cache_mb}")
+        self.store, self.header = store, store.header
+        self.voxel_size = store.header.voxel_size
+        self.config = _config_of(store)
+        self.prior = float(probability(np.array([store.header.prior_log_odds], np.float32))[0])
+        self.chunks = store.chunks
+        self._most = int(cache_mb * 1e6) // CHUNK_BYTES
+        self._known = set(map(tuple, self.chunks.tolist()))
+        self._cache: OrderedDict[Chunk, NDArray[np.float32]] = OrderedDict()
+
+    @classmethod
+    def open(cls, path: str | Path, cache_mb: float = 256.0) -> "ChunkedMap":
+        """The map in a folder such as map.zarr. Raises MapFileError, TaichiMRFError without zarr."""
+        return cls(ChunkStore.open(path), cache_mb)
+
+    @property
+    def extent(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Two corners, (3,) in metres, of the box around all chunks. Raises ConfigError for an empty map."""
+        if not len(self.chunks):
+            raise ConfigError("the map is empty: nothing was ever seen")
+        side = CHUNK_VOXELS * self.voxel_size
+        return self.chunks.min(axis=0) * side, (self.chunks.max(axis=0) + 1) * side
+
+    def log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
+        """Log-odds of occupied at (N, 3) points in metres, (N,); the prior where nobody has looked.
+
+        Raises ConfigError for points of another shape or that are not finite.
+        """
+        voxels = np.clip(np.floor(checked_points(points) / self.voxel_size), -(2**30), 2**30).astype(np.int64)
+        out = np.full(len(voxels), self.header.prior_log_odds, np.float32)
+        chunks, owner = np.unique(voxels // CHUNK_VOXELS, axis=0, return_inverse=True)
+        for number, (x, y, z) in enumerate(chunks.tolist()):
+            if (x, y, z) in self._known:
+                rows = np.flatnonzero(owner.reshape(-1) == number)
+                found = self._block((x, y, z))[tuple((voxels[rows] % CHUNK_VOXELS).T)]
+                out[rows] = np.where(np.isnan(found), self.header.prior_log_odds, found)
+        return out
+
+    def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
+        """Probability of occupied at (N, 3) points in metres, (N,) float32; the prior where nobody has
+        looked."""
+        return probability(self.log_odds(points))
+
+    def state(self, points: ArrayLike) -> NDArray[np.int8]:
+        """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,) int8."""
+        return self._state(self.log_odds(points))
+
+    def box(self, lower: ArrayLike, upper: ArrayLike) -> BoxOfVoxels:
+        """The voxels that a box reaches into, from corner to corner, (3,) in metres each, as dense arrays.
+
+        Raises ConfigError for corners that make no box, CapacityError if it holds more than fits memory.
+        """
+        first, after = voxels_of_box(lower, upper, self.voxel_size)
+        shape = after - first
+        voxels = float(np.prod(shape.astype(np.float64)))
+        check_memory(_BYTES_PER_VOXEL * voxels, f"a box of {voxels / 1e6:.3g} million voxels")
+        log_odds = np.full(shape, self.header.prior_log_odds, np.float32)
+        for begin, block in self._cut(first, after):
+            place = tuple(slice(b, b + n) for b, n in zip(begin - first, block.shape, strict=True))
+            log_odds[place] = np.where(np.isnan(block), self.header.prior_log_odds, block)
+        x, y, z = first.tolist()
+        return BoxOfVoxels(log_odds, self._state(log_odds), (x, y, z), self.voxel_size)
+
+    def voxels(
+        self,
+        lower: ArrayLike | None = None,
+        upper: ArrayLike | None = None,
+        min_probability: float = 0.5,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+        """Voxels that something is known of, of at least this probability, in a box or in all of the map:
+        centres (N, 3) in metres, and (N,).
+
+        Raises ConfigError for a probability outside [0, 1] and for corners that make no box.
+        """
+        if not 0 <= min_probability <= 1:
+            raise ConfigError(f"min_probability must lie between 0 and 1, not {min_probability}")
+        centres: list[NDArray[np.float64]] = [np.zeros((0, 3))]
+        found = [np.zeros(0, np.float32)]
+        if len(self.chunks):
+            low, high = self.extent
+            first, after = voxels_of_box(
+                low if lower is None else lower, high if upper is None else upper, self.voxel_size
+            )
+            for begin, block in self._cut(first, after):
+                occupancy = probability(block)
+                # A comparison with NaN, which is what is unknown, is false.
+                place = np.argwhere(occupancy >= min_probability)
+                centres.append((place + begin + 0.5).astype(np.float64) * self.voxel_size)
+                found.append(occupancy[tuple(place.T)])
+        return np.concatenate(centres), np.concatenate(found)
+
+    def blocks(self, lower: ArrayLike, upper: ArrayLike) -> Iterator[tuple[Chunk, NDArray[np.float32]]]:
+        """The chunks that reach into a box in metres, each with (64, 64, 64) log-odds, NaN for unknown."""
+        first, after = voxels_of_box(lower, upper, self.voxel_size)
+        for chunk in self._chunks_between(first, after):
+            yield chunk, self._block(chunk)
+
+    def _state(self, log_odds: NDArray[np.float32]) -> NDArray[np.int8]:
+        return classify(log_odds, self.header.prior_log_odds, self.header.min_evidence)
+
+    def _chunks_between(self, first: NDArray[np.int64], after: NDArray[np.int64]) -> list[Chunk]:
+        inside = (self.chunks >= first // CHUNK_VOXELS) & (self.chunks <= (after - 1) // CHUNK_VOXELS)
+        return [(x, y, z) for x, y, z in self.chunks[inside.all(axis=1)].tolist()]
+
+    def _cut(
+        self, first: NDArray[np.int64], after: NDArray[np.int64]
+    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
+        """The parts of chunks that lie in a box of voxels, each with its lowest voxel."""
+        for chunk in self._chunks_between(first, after):
+            corner = np.array(chunk, np.int64) * CHUNK_VOXELS
+            begin, end = np.maximum(first, corner), np.minimum(after, corner + CHUNK_VOXELS)
+            cut = tuple(slice(b, e) for b, e in zip(begin - corner, end - corner, strict=True))
+            yield begin, self._block(chunk)[cut]
+
+    def _block(self, chunk: Chunk) -> NDArray[np.float32]:
+        if chunk not in self._cache:
+            self._cache[chunk] = self.store.read(chunk)
+            while len(self._cache) > self._most:
+                self._cache.popitem(last=False)
+        self._cache.move_to_end(chunk)
+        return self._cache[chunk]

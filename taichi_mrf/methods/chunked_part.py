@@ -1,0 +1,89 @@
+"""A box of a map in chunks, taken into memory, where all queries and exports can work on it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf.config.schema import Config
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.methods.chunked import ChunkedMap
+from taichi_mrf.queries.box import voxels_of_box
+from taichi_mrf.queries.known_bricks import Placed
+from taichi_mrf.queries.points import checked_points
+from taichi_mrf.queries.view import View
+from taichi_mrf.system import runtime
+from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS
+from taichi_mrf.voxels.pool import BrickPool
+
+
+@dataclass
+class MapPart:
+    """What a map in chunks says of the bricks from ``lowest`` up to, but without, ``after``, (3,) each;
+    outside of them nothing is known. It has the queries of a map, but neither keyframes nor inference."""
+
+    source: ChunkedMap
+    lowest: NDArray[np.int64]
+    after: NDArray[np.int64]
+    view: View
+    keyframes: Mapping[int, Placed] = field(default_factory=dict)
+    voxel_size: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.voxel_size = self.source.voxel_size
+
+    @property
+    def config(self) -> Config:
+        """The parameters that the map was made with."""
+        return self.source.config
+
+    def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
+        """Probability of occupied at (N, 3) points in metres, (N,)."""
+        points_m = checked_points(points)
+        return np.where(
+            self._inside(points_m), self.source.occupancy(points_m), np.float32(self.source.prior)
+        )
+
+    def state(self, points: ArrayLike) -> NDArray[np.int8]:
+        """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,)."""
+        points_m = checked_points(points)
+        return np.where(self._inside(points_m), self.source.state(points_m), np.int8(0))
+
+    def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+        """All voxels that something is known of, of at least this probability: centres (N, 3) in metres, and
+        (N,)."""
+        brick_m = BRICK * self.voxel_size
+        return self.source.voxels(self.lowest * brick_m, self.after * brick_m, min_probability)
+
+    def _inside(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        bricks = np.floor(points_m / (self.voxel_size * BRICK))
+        return np.all((bricks >= self.lowest) & (bricks < self.after), axis=1)
+
+
+def take_part(m: ChunkedMap, lower: ArrayLike | None = None, upper: ArrayLike | None = None) -> MapPart:
+    """The bricks that a box reaches into, from corner to corner, (3,) in metres each, in memory; None means
+    up to the map's end. Raises ConfigError for corners that make no box or for an empty map, CapacityError if
+    memory would not do."""
+    runtime.init()
+    low, high = m.extent
+    low, high = low if lower is None else np.asarray(lower), high if upper is None else np.asarray(upper)
+    first, after = voxels_of_box(low, high, m.voxel_size)
+    lowest, after = first // BRICK, -(-after // BRICK)
+    pool = BrickPool(m.header.prior_log_odds, m.config.volume.memory_limit_gb)
+    for chunk, block in m.blocks(low, high):
+        values = block.reshape((CHUNK, BRICK) * 3).transpose(0, 2, 4, 1, 3, 5).reshape(-1, VOXELS)
+        bricks = np.indices((CHUNK,) * 3).reshape(3, -1).T + np.array(chunk) * CHUNK
+        inside = ((bricks >= lowest) & (bricks < after)).all(axis=1)
+        # Free and unknown space without a surface near needs no voxels: occupancy() and state() know it.
+        known = ~np.isnan(values)
+        near = (known & (values != np.float32(m.header.seen_free_log_odds))).any(axis=1)
+        taken = np.flatnonzero(inside & near)
+        if len(taken):
+            slots = pool.allocate(bricks[taken].astype(np.int32))
+            pool.owners[slots] = 1
+            pool.write("belief", slots, np.where(known, values, m.header.prior_log_odds)[taken])
+    if not len(pool.in_use):
+        raise ConfigError("there is no surface in this box of the map")
+    volume = replace(m.config.volume, min_evidence=m.header.min_evidence)
+    return MapPart(m, lowest, after, View(pool, m.voxel_size, volume))

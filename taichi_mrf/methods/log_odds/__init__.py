@@ -1,0 +1,1 @@
+"""Occupancy mapping by independent log-odds, OctoMap's method."""

@@ -1,0 +1,68 @@
+"""Occupancy mapping with independent log-odds: the baseline that everybody knows, OctoMap's method.
+
+Every voxel is updated on its own, as if a ray's miss told nothing of the voxels around it. In OctoMap's
+octree equal voxels share a node; here they are kept one by one, which changes no voxel's value.
+"""
+
+from typing import Any, ClassVar
+
+from taichi_mrf.config.schema import Config, LogOddsConfig, Method, SensorConfig, VolumeConfig
+from taichi_mrf.config.values import overridden
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.inference.keyframe import DepthImage
+from taichi_mrf.methods.log_odds.scan import RayFootprint, ScanIntegrator
+from taichi_mrf.methods.recursive import RecursiveMap, Scan
+from taichi_mrf.sensor.noise import NoiseModel
+
+
+class LogOddsMap(RecursiveMap[RayFootprint]):
+    """A map that integrates scans as OctoMap does (Hornung et al. 2013)."""
+
+    METHOD: ClassVar[Method] = "log_odds"
+
+    def __init__(
+        self,
+        voxel_size: float = 0.02,
+        noise: NoiseModel | None = None,
+        *,
+        log_odds: LogOddsConfig | None = None,
+        volume: VolumeConfig | None = None,
+        min_depth: float = SensorConfig.min_depth,
+        max_depth: float = SensorConfig.max_depth,
+        **parameters: Any,
+    ) -> None:
+        """``parameters`` are fields of LogOddsConfig, such as ``hit=0.7`` or ``max_range=4.0``.
+
+        ``noise`` (a Kinect 1 by default) is only asked for the bias, with ``correct_bias=True``.
+        Raises ConfigError for an unknown or impossible parameter.
+        """
+        config = Config(
+            voxel_size,
+            self.METHOD,
+            SensorConfig(min_depth=min_depth, max_depth=max_depth),
+            log_odds=overridden(log_odds or LogOddsConfig(), parameters, "LogOddsMap"),
+            volume=volume or VolumeConfig(),
+        )
+        super().__init__(config, noise)
+        self._integrator = ScanIntegrator(voxel_size, max_depth, config.log_odds, config.volume)
+
+    @classmethod
+    def _create(cls, config: Config, noise: NoiseModel) -> "LogOddsMap":
+        return cls(
+            config.voxel_size,
+            noise,
+            log_odds=config.log_odds,
+            volume=config.volume,
+            min_depth=config.sensor.min_depth,
+            max_depth=config.sensor.max_depth,
+        )
+
+    def _reach(self, image: DepthImage, T_world_camera: Pose) -> RayFootprint:
+        return self._integrator.reach(image, T_world_camera)
+
+    def _integrate(self, scan: Scan[RayFootprint]) -> None:
+        self._integrator.integrate(scan.footprint, scan.T_world_camera, scan.slots, self._pool)
+
+    @property
+    def _scratch_bytes(self) -> int:
+        return self._integrator.nbytes

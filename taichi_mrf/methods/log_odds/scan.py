@@ -1,0 +1,223 @@
+"""One scan integrated into independent log-odds, as OctoMap does it (Hornung et al. 2013, section 3.2).
+
+A ray says "free" of every voxel from the camera's own up to, but not including, the one that it ends in,
+and "occupied" of that one if it ends at a measured surface. For each voxel the scan's rays are counted
+first, hits and misses in the halves of one integer, and then weighed into one change of its log-odds:
+what comes out does not depend on the order of the rays.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf.config.schema import LogOddsConfig, VolumeConfig
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.inference.accumulators import low_half
+from taichi_mrf.inference.footprint import visible_box, window_around
+from taichi_mrf.inference.keyframe import DepthImage, Footprint
+from taichi_mrf.kernels.types import (
+    F32,
+    I32,
+    F32Array,
+    F32Array2,
+    I32Array,
+    I64Array,
+    IVec3,
+    Struct,
+    Template,
+    Vec3,
+    Vec4,
+)
+from taichi_mrf.methods.ray_ends import HIT, end_of, ray_ends
+from taichi_mrf.methods.recursive_update import updated
+from taichi_mrf.system import runtime
+from taichi_mrf.system.memory import check_memory
+from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.numbering import flat, voxel_number
+from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.traversal import clip, make_ray, walk_bricks, walk_voxels
+from taichi_mrf.voxels.window import Window, WindowIndex
+
+
+@dataclass(frozen=True)
+class RayFootprint(Footprint):
+    """A footprint with the ends of the rays that made it (see ray_ends.py)."""
+
+    ends: ti.Ndarray
+
+
+class ScanIntegrator:
+    """Counts and weighs; owns the scratch that all scans share, which grows to the largest of them."""
+
+    def __init__(
+        self, voxel_size: float, max_depth: float, config: LogOddsConfig, volume: VolumeConfig
+    ) -> None:
+        self.voxel_size, self.max_depth, self.config, self.volume = voxel_size, max_depth, config, volume
+        self.index = WindowIndex()
+        self.tally = ti.ndarray(ti.i64, VOXELS)
+        self.tally.fill(0)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the scratch."""
+        return self.tally.shape[0] * 8 + self.index.bricks.shape[0] * 4
+
+    def reach(self, image: DepthImage, T_world_camera: Pose) -> RayFootprint:
+        """The bricks that a scan's rays cross. Raises CapacityError if there are too many of them."""
+        config, centre_m = self.config, T_world_camera[:3, 3]
+        lower_m, upper_m = visible_box(image, T_world_camera, self.max_depth, end_sigmas=0.0)
+        if config.max_range > 0:
+            lower_m = np.maximum(lower_m, centre_m - config.max_range)
+            upper_m = np.minimum(upper_m, centre_m + config.max_range)
+        # A voxel to spare: the centre of a voxel may lie further out than what was measured in it.
+        lower_m, upper_m = lower_m - self.voxel_size, upper_m + self.voxel_size
+        window = window_around(lower_m, upper_m, self.voxel_size, self.volume)
+        if window is None or image.rays == 0:
+            window, nothing = Window.covering(centre_m, centre_m, self.voxel_size), np.zeros(0, np.int32)
+            return RayFootprint(window, nothing, nothing, 1, ti.ndarray(ti.f32, (1, 4)))
+        ends = ray_ends(
+            image, T_world_camera, window, max_depth=self.max_depth, max_range=config.max_range,
+            discretise=config.discretise, correct_bias=config.correct_bias,
+        )  # fmt: skip
+        marks = np.zeros(window.cells, np.int32)
+        box = window.clip_box(self.volume.lower, self.volume.upper)
+        _mark(ends, window.rays_of(T_world_camera)[0], window.shape_vector, *box, marks)
+        crossed = np.flatnonzero(marks).astype(np.int32)
+        self._reserve(len(crossed))
+        return RayFootprint(window, crossed, crossed, 1, ends)
+
+    def integrate(
+        self, footprint: RayFootprint, T_world_camera: Pose, slots: NDArray[np.int32], pool: BrickPool
+    ) -> None:
+        """Change the log-odds of what a scan's rays pass and hit; ``slots`` (n,) are the bricks crossed."""
+        config, window, n = self.config, footprint.window, len(slots)
+        box = window.clip_box(self.volume.lower, self.volume.upper)
+        every_ray = config.update == "ray"
+        self.index.fill(window, footprint.crossed, np.arange(n, dtype=np.int32))
+        count_rays(
+            footprint.ends, window.rays_of(T_world_camera)[0], window.shape_vector, *box,
+            self.index.chunks, self.index.bricks, self.tally, every_ray,
+        )  # fmt: skip
+        self.index.clear(window, footprint.crossed)
+        weigh(
+            slots, pool.belief, self.tally, log_odds(config.hit), log_odds(config.miss),
+            log_odds(config.lowest), log_odds(config.highest), every_ray,
+        )  # fmt: skip
+
+    def _reserve(self, bricks: int) -> None:
+        if bricks * VOXELS > self.tally.shape[0]:
+            what = f"a scan of {bricks * VOXELS / 1e6:.3g} million voxels of {self.voxel_size:g} m"
+            check_memory(8.0 * bricks * VOXELS, what, self.volume.memory_limit_gb)
+            runtime.settle()
+            self.tally = ti.ndarray(ti.i64, bricks * VOXELS)
+            self.tally.fill(0)
+
+
+def log_odds(probability: float) -> float:
+    """ln(p / (1 - p))."""
+    return math.log(probability / (1 - probability))
+
+
+@ti.func
+def _end_voxel(end: Vec4) -> IVec3:
+    return ti.floor(Vec3(end[0], end[1], end[2]), ti.i32)
+
+
+@ti.func
+def _in_box(voxel: IVec3, lower: Vec3, upper: Vec3) -> I32:
+    centre = ti.cast(voxel, ti.f32) + 0.5
+    return (centre - lower).min() > 0.0 and (upper - centre).min() > 0.0
+
+
+@ti.func
+def _mark_brick(state: Template, context: Template, ray: Template, brick: IVec3, t: F32, t_leave: F32):
+    cell = flat(brick, context[0])
+    if context[1][cell] == 0:  # most bricks are marked already, and reading is cheaper
+        context[1][cell] = 1
+    return 1
+
+
+@ti.kernel
+def _mark(ends: F32Array2, centre: Vec3, shape: IVec3, lower: Vec3, upper: Vec3, marks: I32Array):
+    for i in range(ends.shape[0]):
+        end = end_of(ends, i)
+        if end[3] >= 0.0:
+            ray = make_ray(centre, Vec3(end[0], end[1], end[2]) - centre)
+            t_begin, t_end = 0.0, 1.0
+            clip(ray, t_begin, t_end, lower, upper)
+            nothing = 0
+            walk_bricks(ray, t_begin, t_end, shape, marks, False, _mark_brick, nothing, (shape, marks))
+            if _in_box(_end_voxel(end), lower, upper):
+                marks[flat(_end_voxel(end) // BRICK, shape)] = 1
+
+
+@ti.dataclass
+class _Pass(Struct):
+    last: I32  # the voxel that the ray ends in, -1 outside the volume
+
+
+@ti.func
+def _pass_voxel(state: Template, context: Template, voxel: I32, near: F32, far: F32):
+    go = ti.cast(voxel != state.last, ti.i32)
+    if go == 1:
+        _count(context[0], voxel, ti.cast(1, ti.i64), context[1])
+    return go
+
+
+@ti.func
+def _count(tally: Template, voxel: I32, one: ti.i64, every_ray: Template):
+    """Count a ray, or only that there is one: near the camera hundreds of rays pass each voxel."""
+    if ti.static(every_ray):
+        ti.atomic_add(tally[voxel], one)
+    elif (tally[voxel] & one) == 0:
+        ti.atomic_or(tally[voxel], one)
+
+
+@ti.kernel
+def count_rays(
+    ends: F32Array2, centre: Vec3, shape: IVec3, lower: Vec3, upper: Vec3,
+    chunks: I32Array, bricks: I32Array, tally: I64Array, every_ray: Template,
+):  # fmt: skip
+    """Count hits (upper half of the tally) and misses (lower half) of each voxel, or with ``every_ray``
+    off only whether there were any.
+
+    A ray goes from ``centre`` to its end, both in voxels.
+    """
+    for i in range(ends.shape[0]):
+        end = end_of(ends, i)
+        if end[3] >= 0.0:
+            ray = make_ray(centre, Vec3(end[0], end[1], end[2]) - centre)
+            t_begin, t_end = 0.0, 1.0
+            clip(ray, t_begin, t_end, lower, upper)
+            voxel = _end_voxel(end)
+            state = _Pass(-1)
+            if _in_box(voxel, lower, upper):
+                brick = voxel // BRICK
+                state.last = bricks[flat(brick, shape)] * VOXELS + voxel_number(voxel - brick * BRICK)
+            walk_voxels(ray, t_begin, t_end, shape, chunks, bricks, _pass_voxel, state, (tally, every_ray))
+            if state.last >= 0 and end[3] == HIT:
+                _count(tally, state.last, ti.cast(1, ti.i64) << 32, every_ray)
+
+
+@ti.kernel
+def weigh(
+    slots: I32Array, belief: F32Array, tally: I64Array,
+    hit: F32, miss: F32, lowest: F32, highest: F32, every_ray: Template,
+):  # fmt: skip
+    """Change each voxel's log-odds by what was counted, and empty the tally.
+
+    One update for each voxel, in which a hit wins, or with ``every_ray`` the sum over all rays.
+    """
+    for i in range(slots.shape[0] * VOXELS):
+        counted = tally[i]
+        if counted != 0:
+            tally[i] = 0
+            hits, misses = ti.cast(counted >> 32, ti.f32), ti.cast(low_half(counted), ti.f32)
+            change = hits * hit + misses * miss
+            if not ti.static(every_ray):
+                change = hit if hits > 0.0 else miss
+            j = slots[i // VOXELS] * VOXELS + i % VOXELS
+            belief[j] = updated(belief[j], change, lowest, highest)

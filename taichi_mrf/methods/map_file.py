@@ -1,0 +1,190 @@
+"""What maps on disk have in common, whatever the mapping method: one .npz file that NumPy alone can read.
+
+Its header says which format and which method it is of, with which parameters and which noise, and holds
+the keyframes' images and poses. The bricks and what they hold are each method's own matter. Its manifest
+names all members with their checksums, so that nothing of it can change, or be lost, unnoticed.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from taichi_mrf.config.schema import Config, Method, to_yaml
+from taichi_mrf.config.values import from_dict
+from taichi_mrf.errors import CapacityError, MapFileError, TaichiMRFError, said
+from taichi_mrf.geometry.poses import Pose, as_pose
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
+from taichi_mrf.system.npz_file import NpzFile, open_npz
+from taichi_mrf.voxels.layout import VOXELS
+
+FORMAT = 2
+"""What is written: since format 2 with a manifest."""
+
+READABLE = (1, 2)
+"""What is read."""
+
+CLASSES: dict[Method, str] = {"mrf": "MRFMap", "log_odds": "LogOddsMap", "visibility": "VisibilityMap"}
+"""Who reads a map of each method."""
+
+_CAMERA_VALUES = 6
+
+
+@dataclass(frozen=True)
+class StoredKeyframe:
+    """A keyframe's number, name, (H, W) axial depth in metres, pose and camera."""
+
+    id: int
+    name: str
+    depth_m: NDArray[np.float32]
+    T_world_camera: Pose
+    camera: PinholeCamera
+
+
+@dataclass(frozen=True)
+class MapHeader:
+    """What every map has; ``config.method`` says of which method it is."""
+
+    config: Config
+    noise: NoiseModel
+    keyframes: list[StoredKeyframe]
+    next_id: int
+
+    def limited_to(self, memory_limit_gb: float | None) -> Config:
+        """The parameters, with another limit of memory unless it is None."""
+        if memory_limit_gb is None:
+            return self.config
+        volume = replace(self.config.volume, memory_limit_gb=memory_limit_gb)
+        return replace(self.config, volume=volume)
+
+    def arrays(self) -> dict[str, NDArray]:
+        """The header as arrays by name. Raises MapFileError for a noise model that cannot be saved."""
+        keyframes = self.keyframes
+        arrays: dict[str, NDArray] = {
+            "format": np.asarray(FORMAT),
+            "method": np.asarray(self.config.method),
+            "config": np.asarray(to_yaml(self.config)),
+            "keyframe_ids": np.array([k.id for k in keyframes], np.int64),
+            "keyframe_names": np.array([k.name for k in keyframes], np.str_),
+            "keyframe_T_world_camera": np.array([k.T_world_camera for k in keyframes]).reshape(-1, 4, 4),
+            "keyframe_cameras": np.array([_camera_row(k.camera) for k in keyframes]).reshape(-1, 6),
+            "next_id": np.asarray(self.next_id),
+            **_noise_arrays(self.noise),
+        }
+        for number, keyframe in enumerate(keyframes):
+            arrays[f"keyframe_depth_{number}"] = keyframe.depth_m
+        return arrays
+
+
+@contextmanager
+def open_map_file(path: Path, method: Method | None = None) -> Iterator[NpzFile]:
+    """The arrays of a map's file, by name.
+
+    Raises MapFileError naming the file and what is wrong with it, also for what goes wrong inside the
+    ``with`` block, and if the map is of another ``method`` (None takes all).
+    """
+    with naming(path), open_npz(path, MapFileError, "a readable map") as file:
+        if "format" not in file:
+            raise MapFileError(f"{path}: not a map of taichi_mrf")
+        format = file.scalar("format", "iu")
+        if format not in READABLE:
+            newer = ", by a newer version" if format > FORMAT else ""
+            raise MapFileError(
+                f"{path}: written in format {format}{newer}; this version reads formats 1 to {FORMAT}"
+            )
+        if format > 1:
+            file.check_manifest()
+        found = method_of(file)
+        if found not in CLASSES:
+            raise MapFileError(f"{path}: a map of the method '{found}', which this version does not know")
+        if method is not None and found != method:
+            raise MapFileError(
+                f"{path}: a map of the method '{found}', which {CLASSES[found]}.load reads, "
+                f"not {CLASSES[method]}.load"
+            )
+        yield file
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """What goes wrong in the block, with what a file holds, is raised as an error that names the file:
+    CapacityError as such, all else of this package as MapFileError."""
+    try:
+        yield
+    except TaichiMRFError as error:
+        kind = CapacityError if isinstance(error, CapacityError) else MapFileError
+        raise kind(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+
+
+def method_of(file: NpzFile) -> Method:
+    """The mapping method of a map's file; the first maps did not say it, because there was only one."""
+    return file.scalar("method", "U") if "method" in file else "mrf"
+
+
+def read_header(path: Path, file: NpzFile) -> MapHeader:
+    """The header of an open file."""
+    ids = file.array("keyframe_ids", "i", (None,))
+    n = len(ids)
+    names = file.array("keyframe_names", "U", (n,)).tolist()
+    poses = file.array("keyframe_T_world_camera", "f", (n, 4, 4))
+    cameras = file.array("keyframe_cameras", "fi", (n, _CAMERA_VALUES))
+    keyframes = []
+    for i, id in enumerate(ids.tolist()):
+        camera = _camera(cameras[i])
+        depth_m = file.array(f"keyframe_depth_{i}", "f", camera.shape)
+        keyframes.append(StoredKeyframe(id, names[i], depth_m, as_pose(poses[i]), camera))
+    next_id = file.scalar("next_id", "i")
+    if len(set(ids.tolist())) < n or not all(0 <= id < next_id for id in ids.tolist()):
+        raise MapFileError(f"{path}: damaged: the numbers of its keyframes are not those of a map")
+    return MapHeader(_config(path, file), _noise(file), keyframes, next_id)
+
+
+def read_bricks(path: Path, file: NpzFile) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Which bricks a map has, (n, 3), and their beliefs, (n, 512)."""
+    bricks = file.array("bricks", "i", (None, 3))
+    if len(np.unique(bricks, axis=0)) < len(bricks):
+        raise MapFileError(f"{path}: damaged: it has a brick twice")
+    return bricks.astype(np.int32), file.array("belief", "f", (len(bricks), VOXELS)).astype(np.float32)
+
+
+def _config(path: Path, file: NpzFile) -> Config:
+    try:
+        return from_dict(Config, yaml.safe_load(file.scalar("config", "U")), str(path))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise MapFileError(f"{path}: damaged: config cannot be read: {said(error)}") from error
+
+
+def _camera_row(camera: PinholeCamera) -> list[float]:
+    return [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
+
+
+def _camera(row: NDArray[np.float64]) -> PinholeCamera:
+    width, height, *rest = row.tolist()
+    return PinholeCamera(int(width), int(height), *rest)
+
+
+def _noise_arrays(noise: NoiseModel) -> dict[str, NDArray]:
+    if isinstance(noise, PatchNoise):
+        return {
+            "noise_sigma": noise.sigma,
+            "noise_bias": noise.bias,
+            "noise_patch": np.asarray(noise.patch),
+            "noise_camera": np.asarray(_camera_row(noise.camera)),
+        }
+    if isinstance(noise, PolynomialNoise):
+        return {"noise_sigma": noise.sigma, "noise_bias": noise.bias}
+    raise MapFileError(f"a noise model of type {type(noise).__name__} cannot be saved")
+
+
+def _noise(file: NpzFile) -> NoiseModel:
+    if "noise_patch" in file:
+        camera = _camera(file.array("noise_camera", "fi", (_CAMERA_VALUES,)))
+        sigma, bias = (file.array(name, "f", (None, None)) for name in ("noise_sigma", "noise_bias"))
+        return PatchNoise(sigma, bias, file.scalar("noise_patch", "iu"), camera)
+    sigma, bias = (file.array(name, "f", (1, None))[0] for name in ("noise_sigma", "noise_bias"))
+    return PolynomialNoise(sigma, bias)

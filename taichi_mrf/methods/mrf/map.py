@@ -1,0 +1,389 @@
+"""The map: keyframes go in, marginal probabilities of occupancy come out.
+
+MRFMap (Shankar & Michael, RSS 2020) as an object. It keeps the books: which bricks exist and who owns
+them, which keyframes see them. The computation itself is inference/sum_product.py.
+"""
+
+import math
+import weakref
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf.alignment.keyframe_surfels import KeyframeSurfels
+from taichi_mrf.alignment.refine import Aligner, RefinedPose
+from taichi_mrf.config.schema import Config, InferenceConfig, PoseConfig, SensorConfig, VolumeConfig
+from taichi_mrf.config.values import overridden
+from taichi_mrf.errors import KeyframeError
+from taichi_mrf.factor_graph.depth_graph import depth_graph
+from taichi_mrf.factor_graph.graph import FactorGraph
+from taichi_mrf.geometry.poses import as_pose
+from taichi_mrf.inference.incremental import Renewal
+from taichi_mrf.inference.keyframe import DepthImage, Keyframe, checked_depth
+from taichi_mrf.inference.keyframe_bounds import Whereabouts
+from taichi_mrf.inference.messages import count_voices
+from taichi_mrf.inference.prior import prior_probability
+from taichi_mrf.inference.ray_list import RayLister
+from taichi_mrf.inference.schedule import InferReport, Progress, content_key, run_sweeps
+from taichi_mrf.inference.sweep import Sweeper, unknown_begins
+from taichi_mrf.methods.map_file import MapHeader, StoredKeyframe, naming
+from taichi_mrf.methods.mrf.brick_registry import BrickBook
+from taichi_mrf.methods.mrf.checkpoint import Checkpoint, go_back, take_checkpoint
+from taichi_mrf.methods.mrf.keyframe_allocator import Placing
+from taichi_mrf.methods.mrf.memory_budget import Room
+from taichi_mrf.methods.mrf.storage import contents_of, read_contents, write_contents
+from taichi_mrf.methods.statistics import MapStatistics, measure
+from taichi_mrf.queries.extract import extract_voxels
+from taichi_mrf.queries.points import classify, point_log_odds, probability
+from taichi_mrf.queries.profile import RayProfile
+from taichi_mrf.queries.view import View
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config, warn_of_bad_sigma
+from taichi_mrf.system import runtime
+from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.topology import create_topology, recycle
+
+
+class MRFMap:
+    """A probabilistic occupancy map of any set of depth keyframes.
+
+    Keyframes can be added, removed, moved and frozen in any order; after :meth:`infer` the map is the
+    one that the final set gives. Between changes and :meth:`infer`, queries answer with what is known.
+    """
+
+    def __init__(
+        self,
+        voxel_size: float = 0.05,
+        noise: NoiseModel | None = None,
+        *,
+        inference: InferenceConfig | None = None,
+        volume: VolumeConfig | None = None,
+        min_depth: float = SensorConfig.min_depth,
+        max_depth: float = SensorConfig.max_depth,
+        **parameters: Any,
+    ) -> None:
+        """``parameters`` are fields of InferenceConfig, such as ``surface_density=2.1`` or ``prior=0.1``.
+
+        ``noise`` defaults to a Kinect 1. Raises ConfigError for an unknown or impossible parameter.
+        """
+        runtime.init()
+        self.sensor = SensorConfig(min_depth=min_depth, max_depth=max_depth)
+        inference = overridden(inference or InferenceConfig(), parameters, "MRFMap")
+        self.config = Config(
+            voxel_size, sensor=self.sensor, inference=inference, volume=volume or VolumeConfig()
+        )
+        self.noise = noise if noise is not None else PolynomialNoise(self.sensor.sigma, self.sensor.bias)
+        self.voxel_size = self.config.voxel_size
+        self.prior = prior_probability(inference, self.voxel_size)
+        prior_log_odds = math.log(self.prior / (1 - self.prior))
+        self._pool = BrickPool(prior_log_odds, self.config.volume.memory_limit_gb)
+        topology = create_topology(runtime.active() or "cpu", self.config.volume.dense_bricks)
+        weakref.finalize(self, recycle, topology)
+        self._book = BrickBook(topology, self._pool, self.voxel_size)
+        lister = RayLister(self.voxel_size, inference)
+        whereabouts = Whereabouts()
+        parts = (self.sensor, inference, self.config.volume)
+        self._keyframes: dict[int, Keyframe] = {}
+        room = Room(self._pool, inference.message_precision)
+        self._placing = Placing(self._book, lister, *parts, whereabouts, room)
+        self._sweeper = Sweeper(self.voxel_size, self.sensor, inference, self.config.volume)
+        kept = (self._placing.look_again, self._placing.refresh)
+        self._renewal = Renewal(self._pool, self._sweeper, whereabouts, *kept, inference.renew_tolerance)
+        self.view = View(self._pool, self.voxel_size, self.config.volume)
+        self.aligner = Aligner(self.view, KeyframeSurfels(self.voxel_size, max_depth))
+        self._frozen: dict[int, str] = {}
+        self._next_id = 0
+        self._messages_lost = False  # a loaded map has beliefs, but no messages
+
+    @classmethod
+    def from_config(cls, config: Config, camera: PinholeCamera) -> "MRFMap":
+        """A map with a configuration's parameters; ``camera`` is what its noise tables must fit."""
+        return cls._with(config, noise_from_config(config.sensor, camera))
+
+    @classmethod
+    def _with(cls, config: Config, noise: NoiseModel) -> "MRFMap":
+        depths = {"min_depth": config.sensor.min_depth, "max_depth": config.sensor.max_depth}
+        return cls(config.voxel_size, noise, inference=config.inference, volume=config.volume, **depths)
+
+    @property
+    def keyframes(self) -> Mapping[int, Keyframe]:
+        """The keyframes that can still be moved and removed, by id."""
+        return MappingProxyType(self._keyframes)
+
+    @property
+    def frozen(self) -> Mapping[int, str]:
+        """Names of the keyframes that have been frozen, by id."""
+        return MappingProxyType(self._frozen)
+
+    def add_keyframe(
+        self, depth_m: ArrayLike, T_world_camera: ArrayLike, camera: PinholeCamera, name: str = ""
+    ) -> int:
+        """Add a depth image; it takes part from the next :meth:`infer` on.
+
+        ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
+        ``T_world_camera`` is (4, 4). Returns the keyframe's id.
+        Raises KeyframeError for a wrong shape or pose, CapacityError if the map would not fit.
+        """
+        T = as_pose(T_world_camera)
+        image = self._upload(depth_m, camera)
+        keyframe = self._placing.place(self._next_id, name or f"keyframe {self._next_id}", image, T)
+        self._keyframes[keyframe.id] = keyframe
+        self._next_id += 1
+        return keyframe.id
+
+    def remove_keyframe(self, id: int) -> None:
+        """Take a keyframe out, with all that it has said, and the bricks that only it wanted."""
+        keyframe = self._find(id)
+        self._restore_messages()
+        self._placing.take_out(keyframe)
+        del self._keyframes[id]
+
+    def move_keyframe(self, id: int, T_world_camera: ArrayLike) -> None:
+        """Give a keyframe another pose, as a SLAM back-end does; its messages begin anew."""
+        keyframe = self._find(id)
+        T = as_pose(T_world_camera)
+        self._restore_messages()
+        self._placing.take_out(keyframe)
+        try:
+            self._keyframes[id] = self._placing.place(id, keyframe.name, keyframe.image, T)
+        except Exception:
+            self._keyframes[id] = self._placing.put_back(keyframe)
+            raise
+
+    def refine_pose(
+        self, id: int, config: PoseConfig | None = None, guesses: Sequence[ArrayLike] = ()
+    ) -> RefinedPose:
+        """Move a keyframe to the pose under which its depth is most likely in the map of the others, if that
+        is near and better; its messages then begin anew. The search begins at its pose, or at that one of
+        ``guesses``, (4, 4) each, that fits better. Raises KeyframeError if there is no such keyframe."""
+        keyframe = self._find(id)
+        self._restore_messages()
+        if keyframe.messages is not None:
+            self._placing.refresh(keyframe)
+        poses = [as_pose(T) for T in guesses]
+        refined = self.aligner.refine(keyframe, self._keyframes, config or PoseConfig(), poses)
+        if refined.accepted:
+            self.move_keyframe(id, refined.T_world_camera)
+        return refined
+
+    def freeze_keyframe(self, id: int) -> None:
+        """Fold a keyframe's messages into what inference starts from, and forget its image.
+
+        It can be neither moved nor removed any more, and costs neither time nor memory. What it saw of
+        bricks that do not exist yet is lost, but for their being free.
+        """
+        keyframe = self._find(id)
+        self._restore_messages()
+        if keyframe.messages is None:
+            raise KeyframeError(
+                f"keyframe {id} ({keyframe.name}) has no messages to freeze: call infer first"
+            )
+        self._placing.freeze(keyframe)
+        self.aligner.surface.freeze(keyframe)
+        self._frozen[id] = keyframe.name
+        del self._keyframes[id]
+
+    def infer(
+        self,
+        sweeps: int | None = None,
+        tolerance: float | None = None,
+        keyframes: Iterable[int] | None = None,
+        progress: Progress | None = None,
+        method: Literal["sum-product", "max-product"] | None = None,
+    ) -> InferReport:
+        """Compute the marginals by loopy belief propagation.
+
+        Without ``keyframes`` all of them are swept, from no messages and in an order that depends on
+        what they hold: the map is a function of the set of keyframes. With ``keyframes`` (ids) only
+        those are renewed, starting from what is known, which costs no more than they do.
+        ``progress`` is called after each keyframe and stops inference by returning False. ``method`` takes
+        the place of the configuration's, from now on. Raises ConfigError for one that there is not.
+        """
+        if method is not None and method != self.config.inference.method:
+            self._use(method)
+        config = self.config.inference
+        sweeps = config.sweeps if sweeps is None else sweeps
+        tolerance = config.tolerance if tolerance is None else tolerance
+        if keyframes is None:
+            chosen = sorted(self._keyframes.values(), key=content_key)
+            self._pool.restart()
+            for keyframe in chosen:
+                # A ray that starts further out rounds otherwise, so what earlier sweeps learnt must not show.
+                keyframe.begins, keyframe.begins_known = unknown_begins(keyframe.ray_list), False
+                keyframe.messages = None
+                self._placing.refresh(keyframe)
+            self._messages_lost = False
+        else:
+            chosen = [self._find(id) for id in dict.fromkeys(keyframes)]
+            self._restore_messages()
+            for keyframe in chosen:
+                self._placing.refresh(keyframe)
+        for keyframe in chosen:
+            self._pool.touch(keyframe.visible.slots)
+        return run_sweeps(chosen, self._pool, self._sweeper, sweeps, tolerance, progress)
+
+    def renew(
+        self,
+        keyframes: Iterable[int] = (),
+        tolerance: float | None = None,
+        seconds: float | None = None,
+        progress: Progress | None = None,
+    ) -> InferReport:
+        """Bring the marginals up to date without beginning anew: sweep ``keyframes`` (ids), new ones for
+        instance, then those to whom others have said something new, the most affected first, until no
+        keyframe has had more than ``tolerance`` of its voxels' marginals moved since its last sweep.
+
+        Begins no further sweep after ``seconds``; what is left is done by the next call. The report's
+        ``residual`` is the largest share left, its ``sweeps`` count keyframes. ``tolerance`` defaults to
+        ``inference.renew_tolerance``. The map then depends a little on the order of events, which
+        :meth:`infer` does not.
+        """
+        first = [self._find(id).id for id in keyframes]
+        self._restore_messages()
+        if tolerance is None:
+            tolerance = self.config.inference.renew_tolerance
+        return self._renewal.run(self._keyframes, first, tolerance, seconds, progress)
+
+    def factor_graph(self, every: int = 1, memory_limit_gb: float = 0.0) -> FactorGraph:
+        """The factor graph without average messages, for factor_graph.solve: a factor for each ray of every
+        ``every``-th pixel, both ways, and one for each voxel's prior; its cells are the pool's voxels.
+        Raises CapacityError, which names its size, if it does not fit."""
+        keyframes = sorted(self._keyframes.values(), key=content_key)
+        for keyframe in keyframes:
+            self._placing.refresh(keyframe)
+        parts = (self.sensor, self.config.inference, self.config.volume)
+        return depth_graph(keyframes, self._pool, self.voxel_size, *parts, every, memory_limit_gb)
+
+    def adopt(self, log_odds: NDArray[np.float32]) -> None:
+        """Believe these log-odds of the cells of :meth:`factor_graph`, (cells,), until the next infer."""
+        self._pool.restart()
+        for keyframe in self._keyframes.values():
+            keyframe.messages = None
+        self._placing.count_silent(self._keyframes.values())
+        self._pool.write("belief", self._pool.in_use, log_odds.reshape(-1, VOXELS).astype(np.float32))
+        self._pool.touch(self._pool.in_use)
+        self._messages_lost = bool(self._keyframes)
+
+    def checkpoint(self) -> Checkpoint:
+        """What :meth:`restore` needs to undo a full :meth:`infer` that ``progress`` has stopped."""
+        return take_checkpoint(self._pool, self._keyframes.values(), self._messages_lost)
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go back to a checkpoint, since which only :meth:`infer` was called."""
+        go_back(checkpoint, self._pool, self._keyframes.values())
+        self._messages_lost = checkpoint.messages_lost
+        self._placing.count_silent(self._keyframes.values())
+
+    def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """How many keyframes say something of each voxel of some bricks of the pool, (n,) -> (n, 512); all
+        that are frozen count as one, and 255 means so many or more."""
+        spoken = [(k.visible, k.messages) for k in self._keyframes.values() if k.messages is not None]
+        return count_voices(slots, spoken, self._pool)
+
+    def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
+        """Marginal probability of occupied at (N, 3) points in metres, (N,) float32; the prior where
+        nobody has looked."""
+        return probability(self._log_odds(points))
+
+    def state(self, points: ArrayLike) -> NDArray[np.int8]:
+        """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,) int8."""
+        return classify(self._log_odds(points), self._pool.prior_log_odds, self.config.volume.min_evidence)
+
+    def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+        """All allocated voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
+        return extract_voxels(self._pool, self.voxel_size, min_probability)
+
+    def render_depth(self, camera: PinholeCamera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
+        """Axial depth of the likeliest surface seen by each pixel, (H, W) float32, NaN where none is."""
+        return self.view.render_depth(camera, as_pose(T_world_camera), self.sensor.max_depth)
+
+    def ray_profile(
+        self, origin: ArrayLike, direction: ArrayLike, max_range: float | None = None
+    ) -> RayProfile:
+        """Occupancy, visibility and omega (eqs. 15 to 18) along a ray, by range in metres."""
+        return self.view.ray_profile(origin, direction, max_range or self.sensor.max_depth)
+
+    @property
+    def last_voxel_steps(self) -> int:
+        """Voxels that the rays of the last keyframe swept have crossed, each ray's counted."""
+        return self._sweeper.voxel_steps
+
+    def statistics(self) -> MapStatistics:
+        """How large the map is."""
+        keyframes = self._keyframes.values()
+        return measure(
+            self._pool,
+            keyframes=len(keyframes),
+            frozen=len(self._frozen),
+            rays=sum(k.rays for k in keyframes),
+            message_bytes=sum(k.voxel_bytes for k in keyframes),
+            other_bytes=sum(k.image_bytes for k in keyframes) + self._sweeper.nbytes,
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the map to one .npz file, beside it first and then into place. Raises MapFileError."""
+        keyframes = list(self._keyframes.values())
+        stored = [StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera) for k in keyframes]
+        header = MapHeader(self.config, self.noise, stored, self._next_id)
+        write_contents(Path(path), contents_of(header, self._book, keyframes, self._frozen))
+
+    @classmethod
+    def load(cls, path: str | Path, memory_limit_gb: float | None = None) -> "MRFMap":
+        """Read a map that can be queried at once and extended; ``memory_limit_gb`` takes the place of its
+        own. Raises MapFileError, or CapacityError if there is no room for it."""
+        contents = read_contents(Path(path))
+        header, bricks = contents.header, contents.bricks
+        with naming(Path(path)):
+            m = cls._with(header.limited_to(memory_limit_gb), header.noise)
+            if len(bricks):
+                slots = m._book.restore(bricks, contents.frozen_owners)
+            m._book.see_for_good(contents.frozen_crossed)
+            m._frozen = dict(contents.frozen)
+            for stored in header.keyframes:
+                image = m._upload(stored.depth_m, stored.camera)
+                m._keyframes[stored.id] = m._placing.place(
+                    stored.id, stored.name, image, stored.T_world_camera
+                )
+        if len(bricks):
+            m._pool.write("belief", slots, contents.belief)
+            if contents.evidence is not None:
+                m._pool.write("evidence", slots, contents.evidence)
+        m._next_id = header.next_id
+        m._messages_lost = bool(m._keyframes)
+        return m
+
+    def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
+        seen_free = self._pool.prior_log_odds - self.config.inference.message_clamp
+        return point_log_odds(points, self.voxel_size, self._book.topology, self._pool, seen_free)
+
+    def _find(self, id: int) -> Keyframe:
+        if id in self._frozen:
+            raise KeyframeError(f"keyframe {id} ({self._frozen[id]}) is frozen")
+        if id not in self._keyframes:
+            raise KeyframeError(f"there is no keyframe {id}")
+        return self._keyframes[id]
+
+    def _upload(self, depth_m: ArrayLike, camera: PinholeCamera) -> DepthImage:
+        image = DepthImage.upload(checked_depth(depth_m, camera, self.sensor.min_depth), camera, self.noise)
+        if not self._keyframes:
+            warn_of_bad_sigma(image.noise_table, self.sensor.min_depth, self.sensor.max_depth)
+        return image
+
+    def _use(self, method: str) -> None:
+        """Infer by this method from now on: no keyframe has sent its messages by it yet."""
+        inference = overridden(self.config.inference, {"method": method}, "MRFMap.infer")
+        self.config = replace(self.config, inference=inference)
+        self._sweeper.inference = inference
+        for keyframe in self._keyframes.values():
+            keyframe.revision = -1
+
+    def _restore_messages(self) -> None:
+        """A loaded map has no messages, because they are large and follow from the images."""
+        if self._messages_lost:
+            self.infer()

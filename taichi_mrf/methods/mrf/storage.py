@@ -1,0 +1,91 @@
+"""An MRFMap as one .npz file.
+
+What is stored is what a map is made of: its parameters, its bricks with their beliefs, and its
+keyframes' images and poses. Messages are not: they are the largest part of a map in memory and follow
+from the rest. Beliefs are, so that a loaded map answers queries at once.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.errors import MapFileError
+from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.methods.map_file import MapHeader, open_map_file, read_bricks, read_header
+from taichi_mrf.methods.mrf.brick_registry import BrickBook
+from taichi_mrf.system.atomic import write_npz
+from taichi_mrf.voxels.layout import VOXELS
+
+
+@dataclass(frozen=True)
+class MapContents:
+    """All that makes an MRFMap. ``belief`` and ``evidence`` are (n, 512) log-odds of the ``bricks``
+    (n, 3); ``frozen_owners`` (n,) counts the frozen keyframes that want each brick."""
+
+    header: MapHeader
+    bricks: NDArray[np.int32]
+    belief: NDArray[np.float32]
+    evidence: NDArray[np.float32] | None
+    frozen_owners: NDArray[np.int32]
+    frozen_crossed: NDArray[np.int32]
+    frozen: dict[int, str]
+
+
+def contents_of(
+    header: MapHeader, book: BrickBook, keyframes: Iterable[Keyframe], frozen: dict[int, str]
+) -> MapContents:
+    """What is to be stored of a map; ``keyframes`` are those that can still be moved."""
+    pool = book.pool
+    slots = pool.in_order
+    live = np.zeros(pool.capacity, np.int32)
+    for keyframe in keyframes:
+        live[book.topology.slots(keyframe.footprint.window.bricks_of(keyframe.footprint.surface))] += 1
+    return MapContents(
+        header,
+        pool.bricks[slots],
+        pool.read("belief", slots),
+        None if pool.evidence is None else pool.read("evidence", slots),
+        pool.owners[slots] - live[slots],
+        book.frozen_crossed,
+        frozen,
+    )
+
+
+def write_contents(path: Path, contents: MapContents) -> None:
+    """Write a map beside its place first, then into it. Raises MapFileError."""
+    arrays = {
+        **contents.header.arrays(),
+        "bricks": contents.bricks,
+        "belief": contents.belief,
+        "frozen_owners": contents.frozen_owners,
+        "frozen_crossed": contents.frozen_crossed,
+        "frozen_ids": np.array(list(contents.frozen), np.int64),
+        "frozen_names": np.array(list(contents.frozen.values()), np.str_),
+    }
+    if contents.evidence is not None:
+        arrays["evidence"] = contents.evidence
+    write_npz(path, arrays, manifest=True)
+
+
+def read_contents(path: Path) -> MapContents:
+    """Read a map back. Raises MapFileError naming the file and what is wrong with it."""
+    with open_map_file(path, "mrf") as file:
+        header = read_header(path, file)
+        bricks, belief = read_bricks(path, file)
+        n = len(bricks)
+        frozen_ids = file.array("frozen_ids", "i", (None,)).tolist()
+        contents = MapContents(
+            header,
+            bricks,
+            belief,
+            file.array("evidence", "f", (n, VOXELS)) if "evidence" in file else None,
+            file.array("frozen_owners", "i", (n,)).astype(np.int32),
+            file.array("frozen_crossed", "i", (None, 3)).astype(np.int32),
+            dict(zip(frozen_ids, file.array("frozen_names", "U", (len(frozen_ids),)).tolist(), strict=True)),
+        )
+    if (contents.frozen_owners < 0).any():
+        raise MapFileError(f"{path}: damaged: frozen_owners holds a negative number")
+    return contents

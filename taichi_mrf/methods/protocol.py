@@ -1,0 +1,116 @@
+"""What every map can do, whatever the method that makes it: the verbs that the rest of the program uses."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf.config.schema import Config, SensorConfig
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.inference.schedule import InferReport, Progress
+from taichi_mrf.methods.statistics import MapStatistics
+from taichi_mrf.queries.profile import RayProfile
+from taichi_mrf.queries.view import View
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.noise import NoiseModel
+
+
+class PosedDepth(Protocol):
+    """A depth image with its place: a keyframe of a map, or a frame. Depth is (H, W) axial depth in metres, 0
+    for no measurement."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def T_world_camera(self) -> Pose: ...
+    @property
+    def camera(self) -> PinholeCamera: ...
+    @property
+    def depth_m(self) -> NDArray[np.float32]: ...
+
+
+class MappedKeyframe(PosedDepth, Protocol):
+    """What a map remembers of a keyframe."""
+
+    @property
+    def rays(self) -> int:
+        """Number of pixels that hold a measurement."""
+        ...
+
+
+class OccupancyMap(Protocol):
+    """A probabilistic occupancy map of depth keyframes: MRFMap, LogOddsMap, VisibilityMap.
+
+    Between changes and :meth:`infer`, queries answer with what is known.
+    """
+
+    config: Config
+    sensor: SensorConfig
+    noise: NoiseModel
+    voxel_size: float
+    view: View
+    """Follows rays through the map."""
+
+    @property
+    def keyframes(self) -> Mapping[int, MappedKeyframe]: ...
+
+    def add_keyframe(
+        self, depth_m: ArrayLike, T_world_camera: ArrayLike, camera: PinholeCamera, name: str = ""
+    ) -> int:
+        """Add a depth image, (H, W) axial depth in metres, taken at a pose (4, 4); returns its id."""
+        ...
+
+    def remove_keyframe(self, id: int) -> None:
+        """Take a keyframe out."""
+        ...
+
+    def move_keyframe(self, id: int, T_world_camera: ArrayLike) -> None:
+        """Give a keyframe another pose."""
+        ...
+
+    def infer(
+        self,
+        sweeps: int | None = None,
+        tolerance: float | None = None,
+        keyframes: Iterable[int] | None = None,
+        progress: Progress | None = None,
+    ) -> InferReport:
+        """Make the map the one that its keyframes give."""
+        ...
+
+    def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
+        """Probability of occupied at (N, 3) points in metres, (N,) float32."""
+        ...
+
+    def state(self, points: ArrayLike) -> NDArray[np.int8]:
+        """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,) int8."""
+        ...
+
+    def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+        """Voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
+        ...
+
+    def render_depth(self, camera: PinholeCamera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
+        """Axial depth of the likeliest surface seen by each pixel, (H, W) float32, NaN where none is."""
+        ...
+
+    def ray_profile(
+        self, origin: ArrayLike, direction: ArrayLike, max_range: float | None = None
+    ) -> RayProfile:
+        """Occupancy, visibility and omega along a ray, by range in metres."""
+        ...
+
+    def statistics(self) -> MapStatistics:
+        """How large the map is."""
+        ...
+
+    def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """How many keyframes see each voxel of some bricks of ``view.pool``, (n,) -> (n, 512), 0 where the
+        map does not remember it."""
+        ...
+
+    def save(self, path: str | Path) -> None:
+        """Write the map to one .npz file. Raises MapFileError."""
+        ...

@@ -1,0 +1,104 @@
+"""Where the rays of a scan end: at the measured points, at the end of the sensor's range, or once a voxel."""
+
+import numpy as np
+import taichi as ti
+
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.inference.keyframe import DepthImage
+from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, F32Array3, Mat3, Template, Vec3, Vec4
+from taichi_mrf.sensor.forward import depth_of_deviation, pixel_noise
+from taichi_mrf.sensor.rays import pixel_direction
+from taichi_mrf.voxels.window import Window
+
+NO_RAY, FREE_END, HIT = -1.0, 0.0, 1.0
+"""Fourth component of a ray's end: there is no measurement; the ray was cut off and says only what is
+free; a surface was measured here."""
+
+
+def ray_ends(
+    image: DepthImage,
+    T_world_camera: Pose,
+    window: Window,
+    *,
+    max_depth: float,
+    max_range: float = 0.0,
+    discretise: bool = False,
+    correct_bias: bool = False,
+) -> "ti.Ndarray":
+    """The ends of an image's rays as (n, 4): voxels from the window's corner, and what kind of end.
+
+    ``correct_bias`` puts an end where a surface gives the measurement on average. Measurements beyond the
+    axial ``max_depth`` are cut off there. ``discretise`` leaves one ray to the centre of each voxel that
+    holds an end (OctoMap's computeDiscreteUpdate), else there is one for each pixel. What then is longer
+    than the Euclidean ``max_range`` is cut off there (0: nothing is).
+    """
+    table = image.noise_table
+    centre, to_voxels = window.rays_of(T_world_camera)
+    ends = ti.ndarray(ti.f32, (image.camera.width * image.camera.height, 4))
+    _find_ends(
+        image.depth, image.camera.width, image.intrinsics, centre, to_voxels,
+        image.noise, table.patch, table.columns, max_depth, ends, correct_bias,
+    )  # fmt: skip
+    if discretise:
+        ends = _once_a_voxel(ends)
+    if max_range > 0:
+        _cut_off(ends, centre, max_range / window.voxel_size)
+    return ends
+
+
+def _once_a_voxel(ends: "ti.Ndarray") -> "ti.Ndarray":
+    """The centres of the voxels that hold ends, each once for hits and once for rays that were cut off."""
+    every = ends.to_numpy()
+    every = every[every[:, 3] >= 0]
+    once = np.array([[0.0, 0.0, 0.0, NO_RAY]], np.float32)
+    if len(every):
+        voxels = np.floor(every).astype(np.int64)
+        lowest = voxels.min(axis=0)
+        shape = tuple((voxels.max(axis=0) - lowest + 1).tolist())
+        keys = np.unique(np.ravel_multi_index(tuple((voxels - lowest).T), shape))
+        once = (np.stack(np.unravel_index(keys, shape), axis=1) + lowest).astype(np.float32)
+        once[:, :3] += 0.5
+    result = ti.ndarray(ti.f32, once.shape)
+    result.from_numpy(once)
+    return result
+
+
+@ti.func
+def end_of(ends: Template, ray: I32) -> Vec4:
+    """Where a ray ends, and how."""
+    return Vec4(ends[ray, 0], ends[ray, 1], ends[ray, 2], ends[ray, 3])
+
+
+@ti.func
+def put_end(ends: Template, ray: I32, place: Vec3, kind: F32):
+    """Write down where a ray ends, and how."""
+    for axis in ti.static(range(3)):
+        ends[ray, axis] = place[axis]
+    ends[ray, 3] = kind
+
+
+@ti.kernel
+def _find_ends(
+    depth: F32Array, width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
+    noise: F32Array3, patch: I32, columns: I32, max_depth: F32, ends: F32Array2, correct_bias: Template,
+):  # fmt: skip
+    for pixel in range(depth.shape[0]):
+        u, v = pixel % width, pixel // width
+        surface = depth[pixel]
+        kind = NO_RAY
+        if surface > 0.0:
+            if ti.static(correct_bias):
+                surface = depth_of_deviation(surface, 0.0, pixel_noise(noise, patch, columns, u, v))
+            kind = HIT if surface <= max_depth else FREE_END
+        end = centre + to_voxels @ pixel_direction(u, v, intrinsics) * ti.min(surface, max_depth)
+        put_end(ends, pixel, end, kind)
+
+
+@ti.kernel
+def _cut_off(ends: F32Array2, centre: Vec3, longest: F32):
+    for i in range(ends.shape[0]):
+        end = end_of(ends, i)
+        way = Vec3(end[0], end[1], end[2]) - centre
+        if end[3] >= 0.0 and way.norm() > longest:
+            near = centre + way * (longest / way.norm())
+            put_end(ends, i, near, FREE_END)

@@ -1,0 +1,1 @@
+"""Visibility-aware occupancy mapping (Schauwecker and Zell, IROS 2014)."""

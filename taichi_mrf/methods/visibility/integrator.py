@@ -1,0 +1,121 @@
+"""One scan into a visibility map: the host's side of visibility_scan.py, with the scratch that it needs."""
+
+import dataclasses
+import math
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf.config.schema import InferenceConfig, SensorConfig, VisibilityConfig, VolumeConfig
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.inference.footprint import find_footprint
+from taichi_mrf.inference.keyframe import DepthImage, Footprint
+from taichi_mrf.inference.ray_list import RayLister
+from taichi_mrf.methods.visibility import scan as visibility_scan
+from taichi_mrf.system import runtime
+from taichi_mrf.system.memory import check_memory
+from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.traversal import FAR
+from taichi_mrf.voxels.window import WindowIndex
+
+SCRATCH_BYTES = 12
+"""What a scan needs for each voxel of the bricks that its rays cross: P(C), P(V) and P(I)."""
+
+
+class VisibilityIntegrator:
+    """Integrates scans; owns the scratch that they share, which grows to the largest of them."""
+
+    def __init__(
+        self, voxel_size: float, sensor: SensorConfig, visibility: VisibilityConfig, volume: VolumeConfig
+    ) -> None:
+        self.voxel_size, self.visibility, self.volume = voxel_size, visibility, volume
+        self.max_range = visibility.max_range or FAR
+        # A depth is never more than its range, so what lies deeper need not be looked at.
+        self.sensor = dataclasses.replace(sensor, max_depth=min(sensor.max_depth, self.max_range))
+        self.index = WindowIndex()
+        self.lister = RayLister(voxel_size, InferenceConfig(ray_density=0.0))  # every pixel
+        self.occluded = ti.ndarray(ti.f32, VOXELS)
+        self.visible = ti.ndarray(ti.i32, VOXELS)
+        self.inside = ti.ndarray(ti.i32, VOXELS)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the scratch."""
+        return self.occluded.shape[0] * SCRATCH_BYTES + self.index.bricks.shape[0] * 4
+
+    def reach(self, image: DepthImage, T_world_camera: Pose) -> Footprint:
+        """The bricks that a scan's rays cross if they are visible all the way to their ends.
+
+        All of them are wanted, which ``surface`` says. Raises CapacityError if there are too many.
+        """
+        to_its_end = InferenceConfig(end_sigmas=visibility_scan.SURE_SIGMAS)
+        beyond_m = visibility_scan.BEYOND_VOXELS * self.voxel_size
+        footprint = find_footprint(
+            image, self.lister.rays_of(image), T_world_camera, self.voxel_size, self.sensor, to_its_end,
+            self.volume, beyond_m,
+        )  # fmt: skip
+        voxels = len(footprint.crossed) * VOXELS
+        check_memory(
+            voxels * (4.0 + SCRATCH_BYTES),
+            f"a scan of {voxels / 1e6:.3g} million voxels of {self.voxel_size:g} m",
+            self.volume.memory_limit_gb,
+        )
+        return dataclasses.replace(footprint, surface=footprint.crossed)
+
+    def integrate(
+        self,
+        image: DepthImage,
+        T_world_camera: Pose,
+        footprint: Footprint,
+        slots: NDArray[np.int32],
+        pool: BrickPool,
+    ) -> None:
+        """Change the log-odds of the voxels that the scan sees. All bricks of the footprint must exist:
+        ``slots`` are their places in the pool."""
+        config, window, cells = self.visibility, footprint.window, footprint.crossed
+        centre, to_voxels = window.rays_of(T_world_camera)
+        box_lower, box_upper = window.clip_box(self.volume.lower, self.volume.upper)
+        self._reserve(len(slots) * VOXELS)
+
+        # Eq. 1, in the map as it is now; a neighbour may lie in a brick that this scan does not cross.
+        in_use = pool.in_use
+        all_cells = window.cells_of(pool.bricks[in_use])
+        there = all_cells >= 0
+        self.index.fill(window, all_cells[there], in_use[there])
+        visibility_scan.hide(
+            cells, centre, window.shape_vector, box_lower, box_upper,
+            self.index.bricks, pool.belief, self.occluded, self.visible, self.inside,
+        )  # fmt: skip
+        self.index.clear(window, all_cells[there])
+
+        # Eqs. 2, 3 and 7: how far each ray sees, and where it is inside what it has measured.
+        self.index.fill(window, cells, np.arange(len(cells), dtype=np.int32))
+        visibility_scan.follow(
+            image.depth, image.camera.width, image.intrinsics, centre, to_voxels,
+            image.noise, image.noise_table.patch, image.noise_table.columns,
+            self.voxel_size, self.sensor.max_depth, self.max_range,
+            config.visible_if_occluded, config.visible_if_clear, config.q_min, config.q_max,
+            window.shape_vector, box_lower, box_upper, self.index.chunks, self.index.bricks,
+            self.occluded, self.visible, self.inside,
+        )  # fmt: skip
+        self.index.clear(window, cells)
+
+        # Eqs. 4 to 6 and 8: what that says of each voxel.
+        visibility_scan.update(
+            slots, pool.belief, self.visible, self.inside,
+            config.hit_if_occupied, config.hit_if_free, config.hit_if_hidden,
+            _log_odds(config.lowest), _log_odds(config.highest),
+        )  # fmt: skip
+
+    def _reserve(self, voxels: int) -> None:
+        if voxels > self.visible.shape[0]:
+            runtime.settle()
+            self.occluded = ti.ndarray(ti.f32, voxels)
+            self.visible = ti.ndarray(ti.i32, voxels)
+            self.inside = ti.ndarray(ti.i32, voxels)
+
+
+def _log_odds(probability: float) -> float:
+    return math.log(probability / (1 - probability))

@@ -1,0 +1,74 @@
+"""Occupancy mapping that asks first what the sensor could see: the baseline for stereo cameras.
+
+A measurement of a voxel that cannot be seen must be an error, and is not believed: a voxel is updated
+only as far as the map so far lets the sensor see it. Where nothing is known yet, a beam gets a few
+voxels far, and the mapped space grows scan by scan.
+"""
+
+from typing import Any, ClassVar
+
+from taichi_mrf.config.schema import Config, Method, SensorConfig, VisibilityConfig, VolumeConfig
+from taichi_mrf.config.values import overridden
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.inference.keyframe import DepthImage, Footprint
+from taichi_mrf.methods.recursive import RecursiveMap, Scan
+from taichi_mrf.methods.visibility.integrator import VisibilityIntegrator
+from taichi_mrf.sensor.noise import NoiseModel
+
+
+class VisibilityMap(RecursiveMap[Footprint]):
+    """A map that integrates scans as Schauwecker & Zell do (IROS 2014), with their Table I as defaults.
+
+    What a scan adds depends on what the map knew before it, so the order of the keyframes matters.
+    """
+
+    METHOD: ClassVar[Method] = "visibility"
+
+    def __init__(
+        self,
+        voxel_size: float = 0.2,
+        noise: NoiseModel | None = None,
+        *,
+        visibility: VisibilityConfig | None = None,
+        volume: VolumeConfig | None = None,
+        min_depth: float = SensorConfig.min_depth,
+        max_depth: float = SensorConfig.max_depth,
+        **parameters: Any,
+    ) -> None:
+        """``parameters`` are fields of VisibilityConfig, such as ``q_max=0.7`` or ``max_range=10.0``.
+
+        ``noise`` (a Kinect 1 by default) gives the sigma of eq. 7: a stereo camera of baseline b, focal
+        length f and disparity error sigma_d has PolynomialNoise((0, 0, sigma_d / (b * f))). A bias, which
+        the paper's sensor has not, is taken out of the measurements first.
+        Raises ConfigError for an unknown or impossible parameter.
+        """
+        config = Config(
+            voxel_size,
+            self.METHOD,
+            SensorConfig(min_depth=min_depth, max_depth=max_depth),
+            visibility=overridden(visibility or VisibilityConfig(), parameters, "VisibilityMap"),
+            volume=volume or VolumeConfig(),
+        )
+        super().__init__(config, noise)
+        self._integrator = VisibilityIntegrator(voxel_size, config.sensor, config.visibility, config.volume)
+
+    @classmethod
+    def _create(cls, config: Config, noise: NoiseModel) -> "VisibilityMap":
+        return cls(
+            config.voxel_size,
+            noise,
+            visibility=config.visibility,
+            volume=config.volume,
+            min_depth=config.sensor.min_depth,
+            max_depth=config.sensor.max_depth,
+        )
+
+    def _reach(self, image: DepthImage, T_world_camera: Pose) -> Footprint:
+        return self._integrator.reach(image, T_world_camera)
+
+    def _integrate(self, scan: Scan[Footprint]) -> None:
+        self._integrator.integrate(scan.image, scan.T_world_camera, scan.footprint, scan.slots, self._pool)
+
+    @property
+    def _scratch_bytes(self) -> int:
+        return self._integrator.nbytes

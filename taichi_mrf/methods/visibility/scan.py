@@ -1,0 +1,255 @@
+"""One scan into an occupancy map that asks first what the sensor could see: the method itself.
+
+Schauwecker & Zell, "Robust and Efficient Volumetric Occupancy Mapping with an Application to Stereo
+Vision" (IROS 2014); equation numbers are theirs. A voxel v is occupied (O_v), visible (V_v), locally
+occluded (C_v), or inside the obstacle that a ray has measured (I_v). A scan goes in by three steps:
+
+    hide     is a voxel occluded by its neighbours towards the sensor?                              (1)
+    follow   each ray: is the voxel visible from here, and inside the obstacle?           (2), (3), (7)
+    update   each voxel once, with the scan's largest P(V_v) and largest P(I_v)          (4) to (6), (8)
+
+All visibility comes from the map as it was before the scan, so the order of the rays does not matter.
+The paper keeps one update for each voxel and scan and lets hits win over misses as OctoMap does: with
+P(I_v) between 0 and 1, the largest wins. A voxel is hidden only if it is so for all rays: the largest
+P(V_v) wins too.
+"""
+
+from statistics import NormalDist
+
+import taichi as ti
+
+from taichi_mrf.kernels.log_odds import logistic
+from taichi_mrf.kernels.types import (
+    F32,
+    I32,
+    F32Array,
+    F32Array3,
+    I32Array,
+    IVec3,
+    Mat3,
+    Struct,
+    Template,
+    Vec3,
+    Vec4,
+)
+from taichi_mrf.methods.recursive_update import updated
+from taichi_mrf.sensor.forward import SUPPORT, depth_of_deviation, normal_tail, pixel_noise, sigma_at
+from taichi_mrf.sensor.rays import pixel_direction
+from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.numbering import flat
+from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
+
+UNKNOWN = 0.5
+"""P(O_v) of a voxel that has no brick; one that has starts there (recursive_update)."""
+
+SURE = 0.95
+"""P(I_v) that is "close to 1" (section III-C): the ray takes one further voxel, a full hit, and ends. The
+less is left of it behind the measurement, the thinner are the walls."""
+
+SURE_SIGMAS = NormalDist().inv_cdf(SURE)
+"""Sigmas behind the measurement at which P(I_v) is SURE."""
+
+BEYOND_VOXELS = 4.5
+"""Voxel sizes behind that depth in which every ray has ended: the voxel that holds this depth, one whose
+segment's centre lies behind it, and the further one, each up to sqrt(3) long."""
+
+GRAZED = 1e-4
+"""Voxel sizes of a ray's way below which it only touches a voxel: no more than float32 can tell
+(voxels/traversal.py), as at the face of the mapped box, whose other side must stay unknown."""
+
+
+@ti.dataclass
+class Beam(Struct):
+    """What is known of a ray on its way from the sensor."""
+
+    measured: F32  # axial depth, metres, the sensor's bias taken out
+    sigma: F32  # of that measurement
+    grazed: F32  # the least axial depth to spend in a voxel, metres
+    visible: F32  # P(V) of the voxel that it has come through last
+    sure: I32  # whether that voxel was inside the obstacle for sure
+
+
+@ti.kernel
+def hide(
+    cells: I32Array, centre: Vec3, shape: IVec3, box_lower: Vec3, box_upper: Vec3,
+    bricks: I32Array, belief: F32Array, occluded: F32Array, visible: I32Array, inside: I32Array,
+):  # fmt: skip
+    """P(C_v) of each voxel of the bricks at a window's ``cells``, and nothing seen of it by any ray yet.
+
+    ``bricks`` holds the pool's slots of all bricks of the window, those that this scan does not see too.
+    """
+    sensor = ti.floor(centre, ti.i32)
+    for i in range(cells.shape[0] * VOXELS):
+        cell, number = cells[i // VOXELS], i % VOXELS
+        brick = IVec3(cell // (shape[1] * shape[2]), cell // shape[2] % shape[1], cell % shape[2])
+        voxel = brick * BRICK + IVec3(number // BRICK**2, number // BRICK % BRICK, number % BRICK)
+        occluded[i] = local_occlusion(voxel, sensor, shape, box_lower, box_upper, bricks, belief)
+        visible[i] = 0
+        inside[i] = 0
+
+
+@ti.func
+def local_occlusion(
+    voxel: IVec3, sensor: IVec3, shape: IVec3, box_lower: Vec3, box_upper: Vec3,
+    bricks: Template, belief: Template,
+) -> F32:  # fmt: skip
+    """Eq. 1: the least P(O) of the voxels at those faces of v that the sensor sees, usually three.
+
+    In the slab of voxels that holds the sensor, neither of an axis' faces can be seen, and a voxel that
+    holds the sensor itself is not occluded.
+    """
+    least = 1.0
+    seen = 0
+    for axis in ti.static(range(3)):
+        neighbour = voxel
+        if sensor[axis] != voxel[axis]:
+            neighbour[axis] += 1 if sensor[axis] > voxel[axis] else -1
+            least = ti.min(least, occupancy(neighbour, shape, box_lower, box_upper, bricks, belief))
+            seen = 1
+    return least * seen
+
+
+@ti.func
+def occupancy(
+    voxel: IVec3, shape: IVec3, box_lower: Vec3, box_upper: Vec3, bricks: Template, belief: Template
+) -> F32:
+    """P(O) of any voxel, in whatever brick it lies: UNKNOWN where there is none.
+
+    Beyond the box that is mapped, nothing is ever known, and nothing may be in the way for ever: 0.
+    """
+    probability = UNKNOWN
+    middle = ti.cast(voxel, ti.f32) + 0.5
+    if (middle - box_lower).min() < 0.0 or (box_upper - middle).min() < 0.0:
+        probability = 0.0
+    else:
+        slot = bricks[flat(voxel // BRICK, shape)]
+        if slot >= 0:
+            local = voxel % BRICK
+            number = (local[0] * BRICK + local[1]) * BRICK + local[2]
+            probability = logistic(belief[slot * VOXELS + number])
+    return probability
+
+
+@ti.kernel
+def follow(
+    depth: F32Array, width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
+    noise: F32Array3, patch: I32, columns: I32,
+    voxel_size: F32, max_depth: F32, max_range: F32,
+    if_occluded: F32, if_clear: F32, q_min: F32, q_max: F32,
+    shape: IVec3, box_lower: Vec3, box_upper: Vec3, chunks: I32Array, bricks: I32Array,
+    occluded: F32Array, visible: I32Array, inside: I32Array,
+):  # fmt: skip
+    """Follow each ray until it is no longer visible, or sure to be inside what it has measured.
+
+    ``visible`` and ``inside`` take the largest P(V) and P(I) that any ray has for a voxel, as the bits of
+    a float: those of positive floats are ordered as integers, which have an atomic maximum everywhere.
+    """
+    for pixel in range(depth.shape[0]):
+        if depth[pixel] > 0.0:
+            u, v = pixel % width, pixel // width
+            direction = to_voxels @ pixel_direction(u, v, intrinsics)
+            ray = make_ray(centre, direction)
+            here = pixel_noise(noise, patch, columns, u, v)
+
+            # Eq. 7, with any noise model: the sigma of the depth that the measurement stands for.
+            measured = depth_of_deviation(depth[pixel], 0.0, here)
+            sigma = sigma_at(here, measured)
+
+            range_per_depth = direction.norm() * voxel_size
+            end = measured + SURE_SIGMAS * sigma + BEYOND_VOXELS * voxel_size
+            begin, end = 0.0, ti.min(end, max_depth, max_range / range_per_depth)
+            clip(ray, begin, end, box_lower, box_upper)
+
+            beam = Beam(measured, sigma, GRAZED / direction.norm(), 1.0, 0)
+            walk_voxels(
+                ray, begin, end, shape, chunks, bricks, _come_through, beam,
+                (occluded, visible, inside, if_occluded, if_clear, q_min, q_max),
+            )  # fmt: skip
+
+
+@ti.func
+def _come_through(beam: Template, context: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of a ray; ``near`` and ``far`` bound the ray's segment in it, in axial depth."""
+    go = 1
+    if far - near > beam.grazed:
+        beam.visible = visibility(beam.visible, context[0][voxel], context[3], context[4], context[6])
+        if beam.visible < context[5]:  # q_min
+            go = 0
+        else:
+            # The voxel is reduced to a point on the ray: the centre of the ray's segment in it.
+            probability = 1.0
+            if beam.sure == 0:
+                probability = inside_obstacle(0.5 * (near + far), beam.measured, beam.sigma)
+            else:
+                go = 0  # this was the further voxel
+            if probability >= SURE:
+                beam.sure = 1
+            _raise(context[1], voxel, beam.visible)
+            _raise(context[2], voxel, probability)
+    return go
+
+
+@ti.func
+def visibility(before: F32, occluded: F32, if_occluded: F32, if_clear: F32, q_max: F32) -> F32:
+    """Eqs. 2 and 3: P(V) of a voxel, from that of the one before it and its own P(C); 1 from q_max on.
+
+    A voxel behind one that is not visible is not visible either, so two of eq. 2's terms are none.
+    """
+    visible = before * (if_occluded * occluded + if_clear * (1.0 - occluded))
+    return visible if visible < q_max else 1.0
+
+
+@ti.func
+def inside_obstacle(depth: F32, measured: F32, sigma: F32) -> F32:
+    """P(I): the normal distribution's F((depth - measured) / sigma)."""
+    deviation = (depth - measured) / sigma
+    probability = 0.0
+    if deviation > 0.0:
+        probability = 1.0 - normal_tail(deviation)
+    elif deviation > -SUPPORT:
+        probability = normal_tail(-deviation)
+    return probability
+
+
+@ti.func
+def _raise(largest: Template, voxel: I32, value: F32):
+    bits = ti.bit_cast(value, ti.i32)
+    if largest[voxel] < bits:  # most rays come late, and reading is cheaper
+        ti.atomic_max(largest[voxel], bits)
+
+
+@ti.kernel
+def update(
+    slots: I32Array, belief: F32Array, visible: I32Array, inside: I32Array,
+    hit_if_occupied: F32, hit_if_free: F32, hit_if_hidden: F32, lowest: F32, highest: F32,
+):  # fmt: skip
+    """Let each voxel that some ray has seen know, once; its log-odds stay within [lowest, highest]."""
+    for i in range(slots.shape[0] * VOXELS):
+        seen = ti.bit_cast(visible[i], ti.f32)
+        if seen > 0.0:
+            j = slots[i // VOXELS] * VOXELS + i % VOXELS
+            before = belief[j]
+            occupied = interpolated(
+                logistic(before), seen, ti.bit_cast(inside[i], ti.f32),
+                hit_if_occupied, hit_if_free, hit_if_hidden,
+            )  # fmt: skip
+            belief[j] = updated(before, ti.log(occupied / (1.0 - occupied)) - before, lowest, highest)
+
+
+@ti.func
+def interpolated(
+    occupied: F32, visible: F32, inside: F32, hit_if_occupied: F32, hit_if_free: F32, hit_if_hidden: F32
+) -> F32:
+    """Eq. 8: P(O | M) between that after a miss and that after a hit."""
+    hit = bayes(occupied, visible, hit_if_occupied, hit_if_free, hit_if_hidden)
+    miss = bayes(occupied, visible, 1.0 - hit_if_occupied, 1.0 - hit_if_free, 1.0 - hit_if_hidden)
+    return inside * hit + (1.0 - inside) * miss
+
+
+@ti.func
+def bayes(occupied: F32, visible: F32, if_occupied: F32, if_free: F32, if_hidden: F32) -> F32:
+    """P(O | M) of a hit or a miss M, from P(O), P(V), P(M | O, V), P(M | not O, V) and P(M | not V)."""
+    hidden = if_hidden * (1.0 - visible)
+    of_occupied = hidden + if_occupied * visible  # eq. 5
+    of_any = hidden + if_occupied * occupied * visible + if_free * (1.0 - occupied) * visible  # eq. 6
+    return of_occupied * occupied / of_any  # eq. 4

@@ -1,0 +1,198 @@
+"""NumPy's npz files, read without trust: a file that is damaged, cut short, or claims more than it holds is
+refused in one line that names it.
+
+numpy.load notices a wrong checksum only where a member is read to its end, takes the memory that a header
+claims before it looks for the values, and lets through whatever its parsers stumble over.
+"""
+
+import sys
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.errors import CapacityError, TaichiMRFError, said
+from taichi_mrf.system.memory import check_memory
+
+MANIFEST = "manifest"
+"""The member that says which others there are, with their checksums: ``name crc32 bytes`` each."""
+
+DEFLATE_RATIO = 1032
+"""Deflate packs no tighter than this (zlib's technical details), so that no member is larger."""
+
+_CHUNK = 1 << 20
+_MOST_DIMENSIONS = 8
+
+Shape = tuple[int, ...]
+ErrorType = Callable[[str], TaichiMRFError]
+
+
+class NpzFile:
+    """An open file; ``file[name]`` reads an array to its end, whose checksum is then known to be right."""
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile, error: ErrorType) -> None:
+        self._path, self._archive, self._error = path, archive, error
+        members = {info.filename: info for info in archive.infolist()}
+        self._members = {name.removesuffix(".npy"): info for name, info in members.items()}
+
+    @property
+    def names(self) -> list[str]:
+        """The arrays that there are."""
+        return list(self._members)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._members
+
+    def header(self, name: str) -> tuple[Shape, np.dtype]:
+        """An array's shape and type, without reading its values."""
+        with self._member(name) as (_, shape, _, dtype):
+            return shape, dtype
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        with self._member(name) as (stream, shape, fortran, dtype):
+            size = _count(shape) * dtype.itemsize
+            info = self._members[name]
+            if stream.tell() + size != info.file_size:
+                raise self._problem(
+                    name, f"should be {dtype} {shape}, which its {info.file_size} bytes are not"
+                )
+            if info.file_size > DEFLATE_RATIO * (info.compress_size + 1):
+                raise self._problem(name, f"claims {info.file_size / 1e9:.3g} GB that the file cannot hold")
+            check_memory(size, f"{self._path}: {name}")
+            values, place = np.empty(size, np.uint8), 0
+            while chunk := stream.read(_CHUNK):
+                values[place : place + len(chunk)] = np.frombuffer(chunk, np.uint8)
+                place += len(chunk)
+            if place != size:
+                raise self._problem(name, "ends too early")
+            array = values.view(dtype) if size else np.empty(0, dtype)
+            return array.reshape(shape, order="F" if fortran else "C")
+
+    def array(self, name: str, kinds: str, shape: Sequence[int | None]) -> NDArray[Any]:
+        """An array that must be of one of these kinds (NumPy's letters) and of this shape, None being any
+        length; floating-point values must be finite."""
+        found = self[name]
+        fits = len(found.shape) == len(shape) and all(
+            n is None or n == m for n, m in zip(shape, found.shape, strict=True)
+        )
+        if found.dtype.kind not in kinds or not fits:
+            wanted = ", ".join("N" if n is None else str(n) for n in shape)
+            raise self._problem(
+                name, f"is {found.dtype} {found.shape}, where ({wanted}) of another is expected"
+            )
+        if found.dtype.kind == "f" and not np.isfinite(found).all():
+            raise self._problem(name, "holds a value that is not finite")
+        if found.dtype.kind == "U" and not _is_text(found):
+            raise self._problem(name, "holds a character that there is not")
+        return found
+
+    def scalar(self, name: str, kinds: str) -> Any:
+        """One value of one of these kinds."""
+        return self.array(name, kinds, ()).item()
+
+    def check_manifest(self) -> None:
+        """Refuse a file whose members are not those that were written, by its manifest."""
+        wanted = sorted(self.array(MANIFEST, "U", (None,)).tolist())
+        found = sorted(manifest_lines(i for name, i in self._members.items() if name != MANIFEST))
+        if wanted != found:
+            odd = min(set(wanted) ^ set(found), default="").split()
+            raise self._error(f"{self._path}: damaged: {odd[0] if odd else MANIFEST} is not what was saved")
+
+    @contextmanager
+    def _member(self, name: str) -> Iterator[tuple[Any, Shape, bool, np.dtype]]:
+        """A member's stream behind its header, and what that says."""
+        if name not in self._members:
+            raise self._problem(name, "is missing")
+        try:
+            with self._archive.open(self._members[name]) as stream:
+                shape, fortran, dtype = _read_header(stream)
+                yield stream, shape, fortran, dtype
+        except TaichiMRFError:
+            raise
+        except Exception as error:  # zipfile, zlib and NumPy raise whatever their parsing stumbles over
+            raise self._problem(name, f"cannot be read: {said(error)}") from error
+
+    def _problem(self, name: str, problem: str) -> TaichiMRFError:
+        return self._error(f"{self._path}: {name} {problem}")
+
+
+@contextmanager
+def open_npz(path: Path, error: ErrorType, what: str) -> Iterator[NpzFile]:
+    """The arrays of a file, by name. Whatever is wrong with the file is raised as an ``error`` that names it;
+    ``what`` it should be, such as "a readable map". Raises CapacityError if an array does not fit memory."""
+    try:
+        archive = zipfile.ZipFile(path)
+    except FileNotFoundError as problem:
+        raise error(f"{path}: there is no such file") from problem
+    except OSError as problem:
+        raise error(f"{path}: cannot be read: {problem.strerror or problem}") from problem
+    except Exception as problem:  # as above
+        raise error(f"{path}: not {what}: {said(problem)}") from problem
+    with archive:
+        try:
+            _compare_names(archive)
+        except Exception as problem:
+            raise error(f"{path}: not {what}: {said(problem)}") from problem
+        try:
+            yield NpzFile(path, archive, error)
+        except CapacityError:
+            raise
+        except MemoryError as problem:
+            raise error(f"{path}: does not fit into memory") from problem
+
+
+def _is_text(array: NDArray[np.str_]) -> bool:
+    """Whether every character is one of Unicode's; Python ends in a SystemError over others."""
+    if array.dtype.itemsize == 0:
+        return True
+    codes = np.ascontiguousarray(array).reshape(-1).view(np.dtype("u4").newbyteorder(array.dtype.byteorder))
+    return not (codes > sys.maxunicode).any()
+
+
+def _compare_names(archive: zipfile.ZipFile) -> None:
+    """Opening a member compares what the directory calls it with what it calls itself, so that no array hides
+    behind a damaged name, where another would be taken for missing."""
+    for info in archive.infolist():
+        archive.open(info).close()
+
+
+def manifest_lines(members: Iterator[zipfile.ZipInfo]) -> list[str]:
+    """What the manifest says of these members of an archive."""
+    return [f"{i.filename.removesuffix('.npy')} {i.CRC:08x} {i.file_size}" for i in members]
+
+
+def read_npy(path: Path) -> NDArray[Any]:
+    """The array of a ``.npy`` file. Raises OSError, and ValueError for a file that holds anything but one
+    array, to its last byte."""
+    with open(path, "rb") as stream:
+        size = stream.seek(0, 2)
+        stream.seek(0)
+        try:
+            shape, fortran, dtype = _read_header(stream)
+        except Exception as error:  # as above
+            raise ValueError(said(error)) from error
+        if stream.tell() + _count(shape) * dtype.itemsize != size:
+            raise ValueError(f"it should hold {dtype} {shape}, which its {size} bytes are not")
+        values = np.frombuffer(stream.read(), dtype) if _count(shape) * dtype.itemsize else np.empty(0, dtype)
+    return values.reshape(shape, order="F" if fortran else "C")
+
+
+def _read_header(stream: Any) -> tuple[Shape, bool, np.dtype]:
+    version = np.lib.format.read_magic(stream)
+    first = version == (1, 0)
+    read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = read(stream)
+    if dtype.hasobject or len(shape) > _MOST_DIMENSIONS or any(n < 0 for n in shape):
+        raise ValueError(f"{dtype} {shape} is no array of plain values")
+    return tuple(shape), fortran, dtype
+
+
+def _count(shape: Shape) -> int:
+    count = 1
+    for n in shape:
+        count *= n
+    return count

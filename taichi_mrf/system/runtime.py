@@ -1,0 +1,227 @@
+"""Starting Taichi once, on the best backend that this machine has, and saying why it is that one.
+
+A process has one backend. Importing this module neither loads nor starts Taichi.
+"""
+
+import contextlib
+import importlib
+import importlib.metadata
+import io
+import logging
+import os
+import platform
+import sys
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import taichi_mrf
+from taichi_mrf.errors import BackendError
+from taichi_mrf.system import devices
+
+BACKENDS = ("cuda", "vulkan", "cpu")
+"""In the order in which "auto" tries them."""
+
+ABILITIES = {
+    "cuda": "sparse map without bounds",
+    "vulkan": "map within a bounded volume (volume.dense_bricks)",
+    "cpu": "sparse map without bounds",
+}
+"""What a map can do on each backend: Vulkan has no sparse fields."""
+SOFTWARE_BLOCK = 8
+"""Mesa's software Vulkan loses iterations of long loops in larger thread blocks."""
+
+
+@dataclass(frozen=True)
+class Backend:
+    """The backend that was chosen, and why the ones before it were not."""
+
+    name: str
+    device: str
+    reason: str
+    rejected: dict[str, str] = field(default_factory=dict)
+    software: bool = False
+
+
+@dataclass(frozen=True)
+class BackendStatus:
+    """Whether a backend could be used here: its device, or the problem."""
+
+    name: str
+    device: str | None
+    problem: str | None
+    software: bool
+    ability: str
+
+
+_chosen: Backend | None = None
+_log = logging.getLogger(__name__)
+
+
+def init(arch: str = "auto", threads: int = 0, debug: bool = False, profile: bool = False) -> str:
+    """Start Taichi and return the backend's name; :func:`choice` and the log tell the rest.
+
+    ``arch`` is "cuda", "vulkan", "cpu", or "auto" for the first of these that there is. A software
+    Vulkan device is taken only for arch="vulkan". ``threads`` limits the CPU backend (0 = all cores),
+    ``debug`` checks array bounds, ``profile`` lets Taichi time each kernel (experiments/speed/profile.py).
+    Once Taichi runs, "auto" or the same arch change nothing.
+
+    Raises BackendError if the wanted backend is not to be had or another one already runs; there is no
+    fallback from a backend that was asked for.
+    """
+    global _chosen
+    if arch not in ("auto", *BACKENDS):
+        raise BackendError(f"unknown backend '{arch}'; known are auto, {', '.join(BACKENDS)}")
+    _chosen = _chosen or _already_running()
+    if _chosen is None:
+        _chosen = _started(arch, threads, debug, profile)
+        _log.info("Taichi runs on %s (%s), %s", _chosen.name, _chosen.device, _chosen.reason)
+        for name, why in _chosen.rejected.items():
+            _log.info("Taichi does not run on %s: %s", name, why)
+    elif arch not in ("auto", _chosen.name):
+        raise BackendError(
+            f"Taichi already runs on {_chosen.name}: a process has one backend, {arch} needs another process"
+        )
+    return _chosen.name
+
+
+def choice() -> Backend | None:
+    """What :func:`init` chose and why, or None before it."""
+    return _chosen
+
+
+def active() -> str | None:
+    """The backend that runs ("cuda", "vulkan", "cpu"), or None before :func:`init`."""
+    return _chosen.name if _chosen else None
+
+
+def is_software() -> bool:
+    """True if the backend is a software Vulkan device, which needs small thread blocks."""
+    return _chosen is not None and _chosen.software
+
+
+def settle() -> None:
+    """Wait for the kernels in flight, on Vulkan.
+
+    Taichi 1.7.4 never frees an array there that is dropped while a kernel may still use it, so whoever
+    drops arrays right after using them calls this first. Elsewhere nothing needs to be waited for.
+    """
+    if active() == "vulkan":
+        _quiet_taichi().sync()
+
+
+def backends() -> list[BackendStatus]:
+    """Every backend of this machine, without starting one. A software Vulkan device is listed as such."""
+    found = []
+    for name in BACKENDS:
+        try:
+            device, software = _device(name, allow_software=True)
+        except BackendError as error:
+            found.append(BackendStatus(name, None, str(error), False, ABILITIES[name]))
+        else:
+            found.append(BackendStatus(name, device, None, software, ABILITIES[name]))
+    return found
+
+
+def versions() -> dict[str, str]:
+    """Versions of this package and of what its results depend on."""
+    packages = ("taichi", "numpy", "opencv-python-headless")
+    return {
+        "taichi_mrf": taichi_mrf.__version__,
+        "python": platform.python_version(),
+        **{name: importlib.metadata.version(name) for name in packages},
+    }
+
+
+def _started(arch: str, threads: int, debug: bool, profile: bool) -> Backend:
+    """Start the wanted backend, or for "auto" the first that starts."""
+    rejected: dict[str, str] = {}
+    for name in BACKENDS if arch == "auto" else (arch,):
+        try:
+            device, software = _device(name, allow_software=arch == "vulkan")
+            _start(name, software, threads, debug, profile)
+        except BackendError as error:
+            if arch != "auto":
+                raise BackendError(f"{name} cannot be used: {error}") from error
+            rejected[name] = str(error)
+            continue
+        reason = f"{arch} was asked for" if arch != "auto" else f"the first of {', '.join(BACKENDS)} here"
+        return Backend(name, device, reason, rejected, software)
+    raise BackendError("; ".join(f"{name}: {why}" for name, why in rejected.items()))
+
+
+def _device(name: str, allow_software: bool) -> tuple[str, bool]:
+    """(name, whether it is software) of the device a backend would use. Raises BackendError."""
+    if name == "cuda":
+        return devices.cuda_device(), False
+    if name == "vulkan":
+        device = devices.best_vulkan_device(allow_software)
+        return f"{device.name} ({device.kind})", device.software
+    return f"{platform.machine()}, {os.cpu_count()} cores", False
+
+
+def _start(name: str, software: bool, threads: int, debug: bool, profile: bool) -> None:
+    """Start Taichi on one backend, quietly. Raises BackendError if Taichi cannot."""
+    ti = _quiet_taichi()
+    options: dict[str, Any] = {"cpu_max_num_threads": threads} if threads else {}
+    options["kernel_profiler"] = profile
+    if software:
+        options["default_gpu_block_dim"] = SOFTWARE_BLOCK
+    arch = getattr(ti, name)
+    with _quiet_start():
+        if not ti.lang.misc.is_arch_supported(arch):
+            raise BackendError("the driver is there, but Taichi cannot load it")
+        if name == "vulkan":  # Taichi's own choice could be a software device beside a real one
+            allow_software = all(device.software for device in devices.vulkan_devices())
+            index = devices.best_vulkan_device(allow_software).index
+            ti._lib.core.set_vulkan_visible_device(str(index))
+        try:
+            ti.init(arch=arch, debug=debug, log_level=ti.ERROR, enable_fallback=False, **options)
+        except RuntimeError as error:
+            raise BackendError(f"Taichi does not start on it: {' '.join(str(error).split())}") from error
+
+
+def _already_running() -> Backend | None:
+    """The backend that the program around this library has started with ti.init, if it has."""
+    if "taichi" not in sys.modules:
+        return None
+    ti = _quiet_taichi()
+    if ti.lang.impl.get_runtime().prog is None:
+        return None
+    name = "cpu" if ti.cfg.arch == ti.cpu else str(ti.cfg.arch).removeprefix("Arch.")
+    if name not in BACKENDS:
+        raise BackendError(f"Taichi already runs on {name}, which this package does not support")
+    device, software = _device(name, allow_software=True)
+    return Backend(name, device, "Taichi was running on it already", software=software)
+
+
+def _quiet_taichi() -> Any:
+    """Taichi, imported without its banner and its warnings about Python's own deprecations."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        taichi = importlib.import_module("taichi")
+    warnings.filterwarnings("ignore", category=DeprecationWarning, module="taichi")
+    taichi.set_logging_level(taichi.ERROR)
+    return taichi
+
+
+@contextlib.contextmanager
+def _quiet_start() -> Iterator[None]:
+    """Keep ti.init from printing, from asking its home page for a newer version, and from taking
+    another backend than it is told because of an environment variable."""
+    settings = {"TI_SKIP_VERSION_CHECK": "ON", "TI_ARCH": None}
+    saved = {key: os.environ.get(key) for key in settings}
+    _set_environment(settings)
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        _set_environment(saved)
+
+
+def _set_environment(values: dict[str, str | None]) -> None:
+    for key, value in values.items():
+        os.environ.pop(key, None)
+        if value is not None:
+            os.environ[key] = value

@@ -1,0 +1,4 @@
+"""The live page.
+
+Uses `viewer.scene` and `viewer.transport`.
+"""

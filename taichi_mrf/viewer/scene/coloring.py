@@ -1,0 +1,121 @@
+"""Colours of voxels: what is shown, and the scale beside it. All scales are perceptually uniform."""
+
+import base64
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.viewer.live.options import ColorBy
+from taichi_mrf.viewer.messages import LOG_ODDS_STEP
+from taichi_mrf.viewer.scene.voxel_store import Shown
+from taichi_mrf.voxels.colors import LOWEST
+
+_MAPS = {
+    "marginal": cv2.COLORMAP_VIRIDIS,
+    "height": cv2.COLORMAP_CIVIDIS,
+    "uncertainty": cv2.COLORMAP_MAGMA,
+    "keyframes": cv2.COLORMAP_PLASMA,
+}
+
+
+_DARKENED = (0.75, 0.62, 1.0)
+"""The brightness of surfaces across x, y and z."""
+
+_ACROSS = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1)
+_SHADES = np.where(
+    _ACROSS.any(axis=1), _ACROSS @ _DARKENED / np.maximum(_ACROSS.sum(axis=1), 1), sum(_DARKENED) / 3
+)
+
+
+@dataclass(frozen=True)
+class Scale:
+    """A colour scale: 256 colours (256, 3), the values at both ends, and what they are.
+
+    ``table`` gives the colour's number for what the scale is of: for each int16 of log-odds, seen as
+    uint16, or for each number of keyframes; a height has none.
+    """
+
+    color_by: ColorBy
+    colors: NDArray[np.uint8]
+    low: float
+    high: float
+    label: str
+    table: NDArray[np.uint8] | None = None
+
+    @cached_property
+    def shaded(self) -> NDArray[np.uint8]:
+        """The colours, darkened for each way to face, (27 * 256, 3)."""
+        return (self.colors * _SHADES[:, None, None] + 0.5).astype(np.uint8).reshape(-1, 3)
+
+    def legend(self) -> tuple[str, float, float]:
+        """What tells one scale from another."""
+        return self.label, self.low, self.high
+
+
+def scale_of(
+    color_by: ColorBy, threshold: float, heights_m: tuple[float, float], most_keyframes: int = 1
+) -> Scale:
+    """The scale of a mode; ``heights_m`` are the lowest and the highest voxel's, ``most_keyframes`` the
+    largest number that see a voxel. The scale of marginals begins at one half, or at 0 if voxels less
+    probable than that are shown; that of keyframes is logarithmic and ends at a power of two."""
+    ramp = np.arange(256, dtype=np.uint8)[:, None]
+    colors = np.ascontiguousarray(cv2.applyColorMap(ramp, _MAPS[color_by])[:, 0, ::-1])
+    if color_by == "height":
+        return Scale(color_by, colors, *heights_m, "height (m)")
+    if color_by == "keyframes":
+        doublings = max(2, int(np.ceil(np.log2(max(most_keyframes, 1)))))
+        share = np.log2(np.maximum(np.arange(256), 1)) / doublings
+        label = "keyframes that see the voxel"
+        return Scale(color_by, colors, 1.0, float(2**doublings), label, _numbers(share))
+    p = _probabilities()
+    if color_by == "uncertainty":
+        return Scale(color_by, colors, 0.0, 1.0, "uncertainty: entropy (bits)", _numbers(_entropy(p)))
+    low = LOWEST if threshold >= LOWEST else 0.0
+    return Scale(color_by, colors, low, 1.0, "marginal probability", _numbers((p - low) / (1.0 - low)))
+
+
+def voxel_colors(
+    scale: Scale, shown: Shown, heights_m: NDArray[np.floating], facing: NDArray[np.uint8] | None = None
+) -> NDArray[np.uint8]:
+    """Colours (n, 3) of a chunk's voxels, whose centres are at these heights (n,); darkened by the way they
+    face, if that is given."""
+    if scale.table is None:
+        span = max(scale.high - scale.low, 1e-6)
+        numbers = _numbers((heights_m - scale.low) / span)
+    else:
+        of = shown.seen if scale.color_by == "keyframes" else shown.log_odds.view(np.uint16)
+        numbers = scale.table[of]
+    if facing is None:
+        return scale.colors[numbers]
+    return scale.shaded[facing.astype(np.int32) * 256 + numbers]
+
+
+def legend_html(scale: Scale) -> str:
+    """The scale as a strip with numbers, for the page."""
+    strip = np.ascontiguousarray(scale.colors[None, :, ::-1])
+    png = base64.b64encode(cv2.imencode(".png", strip)[1].tobytes()).decode("ascii")
+    return (
+        '<div style="padding:0 0.75em;font-size:0.85em">'
+        f'<img alt="{scale.label}" style="width:100%;height:0.9em;image-rendering:pixelated" '
+        f'src="data:image/png;base64,{png}">'
+        '<div style="display:flex;justify-content:space-between">'
+        f"<span>{scale.low:.3g}</span><span>{scale.label}</span><span>{scale.high:.3g}</span></div></div>"
+    )
+
+
+def _numbers(share: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Shares of the way from the low to the high end, as numbers of colours."""
+    return np.rint(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
+
+
+def _probabilities() -> NDArray[np.float64]:
+    """The probability that belongs to each int16 of log-odds, seen as uint16."""
+    return 0.5 * (1.0 + np.tanh(0.5 * np.arange(65536, dtype=np.uint16).view(np.int16) * LOG_ODDS_STEP))
+
+
+def _entropy(p: NDArray[np.float64]) -> NDArray[np.float64]:
+    p = np.clip(p, 1e-12, 1 - 1e-12)
+    return -(p * np.log2(p) + (1 - p) * np.log2(1 - p))

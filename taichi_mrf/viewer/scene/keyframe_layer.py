@@ -1,0 +1,178 @@
+"""Keyframes in the scene: small frusta with their depth images, the camera's way, the camera itself."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import viser
+import viser.transforms as vtf
+from numpy.typing import NDArray
+
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.viewer.messages import CurrentCamera, Keyframe
+from taichi_mrf.viewer.scene.shown_keyframes import Roster
+
+FRUSTUM_M = 0.15
+"""Distance of a frustum's picture from its camera, metres."""
+
+_COLORS = {"on": (38, 130, 142), "off": (170, 170, 170), "frozen": (70, 100, 190)}
+_CHOSEN = (230, 0, 126)
+_WAY = (230, 0, 126)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A pose as viser takes it."""
+
+    wxyz: NDArray[np.float64]
+    position: NDArray[np.float64]
+
+    @staticmethod
+    def of(T_world_camera: Pose) -> "Placement":
+        """The rotation as a unit quaternion, w first, and the position in metres."""
+        wxyz = np.asarray(vtf.SO3.from_matrix(T_world_camera[:3, :3]).wxyz, np.float64)
+        return Placement(wxyz, T_world_camera[:3, 3])
+
+    def pose(self) -> Pose:
+        """The same as (4, 4)."""
+        T = np.eye(4)
+        T[:3, :3] = vtf.SO3(np.asarray(self.wxyz, np.float64)).as_matrix()
+        T[:3, 3] = self.position
+        return T
+
+
+class KeyframeLayer:
+    """Owns the scene nodes /keyframes, /way, /camera and /gizmo."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._scene = scene
+        self.roster = Roster()
+        self.chosen: int | None = None
+        self.gizmo: viser.TransformControlsHandle | None = None
+        self._frusta: dict[int, viser.CameraFrustumHandle] = {}
+        # viser remembers each name that was ever removed, so names are used again.
+        self._places: dict[int, int] = {}
+        self._free_places: list[int] = []
+        self._pictures = True
+
+    @property
+    def keyframes(self) -> dict[int, Keyframe]:
+        """Those that are known, by number."""
+        return self.roster.keyframes
+
+    def put(self, keyframe: Keyframe) -> None:
+        """Show a keyframe that is new or has changed."""
+        forgotten = self.roster.put(keyframe)
+        for id in forgotten:
+            del self._frusta[id]  # its node is the next one's
+            self._free_places.append(self._places.pop(id))
+        if self.chosen in forgotten:
+            self.release()
+            self.chosen = min(self.keyframes)
+        if keyframe.id in self.keyframes:
+            self._draw(keyframe)
+
+    def choose(self, id: int | None) -> None:
+        """Mark a keyframe as the one that buttons act on."""
+        before, self.chosen = self.chosen, id
+        for each in (before, id):
+            if each in self._frusta:
+                self._draw(self.keyframes[each])
+
+    def show_pictures(self, on: bool) -> None:
+        """Show the depth images in the frusta, or leave them out."""
+        if on != self._pictures:
+            self._pictures = on
+            for id in list(self._frusta):
+                self._draw(self.keyframes[id])
+
+    def draw_way(self) -> None:
+        """Draw the camera's way through all keyframes, in the order of their numbers."""
+        points = self.roster.way_m()
+        if len(points) > 1:
+            segments = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
+            self._scene.add_line_segments("/way", segments, _WAY, thickness=2.0, thickness_units="screen")
+
+    def show_camera(self, camera: CurrentCamera) -> None:
+        """Show where the frame was taken that was read last."""
+        place = Placement.of(camera.T_world_camera)
+        fov, aspect = _view_angles(camera.camera)
+        self._scene.add_camera_frustum(
+            "/camera",
+            fov,
+            aspect,
+            scale=1.6 * _frustum_scale(fov, aspect),
+            thickness=3.0,
+            thickness_units="screen",
+            color=_WAY,
+            cast_shadow=False,
+            receive_shadow=False,
+            wxyz=place.wxyz,
+            position=place.position,
+        )
+
+    def grab(self) -> viser.TransformControlsHandle | None:
+        """Put a gizmo on the chosen keyframe; None if none is chosen."""
+        self.release()
+        if self.chosen is None:
+            return None
+        place = Placement.of(self.keyframes[self.chosen].T_world_camera)
+        self.gizmo = self._scene.add_transform_controls(
+            "/gizmo", scale=0.5, depth_test=False, wxyz=place.wxyz, position=place.position
+        )
+        return self.gizmo
+
+    def release(self) -> None:
+        """Take the gizmo away."""
+        if self.gizmo is not None:
+            self.gizmo.remove()
+            self.gizmo = None
+
+    def clear(self) -> None:
+        """Forget all keyframes."""
+        self.release()
+        for frustum in self._frusta.values():
+            frustum.remove()
+        self._frusta.clear()
+        self._places.clear()
+        self._free_places.clear()
+        self.roster = Roster()
+        self.chosen = None
+        for name in ("/way", "/camera"):
+            self._scene.remove_by_name(name)
+
+    def _draw(self, keyframe: Keyframe) -> None:
+        place = Placement.of(keyframe.T_world_camera)
+        fov, aspect = _view_angles(keyframe.camera)
+        is_chosen = keyframe.id == self.chosen
+        if keyframe.id not in self._places:
+            self._places[keyframe.id] = self._free_places.pop() if self._free_places else len(self._places)
+        self._frusta[keyframe.id] = self._scene.add_camera_frustum(
+            f"/keyframes/{self._places[keyframe.id]}",
+            fov,
+            aspect,
+            scale=_frustum_scale(fov, aspect),
+            thickness=3.0 if is_chosen else 1.5,
+            thickness_units="screen",
+            color=_CHOSEN if is_chosen else _COLORS[keyframe.state],
+            image=keyframe.picture if self._pictures and keyframe.state != "off" else None,
+            format="jpeg",
+            jpeg_quality=70,
+            cast_shadow=False,
+            receive_shadow=False,
+            wxyz=place.wxyz,
+            position=place.position,
+        )
+
+
+def _view_angles(camera: PinholeCamera) -> tuple[float, float]:
+    """Vertical field of view in radians, and width over height at unit depth."""
+    return 2 * float(np.arctan(camera.height / 2 / camera.fy)), (camera.width / camera.fx) / (
+        camera.height / camera.fy
+    )
+
+
+def _frustum_scale(fov: float, aspect: float) -> float:
+    """viser scales a frustum to one unit of volume; this is the scale that puts its picture at FRUSTUM_M."""
+    y = np.tan(fov / 2)
+    return FRUSTUM_M * float(np.cbrt(y * y * aspect / 3))

@@ -1,0 +1,173 @@
+"""The map in the scene: voxels, the cut through them, the outlines of bricks, and another map beside it.
+
+Changes are collected, and sent at most :data:`UPDATES_PER_SECOND` times.
+"""
+
+import time
+from collections.abc import Callable, Iterable
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from taichi_mrf.viewer.live.options import ViewOptions
+from taichi_mrf.viewer.messages import Bricks, Hello, Layer
+from taichi_mrf.viewer.scene.brick_lines import BrickLines
+from taichi_mrf.viewer.scene.coloring import Scale
+from taichi_mrf.viewer.scene.cut_plane import CutPlane, cut_picture
+from taichi_mrf.viewer.scene.look import Look, Up, look_of
+from taichi_mrf.viewer.scene.voxel_layer import VoxelLayer
+from taichi_mrf.viewer.scene.voxel_store import ChunkKey, VoxelStore
+from taichi_mrf.voxels.layout import BRICK
+
+UPDATES_PER_SECOND = 8
+REST_S = 0.5
+"""After so long without news from the mapper, colours that moved a little are brought up to date too."""
+
+_GAP_M = 0.5
+"""Between the map and the one beside it."""
+
+
+_NAMES: dict[Layer, str] = {"map": "this map", "beside": "OctoMap's way"}
+
+
+class MapScene:
+    """Owns the scene nodes /voxels, /beside, /cut, /bricks and /names."""
+
+    def __init__(self, server: viser.ViserServer, hello: Hello) -> None:
+        self._server, self._hello = server, hello
+        self.layers: dict[Layer, VoxelLayer] = {
+            "map": VoxelLayer(server.scene, "/voxels", hello.voxel_size),
+            "beside": VoxelLayer(server.scene, "/beside", hello.voxel_size),
+        }
+        self._cut_plane = CutPlane(server.scene, hello.voxel_size)
+        self._brick_lines = BrickLines(server.scene, hello.voxel_size)
+        self._dirty: dict[Layer, set[ChunkKey]] = {"map": set(), "beside": set()}
+        self._all_dirty = True
+        self._look: Look | None = None
+        self._news_at = self._sent_at = 0.0
+
+    @property
+    def store(self) -> VoxelStore:
+        """What is known of the map."""
+        return self.layers["map"].store
+
+    @property
+    def scale(self) -> Scale | None:
+        """The colours in use; None before anything was drawn."""
+        return None if self._look is None else self._look.scale
+
+    def box_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Lowest and highest corner of all that is shown, in metres; None if that is nothing."""
+        corners = []
+        for layer in self.layers.values():
+            bounds = layer.store.bounds()
+            if bounds is not None:
+                ends = np.stack([bounds[0], bounds[1] + 1]) * BRICK * self._hello.voxel_size
+                corners.append(ends + layer.origin_m)
+        if not corners:
+            return None
+        every = np.concatenate(corners)
+        return every.min(axis=0), every.max(axis=0)
+
+    def take(self, bricks: Bricks) -> None:
+        """Remember what the mapper says; it is drawn by :meth:`flush`."""
+        store = self.layers[bricks.layer].store
+        changed = store.put(bricks.bricks, bricks.log_odds, bricks.seen) | store.remove(bricks.removed)
+        self._dirty[bricks.layer] |= changed
+        self._news_at = time.monotonic()
+
+    def look_changed(self) -> None:
+        """Draw everything anew, and do not wait for the next update's turn."""
+        self._all_dirty = True
+        self._sent_at = 0.0
+
+    def clear(self) -> None:
+        """Take everything out of the scene."""
+        for layer in self.layers.values():
+            layer.clear()
+        self._cut_plane.hide()
+        self._brick_lines.hide()
+        for name in _NAMES:
+            self._server.scene.remove_by_name(f"/names/{name}")
+
+    def patience(self) -> float | None:
+        """Seconds until :meth:`flush` has something to do if nothing happens; None: there is nothing."""
+        now = time.monotonic()
+        if self._all_dirty or any(self._dirty.values()):
+            return max(0.0, self._sent_at + 1 / UPDATES_PER_SECOND - now)
+        if any(layer.inexact() for layer in self.layers.values()):
+            return max(0.0, self._news_at + REST_S - now)
+        return None
+
+    def flush(
+        self,
+        options: ViewOptions,
+        up: Up,
+        crossed: Iterable[NDArray[np.int32]],
+        announce: Callable[[], None] = lambda: None,
+    ) -> bool:
+        """Send what has changed, unless that was done a moment ago; returns whether it was.
+
+        ``crossed`` are bricks (n, 3) that rays went through. ``announce`` is called before the voxels go out,
+        when it is known how many there will be: a browser that draws slowly then shows the number first.
+        """
+        waited = self.patience()
+        if waited is None or waited > 0:
+            return False
+        rested = time.monotonic() >= self._news_at + REST_S
+        look = look_of(options, self.store, up, self._hello.voxel_size)
+        # A scale of heights or a cut that moves with the map's size changes every chunk.
+        everything = self._all_dirty or (self._look is not None and not look.same_everywhere(self._look))
+        map_changed = everything or bool(self._dirty["map"])
+        any_changed = map_changed or bool(self._dirty["beside"])
+        for name, layer in self.layers.items():
+            chunks = layer.all_chunks() if everything else self._dirty[name]
+            layer.prepare(chunks | (layer.inexact() if rested else set()), look, exactly=rested)
+            self._dirty[name] = set()
+        announce()
+        with self._server.atomic():
+            for layer in self.layers.values():
+                layer.send()
+            if map_changed:
+                self._draw_cut(look, crossed)
+                self._brick_lines.show(self.store.bricks() if options.bricks else None)
+            if any_changed:
+                self.layers["beside"].place(self._beside_m(up))
+                self._draw_names(up)
+        self._look, self._all_dirty, self._sent_at = look, False, time.monotonic()
+        return True
+
+    def _draw_cut(self, look: Look, crossed: Iterable[NDArray[np.int32]]) -> None:
+        if look.cut is None:
+            self._cut_plane.hide()
+            return
+        picture = cut_picture(
+            self.store, look.cut, self._hello.prior_log_odds, self._hello.min_evidence, crossed
+        )
+        self._cut_plane.show(self.store, look.cut, picture)
+
+    def _draw_names(self, up: Up) -> None:
+        """Say which map is which, above them, if there are two."""
+        two = bool(self.layers["beside"].store.chunks)
+        for layer, text in _NAMES.items():
+            if not two:
+                self._server.scene.remove_by_name(f"/names/{layer}")
+                continue
+            bounds = self.layers[layer].store.bounds()
+            if bounds is None:
+                continue
+            ends = np.stack([bounds[0], bounds[1] + 1]) * BRICK * self._hello.voxel_size
+            above = ends.mean(axis=0) + self.layers[layer].origin_m
+            axis, sign = up
+            above[axis] = ends[:, axis].max() if sign > 0 else ends[:, axis].min()
+            self._server.scene.add_label(f"/names/{layer}", text, position=above)
+
+    def _beside_m(self, up: Up) -> NDArray[np.float64]:
+        """How far the other map is shifted: past this one, along a level axis."""
+        shift = np.zeros(3)
+        bounds = self.store.bounds()
+        if bounds is not None:
+            axis = 0 if up[0] != 0 else 1
+            shift[axis] = (bounds[1] - bounds[0] + 1)[axis] * BRICK * self._hello.voxel_size + _GAP_M
+        return shift

@@ -1,0 +1,162 @@
+"""The voxels in the scene: one point cloud for each chunk, sent again only if what is to be seen changed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from taichi_mrf.viewer.scene.coloring import Scale, voxel_colors
+from taichi_mrf.viewer.scene.voxel_store import ChunkKey, Cut, VoxelStore, facing
+from taichi_mrf.voxels.layout import CHUNK_VOXELS
+
+NOTICEABLE = 12
+"""A colour that moves by no more than this (of 255, in any channel) waits until the mapper rests."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """What decides how a chunk looks."""
+
+    log_odds: float
+    cut: Cut | None
+    scale: Scale
+    point_size: float
+    """In voxels."""
+    shade: bool
+    up: tuple[int, int]
+    """The axis that points up, and 1 or -1 for its direction."""
+
+    def same_everywhere(self, other: "Look") -> bool:
+        """Whether a voxel that has not changed looks the same."""
+        mine, others = (
+            (look.log_odds, look.cut, look.point_size, look.shade, look.up, look.scale.legend())
+            for look in (self, other)
+        )
+        return mine == others
+
+
+@dataclass
+class _Sent:
+    """What the clients have of a chunk. ``exact`` is false where colours have moved since, unnoticeably."""
+
+    cells: NDArray[np.uint8]
+    colors: NDArray[np.uint8]
+    point_size: float
+    exact: bool = True
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of points (float16) and colours."""
+        return len(self.cells) * 9
+
+
+class VoxelLayer:
+    """Owns the scene nodes under ``prefix``."""
+
+    def __init__(self, scene: viser.SceneApi, prefix: str, voxel_size: float) -> None:
+        self._scene, self._prefix, self._voxel_size = scene, prefix, voxel_size
+        self.store = VoxelStore()
+        self.origin_m = np.zeros(3)
+        self.bytes_sent = 0
+        self._sent: dict[ChunkKey, _Sent] = {}
+        self._prepared: dict[ChunkKey, _Sent | None] = {}
+        self._nodes: dict[ChunkKey, viser.PointCloudHandle] = {}
+
+    @property
+    def voxels_shown(self) -> int:
+        """Voxels that the clients show once everything that is prepared has been sent."""
+        ahead: dict[ChunkKey, _Sent | None] = {**self._sent, **self._prepared}
+        return sum(len(each.cells) for each in ahead.values() if each is not None)
+
+    def place(self, origin_m: NDArray[np.float64]) -> None:
+        """Put the whole layer somewhere else in the world."""
+        self.origin_m = origin_m
+        for key, node in self._nodes.items():
+            node.position = self._position(key)
+
+    def prepare(self, chunks: set[ChunkKey], look: Look, exactly: bool = False) -> None:
+        """Work out what has to be sent of some chunks; :meth:`send` does it. Unless ``exactly``, colours that
+        moved a little are left for later."""
+        for key in sorted(chunks):
+            self._prepare_chunk(key, look, exactly)
+
+    def send(self) -> None:
+        """Bring the scene to what was prepared."""
+        for key, now in self._prepared.items():
+            if now is None:
+                self._take_out(key)
+            else:
+                self._send(key, now)
+        self._prepared.clear()
+
+    def inexact(self) -> set[ChunkKey]:
+        """The chunks that were left for later."""
+        return {key for key, sent in self._sent.items() if not sent.exact}
+
+    def all_chunks(self) -> set[ChunkKey]:
+        """Every chunk that is in the store or in the scene."""
+        return set(self.store.chunks) | set(self._sent)
+
+    def clear(self) -> None:
+        """Take everything out of the scene, and forget the map."""
+        self.store = VoxelStore()
+        self._prepared.clear()
+        for key in list(self._sent):
+            self._take_out(key)
+
+    def points(self) -> NDArray[np.float64]:
+        """Centres (n, 3) in metres, in the world, of all voxels that are shown."""
+        centres = [np.zeros((0, 3))]
+        for key, sent in self._sent.items():
+            centres.append(sent.cells * self._voxel_size + self._position(key))
+        return np.concatenate(centres)
+
+    def _prepare_chunk(self, key: ChunkKey, look: Look, exactly: bool) -> None:
+        shown = self.store.shown(key, look.log_odds, look.cut)
+        before = self._sent.get(key)
+        if not len(shown.cells):
+            if before is not None:
+                self._prepared[key] = None
+            return
+        axis, sign = look.up
+        heights = sign * (key[axis] * CHUNK_VOXELS + 0.5 + shown.cells[:, axis]) * self._voxel_size
+        faces = facing(shown.cells) if look.shade else None
+        now = _Sent(shown.cells, voxel_colors(look.scale, shown, heights, faces), look.point_size)
+        if before is not None and np.array_equal(before.cells, now.cells):
+            moved = np.abs(before.colors.astype(np.int16) - now.colors).max()
+            if before.point_size != now.point_size:
+                self._nodes[key].point_size = now.point_size
+                before.point_size = now.point_size
+            if moved == 0:
+                before.exact = True
+                return
+            if moved <= NOTICEABLE and not exactly:
+                before.exact = False
+                return
+        self._prepared[key] = now
+
+    def _send(self, key: ChunkKey, now: _Sent) -> None:
+        self._nodes[key] = self._scene.add_point_cloud(
+            self._name(key),
+            points=now.cells.astype(np.float16),
+            colors=now.colors,
+            point_size=now.point_size,
+            point_shape="square",
+            precision="float16",
+            scale=self._voxel_size,
+            position=self._position(key),
+        )
+        self._sent[key] = now
+        self.bytes_sent += now.nbytes
+
+    def _take_out(self, key: ChunkKey) -> None:
+        self._nodes.pop(key).remove()
+        del self._sent[key]
+
+    def _name(self, key: ChunkKey) -> str:
+        return f"{self._prefix}/{key[0]}_{key[1]}_{key[2]}"
+
+    def _position(self, key: ChunkKey) -> NDArray[np.float64]:
+        """Of the centre of the chunk's first voxel, from which points are counted."""
+        return self.origin_m + (np.array(key) * CHUNK_VOXELS + 0.5) * self._voxel_size

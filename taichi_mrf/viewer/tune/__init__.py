@@ -1,0 +1,4 @@
+"""The tuning page.
+
+Uses `viewer.scene` and `viewer.transport`.
+"""

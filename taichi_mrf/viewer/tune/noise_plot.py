@@ -1,0 +1,159 @@
+"""The sensor's noise as the map sees it: residuals against depth, with the curves in force over them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from viser import uplot
+
+from taichi_mrf.config.schema import SensorConfig
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.sensor.noise import LEAST_SIGMA_M, evaluate, patch_coefficients
+from taichi_mrf.viewer.tune.messages import Residuals
+
+SPREADS_SHOWN = 4.0
+"""How far up and down the plot reaches: so many times the usual spread, or the usual sigma if that is more.
+Outliers would make it so high that the curves could not be told apart."""
+
+_SERIES = (
+    uplot.Series(label="depth (m)"),
+    uplot.Series(
+        label="residual (mm)", stroke="#9aa5b1", width=0,
+        points={"show": True, "size": 2.5, "fill": "#9aa5b1", "width": 0},
+    ),
+    uplot.Series(
+        label="median of a bin", stroke="#0072b2", width=0,
+        points={"show": True, "size": 7.0, "fill": "#0072b2"},
+    ),
+    uplot.Series(
+        label="median ± spread", stroke="#56b4e9", width=0,
+        points={"show": True, "size": 6.0, "fill": "#ffffff"},
+    ),
+    uplot.Series(label="", stroke="#56b4e9", width=0, points={"show": True, "size": 6.0, "fill": "#ffffff"}),
+    uplot.Series(label="bias", stroke="#d55e00", width=2),
+    uplot.Series(label="bias ± sigma", stroke="#e69f00", width=2),
+    uplot.Series(label="", stroke="#e69f00", width=2),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class NoiseCurves:
+    """Bias and sigma in force: coefficients in ascending powers of depth, a row for each patch of an image.
+    ``note`` says where they come from, if not from the page's own sliders."""
+
+    sigma: NDArray[np.float64]
+    bias: NDArray[np.float64]
+    note: str = ""
+
+    @classmethod
+    def of(cls, sensor: SensorConfig) -> "NoiseCurves":
+        """Those of a configuration. A table that has gone since the map was made is left out, and said so."""
+        tables = [name for name in ("sigma", "bias") if getattr(sensor, f"{name}_table") is not None]
+        if not tables:
+            return cls(*patch_coefficients(sensor))
+        try:
+            coefficients = patch_coefficients(sensor)
+        except ConfigError as error:
+            nowhere = np.full((1, 1), np.nan)
+            return cls(nowhere, nowhere, f"The curves are not drawn: {error}.")
+        names = " and ".join(tables)
+        return cls(
+            *coefficients, f"For {names} the curves are the mean over the patches of the table in force."
+        )
+
+    def at(self, depth_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Bias and sigma at some depths, in metres, means over all patches; (n,) each."""
+        bias, sigma = (evaluate(rows[:, None, :], depth_m) for rows in (self.bias, self.sigma))
+        return bias.mean(axis=0), np.maximum(sigma, LEAST_SIGMA_M).mean(axis=0)
+
+
+class NoisePlot:
+    """Owns the plot; curves follow the sliders at once, residuals come with each map."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self._residuals: Residuals | None = None
+        self._sensor = SensorConfig()
+        self._curves = NoiseCurves.of(self._sensor)
+        nothing = tuple(np.zeros(2) for _ in _SERIES)
+        self._plot: Any = gui.add_uplot(
+            nothing,
+            _SERIES,
+            scales={"x": uplot.Scale(time=False), "y": uplot.Scale(range=(-1.0, 1.0))},
+            axes=(uplot.Axis(label="depth (m)"), uplot.Axis(label="residual (mm)")),
+            legend={"show": False},
+            aspect=1.25,
+            visible=False,
+        )
+        self.text = gui.add_markdown("No map yet.")
+
+    def show(self, residuals: Residuals) -> None:
+        """Residuals of another map."""
+        self._residuals = residuals
+        self._draw()
+
+    def follow(self, sensor: SensorConfig) -> None:
+        """Draw the curves of these coefficients."""
+        if sensor != self._sensor:
+            self._sensor, self._curves = sensor, NoiseCurves.of(sensor)
+            self._draw()
+
+    def _draw(self) -> None:
+        if self._residuals is None:
+            return
+        data = plot_data(self._residuals, self._curves)
+        reach = _reach_mm(self._residuals, self._curves)
+        self._plot.scales = {"x": uplot.Scale(time=False), "y": uplot.Scale(range=(-reach, reach))}
+        self._plot.data = data
+        self._plot.visible = True
+        self.text.content = sentence(self._residuals, self._curves)
+
+
+def plot_data(residuals: Residuals, curves: NoiseCurves) -> tuple[NDArray[np.float64], ...]:
+    """Depth in metres, and over it in millimetres: residuals, medians and spreads of bins, bias and
+    bias ± sigma; NaN where a residual or a bin has no point. All (n,)."""
+    depth, bins = residuals.depth_m.astype(np.float64), residuals.bin_m
+    x = np.concatenate([depth, bins])
+    order = np.argsort(x, kind="stable")
+
+    def placed(begin: int, values_m: NDArray[np.floating]) -> NDArray[np.float64]:
+        column = np.full(len(x), np.nan)
+        column[begin : begin + len(values_m)] = 1000.0 * values_m
+        return column[order]
+
+    bias, sigma = (1000.0 * curve for curve in curves.at(x[order]))
+    return (
+        x[order],
+        placed(0, residuals.residual_m),
+        placed(len(depth), residuals.median_m),
+        placed(len(depth), residuals.median_m + residuals.spread_m),
+        placed(len(depth), residuals.median_m - residuals.spread_m),
+        bias,
+        bias + sigma,
+        bias - sigma,
+    )
+
+
+def _reach_mm(residuals: Residuals, curves: NoiseCurves) -> float:
+    """The largest residual that the plot has room for."""
+    if not len(residuals.bin_m):
+        return 100.0
+    bias, sigma = (np.nan_to_num(curve) for curve in curves.at(residuals.bin_m))
+    usual_m = max(float(np.median(residuals.spread_m)), float(np.median(sigma)))
+    offset_m = max(float(np.median(np.abs(residuals.median_m))), float(np.max(np.abs(bias))))
+    return 1000.0 * (SPREADS_SHOWN * usual_m + offset_m)
+
+
+def sentence(residuals: Residuals, curves: NoiseCurves) -> str:
+    """What the plot says, in words."""
+    if not len(residuals.bin_m):
+        return "The map has no answer for the held-out views."
+    points = "Grey: measured minus expected depth in held-out views, mm. Blue: its median and spread. "
+    ratio = float(np.median(residuals.spread_m / curves.at(residuals.bin_m)[1]))
+    if not np.isfinite(ratio):
+        return points + curves.note
+    return (
+        f"{points}Orange: bias and bias ± sigma. The spread is **{ratio:.1f} times** sigma; the map's own "
+        f"error, some tenths of a voxel, is part of it. {curves.note}"
+    ).rstrip()

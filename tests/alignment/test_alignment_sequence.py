@@ -1,0 +1,207 @@
+"""Refining all poses of a sequence: alignment of all at once, the pipeline, and the experiment."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_scenes import experiment, make_data
+
+from taichi_mrf.alignment.joint import align_jointly
+from taichi_mrf.alignment.oriented_points import oriented_points
+from taichi_mrf.alignment.se3 import moved
+from taichi_mrf.config.schema import Config, EvaluationConfig, PoseConfig, VolumeConfig
+from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.experiments.poses import DISTURBED_M, DISTURBED_RAD, halved, run_poses
+from taichi_mrf.experiments.scenes import Scene, SceneView
+from taichi_mrf.geometry.poses import Pose, tangent_norms
+from taichi_mrf.inference.keyframe import DepthImage
+from taichi_mrf.mapping.pipeline import Event, KeyframeAdded, KeyframeRefined, KeyframeSwept, map_sequence
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.noise import PolynomialNoise
+
+pytestmark = pytest.mark.usefixtures("one_backend")
+
+COUNT = 8
+REFINE = Config(
+    voxel_size=0.1, poses=PoseConfig(refine=True, rounds=1), evaluation=EvaluationConfig(hold_out=0)
+)
+
+
+@cache
+def true_frames() -> list[Frame]:
+    """A third of the way round the built-in room."""
+    dataset = open_dataset("synthetic:room?width=160&height=120&frames=20", color=False)
+    return [dataset.read(i) for i in range(COUNT)]
+
+
+def disturbed(seed: int) -> list[Pose]:
+    random = np.random.default_rng(seed)
+    scale = np.repeat([DISTURBED_M, DISTURBED_RAD], 3)
+    true = [frame.T_world_camera for frame in true_frames()]
+    return [true[0], *(moved(T, random.normal(0, scale)) for T in true[1:])]
+
+
+class WrongPoses(Dataset):
+    """The room with the poses of a bad tracker."""
+
+    def __init__(self, poses: Sequence[Pose]) -> None:
+        super().__init__("wrong", true_frames()[0].camera)
+        self.poses = poses
+
+    @property
+    def frame_names(self) -> Sequence[str]:
+        return [frame.name for frame in true_frames()]
+
+    def read(self, index: int) -> Frame:
+        return replace(true_frames()[index], T_world_camera=self.poses[index])
+
+
+def errors(poses: Sequence[Pose]) -> np.ndarray:
+    """Mean rotation (radians) and translation (metres) off the truth; the first is no error at all."""
+    true = [frame.T_world_camera for frame in true_frames()]
+    each = [tangent_norms(a, b) for a, b in zip(true, poses, strict=True)]
+    assert each[0] == (0, 0)
+    return np.mean(each[1:], axis=0)
+
+
+def test_all_at_once_takes_back_more_than_half() -> None:
+    points = {
+        i: oriented_points(DepthImage.upload(f.depth_m, f.camera, PolynomialNoise((0.003,))), 10.0)
+        for i, f in enumerate(true_frames())
+    }
+    start = dict(enumerate(disturbed(0)))
+    found = align_jointly(points, start, start, PoseConfig())
+    before, after = errors(list(start.values())), errors(list(found.values()))
+    assert (after < 0.5 * before).all()
+
+
+def test_poses_recorded_well_are_trusted() -> None:
+    points = {
+        i: oriented_points(DepthImage.upload(f.depth_m, f.camera, PolynomialNoise((0.003,))), 10.0)
+        for i, f in enumerate(true_frames()[:3])
+    }
+    start = dict(enumerate(disturbed(0)[:3]))
+    sure = PoseConfig(translation_sigma=1e-5, rotation_sigma=1e-5)
+    found = align_jointly(points, start, start, sure)
+    for id, T in found.items():
+        np.testing.assert_allclose(T, start[id], atol=1e-4)
+
+
+def test_a_keyframe_without_partners_stays_where_it_was_recorded() -> None:
+    frames = [true_frames()[i] for i in (0, 1)]
+    points = {
+        i: oriented_points(DepthImage.upload(f.depth_m, f.camera, PolynomialNoise((0.003,))), 10.0)
+        for i, f in enumerate(frames)
+    }
+    away = frames[1].T_world_camera.copy()
+    away[:3, 3] += 30.0
+    poses = {0: frames[0].T_world_camera, 1: away}
+    np.testing.assert_allclose(align_jointly(points, poses, poses, PoseConfig())[1], away, atol=1e-9)
+
+
+def test_the_pipeline_corrects_poses_and_tells_both() -> None:
+    events: list[Event] = []
+    wrong = disturbed(1)
+    result = map_sequence(WrongPoses(wrong), REFINE, events.append)
+    assert isinstance(result.map, MRFMap)
+    assert [change.name for change in result.poses] == [frame.name for frame in true_frames()]
+    for change, T_recorded in zip(result.poses, wrong, strict=True):
+        np.testing.assert_array_equal(change.T_recorded, T_recorded)
+        np.testing.assert_array_equal(change.T_refined, result.map.keyframes[change.keyframe].T_world_camera)
+        assert (change.rotation_rad, change.translation_m) == tangent_norms(T_recorded, change.T_refined)
+    refined = [change.T_refined for change in result.poses]
+    assert (errors(refined) < 0.5 * errors(wrong)).all()
+    assert "refining" in result.seconds
+    kinds = [type(event) for event in events]
+    assert kinds.index(KeyframeAdded) < kinds.index(KeyframeRefined) < kinds.index(KeyframeSwept)
+    asked = [(e.round, e.rounds, e.number, e.keyframes) for e in events if isinstance(e, KeyframeRefined)]
+    assert asked == [(1, 1, number, COUNT) for number in range(1, COUNT + 1)]
+    # The map is that of the refined poses, whatever was done on the way.
+    again = MRFMap.from_config(result.map.config, result.map.keyframes[0].camera)
+    for frame, T in zip(true_frames(), refined, strict=True):
+        again.add_keyframe(frame.depth_m, T, frame.camera)
+    again.infer()
+    centres, _ = again.voxels(min_probability=0.0)
+    np.testing.assert_array_equal(result.map.occupancy(centres), again.occupancy(centres))
+
+
+def test_a_stopped_run_goes_on_with_the_recorded_poses_of_its_keyframes() -> None:
+    wrong = disturbed(2)
+    left = [3]
+
+    def listen(event: Event) -> None:
+        left[0] -= isinstance(event, KeyframeAdded)
+
+    part = map_sequence(WrongPoses(wrong), REFINE, listen, should_stop=lambda: left[0] <= 0)
+    assert part.interrupted
+    assert len(part.poses) == 3
+    whole = map_sequence(WrongPoses(wrong), REFINE, resume_from=part.map)
+    assert len(whole.poses) == COUNT
+    for change, T_recorded in zip(whole.poses, wrong, strict=True):
+        np.testing.assert_array_equal(change.T_recorded, T_recorded)
+    assert (errors([change.T_refined for change in whole.poses]) < 0.5 * errors(wrong)).all()
+
+
+def test_a_stop_in_the_rounds_undoes_the_round() -> None:
+    wrong = disturbed(1)
+    told: list[Event] = []
+
+    def stop() -> bool:
+        return any(isinstance(event, KeyframeRefined) and event.number == 3 for event in told)
+
+    stopped = map_sequence(WrongPoses(wrong), REFINE, told.append, should_stop=stop)
+    assert stopped.interrupted
+    assert stopped.sweeps == 1
+    without = replace(REFINE, poses=replace(REFINE.poses, rounds=0))
+    as_added = map_sequence(WrongPoses(wrong), without)
+    for change, expected in zip(stopped.poses, as_added.poses, strict=True):
+        np.testing.assert_array_equal(change.T_refined, expected.T_refined)
+
+
+def test_without_it_nothing_is_moved() -> None:
+    wrong = disturbed(1)
+    result = map_sequence(WrongPoses(wrong), replace(REFINE, poses=PoseConfig()), limit=2)
+    assert result.poses == []
+    for keyframe, T in zip(result.map.keyframes.values(), wrong, strict=False):
+        np.testing.assert_array_equal(keyframe.T_world_camera, T)
+
+
+def test_only_mrf_maps_can_move_keyframes() -> None:
+    with pytest.raises(ConfigError, match=r"poses.refine needs the method mrf"):
+        map_sequence(WrongPoses(disturbed(1)), replace(REFINE, method="log_odds"))
+
+
+def test_every_second_pixel_is_the_same_view() -> None:
+    camera = PinholeCamera(width=9, height=7, fx=10.0, fy=11.0, cx=4.2, cy=3.1)
+    depth = np.arange(63, dtype=np.float32).reshape(7, 9)
+    view = SceneView("a", np.eye(4), depth, depth + 1, depth > 3)
+    half = halved(Scene("s", camera, PolynomialNoise((0.01,)), VolumeConfig(), 5.0, [view]))
+    assert half.views[0].measured_m.shape == half.camera.shape == (4, 5)
+    np.testing.assert_allclose(half.camera.rays(), camera.rays()[::2, ::2])
+    np.testing.assert_array_equal(half.views[0].true_m, view.true_m[::2, ::2])
+
+
+def test_the_experiment_goes_on_where_it_was(tmp_path: Path) -> None:
+    data = make_data(tmp_path)
+    options = {"voxel_sizes": (0.1,), "seeds": (0,), "limit": 4}
+    tables, paths = run_poses(experiment(data, tmp_path / "out", **options))
+    (table,) = tables
+    names = [row[2] for row in table.rows]
+    simulated = ["true", "disturbed", "disturbed, refined"]
+    real = ["recorded", "recorded, refined", "recorded, views aligned", "recorded, refined, views aligned"]
+    assert names == [*simulated, *simulated, *real]
+    assert {path.name for path in paths} == {"poses.csv", "poses.tex", "poses.png"}
+    again = experiment(data, tmp_path / "out", **options)
+    run_poses(again)
+    assert again.ledger.computed == 0
+    kept = (tmp_path / "out" / "ledger.jsonl").read_text().splitlines()
+    results = [json.loads(line)["result"] for line in kept[1:]]
+    assert results[0]["translation_m"] == [0.0]
+    assert results[1]["translation_m"][0] > 0

@@ -1,0 +1,357 @@
+"""The console program as a person runs it: a process, its exit status, its files and its words."""
+
+import json
+import os
+import pty
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from taichi_mrf.config.schema import load
+
+ROOM = "synthetic:room?frames=12&width=160&height=120"
+COARSE = ("--voxel-size", "0.1", "--runtime.arch", "cpu")
+FAST = (*COARSE, "--no-pictures")
+FILES = {"map.npz", "voxels.ply", "config.yaml", "report.json"}
+PICTURES = {"top_view.png", "depth.png", "perspective.png"}
+
+
+def taichi_mrf(
+    *arguments: str | Path, options: tuple[str, ...] = (), before: Callable[[], None] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run the program from the source tree; ``options`` are the interpreter's."""
+    return subprocess.run(
+        [sys.executable, *options, "-m", "taichi_mrf", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=before,
+    )
+
+
+def mapped(*arguments: str | Path) -> str:
+    """Run ``map``, which must succeed without complaints; returns what it printed."""
+    done = taichi_mrf("map", *arguments)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return done.stdout
+
+
+def report_of(out: Path) -> dict:
+    return json.loads((out / "report.json").read_text(encoding="utf-8"))
+
+
+def marginals(out: Path) -> dict[tuple[float, ...], float]:
+    """Position -> probability of the occupied voxels that a run wrote."""
+    cloud = trimesh.load(out / "voxels.ply")
+    occupancy = cloud.metadata["_ply_raw"]["vertex"]["data"]["occupancy"]
+    return {tuple(np.round(c, 3)): float(p) for c, p in zip(cloud.vertices, occupancy, strict=True)}
+
+
+def assert_refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
+    """Exit status 2, and one line on stderr with all these words."""
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.count("\n") == 1, done.stderr
+    for word in words:
+        assert word in done.stderr
+    assert done.stdout == ""
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A run over the built-in room: its folder, and what it printed."""
+    out = tmp_path_factory.mktemp("room") / "deep" / "out"
+    return out, mapped(ROOM, "--out", out, *COARSE)
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """A folder of three frames in the 7-Scenes layout: a wall 1.5 m away."""
+    folder = tmp_path / "recording"
+    folder.mkdir()
+    for index in range(3):
+        stem = folder / f"frame-{index:06d}"
+        cv2.imwrite(f"{stem}.depth.png", np.full((480, 640), 1500, np.uint16))
+        np.savetxt(f"{stem}.pose.txt", np.eye(4))
+    return folder
+
+
+def test_help_is_printed_without_loading_taichi_or_numpy() -> None:
+    done = taichi_mrf("--help", options=("-X", "importtime"))
+    assert done.returncode == 0
+    assert "map" in done.stdout
+    assert "info" in done.stdout
+    imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
+    assert "taichi_mrf.cli.main" in imported
+    assert not imported & {"taichi", "numpy", "cv2", "viser", "matplotlib"}
+
+
+def test_the_help_of_map_shows_every_parameter() -> None:
+    done = taichi_mrf("map", "--help")
+    assert done.returncode == 0
+    for flag in ("--out", "--config", "--every", "--limit", "--resume", "--voxel-size", "--inference.sweeps"):
+        assert flag in done.stdout
+    assert "Gauss-Seidel sweeps over all keyframes." in done.stdout
+
+
+def test_version_and_info() -> None:
+    import taichi_mrf as package
+
+    assert taichi_mrf("--version").stdout == f"taichi-mrf {package.__version__}\n"
+    done = taichi_mrf("info", "--arch", "cpu")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("Runs on cpu")
+    for word in ("cuda", "vulkan", "taichi 1.7", "numpy", package.__version__):
+        assert word in done.stdout
+
+
+@pytest.mark.parametrize("name", ["batch", "live", "tune"])
+def test_the_applications_are_the_commands(name: str, repository: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(repository)}
+    app = [sys.executable, repository / "apps" / f"{name}.py", "--help"]
+    done = subprocess.run(app, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0
+    assert f"taichi-mrf {'map' if name == 'batch' else name}" in done.stdout
+
+
+def test_the_shell_is_told_how_to_complete() -> None:
+    done = taichi_mrf("--tyro-print-completion", "bash")
+    assert done.returncode == 0
+    for name in ("map", "tune", "export", "laser"):
+        assert name in done.stdout
+
+
+def test_a_run_writes_its_files_and_nothing_else(room: tuple[Path, str]) -> None:
+    out, printed = room
+    assert {path.name for path in out.iterdir()} == FILES | PICTURES
+    for name in FILES | PICTURES:
+        assert (out / name).stat().st_size > 0
+        assert str(out / name) in printed
+    assert "median error" in printed
+    for picture in out.glob("*.png"):
+        assert cv2.imread(str(picture)) is not None
+
+
+def test_the_report_tells_what_was_done(room: tuple[Path, str]) -> None:
+    report = report_of(room[0])
+    assert report["source"] == ROOM
+    assert report["backend"] == "cpu"
+    assert report["interrupted"] is False
+    assert (report["frames"], report["keyframes"]) == (12, 11)
+    assert 0 < report["rays"] <= 11 * 160 * 120
+    assert report["voxels"] == 512 * report["bricks"] > 0
+    assert report["peak_memory_mb"] > report["map_memory_mb"] > 0
+    assert {"opening", "reading", "adding", "inferring", "checking", "writing"} <= report["seconds"].keys()
+    assert report["accuracy"]["frames"] == 1
+    assert 0 < report["accuracy"]["median_abs"] < 0.1
+    assert report["skipped_frames"] == {}
+
+
+def test_the_files_of_a_run_open_elsewhere(room: tuple[Path, str]) -> None:
+    out, _ = room
+    occupied = marginals(out)
+    assert len(occupied) > 100
+    assert all(0.5 <= p <= 1 for p in occupied.values())
+    config = load(out / "config.yaml")
+    assert config.voxel_size == 0.1
+    assert config.runtime.arch == "cpu"
+
+
+def test_flags_come_before_the_file_and_the_file_before_the_defaults(tmp_path: Path) -> None:
+    (tmp_path / "my.yaml").write_text("voxel_size: 0.2\ninference: {sweeps: 1, damping: 0.1}\n")
+    out = tmp_path / "out"
+    arguments = ("--config", tmp_path / "my.yaml", "--inference.sweeps", "2")
+    mapped(ROOM, "--out", out, "--limit", "2", "--no-pictures", *arguments)
+    config = load(out / "config.yaml")
+    assert (config.voxel_size, config.inference.sweeps, config.inference.damping) == (0.2, 2, 0.1)
+    assert config.inference.message_clamp == 6.9
+
+
+def test_a_second_run_takes_the_place_of_the_first(tmp_path: Path) -> None:
+    for limit in ("2", "3"):
+        mapped(ROOM, "--out", tmp_path, "--limit", limit, *FAST)
+        assert report_of(tmp_path)["keyframes"] == int(limit)
+    assert {path.name for path in tmp_path.iterdir()} == FILES
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["synthetic:romm"], ["did you mean 'synthetic:room'"]),
+        (["no/such/folder"], ["no/such/folder", "no such folder"]),
+        ([ROOM, "--voxel-size", "-0.05"], ["voxel_size must be a positive number of metres, not -0.05"]),
+        ([ROOM, "--every", "0"], ["--every must be at least 1"]),
+        ([ROOM, "--limit", "0"], ["--limit must be at least 1"]),
+        ([ROOM, "--inference.damping", "1.5"], ["inference.damping must be at least 0 and less than 1"]),
+        ([ROOM, "--config", "no.yaml"], ["no.yaml", "No such file"]),
+        ([ROOM, "--voxel-size", "0.00002", "--runtime.arch", "cpu"], ["GB"]),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    tmp_path: Path, arguments: list[str], words: list[str]
+) -> None:
+    assert_refused(taichi_mrf("map", *arguments, "--out", tmp_path / "a" / "b"), *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unknown_key_names_the_nearest(tmp_path: Path) -> None:
+    (tmp_path / "my.yaml").write_text("inference: {sweps: 1}\n")
+    done = taichi_mrf("map", ROOM, "--out", tmp_path / "out", "--config", tmp_path / "my.yaml")
+    assert_refused(done, "my.yaml", "sweps", "did you mean 'sweeps'")
+
+
+def test_an_unknown_flag_is_a_usage_error_that_names_the_nearest(tmp_path: Path) -> None:
+    done = taichi_mrf("map", ROOM, "--out", tmp_path / "out", "--inference.sweps", "1")
+    assert done.returncode == 2
+    assert "--inference.sweeps" in done.stderr
+
+
+def test_an_empty_folder(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    done = taichi_mrf("map", tmp_path / "empty", "--out", tmp_path / "out", *FAST)
+    assert_refused(done, str(tmp_path / "empty"), "empty")
+    assert not (tmp_path / "out").exists()
+
+
+def damage_image(folder: Path) -> None:
+    (folder / "frame-000001.depth.png").write_bytes(b"no image")
+
+
+def wrong_type(folder: Path) -> None:
+    cv2.imwrite(str(folder / "frame-000001.depth.png"), np.full((480, 640, 3), 150, np.uint8))
+
+
+def nan_pose(folder: Path) -> None:
+    np.savetxt(folder / "frame-000001.pose.txt", np.full((4, 4), np.nan))
+
+
+def no_pose(folder: Path) -> None:
+    (folder / "frame-000001.pose.txt").unlink()
+
+
+@pytest.mark.parametrize("damage", [damage_image, wrong_type, nan_pose, no_pose])
+def test_a_broken_frame_is_named_or_skipped(
+    tmp_path: Path, recording: Path, damage: Callable[[Path], None]
+) -> None:
+    damage(recording)
+    out = tmp_path / "out"
+    assert_refused(taichi_mrf("map", recording, "--out", out, *FAST), "frame-000001")
+    assert not out.exists()
+    printed = mapped(recording, "--out", out, "--skip-bad-frames", *FAST)
+    report = report_of(out)
+    assert list(report["skipped_frames"]) == ["frame-000001"]
+    assert report["skipped_frames"]["frame-000001"].split()[0] in printed
+    assert report["keyframes"] == 2
+
+
+def test_a_recording_of_broken_frames_only_is_an_error(tmp_path: Path, recording: Path) -> None:
+    for path in recording.glob("*.depth.png"):
+        path.write_bytes(b"")
+    done = taichi_mrf("map", recording, "--out", tmp_path / "out", "--skip-bad-frames", *FAST)
+    assert_refused(done, "3 are broken")
+
+
+def test_an_output_that_cannot_be_written_is_found_before_mapping(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    assert_refused(taichi_mrf("map", ROOM, "--out", tmp_path / "file", *FAST), str(tmp_path / "file"))
+    assert_refused(taichi_mrf("map", ROOM, "--out", tmp_path / "file" / "out", *FAST), "cannot be made")
+    if os.geteuid() != 0:
+        (tmp_path / "closed").mkdir(mode=0o500)
+        done = taichi_mrf("map", ROOM, "--out", tmp_path / "closed" / "out", *FAST)
+        assert_refused(done, str(tmp_path / "closed"), "Permission denied")
+
+
+def test_a_full_disk_names_the_file_and_leaves_no_half(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def allow_small_files_only() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+
+    monkeypatch.setenv("TI_OFFLINE_CACHE", "0")  # its files would meet the limit first
+    out = tmp_path / "out"
+    done = taichi_mrf("map", ROOM, "--out", out, *FAST, before=allow_small_files_only)
+    assert_refused(done, str(out / "map.npz"), "cannot be written")
+    assert not out.exists()
+
+
+def interrupted_run(out: Path, number: int, presses: int = 1) -> int:
+    """Start a run on a terminal, stop it once it shows progress, and return its exit status."""
+    main_end, program_end = pty.openpty()
+    source = "synthetic:room?frames=300&width=160&height=120"
+    with subprocess.Popen(
+        [sys.executable, "-m", "taichi_mrf", "map", source, "--out", out, *FAST],
+        stdin=program_end,
+        stdout=program_end,
+        stderr=program_end,
+    ) as process:
+        os.close(program_end)
+        shown = b""
+        sent = 0
+        while True:
+            try:
+                shown += os.read(main_end, 4096)
+            except OSError:  # the other end is closed: the program has ended
+                break
+            if sent == 0 and b"Adding" in shown:
+                process.send_signal(number)
+                sent = 1
+            elif 0 < sent < presses and b"Stopping" in shown:
+                process.send_signal(number)
+                sent += 1
+        os.close(main_end)
+    return process.returncode
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_keeps_what_is_mapped_and_resume_goes_on(tmp_path: Path, number: signal.Signals) -> None:
+    assert interrupted_run(tmp_path / "out", number) == 128 + number
+    report = report_of(tmp_path / "out")
+    assert report["interrupted"] is True
+    assert 0 < report["keyframes"] < 270
+    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
+
+
+def test_ctrl_c_twice_aborts_and_leaves_nothing(tmp_path: Path) -> None:
+    assert interrupted_run(tmp_path / "out", signal.SIGINT, presses=2) == 130
+    assert not (tmp_path / "out").exists()
+
+
+def test_resume_ends_in_the_map_of_one_run(tmp_path: Path, room: tuple[Path, str]) -> None:
+    mapped(ROOM, "--out", tmp_path, "--limit", "5", *FAST)
+    mapped(ROOM, "--out", tmp_path, "--resume", "--no-pictures")
+    whole, resumed = report_of(room[0]), report_of(tmp_path)
+    assert resumed["keyframes"] == whole["keyframes"]
+    assert resumed["rays"] == whole["rays"]
+    expected, got = marginals(room[0]), marginals(tmp_path)
+    common = expected.keys() & got.keys()
+    assert len(common) > 0.999 * max(len(expected), len(got))
+    close = sum(abs(expected[key] - got[key]) < 0.01 for key in common)
+    assert close > 0.999 * len(common)
+
+
+def test_resume_with_other_parameters_is_refused(tmp_path: Path) -> None:
+    mapped(ROOM, "--out", tmp_path, "--limit", "2", *FAST)
+    done = taichi_mrf("map", ROOM, "--out", tmp_path, "--resume", "--voxel-size", "0.2")
+    assert_refused(done, "config.yaml", "voxel_size")
+
+
+def test_resume_without_an_earlier_run_starts_one(tmp_path: Path) -> None:
+    mapped(ROOM, "--out", tmp_path, "--limit", "2", "--resume", *FAST)
+    assert report_of(tmp_path)["keyframes"] == 2
+
+
+@pytest.mark.shared_data
+def test_real_frames(tmp_path: Path, shared_data: Path) -> None:
+    source = shared_data / "seven_scenes_redkitchen"
+    mapped(source, "--out", tmp_path, "--limit", "12", "--runtime.arch", "cpu", "--no-pictures")
+    report = report_of(tmp_path)
+    assert report["keyframes"] == 11
+    assert report["accuracy"]["median_abs"] < 0.05

@@ -1,0 +1,172 @@
+"""``taichi-mrf eval`` as a person runs it, and maps of the other methods: processes, files, words, status."""
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from small_scenes import make_data
+from test_cli import FAST, ROOM, assert_refused, mapped, report_of, taichi_mrf
+
+from taichi_mrf.experiments.table3 import PAPER
+from taichi_mrf.experiments.tables import entry_text
+from taichi_mrf.methods.registry import load_map
+from taichi_mrf.system import runtime
+
+FILES = {"table3.csv", "table3.tex", "table3.png", "table3.jsonl", "table3_config.yaml"}
+CPU = ("--runtime.arch", "cpu")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Made on the CPU: the other backends' runs leave these tests out, to which they would add only time."""
+    runtime.init("cpu")
+    return make_data(tmp_path_factory.mktemp("data"))
+
+
+def evaluated(data: Path, out: Path, *arguments: str) -> str:
+    """Run ``eval``, which must succeed without complaints; returns what it printed."""
+    done = taichi_mrf("eval", *arguments, "--data", data, "--out", out, *CPU)
+    assert (done.returncode, done.stderr) == (0, ""), done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def table3(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A run of Table III: its folder, and what it printed."""
+    out = tmp_path_factory.mktemp("table3") / "deep" / "out"
+    return out, evaluated(data, out, "table3", "--voxel-sizes", "0.2", "0.05", "--seeds", "0")
+
+
+def rows_of(out: Path) -> list[dict[str, str]]:
+    with open(out / "table3.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_table_is_printed_beside_the_papers(table3: tuple[Path, str]) -> None:
+    out, printed = table3
+    assert {path.name for path in out.iterdir()} == FILES
+    lines = printed.splitlines()
+    for row in rows_of(out):
+        # Piped, a row is a line, with the digits of the table.
+        (line,) = (each for each in lines if row["voxels"] in each and f" {row['map']} " in each)
+        assert f"{float(row['5cm']):.3f} ± {float(row['5cm (std)']):.3f}" in line
+        if (row["map"], row["voxels"]) == ("MRFMap", "5 cm"):
+            assert entry_text(PAPER["MRFMap", 0.05], 3) in line
+    assert len(rows_of(out)) == 2 * (1 + 4 * 2)
+    for words in (
+        "Table III",
+        "paper",
+        "sensor's own noise",
+        *(str(out / name) for name in FILES - {"table3.jsonl"}),
+    ):
+        assert words in printed
+    assert cv2.imread(str(out / "table3.png")) is not None
+
+
+def test_how_it_was_run_is_written_down(table3: tuple[Path, str]) -> None:
+    written = yaml.safe_load((table3[0] / "table3_config.yaml").read_text())
+    assert written["evaluation"]["experiment"] == "table3"
+    assert written["evaluation"]["voxel_sizes"] == [0.2, 0.05]
+    assert written["evaluation"]["seeds"] == [0]
+    assert written["maps"]["inference"]["sweeps"] == 3
+
+
+def test_a_second_run_computes_nothing_and_says_the_same(table3: tuple[Path, str], data: Path) -> None:
+    out, printed = table3
+    before = {name: (out / name).read_bytes() for name in FILES - {"table3.png"}}
+    again = evaluated(data, out, "table3", "--voxel-sizes", "0.2", "0.05", "--seeds", "0")
+    assert again == printed
+    # Build times are in the table and in the ledger: computed once more they would differ.
+    assert {name: (out / name).read_bytes() for name in before} == before
+
+
+def test_ctrl_c_keeps_what_was_found(table3: tuple[Path, str], data: Path, tmp_path: Path) -> None:
+    command = [
+        sys.executable, "-m", "taichi_mrf", "eval", "table3", "--data", data, "--out", tmp_path,
+        "--voxel-sizes", "0.2", "0.05", "--seeds", "0", *CPU,
+    ]  # fmt: skip
+    ledger = tmp_path / "table3.jsonl"
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        while process.poll() is None and not (ledger.exists() and ledger.read_text().count("\n") > 1):
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        printed, said = process.communicate()
+    assert (process.returncode, said) == (130, "")
+    assert "the same command goes on from here" in " ".join(printed.split())
+    kept = ledger.read_text()
+    assert 1 <= kept.count("\n") - 1 < (table3[0] / "table3.jsonl").read_text().count("\n") - 1
+    assert not (tmp_path / "table3.csv").exists()
+    evaluated(data, tmp_path, "table3", "--voxel-sizes", "0.2", "0.05", "--seeds", "0")
+    assert ledger.read_text().startswith(kept)
+    assert {path.name for path in tmp_path.iterdir()} == FILES
+    for row, whole in zip(rows_of(tmp_path), rows_of(table3[0]), strict=True):
+        assert {**row, "map (s)": ""} == {**whole, "map (s)": ""}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["table3", "--data", "no/such"], ["no/such", "no such folder", "--data"]),
+        (["table1", "--data", "."], ["coffin_world/clean_depth.npz", "No such file"]),
+        (["table3", "--limit", "0"], ["--limit must be at least 1, not 0"]),
+        (["table3", "--limit", "1"], ["seven_scenes_redkitchen: 1 views", "at least 2"]),
+        (["table3", "--voxel-sizes", "0.1", "-0.2"], ["--voxel-sizes must be positive", "-0.2"]),
+        (["table3", "--voxel-sizes", "nan"], ["--voxel-sizes must be positive"]),
+        (["table3", "--voxel-sizes", "0.1", "0.1"], ["--voxel-sizes must differ"]),
+        (["table1", "--seeds", "-1"], ["--seeds must not be negative, not -1"]),
+        (["table1", "--seeds", "1", "1"], ["--seeds must differ"]),
+        (["table1", "--seeds"], ["--seeds needs at least one number"]),
+    ],
+)
+def test_bad_input_is_one_line(data: Path, tmp_path: Path, arguments: list[str], words: list[str]) -> None:
+    if "--data" not in arguments:
+        arguments = [*arguments, "--data", str(data)]
+    done = taichi_mrf("eval", *arguments, "--out", tmp_path / "out", *CPU)
+    assert_refused(done, *words)
+    assert list(tmp_path.glob("out/*.csv")) == []
+
+
+@pytest.mark.parametrize(
+    "arguments", [["table9"], ["table3", "--limit", "few"], ["table3", "--voxel-sizes", "x"]]
+)
+def test_what_cannot_be_parsed_is_a_usage_error(tmp_path: Path, arguments: list[str]) -> None:
+    done = taichi_mrf("eval", *arguments, "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert arguments[-1] in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_results_of_another_version_are_refused(data: Path, tmp_path: Path) -> None:
+    ledger = tmp_path / "table3.jsonl"
+    ledger.write_text(json.dumps({"made_with": {"backend": "cpu", "version": "0.0.1"}}) + "\n")
+    before = ledger.read_bytes()
+    done = taichi_mrf("eval", "table3", "--data", data, "--out", tmp_path, "--voxel-sizes", "0.2", *CPU)
+    assert_refused(done, "table3.jsonl", "another version")
+    assert ledger.read_bytes() == before
+
+
+@pytest.mark.parametrize("method", ["log_odds", "visibility"])
+def test_map_makes_maps_of_the_other_methods(tmp_path: Path, method: str) -> None:
+    mapped(ROOM, "--out", tmp_path, "--method", method, "--limit", "3", *FAST)
+    report = report_of(tmp_path)
+    assert (report["method"], report["keyframes"]) == (method, 3)
+    m = load_map(tmp_path / "map.npz")
+    assert m.config.method == method
+    centres, probability = m.voxels(min_probability=0.0)
+    assert len(centres) > 50
+    np.testing.assert_allclose(m.occupancy(centres), probability, atol=1e-6)
+    assert probability.min() < 0.45
+    for other in {"mrf", "log_odds", "visibility"} - {method}:
+        done = taichi_mrf("map", ROOM, "--out", tmp_path, "--resume", "--method", other, "--no-pictures")
+        assert_refused(done, "config.yaml", "method")
+    mapped(ROOM, "--out", tmp_path, "--resume", "--limit", "5", "--no-pictures")
+    resumed = report_of(tmp_path)
+    assert (resumed["method"], resumed["keyframes"]) == (method, 5)

@@ -1,0 +1,209 @@
+"""Parameters: one definition, its text in YAML and back, and clear words for what is wrong."""
+
+import dataclasses
+import typing
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from taichi_mrf.config.schema import (
+    Config,
+    EvaluationConfig,
+    InferenceConfig,
+    KeyframeConfig,
+    LogOddsConfig,
+    PoseConfig,
+    RuntimeConfig,
+    SensorConfig,
+    VisibilityConfig,
+    VolumeConfig,
+    load,
+    to_yaml,
+)
+from taichi_mrf.config.text import commented_yaml, differences, field_help
+from taichi_mrf.errors import ConfigError
+
+SECTIONS = (
+    Config,
+    SensorConfig,
+    InferenceConfig,
+    LogOddsConfig,
+    VisibilityConfig,
+    KeyframeConfig,
+    PoseConfig,
+    VolumeConfig,
+    EvaluationConfig,
+    RuntimeConfig,
+)
+Depths = NDArray[np.float64]
+DEPTHS = np.linspace(0.4, 5.0, 50)
+
+
+def numbers(least: float, most: float) -> st.SearchStrategy[float]:
+    """Taichi, once started, rounds subnormal numbers to 0 in all of the process."""
+    return st.floats(least, most, allow_subnormal=False)
+
+
+configs = st.builds(
+    Config,
+    voxel_size=numbers(1e-4, 10),
+    sensor=st.builds(
+        SensorConfig,
+        sigma=st.lists(numbers(-1e3, 1e3), min_size=1, max_size=4).map(tuple),
+        patch=st.integers(1, 100),
+        max_depth=numbers(1, 100),
+    ),
+    inference=st.builds(
+        InferenceConfig,
+        sweeps=st.integers(0, 10),
+        damping=numbers(0, 0.99),
+        prior=st.none() | numbers(0.01, 0.99),
+        outlier_floor=numbers(0, 1),
+        average=st.sampled_from(["probability", "log_odds"]),
+    ),
+    keyframes=st.builds(KeyframeConfig, rotation=numbers(0, 4), against=st.sampled_from(["last", "all"])),
+    volume=st.just(VolumeConfig()) | st.just(VolumeConfig(lower=(-1.0, -2.0, -3.0), upper=(1.0, 2.0, 3.0))),
+    runtime=st.builds(RuntimeConfig, threads=st.integers(0, 64), debug=st.booleans()),
+)
+
+
+def written(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "config.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("to_text", [to_yaml, commented_yaml])
+@given(config=configs)
+def test_yaml_reads_back_unchanged(
+    tmp_path_factory: pytest.TempPathFactory, to_text: Callable[[Config], str], config: Config
+) -> None:
+    assert load(written(tmp_path_factory.getbasetemp(), to_text(config))) == config
+
+
+def test_the_default_file_is_the_defaults_with_every_field_and_its_help(repository: Path) -> None:
+    text = (repository / "configs" / "default.yaml").read_text(encoding="utf-8")
+    assert load(repository / "configs" / "default.yaml") == Config()
+    assert text.endswith(commented_yaml(Config()))  # if not: paste that text below the heading
+    values = yaml.safe_load(text)
+    assert set(values) == {field.name for field in dataclasses.fields(Config)}
+    for field in dataclasses.fields(Config):
+        section = getattr(Config(), field.name)
+        if dataclasses.is_dataclass(section):
+            assert set(values[field.name]) == {each.name for each in dataclasses.fields(section)}
+
+
+@pytest.mark.parametrize("cls", SECTIONS, ids=lambda cls: cls.__name__)
+def test_every_field_has_a_help_text(cls: type) -> None:
+    texts = field_help(cls)
+    assert list(texts) == [field.name for field in dataclasses.fields(cls)]
+    assert all(len(text) > 10 and "\n" not in text for text in texts.values())
+
+
+def test_the_sections_above_are_all_there_are() -> None:
+    nested = {hint for hint in typing.get_type_hints(Config).values() if dataclasses.is_dataclass(hint)}
+    assert nested == set(SECTIONS) - {Config}
+
+
+@pytest.mark.parametrize(
+    ("name", "sigma"),
+    [
+        ("kinect1", lambda z: 0.0012 + 0.0019 * (z - 0.4) ** 2),
+        ("kinect_one", lambda z: 1e-3 * (1.5 - 0.5 * z + 0.3 * z**2)),
+        ("realsense_d435", lambda z: 0.08 * z**2 / (848 / 2 * 0.05)),
+        ("stereo", lambda z: 0.286 * z**2 / (0.5372 * 707.1)),
+    ],
+)
+def test_each_sensor_file_holds_the_formula_that_it_cites(
+    repository: Path, name: str, sigma: Callable[[Depths], Depths]
+) -> None:
+    config = load(repository / "configs" / f"{name}.yaml")
+    np.testing.assert_allclose(
+        np.polynomial.Polynomial(config.sensor.sigma)(DEPTHS), sigma(DEPTHS), rtol=1e-4
+    )
+    assert (sigma(DEPTHS) > 0).all()
+
+
+def test_every_file_in_configs_loads(repository: Path) -> None:
+    files = sorted((repository / "configs").glob("*.yaml"))
+    assert len(files) >= 5
+    for path in files:
+        load(path)
+
+
+def test_the_default_sensor_is_the_kinect_1(repository: Path) -> None:
+    assert load(repository / "configs" / "kinect1.yaml").sensor.sigma == SensorConfig().sigma
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("voxel_sise: 0.1", "unknown parameter 'voxel_sise'; did you mean 'voxel_size'"),
+        ("inference: {sweps: 2}", "inference: unknown parameter 'sweps'; did you mean 'sweeps'"),
+        ("zebra: 1", "known are: voxel_size"),
+        ("voxel_size: -0.05", "voxel_size must be a positive number of metres, not -0.05"),
+        ("voxel_size: .nan", "voxel_size must be a positive"),
+        ("voxel_size: five", "voxel_size must be a number, not 'five'"),
+        ("voxel_size: [1]", "voxel_size must be of type float"),
+        ("inference: {sweeps: 2.5}", "sweeps must be of type int"),
+        ("inference: {sweeps: true}", "sweeps must be of type int"),
+        ("inference: {damping: 1.0}", "damping must be at least 0 and less than 1"),
+        ("inference: {prior: 1.5}", "prior must lie between 0 and 1"),
+        ("inference: {average: mean}", "average must be one of probability, log_odds, not 'mean'"),
+        ("inference: 3", "inference: expected a mapping"),
+        ("sensor: {sigma: 0.1}", "sigma must be a list"),
+        ("sensor: {sigma: []}", "sigma needs at least one coefficient"),
+        ("sensor: {max_depth: 0.05}", "max_depth must be more than sensor.min_depth"),
+        ("volume: {lower: [0, 0, 0]}", "volume.lower goes with volume.upper"),
+        ("volume: {lower: [0, 0, 0], upper: [1, -1, 1]}", "must lie above volume.lower on every axis"),
+        ("volume: {lower: [0, 0], upper: [1, 1]}", "lower must have 3 entries, not 2"),
+        ("evaluation: {hold_out: 1}", "hold_out must be 0, or at least 2"),
+        ("runtime: {arch: metal}", "arch must be one of auto, cuda, vulkan, cpu"),
+        ("- 1\n- 2", "expected a mapping"),
+        ("a: [1", "not valid YAML"),
+    ],
+)
+def test_what_is_wrong_is_named_in_one_line(tmp_path: Path, text: str, words: str) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    message = str(caught.value)
+    assert words in message
+    assert message.startswith(str(path))
+    assert "\n" not in message
+
+
+def test_a_file_that_is_not_there_or_not_text(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="No such file"):
+        load(tmp_path / "missing.yaml")
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load(tmp_path / "binary.yaml")
+
+
+def test_an_empty_file_is_the_defaults(tmp_path: Path) -> None:
+    assert load(written(tmp_path, "")) == Config()
+
+
+def test_numbers_as_yaml_writes_them(tmp_path: Path) -> None:
+    config = load(written(tmp_path, "voxel_size: 1\ninference: {outlier_floor: 1e-6}"))
+    assert config.voxel_size == 1.0
+    assert config.inference.outlier_floor == 1e-6
+
+
+def test_tables_are_found_from_the_files_folder(tmp_path: Path) -> None:
+    config = load(written(tmp_path, "sensor: {sigma_table: tables/sigma.npy, bias_table: /abs/bias.npy}"))
+    assert config.sensor.sigma_table == str((tmp_path / "tables" / "sigma.npy").resolve())
+    assert config.sensor.bias_table == "/abs/bias.npy"
+
+
+def test_differences_names_the_fields() -> None:
+    other = dataclasses.replace(Config(), voxel_size=0.1, keyframes=KeyframeConfig(rotation=0.5))
+    assert differences(Config(), other) == ["voxel_size", "keyframes.rotation"]
+    assert differences(other, other) == []

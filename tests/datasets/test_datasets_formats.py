@@ -1,0 +1,212 @@
+"""Recordings written in every folder format are recognised and come back as they were written."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from datasets_recordings import (
+    CAMERA_TXT,
+    Content,
+    stamped_line,
+    write_log,
+    write_numbered,
+    write_rows,
+    write_seven_scenes,
+    write_tum,
+)
+
+from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.camera import PinholeCamera
+
+CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+def write_freiburg(path: Path, poses: list[Pose], first: int) -> None:
+    """As ICL-NUIM publishes it: left-handed, y up."""
+    path.write_text("\n".join(stamped_line(first + i, MIRROR @ T @ MIRROR) for i, T in enumerate(poses)))
+
+
+def write_redwood(folder: Path, content: Content) -> Path:
+    write_numbered(folder, content, place="depth")
+    write_log(folder / "livingroom1-traj.txt", content.poses)
+    return folder
+
+
+def write_icl(folder: Path, content: Content) -> Path:
+    write_numbered(folder, content, first=1)
+    write_freiburg(folder / "livingRoom2.gt.freiburg", content.poses, first=1)
+    return folder
+
+
+def write_house(folder: Path, content: Content) -> Path:
+    write_numbered(folder, content, first=180)
+    write_rows(folder / "T_world_camera.txt", content.poses)
+    return folder
+
+
+FORMATS = {  # writer, steps per metre, whether colour is written
+    "seven_scenes": (write_seven_scenes, 1000.0, True),
+    "tum": (write_tum, 5000.0, True),
+    "redwood": (write_redwood, 1000.0, True),
+    "icl": (write_icl, 5000.0, False),
+    "house": (write_house, 5000.0, False),
+}
+
+
+def assert_same(dataset: Dataset, content: Content, steps: float, colored: bool) -> None:
+    assert len(dataset) == len(dataset.frame_names) == content.count
+    for i, frame in enumerate(dataset):
+        np.testing.assert_allclose(frame.depth_m, content.depth[i] / steps, rtol=1e-6)
+        assert frame.depth_m.dtype == np.float32
+        assert frame.depth_m[0, 0] == 0
+        np.testing.assert_allclose(frame.T_world_camera, content.poses[i], atol=1e-9)
+        assert frame.camera == dataset.camera
+        assert frame.name == dataset.frame_names[i]
+        if colored:
+            np.testing.assert_array_equal(frame.color, content.color[i])
+        else:
+            assert frame.color is None
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_round_trip(tmp_path: Path, name: str) -> None:
+    writer, steps, colored = FORMATS[name]
+    content = Content()
+    dataset = open_dataset(writer(tmp_path / "recording", content))
+    assert dataset.name == "recording"
+    assert dataset.camera == CAMERA
+    assert dataset.dropped == 0
+    assert_same(dataset, content, steps, colored)
+    stamps = [frame.stamp for frame in dataset]
+    assert stamps == sorted(set(stamps))
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_callers_word_wins(tmp_path: Path, name: str) -> None:
+    writer, _, _ = FORMATS[name]
+    content = Content(3)
+    camera = PinholeCamera(16, 12, 20.0, 20.0, 8.0, 6.0)
+    folder = writer(tmp_path / "recording", content)
+    dataset = open_dataset(folder, camera=camera, depth_scale=2000.0, color=False)
+    assert dataset.camera == camera
+    assert_same(dataset, content, 2000.0, colored=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "folder", "expected"),
+    [
+        ("seven_scenes", "chess", PinholeCamera(640, 480, 585, 585, 320, 240)),
+        ("tum", "rgbd_dataset_freiburg1_desk", PinholeCamera(640, 480, 517.3, 516.5, 318.6, 255.3)),
+        ("tum", "rgbd_dataset_freiburg3_office", PinholeCamera(640, 480, 535.4, 539.2, 320.1, 247.6)),
+        ("tum", "mine", PinholeCamera(640, 480, 525, 525, 319.5, 239.5)),
+        ("redwood", "livingroom1", PinholeCamera(640, 480, 525, 525, 319.5, 239.5)),
+        ("icl", "traj2", PinholeCamera(640, 480, 481.2, 480, 319.5, 239.5)),
+        ("house", "house", PinholeCamera(640, 480, 525, 525, 319.5, 239.5)),
+        ("house", "icl_nuim_traj2", PinholeCamera(640, 480, 481.2, 480, 319.5, 239.5)),
+    ],
+)
+def test_an_assumed_camera_is_noted(tmp_path: Path, name: str, folder: str, expected: PinholeCamera) -> None:
+    path = FORMATS[name][0](tmp_path / folder, Content(2))
+    (path / "camera.txt").unlink()
+    dataset = open_dataset(path)
+    assert dataset.camera == expected
+    assert any("assumed" in note and f"fx {expected.fx:g}" in note for note in dataset.notes)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "expected"),
+    [
+        ("camera.txt", f"# width height fx fy cx cy\n{CAMERA_TXT}\n", CAMERA),
+        ("camera.yaml", "{width: 16, height: 12, fx: 14, fy: 15.0, cx: 7.5, cy: 5.5}", CAMERA),
+        ("camera-intrinsics.txt", "14 0 7.5\n0 15 5.5\n0 0 1", CAMERA),
+        ("intrinsics.txt", "1.4e1 0 7.5\n0 15 5.5\n0 0 1", CAMERA),
+    ],
+)
+def test_camera_files(tmp_path: Path, file: str, text: str, expected: PinholeCamera) -> None:
+    folder = write_house(tmp_path / "recording", Content(2))
+    (folder / "camera.txt").unlink()
+    (folder / file).write_text(text)
+    dataset = open_dataset(folder)
+    assert dataset.camera == expected
+    assert not any("assumed" in note for note in dataset.notes)
+    assert dataset.read(1).depth_m.shape == (12, 16)
+
+
+def test_seven_scenes_sentinel_and_order(tmp_path: Path) -> None:
+    content = Content(12)
+    content.depth[11][3, 4] = 65535
+    dataset = open_dataset(write_seven_scenes(tmp_path, content))
+    assert list(dataset.frame_names[:3]) == ["frame-000000", "frame-000010", "frame-000020"]
+    assert dataset.read(11).depth_m[3, 4] == 0
+    assert dataset.read(11).stamp == pytest.approx(110 / 30)
+
+
+def test_tum_drops_depth_without_a_pose_near_enough(tmp_path: Path) -> None:
+    content = Content(10)
+    folder = write_tum(tmp_path, content)
+    poses = (folder / "groundtruth.txt").read_text().splitlines()
+    (folder / "groundtruth.txt").write_text("\n".join(poses[:4] + poses[6:]))  # frames 3 and 4 lose theirs
+    dataset = open_dataset(folder)
+    assert dataset.dropped == 2
+    assert any(note.startswith("2 of 10 depth images dropped") for note in dataset.notes)
+    kept = [0, 1, 2, 5, 6, 7, 8, 9]
+    for i, frame in zip(kept, dataset, strict=True):
+        np.testing.assert_allclose(frame.T_world_camera, content.poses[i], atol=1e-9)
+        np.testing.assert_array_equal(frame.color, content.color[i])
+    # With a gap that reaches the neighbours' poses, those still go to the frames that are closest.
+    assert open_dataset(folder, max_time_gap=0.03).dropped == 2
+
+
+def test_tum_without_colour_and_unsorted(tmp_path: Path) -> None:
+    content = Content(4)
+    folder = write_tum(tmp_path, content)
+    (folder / "rgb.txt").unlink()
+    lines = (folder / "depth.txt").read_text().splitlines()
+    (folder / "depth.txt").write_text("\n".join(reversed(lines)))
+    assert_same(open_dataset(folder), content, 5000.0, colored=False)
+
+
+def test_icl_images_outside_the_trajectory_are_dropped_and_counted(tmp_path: Path) -> None:
+    """The published trajectories begin at image 1, the images at 0."""
+    content = Content(6)
+    write_numbered(tmp_path, content, first=0)
+    write_freiburg(tmp_path / "livingRoom2.gt.freiburg", content.poses[1:5], first=1)
+    dataset = open_dataset(tmp_path)
+    assert list(dataset.frame_names) == ["00001", "00002", "00003", "00004"]
+    assert dataset.dropped == 2
+    assert any("2 of 6 images dropped" in note for note in dataset.notes)
+    np.testing.assert_allclose(dataset.read(0).T_world_camera, content.poses[1], atol=1e-9)
+
+
+@pytest.mark.parametrize(("write", "steps"), [(write_rows, 5000.0), (write_log, 1000.0)])
+@pytest.mark.parametrize("first", [0, 7])
+def test_images_taken_out_of_a_recording_keep_their_poses(
+    tmp_path: Path, write: Callable[[Path, list[Pose]], Path], steps: float, first: int
+) -> None:
+    content = Content(8)
+    write_numbered(tmp_path, content, first=first)
+    write(tmp_path / "trajectory.txt", content.poses)
+    (tmp_path / f"{first + 3:05d}.png").unlink()
+    dataset = open_dataset(tmp_path)
+    for frame in dataset:
+        i = int(frame.name) - first
+        np.testing.assert_allclose(frame.T_world_camera, content.poses[i], atol=1e-9)
+        np.testing.assert_allclose(frame.depth_m, content.depth[i] / steps, rtol=1e-6)
+    assert any("7 images but 8 poses" in note for note in dataset.notes)
+
+
+def test_reading_is_lazy_and_repeatable(tmp_path: Path) -> None:
+    content = Content(3)
+    folder = write_house(tmp_path, content)
+    dataset = open_dataset(folder)
+    once, again = dataset.read(2), dataset.read(2)
+    np.testing.assert_array_equal(once.depth_m, again.depth_m)
+    (folder / "00181.png").unlink()
+    np.testing.assert_array_equal(dataset.read(2).depth_m, once.depth_m)
+    with pytest.raises(IndexError):
+        dataset.read(3)
+    with pytest.raises(IndexError):
+        dataset.read(-1)

@@ -1,0 +1,427 @@
+"""Bags of all three kinds, read back; what is chosen in them, what is left out, and what is said of bad
+ones."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from datasets_recordings import stamped_line
+from inputs_bags import START, Bag, Kind, writing
+
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.geometry.poses import Pose, look_at
+from taichi_mrf.sensor.camera import PinholeCamera
+
+CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
+COUNT = 5
+FRAME, BODY = "camera_depth_optical_frame", "base_link"
+T_body_camera = look_at([0.1, 0.2, 0.3], [1.0, 0.0, 0.0])
+KINDS: tuple[Kind, ...] = ("ros1", "sqlite", "mcap")
+
+
+def steps(i: int) -> np.ndarray:
+    image = np.random.default_rng(i).integers(400, 9000, (12, 16)).astype(np.uint16)
+    image[0, 0] = 0
+    return image
+
+
+def world_body(i: int) -> Pose:
+    return look_at([0.1 * i, 0.2, 0.0], [3.0, 0.1 * i, 0.2])
+
+
+def stamp(i: int) -> float:
+    return 1.0 + 0.1 * i
+
+
+def images(bag: Bag, topic: str = "/camera/depth/image_raw", info: bool = True) -> None:
+    if info:
+        bag.camera_info(topic.rpartition("/")[0] + "/camera_info", FRAME, CAMERA)
+    for i in range(COUNT):
+        bag.image(topic, stamp(i), FRAME, steps(i), "16UC1")
+
+
+def odometry(bag: Bag, topic: str = "/odom", child: str = BODY) -> None:
+    for i in range(COUNT):
+        bag.odometry(topic, stamp(i), "odom", child, world_body(i))
+
+
+def mounted(bag: Bag) -> None:
+    bag.tf("/tf_static", 0.0, BODY, FRAME, T_body_camera)
+
+
+def plain(bag: Bag) -> None:
+    images(bag)
+    odometry(bag)
+    mounted(bag)
+
+
+Write = Callable[[Bag], None]
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Callable[..., Path]:
+    """Writes a bag; returns its path."""
+
+    def write(*parts: Write, kind: Kind = "ros1", name: str = "walk") -> Path:
+        path = tmp_path / (f"{name}.bag" if kind == "ros1" else name)
+        with writing(path, kind) as bag:
+            for part in parts:
+                part(bag)
+        return path
+
+    return write
+
+
+def refused(source: object, **options: object) -> str:
+    """What is said of a source that cannot be opened, in one line."""
+    with pytest.raises(DatasetError) as caught:
+        open_dataset(str(source), **options)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("inside", [False, True], ids=["as it is", "the file in the folder"])
+def test_every_kind_comes_back(make: Callable[..., Path], kind: Kind, inside: bool) -> None:
+    path = make(plain, kind=kind)
+    if inside and kind != "ros1":
+        path = next(path.glob("*.mcap" if kind == "mcap" else "*.db3"))
+    dataset = open_dataset(path)
+    assert (dataset.camera, len(dataset), dataset.dropped) == (CAMERA, COUNT, 0)
+    assert list(dataset.frame_names) == [f"{i:06d}" for i in range(COUNT)]
+    for i in (3, 0, 4, 1, 2):
+        frame = dataset.read(i)
+        np.testing.assert_array_equal(frame.depth_m, steps(i).astype(np.float32) / np.float32(1000))
+        np.testing.assert_allclose(frame.T_world_camera, world_body(i) @ T_body_camera, atol=1e-9)
+        assert frame.stamp == pytest.approx(START + stamp(i), abs=1e-6)
+    with pytest.raises(IndexError, match="5 frames"):
+        dataset.read(COUNT)
+    assert any(BODY in note and FRAME in note for note in dataset.notes)
+
+
+@pytest.mark.parametrize("big", [False, True], ids=["little-endian", "big-endian"])
+def test_encodings(make: Callable[..., Path], big: bool) -> None:
+    metres = steps(0) / np.float32(1000)
+    missing = np.where(steps(0) > 0, metres, np.nan).astype(np.float32)
+    missing[1, 1] = np.inf
+
+    def write(bag: Bag) -> None:
+        for name in ("a", "b", "c", "d", "e"):
+            bag.camera_info(f"/{name}/camera_info", FRAME, CAMERA)
+        bag.image("/a/depth", 1.0, FRAME, steps(0), "16UC1", big)
+        bag.image("/b/depth", 1.0, FRAME, missing, "32FC1", big)
+        bag.compressed_depth("/c/depth/compressedDepth", 1.0, FRAME, steps(0))
+        bag.compressed_depth("/d/depth/compressedDepth", 1.0, FRAME, metres, "32FC1")
+        bag.image("/e/depth", 1.0, FRAME, steps(0), "mono16", big)
+        bag.pose_stamped("/pose", 1.0, "map", np.eye(4))
+
+    path = make(write)
+    exact = metres.copy()
+    np.testing.assert_array_equal(open_dataset(f"{path}?depth=/a/depth").read(0).depth_m, exact)
+    np.testing.assert_array_equal(open_dataset(f"{path}?depth=e/depth").read(0).depth_m, exact)
+    compressed = open_dataset(f"{path}?depth=/c/depth/compressedDepth")
+    assert compressed.camera == CAMERA
+    np.testing.assert_array_equal(compressed.read(0).depth_m, exact)
+    exact[1, 1] = 0
+    np.testing.assert_array_equal(open_dataset(f"{path}?depth=/b/depth").read(0).depth_m, exact)
+    # The plugin makes inverse depths whole numbers of 1 / 10100 per metre.
+    quantised = open_dataset(f"{path}?depth=/d/depth/compressedDepth").read(0).depth_m
+    np.testing.assert_allclose(quantised, metres, atol=9.0**2 / 10100 / 2 * 1.01)
+    assert quantised[0, 0] == 0
+    halved = open_dataset(f"{path}?depth=/a/depth", depth_scale=2000.0).read(0).depth_m
+    np.testing.assert_allclose(halved, metres / 2, rtol=1e-6)
+    said = refused(path)
+    for name in ("/a/depth", "/b/depth", "/c/depth/compressedDepth", "/d/depth/compressedDepth", "/e/depth"):
+        assert f"?depth={name}" in said
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_poses_out_of_the_tree(make: Callable[..., Path], kind: Kind) -> None:
+    def write(bag: Bag) -> None:
+        images(bag)
+        mounted(bag)
+        for i in range(COUNT):
+            bag.tf("/tf", stamp(i), "map", "odom", look_at([0, 0, 0.1 * i], [1, 0, 0]))
+            bag.tf("/tf", stamp(i), "odom", BODY, world_body(i))
+
+    path = make(write, kind=kind)
+    for query, base in (("", True), ("?pose=tf&frame=odom", False)):
+        dataset = open_dataset(f"{path}{query}")
+        for i in range(COUNT):
+            expected = world_body(i) @ T_body_camera
+            if base:
+                expected = look_at([0, 0, 0.1 * i], [1, 0, 0]) @ expected
+            np.testing.assert_allclose(dataset.read(i).T_world_camera, expected, atol=1e-9)
+    assert "tf has no frame 'nowhere'; its frames: base_link, camera_depth" in refused(
+        f"{path}?frame=nowhere"
+    )
+
+
+def test_the_frame_of_a_topic_can_be_left_for_another(make: Callable[..., Path]) -> None:
+    T_map_odom = look_at([5, 0, 0], [6, 1, 0])
+    path = make(plain, lambda bag: bag.tf("/tf_static", 0.0, "map", "odom", T_map_odom))
+    frame = open_dataset(f"{path}?frame=map").read(1)
+    np.testing.assert_allclose(frame.T_world_camera, T_map_odom @ world_body(1) @ T_body_camera, atol=1e-9)
+
+
+def test_a_pose_without_a_mounting_is_the_cameras(make: Callable[..., Path]) -> None:
+    dataset = open_dataset(make(images, odometry))
+    np.testing.assert_allclose(dataset.read(1).T_world_camera, world_body(1), atol=1e-9)
+    assert any(f"no transform from {BODY} to {FRAME}" in note for note in dataset.notes)
+
+
+def test_the_body_of_a_pose_can_be_named(make: Callable[..., Path]) -> None:
+    def write(bag: Bag) -> None:
+        images(bag)
+        mounted(bag)
+        bag.tf("/tf_static", 0.0, "marker", BODY, look_at([0, 0, 1], [1, 0, 1]))
+        for i in range(COUNT):
+            bag.pose_stamped("/pose", stamp(i), "world", world_body(i))
+
+    path = make(write)
+    T_marker_body = look_at([0, 0, 1], [1, 0, 1])
+    for query, T_pose_camera in (
+        ("", T_marker_body @ T_body_camera),
+        (f"?body={BODY}", T_body_camera),
+        (f"?body={FRAME}", np.eye(4)),
+    ):
+        frame = open_dataset(f"{path}{query}").read(2)
+        np.testing.assert_allclose(frame.T_world_camera, world_body(2) @ T_pose_camera, atol=1e-9)
+
+
+def test_poses_from_a_file(make: Callable[..., Path], tmp_path: Path) -> None:
+    poses = tmp_path / "track.txt"
+    poses.write_text("\n".join(stamped_line(START + stamp(i), world_body(i)) for i in range(COUNT)))
+    path = make(images)
+    dataset = open_dataset(f"{path}?poses={poses}")
+    np.testing.assert_allclose(dataset.read(1).T_world_camera, world_body(1), atol=1e-6)
+
+
+def test_poses_can_be_left_to_be_tracked(make: Callable[..., Path]) -> None:
+    path = make(images)
+    for dataset in (open_dataset(f"{path}?poses=track"), open_dataset(path, track=True)):
+        assert dataset.tracked
+        assert (len(dataset), dataset.dropped) == (COUNT, 0)
+        np.testing.assert_array_equal(dataset.read(0).T_world_camera, dataset.read(1).T_world_camera)
+
+
+def test_images_without_poses_are_left_out_and_counted(make: Callable[..., Path]) -> None:
+    def write(bag: Bag) -> None:
+        images(bag)
+        for seconds in (1.08, 1.12, 1.19, 1.32):
+            bag.pose_stamped("/pose", seconds, "map", look_at([seconds, 0, 0], [9, 0, 0]))
+
+    path = make(write)
+    dataset = open_dataset(path, max_time_gap=0.05)
+    assert (list(dataset.frame_names), dataset.dropped) == (["000001"], 4)
+    assert dataset.read(0).T_world_camera[0, 3] == pytest.approx(1.1, abs=1e-6)
+    assert any("4 of 5 images of /camera/depth/image_raw dropped" in note for note in dataset.notes)
+    wider = open_dataset(path, max_time_gap=0.13)
+    assert list(wider.frame_names) == ["000001", "000002", "000003"]
+    said = refused(path, max_time_gap=0.001)
+    assert "none of 5 images of /camera/depth/image_raw" in said
+    assert "within 0.001 s" in said
+    assert "/pose: 1600000001.080 to 1600000001.320 s" in said
+
+
+def test_broken_poses_are_left_out_and_counted(make: Callable[..., Path]) -> None:
+    def not_finite(bag: Bag) -> None:
+        T = np.eye(4)
+        T[0, 3] = np.nan
+        bag.odometry("/odom", 1.15, "odom", BODY, T)
+
+    dataset = open_dataset(make(plain, not_finite))
+    assert len(dataset) == COUNT
+    assert any("1 messages of /odom left out" in note for note in dataset.notes)
+
+
+def test_the_distortion_of_a_camera_is_undone_unless_told_otherwise(make: Callable[..., Path]) -> None:
+    lens = (-0.2, 0.05, 0.001, -0.002, 0.0)
+
+    def write(bag: Bag) -> None:
+        images(bag, info=False)
+        odometry(bag)
+        bag.camera_info("/camera/depth/camera_info", FRAME, CAMERA, lens)
+
+    path = make(write)
+    told = open_dataset(path, undistort=lens).read(0).depth_m
+    as_they_are = open_dataset(path, undistort=(0.0, 0.0, 0.0, 0.0)).read(0).depth_m
+    np.testing.assert_array_equal(open_dataset(path).read(0).depth_m, told)
+    np.testing.assert_array_equal(as_they_are, steps(0) / np.float32(1000))
+    assert (told != as_they_are).any()
+
+
+def test_rectified_images_have_the_projections_camera(make: Callable[..., Path]) -> None:
+    rectified = PinholeCamera(16, 12, 13.0, 13.5, 8.0, 6.0)
+
+    def write(bag: Bag) -> None:
+        for topic in ("/camera/image_rect", "/camera/image_raw"):
+            images(bag, topic, info=False)
+        odometry(bag)
+        bag.camera_info(
+            "/camera/camera_info", FRAME, CAMERA, (-0.2, 0.05, 0.0, 0.0, 0.0), "plumb_bob", rectified
+        )
+
+    path = make(write)
+    dataset = open_dataset(f"{path}?depth=/camera/image_rect")
+    assert (dataset.camera, dataset.distortion) == (rectified, ())
+    assert open_dataset(f"{path}?depth=/camera/image_raw").camera == CAMERA
+
+
+def test_a_lens_that_is_not_opencvs_is_named(make: Callable[..., Path]) -> None:
+    def write(bag: Bag) -> None:
+        images(bag, info=False)
+        odometry(bag)
+        bag.camera_info("/camera/depth/camera_info", FRAME, CAMERA, (0.1, 0.0, 0.0, 0.1), "equidistant")
+
+    said = refused(make(write))
+    assert "/camera/depth/camera_info" in said
+    assert "'equidistant'" in said
+    assert "--undistort 0,0,0,0" in said
+
+
+def test_without_a_camera_the_user_can_give_one(make: Callable[..., Path]) -> None:
+    path = make(lambda bag: images(bag, info=False), odometry)
+    assert "--camera fx,fy,cx,cy" in refused(path)
+    dataset = open_dataset(path, intrinsics=(14.0, 15.0, 7.5, 5.5))
+    assert dataset.camera == CAMERA
+
+
+def test_several_cameras_are_chosen_among(make: Callable[..., Path]) -> None:
+    other = PinholeCamera(16, 12, 20.0, 20.0, 7.5, 5.5)
+
+    def write(bag: Bag) -> None:
+        images(bag, "/camera/depth/image_raw", info=False)
+        odometry(bag)
+        bag.camera_info("/camera/a/camera_info", FRAME, CAMERA)
+        bag.camera_info("/camera/b/camera_info", FRAME, other)
+
+    path = make(write)
+    assert "?info=/camera/a/camera_info or ?info=/camera/b/camera_info" in refused(path)
+    assert open_dataset(f"{path}?info=/camera/b/camera_info").camera == other
+
+
+def uncalibrated(bag: Bag) -> None:
+    images(bag, info=False)
+    odometry(bag)
+    camera = PinholeCamera(16, 12, 1.0, 1.0, 0.0, 0.0)
+    object.__setattr__(camera, "fx", 0.0)
+    object.__setattr__(camera, "fy", 0.0)
+    bag.camera_info("/camera/depth/camera_info", FRAME, camera)
+
+
+def only_color(bag: Bag) -> None:
+    bag.camera_info("/camera/color/camera_info", FRAME, CAMERA)
+    bag.image("/camera/color/image_raw", 1.0, FRAME, np.zeros((12, 16, 3), np.uint8), "rgb8")
+    odometry(bag)
+
+
+BAD: dict[str, tuple[tuple[Write, ...], str, tuple[str, ...]]] = {
+    "no depth": ((only_color,), "", ("topics of depth images", "16UC1", "/camera/color/image_raw (Image)")),
+    "colour as depth": (
+        (only_color,),
+        "?depth=/camera/color/image_raw",
+        ("topic /camera/color/image_raw", "'rgb8' is no depth", "16UC1"),
+    ),
+    "no such topic": ((plain,), "?depth=/nowhere", ("no topic /nowhere", "/camera/depth/image_raw")),
+    "not an image": ((plain,), "?depth=/odom", ("topic /odom", "nav_msgs/msg/Odometry")),
+    "no poses": ((images,), "", ("holds no poses", "?poses=FILE")),
+    "no such pose": ((plain,), "?pose=/nowhere", ("no topic /nowhere", "/odom")),
+    "not a pose": (
+        (plain,),
+        "?pose=/camera/depth/image_raw",
+        ("topic /camera/depth/image_raw", "PoseStamped"),
+    ),
+    "no such tree": (
+        (images, odometry),
+        "?pose=tf",
+        ("tf has no frame 'camera_depth_optical_frame'", "none"),
+    ),
+    "two poses": (
+        (plain, lambda bag: odometry(bag, "/vio")),
+        "",
+        ("several topics of poses", "?pose=/odom or ?pose=/vio"),
+    ),
+    "no such option": ((plain,), "?topic=/odom", ("unknown parameter 'topic'",)),
+    "no such body": ((plain,), "?body=trailer", ("no frame 'trailer'",)),
+    "uncalibrated": ((uncalibrated,), "", ("/camera/depth/camera_info", "not calibrated", "--camera")),
+    "of Intel's library": (
+        (lambda bag: images(bag, "/device_0/sensor_0/Depth_0/image/data", info=False),),
+        "",
+        ("RealSense", "realsense:", "?poses=FILE"),
+    ),
+}
+
+
+@pytest.mark.parametrize("problem", BAD)
+def test_what_cannot_be_chosen_is_said_in_one_line(make: Callable[..., Path], problem: str) -> None:
+    parts, query, words = BAD[problem]
+    path = make(*parts)
+    said = refused(f"{path}{query}")
+    assert str(path) in said
+    for word in words:
+        assert word in said
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.9])
+def test_a_bag_that_is_cut_short_is_named(make: Callable[..., Path], kind: Kind, share: float) -> None:
+    path = make(plain, kind=kind)
+    file = path if kind == "ros1" else next(path.glob("walk.*"))
+    data = file.read_bytes()
+    file.write_bytes(data[: int(share * len(data))])
+    said = refused(file)
+    assert said.startswith(str(file))
+    if kind != "ros1":
+        assert str(path) in refused(path)
+
+
+def test_a_damaged_image_is_a_broken_frame(make: Callable[..., Path]) -> None:
+    def write(bag: Bag) -> None:
+        plain(bag)
+        bag.image("/camera/depth/image_raw", 1.05, FRAME, steps(0)[:6], "16UC1")
+        bag.image("/camera/depth/image_raw", 1.25, FRAME, steps(0).astype(np.uint8), "8UC1")
+
+    dataset = open_dataset(make(write))
+    assert len(dataset) == COUNT + 2
+    with pytest.raises(FrameError, match=r"frame 000001: .*topic /camera/depth/image_raw: .* 16 x 6 pixels"):
+        dataset.read(1)
+    with pytest.raises(FrameError, match=r"frame 000004: .*walk\.bag: topic .*'8UC1' is no depth"):
+        dataset.read(4)
+    assert (dataset.read(5).depth_m > 0).any()
+
+
+def test_messages_of_one_moment_are_kept_apart(make: Callable[..., Path]) -> None:
+    """A recorder that wrote them out together gave them one time; their headers tell them apart."""
+
+    def write(bag: Bag) -> None:
+        mounted(bag)
+        odometry(bag)
+        bag.camera_info("/camera/depth/camera_info", FRAME, CAMERA)
+        for i in range(COUNT):
+            bag.latency = 3.0 - stamp(i)
+            bag.image("/camera/depth/image_raw", stamp(i), FRAME, steps(i), "16UC1")
+
+    for kind in KINDS:
+        dataset = open_dataset(make(write, kind=kind, name=f"burst_{kind}"))
+        for i in (4, 0, 2):
+            np.testing.assert_array_equal(
+                dataset.read(i).depth_m, steps(i).astype(np.float32) / np.float32(1000)
+            )
+
+
+def test_without_its_library_one_line_says_what_to_install(
+    make: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = make(plain)
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    assert "pip install 'taichi-mrf[ros]'" in refused(path)
+
+
+def test_a_folder_of_bags_names_them(make: Callable[..., Path], tmp_path: Path) -> None:
+    make(plain)
+    make(plain, kind="mcap", name="second")
+    assert refused(tmp_path).endswith("name one: second, walk.bag")

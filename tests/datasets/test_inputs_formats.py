@@ -1,0 +1,321 @@
+"""ScanNet, Replica and Open3D folders, and npz files, written here and read back."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from datasets_recordings import (
+    CAMERA_TXT,
+    Content,
+    row_of,
+    text_of,
+    write_image,
+    write_log,
+    write_numbered,
+)
+
+from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.geometry.poses import inverse
+from taichi_mrf.live.open_source import open_source
+from taichi_mrf.sensor.camera import PinholeCamera
+
+CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
+K = np.array([[14.0, 0, 7.5], [0, 15.0, 5.5], [0, 0, 1]])
+
+
+@pytest.fixture
+def content() -> Content:
+    return Content()
+
+
+def assert_same(dataset: Dataset, content: Content, steps: float, colored: bool = False) -> None:
+    assert len(dataset) == content.count
+    assert dataset.camera == CAMERA
+    for i, frame in enumerate(dataset):
+        np.testing.assert_allclose(frame.depth_m, content.depth[i] / np.float32(steps), rtol=1e-6)
+        np.testing.assert_allclose(frame.T_world_camera, content.poses[i], atol=1e-9)
+        assert (frame.color is not None) == colored
+        if frame.color is not None:
+            np.testing.assert_array_equal(frame.color, content.color[i])
+
+
+def refused(source: Path, **options: object) -> str:
+    with pytest.raises(DatasetError) as caught:
+        open_dataset(source, **options)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def write_scannet(folder: Path, content: Content) -> Path:
+    """Numbers without leading zeros, of which the tenth comes after the second."""
+    for i in range(content.count):
+        write_image(folder / f"depth/{5 * i}.png", content.depth[i])
+        (folder / "pose").mkdir(exist_ok=True)
+        (folder / f"pose/{5 * i}.txt").write_text(text_of(content.poses[i]))
+    (folder / "intrinsic").mkdir()
+    wide = np.eye(4)
+    wide[:3, :3] = K
+    (folder / "intrinsic/intrinsic_depth.txt").write_text(text_of(wide))
+    return folder
+
+
+def test_scannet(tmp_path: Path, content: Content) -> None:
+    folder = write_scannet(tmp_path / "scene0000_00", content)
+    dataset = open_dataset(folder)
+    assert_same(dataset, content, 1000.0)
+    assert list(dataset.frame_names) == ["0", "5", "10", "15", "20"]
+    assert dataset.notes == []
+
+
+def test_scannet_leaves_out_what_was_not_tracked(tmp_path: Path, content: Content) -> None:
+    folder = write_scannet(tmp_path, content)
+    (folder / "pose/5.txt").write_text("-inf -inf -inf -inf\n" * 4)
+    (folder / "pose/15.txt").unlink()
+    dataset = open_dataset(folder)
+    assert (list(dataset.frame_names), dataset.dropped) == (["0", "10", "15", "20"], 1)
+    assert "1 of 5 images dropped: tracking was lost" in dataset.notes
+    with pytest.raises(FrameError, match=r"frame 15: .*15\.txt: the pose is missing"):
+        dataset.read(2)
+    for path in (folder / "pose").iterdir():
+        path.write_text("-inf -inf -inf -inf\n" * 4)
+    (folder / "pose/15.txt").write_text("inf")
+    assert "lost in all 5 images" in refused(folder)
+
+
+def test_scannets_own_camera_is_assumed_without_a_file(tmp_path: Path, content: Content) -> None:
+    folder = write_scannet(tmp_path, content)
+    (folder / "intrinsic/intrinsic_depth.txt").unlink()
+    dataset = open_dataset(folder)
+    assert dataset.camera.fx == pytest.approx(577.87, abs=0.01)
+    assert any("assumed the camera of ScanNet" in note for note in dataset.notes)
+
+
+def write_replica(folder: Path, content: Content, parameters: Path) -> Path:
+    for i in range(content.count):
+        write_image(folder / f"results/depth{i:06d}.png", content.depth[i])
+        write_image(folder / f"results/frame{i:06d}.png", content.color[i])
+    (folder / "traj.txt").write_text("\n".join(row_of(pose) for pose in content.poses))
+    camera = {"w": 16, "h": 12, "fx": 14.0, "fy": 15.0, "cx": 7.5, "cy": 5.5, "scale": 6553.5}
+    parameters.write_text(json.dumps({"camera": camera}))
+    return folder
+
+
+@pytest.mark.parametrize("place", [".", ".."], ids=["beside", "above"])
+def test_replica(tmp_path: Path, content: Content, place: str) -> None:
+    folder = tmp_path / "room0"
+    folder.mkdir()
+    dataset = open_dataset(write_replica(folder, content, folder / place / "cam_params.json"))
+    assert_same(dataset, content, 6553.5, colored=True)
+    assert dataset.notes == []
+
+
+def test_replica_that_is_not_whole(tmp_path: Path, content: Content) -> None:
+    folder = write_replica(tmp_path, content, tmp_path / "cam_params.json")
+    (folder / "cam_params.json").write_text('{"camera": {"w": 16}}')
+    assert "cam_params.json: camera needs the numbers w, h" in refused(folder)
+    (folder / "cam_params.json").write_text("{")
+    assert "cam_params.json" in refused(folder)
+    (folder / "cam_params.json").unlink()
+    assert any("assumed the camera of Replica" in note for note in open_dataset(folder).notes)
+    (folder / "traj.txt").write_text(row_of(np.eye(4)))
+    assert "one for each depth image, found 1 poses" in refused(folder)
+    (folder / "traj.txt").unlink()
+    assert "traj.txt: is missing" in refused(folder)
+
+
+def column_by_column(matrix: np.ndarray) -> list[float]:
+    return [float(x) for x in matrix.T.reshape(-1)]
+
+
+INTRINSIC = {"width": 16, "height": 12, "intrinsic_matrix": column_by_column(K)}
+
+
+def test_open3d_with_a_log(tmp_path: Path, content: Content) -> None:
+    folder = write_numbered(tmp_path, content, place="depth")
+    (folder / "camera.txt").unlink()
+    (folder / "camera_intrinsic.json").write_text(json.dumps(INTRINSIC))
+    write_log(folder / "trajectory.log", content.poses)
+    assert_same(open_dataset(folder), content, 1000.0, colored=True)
+
+
+@pytest.mark.parametrize("kind", ["PinholeCameraTrajectory", "PoseGraph"])
+def test_open3d_with_a_json(tmp_path: Path, content: Content, kind: str) -> None:
+    folder = write_numbered(tmp_path, content, place="depth")
+    if kind == "PoseGraph":
+        values: dict = {"nodes": [{"pose": column_by_column(pose)} for pose in content.poses]}
+    else:
+        (folder / "camera.txt").unlink()
+        extrinsics = [column_by_column(inverse(pose)) for pose in content.poses]
+        values = {"parameters": [{"extrinsic": e, "intrinsic": INTRINSIC} for e in extrinsics]}
+    (folder / "trajectory.json").write_text(json.dumps({"class_name": kind, **values}))
+    dataset = open_dataset(folder)
+    assert_same(dataset, content, 1000.0, colored=True)
+    assert dataset.notes == []
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("trajectory.json", '{"class_name": "PoseGraph", "nodes": []}', "holds no pose"),
+        ("trajectory.json", '{"class_name": "PoseGraph", "nodes": [{"pose": [1]}]}', "entry 0: needs the 16"),
+        ("trajectory.json", '{"class_name": "Mesh"}', "without a trajectory"),
+        ("trajectory.json", "[1]", "without a trajectory"),
+        ("camera_intrinsic.json", "[", "not valid JSON"),
+        ("camera_intrinsic.json", '{"width": 16, "height": 12}', "an intrinsic needs width"),
+        (
+            "camera_intrinsic.json",
+            '{"width": 0, "height": 12, "intrinsic_matrix": [1,0,0,0,1,0,1,1,1]}',
+            "at least 1",
+        ),
+    ],
+)
+def test_open3d_files_that_make_no_sense(
+    tmp_path: Path, content: Content, name: str, text: str, said: str
+) -> None:
+    folder = write_numbered(tmp_path, content, place="depth")
+    (folder / "camera.txt").unlink()
+    if name.startswith("camera"):
+        write_log(folder / "trajectory.log", content.poses)
+    (folder / name).write_text(text)
+    assert said in refused(folder)
+
+
+def arrays(content: Content) -> dict[str, np.ndarray]:
+    return {
+        "depth_m": np.stack(content.depth) / np.float32(1000),
+        "T_world_camera": np.stack(content.poses),
+        "K": K,
+        "stamp": np.arange(content.count) * 0.5,
+        "color": np.stack(content.color),
+    }
+
+
+def write_npz(path: Path, values: dict[str, np.ndarray]) -> Path:
+    np.savez_compressed(path, **values)  # type: ignore[arg-type]
+    return path
+
+
+def test_npz(tmp_path: Path, content: Content) -> None:
+    path = write_npz(tmp_path / "walk.npz", arrays(content))
+    dataset = open_dataset(path)
+    assert_same(dataset, content, 1000.0, colored=True)
+    assert [frame.stamp for frame in dataset] == [0.0, 0.5, 1.0, 1.5, 2.0]
+    assert list(dataset.frame_names) == [f"walk-{i:06d}" for i in range(5)]
+    assert open_dataset(path, color=False).read(0).color is None
+    with pytest.raises(IndexError, match="5 frames"):
+        dataset.read(5)
+
+
+def test_npz_of_steps_and_numbers(tmp_path: Path, content: Content) -> None:
+    values = {name: value for name, value in arrays(content).items() if name in ("depth_m", "T_world_camera")}
+    values |= {"depth_m": np.stack(content.depth), "T_world_camera": values["T_world_camera"][:, :3]}
+    values |= {name: np.array(getattr(CAMERA, name)) for name in ("fx", "fy", "cx", "cy")}
+    path = write_npz(tmp_path / "walk.npz", values)
+    assert "needs depth_scale" in refused(path)
+    assert_same(open_dataset(path, depth_scale=2000.0), content, 2000.0)
+    scaled = write_npz(tmp_path / "scaled.npz", {**values, "depth_scale": np.array(4000.0)})
+    assert_same(open_dataset(scaled), content, 4000.0)
+
+
+def test_a_folder_of_npz_is_one_sequence(tmp_path: Path, content: Content) -> None:
+    values = arrays(content)
+    both = {"K": K, **{name: values[name][:2] for name in ("depth_m", "T_world_camera", "stamp", "color")}}
+    write_npz(tmp_path / "a.npz", both)
+    for i in (2, 3, 4):
+        one = {name: values[name][i] for name in ("depth_m", "T_world_camera", "stamp", "color")}
+        write_npz(tmp_path / f"b{i}.npz", {"K": K, **one})
+    dataset = open_dataset(tmp_path)
+    assert list(dataset.frame_names) == ["a-000000", "a-000001", "b2", "b3", "b4"]
+    assert_same(dataset, content, 1000.0, colored=True)
+    write_npz(tmp_path / "c.npz", {**both, "K": 2 * K})
+    assert "c.npz: has another camera than a.npz" in refused(tmp_path)
+
+
+def test_missing_depth_is_zero(tmp_path: Path, content: Content) -> None:
+    values = arrays(content)
+    values["depth_m"][0, 0, :3] = (np.nan, np.inf, -1)
+    depth_m = open_dataset(write_npz(tmp_path / "walk.npz", values)).read(0).depth_m
+    np.testing.assert_array_equal(depth_m[0, :3], 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"depth_m": None}, "depth_m is missing"),
+        ({"T_world_camera": None}, "T_world_camera is missing"),
+        ({"K": None}, "needs K (3, 3), or fx, fy, cx, cy; fx, fy, cx, cy missing"),
+        ({"K": np.eye(4)}, "K is (4, 4)"),
+        ({"K": np.zeros((3, 3))}, "both must be positive"),
+        ({"T_world_camera": np.zeros((4, 4, 4))}, "T_world_camera is (4, 4, 4); expected (5, 4, 4)"),
+        ({"T_world_camera": np.zeros(3)}, "T_world_camera is (3,)"),
+        ({"depth_m": np.zeros((5, 12))}, None),
+        ({"depth_m": np.zeros((5, 12, 16), complex)}, "depth_m is complex128"),
+        ({"stamp": np.zeros(4)}, "stamp is (4,)"),
+        ({"color": np.zeros((5, 12, 16, 3))}, "color is float64"),
+        ({"depth_m": np.array(["deep"])}, "depth_m is <U4"),
+        ({"T_world_camera": np.array([None] * 5)}, "T_world_camera"),
+        ({"depth_scale": np.array(0.0)}, "depth_scale must be a positive number"),
+    ],
+)
+def test_fields_that_make_no_sense_are_named(
+    tmp_path: Path, content: Content, change: dict, said: str | None
+) -> None:
+    values = {name: value for name, value in {**arrays(content), **change}.items() if value is not None}
+    path = write_npz(tmp_path / "walk.npz", values)
+    text = refused(path)
+    assert text.startswith(str(path))
+    assert said is None or said in text
+
+
+def test_a_broken_pose_of_an_npz_is_one_frames(tmp_path: Path, content: Content) -> None:
+    values = arrays(content)
+    values["T_world_camera"][1] *= 2
+    dataset = open_dataset(write_npz(tmp_path / "walk.npz", values))
+    with pytest.raises(FrameError, match=r"frame walk-000001: .*walk\.npz: T_world_camera"):
+        dataset.read(1)
+    assert (dataset.read(2).depth_m > 0).any()
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7])
+def test_a_damaged_npz_is_named(tmp_path: Path, content: Content, share: float) -> None:
+    path = write_npz(tmp_path / "walk.npz", arrays(content))
+    data = bytearray(path.read_bytes())
+    path.write_bytes(data[: int(len(data) * share)])
+    assert str(path) in refused(path)
+    large = {"depth_m": np.ones((5, 60, 80)), "T_world_camera": np.stack(content.poses), "K": K}
+    np.savez(path, **large)  # type: ignore[arg-type]
+    data = bytearray(path.read_bytes())
+    position = data.find(b"depth_m.npy") + 50_000
+    data[position : position + 40] = bytes(40)
+    path.write_bytes(data)
+    with pytest.raises(FrameError, match=r"walk-000000: .*walk\.npz: depth_m cannot be read"):
+        open_dataset(path).read(0)
+
+
+def test_other_files_are_not_taken_for_frames(tmp_path: Path) -> None:
+    path = write_npz(tmp_path / "other.npz", {"values": np.zeros(3)})
+    assert "none that is known here" in refused(path)
+    assert "no such folder or file" in refused(tmp_path / "nowhere.npz")
+    assert "takes no options after a question mark" in refused(f"{path}?depth=/camera")  # type: ignore[arg-type]
+
+
+def test_live_takes_frames_for_frames_and_not_for_a_map(
+    tmp_path: Path, content: Content, one_backend: str
+) -> None:
+    from taichi_mrf.config.schema import Config
+
+    path = write_npz(tmp_path / "walk.npz", arrays(content))
+    source, _ = open_source(str(path), Config(), every=1, limit=None, speed=0.0, loop=False)
+    assert source.new_replay is not None
+    assert source.new_replay().frames == content.count
+
+
+@pytest.mark.shared_data
+def test_the_coffin_scene_is_such_a_file(shared_data: Path) -> None:
+    dataset = open_dataset(shared_data / "coffin_world" / "clean_depth.npz")
+    frame = dataset.read(len(dataset) - 1)
+    assert 0.1 < np.median(frame.depth_m[frame.depth_m > 0]) < 10
+    assert CAMERA_TXT  # the recordings of the other formats are of another size
+    assert frame.depth_m.shape == dataset.camera.shape

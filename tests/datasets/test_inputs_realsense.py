@@ -1,0 +1,208 @@
+"""RealSense cameras and recordings with poses from a file, played by a stand-in for the camera's library."""
+
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+from datasets_recordings import stamped_line
+from test_realsense import STEPS
+
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.geometry.poses import look_at
+from taichi_mrf.sensor.camera import PinholeCamera
+
+COUNT = 6
+FIRST = 1000.0
+"""Seconds of the first image; they come at 10 Hz."""
+
+
+def stamp(i: int) -> float:
+    return FIRST + 0.1 * i
+
+
+class Pipeline:
+    """Plays images 0 to COUNT - 1, each with its own depth; in real time the first one is lost on every
+    second start. Without a file it is a camera, which goes on."""
+
+    starts = 0
+    stopped = 0
+    lost: tuple[int, ...] = ()
+
+    def start(self, config: SimpleNamespace) -> SimpleNamespace:
+        if config.file is not None and not Path(config.file).read_bytes().startswith(b"#ROSBAG"):
+            raise RuntimeError("Failed to resolve request.\n Request to enable_device_from_file was invalid")
+        type(self).starts += 1
+        self.left = [i for i in range(COUNT) if i not in self.lost]
+        if config.playback is not None and config.playback.real_time and self.starts % 2 == 0:
+            self.left.pop(0)
+        return config.profile()
+
+    def wait_for_frames(self, timeout_ms: int) -> SimpleNamespace:
+        if not self.left:
+            raise RuntimeError(f"Frame didn't arrive within {timeout_ms}")
+        i = self.left.pop(0)
+        image = SimpleNamespace(
+            get_data=lambda: STEPS + 10 * i,
+            get_timestamp=lambda: 1000.0 * stamp(i),
+            get_frame_number=lambda: 100 + i,
+        )
+        return SimpleNamespace(get_depth_frame=lambda: image)
+
+    def stop(self) -> None:
+        type(self).stopped += 1
+
+
+class Config:
+    def __init__(self) -> None:
+        self.file: str | None = None
+        self.playback: SimpleNamespace | None = None
+
+    def enable_device_from_file(self, file: str, repeat_playback: bool) -> None:
+        assert not repeat_playback
+        self.file, self.playback = file, SimpleNamespace(real_time=True)
+
+    def enable_stream(self, *asked: object) -> None:
+        self.asked = asked
+
+    def resolve(self, wrapped: object) -> SimpleNamespace:
+        return self.profile()
+
+    def profile(self) -> SimpleNamespace:
+        intrinsics = SimpleNamespace(width=4, height=3, fx=4.0, fy=5.0, ppx=1.5, ppy=1.0)
+        video = SimpleNamespace(get_intrinsics=lambda: intrinsics)
+        sensor = SimpleNamespace(get_depth_scale=lambda: 0.0005)
+        player = SimpleNamespace(set_real_time=lambda on: setattr(self.playback, "real_time", on))
+        return SimpleNamespace(
+            get_stream=lambda kind: SimpleNamespace(as_video_stream_profile=lambda: video),
+            get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: sensor, as_playback=lambda: player),
+        )
+
+
+@pytest.fixture
+def library(monkeypatch: pytest.MonkeyPatch) -> type[Pipeline]:
+    """A pyrealsense2 whose pipelines are this test's."""
+
+    class TestPipeline(Pipeline):
+        pass
+
+    module = ModuleType("pyrealsense2")
+    names = {"pipeline": TestPipeline, "config": Config, "pipeline_wrapper": lambda pipeline: pipeline}
+    names |= {"stream": SimpleNamespace(depth="depth"), "format": SimpleNamespace(z16="z16")}
+    for name, value in names.items():
+        setattr(module, name, value)
+    monkeypatch.setitem(sys.modules, "pyrealsense2", module)
+    return TestPipeline
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    path = tmp_path / "walk.bag"
+    path.write_bytes(b"#ROSBAG V2.0\n")
+    return path
+
+
+@pytest.fixture
+def poses(tmp_path: Path) -> Path:
+    """From 0.05 s before the second image to 0.05 s after the fifth, every 0.1 s."""
+    path = tmp_path / "track.txt"
+    times = [0.05 + 0.1 * i for i in range(5)]
+    lines = (stamped_line(FIRST + t, look_at([t, 0, 0], [9, 0, 0])) for t in times)
+    path.write_text("\n".join(lines))
+    return path
+
+
+def test_a_recording_is_a_sequence_that_ends(library: type[Pipeline], recording: Path) -> None:
+    source = open_dataset(f"realsense:{recording}")
+    assert (len(source), source.endless, source.name) == (COUNT, False, "walk")
+    assert source.camera == PinholeCamera(4, 3, 4.0, 5.0, 1.5, 1.0)
+    assert list(source.frame_names) == [f"realsense-{100 + i:06d}" for i in range(COUNT)]
+    for i in (0, 1, 3, 5, 2, 2, 4):
+        frame = source.read(i)
+        np.testing.assert_allclose(frame.depth_m, (STEPS + 10 * i) * 0.0005, rtol=1e-6)
+        assert frame.stamp == pytest.approx(stamp(i))
+    assert any("stand still" in note and "?poses=FILE" in note for note in source.notes)
+    with pytest.raises(IndexError, match="6 frames"):
+        source.read(COUNT)
+    del source
+    assert library.stopped == library.starts
+
+
+def test_a_recording_gets_the_poses_of_a_file(library: type[Pipeline], recording: Path, poses: Path) -> None:
+    source = open_dataset(f"realsense:{recording}?poses={poses}")
+    assert (len(source), source.dropped) == (4, 2)
+    for index, i in enumerate(range(1, 5)):
+        frame = source.read(index)
+        assert frame.name == f"realsense-{100 + i:06d}"
+        np.testing.assert_allclose(frame.T_world_camera[:3, 3], [0.1 * i, 0, 0], atol=1e-6)
+    assert not any("stand still" in note for note in source.notes)
+    with pytest.raises(DatasetError, match=r"walk\.bag: none of its 6 depth images .* within 0\.01 s"):
+        open_dataset(f"realsense:{recording}?poses={poses}", max_time_gap=0.01)
+
+
+def test_an_image_that_does_not_come_again_is_a_broken_frame(
+    library: type[Pipeline], recording: Path
+) -> None:
+    source = open_dataset(f"realsense:{recording}")
+    source.read(5)
+    library.lost = (2,)
+    with pytest.raises(FrameError, match=r"frame realsense-000102: .* does not come a second time"):
+        source.read(2)
+    np.testing.assert_allclose(source.read(3).depth_m, (STEPS + 30) * 0.0005, rtol=1e-6)
+
+
+def test_what_is_no_recording_is_named(library: type[Pipeline], tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"nowhere\.bag: there is no such file"):
+        open_dataset(f"realsense:{tmp_path}/nowhere.bag")
+    path = tmp_path / "other.bag"
+    path.write_bytes(b"no bag")
+    with pytest.raises(DatasetError, match=r"other\.bag: cannot be played: Failed to resolve") as caught:
+        open_dataset(f"realsense:{path}")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(DatasetError, match="unknown parameter 'pose'"):
+        open_dataset(f"realsense:{path}?pose=x")
+    with pytest.raises(DatasetError, match="depth_scale"):
+        open_dataset(f"realsense:{path}", depth_scale=1000.0)
+
+
+def test_an_empty_recording_is_named(library: type[Pipeline], recording: Path) -> None:
+    library.lost = tuple(range(COUNT))
+    with pytest.raises(DatasetError, match=r"walk\.bag: holds no depth images"):
+        open_dataset(f"realsense:{recording}")
+
+
+@pytest.mark.parametrize(
+    "form", ["realsense:?poses={}", "realsense:poses={}", "realsense:width=4&height=3&poses={}"]
+)
+def test_a_camera_gets_the_poses_of_a_file(library: type[Pipeline], poses: Path, form: str) -> None:
+    source = open_dataset(form.format(poses))
+    assert source.endless
+    assert not any("stand still" in note for note in source.notes)
+    with pytest.raises(FrameError, match=r"no poses within 0\.1 s"):
+        source.read(0)
+    frame = source.read(1)
+    np.testing.assert_allclose(frame.T_world_camera[:3, 3], [0.1, 0, 0], atol=1e-6)
+
+
+def test_a_camera_can_be_thinned_out(library: type[Pipeline]) -> None:
+    source = open_dataset("realsense:", image_scale=0.5)
+    assert source.endless
+    assert source.camera.shape == (2, 2)
+    np.testing.assert_allclose(source.read(0).depth_m, STEPS[::2, ::2] * 0.0005, rtol=1e-6)
+
+
+def test_poses_can_be_left_to_be_tracked(library: type[Pipeline], recording: Path) -> None:
+    for name in ("realsense:?poses=track", f"realsense:{recording}?poses=track"):
+        source = open_dataset(name)
+        assert source.tracked
+        assert not any("stand still" in note for note in source.notes)
+        assert source.read(0).T_world_camera.shape == (4, 4)
+    assert len(open_dataset(f"realsense:{recording}", track=True)) == COUNT
+    assert not open_dataset("realsense:").tracked
+
+
+def test_poses_that_cannot_be_read_are_named(library: type[Pipeline], tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"nowhere\.txt"):
+        open_dataset(f"realsense:?poses={tmp_path}/nowhere.txt")

@@ -1,0 +1,123 @@
+"""A RealSense camera, played by a stand-in for its library; and what is said where that is not installed."""
+
+import sys
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.realsense.device import MISSES
+from taichi_mrf.errors import DatasetError, FrameError
+
+STEPS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
+
+
+class Pipeline:
+    """A camera of 4 x 3 pixels that sends what is in ``images``: depth in steps, or None for nothing."""
+
+    images: tuple[np.ndarray | None, ...] = ()
+    problem: str | None = None
+
+    def __init__(self) -> None:
+        self.left = list(self.images)
+        self.stopped = False
+
+    def start(self, config: SimpleNamespace) -> SimpleNamespace:
+        if self.problem:
+            raise RuntimeError(self.problem)
+        width, height = config.asked[1:3]
+        intrinsics = SimpleNamespace(width=width, height=height, fx=4.0, fy=5.0, ppx=1.5, ppy=1.0)
+        video = SimpleNamespace(get_intrinsics=lambda: intrinsics)
+        sensor = SimpleNamespace(get_depth_scale=lambda: 0.0005)
+        return SimpleNamespace(
+            get_stream=lambda kind: SimpleNamespace(as_video_stream_profile=lambda: video),
+            get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: sensor),
+        )
+
+    def wait_for_frames(self, timeout_ms: int) -> SimpleNamespace:
+        steps = self.left.pop(0) if self.left else None
+        if steps is None:
+            raise RuntimeError(f"Frame didn't arrive within {timeout_ms}")
+        image = SimpleNamespace(get_data=lambda: steps, get_timestamp=lambda: 2500.0)
+        return SimpleNamespace(get_depth_frame=lambda: image)
+
+    def stop(self) -> None:
+        self.stopped = True
+
+
+@pytest.fixture
+def library(monkeypatch: pytest.MonkeyPatch) -> type[Pipeline]:
+    """A pyrealsense2 whose cameras are Pipelines of this test."""
+
+    class Config(SimpleNamespace):
+        def enable_stream(self, *asked: object) -> None:
+            self.asked = asked
+
+    class TestPipeline(Pipeline):
+        pass
+
+    module = ModuleType("pyrealsense2")
+    names = {"pipeline": TestPipeline, "config": Config}
+    names |= {"stream": SimpleNamespace(depth="depth"), "format": SimpleNamespace(z16="z16")}
+    for name, value in names.items():
+        setattr(module, name, value)
+    monkeypatch.setitem(sys.modules, "pyrealsense2", module)
+    return TestPipeline
+
+
+def test_without_its_library_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
+    with pytest.raises(DatasetError, match=r"pip install 'taichi-mrf\[realsense\]'"):
+        open_dataset("realsense:")
+
+
+def test_images_come_in_metres_with_the_cameras_own_intrinsics(library: type[Pipeline]) -> None:
+    library.images = (STEPS, STEPS)
+    source = open_dataset("realsense:width=4&height=3")
+    assert source.endless
+    assert (source.camera.fx, source.camera.fy, source.camera.cx, source.camera.cy) == (4.0, 5.0, 1.5, 1.0)
+    frame = source.read(7)
+    np.testing.assert_allclose(frame.depth_m, STEPS * 0.0005, rtol=1e-6)
+    assert frame.depth_m.dtype == np.float32
+    assert (frame.name, frame.stamp) == ("realsense-000007", 2.5)
+    np.testing.assert_allclose(frame.T_world_camera[:3, 2], [1, 0, 0], atol=1e-12)
+    assert any("stand still" in note for note in source.notes)
+
+
+def test_a_missed_image_is_a_broken_frame_and_many_are_the_end(library: type[Pipeline]) -> None:
+    library.images = (None, STEPS, *[None] * MISSES)
+    source = open_dataset("realsense:width=4&height=3")
+    with pytest.raises(FrameError, match="no image"):
+        source.read(0)
+    source.read(1)
+    for index in range(MISSES - 1):
+        with pytest.raises(FrameError):
+            source.read(index)
+    with pytest.raises(DatasetError, match="the camera is lost") as caught:
+        source.read(9)
+    assert not isinstance(caught.value, FrameError)
+
+
+def test_an_image_of_another_size_is_a_broken_frame(library: type[Pipeline]) -> None:
+    library.images = (STEPS[:2],)
+    with pytest.raises(FrameError, match="shape"):
+        open_dataset("realsense:width=4&height=3").read(0)
+
+
+def test_what_the_library_says_is_passed_on(library: type[Pipeline]) -> None:
+    library.problem = "No device connected"
+    with pytest.raises(DatasetError, match="realsense: cannot be started: No device connected"):
+        open_dataset("realsense:")
+
+
+def test_a_wrong_option_is_named(library: type[Pipeline]) -> None:
+    with pytest.raises(DatasetError, match="heigth"):
+        open_dataset("realsense:heigth=3")
+
+
+def test_the_camera_is_given_back_with_its_source(library: type[Pipeline]) -> None:
+    source = open_dataset("realsense:width=4&height=3")
+    pipeline = source.pipeline
+    del source
+    assert pipeline.stopped

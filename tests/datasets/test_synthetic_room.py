@@ -1,0 +1,276 @@
+"""The synthetic room: its pictures agree with its geometry, its geometry with plain formulas."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.synthetic.analytic_scene import KINDS, Scene, Solid, distance_to
+from taichi_mrf.datasets.synthetic.room import SyntheticRoom
+from taichi_mrf.datasets.synthetic.room_furniture import (
+    HEIGHT,
+    LENGTH,
+    ROOM_IN_WORLD,
+    WIDTH,
+    camera_pose,
+    room_scene,
+)
+from taichi_mrf.errors import BackendError, DatasetError
+from taichi_mrf.geometry.poses import as_pose, look_at, tangent_norms
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system import runtime
+
+SMALL = "synthetic:room?width=160&height=120&frames=60"
+CAMERA = PinholeCamera(width=160, height=120, fx=131.25, fy=131.25, cx=79.5, cy=59.5)
+
+number = st.floats(-2, 2)
+size = st.floats(0.05, 1)
+solids = st.builds(
+    Solid,
+    kind=st.sampled_from(KINDS),
+    center=st.tuples(number, number, number),
+    half_size=st.tuples(size, size, size),
+    yaw=st.floats(-4, 4),
+)
+
+
+def opened(source: str) -> SyntheticRoom:
+    dataset = open_dataset(source)
+    assert isinstance(dataset, SyntheticRoom)
+    return dataset
+
+
+def world_rays(camera: PinholeCamera, T: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Directions in the world, (H * W, 3), one metre of axial depth long."""
+    return camera.rays().reshape(-1, 3) @ T[:3, :3].T
+
+
+def sphere_traced(scene: Scene, eye: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Ray parameters of the first surface: steps of the signed distance, which can pass no surface."""
+    t = np.zeros(len(rays))
+    length = np.linalg.norm(rays, axis=1)
+    moving = np.arange(len(rays))
+    for _ in range(400):
+        distance = scene.signed_distance(eye + t[moving, None] * rays[moving])
+        t[moving] += distance / length[moving]
+        moving = moving[(distance > 1e-9) & (t[moving] < 20)]
+    return t
+
+
+def samples_on(solid: Solid, count: int) -> NDArray[np.float64]:
+    """Points spread over a solid's surface, world frame, (N, 3)."""
+    random = np.random.default_rng(0)
+    a, b, c = solid.half_size
+    if solid.kind == "sphere":
+        directions = random.normal(size=(count, 3))
+        return solid.center + a * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    if solid.kind == "cylinder":
+        angle = random.uniform(0, 2 * np.pi, count)
+        radius = np.where(np.arange(count) % 2 == 0, a, a * np.sqrt(random.uniform(0, 1, count)))
+        z = np.where(
+            np.arange(count) % 2 == 0, random.uniform(-c, c, count), c * random.choice([-1, 1], count)
+        )
+        return solid.center + np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+    local = random.uniform(-1, 1, (count, 3))
+    axis = random.integers(0, 3, count)
+    local[np.arange(count), axis] = random.choice([-1.0, 1.0], count)
+    local *= (a, b, c)
+    cos, sin = np.cos(solid.yaw), np.sin(solid.yaw)
+    return solid.center + local @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]).T
+
+
+@given(solids)
+def test_distance_is_zero_on_the_surface(solid: Solid) -> None:
+    np.testing.assert_allclose(distance_to(solid, samples_on(solid, 200)), 0, atol=1e-9)
+
+
+@given(solids, st.lists(st.tuples(number, number, number), min_size=1, max_size=5))
+def test_distance_is_that_to_the_nearest_surface_point(solid: Solid, points: list[tuple]) -> None:
+    surface = samples_on(solid, 20000)
+    for point, signed in zip(points, distance_to(solid, np.array(points)), strict=True):
+        nearest = np.linalg.norm(surface - point, axis=1).min()
+        assert abs(signed) <= nearest + 1e-9  # no sample can be nearer than the surface
+        assert nearest - abs(signed) < 0.12  # the samples lie this dense on the largest solid
+
+
+@given(solids)
+def test_the_sign_tells_inside_from_outside(solid: Solid) -> None:
+    surface = samples_on(solid, 100)
+    inwards = np.asarray(solid.center) - surface
+    assert (distance_to(solid, surface + 0.1 * inwards) < 0).all()
+    assert (distance_to(solid, surface - 0.1 * inwards) > 0).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_pictures_of_random_scenes_agree_with_sphere_tracing(backend: str, seed: int) -> None:
+    from taichi_mrf.datasets.synthetic.analytic_render import render
+
+    random = np.random.default_rng(seed)
+    scene = Scene(
+        tuple(
+            Solid(
+                KINDS[i % 3],
+                tuple(random.uniform(-1.5, 1.5, 3)),
+                tuple(random.uniform(0.05, 0.5, 3)),
+                random.uniform(-4, 4),
+            )
+            for i in range(12)
+        ),
+        light=(0, 0, 3),
+    )
+    eye = np.array([4.0 * np.cos(seed), 4.0 * np.sin(seed), random.uniform(-2, 2)])
+    T = look_at(eye, (0, 0, 0))
+    depth, _ = render(scene, CAMERA, T, color=False)
+    rays = world_rays(CAMERA, T)
+    expected = sphere_traced(scene, eye, rays)
+    hit = np.abs(scene.signed_distance(eye + expected[:, None] * rays)) < 1e-6
+    rendered = depth.ravel()
+    # A ray that just touches an edge may count as either; no others.
+    assert ((rendered > 0) != hit).sum() <= 2
+    both = hit & (rendered > 0)
+    assert both.sum() > 500
+    off = np.abs(rendered - expected)[both]
+    assert (off > 1e-4).sum() <= 2
+    assert np.median(off) < 1e-6
+
+
+@pytest.mark.parametrize("index", range(0, 60, 7))
+def test_clean_depth_lies_on_the_surface_and_before_all_others(backend: str, index: int) -> None:
+    room = opened(SMALL)
+    T, depth = room.pose(index), room.clean_depth(index).astype(np.float64).ravel()
+    rays = world_rays(room.camera, T)
+    assert (depth > 0).all()  # the room is closed
+    assert np.abs(room.signed_distance(T[:3, 3] + depth[:, None] * rays)).max() < 1e-4
+    for share in (0.1, 0.3, 0.5, 0.7, 0.9, 0.97):
+        assert room.signed_distance(T[:3, 3] + (share * depth)[:, None] * rays).min() > -1e-4
+
+
+def test_depth_is_axial(backend: str) -> None:
+    """A camera square to a wall sees one depth everywhere."""
+    from taichi_mrf.datasets.synthetic.analytic_render import render
+
+    scene = Scene((Solid("box", (3.0, 0.0, 0.0), (1.0, 50.0, 50.0)),), light=(0, 0, 1))
+    depth, _ = render(scene, CAMERA, look_at((0, 0, 0), (1, 0, 0)), color=False)
+    np.testing.assert_allclose(depth, 2.0, atol=1e-6)
+
+
+def test_the_room_is_a_furnished_room_around_the_origin() -> None:
+    scene = room_scene()
+    x, y, z = ROOM_IN_WORLD
+    random = np.random.default_rng(0)
+    points = random.uniform((-LENGTH / 2, -WIDTH / 2, 0), (LENGTH / 2, WIDTH / 2, HEIGHT), (20000, 3))
+    solid = scene.signed_distance(points + ROOM_IN_WORLD) < 0
+    assert 0.02 < solid.mean() < 0.2
+    assert scene.signed_distance([(0, 0, 0)])[0] > 0
+    assert x - LENGTH / 2 < 0 < x + LENGTH / 2
+    assert y - WIDTH / 2 < 0 < y + WIDTH / 2
+    assert z < 0 < z + HEIGHT
+    assert {solid.kind for solid in scene.solids} == set(KINDS)
+
+
+def test_the_camera_keeps_clear_moves_smoothly_and_closes_its_loop() -> None:
+    scene = room_scene()
+    count = 240
+    poses = [camera_pose(i / count) for i in range(count)]
+    eyes = np.array([T[:3, 3] for T in poses])
+    assert scene.signed_distance(eyes).min() > 0.4  # the least depth of a Kinect
+    steps = [tangent_norms(a, b) for a, b in zip(poses, poses[1:] + poses[:1], strict=True)]
+    rotation, translation = np.array(steps).T
+    assert rotation.max() < 4 * 2 * np.pi / count
+    assert translation.max() < 2 * translation.mean()
+    for T in poses:
+        np.testing.assert_allclose(as_pose(T), T, atol=1e-12)
+        assert T[2, 1] < 0  # the image's down is the world's down
+
+
+def test_all_walls_and_most_of_the_room_are_seen(backend: str) -> None:
+    room = opened("synthetic:room?width=80&height=60&frames=30&noise=none")
+    points = []
+    for i in range(len(room)):
+        T, depth = room.pose(i), room.clean_depth(i).astype(np.float64).reshape(-1, 1)
+        points.append(T[:3, 3] + depth * world_rays(room.camera, T) - ROOM_IN_WORLD)
+    cloud = np.concatenate(points)
+    np.testing.assert_allclose(cloud.min(axis=0), (-LENGTH / 2, -WIDTH / 2, 0), atol=1e-3)
+    np.testing.assert_allclose(cloud.max(axis=0), (LENGTH / 2, WIDTH / 2, HEIGHT), atol=1e-3)
+
+
+def test_frames_are_deterministic_whatever_the_order(backend: str) -> None:
+    once = {i: opened(SMALL).read(i) for i in (2, 5)}
+    room = opened(SMALL)
+    for i in (5, 2):
+        again = room.read(i)
+        np.testing.assert_array_equal(again.depth_m, once[i].depth_m)
+        np.testing.assert_array_equal(again.color, once[i].color)
+    assert (opened(SMALL + "&seed=1").read(2).depth_m != once[2].depth_m).any()
+
+
+def test_noise_is_that_of_a_kinect(backend: str) -> None:
+    room = opened("synthetic:room?width=640&height=480&frames=60")
+    clean, noisy = room.clean_depth(50).astype(np.float64), room.read(50).depth_m.astype(np.float64)
+    seen = noisy > 0
+    assert 0.8 < seen.mean() < 0.999
+    sigma = 0.001504 - 0.00152 * clean + 0.0019 * clean**2
+    step = 0.00285 * clean**2
+    expected = np.sqrt(sigma**2 + step**2 / 12)  # rounding to steps adds a twelfth of their square
+    normalised = ((noisy - clean) / expected)[seen]
+    assert abs(normalised.mean()) < 0.02
+    assert normalised.std() == pytest.approx(1, abs=0.05)
+
+
+def test_without_noise_a_frame_holds_the_clean_depth(backend: str) -> None:
+    room = opened(SMALL + "&noise=none")
+    frame = room.read(3)
+    np.testing.assert_array_equal(frame.depth_m, room.clean_depth(3))
+    np.testing.assert_array_equal(frame.T_world_camera, room.pose(3))
+    assert frame.camera == room.camera == CAMERA
+    assert frame.name == room.frame_names[3]
+    assert frame.color is not None
+    assert frame.color.shape == (120, 160, 3)
+    assert len(np.unique(frame.color.reshape(-1, 3), axis=0)) > 500
+    assert open_dataset(SMALL, color=False).read(3).color is None
+
+
+def test_options_and_defaults() -> None:
+    room = opened("synthetic:room")
+    assert len(room) == len(room.frame_names) == 32
+    assert room.camera == PinholeCamera(320, 240, 262.5, 262.5, 159.5, 119.5)
+    assert len(opened("synthetic:room?frames=7&seed=3&noise=none")) == 7
+    assert open_dataset("synthetic:room", camera=CAMERA).camera == CAMERA
+    with pytest.raises(IndexError):
+        room.read(32)
+    with pytest.raises(IndexError):
+        room.read(-1)
+
+
+@pytest.mark.parametrize(
+    ("query", "problem"),
+    [
+        ("frame=3", "unknown parameter 'frame'; did you mean 'frames'?"),
+        ("frames=many", "frames must be of type int"),
+        ("frames=", "frames must be of type int"),
+        ("frames=0", "frames must be at least 1"),
+        ("width=-640", "width must be at least"),
+        ("noise=some", "noise must be one of kinect, none"),
+        ("frames", "name=value"),
+        ("frames=[", "name=value"),
+    ],
+)
+def test_wrong_options(query: str, problem: str) -> None:
+    with pytest.raises(DatasetError) as caught:
+        open_dataset(f"synthetic:room?{query}")
+    assert str(caught.value).startswith("synthetic:room")
+    assert problem in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_depth_scale_has_no_meaning_here() -> None:
+    with pytest.raises(DatasetError, match="depth_scale"):
+        open_dataset("synthetic:room", depth_scale=5000)
+
+
+def test_rendering_before_taichi_runs_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runtime, "active", lambda: None)
+    with pytest.raises(BackendError, match=r"call taichi_mrf\.init\(\) first"):
+        opened(SMALL).read(0)

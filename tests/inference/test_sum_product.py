@@ -1,0 +1,278 @@
+"""The marginals against brute force where the graph is a tree, and against float64 NumPy where it is not."""
+
+from typing import Literal
+
+import numpy as np
+import pytest
+import small_room
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+from oracles import inference as reference
+from oracles.forward import Noise
+
+from taichi_mrf.config.schema import InferenceConfig
+from taichi_mrf.experiments.speed.launches import count_launches
+from taichi_mrf.inference.prior import prior_probability
+from taichi_mrf.inference.schedule import content_key
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.noise import PolynomialNoise
+
+pytestmark = pytest.mark.usefixtures("backend")
+
+VOXEL = 0.1
+ONE_PIXEL = PinholeCamera(1, 1, 100.0, 100.0, 0.0, 0.0)
+EXACT = {
+    "segment_lengths": False,
+    "message_precision": "float32",
+    "message_clamp": 25.0,
+    "cavity_clamp": 25.0,
+    "free_share": 0.0,
+    "min_length": 0.0,
+}
+
+
+def random_pose(rng: np.random.Generator, reach: float = 2.0) -> np.ndarray:
+    Q, R = np.linalg.qr(rng.normal(size=(3, 3)))
+    Q *= np.sign(np.diag(R))
+    if np.linalg.det(Q) < 0:
+        Q[:, 0] *= -1
+    T = np.eye(4)
+    T[:3, :3] = Q
+    T[:3, 3] = rng.uniform(-reach, reach, 3)
+    return T
+
+
+def look_along(origin: np.ndarray, direction: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A camera whose only pixel looks along ``direction``."""
+    z = direction / np.linalg.norm(direction)
+    x = np.cross(z, rng.normal(size=3))
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    T[:3, 3] = origin
+    return T
+
+
+def image(depth: float) -> np.ndarray:
+    return np.full((1, 1), depth, np.float32)
+
+
+def allocated(m: MRFMap) -> set[reference.Voxel]:
+    centres, _ = m.voxels(0.0)
+    return {tuple(v) for v in np.floor(centres / VOXEL).astype(int).tolist()}
+
+
+def marginals(m: MRFMap, voxels: list[reference.Voxel]) -> np.ndarray:
+    return m.occupancy((np.array(voxels) + 0.5) * VOXEL).astype(np.float64)
+
+
+# A sigma wide enough that every voxel of the short ray lies in a brick near the measured surface.
+wide = st.floats(0.25, 0.6)
+shallow = st.floats(0.3, 0.7)
+seeds = st.integers(0, 2**32 - 1)
+priors = st.floats(0.02, 0.6)
+
+
+def well_cut(rays: list[reference.Ray], longest: int) -> bool:
+    """No corner is grazed (float32 may take the other way round it), and few enough voxels to enumerate."""
+    cells = [s for ray in rays for s in ray.segments]
+    return all(s.length > 0.02 for s in cells) and all(len(ray.segments) <= longest for ray in rays)
+
+
+@settings(max_examples=60)
+@given(
+    seed=seeds, depth=shallow, sigma=wide, prior=priors, bias=st.floats(-0.05, 0.05),
+    method=st.sampled_from(["sum-product", "max-product"]), retrace=st.booleans(),
+)  # fmt: skip
+def test_one_ray_equals_enumeration(
+    seed: int,
+    depth: float,
+    sigma: float,
+    prior: float,
+    bias: float,
+    method: Literal["sum-product", "max-product"],
+    retrace: bool,
+) -> None:
+    rng = np.random.default_rng(seed)
+    T = random_pose(rng)
+    sensor, config = Noise((sigma,), (bias,)), InferenceConfig(prior=prior, **EXACT)
+    rays = reference.cast(image(depth), T, ONE_PIXEL, VOXEL, sensor, config, max_depth=0.75)
+    assume(well_cut(rays, 12))
+    m = MRFMap(VOXEL, PolynomialNoise((sigma,), (bias,)), inference=config, max_depth=0.75)
+    m._sweeper.retrace = retrace
+    m.add_keyframe(image(depth), T, ONE_PIXEL)
+    m.infer(sweeps=2, method=method)
+    exact = reference.enumerate_marginals(rays, prior, config.outlier_floor, method == "max-product")
+    np.testing.assert_allclose(marginals(m, list(exact)), list(exact.values()), atol=1e-4)
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.filter_too_much])
+@given(
+    seed=seeds, depths=st.tuples(shallow, shallow), sigma=wide, prior=priors,
+    method=st.sampled_from(["sum-product", "max-product"]),
+)  # fmt: skip
+def test_two_rays_that_share_one_voxel_equal_enumeration(
+    seed: int,
+    depths: tuple[float, float],
+    sigma: float,
+    prior: float,
+    method: Literal["sum-product", "max-product"],
+) -> None:
+    rng = np.random.default_rng(seed)
+    shared = (rng.integers(-20, 20, 3) + rng.uniform(0.2, 0.8, 3)) * VOXEL
+    sensor, config = Noise((sigma,)), InferenceConfig(prior=prior, **EXACT)
+    poses, rays = [], []
+    for depth in depths:
+        direction = rng.normal(size=3)
+        direction /= np.linalg.norm(direction)
+        poses.append(look_along(shared - direction * rng.uniform(0.05, 0.3), direction, rng))
+        rays += reference.cast(image(depth), poses[-1], ONE_PIXEL, VOXEL, sensor, config, max_depth=0.4)
+    common = {s.voxel for s in rays[0].segments} & {s.voxel for s in rays[1].segments}
+    assume(len(common) == 1 and well_cut(rays, 9))
+    m = MRFMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=0.4)
+    for depth, T in zip(depths, poses, strict=True):
+        m.add_keyframe(image(depth), T, ONE_PIXEL)
+    assume({s.voxel for ray in rays for s in ray.segments} <= allocated(m))
+    m.infer(sweeps=6, method=method)
+    exact = reference.enumerate_marginals(rays, prior, config.outlier_floor, method == "max-product")
+    np.testing.assert_allclose(marginals(m, list(exact)), list(exact.values()), atol=1e-4)
+
+
+@settings(max_examples=40)
+@given(
+    seed=seeds,
+    pixels=st.sampled_from([(1, 1), (2, 1), (2, 2)]),
+    count=st.integers(1, 4),
+    sigma=st.floats(0.02, 0.3),
+    likelihood=st.sampled_from(["auto", "segment", "centre"]),
+    average=st.sampled_from(["probability", "log_odds"]),
+    lengths=st.booleans(),
+    damping=st.sampled_from([0.0, 0.3]),
+    sweeps=st.integers(1, 5),
+    free_share=st.sampled_from([0.0, 0.25, 1.0]),
+    method=st.sampled_from(["sum-product", "max-product"]),
+)
+def test_loops_equal_the_numpy_schedule(
+    seed: int,
+    pixels: tuple[int, int],
+    count: int,
+    sigma: float,
+    likelihood: str,
+    average: str,
+    lengths: bool,
+    damping: float,
+    sweeps: int,
+    free_share: float,
+    method: Literal["sum-product", "max-product"],
+) -> None:
+    rng = np.random.default_rng(seed)
+    camera = PinholeCamera(pixels[0], pixels[1], 8.0, 8.0, (pixels[0] - 1) / 2, (pixels[1] - 1) / 2)
+    config = InferenceConfig(
+        method=method,
+        sweeps=sweeps,
+        likelihood=likelihood,  # type: ignore[arg-type]
+        average=average,  # type: ignore[arg-type]
+        segment_lengths=lengths,
+        damping=damping,
+        message_precision="float32",
+        min_length=0.0,
+        outlier_floor=1e-3,
+        free_share=free_share,
+    )
+    sensor = Noise((sigma,), (0.01,))
+    m = MRFMap(VOXEL, PolynomialNoise((sigma,), (0.01,)), inference=config, max_depth=1.5)
+    rays = {}
+    middle = rng.uniform(-1, 1, 3)
+    for _ in range(count):
+        direction = rng.normal(size=3)
+        direction /= np.linalg.norm(direction)
+        T = look_along(middle - 0.6 * direction, direction, rng)
+        depth = rng.uniform(0.5, 0.8, camera.shape).astype(np.float32)
+        rays[m.add_keyframe(depth, T, camera)] = reference.cast(
+            depth, T, camera, VOXEL, sensor, config, max_depth=1.5
+        )
+    assume(all(s.length > 0.01 for cast in rays.values() for ray in cast for s in ray.segments))
+    order = sorted(m.keyframes.values(), key=content_key)
+    voxels = allocated(m)
+    m.infer()
+    expected = reference.infer([rays[k.id] for k in order], voxels, prior_probability(config, VOXEL), config)
+    seen = sorted({s.voxel for cast in rays.values() for ray in cast for s in ray.segments} & voxels)
+    got = marginals(m, seen)
+    np.testing.assert_allclose(got, [reference.logistic(expected[v]) for v in seen], atol=1e-3)
+
+
+@settings(max_examples=30)
+@given(seed=seeds, depth=shallow, sigma=wide, prior=priors)
+def test_messages_with_lengths_are_those_of_the_factor(
+    seed: int, depth: float, sigma: float, prior: float
+) -> None:
+    """With lengths, a voxel stops the ray with 1 - (1 - m)^l: the factor, enumerated with those chances,
+    must send the same message."""
+    rng = np.random.default_rng(seed)
+    T = random_pose(rng)
+    sensor = Noise((sigma,))
+    config = InferenceConfig(prior=prior, **{**EXACT, "segment_lengths": True})
+    (ray,) = reference.cast(image(depth), T, ONE_PIXEL, VOXEL, sensor, config, max_depth=0.75)
+    assume(well_cut([ray], 12))
+    m = MRFMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=0.75)
+    m.add_keyframe(image(depth), T, ONE_PIXEL)
+    m.infer(sweeps=1)
+    stops = np.array([1 - (1 - prior) ** s.length for s in ray.segments])
+    voxels = [s.voxel for s in ray.segments]
+    n = len(voxels)
+    states = (np.arange(2**n)[:, None] >> np.arange(n)) & 1
+    factor = np.full(2**n, ray.beyond)
+    for i in reversed(range(n)):
+        factor = np.where(states[:, i] == 1, ray.densities[i], factor)
+    factor = factor + config.outlier_floor
+    expected = []
+    for i in range(n):
+        others = np.delete(np.where(states == 1, stops, 1 - stops), i, axis=1).prod(axis=1) * factor
+        ratio = others[states[:, i] == 1].sum() / others[states[:, i] == 0].sum()
+        expected.append(ratio * prior / (ratio * prior + 1 - prior))
+    np.testing.assert_allclose(marginals(m, voxels), expected, atol=1e-4)
+
+
+def test_float16_messages_move_beliefs_a_little() -> None:
+    """What the default precision costs, against the same map in float32."""
+    rng = np.random.default_rng(3)
+    camera = PinholeCamera(24, 18, 20.0, 20.0, 11.5, 8.5)
+    maps = {p: MRFMap(VOXEL, PolynomialNoise((0.03,)), message_precision=p) for p in ("float16", "float32")}
+    for _ in range(4):
+        T = random_pose(rng, 0.1)
+        depth = (1.5 / np.abs(camera.rays() @ T[:3, :3].T).max(axis=-1)).astype(np.float32)
+        for m in maps.values():
+            m.add_keyframe(depth, T, camera)
+    for m in maps.values():
+        m.infer()
+    voxels = sorted(allocated(maps["float32"]))
+    difference = np.abs(marginals(maps["float16"], voxels) - marginals(maps["float32"], voxels))
+    assert 0 < difference.max() < 0.01
+
+
+@pytest.mark.parametrize("average", ["log_odds", "probability"])
+def test_rays_followed_twice_say_what_their_trace_says(average: Literal["log_odds", "probability"]) -> None:
+    marginals = []
+    for retrace in (False, True):
+        m = MRFMap(small_room.VOXEL_SIZE, inference=InferenceConfig(average=average))
+        m._sweeper.retrace = retrace
+        for frame in small_room.frames()[:4]:
+            small_room.add(m, frame)
+        m.infer()
+        marginals.append(m.voxels(0.0)[1])
+    # Differences of sums in float32 are not the sums of the rest.
+    apart = np.abs(marginals[1] - marginals[0])
+    assert 0 < apart.max() < 0.02
+    assert np.quantile(apart, 0.999) < 1e-3
+
+
+def test_the_host_waits_for_no_step_of_a_sweep(backend: str) -> None:
+    if backend == "cpu":
+        pytest.skip("on a CPU arrays of the host are handed to kernels as they are, and nobody waits")
+    m = small_room.build([0, 1])
+    with count_launches() as launches:
+        m.infer(sweeps=1)
+    # Each keyframe's order, and what has moved in the end.
+    assert launches.waits == 2 * len(m.keyframes)
+    assert launches.number > 6 * len(m.keyframes)

@@ -1,0 +1,96 @@
+"""What a live run shows beside its map: rays, images of a view, and OctoMap's way with the same frames."""
+
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+import small_room
+from live_scene import CONFIG, FakeLink, finished, map_voxels, room, session_of, shown
+
+from taichi_mrf.config.schema import Config
+from taichi_mrf.methods.registry import create_map
+from taichi_mrf.viewer.messages import Images, PixelRay, RayAnswer, RayThrough, Switch, Watch
+
+pytestmark = pytest.mark.usefixtures("one_backend")
+
+
+def test_a_pixels_ray_has_its_measurement_along_the_ray() -> None:
+    link = FakeLink()
+    session = session_of(link, room(2))
+    m = finished(session)
+    frame = small_room.frames()[1]
+    u, v = 20, 100
+    link.ask(PixelRay(1, float(u), float(v)))
+    finished(session)
+    (answer,) = link.of_type(RayAnswer)
+    slant = frame.camera.range_per_depth()[v, u]
+    depth = frame.depth_m[v, u]
+    assert depth > 0
+    assert answer.measured_m == pytest.approx(depth * slant)
+    sigma, bias = m.noise.table(frame.camera).at_pixels(frame.depth_m)
+    assert answer.sigma_m == pytest.approx(sigma[v, u] * slant)
+    assert answer.bias_m == pytest.approx(bias[v, u] * slant)
+    towards = frame.T_world_camera[:3, :3] @ frame.camera.rays()[v, u]
+    np.testing.assert_allclose(answer.direction, towards / np.linalg.norm(towards), atol=1e-6)
+    profile = m.ray_profile(frame.T_world_camera[:3, 3], towards)
+    np.testing.assert_array_equal(answer.omega, profile.omega)
+    assert abs(answer.distance[np.argmax(answer.omega)] - answer.measured_m) < 2 * m.voxel_size
+
+
+def test_a_ray_through_a_point_is_that_of_a_keyframe_that_sees_it() -> None:
+    link = FakeLink()
+    session = session_of(link)
+    finished(session)
+    frame = small_room.frames()[2]
+    u, v = 70, 90
+    depth = float(frame.depth_m[v, u])
+    point = (frame.T_world_camera @ np.append(frame.camera.rays()[v, u] * depth, 1.0))[:3]
+    eye = (0.0, 0.0, 1.0)
+    link.ask(RayThrough(tuple(point), eye, 2), RayThrough(tuple(point), eye, None))
+    behind = tuple((frame.T_world_camera @ [0.0, 0.0, -50.0, 1.0])[:3])
+    link.ask(RayThrough(behind, eye, 2))
+    finished(session)
+    wanted, nearest, from_eye = link.of_type(RayAnswer)
+    assert wanted.title == f"{frame.name}, pixel ({u}, {v})"
+    assert wanted.measured_m == pytest.approx(np.linalg.norm(point - frame.T_world_camera[:3, 3]), rel=1e-5)
+    assert nearest.measured_m is not None
+    assert from_eye.measured_m is None
+    assert from_eye.origin == eye
+
+
+def test_images_of_a_view_are_small_and_scored() -> None:
+    link = FakeLink()
+    session = session_of(link, room(2))
+    link.ask(Watch(images=True, view=None, beside=False))
+    finished(session)
+    images = link.of_type(Images)
+    assert images[0].title == small_room.frames()[0].name
+    for image in (images[0].measured, images[0].rendered, images[0].accuracy):
+        assert image.shape == (120, 160, 3)
+        assert image.dtype == np.uint8
+    assert images[0].score.startswith("right ")
+    assert "no answer" in images[0].score
+
+
+def test_octomaps_way_follows_the_keyframes_and_goes_away_again() -> None:
+    def beside() -> set[tuple[int, int, int]]:
+        return shown(link.sent).voxels("beside")
+
+    def log_odds_voxels(chosen: Iterable[int]) -> set[tuple[int, int, int]]:
+        config = Config(voxel_size=CONFIG.voxel_size, method="log_odds")
+        m = create_map(config, small_room.frames()[0].camera)
+        for i in chosen:
+            small_room.add(m, small_room.frames()[i])
+        return map_voxels(m)
+
+    link = FakeLink()
+    session = session_of(link)
+    link.ask(Watch(images=False, view=None, beside=True))
+    finished(session)
+    assert beside() == log_odds_voxels(range(4))
+    link.ask(Switch(1, on=False))
+    finished(session)
+    assert beside() == log_odds_voxels([0, 2, 3])
+    link.ask(Watch(images=False, view=None, beside=False))
+    finished(session)
+    assert shown(link.sent).bricks["beside"] == {}

@@ -1,0 +1,303 @@
+"""The live page in a real Chromium: what it shows, counted in the browser, and what its widgets do."""
+
+import re
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import pytest
+from browser import LivePage, Seen, chromium, missing
+from live_program import LiveProgram, wait_for
+
+from taichi_mrf import MRFMap
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.system import runtime
+from taichi_mrf.viewer.messages import LOG_ODDS_STEP
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+ROOM = "synthetic:room?frames=6&width=96&height=72"
+
+pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator["Browser"]:
+    with chromium() as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def program(browser: "Browser") -> Iterator[LiveProgram]:
+    """The room at a twentieth of its pace: one frame in four seconds, which a busy machine can draw. It
+    begins when Chromium is there to see it."""
+    with LiveProgram(ROOM, "--voxel-size", "0.08", "--runtime.arch", "cpu", "--speed", "0.05") as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def saved(program: LiveProgram, browser: "Browser", tmp_path_factory: pytest.TempPathFactory) -> MRFMap:
+    """The map as the page's button saves it, once it is complete. Whoever asks for it first sees it grow."""
+    path = tmp_path_factory.mktemp("saved") / "map.npz"
+    with LivePage(browser, program.address) as page:
+        page.until_settled()
+        page.tab("Save")
+        page.download("Map").save_as(path)
+    runtime.init("cpu")
+    return MRFMap.load(path)
+
+
+@pytest.fixture(scope="module")
+def late_page(program: LiveProgram, saved: MRFMap, browser: "Browser") -> Iterator[LivePage]:
+    """A page that was opened when the map was complete."""
+    with LivePage(browser, program.address) as opened:
+        opened.until_settled()
+        yield opened
+
+
+@pytest.fixture
+def page(late_page: LivePage, request: pytest.FixtureRequest) -> Iterator[LivePage]:
+    """The same, with all widgets as they were at first; no test may leave an error behind."""
+    late_page.tab("Map")
+    yield late_page
+    late_page.screenshot(request.node.name)
+    assert late_page.problems == []
+
+
+def voxels_of(m: MRFMap, probability: float) -> int:
+    """How many voxels of a map are at least so probable."""
+    return len(m.voxels(probability)[0])
+
+
+def test_voxels_appear_as_keyframes_arrive(program: LiveProgram, browser: "Browser") -> None:
+    equal_counts, keyframes = set(), set()
+    with LivePage(browser, program.address) as page:
+
+        def complete(seen: Seen) -> bool:
+            if seen.agrees and seen.voxels:
+                equal_counts.add(seen.voxels)
+            keyframes.add(len(seen.keyframes))
+            return seen.settled
+
+        final = page.until(complete, "a complete map")
+        page.screenshot("complete_early_page")
+        assert page.problems == []
+    assert len(equal_counts) >= 3, "the scene was equal to the page's count only now and then"
+    assert len(keyframes) >= 3
+    assert max(keyframes) == len(final.keyframes) == 5  # one frame in six is kept out
+
+
+def test_a_late_joiner_sees_the_whole_map(page: LivePage, saved: MRFMap) -> None:
+    seen = page.look()
+    assert seen.voxels == seen.said == voxels_of(saved, 0.5) > 1000
+    assert len(seen.keyframes) == len(saved.keyframes)
+    assert {"/way", "/camera"} <= set(seen.nodes)
+
+
+def test_the_first_view_has_all_keyframes_in_it(page: LivePage) -> None:
+    box = page.page.viewport_size
+    for x, y, _ in page.places("/keyframes/", "picture"):
+        assert 0 < x < box["width"]
+        assert 0 < y < box["height"]
+
+
+def test_the_threshold_moves_the_count(page: LivePage, saved: MRFMap) -> None:
+    before = page.look()
+    for threshold in (0.8, 0.2):
+        page.slide("Threshold", threshold)
+        others = (0, before.voxels)
+        seen = page.until(lambda s, others=others: s.agrees and s.voxels not in others, "another count")
+        odds = threshold / (1 - threshold) * np.exp([-LOG_ODDS_STEP, LOG_ODDS_STEP])
+        most, fewest = (voxels_of(saved, p) for p in odds / (1 + odds))
+        assert fewest <= seen.voxels <= most
+        before = seen
+    page.nudge("Threshold", "ArrowRight")
+    page.until(lambda seen: seen.agrees and seen.voxels < before.voxels, "fewer voxels")
+    page.slide("Threshold", 0.5)
+    page.until(lambda seen: seen.agrees and seen.voxels == voxels_of(saved, 0.5), "the first count")
+
+
+def test_the_colour_menu_changes_the_colours(page: LivePage) -> None:
+    first = page.look()
+    known = {first.colors}
+    for mode, legend in [("height", "height (m)"), ("uncertainty", "bits"), ("keyframes", "see the voxel")]:
+        page.select("Color by", mode)
+        seen = page.until(lambda seen: seen.colors not in known and seen.agrees, f"colours by {mode}")
+        page.until(lambda seen, legend=legend: legend in page.text(), f"the scale of {mode}")
+        page.screenshot(f"colours_{mode}")
+        known.add(seen.colors)
+        assert seen.voxels == first.voxels
+    page.select("Color by", "marginal")
+    page.until(lambda seen: seen.colors == first.colors, "the first colours")
+
+
+def test_the_cut_hides_voxels_and_shows_a_picture(page: LivePage) -> None:
+    before = page.look()
+    assert "/cut" not in before.nodes
+    page.select("Cut axis", "z")
+    half = page.until(lambda seen: seen.agrees and 0 < seen.voxels < before.voxels, "fewer voxels")
+    page.until(lambda seen: len(page.places("/cut", "picture")) == 1, "the picture of the cut")
+    page.screenshot("cut_z")
+    page.slide("Cut at", 0.3)
+    lower = page.until(lambda seen: seen.agrees and 0 < seen.voxels < half.voxels, "fewer still")
+    page.select("Cut axis", "x")
+    page.until(lambda seen: seen.agrees and seen.voxels not in (0, lower.voxels), "another cut")
+    page.screenshot("cut_x")
+    page.slide("Cut at", 0.5)
+    page.select("Cut axis", "none")
+    after = page.until(lambda seen: seen.agrees and seen.voxels == before.voxels, "all voxels")
+    assert "/cut" not in after.nodes
+
+
+def test_the_outlines_of_bricks_come_and_go(page: LivePage) -> None:
+    page.tick("Bricks")
+    page.until(lambda seen: "/bricks" in seen.nodes, "the outlines")
+    page.screenshot("bricks")
+    page.tick("Bricks", on=False)
+    page.until(lambda seen: "/bricks" not in seen.nodes, "no outlines")
+
+
+def test_dark_and_light(page: LivePage) -> None:
+    for dark in (True, False):
+        page.tick("Dark", on=dark)
+        scheme = "dark" if dark else "light"
+        page.page.wait_for_selector(f'html[data-mantine-color-scheme="{scheme}"]', state="attached")
+        wait_for(lambda: is_dark(page, scheme) == dark, f"a {scheme} scene", page.pause)  # noqa: B023
+
+
+def is_dark(page: LivePage, name: str) -> bool:
+    """Whether the scene's corner is; the screenshot that says so goes by this name."""
+    return bool(cv2.imread(str(page.screenshot(name)))[-40:, :40].mean() < 80)
+
+
+def wait_for_the_plot(page: LivePage) -> str:
+    """Wait until the plot of a ray has something in it; returns what is written beside it."""
+    page.tab("Ray")
+    page.page.locator(".uplot canvas").first.wait_for(state="visible")
+    page.page.wait_for_function(
+        """() => { const canvas = document.querySelector('.uplot canvas');
+        const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+        const colors = new Set();
+        for (let i = 0; i < data.length; i += 4)
+            if (data[i + 3] > 250) colors.add(data[i] * 65536 + data[i + 1] * 256 + data[i + 2]);
+        return colors.size >= 3; }"""
+    )
+    return page.text()
+
+
+def test_a_click_on_a_voxel_fills_the_plot(page: LivePage) -> None:
+    nearest = sorted(page.places("/voxels/", "points"), key=lambda place: place[2])
+    x, y, _ = page.free_places(nearest[:20])[0]
+    page.click(x, y)
+    page.until(lambda seen: "/ray" in seen.nodes, "the ray in the scene")
+    text = wait_for_the_plot(page)
+    assert re.search(r"Likeliest surface at \d+\.\d+ m \(p = [01]\.\d\d\)", text), text
+
+
+def test_the_ray_of_a_pixel_is_that_of_its_measurement(page: LivePage) -> None:
+    frame = open_dataset(ROOM).read(3)
+    depth_m, camera = frame.depth_m, frame.camera
+    v, u = np.argwhere(depth_m > 0)[1234].tolist()
+    expected_m = depth_m[v, u] * np.hypot(
+        1, np.hypot((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
+    )
+    page.tab("Keyframes")
+    page.select("Keyframe", f"3: {frame.name} (on)")
+    page.tab("Ray")
+    page.fill("Pixel (u, v)", u, v)
+    page.press("Ray of pixel")
+    page.until(lambda seen: f"{frame.name}, pixel ({u}, {v})" in page.text(), "that pixel's ray")
+    assert f"measured {expected_m:.3f} m" in wait_for_the_plot(page)
+
+
+def test_a_click_on_a_keyframes_picture_chooses_it(page: LivePage) -> None:
+    page.tab("Keyframes")
+    places = {id: page.places(f"/keyframes/{id}", "picture")[0] for id in range(5)}
+    id = min(places, key=lambda id: places[id][2])
+    page.click(*places[id][:2])
+    page.until(lambda seen: page.input("Keyframe").input_value() == f"{id}: room-{id:04d} (on)", "the choice")
+    page.tab("Ray")
+    page.until(lambda seen: f"room-{id:04d}, pixel (" in page.text(), "the ray of the pixel")
+    u, v = map(float, re.search(r"pixel \((\S+), (\S+)\)", page.text()).groups())
+    assert abs(u - 47.5) < 24
+    assert abs(v - 35.5) < 18
+
+
+def test_three_images_beside_the_map(page: LivePage) -> None:
+    page.tab("Images")
+    page.tick("Show images")
+    labels = ("measured depth", "depth rendered from the map", "accuracy")
+    sizes = "() => [...document.querySelectorAll('img')].map(i => [i.naturalWidth, i.naturalHeight])"
+    page.until(lambda seen: page.page.evaluate(sizes).count([96, 72]) == 3, "three images")
+    page.until(lambda seen: re.search(r"right \d+%", page.text()), "their score")
+    text = page.text()
+    for label in labels:
+        assert label in text
+    page.screenshot("images")
+    page.select("View", "chosen keyframe")
+    name = page_chosen(page)
+    page.tab("Images")
+    page.until(lambda seen: name in page.text(), "the chosen keyframe's images")
+    page.select("View", "current camera")
+    page.tick("Show images", on=False)
+
+
+def page_chosen(page: LivePage) -> str:
+    """The name of the keyframe that is chosen."""
+    page.tab("Keyframes")
+    return page.input("Keyframe").input_value().split()[1]
+
+
+def test_octomaps_way_is_shown_beside_the_map(page: LivePage) -> None:
+    before = page.look()
+    page.tick("Beside")
+    seen = page.until(lambda seen: seen.settled and seen.beside > 1000, "the other map")
+    assert seen.voxels == before.voxels
+    page.screenshot("beside")
+    page.tick("Beside", on=False)
+    page.until(lambda seen: seen.agrees and seen.said_beside == 0, "the map alone")
+
+
+def test_two_viewers_in_a_wide_and_a_narrow_window(
+    page: LivePage, program: LiveProgram, browser: "Browser"
+) -> None:
+    before = page.look()
+    with LivePage(browser, program.address, width=400, height=700) as narrow:
+        assert narrow.until_settled().voxels == before.voxels
+        narrow.screenshot("narrow")
+        assert narrow.page.evaluate("() => document.documentElement.scrollWidth") <= 400
+        for label in ("Threshold", "Color by", "Cut at"):
+            widget = narrow.input(label)
+            widget.scroll_into_view_if_needed()
+            box = widget.bounding_box()
+            assert box["x"] >= 0
+            assert box["x"] + box["width"] <= 400
+        narrow.slide("Threshold", 0.9)
+        seen = narrow.until(lambda seen: seen.agrees and seen.voxels < before.voxels, "fewer voxels")
+        page.until(lambda other: other.agrees and other.voxels == seen.voxels, "the same for both")
+        page.slide("Threshold", 0.5)
+        narrow.until(lambda other: other.agrees and other.voxels == before.voxels, "the same for both")
+        assert narrow.problems == []
+
+
+def test_the_view_follows_the_camera(page: LivePage) -> None:
+    away = np.linalg.norm(np.subtract(page.position(), page.position("/camera")))
+    page.tick("Follow")
+    page.press("Reset")
+    places = set()
+
+    def followed(seen: Seen) -> bool:
+        if "/camera" not in seen.nodes:
+            return False
+        camera, eye = page.position("/camera"), page.position()
+        if np.linalg.norm(np.subtract(camera, eye)) < 0.5 * away:
+            places.add(camera)
+        return len(places) >= 2
+
+    page.until(followed, "an eye that moves with the camera")
+    page.select("Speed", "2x")
+    page.screenshot("followed")
+    page.tick("Follow", on=False)
+    page.until_settled()

@@ -1,0 +1,115 @@
+"""Maps on disk: what is loaded is what was saved, can be extended, and a bad file says so."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import small_room
+
+from taichi_mrf.errors import MapFileError
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.noise import PatchNoise
+
+pytestmark = pytest.mark.usefixtures("one_backend")
+
+
+def test_a_loaded_map_answers_the_same_at_once(tmp_path: Path) -> None:
+    m = small_room.build([0, 1, 2])
+    m.save(tmp_path / "map.npz")
+    loaded = MRFMap.load(tmp_path / "map.npz")
+    probes = small_room.probes()
+    np.testing.assert_array_equal(loaded.occupancy(probes), m.occupancy(probes))
+    np.testing.assert_array_equal(loaded.state(probes), m.state(probes))
+    assert loaded.config == m.config
+    assert [k.name for k in loaded.keyframes.values()] == [k.name for k in m.keyframes.values()]
+
+
+def test_a_loaded_map_goes_on_as_if_it_had_never_been_saved(tmp_path: Path) -> None:
+    m = small_room.build([0, 1])
+    m.save(tmp_path / "map.npz")
+    loaded = MRFMap.load(tmp_path / "map.npz")
+    small_room.add(loaded, small_room.frames()[2])
+    (first, *_) = loaded.keyframes
+    loaded.remove_keyframe(first)
+    loaded.infer()
+    probes = small_room.probes()
+    np.testing.assert_array_equal(loaded.occupancy(probes), small_room.build([1, 2]).occupancy(probes))
+
+
+def test_frozen_keyframes_survive(tmp_path: Path) -> None:
+    m = small_room.build([0, 1, 2])
+    (first, second, _) = m.keyframes
+    m.freeze_keyframe(first)
+    m.save(tmp_path / "map.npz")
+    loaded = MRFMap.load(tmp_path / "map.npz")
+    assert dict(loaded.frozen) == dict(m.frozen)
+    probes = small_room.probes()
+    for each in (m, loaded):
+        each.remove_keyframe(second)
+        each.infer()
+    np.testing.assert_allclose(loaded.occupancy(probes), m.occupancy(probes), atol=1e-6)
+    np.testing.assert_array_equal(loaded.state(probes), m.state(probes))
+
+
+def test_patch_noise_is_stored(tmp_path: Path) -> None:
+    camera = PinholeCamera(40, 30, 40.0, 40.0, 19.5, 14.5)
+    tables = np.random.default_rng(0).uniform(0.01, 0.02, (2, 12, 2))
+    m = MRFMap(0.1, PatchNoise(tables[0], tables[1], 10, camera))
+    m.add_keyframe(np.full(camera.shape, 1.5, np.float32), np.eye(4), camera)
+    m.save(tmp_path / "map.npz")
+    noise = MRFMap.load(tmp_path / "map.npz").noise
+    assert isinstance(noise, PatchNoise)
+    np.testing.assert_array_equal(noise.table(camera).coefficients, m.noise.table(camera).coefficients)
+
+
+def test_an_empty_map_is_a_map(tmp_path: Path) -> None:
+    MRFMap(0.1).save(tmp_path / "map.npz")
+    assert MRFMap.load(tmp_path / "map.npz").statistics().voxels == 0
+
+
+def test_saving_over_a_map_replaces_it_whole(tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    small_room.build([0]).save(path)
+    small_room.build([1]).save(path)
+    assert [p.name for p in tmp_path.iterdir()] == ["map.npz"]
+    assert [k.name for k in MRFMap.load(path).keyframes.values()] == [small_room.frames()[1].name]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(None, "no such file"), (b"", "not a readable map"), (b"not a zip at all", "not a readable map")],
+)
+def test_a_bad_file_is_named(tmp_path: Path, content: bytes | None, message: str) -> None:
+    path = tmp_path / "map.npz"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(MapFileError, match=message) as caught:
+        MRFMap.load(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_cut_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    small_room.build([0]).save(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(MapFileError, match="not a readable map"):
+        MRFMap.load(path)
+
+
+def test_another_npz_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    np.savez(path, a=np.zeros(3))
+    with pytest.raises(MapFileError, match="not a map"):
+        MRFMap.load(path)
+
+
+def test_a_map_that_lacks_a_part_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    small_room.build([0]).save(path)
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files if name != "belief"}
+    np.savez(path, **arrays)
+    with pytest.raises(MapFileError, match="belief"):
+        MRFMap.load(path)

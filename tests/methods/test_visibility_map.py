@@ -1,0 +1,288 @@
+"""Whole maps against the oracle in NumPy, and what such a map must do whatever its numbers are."""
+
+import dataclasses
+from pathlib import Path
+
+import corridor
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from oracles import visibility as reference
+from oracles.forward import Noise
+
+from taichi_mrf.config.schema import VisibilityConfig, VolumeConfig
+from taichi_mrf.errors import CapacityError, ConfigError
+from taichi_mrf.methods.visibility.map import VisibilityMap
+from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.noise import PatchNoise, PolynomialNoise
+
+pytestmark = pytest.mark.usefixtures("backend")
+
+VOXEL = 0.2
+ONE_PIXEL = PinholeCamera(1, 1, 100.0, 100.0, 0.0, 0.0)
+NEAR = VolumeConfig(dense_bricks=32)
+"""Where a map is dense (Vulkan), it need not reach far here."""
+
+STEREO = PolynomialNoise((0.0, 0.0, corridor.STEREO_LAMBDA))
+
+
+def random_pose(rng: np.random.Generator, reach: float) -> np.ndarray:
+    Q, R = np.linalg.qr(rng.normal(size=(3, 3)))
+    Q *= np.sign(np.diag(R))
+    if np.linalg.det(Q) < 0:
+        Q[:, 0] *= -1
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Q, rng.uniform(-reach, reach, 3)
+    return T
+
+
+def centres(voxels: list[reference.Voxel]) -> np.ndarray:
+    return (np.array(voxels, np.float64).reshape(-1, 3) + 0.5) * VOXEL
+
+
+def close_calls(scan: dict[reference.Voxel, reference.Seen], *others: dict) -> bool:
+    """Whether float32 could decide otherwise than float64: at q_min, at q_max, or where a ray is sure."""
+    sure = any(abs(p - reference.SURE) < 1e-4 for seen in scan.values() for p in seen.inside)
+    return sure or any(scan != other for other in others)
+
+
+@settings(max_examples=40)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    pixels=st.sampled_from([(1, 1), (3, 2), (4, 4)]),
+    scans=st.integers(1, 10),
+    sigma=st.sampled_from([(0.02,), (0.01, 0.0, 0.1), (0.3,)]),
+    bias=st.sampled_from([(0.0,), (0.1,), (0.02, -0.03)]),
+    max_range=st.sampled_from([0.0, 1.5]),
+    volume=st.sampled_from([None, ((-1.2, -1.0, -2.0), (1.0, 1.2, 0.8))]),
+)
+def test_scans_equal_the_oracles(
+    seed: int,
+    pixels: tuple[int, int],
+    scans: int,
+    sigma: tuple[float, ...],
+    bias: tuple[float, ...],
+    max_range: float,
+    volume: reference.Box | None,
+) -> None:
+    """Scans from about the same place, so that later ones see far, and across what earlier ones met."""
+    rng = np.random.default_rng(seed)
+    camera = PinholeCamera(pixels[0], pixels[1], 6.0, 6.0, (pixels[0] - 1) / 2, (pixels[1] - 1) / 2)
+    config = VisibilityConfig(max_range=max_range)
+    box = NEAR if volume is None else dataclasses.replace(NEAR, lower=volume[0], upper=volume[1])
+    m = VisibilityMap(
+        VOXEL, PolynomialNoise(sigma, bias), visibility=config, volume=box, min_depth=0.2, max_depth=3.0
+    )
+    noise, known = Noise(sigma, bias), {}
+    looks = [(random_pose(rng, 0.5), rng.uniform(0.3, 1.8, camera.shape)) for _ in range(2)]
+    for number in range(scans):
+        T, depth = looks[number % 2]
+        depth = depth.astype(np.float32)
+        scan, *others = (
+            reference.follow(known, depth, T, camera, VOXEL, noise, c, 3.0, volume)
+            for c in (
+                config,
+                dataclasses.replace(config, q_min=config.q_min + 1e-5, q_max=config.q_max + 1e-5),
+                dataclasses.replace(config, q_min=config.q_min - 1e-5, q_max=config.q_max - 1e-5),
+            )
+        )
+        assume(not close_calls(scan, *others))
+        assume(all(length > 0.01 for seen in scan.values() for length in seen.length))
+        known = reference.integrate(known, scan, config)
+        m.add_keyframe(depth, T, camera)
+    voxels = sorted(known)
+    # float32 rounds P(I) where sigma is small, and what one scan leaves of that adds up over all of them.
+    np.testing.assert_allclose(m.occupancy(centres(voxels)), [known[v] for v in voxels], atol=1e-5 * scans)
+    mapped, _ = m.voxels(0.0)
+    assert {tuple(v) for v in np.floor(mapped / VOXEL).astype(int).tolist()} == set(voxels)
+
+
+def along(direction: tuple[float, float, float], origin: tuple[float, float, float]) -> np.ndarray:
+    """A camera whose only pixel looks along an axis of the world."""
+    z = np.array(direction)
+    x = np.roll(z, 1)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    T[:3, 3] = origin
+    return T
+
+
+def repeat(m: VisibilityMap, depth: float, T: np.ndarray, times: int) -> None:
+    for _ in range(times):
+        m.add_keyframe(np.full((1, 1), depth, np.float32), T, ONE_PIXEL)
+
+
+def test_a_voxel_in_full_view_follows_bayes_rule() -> None:
+    """The sensor's own voxel is fully visible: five misses are five times Bayes' rule."""
+    m = VisibilityMap(VOXEL, PolynomialNoise((0.01,)), volume=NEAR)
+    repeat(m, 3.0, along((0, 0, 1), (0.1, 0.1, 0.1)), 5)
+    odds = (0.45 / 0.57) ** 5
+    assert m.occupancy(np.array([[0.1, 0.1, 0.1]]))[0] == pytest.approx(odds / (1 + odds), abs=1e-6)
+
+
+def test_probabilities_stay_within_their_bounds() -> None:
+    m = VisibilityMap(VOXEL, PolynomialNoise((0.01,)), volume=NEAR, lowest=0.2, highest=0.9)
+    repeat(m, 1.1, along((0, 0, 1), (0.1, 0.1, 0.1)), 60)
+    p = m.occupancy(np.array([[0.1, 0.1, z] for z in (0.1, 0.7, 1.3)]))
+    np.testing.assert_allclose(p, [0.2, 0.2, 0.9], atol=1e-6)
+
+
+def test_the_first_scan_reaches_four_unknown_voxels() -> None:
+    m = VisibilityMap(VOXEL, PolynomialNoise((0.01,)), volume=NEAR)
+    repeat(m, 3.0, along((0, 0, 1), (0.1, 0.1, 0.1)), 1)
+    row = np.array([[0.1, 0.1, 0.1 + VOXEL * i] for i in range(16)])
+    np.testing.assert_array_equal(m.state(row), [FREE] * 5 + [UNKNOWN] * 11)
+    for i, visible in enumerate([1.0, 0.6, 0.36, 0.216, 0.1296]):
+        of_occupied = 0.95 * (1 - visible) + 0.45 * visible
+        of_free = 0.95 * (1 - visible) + 0.57 * visible
+        expected = of_occupied / (of_occupied + of_free)
+        assert m.occupancy(row[i : i + 1])[0] == pytest.approx(expected, abs=1e-6)
+
+
+def test_measurements_through_a_known_wall_are_not_believed() -> None:
+    """What OctoMap would make an artefact: wrong matches, scan by scan, 2 m behind a wall."""
+    noise, T = PolynomialNoise((0.01,)), along((0, 0, 1), (0.1, 0.1, 0.1))
+    m = VisibilityMap(VOXEL, noise, volume=NEAR)
+    repeat(m, 2.1, T, 60)  # a wall at z = 2.2 m
+    wall, behind = np.array([[0.1, 0.1, 2.3]]), np.array([[0.1, 0.1, 2.7 + VOXEL * i] for i in range(10)])
+    before = m.occupancy(wall)[0]
+    assert before == pytest.approx(0.971, abs=1e-6)
+    untouched = m.state(behind)
+    repeat(m, 4.1, T, 3)
+    np.testing.assert_array_equal(m.state(behind), untouched)
+    assert (untouched == UNKNOWN).all()
+    assert m.occupancy(wall)[0] < before  # but the wall itself is in full view, and doubted
+    assert m.state(wall)[0] == OCCUPIED
+
+
+def test_no_measurement_changes_nothing() -> None:
+    m = VisibilityMap(VOXEL)
+    m.add_keyframe(np.zeros((4, 4), np.float32), np.eye(4), PinholeCamera(4, 4, 4.0, 4.0, 1.5, 1.5))
+    assert len(m.voxels(0.0)[0]) == 0
+
+
+# The scans of a map.
+
+
+def views() -> tuple[PinholeCamera, np.ndarray, list[np.ndarray]]:
+    camera = corridor.camera(48)
+    poses = []
+    for step in (0.0, 0.13, 0.31, 0.4):
+        T = corridor.pose()
+        T[2, 3] += step
+        poses.append(T)
+    return camera, corridor.depth_image(camera), poses
+
+
+def belief(m: VisibilityMap) -> dict[tuple[float, ...], float]:
+    at, p = m.voxels(0.0)
+    return dict(zip(map(tuple, at.tolist()), p.tolist(), strict=True))
+
+
+def build(poses: list[np.ndarray]) -> VisibilityMap:
+    camera, depth, _ = views()
+    m = VisibilityMap(VOXEL, STEREO, volume=NEAR, max_depth=6.0)
+    for T in poses:
+        m.add_keyframe(depth, T, camera)
+    return m
+
+
+def test_removing_gives_the_map_of_the_others() -> None:
+    _, _, poses = views()
+    m = build(poses)
+    m.remove_keyframe(1)
+    m.infer()
+    assert belief(m) == belief(build([poses[0], *poses[2:]]))
+
+
+def test_moving_gives_the_map_of_the_final_poses() -> None:
+    _, _, poses = views()
+    m = build(poses[:3])
+    m.move_keyframe(1, poses[3])
+    m.infer()
+    assert belief(m) == belief(build([poses[0], poses[3], poses[2]]))
+
+
+def test_a_loaded_map_goes_on_as_if_it_had_not_been_saved(tmp_path: Path) -> None:
+    camera, depth, poses = views()
+    m = build(poses[:3])
+    m.save(tmp_path / "map.npz")
+    loaded = VisibilityMap.load(tmp_path / "map.npz")
+    assert loaded.config == m.config
+    assert belief(loaded) == belief(m)
+    for each in (m, loaded):
+        each.add_keyframe(depth, poses[3], camera)
+    assert belief(loaded) == belief(m)
+
+
+def test_the_order_of_the_rays_does_not_change_a_bit() -> None:
+    """A camera turned upside down has the same rays, and the image's last pixel is its first."""
+    camera, depth, poses = views()
+    upright, turned = (
+        VisibilityMap(VOXEL, STEREO, volume=NEAR, max_depth=6.0),
+        VisibilityMap(VOXEL, STEREO, volume=NEAR, max_depth=6.0),
+    )
+    rolled = dataclasses.replace(camera, cx=camera.width - 1 - camera.cx, cy=camera.height - 1 - camera.cy)
+    for T in poses * 2:
+        upright.add_keyframe(depth, T, camera)
+        turned.add_keyframe(depth[::-1, ::-1].copy(), T @ np.diag([-1.0, -1.0, 1.0, 1.0]), rolled)
+    assert belief(upright) == belief(turned)
+
+
+def test_a_patch_table_of_one_polynomial_is_that_polynomial() -> None:
+    camera, depth, poses = views()
+    patches = -(-camera.width // 10) * -(-camera.height // 10)
+    table = np.tile([[0.0, 0.0, corridor.STEREO_LAMBDA]], (patches, 1))
+    m = VisibilityMap(VOXEL, PatchNoise(table, 0 * table, 10, camera), max_depth=6.0)
+    for T in poses:
+        m.add_keyframe(depth, T, camera)
+    assert belief(m) == belief(build(poses))
+
+
+# The paper's Fig. 5a.
+
+
+@pytest.mark.parametrize(("voxel_size", "fewest", "most"), [(0.2, 55, 75), (0.4, 25, 40)])
+def test_the_mapped_distance_grows_with_the_updates(voxel_size: float, fewest: int, most: int) -> None:
+    """Integrating one image of a long corridor again and again: about 65 updates to 10 m at 0.2 m, and
+    each voxel on the way takes about the same number."""
+    curve = np.array(corridor.grow(voxel_size, 10.0, corridor.camera(160)))
+    assert fewest <= len(curve) <= most
+    assert curve[-1] >= 10.0
+    assert (np.diff(curve) >= 0).all()
+    assert np.diff(curve)[curve[:-1] > 0].max() < 5 * voxel_size
+    updates = np.searchsorted(curve, [4.0, 6.0, 8.0, 10.0])
+    assert np.ptp(np.diff(updates)) <= 3
+
+
+def test_a_lower_q_max_lets_the_map_grow_faster() -> None:
+    """Section IV-A: the speed "strongly depends on" q_max."""
+    camera = corridor.camera(80)
+    depth, reached = corridor.depth_image(camera), []
+    for q_max in (0.62, 0.7, 0.8):
+        m = VisibilityMap(0.4, STEREO, max_depth=14.0, q_max=q_max)
+        for _ in range(16):
+            m.add_keyframe(depth, corridor.pose(), camera)
+        reached.append(corridor.mapped_distance(m))
+    assert reached[0] > reached[1] > reached[2]
+
+
+# Bad input.
+
+
+def test_impossible_parameters_are_refused_by_name() -> None:
+    with pytest.raises(ConfigError, match="did you mean 'q_max'"):
+        VisibilityMap(qmax=0.5)
+    with pytest.raises(ConfigError, match=r"visibility\.q_max must be more than visibility\.q_min"):
+        VisibilityMap(q_min=0.8)
+
+
+def test_a_scan_that_would_not_fit_is_refused_and_leaves_the_map_as_it_was() -> None:
+    camera, depth, poses = views()
+    m = VisibilityMap(0.02, STEREO, max_depth=20.0, volume=VolumeConfig(memory_limit_gb=0.05))
+    with pytest.raises(CapacityError, match="choose larger voxels"):
+        m.add_keyframe(depth, poses[0], camera)
+    assert len(m.voxels(0.0)[0]) == 0
+    assert not m.keyframes

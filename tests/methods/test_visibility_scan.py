@@ -1,0 +1,363 @@
+# ruff: noqa: ANN202
+"""The steps of a scan with visibility: each equation against the oracle and against what is worked out by
+hand, and the kernels on rows of voxels that are short enough to write down."""
+
+import math
+
+import numpy as np
+import pytest
+import taichi as ti
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles import visibility as reference
+
+from taichi_mrf.config.schema import VisibilityConfig
+from taichi_mrf.kernels.types import F32, AnyArray, F32Array, I32Array, Vec4
+from taichi_mrf.methods.visibility import scan
+from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.window import Window, WindowIndex
+
+pytestmark = pytest.mark.usefixtures("backend")
+
+VOXEL = 0.2
+TABLE_1 = VisibilityConfig()
+MODEL = (TABLE_1.hit_if_occupied, TABLE_1.hit_if_free, TABLE_1.hit_if_hidden)
+RULES = (TABLE_1.visible_if_occluded, TABLE_1.visible_if_clear, TABLE_1.q_min, TABLE_1.q_max)
+
+probabilities = st.just(0.0) | st.floats(1e-6, 1.0)
+between = st.floats(0.015625, 0.984375, width=32)
+
+
+@ti.kernel
+def _interpolated(occupied: F32, visible: F32, inside: F32, model: Vec4, out: F32Array):
+    for _ in range(1):
+        out[0] = scan.interpolated(occupied, visible, inside, model[0], model[1], model[2])
+
+
+@ti.kernel
+def _visibility(before: F32, occluded: F32, rules: Vec4, out: F32Array):
+    for _ in range(1):
+        out[0] = scan.visibility(before, occluded, rules[0], rules[1], rules[3])
+
+
+@ti.kernel
+def _inside(depth: F32, measured: F32, sigma: F32, out: F32Array):
+    for _ in range(1):
+        out[0] = scan.inside_obstacle(depth, measured, sigma)
+
+
+def interpolated(occupied: float, visible: float, inside: float, model: tuple[float, ...] = MODEL) -> float:
+    out = np.zeros(1, np.float32)
+    _interpolated(occupied, visible, inside, ti.Vector([*model, 0.0], ti.f32), out)
+    return float(out[0])
+
+
+def visibility(before: float, occluded: float) -> float:
+    out = np.zeros(1, np.float32)
+    _visibility(before, occluded, ti.Vector(list(RULES), ti.f32), out)
+    return float(out[0])
+
+
+def inside_obstacle(depth: float, measured: float, sigma: float) -> float:
+    out = np.zeros(1, np.float32)
+    _inside(depth, measured, sigma, out)
+    return float(out[0])
+
+
+def logit(p: float) -> float:
+    return math.log(p / (1 - p))
+
+
+# Equations 4 to 6 and 8.
+
+
+@given(between, probabilities, probabilities, between, between, between)
+def test_an_update_is_the_papers(
+    occupied: float, visible: float, inside: float, if_occupied: float, if_free: float, if_hidden: float
+) -> None:
+    config = VisibilityConfig(hit_if_occupied=if_occupied, hit_if_free=if_free, hit_if_hidden=if_hidden)
+    expected = reference.interpolated(occupied, visible, inside, config)
+    assert interpolated(occupied, visible, inside, (if_occupied, if_free, if_hidden)) == pytest.approx(
+        expected, abs=1e-6
+    )
+
+
+@given(between)
+def test_a_visible_voxel_follows_bayes_rule(occupied: float) -> None:
+    odds = occupied / (1 - occupied)
+    hit, miss = odds * 0.55 / 0.43, odds * 0.45 / 0.57
+    assert interpolated(occupied, 1.0, 1.0) == pytest.approx(hit / (1 + hit), abs=1e-6)
+    assert interpolated(occupied, 1.0, 0.0) == pytest.approx(miss / (1 + miss), abs=1e-6)
+
+
+@given(between, probabilities)
+def test_what_is_not_visible_tells_nothing(occupied: float, inside: float) -> None:
+    assert interpolated(occupied, 0.0, inside) == pytest.approx(occupied, abs=1e-6)
+
+
+@given(between, probabilities, probabilities, probabilities)
+def test_the_further_inside_the_more_occupied(
+    occupied: float, visible: float, one: float, other: float
+) -> None:
+    less, more = sorted((one, other))
+    assert interpolated(occupied, visible, less) <= interpolated(occupied, visible, more) + 1e-6
+
+
+@given(between, probabilities, probabilities)
+def test_the_more_visible_the_more_is_learnt(occupied: float, one: float, other: float) -> None:
+    less, more = sorted((one, other))
+    assert interpolated(occupied, more, 0.0) <= interpolated(occupied, less, 0.0) + 1e-6 <= occupied + 2e-6
+    assert interpolated(occupied, more, 1.0) >= interpolated(occupied, less, 1.0) - 1e-6 >= occupied - 2e-6
+
+
+@given(st.floats(0.1, 0.6), st.floats(0.06, 0.5))
+def test_an_interpolated_miss_keeps_the_conditional_of_a_miss(visible: float, inside: float) -> None:
+    """The paper's published code takes P(H | not V) there for P(not H | not V), 0.05 for 0.95, which makes
+    a voxel that can hardly be seen almost as free as one in full view. We follow the paper."""
+    followed = interpolated(0.5, visible, inside)
+    deviating = reference.interpolated(0.5, visible, inside, TABLE_1, TABLE_1.hit_if_hidden)
+    assert followed - deviating > 0.01
+    in_view = interpolated(0.5, 1.0, inside)
+    assert abs(followed - 0.5) < abs(in_view - 0.5) or followed > 0.5
+    assert reference.interpolated(0.5, 1.0, inside, TABLE_1, TABLE_1.hit_if_hidden) == pytest.approx(in_view)
+
+
+# Equations 2, 3 and 7.
+
+
+@given(probabilities, probabilities)
+def test_visibility_never_grows_but_for_the_clamp(before: float, occluded: float) -> None:
+    after = visibility(before, occluded)
+    assert after <= before + 1e-6 or (after == 1.0 and before >= TABLE_1.q_max)
+
+
+@given(st.lists(probabilities, max_size=20))
+def test_visibility_along_a_ray_is_the_papers(occluded: list[float]) -> None:
+    before, along = 1.0, []
+    for c in occluded:
+        before = visibility(before, c)
+        along.append(before)
+    expected = reference.visibilities(occluded, VisibilityConfig(q_min=0.0))
+    close_call = any(abs(v - TABLE_1.q_max) < 1e-5 for v in raw_visibilities(occluded))
+    if not close_call:  # float32 and float64 may fall on either side of q_max
+        np.testing.assert_allclose(along, expected, atol=1e-5)
+
+
+def raw_visibilities(occluded: list[float]) -> list[float]:
+    """The visibilities before they are clamped."""
+    out, before = [], 1.0
+    for c in occluded:
+        out.append(before * (1 - 0.8 * c))
+        before = 1.0 if out[-1] >= TABLE_1.q_max else out[-1]
+    return out
+
+
+@given(st.floats(0.1, 20.0), st.floats(0.1, 20.0), st.floats(0.005, 2.0))
+def test_inside_is_the_normal_distribution(depth: float, measured: float, sigma: float) -> None:
+    depth, measured, sigma = (float(np.float32(x)) for x in (depth, measured, sigma))
+    expected = reference.inside(depth, measured, sigma)
+    assert inside_obstacle(depth, measured, sigma) == pytest.approx(expected, abs=1e-5)
+    assert inside_obstacle(measured, measured, sigma) == pytest.approx(0.5, abs=1e-6)
+
+
+def test_sure_is_where_the_oracle_has_it() -> None:
+    assert reference.SURE == scan.SURE
+    assert reference.inside(scan.SURE_SIGMAS, 0.0, 1.0) == pytest.approx(scan.SURE)
+
+
+# Equation 1, for every voxel of some bricks.
+
+
+@settings(max_examples=40)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    share=st.floats(0.0, 1.0),
+    sensor=st.tuples(*[st.floats(0.0, 64.0)] * 3),
+    low=st.tuples(*[st.integers(0, 20)] * 3),
+    high=st.tuples(*[st.integers(40, 64)] * 3),
+)
+def test_local_occlusion_is_the_papers_across_bricks(
+    seed: int,
+    share: float,
+    sensor: tuple[float, float, float],
+    low: tuple[int, int, int],
+    high: tuple[int, int, int],
+) -> None:
+    rng = np.random.default_rng(seed)
+    window = Window((0, 0, 0), (8, 8, 8), VOXEL)
+    # Bricks here and there, among them some that are next to each other, and log-odds in them.
+    corner = rng.integers(0, 7, 3)
+    block = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3) + corner
+    bricks = block[rng.random(len(block)) < max(share, 0.2)].astype(np.int32)
+    cells, slots = window.cells_of(bricks), rng.permutation(len(bricks)).astype(np.int32)
+    log_odds = rng.normal(0, 1.5, len(bricks) * VOXELS).astype(np.float32)
+
+    index = WindowIndex()
+    index.fill(window, cells, slots)
+    belief = on_device(log_odds, ti.f32)
+    occluded, visible, inside = scratch(len(bricks))
+    centre = np.asarray(sensor, np.float32)
+    scan.hide(
+        cells, ti.Vector(centre.tolist(), ti.f32), window.shape_vector,
+        ti.Vector([float(x) for x in low], ti.f32), ti.Vector([float(x) for x in high], ti.f32),
+        index.bricks, belief, occluded, visible, inside,
+    )  # fmt: skip
+
+    offsets = np.stack(np.unravel_index(np.arange(VOXELS), (BRICK,) * 3), axis=1)
+    known = {}
+    for brick, slot in zip(bricks, slots.tolist(), strict=True):
+        odds = log_odds[slot * VOXELS : (slot + 1) * VOXELS].astype(np.float64)
+        voxels = map(tuple, (brick * BRICK + offsets).tolist())
+        known.update(zip(voxels, (1 / (1 + np.exp(-odds))).tolist(), strict=True))
+    box = (tuple(map(float, low)), tuple(map(float, high)))
+    here = tuple(int(c) for c in np.floor(centre))
+    expected = [
+        reference.local_occlusion(known, tuple(v), here, box)
+        for brick in bricks
+        for v in (brick * BRICK + offsets).tolist()
+    ]
+    np.testing.assert_allclose(occluded.to_numpy()[: len(expected)], expected, atol=1e-6)
+
+
+# Rows of voxels.
+
+
+def on_device(values: np.ndarray, dtype: object) -> "ti.Ndarray":
+    array = ti.ndarray(dtype, max(1, len(values)))
+    if len(values):
+        array.from_numpy(values)
+    return array
+
+
+def scratch(bricks: int) -> tuple["ti.Ndarray", "ti.Ndarray", "ti.Ndarray"]:
+    n = max(1, bricks) * VOXELS
+    return ti.ndarray(ti.f32, n), ti.ndarray(ti.i32, n), ti.ndarray(ti.i32, n)
+
+
+@ti.kernel
+def _floats(bits: I32Array, out: AnyArray):
+    for i in range(out.shape[0]):
+        out[i] = ti.bit_cast(bits[i], ti.f32)
+
+
+def follow_row(
+    occluded: list[float],
+    measured: float,
+    sigma: float,
+    bias: float = 0.0,
+    max_depth: float = 100.0,
+    max_range: float = 100.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """One ray along x through the middle of a row of voxels with these P(C): P(V) and P(I) of each."""
+    length = -(-len(occluded) // BRICK)
+    window = Window((0, 0, 0), (-(-length // 8) * 8, 8, 8), VOXEL)
+    bricks = np.array([(i, 0, 0) for i in range(length)], np.int32)
+    index = WindowIndex()
+    index.fill(window, window.cells_of(bricks), np.arange(length, dtype=np.int32))
+    rows = np.arange(length * BRICK)
+    numbers = rows // BRICK * VOXELS + rows % BRICK * BRICK**2
+    hidden, visible, inside = scratch(length)
+    values = np.zeros(length * VOXELS, np.float32)
+    values[numbers[: len(occluded)]] = occluded
+    hidden.from_numpy(values)
+    visible.fill(0)
+    inside.fill(0)
+    T = np.eye(4)
+    T[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]  # the camera looks along x
+    T[:3, 3] = [1e-3, 0.5 * VOXEL, 0.5 * VOXEL]
+    centre, to_voxels = window.rays_of(T)
+    lower, upper = window.clip_box(None, None)
+    noise = np.zeros((1, 2, 5), np.float32)
+    noise[0, 0, 0], noise[0, 1, 0] = sigma, bias
+    scan.follow(
+        np.array([measured], np.float32), 1, ti.Vector([1.0, 1.0, 0.0, 0.0], ti.f32), centre, to_voxels,
+        noise, 1, 1, VOXEL, max_depth, max_range, *RULES,
+        window.shape_vector, lower, upper, index.chunks, index.bricks, hidden, visible, inside,
+    )  # fmt: skip
+    out = np.zeros(length * VOXELS, np.float32), np.zeros(length * VOXELS, np.float32)
+    _floats(visible, out[0])
+    _floats(inside, out[1])
+    return out[0][numbers], out[1][numbers]
+
+
+def test_a_beam_dies_after_four_unknown_voxels() -> None:
+    """The sensor's own voxel is not occluded; each unknown one leaves 0.2 * 0.5 + 1.0 * 0.5."""
+    visible, inside = follow_row([0.0] + [0.5] * 15, measured=10.0, sigma=0.01)
+    np.testing.assert_allclose(visible[:5], [1.0, 0.6, 0.36, 0.216, 0.1296], atol=1e-6)
+    np.testing.assert_array_equal(visible[5:], 0.0)
+    np.testing.assert_array_equal(inside, 0.0)
+
+
+def test_a_beam_that_is_hardly_weakened_is_not_weakened() -> None:
+    """0.2 * 0.3 + 0.7 = 0.76 is q_max or more and counts as 1, so it never adds up."""
+    visible, _ = follow_row([0.0] + [0.3] * 30, measured=10.0, sigma=0.01)
+    np.testing.assert_array_equal(visible[:31], 1.0)
+
+
+def test_a_beam_ends_one_full_hit_behind_what_it_measured() -> None:
+    """Sigma 0.1, measured 2.0: the voxels' centres lie 1, 1 and 3 sigma from it."""
+    visible, inside = follow_row([0.0] * 24, measured=2.0, sigma=0.1)
+    centre = (np.arange(24) + 0.5) * VOXEL
+    # The ray enters the row 1 mm behind its begin, so the first centre is not quite the segment's.
+    expected = [reference.inside(x - 1e-3, 2.0, 0.1) for x in centre[:12]]
+    expected[0] = reference.inside((VOXEL - 1e-3) / 2, 2.0, 0.1)
+    np.testing.assert_allclose(inside[:12], expected, atol=1e-5)
+    assert inside[11] >= scan.SURE > inside[10]
+    assert inside[12] == 1.0
+    np.testing.assert_array_equal(inside[13:], 0.0)
+    np.testing.assert_array_equal(visible[:13], 1.0)
+    np.testing.assert_array_equal(visible[13:], 0.0)
+
+
+def test_bias_shifts_the_measurement() -> None:
+    _, moved = follow_row([0.0] * 24, measured=2.3, sigma=0.1, bias=0.3)
+    _, plain = follow_row([0.0] * 24, measured=2.0, sigma=0.1)
+    np.testing.assert_allclose(moved, plain, atol=1e-5)
+
+
+@pytest.mark.parametrize("cut", [{"max_depth": 1.1}, {"max_range": 1.1}])
+def test_a_beam_that_is_cut_off_sees_free_space_alone(cut: dict[str, float]) -> None:
+    visible, inside = follow_row([0.0] * 24, measured=4.0, sigma=0.1, **cut)
+    np.testing.assert_array_equal(visible > 0, np.arange(24) < 6)
+    np.testing.assert_array_equal(inside, 0.0)
+
+
+def test_an_occupied_voxel_in_the_way_leaves_little() -> None:
+    """Behind P(C) = 0.971 is 1 - 0.8 * 0.971 = 0.2232, and behind a second such voxel less than q_min."""
+    visible, _ = follow_row([0.0, 0.0, 0.971, 0.971, 0.0], measured=10.0, sigma=0.01)
+    np.testing.assert_allclose(visible[:5], [1, 1, 0.2232, 0, 0], atol=1e-6)
+
+
+@ti.kernel
+def _seen(values: F32Array, bits: I32Array):
+    for i in range(values.shape[0]):
+        bits[i] = ti.bit_cast(values[i], ti.i32)
+
+
+@given(st.lists(st.floats(-3.5, 3.5, width=32, allow_subnormal=False), min_size=1, max_size=30), st.data())
+@settings(max_examples=30)
+def test_voxels_are_updated_within_bounds_and_only_if_seen(
+    log_odds: list[float], data: st.DataObject
+) -> None:
+    n = len(log_odds)
+    visible = np.array([data.draw(probabilities) for _ in range(n)], np.float32)
+    inside = np.array([data.draw(probabilities) for _ in range(n)], np.float32)
+    before = np.zeros(2 * VOXELS, np.float32)
+    before[VOXELS : VOXELS + n] = log_odds  # the scan's only brick has slot 1
+    belief, bits = on_device(before, ti.f32), scratch(1)[1:]
+    for array, values in zip(bits, (visible, inside), strict=True):
+        array.fill(0)
+        _seen(values, array)
+    scan.update(np.array([1], np.int32), belief, *bits, *MODEL, logit(TABLE_1.lowest), logit(TABLE_1.highest))
+    after = belief.to_numpy()
+    np.testing.assert_array_equal(after[:VOXELS], 0.0)
+    np.testing.assert_array_equal(after[VOXELS + n :], 0.0)
+    for i in range(n):
+        if visible[i] == 0:
+            assert after[VOXELS + i] == before[VOXELS + i]
+            continue
+        p = reference.interpolated(
+            1 / (1 + math.exp(-log_odds[i])), float(visible[i]), float(inside[i]), TABLE_1
+        )
+        p = min(max(p, TABLE_1.lowest), TABLE_1.highest)
+        assert after[VOXELS + i] == pytest.approx(logit(p), abs=2e-5)

@@ -1,0 +1,118 @@
+"""Writes small recordings in every folder format, for the tests of their readers."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.geometry.poses import Pose, look_at
+
+SIZE = (12, 16)
+"""(height, width) of the images."""
+
+CAMERA_TXT = "16 12 14 15 7.5 5.5"
+
+
+@dataclass
+class Content:
+    """What the frames of a recording hold: raw 16-bit depth, colour, and poses."""
+
+    count: int = 5
+    depth: list[NDArray[np.uint16]] = field(init=False)
+    color: list[NDArray[np.uint8]] = field(init=False)
+    poses: list[Pose] = field(init=False)
+
+    def __post_init__(self) -> None:
+        random = np.random.default_rng(self.count)
+        self.depth = [random.integers(400, 9000, SIZE).astype(np.uint16) for _ in range(self.count)]
+        self.color = [random.integers(0, 256, (*SIZE, 3)).astype(np.uint8) for _ in range(self.count)]
+        self.poses = [look_at(random.normal(size=3), random.normal(size=3)) for _ in range(self.count)]
+        for image in self.depth:
+            image[0, 0] = 0
+
+
+def write_image(path: Path, image: NDArray) -> Path:
+    """Write an image; three channels are RGB."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    ok, data = cv2.imencode(path.suffix, image[..., ::-1] if image.ndim == 3 else image)
+    assert ok
+    path.write_bytes(data.tobytes())
+    return path
+
+
+def text_of(matrix: NDArray[np.float64]) -> str:
+    """A matrix, row by row, with all its digits."""
+    return "\n".join(" ".join(map(repr, row.tolist())) for row in matrix)
+
+
+def row_of(matrix: NDArray[np.float64]) -> str:
+    """A matrix in one line."""
+    return text_of(matrix).replace("\n", " ")
+
+
+def quaternion_of(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """x y z w of a rotation, from its axis (the eigenvector to the eigenvalue 1) and angle."""
+    values, vectors = np.linalg.eig(R)
+    axis = np.real(vectors[:, np.argmin(np.abs(values - 1))])
+    antisymmetric = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    angle = np.arctan2(antisymmetric @ axis / 2, (np.trace(R) - 1) / 2)
+    return np.array([*(np.sin(angle / 2) * axis), np.cos(angle / 2)])
+
+
+def stamped_line(stamp: float, pose: Pose) -> str:
+    """stamp tx ty tz qx qy qz qw."""
+    numbers = (stamp, *pose[:3, 3], *quaternion_of(pose[:3, :3]))
+    return " ".join(repr(float(number)) for number in numbers)
+
+
+def write_seven_scenes(folder: Path, content: Content) -> Path:
+    """Frames 0, 10, 20 ... with JPEG-free colour, so that it comes back exactly."""
+    for i in range(content.count):
+        stem = f"frame-{10 * i:06d}"
+        write_image(folder / f"{stem}.depth.png", content.depth[i])
+        write_image(folder / f"{stem}.color.png", content.color[i])
+        (folder / f"{stem}.pose.txt").write_text(text_of(content.poses[i]))
+    (folder / "camera.txt").write_text(CAMERA_TXT)
+    return folder
+
+
+def write_tum(folder: Path, content: Content, start: float = 1305031102.0) -> Path:
+    """Depth each 33 ms, colour 4 ms and poses 7 ms later."""
+    depth_lines, color_lines, pose_lines = ["# stamp file"], ["# stamp file"], ["# stamp pose"]
+    for i in range(content.count):
+        stamp = start + 0.033 * i
+        write_image(folder / f"depth/{stamp:.6f}.png", content.depth[i])
+        write_image(folder / f"rgb/{stamp + 0.004:.6f}.png", content.color[i])
+        depth_lines.append(f"{stamp:.6f} depth/{stamp:.6f}.png")
+        color_lines.append(f"{stamp + 0.004:.6f} rgb/{stamp + 0.004:.6f}.png")
+        pose_lines.append(stamped_line(stamp + 0.007, content.poses[i]))
+    (folder / "depth.txt").write_text("\n".join(depth_lines))
+    (folder / "rgb.txt").write_text("\n".join(color_lines))
+    (folder / "groundtruth.txt").write_text("\n".join(pose_lines))
+    (folder / "camera.txt").write_text(CAMERA_TXT)
+    return folder
+
+
+def write_numbered(folder: Path, content: Content, first: int = 0, place: str = ".") -> Path:
+    """Numbered depth images without a trajectory, colour beside them if they lie in a folder of their own."""
+    for i in range(content.count):
+        write_image(folder / place / f"{first + i:05d}.png", content.depth[i])
+        if place != ".":
+            write_image(folder / "color" / f"{first + i:05d}.png", content.color[i])
+    (folder / "camera.txt").write_text(CAMERA_TXT)
+    return folder
+
+
+def write_rows(path: Path, poses: list[Pose]) -> Path:
+    """One 3 x 4 matrix a line."""
+    path.write_text("\n".join(row_of(pose[:3]) for pose in poses))
+    return path
+
+
+def write_log(path: Path, poses: list[Pose], first: int = 0) -> Path:
+    """Choi's layout."""
+    blocks = (f"{first + i} {first + i} {first + i + 1}\n{text_of(pose)}" for i, pose in enumerate(poses))
+    path.write_text("\n".join(blocks))
+    return path

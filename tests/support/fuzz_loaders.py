@@ -1,0 +1,412 @@
+"""Everything that reads a file, with a good input to damage: what tests/test_fuzz.py and fuzz_soak.py share.
+
+A loader's ``read`` gives all that is in the input as bytes, so that what was read of a damaged one can be
+told from what was there before.
+"""
+
+import gzip
+import json
+import pickle
+from collections.abc import Callable
+from dataclasses import astuple, dataclass
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+from datasets_recordings import (
+    Content,
+    stamped_line,
+    write_image,
+    write_log,
+    write_numbered,
+    write_seven_scenes,
+    write_tum,
+)
+from inputs_bags import Kind, writing
+from laser_logs import ODOMETRY, flaser, robotlaser
+from laser_logs import write_npz as write_scans
+from test_inputs_bags import plain
+from test_inputs_formats import INTRINSIC, arrays, column_by_column, write_npz, write_replica, write_scannet
+from test_inputs_stereo import write as write_stereo_file
+from test_stereo_pairs import write_kitti
+
+from taichi_mrf.calibration.depth_files import DepthFiles
+from taichi_mrf.calibration.image_stamps import read_stamps
+from taichi_mrf.calibration.pose_stream import read_pose_stream
+from taichi_mrf.config.schema import Config, load
+from taichi_mrf.config.text import commented_yaml
+from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets.laser.plan_image import read_floor_plan
+from taichi_mrf.datasets.laser.readers import open_scans
+from taichi_mrf.datasets.synthetic.mesh_scene import load_mesh
+from taichi_mrf.errors import FrameError, TaichiMRFError
+from taichi_mrf.export.octomap import write_bt, write_ot
+from taichi_mrf.export.octomap_reader import read_octomap
+from taichi_mrf.methods.log_odds.map import LogOddsMap
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.methods.registry import load_map
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.noise import PatchNoise, noise_from_config
+from taichi_mrf.system.atomic import write_npz as write_arrays
+
+CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
+
+
+class FramesRefusedError(TaichiMRFError):
+    """Some frames are broken and named, the others could be read."""
+
+
+@dataclass(frozen=True)
+class Loader:
+    """``make`` writes a good input into an empty folder and returns what ``read`` is to be given; ``sealed``
+    says that the format has checksums, so that damaged bytes must not read as something else."""
+
+    name: str
+    make: Callable[[Path], Path]
+    read: Callable[[Path], bytes]
+    sealed: bool = False
+
+
+def frames_of(dataset: Dataset) -> bytes:
+    """All frames of a recording, each of which must be sound, or refused by its name."""
+    found, refused = [], []
+    for index, name in enumerate(dataset.frame_names):
+        try:
+            frame = dataset.read(index)
+        except FrameError as error:
+            refused.append((name, str(error)))
+            continue
+        assert frame.depth_m.shape == frame.camera.shape == dataset.camera.shape
+        assert frame.depth_m.dtype == np.float32
+        assert np.isfinite(frame.depth_m).all()
+        assert (frame.depth_m >= 0).all()
+        assert frame.T_world_camera.shape == (4, 4)
+        assert np.isfinite(frame.T_world_camera).all()
+        parts = (frame.depth_m.tobytes(), frame.T_world_camera.tobytes(), frame.stamp, name)
+        found.append((*parts, None if frame.color is None else frame.color.tobytes()))
+    assert all(f"frame {name}: " in said for name, said in refused)
+    if refused:
+        raise FramesRefusedError(refused[0][1])
+    return pickle.dumps((astuple(dataset.camera), dataset.dropped, found))
+
+
+def mapped(dataset: Dataset) -> None:
+    """Put whatever could be read of a damaged recording into a map: it is one, or is refused."""
+    m = MRFMap(0.25, max_depth=6.0)
+    for index in range(min(2, len(dataset))):
+        try:
+            frame = dataset.read(index)
+            m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera, frame.name)
+        except TaichiMRFError:
+            continue
+    _answers(m)
+
+
+def _answers(m: OccupancyMap) -> None:
+    """What a map says of itself is sound."""
+    m.infer(sweeps=1)
+    centres, p = m.voxels(0.0)
+    assert np.isfinite(centres).all()
+    assert ((p >= 0) & (p <= 1)).all()
+    assert np.isfinite(m.occupancy(centres[:100])).all()
+
+
+def _dataset(path: Path) -> bytes:
+    dataset = open_dataset(path)
+    content = frames_of(dataset)
+    _again.dataset = dataset
+    return content
+
+
+class _Again:
+    """The recording that was read last."""
+
+    dataset: Dataset | None = None
+
+
+_again = _Again()
+
+
+def map_last_dataset() -> None:
+    """Map what was read last, if it was a recording."""
+    if _again.dataset is not None:
+        mapped(_again.dataset)
+        _again.dataset = None
+
+
+def _map(path: Path) -> bytes:
+    """The map as it would be saved again."""
+    m = load_map(path)
+    again = path.with_name(".again.npz")
+    m.save(again)
+    content = again.read_bytes()
+    again.unlink()
+    if content != path.read_bytes():
+        _answers(m)
+    return content
+
+
+def _arrays_of(*values: object) -> bytes:
+    return pickle.dumps(values)
+
+
+def _scans(path: Path) -> bytes:
+    scans = open_scans(path)
+    assert np.isfinite(scans.range_m).all()
+    assert np.isfinite(scans.pose_x_y_theta).all()
+    return _arrays_of(scans.range_m, scans.angle_rad, scans.pose_x_y_theta, scans.hit)
+
+
+def _octomap(path: Path) -> bytes:
+    leaves = read_octomap(path)
+    bricks, log_odds = leaves.bricks()
+    assert np.isfinite(log_odds).all()
+    return _arrays_of(leaves.voxel_size, bricks, log_odds)
+
+
+def _config(path: Path) -> bytes:
+    config = load(path)
+    noise = noise_from_config(config.sensor, CAMERA)
+    assert np.isfinite(noise.table(CAMERA).coefficients).all()
+    return commented_yaml(config).encode() + noise.table(CAMERA).coefficients.tobytes()
+
+
+def _noise(path: Path) -> bytes:
+    noise = PatchNoise.load(path)
+    return _arrays_of(noise.sigma, noise.bias, noise.patch, astuple(noise.camera))
+
+
+def _stream(path: Path) -> bytes:
+    stream = read_pose_stream(path)
+    return _arrays_of(stream.stamps, stream.poses)
+
+
+def _plan(path: Path) -> bytes:
+    plan = read_floor_plan(path, (4.0, 3.0))
+    return _arrays_of(plan.wall, plan.pixel_x_y)
+
+
+def _mesh(path: Path) -> bytes:
+    mesh = load_mesh(path)
+    return _arrays_of(mesh.vertices, mesh.triangles)
+
+
+def _depth_images(path: Path) -> bytes:
+    files = DepthFiles(path, 1000.0)
+    return _arrays_of(*((name, files.read(name)) for name in files.names))
+
+
+def _content() -> Content:
+    return Content(2)
+
+
+def _seven_scenes(folder: Path) -> Path:
+    return write_seven_scenes(folder, _content())
+
+
+def _with_camera(name: str, text: str, folder: Path) -> Path:
+    write_seven_scenes(folder, _content())
+    (folder / "camera.txt").unlink()
+    (folder / name).write_text(text)
+    return folder
+
+
+def _tum(folder: Path) -> Path:
+    return write_tum(folder, _content())
+
+
+def _redwood(folder: Path) -> Path:
+    write_log(write_numbered(folder, _content()) / "trajectory.log", _content().poses)
+    return folder
+
+
+def _icl(folder: Path) -> Path:
+    write_numbered(folder, _content())
+    lines = [stamped_line(i, pose) for i, pose in enumerate(_content().poses)]
+    (folder / "livingRoom2.gt.freiburg").write_text("\n".join(lines))
+    return folder
+
+
+def _open3d(folder: Path) -> Path:
+    write_numbered(folder, _content(), place="depth")
+    (folder / "camera.txt").unlink()
+    entries = [{"extrinsic": column_by_column(p), "intrinsic": INTRINSIC} for p in _content().poses]
+    values = {"class_name": "PinholeCameraTrajectory", "parameters": entries}
+    (folder / "trajectory.json").write_text(json.dumps(values, indent=1))
+    return folder
+
+
+def _scannet(folder: Path) -> Path:
+    return write_scannet(folder, _content())
+
+
+def _replica(folder: Path) -> Path:
+    return write_replica(folder, _content(), folder / "cam_params.json")
+
+
+def _npz(folder: Path) -> Path:
+    return write_npz(folder / "walk.npz", arrays(_content()))
+
+
+def _npz_folder(folder: Path) -> Path:
+    for name in ("a", "b"):
+        write_npz(folder / f"{name}.npz", arrays(_content()))
+    return folder
+
+
+def _kitti(folder: Path) -> Path:
+    return write_kitti(folder)
+
+
+def _stereo(folder: Path) -> Path:
+    return write_stereo_file(folder, ["a", "b", "c"])
+
+
+def _bag(kind: Kind, folder: Path) -> Path:
+    path = folder / ("walk.bag" if kind == "ros1" else "walk")
+    with writing(path, kind) as bag:
+        plain(bag)
+    return path
+
+
+def _carmen_text() -> str:
+    lines = [ODOMETRY, flaser([1.0, 2.0, 3.0], [0.1, 0.2, 0.3]), ODOMETRY, flaser([1.5, 2, 60], [1, 2, 3])]
+    return "\n".join([*lines, "PARAM x 1"])
+
+
+def _carmen(folder: Path) -> Path:
+    (folder / "walk.log").write_text(_carmen_text())
+    return folder / "walk.log"
+
+
+def _robotlaser(folder: Path) -> Path:
+    lines = [robotlaser([1.0, 2.0, 3.0], [0.1, i, 0.3], -1.5, 1.5, 81.9, (3, 4, 5)) for i in range(2)]
+    (folder / "walk.log").write_text("\n".join(lines))
+    return folder / "walk.log"
+
+
+def _carmen_gzip(folder: Path) -> Path:
+    (folder / "walk.log.gz").write_bytes(gzip.compress(_carmen_text().encode()))
+    return folder / "walk.log.gz"
+
+
+def _scan_npz(folder: Path) -> Path:
+    return write_scans(folder / "scans.npz")
+
+
+def _plan_png(folder: Path) -> Path:
+    wall = np.full((30, 40), 255, np.uint8)
+    wall[::7] = 0
+    return write_image(folder / "plan.png", wall)
+
+
+@cache
+def _small_map(method: str) -> OccupancyMap:
+    """Two views of a wall, of which an MRFMap has frozen one."""
+    m: OccupancyMap = MRFMap(0.2, max_depth=4.0) if method == "mrf" else LogOddsMap(0.2, max_depth=4.0)
+    for i in range(3):
+        depth_m = np.full(CAMERA.shape, 1.5 + 0.1 * i, np.float32)
+        m.add_keyframe(depth_m, np.eye(4), CAMERA, f"frame {i}")
+    m.infer()
+    if isinstance(m, MRFMap):
+        m.freeze_keyframe(0)
+        m.infer()
+    return m
+
+
+def _saved_map(method: str, folder: Path) -> Path:
+    _small_map(method).save(folder / "map.npz")
+    return folder / "map.npz"
+
+
+def _octree(suffix: str, folder: Path) -> Path:
+    path = folder / f"map{suffix}"
+    (write_ot if suffix == ".ot" else write_bt)(path, _small_map("log_odds"))
+    return path
+
+
+def _yaml(folder: Path) -> Path:
+    tables = np.random.default_rng(0).uniform(0.01, 0.02, (4, 3))
+    np.save(folder / "sigma.npy", tables)
+    np.save(folder / "bias.npy", tables)
+    text = commented_yaml(Config()).replace("sigma_table: null", "sigma_table: sigma.npy")
+    text = text.replace("bias_table: null", "bias_table: bias.npy").replace("patch: 20", "patch: 8")
+    (folder / "my.yaml").write_text("\n".join(x for x in text.splitlines() if "#" not in x))
+    return folder / "my.yaml"
+
+
+def _noise_npz(folder: Path) -> Path:
+    tables = np.random.default_rng(0).uniform(0.01, 0.02, (4, 3))
+    write_arrays(folder / "noise.npz", PatchNoise(tables, tables, 8, CAMERA).arrays())
+    return folder / "noise.npz"
+
+
+def _stream_file(folder: Path) -> Path:
+    lines = [stamped_line(0.1 * i, pose) for i, pose in enumerate(_content().poses)]
+    (folder / "poses.txt").write_text("\n".join(lines))
+    return folder / "poses.txt"
+
+
+def _stamps_file(folder: Path) -> Path:
+    (folder / "stamps.txt").write_text("0.5 a.png\n1.5 b.png\n")
+    return folder / "stamps.txt"
+
+
+def _stack(suffix: str, folder: Path) -> Path:
+    depth_m = np.stack(_content().depth) / np.float32(1000)
+    if suffix == ".npy":
+        np.save(folder / "stack.npy", depth_m)
+    else:
+        np.savez(folder / "stack.npz", depth_m=depth_m)
+    return folder / f"stack{suffix}"
+
+
+def _ply(folder: Path) -> Path:
+    lines = ["ply", "format ascii 1.0", "element vertex 3", *(f"property float {axis}" for axis in "xyz")]
+    lines += ["element face 1", "property list uchar int vertex_indices", "end_header"]
+    (folder / "mesh.ply").write_text("\n".join([*lines, "0 0 0", "1 0 0", "0 1 0", "3 0 1 2", ""]))
+    return folder / "mesh.ply"
+
+
+def _stamps(path: Path) -> bytes:
+    return _arrays_of(read_stamps(path))
+
+
+K_TXT = "14 0 7.5\n0 15 5.5\n0 0 1"
+CAMERA_YAML = "width: 16\nheight: 12\nfx: 14\nfy: 15\ncx: 7.5\ncy: 5.5\n"
+
+LOADERS = [
+    Loader("7-Scenes", _seven_scenes, _dataset),
+    Loader("7-Scenes, camera.yaml", partial(_with_camera, "camera.yaml", CAMERA_YAML), _dataset),
+    Loader("7-Scenes, intrinsics.txt", partial(_with_camera, "intrinsics.txt", K_TXT), _dataset),
+    Loader("TUM RGB-D", _tum, _dataset),
+    Loader("Redwood .log", _redwood, _dataset),
+    Loader("ICL-NUIM .freiburg", _icl, _dataset),
+    Loader("Open3D JSON", _open3d, _dataset),
+    Loader("ScanNet", _scannet, _dataset),
+    Loader("Replica", _replica, _dataset),
+    Loader("frames npz", _npz, _dataset, sealed=True),
+    Loader("frames npz, folder", _npz_folder, _dataset, sealed=True),
+    Loader("KITTI stereo", _kitti, _dataset),
+    Loader("stereo YAML", _stereo, _dataset),
+    Loader("ROS 1 bag", partial(_bag, "ros1"), _dataset),
+    Loader("ROS 2 bag, sqlite", partial(_bag, "sqlite"), _dataset),
+    Loader("MCAP", partial(_bag, "mcap"), _dataset),
+    Loader("CARMEN log", _carmen, _scans),
+    Loader("CARMEN log, ROBOTLASER1", _robotlaser, _scans),
+    Loader("CARMEN log, gzip", _carmen_gzip, _scans, sealed=True),
+    Loader("scans npz", _scan_npz, _scans, sealed=True),
+    Loader("floor plan", _plan_png, _plan),
+    Loader("map, MRFMap", partial(_saved_map, "mrf"), _map, sealed=True),
+    Loader("map, LogOddsMap", partial(_saved_map, "log_odds"), _map, sealed=True),
+    Loader("OctoMap .ot", partial(_octree, ".ot"), _octomap),
+    Loader("OctoMap .bt", partial(_octree, ".bt"), _octomap),
+    Loader("configuration YAML", _yaml, _config),
+    Loader("noise.npz", _noise_npz, _noise, sealed=True),
+    Loader("pose stream", _stream_file, _stream),
+    Loader("stamps", _stamps_file, _stamps),
+    Loader("depth stack npy", partial(_stack, ".npy"), _depth_images),
+    Loader("depth stack npz", partial(_stack, ".npz"), _depth_images, sealed=True),
+    Loader("mesh PLY", _ply, _mesh),
+]

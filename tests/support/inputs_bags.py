@@ -1,0 +1,200 @@
+"""Writes ROS 1 bags, ROS 2 bags and MCAP files with rosbags, for the tests of their reader."""
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from datasets_recordings import quaternion_of
+from numpy.typing import NDArray
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.camera import PinholeCamera
+
+Kind = Literal["ros1", "sqlite", "mcap"]
+START = 1_600_000_000.0
+"""Seconds of the first stamps."""
+
+
+def nanoseconds(stamp: float) -> int:
+    """A stamp in seconds after START, in nanoseconds."""
+    return round((START + stamp) * 1e9)
+
+
+class Bag:
+    """A bag in the making. Stamps are seconds after START; messages are recorded ``latency`` later."""
+
+    latency = 0.05
+
+    def __init__(self, kind: Kind, writer: Any) -> None:
+        self.kind, self.writer = kind, writer
+        self.types = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+        if kind == "ros1":  # whose store of types has no tf2
+            text = "geometry_msgs/TransformStamped[] transforms"
+            self.types.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
+        self.connections: dict[str, Any] = {}
+
+    def send(self, topic: str, name: str, stamp: float, **fields: Any) -> None:
+        """Record a message of a type such as sensor_msgs/msg/Image."""
+        if topic not in self.connections:
+            self.connections[topic] = self.writer.add_connection(topic, name, typestore=self.types)
+        message = self.message(name, **fields)
+        serialize = self.types.serialize_ros1 if self.kind == "ros1" else self.types.serialize_cdr
+        self.writer.write(
+            self.connections[topic], nanoseconds(stamp + self.latency), serialize(message, name)
+        )
+
+    def message(self, name: str, **fields: Any) -> Any:
+        return self.types.types[name](**fields)
+
+    def header(self, stamp: float, frame: str) -> Any:
+        seconds, rest = divmod(nanoseconds(stamp), 10**9)
+        time = self.message("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
+        sequence = {"seq": 0} if self.kind == "ros1" else {}
+        return self.message("std_msgs/msg/Header", stamp=time, frame_id=frame, **sequence)
+
+    def image(
+        self, topic: str, stamp: float, frame: str, image: NDArray, encoding: str, big: bool = False
+    ) -> None:
+        """An Image whose rows are padded by four bytes."""
+        height, width = image.shape[:2]
+        data = image.astype(image.dtype.newbyteorder(">" if big else "<")).view(np.uint8).reshape(height, -1)
+        padded = np.pad(data, ((0, 0), (0, 4)))
+        self.send(
+            topic,
+            "sensor_msgs/msg/Image",
+            stamp,
+            header=self.header(stamp, frame),
+            height=height,
+            width=width,
+            encoding=encoding,
+            is_bigendian=int(big),
+            step=padded.shape[1],
+            data=padded.reshape(-1),
+        )
+
+    def compressed_depth(
+        self, topic: str, stamp: float, frame: str, image: NDArray, kind: str = "16UC1"
+    ) -> None:
+        """A CompressedImage as image_transport's compressedDepth plugin writes it; 32FC1 from metres."""
+        scale, offset = 0.0, 0.0
+        if kind == "32FC1":  # depth_quantization 100, depth_max 10 m: the plugin's own defaults
+            scale, offset = 100.0 * 101.0, 1 - 100.0 * 101.0 / 10.0
+            with np.errstate(divide="ignore"):
+                image = np.where(image > 0, np.rint(scale / image + offset), 0).astype(np.uint16)
+        png = cv2.imencode(".png", image)[1].tobytes()
+        data = struct.pack("<iff", 0, scale, offset) + png
+        self.send(
+            topic,
+            "sensor_msgs/msg/CompressedImage",
+            stamp,
+            header=self.header(stamp, frame),
+            format=f"{kind}; compressedDepth png",
+            data=np.frombuffer(data, np.uint8),
+        )
+
+    def camera_info(
+        self,
+        topic: str,
+        frame: str,
+        camera: PinholeCamera,
+        distortion: tuple[float, ...] = (),
+        model: str = "plumb_bob",
+        projection: PinholeCamera | None = None,
+    ) -> None:
+        """A CameraInfo; ``projection`` is that of the rectified images."""
+        roi = self.message(
+            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        )
+        P = np.zeros((3, 4))
+        P[:, :3] = matrix(projection or camera)
+        arrays = {
+            "d": np.array(distortion or [0.0] * 5),
+            "k": matrix(camera).reshape(-1),
+            "r": np.eye(3).reshape(-1),
+            "p": P.reshape(-1),
+        }
+        if self.kind == "ros1":
+            arrays = {name.upper(): values for name, values in arrays.items()}
+        self.send(
+            topic,
+            "sensor_msgs/msg/CameraInfo",
+            0.0,
+            header=self.header(0.0, frame),
+            height=camera.height,
+            width=camera.width,
+            distortion_model=model,
+            binning_x=0,
+            binning_y=0,
+            roi=roi,
+            **arrays,
+        )
+
+    def pose(self, T: Pose) -> Any:
+        x, y, z, w = quaternion_of(T[:3, :3])
+        return self.message(
+            "geometry_msgs/msg/Pose",
+            position=self.message("geometry_msgs/msg/Point", **dict(zip("xyz", T[:3, 3], strict=True))),
+            orientation=self.message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+        )
+
+    def odometry(self, topic: str, stamp: float, frame: str, child: str, T: Pose) -> None:
+        zero = self.message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+        twist = self.message("geometry_msgs/msg/Twist", linear=zero, angular=zero)
+        self.send(
+            topic,
+            "nav_msgs/msg/Odometry",
+            stamp,
+            header=self.header(stamp, frame),
+            child_frame_id=child,
+            pose=self.message(
+                "geometry_msgs/msg/PoseWithCovariance", pose=self.pose(T), covariance=np.zeros(36)
+            ),
+            twist=self.message("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
+        )
+
+    def pose_stamped(self, topic: str, stamp: float, frame: str, T: Pose) -> None:
+        name = "geometry_msgs/msg/PoseStamped"
+        self.send(topic, name, stamp, header=self.header(stamp, frame), pose=self.pose(T))
+
+    def tf(self, topic: str, stamp: float, parent: str, child: str, T: Pose) -> None:
+        x, y, z, w = quaternion_of(T[:3, :3])
+        transform = self.message(
+            "geometry_msgs/msg/TransformStamped",
+            header=self.header(stamp, parent),
+            child_frame_id=child,
+            transform=self.message(
+                "geometry_msgs/msg/Transform",
+                translation=self.message(
+                    "geometry_msgs/msg/Vector3", **dict(zip("xyz", T[:3, 3], strict=True))
+                ),
+                rotation=self.message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+            ),
+        )
+        self.send(topic, "tf2_msgs/msg/TFMessage", stamp, transforms=[transform])
+
+
+def matrix(camera: PinholeCamera) -> NDArray[np.float64]:
+    """The 3 x 3 matrix of a camera."""
+    return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+
+
+@contextmanager
+def writing(path: Path, kind: Kind) -> Iterator[Bag]:
+    """A new bag: a .bag file for ros1, else the folder of a ROS 2 bag."""
+    if kind == "ros1":
+        writer: Any = Writer1(path)
+        writer.set_compression(Writer1.CompressionFormat.LZ4)
+        writer.chunk_threshold = 1 << 14
+    else:
+        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+        writer = Writer2(path, version=9, storage_plugin=plugin)
+    with writer:
+        yield Bag(kind, writer)

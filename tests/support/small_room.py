@@ -1,0 +1,48 @@
+"""A small stretch of the built-in room, mapped coarsely: what tests of whole maps share.
+
+As a program it maps the room on a backend of its own and writes the marginals at the probe points,
+because Taichi can be started only once in a process: ``python small_room.py cpu out.npy``.
+"""
+
+import sys
+from functools import cache
+
+import numpy as np
+
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.system import runtime
+
+VOXEL_SIZE = 0.08
+
+
+@cache
+def frames() -> list[Frame]:
+    """Ten frames around the room."""
+    dataset = open_dataset("synthetic:room?width=160&height=120&frames=10")
+    return [dataset.read(i) for i in range(len(dataset))]
+
+
+def add(m: MRFMap, frame: Frame) -> int:
+    return m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera, frame.name)
+
+
+def build(chosen: list[int]) -> MRFMap:
+    """A map of some of the frames, fully inferred."""
+    m = MRFMap(VOXEL_SIZE)
+    for i in chosen:
+        add(m, frames()[i])
+    m.infer()
+    return m
+
+
+def probes() -> np.ndarray:
+    """Centres of all voxels in a box around the room."""
+    axes = [np.arange(-52, 52), np.arange(-46, 46), np.arange(-24, 24)]
+    return (np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) + 0.5) * VOXEL_SIZE
+
+
+if __name__ == "__main__":
+    runtime.init(sys.argv[1])
+    np.save(sys.argv[2], build(list(range(5))).occupancy(probes()))

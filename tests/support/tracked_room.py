@@ -1,0 +1,68 @@
+"""A walk through the built-in room as a camera without poses sees it: what tests of tracking share."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.config.schema import Config, EvaluationConfig
+from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.geometry.poses import Pose, tangent_norms
+from taichi_mrf.sensor.frame import Frame
+
+CONFIG = Config(voxel_size=0.05, evaluation=EvaluationConfig(hold_out=0))
+COUNT = 24
+START = np.eye(4)
+"""Where the walk is taken to begin; it does not say where in the room that is."""
+
+
+@cache
+def frames() -> list[Frame]:
+    """A quarter of the way around the room: 8 cm and 4 degrees from one image to the next, as of a camera
+    that is carried about at 10 images a second, with a Kinect 1's noise."""
+    dataset = open_dataset("synthetic:room?frames=100&width=160&height=120", color=False)
+    return [replace(dataset.read(i), stamp=i / 10) for i in range(COUNT)]
+
+
+@dataclass
+class Walk(Dataset):
+    """The walk. ``shown`` are the depth images that stand in for some, by index."""
+
+    shown: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)
+    order: Sequence[int] = tuple(range(COUNT))
+
+    @property
+    def frame_names(self) -> Sequence[str]:
+        return [f"walk-{i:03d}" for i in range(len(self.order))]
+
+    def read(self, index: int) -> Frame:
+        frame = frames()[self.order[index]]
+        depth_m = self.shown.get(index, frame.depth_m)
+        stamp = index / 10
+        return replace(
+            frame, depth_m=depth_m, T_world_camera=START, name=self.frame_names[index], stamp=stamp
+        )
+
+
+def walk(
+    order: Sequence[int] = tuple(range(COUNT)), shown: Mapping[int, NDArray[np.float32]] | None = None
+) -> Walk:
+    return Walk("walk", frames()[0].camera, tracked=True, order=order, shown=shown or {})
+
+
+def true_pose(index: int) -> Pose:
+    """Where a frame was taken, as seen from the first."""
+    return np.linalg.inv(frames()[0].T_world_camera) @ frames()[index].T_world_camera
+
+
+def errors(poses: Mapping[int, Pose], order: Sequence[int] = tuple(range(COUNT))) -> NDArray[np.float64]:
+    """(N, 2): how far each pose is off, in radians and metres."""
+    return np.array([tangent_norms(true_pose(order[i]), T) for i, T in poses.items()])
+
+
+def nowhere() -> NDArray[np.float32]:
+    """An image of another place: a slanted wall, near by."""
+    rows, columns = np.mgrid[: frames()[0].camera.height, : frames()[0].camera.width]
+    return (0.7 + 0.002 * columns + 0.001 * rows).astype(np.float32)

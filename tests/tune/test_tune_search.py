@@ -1,0 +1,119 @@
+"""The automatic search: where it looks, that it can be repeated, and what it is compared with."""
+
+import dataclasses
+import math
+import sys
+
+import pytest
+from tune_scene import CONFIG, working_set
+
+from taichi_mrf.config.schema import Config, InferenceConfig, SensorConfig
+from taichi_mrf.config.text import differences
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.tune.search import DEFAULT_SEARCH, SIGMA_SCALE, Search, dimensions
+from taichi_mrf.tune.verdict import FOUND, SHIPPED, STARTED, Judged, contenders, judge_unseen, verdict_lines
+from taichi_mrf.viewer.tune.knobs import KNOBS
+
+pytest.importorskip("optuna", reason="the search needs Optuna (extra: auto)")
+
+
+def asked(seed: int, tries: int = 8) -> list[Config]:
+    search = Search(CONFIG, ("inference.surface_density", "inference.sweeps"), tries, seed)
+    found = []
+    while not search.done:
+        found.append(search.ask())
+        assert search.ask() is found[-1]
+        search.tell(-abs(found[-1].inference.surface_density - 5.0))
+    return found
+
+
+def test_the_first_try_is_where_the_search_begins() -> None:
+    search = Search(CONFIG, DEFAULT_SEARCH, 2, seed=0)
+    assert search.ask() == CONFIG
+    search.tell(1.0)
+    second = search.ask()
+    assert set(differences(CONFIG, second)) == {
+        "inference.surface_density",
+        "inference.outlier_floor",
+        "inference.message_clamp",
+        "inference.free_share",
+        "sensor.sigma",
+    }
+    assert search.best == CONFIG
+
+
+def test_a_search_can_be_repeated_by_its_seed() -> None:
+    assert asked(1) == asked(1)
+    assert asked(1) != asked(2)
+
+
+def test_it_comes_nearer_to_what_is_likeliest() -> None:
+    best = max(asked(0, tries=40), key=lambda config: -abs(config.inference.surface_density - 5.0))
+    assert abs(best.inference.surface_density - 5.0) < 0.5
+
+
+def test_a_failed_try_counts_but_is_never_the_best() -> None:
+    search = Search(CONFIG, ("inference.free_share",), 2, seed=0)
+    search.ask()
+    search.tell(math.nan)
+    assert (search.told, search.best) == (1, None)
+    only = search.ask()
+    search.tell(-3.0)
+    assert search.best == only
+    assert search.done
+
+
+def test_the_scale_multiplies_every_coefficient_of_sigma() -> None:
+    search = Search(CONFIG, (SIGMA_SCALE,), 2, seed=0)
+    search.ask()
+    search.tell(0.0)
+    ratio = [a / b for a, b in zip(search.ask().sensor.sigma, CONFIG.sensor.sigma, strict=True)]
+    assert ratio == pytest.approx([ratio[0]] * 3, rel=1e-3)
+    assert ratio[0] != pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("name", [knob.name for knob in KNOBS if knob.applies(CONFIG)])
+def test_everything_that_applies_can_be_searched(name: str) -> None:
+    search = Search(CONFIG, (name,), 5, seed=0)
+    for number in range(5):
+        config = search.ask()
+        field = name.partition("[")[0]
+        assert set(differences(CONFIG, config)) <= {field}
+        search.tell(float(number))
+
+
+def test_what_cannot_be_searched_is_told_in_one_line() -> None:
+    with pytest.raises(ConfigError, match=r"--search inference.swep: cannot be searched"):
+        dimensions(("inference.swep",), CONFIG)
+    with pytest.raises(ConfigError, match="changes nothing"):
+        dimensions(("log_odds.hit",), CONFIG)
+    table = dataclasses.replace(CONFIG, sensor=SensorConfig(sigma_table="sigma.npy"))
+    with pytest.raises(ConfigError, match="sigma_table is in force"):
+        dimensions((SIGMA_SCALE,), table)
+
+
+def test_without_optuna_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(ConfigError, match=r"--auto needs optuna, .*: pip install 'taichi-mrf\[auto\]'"):
+        Search(CONFIG, DEFAULT_SEARCH, 3, 0)
+
+
+def test_what_was_found_is_compared_with_the_shipped_defaults_and_the_start() -> None:
+    found = dataclasses.replace(CONFIG, inference=InferenceConfig(sweeps=5))
+    assert contenders(CONFIG, found) == [(SHIPPED, CONFIG), (FOUND, found)]
+    start = dataclasses.replace(CONFIG, inference=InferenceConfig(sweeps=1))
+    assert contenders(start, found) == [(SHIPPED, CONFIG), (STARTED, start), (FOUND, found)]
+
+
+def test_the_verdict_is_that_of_the_unseen_views() -> None:
+    frames = working_set()
+    judged = judge_unseen(frames, [(SHIPPED, CONFIG)], lambda activity, share: True)
+    swapped = dataclasses.replace(frames, held_out=frames.unseen, unseen=frames.held_out)
+    other = judge_unseen(swapped, [(SHIPPED, CONFIG)], lambda activity, share: True)
+    assert judged is not None
+    assert other is not None
+    assert judged[0].scores.log_likelihood != other[0].scores.log_likelihood
+    assert judge_unseen(frames, [(SHIPPED, CONFIG)], lambda activity, share: False) is None
+    better = dataclasses.replace(judged[0].scores, log_likelihood=judged[0].scores.log_likelihood + 0.25)
+    lines = verdict_lines([*judged, Judged(FOUND, CONFIG, better)], 1)
+    assert any(line.strip().startswith("log-likelihood") and line.endswith("+0.250") for line in lines)

@@ -1,0 +1,204 @@
+"""Colours, widgets made from options, clicks and curves: what the page computes by itself."""
+
+import dataclasses
+import math
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from taichi_mrf.geometry.poses import as_pose
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.viewer.live.options import ColorBy, ViewOptions
+from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Keyframe, RayAnswer, pack_log_odds
+from taichi_mrf.viewer.scene.coloring import legend_html, scale_of, voxel_colors
+from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, Placement
+from taichi_mrf.viewer.scene.look import look_of, up_of, up_vector
+from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
+from taichi_mrf.viewer.scene.ray_plot import curves
+from taichi_mrf.viewer.scene.voxel_store import Shown, VoxelStore, facing
+from taichi_mrf.voxels.colors import marginal_colors
+
+HEIGHTS = (0.0, 2.0)
+
+
+def shown(log_odds: np.ndarray, seen: np.ndarray | None = None) -> Shown:
+    n = len(log_odds)
+    return Shown(
+        np.zeros((n, 3), np.uint8),
+        pack_log_odds(log_odds.astype(np.float32)),
+        np.zeros(n, np.uint8) if seen is None else seen.astype(np.uint8),
+    )
+
+
+def test_marginals_have_the_colours_of_the_files_and_pictures() -> None:
+    p = np.linspace(0.5, 0.9999, 200)
+    log_odds = np.log(p / (1 - p))
+    colors = voxel_colors(scale_of("marginal", 0.5, HEIGHTS), shown(log_odds), np.zeros(200))
+    # The log-odds are rounded to 1/512, which is at most one of 256 colours.
+    assert np.abs(colors.astype(int) - marginal_colors(p)).max() <= 4
+
+
+def test_the_scale_reaches_down_when_improbable_voxels_are_shown() -> None:
+    assert scale_of("marginal", 0.5, HEIGHTS).low == 0.5
+    low = scale_of("marginal", 0.2, HEIGHTS)
+    dark = voxel_colors(low, shown(np.array([-20.0])), np.zeros(1))
+    np.testing.assert_array_equal(dark[0], low.colors[0])
+
+
+def test_uncertainty_is_brightest_at_one_half() -> None:
+    scale = scale_of("uncertainty", 0.5, HEIGHTS)
+    colors = voxel_colors(scale, shown(np.array([0.0, 1.0, -1.0, 12.0])), np.zeros(4)).astype(int)
+    np.testing.assert_array_equal(colors[0], scale.colors[255])
+    p = 1 / (1 + math.exp(-1))
+    entropy = -(p * math.log2(p) + (1 - p) * math.log2(1 - p))
+    np.testing.assert_array_equal(colors[1], scale.colors[round(255 * entropy)])
+    np.testing.assert_array_equal(colors[1], colors[2])
+    np.testing.assert_array_equal(colors[3], scale.colors[0])
+
+
+def test_keyframes_are_counted_on_a_logarithmic_scale() -> None:
+    scale = scale_of("keyframes", 0.5, HEIGHTS, most_keyframes=60)
+    assert (scale.low, scale.high) == (1.0, 64.0)
+    seen = np.array([0, 1, 8, 64, 255])
+    colors = voxel_colors(scale, shown(np.zeros(5), seen), np.zeros(5))
+    np.testing.assert_array_equal(colors, scale.colors[[0, 0, round(255 / 2), 255, 255]])
+    assert scale_of("keyframes", 0.5, HEIGHTS, most_keyframes=0).high == 4.0
+
+
+def test_heights_run_over_the_map() -> None:
+    scale = scale_of("height", 0.5, HEIGHTS)
+    colors = voxel_colors(scale, shown(np.zeros(3)), np.array([0.0, 1.0, 2.0]))
+    np.testing.assert_array_equal(colors, scale.colors[[0, 128, 255]])
+
+
+@pytest.mark.parametrize("color_by", get_args(ColorBy))
+def test_every_mode_has_a_legend_with_its_ends(color_by: ColorBy) -> None:
+    scale = scale_of(color_by, 0.5, HEIGHTS)
+    text = legend_html(scale)
+    assert f"<span>{scale.low:.3g}</span>" in text
+    assert f"<span>{scale.high:.3g}</span>" in text
+
+
+def test_up_is_the_axis_that_cameras_hold_upwards() -> None:
+    # OpenCV's camera looks along z with y down; here it looks along the world's x, level.
+    level = np.eye(4)
+    level[:3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    assert up_of(as_pose(level)) == (2, 1)
+    np.testing.assert_array_equal(up_vector(up_of(np.eye(4))), [0, -1, 0])
+
+
+def test_looks_that_differ_only_in_unused_heights_are_the_same() -> None:
+    small, large = VoxelStore(), VoxelStore()
+    large.put(np.array([[5, 5, 5]], np.int32), np.zeros((1, 512), np.int16), np.zeros((1, 512), np.uint8))
+    by_marginal, by_height = ViewOptions(), ViewOptions(color_by="height")
+    up = (2, 1)
+    assert look_of(by_marginal, small, up, 0.05).same_everywhere(look_of(by_marginal, large, up, 0.05))
+    assert not look_of(by_height, small, up, 0.05).same_everywhere(look_of(by_height, large, up, 0.05))
+    moved = dataclasses.replace(by_marginal, threshold=0.6)
+    assert not look_of(by_marginal, large, up, 0.05).same_everywhere(look_of(moved, large, up, 0.05))
+
+
+CAMERA = PinholeCamera(64, 48, 50.0, 55.0, 30.0, 25.0)
+
+
+def keyframe(id: int, T_world_camera: np.ndarray) -> Keyframe:
+    return Keyframe(
+        id, "k", T_world_camera, CAMERA, 1, "on", np.zeros((2, 2, 3), np.uint8), np.zeros((0, 3), np.int32)
+    )
+
+
+def test_a_click_on_a_picture_finds_its_pixel() -> None:
+    rng = np.random.default_rng(3)
+    place = Placement(rng.normal(size=4), rng.normal(size=3))
+    place = Placement(place.wxyz / np.linalg.norm(place.wxyz), place.position)
+    T = place.pose()
+    u, v = 12.0, 40.0
+    on_picture = FRUSTUM_M * np.array([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, 1.0])
+    point = T[:3, :3] @ on_picture + T[:3, 3]
+    eye = point + rng.normal(size=3)
+    hit = first_pixel(eye, point - eye, [keyframe(7, T)])
+    assert hit is not None
+    assert (hit.keyframe, round(hit.u, 6), round(hit.v, 6)) == (7, u, v)
+    assert hit.range_m == pytest.approx(np.linalg.norm(point - eye))
+    assert first_pixel(eye, eye - point, [keyframe(7, T)]) is None
+    np.testing.assert_allclose(Placement.of(T).pose(), T, atol=1e-12)
+
+
+def test_a_click_meets_the_nearest_voxel_on_its_way() -> None:
+    centres = np.array([[3.0, 0.02, 0], [2.0, 0.03, 0], [1.0, 0.2, 0], [-1.0, 0, 0]])
+    hit = first_voxel((0, 0, 0), (5, 0, 0), centres, 0.1)
+    assert hit is not None
+    np.testing.assert_array_equal(hit[0], centres[1])
+    assert hit[1] == pytest.approx(2.0)
+    assert first_voxel((0, 0, 0), (0, 0, 1), centres, 0.1) is None
+
+
+def answer(measured_m: float | None) -> RayAnswer:
+    return RayAnswer(
+        "ray",
+        (0, 0, 0),
+        (1, 0, 0),
+        distance=np.array([0.5, 0.875, 2.0], np.float32),
+        length=np.array([0.5, 0.25, 0.5], np.float32),
+        occupancy=np.array([0.2, 0.4, 0.9], np.float32),
+        visibility=np.array([1.0, 0.8, 0.5], np.float32),
+        omega=np.array([0.1, 0.2, 4.0], np.float32),
+        measured_m=measured_m,
+        bias_m=0.1,
+        sigma_m=0.05,
+    )
+
+
+def test_the_curves_are_steps_over_the_voxels() -> None:
+    x, band, measured, visibility, omega, occupancy = curves(answer(1.95))
+    assert np.all(np.diff(x) > 0)
+    for at, p, vis, om in ((1.2, 0.0, 0.8, 0.0), (1.85, 0.9, 0.5, 1.0)):
+        here = np.argmin(np.abs(x - at))
+        assert occupancy[here] == pytest.approx(p)
+        assert visibility[here] == pytest.approx(vis)
+        assert omega[here] == pytest.approx(om)
+    assert x[0] == pytest.approx(1.8 - 0.75, abs=1e-5)
+    # The band is the measurement less its bias, and one sigma to either side.
+    np.testing.assert_allclose([x[band > 0].min(), x[band > 0].max()], [1.8, 1.9], atol=1e-5)
+    np.testing.assert_allclose(x[measured > 0], 1.95, atol=2e-6)
+    assert not curves(answer(None))[1].any()
+
+
+def test_an_empty_ray_has_curves_too() -> None:
+    none = np.zeros(0, np.float32)
+    empty = RayAnswer("ray", (0, 0, 0), (1, 0, 0), none, none, none, none, none, None, 0.0, 0.01)
+    assert all(len(curve) == len(curves(empty)[0]) for curve in curves(empty))
+
+
+def test_packed_steps_are_what_the_store_compares_with() -> None:
+    store = VoxelStore()
+    values = np.full((1, 512), round(0.4 / LOG_ODDS_STEP), np.int16)
+    store.put(np.zeros((1, 3), np.int32), values, np.zeros((1, 512), np.uint8))
+    p = 1 / (1 + math.exp(-0.39))
+    assert len(store.shown((0, 0, 0), math.log(p / (1 - p)), None).cells) == 512
+    assert len(store.shown((0, 0, 0), 0.41, None).cells) == 0
+
+
+def test_surfaces_are_darkened_by_the_way_they_face() -> None:
+    grid = np.zeros((64, 64, 64), bool)
+    grid[10, 5:15, 5:15] = True  # a wall across x
+    grid[40, 40, 40] = True
+    grid[63, 20:23, 20:23] = True  # at the chunk's end: the next chunk may go on
+    cells = np.argwhere(grid).astype(np.uint8)
+    numbers = facing(cells)
+    for cell, number in zip(cells.tolist(), numbers.tolist(), strict=True):
+        missing = [sum(not grid[tuple(c)] for c in neighbours(cell, axis)) for axis in range(3)]
+        assert number == (missing[0] * 3 + missing[1]) * 3 + missing[2]
+    scale = scale_of("marginal", 0.5, HEIGHTS)
+    bright = shown(np.full(3, 9.0))
+    plain = voxel_colors(scale, bright, np.zeros(3)).astype(float)
+    dark = voxel_colors(scale, bright, np.zeros(3), np.array([18, 2, 0], np.uint8)).astype(float)
+    assert np.all(dark[0] < 0.8 * plain[0] + 1)
+    np.testing.assert_array_equal(dark[1], plain[1])  # level surfaces stay as bright as the scale says
+
+
+def neighbours(cell: list[int], axis: int) -> list[list[int]]:
+    """The two next to a cell along an axis that are in the chunk."""
+    both = [[c + step * (a == axis) for a, c in enumerate(cell)] for step in (-1, 1)]
+    return [each for each in both if 0 <= each[axis] < 64]

@@ -1,0 +1,62 @@
+"""What the page remembers of keyframes: all that can be changed, and a bounded share of what is frozen."""
+
+import numpy as np
+
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.viewer.messages import Keyframe, KeyframeState
+from taichi_mrf.viewer.scene.shown_keyframes import MOST_FROZEN, MOST_WAYPOINTS, Roster
+
+CAMERA = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
+
+
+def keyframe(id: int, state: KeyframeState = "on") -> Keyframe:
+    T = np.eye(4)
+    T[0, 3] = id
+    crossed = np.array([[id, 0, 0], [id + 1, 0, 0]], np.int32)
+    return Keyframe(id, f"frame {id}", T, CAMERA, 1, state, np.zeros((2, 2, 3), np.uint8), crossed)
+
+
+def bricks(roster: Roster) -> set[tuple[int, ...]]:
+    return {tuple(brick) for each in roster.crossed() for brick in each.tolist()}
+
+
+def test_frozen_keyframes_are_forgotten_but_not_what_they_saw_nor_where_they_were() -> None:
+    roster, forgotten = Roster(), []
+    for id in range(3 * MOST_FROZEN):
+        roster.put(keyframe(id))
+        forgotten += roster.put(keyframe(id, "frozen"))
+    assert forgotten == list(range(2 * MOST_FROZEN))
+    assert sorted(roster.keyframes) == list(range(2 * MOST_FROZEN, 3 * MOST_FROZEN))
+    assert roster.recorded.keys() == roster.keyframes.keys()
+    assert bricks(roster) == {(x, 0, 0) for x in range(3 * MOST_FROZEN + 1)}
+    np.testing.assert_array_equal(roster.way_m()[:, 0], np.arange(3 * MOST_FROZEN))
+
+
+def test_what_can_be_changed_is_never_forgotten() -> None:
+    roster = Roster()
+    for id in range(4 * MOST_FROZEN):
+        assert roster.put(keyframe(id)) == []
+    assert len(roster.keyframes) == 4 * MOST_FROZEN
+
+
+def test_a_long_way_keeps_its_ends_and_its_order() -> None:
+    roster = Roster()
+    count = 3 * MOST_WAYPOINTS
+    for id in range(count):
+        roster.put(keyframe(id, "frozen"))
+    way = roster.way_m()[:, 0]
+    assert len(way) <= MOST_WAYPOINTS + MOST_FROZEN
+    assert way[0] == 0
+    assert way[-1] == count - 1
+    assert np.all(np.diff(way) > 0)
+    assert np.diff(way).max() <= 4
+
+
+def test_a_keyframe_that_is_off_has_seen_nothing_and_remembers_where_it_was() -> None:
+    roster = Roster()
+    roster.put(keyframe(1))
+    moved = keyframe(1, "off")
+    moved.T_world_camera[1, 3] = 5.0
+    roster.put(moved)
+    assert bricks(roster) == set()
+    assert roster.recorded[1][1, 3] == 0.0
