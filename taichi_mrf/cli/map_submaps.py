@@ -19,9 +19,9 @@ from taichi_mrf.config.schema import with_absolute_tables
 from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets.registry import absolute_source
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.evaluation.pictures.submap_picture import write_submap_picture
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.submaps.job import Sequence
+from taichi_mrf.submaps.picture import write_submap_picture
 from taichi_mrf.submaps.rounds import SubmapsResult, map_in_submaps
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.system.libraries import library

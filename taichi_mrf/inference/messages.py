@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.keyframe import VisibleBricks
-from taichi_mrf.kernels.strips import strip_begin, strip_length
 from taichi_mrf.kernels.types import F32, AnyArray, F32Array, I32Array, Template
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.strips import strip_begin, strip_length
 
 
 def new_messages(visible: VisibleBricks, precision: str) -> "ti.Ndarray":

@@ -27,7 +27,6 @@ from taichi_mrf.inference.first_occupied import NEVER
 from taichi_mrf.inference.max_product import best_message, cost, see_best
 from taichi_mrf.inference.ray_list import block_of
 from taichi_mrf.kernels.log_odds import clamped_log_odds, exp_of_negative, logistic, softplus
-from taichi_mrf.kernels.strips import strip_begin
 from taichi_mrf.kernels.types import (
     F32,
     I32,
@@ -54,6 +53,7 @@ from taichi_mrf.sensor.forward import (
 )
 from taichi_mrf.sensor.rays import deals, dealt_ray, pixel_direction
 from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.strips import strip_begin
 from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
 
 TINY = 1e-30
@@ -86,7 +86,7 @@ def cavity(
     """Eq. 6: what a voxel tells this keyframe's rays is all that it knows but from them.
 
     Writes log(1 - m) for each voxel, its log-odds bounded by ``lowest`` and ``highest``, and empties the
-    sums. ``strip``: voxels an iteration (kernels/strips.py), here and below.
+    sums. ``strip``: voxels an iteration (voxels/strips.py), here and below.
     """
     for part in range(slots.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, slots, strip)

@@ -12,12 +12,12 @@ from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.accumulators import finest_scale
 from taichi_mrf.inference.keyframe import Keyframe, RayList
 from taichi_mrf.kernels.resident import on_host
-from taichi_mrf.kernels.strips import strip_length
 from taichi_mrf.kernels.vectors import vec4_array
 from taichi_mrf.sensor.forward import AUTO, CENTRE, SEGMENT
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.strips import strip_length
 from taichi_mrf.voxels.traversal import FAR
 from taichi_mrf.voxels.window import WindowIndex
 

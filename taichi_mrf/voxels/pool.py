@@ -15,11 +15,11 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
-from taichi_mrf.kernels.strips import strip_begin, strip_length
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Template
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.strips import strip_begin, strip_length
 
 GROWTH = 1.2
 """A full pool grows by this factor: little enough that the slack does not show in the bytes a voxel."""

@@ -15,10 +15,10 @@ from taichi_mrf.inference.keyframe_bounds import Whereabouts
 from taichi_mrf.inference.messages import carry_over, new_messages, withdraw_messages
 from taichi_mrf.inference.ray_list import RayLister
 from taichi_mrf.inference.sweep import unknown_begins
-from taichi_mrf.kernels.strips import strip_length
 from taichi_mrf.methods.mrf.brick_registry import BrickBook
 from taichi_mrf.methods.mrf.memory_budget import Room
 from taichi_mrf.system import runtime
+from taichi_mrf.voxels.strips import strip_length
 
 SCOUTS = 4
 """Of so many neighbouring rays one is followed through free space to find the bricks that they cross."""

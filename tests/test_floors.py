@@ -1,0 +1,94 @@
+"""docs/floors.yaml holds: a package imports only what its entry allows, no two modules import each other in a
+circle, every package says what it is for, and no file grows past 400 lines."""
+
+import ast
+from functools import cache
+from pathlib import Path
+
+import yaml
+
+import taichi_mrf
+
+PACKAGE = Path(taichi_mrf.__file__).parent
+FLOORS = yaml.safe_load((PACKAGE.parent / "docs" / "floors.yaml").read_text(encoding="utf-8"))
+OPEN_TO_ALL = {"errors", ""}
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """Every module's dotted name below the package, with its file."""
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        found[".".join(parts).removesuffix("__init__").removesuffix(".")] = path
+    return found
+
+
+@cache
+def imports() -> dict[str, set[str]]:
+    """The modules that each module imports, wherever in the file it does so."""
+    return {name: _imported(path) & set(modules()) for name, path in modules().items()}
+
+
+def _imported(path: Path) -> set[str]:
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            submodules = {f"{node.module}.{alias.name}" for alias in node.names}
+            inner = {name for name in submodules if _inside(name) in modules()}
+            found |= inner or {node.module}
+    return {_inside(name) for name in found if name.split(".")[0] == "taichi_mrf"}
+
+
+def _inside(name: str) -> str:
+    return name.removeprefix("taichi_mrf").removeprefix(".")
+
+
+def room(module: str) -> str:
+    return module.split(".")[0]
+
+
+def test_the_table_has_no_cycle() -> None:
+    seen: set[str] = set()
+    for name, floor in FLOORS.items():
+        assert set(floor["uses"]) <= seen, f"{name} uses what stands below it in docs/floors.yaml"
+        seen.add(name)
+
+
+def test_packages_import_only_what_the_table_allows() -> None:
+    wrong = [
+        f"{module} imports {name}"
+        for module, names in imports().items()
+        for name in names
+        if room(module) not in {"", "__main__"}
+        and room(name) not in {room(module), *OPEN_TO_ALL, *FLOORS[room(module)]["uses"]}
+    ]
+    assert not wrong
+
+
+def test_the_table_allows_nothing_that_nobody_uses() -> None:
+    used: dict[str, set[str]] = {name: set() for name in FLOORS}
+    for module, names in imports().items():
+        if room(module) in used:
+            used[room(module)] |= {room(name) for name in names} - {room(module), *OPEN_TO_ALL}
+    assert used == {name: set(floor["uses"]) for name, floor in FLOORS.items()}
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    graph = {name: set(names) - {name} for name, names in imports().items()}
+    while leaves := {name for name, names in graph.items() if not names & set(graph)}:
+        graph = {name: names for name, names in graph.items() if name not in leaves}
+    in_circles = {name for name in graph if any(name in graph[other] for other in graph)}
+    assert not {name for name in in_circles if room(name) != "cli"}
+
+
+def test_every_package_says_what_it_is_for() -> None:
+    packages = [path for path in modules().values() if path.name == "__init__.py"]
+    assert not [path for path in packages if not ast.get_docstring(ast.parse(path.read_text("utf-8")))]
+
+
+def test_no_file_grows_past_400_lines() -> None:
+    lengths = {name: len(path.read_text("utf-8").splitlines()) for name, path in modules().items()}
+    assert not {name: length for name, length in lengths.items() if length > 400}
