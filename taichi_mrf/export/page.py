@@ -13,7 +13,7 @@ from taichi_mrf.system.atomic import write_text
 from taichi_mrf.viewer.live.options import ViewOptions
 from taichi_mrf.viewer.messages import pack_log_odds
 from taichi_mrf.viewer.scene.look import look_of
-from taichi_mrf.viewer.scene.viewpoint import Eye
+from taichi_mrf.viewer.scene.viewpoint import ViewpointController
 from taichi_mrf.viewer.scene.voxel_layer import VoxelLayer
 from taichi_mrf.viewer.transport.server import start_server
 from taichi_mrf.voxels.layout import BRICK, VOXELS
@@ -32,7 +32,7 @@ def write_page(path: str | Path, m: QueriedMap, threshold: float = 0.5) -> None:
             # Some maps say one half of what nobody has seen, which is not to be shown.
             seen = np.where(log_odds == reader.pool.prior_log_odds, _NOT_SHOWN, log_odds)
             layer.store.put(bricks, pack_log_odds(seen), np.zeros((len(bricks), VOXELS), np.uint8))
-        eye = Eye(server)
+        eye = ViewpointController(server)
         eye.set_up(up_of_map(m))
         bounds = layer.store.bounds()
         if bounds is not None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
-from taichi_mrf.inference.keyframe_bounds import Whereabouts
+from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
 from taichi_mrf.inference.messages import places_of
 from taichi_mrf.inference.schedule import InferProgress, InferReport, Progress
 from taichi_mrf.inference.sweep import Sweeper
@@ -25,42 +25,42 @@ from taichi_mrf.voxels.pool import BrickPool
 def moved_share(keyframe: Keyframe, pool: BrickPool) -> float:
     """The share of the voxels seen by a keyframe whose marginals have moved since its last sweep; 1 if it was
     never swept. A marginal counts each time that it moves by over 0.01, a brick as its voxels at most."""
-    visible = keyframe.visible if keyframe.coming is None else keyframe.coming
-    heard = heard_of(keyframe, visible)
+    visible = keyframe.visible if keyframe.pending_visible is None else keyframe.pending_visible
+    heard = change_count_seen_by(keyframe, visible)
     if heard is None or keyframe.messages is None:
         return 1.0
     if len(heard) == 0:
         return 0.0
-    moved = np.minimum(pool.stirred[visible.slots] - heard, VOXELS)
+    moved = np.minimum(pool.change_count[visible.slots] - heard, VOXELS)
     return float(moved.sum()) / (len(moved) * VOXELS)
 
 
-def heard_of(keyframe: Keyframe, visible: VisibleBricks) -> NDArray[np.int64] | None:
+def change_count_seen_by(keyframe: Keyframe, visible: VisibleBricks) -> NDArray[np.int64] | None:
     """``heard`` of a keyframe for a newer list of its bricks: nothing of one that was not on the old, all of
     which then counts as moved."""
-    if visible is keyframe.visible or keyframe.heard is None:
-        return keyframe.heard
+    if visible is keyframe.visible or keyframe.change_count_at_last_sweep is None:
+        return keyframe.change_count_at_last_sweep
     place = places_of(keyframe.visible, visible)
     heard = np.full(len(place), -VOXELS, np.int64)
-    heard[place >= 0] = keyframe.heard[place[place >= 0]]
+    heard[place >= 0] = keyframe.change_count_at_last_sweep[place[place >= 0]]
     return heard
 
 
-class Renewal:
+class IncrementalInference:
     """Sweeps the most affected keyframes until none is affected by more than the tolerance."""
 
     def __init__(
         self,
         pool: BrickPool,
         sweeper: Sweeper,
-        whereabouts: Whereabouts,
+        bounds: KeyframeBounds,
         look_again: Callable[[Keyframe], object],
         refresh: Callable[[Keyframe], object],
         usual: float,
     ) -> None:
         """``look_again`` brings the list of a keyframe's bricks up to date, ``refresh`` its messages too;
         ``usual`` is the tolerance above which a keyframe waits even if a call tolerates more."""
-        self.pool, self.sweeper, self.whereabouts, self.usual = pool, sweeper, whereabouts, usual
+        self.pool, self.sweeper, self.bounds, self.usual = pool, sweeper, bounds, usual
         self.look_again, self.refresh = look_again, refresh
         self._waiting: set[int] = set()
 
@@ -83,7 +83,7 @@ class Renewal:
         queue = list(first)
         largest = 0.0
         while True:
-            self._waiting |= self.whereabouts.near(self.pool.take_stirred())
+            self._waiting |= self.bounds.near(self.pool.take_changed())
             if queue:
                 id = queue.pop(0)
             else:
@@ -101,7 +101,9 @@ class Renewal:
             if self.sweeper.sweep(keyframe, self.pool):
                 self.sweeper.take_moved(keyframe, self.pool)
             else:
-                keyframe.heard = np.zeros(0, np.int64)  # it sees no brick, so there is nothing to say
+                keyframe.change_count_at_last_sweep = np.zeros(
+                    0, np.int64
+                )  # it sees no brick, so there is nothing to say
             rays, swept = rays + keyframe.rays, swept + 1
             if progress is not None and not progress(InferProgress(1, 1, swept, swept, keyframe.rays)):
                 break

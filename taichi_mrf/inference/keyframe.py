@@ -162,10 +162,11 @@ class VisibleBricks:
 class Keyframe:
     """One keyframe of a map.
 
-    ``messages`` is (bricks * 512) log-odds, in the order of ``visible``; ``begins`` is, for each ray of the
-    list, the depth up to which it crosses none of these bricks, once it is known; ``revision`` is that of
-    the beliefs right after its last sweep, and ``heard`` (bricks) how often marginals of each brick had moved
-    by then. ``coming`` is what the keyframe sees now, if its messages are still those of ``visible``.
+    ``messages`` is (bricks * 512) log-odds, in the order of ``visible``. ``entry_depths`` is, for each ray of
+    the list, the depth up to which it crosses none of these bricks, once it is known. ``revision`` is that of
+    the beliefs right after its last sweep, and ``change_count_at_last_sweep`` (bricks) how often marginals of
+    each brick had changed by then. ``pending_visible`` is what the keyframe sees now, if its messages are
+    still those of ``visible``.
     """
 
     id: int
@@ -175,12 +176,12 @@ class Keyframe:
     T_world_camera: Pose
     footprint: Footprint
     visible: VisibleBricks
-    begins: ti.Ndarray
-    begins_known: bool = False
+    entry_depths: ti.Ndarray
+    entry_depths_known: bool = False
     revision: int = -1
     messages: ti.Ndarray | None = None
-    heard: NDArray[np.int64] | None = None
-    coming: VisibleBricks | None = None
+    change_count_at_last_sweep: NDArray[np.int64] | None = None
+    pending_visible: VisibleBricks | None = None
 
     @property
     def camera(self) -> PinholeCamera:
@@ -199,7 +200,7 @@ class Keyframe:
     @property
     def image_bytes(self) -> int:
         """Bytes of the depth image and of the list of its rays."""
-        return self.image.depth.shape[0] * 4 + self.ray_list.nbytes + self.begins.shape[0] * 4
+        return self.image.depth.shape[0] * 4 + self.ray_list.nbytes + self.entry_depths.shape[0] * 4
 
     @property
     def voxel_bytes(self) -> int:

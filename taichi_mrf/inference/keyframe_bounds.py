@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from taichi_mrf.voxels.window import Window
 
 
-class Whereabouts:
+class KeyframeBounds:
     """The boxes of bricks that keyframes look at, all in one array, to be asked at once."""
 
     def __init__(self) -> None:

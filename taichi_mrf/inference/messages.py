@@ -56,7 +56,7 @@ def places_of(old: VisibleBricks, visible: VisibleBricks) -> NDArray[np.int32]:
     return np.where(same, place, -1).astype(np.int32)
 
 
-def count_voices(
+def count_observations(
     slots: NDArray[np.int32], spoken: Iterable[tuple[VisibleBricks, "ti.Ndarray"]], pool: BrickPool
 ) -> NDArray[np.uint8]:
     """How many keyframes say something of each voxel of some bricks, (n,) -> (n, 512); 255 is "or more".

@@ -48,7 +48,7 @@ def stride_metres(camera: PinholeCamera, voxel_size: float, ray_density: float) 
     return voxel_size * min(camera.fx, camera.fy) / math.sqrt(rays_per_voxel)
 
 
-class RayLister:
+class RayBundler:
     """Makes the lists of rays for one voxel size; owns the scratch, which grows to the largest image."""
 
     def __init__(self, voxel_size: float, inference: InferenceConfig) -> None:

@@ -98,7 +98,7 @@ def cavity(
 
 @ti.kernel
 def send_messages(
-    blocks: I32Array, depth: F32Array, rays: I32, begins: F32Array, begins_known: I32,
+    blocks: I32Array, depth: F32Array, rays: I32, entry_depths: F32Array, entry_depths_known: I32,
     width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
     noise: F32Array3, patch: I32, columns: I32,
     voxel_size: F32, max_depth: F32, end_sigmas: F32, floor: F32,
@@ -115,8 +115,8 @@ def send_messages(
     so that the way back need not be walked again. ``longest`` is never less than a ray has voxels.
     With ``retrace``, which cannot ``maximise``, each ray is followed a second time and leaves no trace.
     ``steps`` receives each worker's number of voxels crossed.
-    ``begins`` holds the depth at which each ray meets its first brick: learnt by the sweep that does not
-    know it yet, and where later sweeps start. Rays are dealt out in runs of ``run`` neighbours; one that
+    ``entry_depths`` holds the depth at which each ray meets its first brick: found by the first sweep, and
+    where later sweeps start. Rays are dealt out in runs of ``run`` neighbours; one that
     stands for a block of pixels counts as many as they are.
     """
     if ti.static(block_dim > 0):
@@ -141,8 +141,8 @@ def send_messages(
                 # The ray ends where its measurement has nothing more to say, or where the map does.
                 last = depth_of_deviation(measured, -end_sigmas, here)
                 begin, end = 0.0, ti.min(last, max_depth)
-                if begins_known == 1:
-                    begin = begins[i]
+                if entry_depths_known == 1:
+                    begin = entry_depths[i]
                 clip(ray, begin, end, box_lower, box_upper)
 
                 # Forward: eq. 11 for each voxel, from the camera outwards.
@@ -156,8 +156,8 @@ def send_messages(
                      trace_voxel, trace, maximise, retrace, floor),
                 )  # fmt: skip
 
-                if begins_known == 0:
-                    begins[i] = ahead.first
+                if entry_depths_known == 0:
+                    entry_depths[i] = ahead.first
                 steps[worker] += ahead.voxels
 
                 # What gets through to where the map ends may have met its surface there.

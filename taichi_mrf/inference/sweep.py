@@ -64,11 +64,11 @@ def least_log_odds(inference: InferenceConfig, prior_log_odds: float) -> float:
     return max(-inference.cavity_clamp, math.log(chance / (1.0 - chance)))
 
 
-def unknown_begins(rays: RayList) -> "ti.Ndarray":
+def unknown_entry_depths(rays: RayList) -> "ti.Ndarray":
     """The depth at which each ray meets its first brick: not known, so never."""
-    begins = ti.ndarray(ti.f32, rays.blocks.shape[0])
-    begins.fill(FAR)
-    return begins
+    entry_depths = ti.ndarray(ti.f32, rays.blocks.shape[0])
+    entry_depths.fill(FAR)
+    return entry_depths
 
 
 class Sweeper:
@@ -133,7 +133,7 @@ class Sweeper:
         # Eqs. 4, 11, 13 and 14: what the rays make of that and of their measurements.
         self.index.fill(window, bricks.cells, self.order)
         sum_product.send_messages(
-            rays.blocks, rays.depth, rays.number, keyframe.begins, int(keyframe.begins_known),
+            rays.blocks, rays.depth, rays.number, keyframe.entry_depths, int(keyframe.entry_depths_known),
             image.camera.width, image.intrinsics, centre, to_voxels,
             image.noise, image.noise_table.patch, image.noise_table.columns,
             self.voxel_size, self.sensor.max_depth, config.end_sigmas, config.outlier_floor,
@@ -144,7 +144,7 @@ class Sweeper:
             LIKELIHOODS[config.likelihood], config.segment_lengths, log_average,
             config.method == "max-product", self.retrace and config.method != "max-product", workers.block,
         )  # fmt: skip
-        keyframe.begins_known = True
+        keyframe.entry_depths_known = True
         self.index.clear(window, bricks.cells)
 
         # Eqs. 7 and 8: the average over rays is the keyframe's new message, and changes the beliefs.
@@ -158,12 +158,12 @@ class Sweeper:
         return True
 
     def take_moved(self, keyframe: Keyframe, pool: BrickPool) -> NDArray[np.int32]:
-        """How many voxels of each visible brick moved in the keyframe's last sweep, (n,); the pool counts
-        them as stirred, and the keyframe as heard. Keyframes are asked in the order of their sweeps."""
+        """How many voxels of each visible brick moved in the keyframe's last sweep, (n,). The pool adds
+        them to its change counts, which the keyframe remembers. Keyframes are asked in the order of their sweeps."""
         visible = keyframe.visible
         moved = np.array(on_host(visible.on_device().moved))
-        pool.stir(visible.slots, moved)
-        keyframe.heard = pool.stirred[visible.slots]
+        pool.count_changes(visible.slots, moved)
+        keyframe.change_count_at_last_sweep = pool.change_count[visible.slots]
         return moved
 
     def _scale(self, keyframe: Keyframe) -> float:

@@ -17,7 +17,7 @@ LEAST_LOG_ODDS = 0.0
 crosses exists, seven in ten of them free at 2 cm, and a voxel seen to be free never falls below 0.12."""
 
 
-class Beside:
+class BaselineOverlay:
     """A LogOddsMap that follows a mapper's keyframes, one piece of work at a time."""
 
     def __init__(self, config: Config, noise: NoiseModel) -> None:

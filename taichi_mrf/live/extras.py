@@ -4,7 +4,7 @@ import dataclasses
 import time
 
 from taichi_mrf.inference.schedule import Progress
-from taichi_mrf.live.baseline_overlay import Beside
+from taichi_mrf.live.baseline_overlay import BaselineOverlay
 from taichi_mrf.live.pictures import view_images
 from taichi_mrf.live.run import Run
 from taichi_mrf.viewer.messages import Notice, Watch
@@ -21,7 +21,7 @@ class Extras:
     def __init__(self, run: Run) -> None:
         self._run = run
         self._watch = NOTHING
-        self._beside: Beside | None = None
+        self._beside: BaselineOverlay | None = None
         self._shown_version = -1
         self._images_made = float("-inf")
 
@@ -66,7 +66,7 @@ class Extras:
     def _catch_up(self, progress: Progress) -> bool:
         mapper = self._run.mapper
         if self._beside is None:
-            self._beside = Beside(self._run.source.config, mapper.map.noise)
+            self._beside = BaselineOverlay(self._run.source.config, mapper.map.noise)
             frozen = len(mapper.roster.with_state("frozen"))
             if frozen:
                 text = f"beside the map {frozen} frozen keyframes are missing: their images are forgotten"

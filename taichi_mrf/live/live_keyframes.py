@@ -37,7 +37,7 @@ class Entry:
 
 
 @dataclass
-class Roster:
+class LiveKeyframes:
     """All keyframes of a run by number, in the order in which they came. A number is never given twice."""
 
     entries: dict[int, Entry] = field(default_factory=dict)

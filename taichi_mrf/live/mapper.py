@@ -14,10 +14,10 @@ from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.inference.schedule import InferProgress
-from taichi_mrf.live.live_keyframes import Entry, Roster
+from taichi_mrf.live.live_keyframes import Entry, LiveKeyframes
 from taichi_mrf.live.pictures import thumbnail
 from taichi_mrf.live.publish import Publisher
-from taichi_mrf.live.ray_answers import Seer
+from taichi_mrf.live.ray_answers import PosedDepthImage
 from taichi_mrf.mapping.freezing import surplus
 from taichi_mrf.mapping.refinement import refiner_of
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -48,7 +48,7 @@ class Mapper:
         ConfigError if ``poses`` asks for what the map cannot do."""
         self.map = m
         self.refiner = refiner_of(m, poses or PoseConfig())
-        self.roster = Roster(next_id=first_id)
+        self.roster = LiveKeyframes(next_id=first_id)
         for id, keyframe in m.keyframes.items():
             self.roster.add(keyframe, keyframe.rays, thumbnail(keyframe.depth_m), id)
         self.publisher = Publisher(
@@ -120,7 +120,7 @@ class Mapper:
         entry.T_world_camera = entry.T_home = T_world_camera
         return True
 
-    def freeze(self, id: int, by_hand: bool = True) -> messages.Keyframe:
+    def freeze(self, id: int, by_hand: bool = True) -> messages.KeyframeInfo:
         """Fold a keyframe into the map for good; returns the last that is to be said of it, because its image
         is forgotten. Raises KeyframeError."""
         entry = self._changeable(id)
@@ -176,7 +176,7 @@ class Mapper:
             self.unanswered = False
         return complete
 
-    def describe(self, entry: Entry) -> messages.Keyframe:
+    def describe(self, entry: Entry) -> messages.KeyframeInfo:
         """What the viewer must know of a keyframe."""
         return self._message(entry, entry.picture, self.crossed(entry))
 
@@ -192,14 +192,14 @@ class Mapper:
         """A keyframe's depth image, (H, W) in metres; None once it is frozen."""
         return self._keyframe(entry).depth_m if entry.state == "on" else entry.depth_m
 
-    def seer(self, entry: Entry) -> Seer:
+    def seer(self, entry: Entry) -> PosedDepthImage:
         """A keyframe as what rays can be asked of. Raises KeyframeError for a frozen one."""
         depth_m = self.depth_of(entry)
         if depth_m is None:
             raise KeyframeError(f"keyframe {entry.id} ({entry.name}) is frozen: its image is forgotten")
-        return Seer(entry.name, entry.T_world_camera, entry.camera, depth_m)
+        return PosedDepthImage(entry.name, entry.T_world_camera, entry.camera, depth_m)
 
-    def seers_near(self, point: NDArray[np.float64]) -> Iterator[Seer]:
+    def seers_near(self, point: NDArray[np.float64]) -> Iterator[PosedDepthImage]:
         """All keyframes that are on, the nearest to a point first."""
         entries = self.roster.with_state("on")
         entries.sort(key=lambda entry: float(np.linalg.norm(entry.T_world_camera[:3, 3] - point)))
@@ -243,8 +243,8 @@ class Mapper:
 
     def _message(
         self, entry: Entry, picture: NDArray[np.uint8], crossed: NDArray[np.int32]
-    ) -> messages.Keyframe:
-        return messages.Keyframe(
+    ) -> messages.KeyframeInfo:
+        return messages.KeyframeInfo(
             entry.id,
             entry.name,
             entry.T_world_camera,

@@ -18,7 +18,7 @@ from taichi_mrf.viewer.messages import (
     File,
     Hello,
     Images,
-    Keyframe,
+    KeyframeInfo,
     Layer,
     Notice,
     Quit,
@@ -103,7 +103,7 @@ class Outbox:
         which MOST says how many."""
         if isinstance(update, LATEST_ONLY):
             return type(update).__name__
-        if isinstance(update, Keyframe):
+        if isinstance(update, KeyframeInfo):
             return "keyframe", update.id
         if isinstance(update, Hello):
             return Hello.__name__

@@ -18,7 +18,7 @@ BEHIND_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
-class Seer:
+class PosedDepthImage:
     """A depth image that may have seen a point; ``depth_m`` (H, W) in metres, 0 for no measurement."""
 
     name: str
@@ -36,7 +36,7 @@ class PixelNoise:
     sigma_m: float
 
 
-def pixel_answer(m: OccupancyMap, seer: Seer, u: float, v: float) -> RayAnswer:
+def pixel_answer(m: OccupancyMap, seer: PosedDepthImage, u: float, v: float) -> RayAnswer:
     """The ray of a pixel. Raises KeyframeError if the image has no such pixel."""
     along = pixel_direction(seer.camera, u, v)
     if not _in_image(seer.camera, u, v):
@@ -48,8 +48,8 @@ def point_answer(
     m: OccupancyMap,
     point: Sequence[float],
     eye: Sequence[float],
-    wanted: Seer | None,
-    others: Iterable[Seer],
+    wanted: PosedDepthImage | None,
+    others: Iterable[PosedDepthImage],
 ) -> RayAnswer:
     """The ray through a point: of the wanted keyframe if the point lies in its image, else of the first
     other one that sees it, else from the eye, where nothing was measured."""
@@ -68,7 +68,7 @@ def point_answer(
     return _profiled(m, "from where you look; no keyframe sees this point", start, along, None, reach)
 
 
-def projected(seer: Seer, point: NDArray[np.float64]) -> tuple[float, float, float] | None:
+def projected(seer: PosedDepthImage, point: NDArray[np.float64]) -> tuple[float, float, float] | None:
     """(u, v, axial depth) of a world point in an image, None if it lies outside or behind."""
     x, y, z = (inverse(seer.T_world_camera) @ np.append(point, 1.0))[:3]
     if z <= 0:
@@ -93,7 +93,9 @@ def noise_at(
     return bias, max(sigma, LEAST_SIGMA_M)
 
 
-def _answer(m: OccupancyMap, seer: Seer, u: float, v: float, along: NDArray[np.float64]) -> RayAnswer:
+def _answer(
+    m: OccupancyMap, seer: PosedDepthImage, u: float, v: float, along: NDArray[np.float64]
+) -> RayAnswer:
     column, row = _nearest(seer.camera, u, v)
     depth, range_per_depth = float(seer.depth_m[row, column]), float(np.linalg.norm(along))
     noise = None
@@ -130,7 +132,7 @@ def _profiled(
     )
 
 
-def _sees(m: OccupancyMap, seer: Seer, u: float, v: float, depth_m: float) -> bool:
+def _sees(m: OccupancyMap, seer: PosedDepthImage, u: float, v: float, depth_m: float) -> bool:
     """Whether the measurement at a pixel leaves the view free up to a depth."""
     column, row = _nearest(seer.camera, u, v)
     measured = float(seer.depth_m[row, column])

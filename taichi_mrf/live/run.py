@@ -16,7 +16,7 @@ from taichi_mrf.mapping.tracking import Track, tracker_of
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system import runtime
-from taichi_mrf.viewer.messages import CurrentCamera, Hello, Keyframe, Notice, Request, Update
+from taichi_mrf.viewer.messages import CurrentCamera, Hello, KeyframeInfo, Notice, Request, Update
 
 WAY_BACK = "bring the camera back to where it was then, or to where it started"
 
@@ -142,7 +142,7 @@ class Run:
             if self.track.frames:
                 self.track.frames[len(self.track.frames) - 1] = tracked
 
-    def describe(self, id: int) -> Keyframe:
+    def describe(self, id: int) -> KeyframeInfo:
         """What the viewer must know of a keyframe."""
         return self.mapper.describe(self.mapper.roster.find(id))
 

@@ -25,7 +25,7 @@ from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.inference.keyframe import DepthImage, Footprint, checked_depth
 from taichi_mrf.inference.schedule import InferProgress, InferReport, Progress
 from taichi_mrf.methods.map_file import MapHeader, StoredKeyframe, naming
-from taichi_mrf.methods.mrf.brick_registry import BrickBook
+from taichi_mrf.methods.mrf.brick_registry import BrickRegistry
 from taichi_mrf.methods.recursive_storage import RecursiveContents, read_recursive, write_recursive
 from taichi_mrf.methods.recursive_update import LEAST_LOG_ODDS, UNKNOWN_LOG_ODDS
 from taichi_mrf.methods.statistics import MapStatistics, measure
@@ -119,7 +119,7 @@ class RecursiveMap(ABC, Generic[FootprintT]):
         self._pool = BrickPool(UNKNOWN_LOG_ODDS, config.volume.memory_limit_gb)
         topology = create_topology(runtime.active() or "cpu", config.volume.dense_bricks)
         weakref.finalize(self, recycle, topology)
-        self._book = BrickBook(topology, self._pool, self.voxel_size)
+        self._registry = BrickRegistry(topology, self._pool, self.voxel_size)
         any_evidence_counts = dataclasses.replace(config.volume, min_evidence=0.0)
         occlusion = Occlusion(unknown=UNKNOWN_LOG_ODDS, empty_below=0.0)
         self.view = View(self._pool, self.voxel_size, any_evidence_counts, occlusion)
@@ -287,7 +287,7 @@ class RecursiveMap(ABC, Generic[FootprintT]):
         with naming(Path(path)):
             m = cls._create(header.limited_to(memory_limit_gb), header.noise)
             if len(bricks):
-                m._pool.write("belief", m._book.restore(bricks, 1), contents.belief)
+                m._pool.write("belief", m._registry.restore(bricks, 1), contents.belief)
         for k in header.keyframes:
             m._keyframes[k.id] = ScanRecord(k.id, k.name, k.depth_m, k.T_world_camera, k.camera)
         m._next_id, m._stale = header.next_id, contents.stale
@@ -295,7 +295,7 @@ class RecursiveMap(ABC, Generic[FootprintT]):
 
     def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
         # Every brick that was seen exists, so there is no place that is seen and has none.
-        return point_log_odds(points, self.voxel_size, self._book.topology, self._pool, UNKNOWN_LOG_ODDS)
+        return point_log_odds(points, self.voxel_size, self._registry.topology, self._pool, UNKNOWN_LOG_ODDS)
 
     def _find(self, id: int) -> ScanRecord:
         if id not in self._keyframes:
@@ -306,9 +306,9 @@ class RecursiveMap(ABC, Generic[FootprintT]):
         """Allocate what a scan's rays cross and integrate it; what is raised leaves the map as it was."""
         image = DepthImage.upload(record.depth_m, record.camera, self.noise)
         footprint = self._reach(image, record.T_world_camera)
-        self._book.anchor_at(record.T_world_camera[:3, 3])
-        self._book.claim(footprint)
-        slots = self._book.visible(footprint).slots
+        self._registry.anchor_at(record.T_world_camera[:3, 3])
+        self._registry.claim(footprint)
+        slots = self._registry.visible(footprint).slots
         if len(slots):
             self._integrate(Scan(image, record.T_world_camera, footprint, slots))
             self._pool.revision += 1
@@ -319,5 +319,5 @@ class RecursiveMap(ABC, Generic[FootprintT]):
         """Give all bricks back."""
         self._pool.release(self._pool.in_use)
         self._pool.revision += 1
-        self._book.topology.clear()
-        self._book.start_over()
+        self._registry.topology.clear()
+        self._registry.start_over()

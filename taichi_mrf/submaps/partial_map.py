@@ -30,19 +30,19 @@ class PartialMap(MRFMap):
     def assume(self, bricks: Bricks, evidence: NDArray[np.float32]) -> None:
         """Start inference in these bricks from these log-odds, (n, 512): the prior and what keyframes say
         that are not here. Bricks that only those have measured a surface in come to exist."""
-        topology = self._book.topology
+        topology = self._registry.topology
         topology.check(bricks, self.voxel_size)
         slots = topology.slots(bricks)
         missing = slots < 0
         if missing.any():
-            slots[missing] = self._book.create(bricks[missing])
+            slots[missing] = self._registry.create(bricks[missing])
         self._pool.owners[slots] += 1
         self._pool.write("evidence", slots, evidence)
 
     def beliefs(self, bricks: Bricks, without: Iterable[int] = ()) -> NDArray[np.float32]:
         """The log-odds in bricks that exist, (n, 3) -> (n, 512), less the messages of some keyframes, by id.
         Nothing may have been added or moved since the last :meth:`infer`."""
-        slots = self._book.topology.slots(bricks)
+        slots = self._registry.topology.slots(bricks)
         snapshot = self._pool.snapshot()
         for id in without:
             keyframe = self._keyframes[id]

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Hashable
 
 from taichi_mrf.live.outbox import Outbox, Waiting, WaitingBricks
-from taichi_mrf.viewer.messages import Hello, Keyframe, Update
+from taichi_mrf.viewer.messages import Hello, KeyframeInfo, Update
 from taichi_mrf.viewer.tune.messages import Activity, Chosen, HeldOutView, Pinned, Residuals, Tried, Tuning
 
 LATEST_ONLY = (Tuning, Activity, Pinned, Chosen, Residuals, HeldOutView)
@@ -25,5 +25,5 @@ class TuneOutbox(Outbox):
         if isinstance(update, Tuning):
             return lambda waiting: not isinstance(waiting, (*LATEST_ONLY, Tried))
         if isinstance(update, Hello):
-            return lambda waiting: not isinstance(waiting, Keyframe | Hello | WaitingBricks)
+            return lambda waiting: not isinstance(waiting, KeyframeInfo | Hello | WaitingBricks)
         return None

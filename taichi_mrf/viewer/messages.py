@@ -63,7 +63,7 @@ class Bricks:
 
 
 @dataclass(frozen=True)
-class Keyframe:
+class KeyframeInfo:
     """A keyframe that is new or has changed.
 
     ``picture`` is the depth image in colours, (h, w, 3) uint8 and small; ``crossed`` (n, 3) int32 are the
@@ -162,7 +162,9 @@ class File:
     client: int
 
 
-Update = Hello | Bricks | Keyframe | CurrentCamera | Status | Notice | RayAnswer | Images | File | TuneUpdate
+Update = (
+    Hello | Bricks | KeyframeInfo | CurrentCamera | Status | Notice | RayAnswer | Images | File | TuneUpdate
+)
 
 
 @dataclass(frozen=True)

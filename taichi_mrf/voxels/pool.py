@@ -53,7 +53,7 @@ class BrickPool:
         self.bricks = np.zeros((0, 3), np.int32)
         self.owners = np.zeros(0, np.int32)
         self.identity = np.zeros(0, np.int64)
-        self.stirred = np.zeros(0, np.int64)  # marginals that have moved in each brick since it was born
+        self.change_count = np.zeros(0, np.int64)  # marginals that have moved in each brick since it was born
         self.revision = 0  # changes whenever the beliefs do
         self._touched = np.zeros(0, bool)
         self._stirring = np.zeros(0, bool)
@@ -90,7 +90,7 @@ class BrickPool:
         # An identity is never given twice, so a slot that changes hands can be told from one that did not.
         self.identity[slots] = self._born + np.arange(len(bricks))
         self._born += len(bricks)
-        self.stirred[slots] = 0
+        self.change_count[slots] = 0
         self._stirring[slots] = True
         self.touch(slots)
         _fill_bricks(self.belief, slots, self.prior_log_odds, strip_length())
@@ -124,12 +124,12 @@ class BrickPool:
         self._touched[:] = False
         return slots
 
-    def stir(self, slots: NDArray[np.int32], moved: NDArray[np.int32]) -> None:
+    def count_changes(self, slots: NDArray[np.int32], moved: NDArray[np.int32]) -> None:
         """Count marginals that have moved in some bricks, (n,) each."""
-        self.stirred[slots] += moved
+        self.change_count[slots] += moved
         self._stirring[slots[moved > 0]] = True
 
-    def take_stirred(self) -> NDArray[np.int32]:
+    def take_changed(self) -> NDArray[np.int32]:
         """Coordinates (n, 3) of the bricks that are new, or in which marginals have moved, since this was
         last called."""
         bricks = self.bricks[self._stirring & (self.owners > 0)]
@@ -207,7 +207,7 @@ class BrickPool:
         self.bricks = np.concatenate([self.bricks, np.zeros((more, 3), np.int32)])
         self.owners = np.concatenate([self.owners, np.zeros(more, np.int32)])
         self.identity = np.concatenate([self.identity, np.full(more, -1, np.int64)])
-        self.stirred = np.concatenate([self.stirred, np.zeros(more, np.int64)])
+        self.change_count = np.concatenate([self.change_count, np.zeros(more, np.int64)])
         self._touched = np.concatenate([self._touched, np.zeros(more, bool)])
         self._stirring = np.concatenate([self._stirring, np.zeros(more, bool)])
         for slot in range(self.capacity, capacity):

@@ -21,7 +21,7 @@ from taichi_mrf.errors import CapacityError
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.inference.footprint import find_footprint, visible_box
 from taichi_mrf.inference.keyframe import DepthImage, Footprint, RayList
-from taichi_mrf.inference.ray_list import RayLister
+from taichi_mrf.inference.ray_list import RayBundler
 from taichi_mrf.kernels.types import F32, I32, AnyArray, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
@@ -126,7 +126,7 @@ def assert_between(footprint: Footprint, rays: Rays, box: tuple[NDArray, NDArray
 
 
 def every_ray(image: DepthImage) -> RayList:
-    return RayLister(VOXEL, InferenceConfig(ray_density=0.0)).rays_of(image)
+    return RayBundler(VOXEL, InferenceConfig(ray_density=0.0)).rays_of(image)
 
 
 def footprint_of(

@@ -14,7 +14,7 @@ from taichi_mrf.inference.ray_list import (
     BITS,
     LEVELS,
     TILE,
-    RayLister,
+    RayBundler,
     stride_metres,
 )
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -35,7 +35,7 @@ def listed(depth: NDArray[np.float32], **parameters: object) -> RayList:
     image = DepthImage.upload(
         checked_depth(depth, camera_of(*depth.shape[::-1]), 0.1), camera_of(*depth.shape[::-1]), NOISE
     )
-    return RayLister(VOXEL, InferenceConfig(**parameters)).rays_of(image)  # type: ignore[arg-type]
+    return RayBundler(VOXEL, InferenceConfig(**parameters)).rays_of(image)  # type: ignore[arg-type]
 
 
 Block = tuple[int, int, int, int]

@@ -16,7 +16,7 @@ from live_scene import (
     shown,
 )
 
-from taichi_mrf.viewer.messages import Bricks, Freeze, Keyframe, Move, Request, Switch, Update
+from taichi_mrf.viewer.messages import Bricks, Freeze, KeyframeInfo, Move, Request, Switch, Update
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 
@@ -90,15 +90,15 @@ def test_edits_while_frames_come_act_at_once_and_end_in_the_same_map() -> None:
     asked: list[Request] = [Switch(0, on=False)]
 
     def react(update: Update) -> list[Request]:
-        return [asked.pop()] if isinstance(update, Keyframe) and update.id == 2 and asked else []
+        return [asked.pop()] if isinstance(update, KeyframeInfo) and update.id == 2 and asked else []
 
     link = FakeLink(react)
     session = session_of(link, room(5))
     m = finished(session)
     assert marginals(m) == marginals(built([1, 2, 3, 4]))
     assert_shown_is(session, link)
-    off = next(i for i, u in enumerate(link.sent) if isinstance(u, Keyframe) and u.state == "off")
-    later = [u.id for u in link.sent[off:] if isinstance(u, Keyframe) and u.state == "on"]
+    off = next(i for i, u in enumerate(link.sent) if isinstance(u, KeyframeInfo) and u.state == "off")
+    later = [u.id for u in link.sent[off:] if isinstance(u, KeyframeInfo) and u.state == "on"]
     assert later == [3, 4]
     bricks_off = next(u for u in link.sent[off:] if isinstance(u, Bricks))
     assert len(bricks_off.removed) > 0
@@ -109,7 +109,7 @@ def test_an_edit_breaks_full_inference_off_and_is_seen_at_once() -> None:
     session = session_of(link)
     m = finished(session)
     assert marginals(m) == marginals(built([0, 1, 2]))
-    off = next(i for i, u in enumerate(link.sent) if isinstance(u, Keyframe) and u.state == "off")
+    off = next(i for i, u in enumerate(link.sent) if isinstance(u, KeyframeInfo) and u.state == "off")
     assert isinstance(link.sent[off + 1], Bricks)
     at_once = shown(link.sent[: off + 2])
     without = {tuple(b) for b in m.view.pool.bricks[m.view.pool.in_use].tolist()}

@@ -38,7 +38,7 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.viewer.messages import (
     CurrentCamera,
-    Keyframe,
+    KeyframeInfo,
     Move,
     Notice,
     PixelRay,
@@ -126,7 +126,7 @@ def test_keyframes_are_aligned_as_they_come_and_together_at_the_end() -> None:
     finished(session)
     assert link.errors() == []
     first = {}
-    for keyframe in link.of_type(Keyframe):
+    for keyframe in link.of_type(KeyframeInfo):
         first.setdefault(keyframe.id, keyframe.T_world_camera)
     came, ended = list(first.values()), list(told_poses(link).values())
     assert (off(came) < 0.7 * off(wrong_poses())).all()
@@ -174,11 +174,11 @@ def test_a_stop_in_the_rounds_takes_them_back() -> None:
     link = FakeLink()
     session = session_of(link, wrong(), REFINE)
     m = session.state.mapper
-    session.run(lambda: len(link.of_type(Keyframe)) > COUNT)  # the first that a round has moved
+    session.run(lambda: len(link.of_type(KeyframeInfo)) > COUNT)  # the first that a round has moved
     assert not session.state.is_done
     assert m.unaligned
     first = {}
-    for keyframe in link.of_type(Keyframe):
+    for keyframe in link.of_type(KeyframeInfo):
         first.setdefault(keyframe.id, keyframe.T_world_camera)
     for id, T in told_poses(link).items():
         np.testing.assert_array_equal(T, first[id])

@@ -38,7 +38,7 @@ from taichi_mrf.viewer.messages import (
     Freeze,
     Hello,
     Images,
-    Keyframe,
+    KeyframeInfo,
     Move,
     Notice,
     Pause,
@@ -66,7 +66,7 @@ def test_a_run_ends_in_the_map_of_its_frames() -> None:
     assert marginals(finished(session)) == marginals(built(range(4)))
     assert_shown_is(session, link)
     assert isinstance(link.sent[0], Hello)
-    assert [k.name for k in link.of_type(Keyframe)] == [f.name for f in small_room.frames()[:4]]
+    assert [k.name for k in link.of_type(KeyframeInfo)] == [f.name for f in small_room.frames()[:4]]
     status = last_status(link)
     assert (status.frame, status.frames, status.keyframes, status.finished) == (4, 4, 4, True)
     assert not status.pending
@@ -139,13 +139,13 @@ def test_a_paused_run_takes_one_keyframe_a_step() -> None:
     session = session_of(link)
     link.ask(Pause(True))
     session.run(lambda: link.waits > 0)
-    assert link.of_type(Keyframe) == []
+    assert link.of_type(KeyframeInfo) == []
     assert last_status(link).paused
     for steps in (1, 2):
         link.ask(Step())
         waits = link.waits
         session.run(lambda waits=waits: link.waits > waits)
-        assert len(link.of_type(Keyframe)) == steps
+        assert len(link.of_type(KeyframeInfo)) == steps
         assert marginals(session.state.mapper.map) == marginals(built(range(steps)))
     link.ask(Pause(False))
     assert marginals(finished(session)) == marginals(built(range(4)))
@@ -155,7 +155,7 @@ def test_going_on_does_not_wait_for_full_inference() -> None:
     asked: list[Request] = [Pause(False)]
 
     def react(update: Update) -> list[Request]:
-        if isinstance(update, Keyframe) and update.id == 1:
+        if isinstance(update, KeyframeInfo) and update.id == 1:
             return [Pause(True)]
         if isinstance(update, Status) and update.activity == "sweeping keyframe 1 of 2: 1 of 3" and asked:
             return [asked.pop()]
@@ -285,7 +285,7 @@ def test_frames_that_are_held_out_stay_out() -> None:
     link = FakeLink()
     session_of(link, room(10), config).run(never)
     names = [frame.name for frame in small_room.frames()]
-    assert [k.name for k in link.of_type(Keyframe)] == [n for i, n in enumerate(names) if i != 5]
+    assert [k.name for k in link.of_type(KeyframeInfo)] == [n for i, n in enumerate(names) if i != 5]
 
 
 def test_a_new_viewer_is_told_everything() -> None:

@@ -91,7 +91,7 @@ def test_evidence_of_absent_keyframes_counts_as_frozen_ones_do(one_backend: str)
     for id in (0, 1):
         together.freeze_keyframe(id)
     bricks = together.bricks()
-    evidence = together._pool.read("evidence", together._book.topology.slots(bricks))
+    evidence = together._pool.read("evidence", together._registry.topology.slots(bricks))
     together.infer()
     alone = partial([2])
     assert len(alone.bricks()) < len(bricks)

@@ -16,7 +16,16 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Bricks, Hello, Keyframe, Notice, Request, Status, Update
+from taichi_mrf.viewer.messages import (
+    LOG_ODDS_STEP,
+    Bricks,
+    Hello,
+    KeyframeInfo,
+    Notice,
+    Request,
+    Status,
+    Update,
+)
 from taichi_mrf.voxels.layout import BRICK, grid_keys, offsets_in_brick
 
 CONFIG = Config(voxel_size=small_room.VOXEL_SIZE, evaluation=EvaluationConfig(hold_out=0))
@@ -58,13 +67,13 @@ class Shown:
     """What a viewer knows after some updates: the bricks of each layer, and the keyframes."""
 
     bricks: dict[str, dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]]] = field(default_factory=dict)
-    keyframes: dict[int, Keyframe] = field(default_factory=dict)
+    keyframes: dict[int, KeyframeInfo] = field(default_factory=dict)
 
     def hear(self, update: Update) -> None:
         if isinstance(update, Hello):
             self.bricks.clear()
             self.keyframes.clear()
-        elif isinstance(update, Keyframe):
+        elif isinstance(update, KeyframeInfo):
             self.keyframes[update.id] = update
         elif isinstance(update, Bricks):
             layer = self.bricks.setdefault(update.layer, {})

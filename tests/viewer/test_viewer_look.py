@@ -10,7 +10,7 @@ import pytest
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.viewer.live.options import ColorBy, ViewOptions
-from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Keyframe, RayAnswer, pack_log_odds
+from taichi_mrf.viewer.messages import LOG_ODDS_STEP, KeyframeInfo, RayAnswer, pack_log_odds
 from taichi_mrf.viewer.scene.coloring import legend_html, scale_of, voxel_colors
 from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, Placement
 from taichi_mrf.viewer.scene.look import look_of, up_of, up_vector
@@ -102,8 +102,8 @@ def test_looks_that_differ_only_in_unused_heights_are_the_same() -> None:
 CAMERA = PinholeCamera(64, 48, 50.0, 55.0, 30.0, 25.0)
 
 
-def keyframe(id: int, T_world_camera: np.ndarray) -> Keyframe:
-    return Keyframe(
+def keyframe(id: int, T_world_camera: np.ndarray) -> KeyframeInfo:
+    return KeyframeInfo(
         id, "k", T_world_camera, CAMERA, 1, "on", np.zeros((2, 2, 3), np.uint8), np.zeros((0, 3), np.int32)
     )
 

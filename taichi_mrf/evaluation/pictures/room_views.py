@@ -29,7 +29,7 @@ _PLAN_SIZE_IN = 10.0
 
 
 @dataclass(frozen=True)
-class Room:
+class DrawnMap:
     """What is drawn of a map, world frame, metres. At least one voxel."""
 
     centres: NDArray[np.floating]
@@ -51,7 +51,7 @@ class Room:
     """Where the keyframes were taken, in their order."""
 
 
-def top_view(room: Room) -> "Figure":
+def top_view(room: DrawnMap) -> "Figure":
     """The voxels seen from above, coloured by height, with the way of the camera.
 
     The axes are those of the world frame, turned by as little as makes them level.
@@ -89,7 +89,7 @@ def top_view(room: Room) -> "Figure":
     return figure
 
 
-def perspective(room: Room) -> "Figure":
+def perspective(room: DrawnMap) -> "Figure":
     """The voxels coloured by marginal, seen from outside through what would be in the way."""
     from matplotlib.colors import ListedColormap
 
@@ -117,7 +117,7 @@ def perspective(room: Room) -> "Figure":
     return figure
 
 
-def _voxels(room: Room) -> str:
+def _voxels(room: DrawnMap) -> str:
     return f"{len(room.centres):,} occupied voxels of {100 * room.voxel_size:.3g} cm"
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from taichi_mrf.evaluation.depth_error import depth_error
 from taichi_mrf.evaluation.pictures.figures import new_figure, notice
-from taichi_mrf.evaluation.pictures.room_views import Room, perspective, top_view
+from taichi_mrf.evaluation.pictures.room_views import DrawnMap, perspective, top_view
 from taichi_mrf.evaluation.pictures.surfaces import seen_surfaces, up_direction
 from taichi_mrf.methods.protocol import OccupancyMap, PosedDepth
 from taichi_mrf.sensor.frame import Frame
@@ -48,7 +48,7 @@ def _room_figures(m: OccupancyMap) -> dict[str, "Figure"]:
         return {"top_view.png": nothing, "perspective.png": nothing}
     surfaces = seen_surfaces(m)
     poses = [keyframe.T_world_camera for keyframe in m.keyframes.values()]
-    room = Room(
+    room = DrawnMap(
         centres=centres,
         probability=probability,
         normals=surfaces.thickened().normals_at(centres),

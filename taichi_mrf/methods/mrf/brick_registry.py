@@ -20,7 +20,7 @@ REMEMBERED = 64
 """Changes of the set of bricks that are kept, so that few lists must be made anew."""
 
 
-class BrickBook:
+class BrickRegistry:
     """Keeps topology and pool in step. ``version`` changes whenever a brick comes or goes."""
 
     def __init__(self, topology: Topology, pool: BrickPool, voxel_size: float) -> None:
@@ -33,7 +33,7 @@ class BrickBook:
     def claim(self, footprint: Footprint) -> None:
         """Allocate the bricks that a keyframe needs, and count it as an owner and as a looker.
 
-        Raises CapacityError, before anything has changed, if there is no room for them.
+        Raises CapacityError, before anything has changed, if there is no budget for them.
         """
         crossed = footprint.window.bricks_of(footprint.crossed)
         self.topology.check(crossed, self.voxel_size)
@@ -53,7 +53,7 @@ class BrickBook:
     def restore(self, bricks: Bricks, owners: NDArray[np.int32] | int) -> NDArray[np.int32]:
         """The bricks of a saved map (n, 3), at least one, with so many owners each; returns their slots.
 
-        Raises CapacityError if there is no room for them.
+        Raises CapacityError if there is no budget for them.
         """
         self.topology.anchor(bricks[len(bricks) // 2])
         self.topology.check(bricks, self.voxel_size)

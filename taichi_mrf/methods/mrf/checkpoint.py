@@ -29,7 +29,9 @@ class Checkpoint:
 def take_checkpoint(pool: BrickPool, keyframes: Iterable[Keyframe], messages_lost: bool) -> Checkpoint:
     """Copy the beliefs. The messages need no copy: full inference begins with new arrays."""
     return Checkpoint(
-        pool.snapshot(), {k.id: (k.visible, k.messages, k.heard) for k in keyframes}, messages_lost
+        pool.snapshot(),
+        {k.id: (k.visible, k.messages, k.change_count_at_last_sweep) for k in keyframes},
+        messages_lost,
     )
 
 
@@ -37,5 +39,7 @@ def go_back(checkpoint: Checkpoint, pool: BrickPool, keyframes: Iterable[Keyfram
     """Undo all sweeps since the checkpoint."""
     pool.restore(checkpoint.pool)
     for keyframe in keyframes:
-        keyframe.visible, keyframe.messages, keyframe.heard = checkpoint.messages[keyframe.id]
-        keyframe.coming = None
+        keyframe.visible, keyframe.messages, keyframe.change_count_at_last_sweep = checkpoint.messages[
+            keyframe.id
+        ]
+        keyframe.pending_visible = None

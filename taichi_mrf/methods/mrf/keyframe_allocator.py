@@ -9,14 +9,14 @@ from taichi_mrf.config.schema import InferenceConfig, SensorConfig, VolumeConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.footprint import find_footprint
-from taichi_mrf.inference.incremental import heard_of
+from taichi_mrf.inference.incremental import change_count_seen_by
 from taichi_mrf.inference.keyframe import DepthImage, Footprint, Keyframe, RayList
-from taichi_mrf.inference.keyframe_bounds import Whereabouts
+from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
 from taichi_mrf.inference.messages import carry_over, new_messages, withdraw_messages
-from taichi_mrf.inference.ray_list import RayLister
-from taichi_mrf.inference.sweep import unknown_begins
-from taichi_mrf.methods.mrf.brick_registry import BrickBook
-from taichi_mrf.methods.mrf.memory_budget import Room
+from taichi_mrf.inference.ray_list import RayBundler
+from taichi_mrf.inference.sweep import unknown_entry_depths
+from taichi_mrf.methods.mrf.brick_registry import BrickRegistry
+from taichi_mrf.methods.mrf.memory_budget import MemoryBudget
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.strips import strip_length
 
@@ -25,30 +25,30 @@ SCOUTS = 4
 
 
 @dataclass(frozen=True)
-class Placing:
+class KeyframeAllocator:
     """What it takes to place keyframes in a map, and to take them out again."""
 
-    book: BrickBook
-    lister: RayLister
+    registry: BrickRegistry
+    bundler: RayBundler
     sensor: SensorConfig
     inference: InferenceConfig
     volume: VolumeConfig
-    whereabouts: Whereabouts
-    room: Room
+    bounds: KeyframeBounds
+    budget: MemoryBudget
 
     def place(self, id: int, name: str, image: DepthImage, T_world_camera: Pose) -> Keyframe:
         """Find out which bricks a keyframe needs and sees, and claim them. Raises CapacityError if there is
-        no room for them."""
-        rays, voxel_size = self.lister.rays_of(image), self.book.voxel_size
+        no budget for them."""
+        rays, voxel_size = self.bundler.rays_of(image), self.registry.voxel_size
         parts = (voxel_size, self.sensor, self.inference, self.volume)
         footprint = find_footprint(image, rays, T_world_camera, *parts, scouts=SCOUTS)
-        self.room.check(footprint, 4 * (image.depth.shape[0] + rays.blocks.shape[0]) + rays.nbytes)
-        self.book.anchor_at(T_world_camera[:3, 3])
+        self.budget.check(footprint, 4 * (image.depth.shape[0] + rays.blocks.shape[0]) + rays.nbytes)
+        self.registry.anchor_at(T_world_camera[:3, 3])
         return self._claimed(id, name, image, rays, T_world_camera, footprint)
 
     def put_back(self, keyframe: Keyframe) -> Keyframe:
         """Place a keyframe again, without messages, where it has just been taken out: what it needs is free,
-        and nobody is asked for room."""
+        and nobody is asked for budget."""
         parts = (keyframe.image, keyframe.ray_list, keyframe.T_world_camera, keyframe.footprint)
         return self._claimed(keyframe.id, keyframe.name, *parts)
 
@@ -56,62 +56,62 @@ class Placing:
         self, id: int, name: str, image: DepthImage, rays: RayList, T_world_camera: Pose, footprint: Footprint
     ) -> Keyframe:
         """A keyframe whose bricks have been claimed, and that is counted."""
-        self.book.claim(footprint)
-        self.whereabouts.put(id, footprint.window)
-        visible, begins = self.book.visible(footprint), unknown_begins(rays)
-        keyframe = Keyframe(id, name, image, rays, T_world_camera, footprint, visible, begins)
-        self.room.take(keyframe)
+        self.registry.claim(footprint)
+        self.bounds.put(id, footprint.window)
+        visible, entry_depths = self.registry.visible(footprint), unknown_entry_depths(rays)
+        keyframe = Keyframe(id, name, image, rays, T_world_camera, footprint, visible, entry_depths)
+        self.budget.take(keyframe)
         return keyframe
 
     def take_out(self, keyframe: Keyframe) -> None:
         """Undo :meth:`place`, and withdraw the keyframe's messages."""
-        pool = self.book.pool
+        pool = self.registry.pool
         if keyframe.messages is not None:
             messages, slots = self.refresh(keyframe), keyframe.visible.slots
             if len(slots):
-                pool.stir(slots, withdraw_messages(keyframe.visible, messages, pool.belief))
+                pool.count_changes(slots, withdraw_messages(keyframe.visible, messages, pool.belief))
                 pool.revision += 1
                 pool.touch(slots)
-        self.book.disclaim(keyframe.footprint)
-        self.whereabouts.drop(keyframe.id)
-        self.room.give_back(keyframe.id)
+        self.registry.disclaim(keyframe.footprint)
+        self.bounds.drop(keyframe.id)
+        self.budget.give_back(keyframe.id)
         runtime.settle()  # before its arrays are dropped
 
     def freeze(self, keyframe: Keyframe) -> None:
         """Add a keyframe's messages to what inference starts from, and keep its bricks for good."""
-        pool, messages = self.book.pool, self.refresh(keyframe)
+        pool, messages = self.registry.pool, self.refresh(keyframe)
         if len(keyframe.visible.slots):
             sum_product.fold(keyframe.visible.slots, pool.keep_evidence(), messages, strip_length())
-        self.book.freeze(keyframe.footprint)
-        self.whereabouts.drop(keyframe.id)
-        self.room.give_back(keyframe.id)
+        self.registry.freeze(keyframe.footprint)
+        self.bounds.drop(keyframe.id)
+        self.budget.give_back(keyframe.id)
         pool.touch(keyframe.visible.slots)
         runtime.settle()  # before its arrays are dropped
 
-    def count_silent(self, keyframes: Iterable[Keyframe]) -> None:
-        """Note which of them have lost their messages, for which there must be room again."""
+    def mark_without_messages(self, keyframes: Iterable[Keyframe]) -> None:
+        """Note which of them have lost their messages, for which there must be memory again."""
         for keyframe in keyframes:
             if keyframe.messages is None:
-                self.room.has_fallen_silent(keyframe.id)
+                self.budget.mark_unallocated(keyframe.id)
 
     def look_again(self, keyframe: Keyframe) -> None:
         """Find out what a keyframe sees now, and leave its messages as they are."""
-        seen = keyframe.visible if keyframe.coming is None else keyframe.coming
-        visible = self.book.visible_again(keyframe.footprint, seen)
-        keyframe.coming = None if visible is keyframe.visible else visible
+        seen = keyframe.visible if keyframe.pending_visible is None else keyframe.pending_visible
+        visible = self.registry.visible_again(keyframe.footprint, seen)
+        keyframe.pending_visible = None if visible is keyframe.visible else visible
 
     def refresh(self, keyframe: Keyframe) -> "ti.Ndarray":
         """Bring a keyframe's bricks and messages up to date; bricks new to it get no message yet."""
         old, old_messages = keyframe.visible, keyframe.messages
         self.look_again(keyframe)
-        if keyframe.coming is not None:
-            keyframe.heard = heard_of(keyframe, keyframe.coming)
-            keyframe.visible, keyframe.coming = keyframe.coming, None
-            keyframe.begins = unknown_begins(keyframe.ray_list)
-            keyframe.begins_known = False
+        if keyframe.pending_visible is not None:
+            keyframe.change_count_at_last_sweep = change_count_seen_by(keyframe, keyframe.pending_visible)
+            keyframe.visible, keyframe.pending_visible = keyframe.pending_visible, None
+            keyframe.entry_depths = unknown_entry_depths(keyframe.ray_list)
+            keyframe.entry_depths_known = False
         if old_messages is None or keyframe.visible is not old:
             keyframe.messages = new_messages(keyframe.visible, self.inference.message_precision)
-            self.room.has_spoken(keyframe.id)
+            self.budget.has_spoken(keyframe.id)
             keyframe.revision = -1
             if old_messages is not None:
                 carry_over(old, old_messages, keyframe.visible, keyframe.messages)

@@ -23,19 +23,19 @@ from taichi_mrf.errors import KeyframeError
 from taichi_mrf.factor_graph.depth_graph import depth_graph
 from taichi_mrf.factor_graph.graph import FactorGraph
 from taichi_mrf.geometry.poses import as_pose
-from taichi_mrf.inference.incremental import Renewal
+from taichi_mrf.inference.incremental import IncrementalInference
 from taichi_mrf.inference.keyframe import DepthImage, Keyframe, checked_depth
-from taichi_mrf.inference.keyframe_bounds import Whereabouts
-from taichi_mrf.inference.messages import count_voices
+from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
+from taichi_mrf.inference.messages import count_observations
 from taichi_mrf.inference.prior import prior_probability
-from taichi_mrf.inference.ray_list import RayLister
+from taichi_mrf.inference.ray_list import RayBundler
 from taichi_mrf.inference.schedule import InferReport, Progress, content_key, run_sweeps
-from taichi_mrf.inference.sweep import Sweeper, unknown_begins
+from taichi_mrf.inference.sweep import Sweeper, unknown_entry_depths
 from taichi_mrf.methods.map_file import MapHeader, StoredKeyframe, naming
-from taichi_mrf.methods.mrf.brick_registry import BrickBook
+from taichi_mrf.methods.mrf.brick_registry import BrickRegistry
 from taichi_mrf.methods.mrf.checkpoint import Checkpoint, go_back, take_checkpoint
-from taichi_mrf.methods.mrf.keyframe_allocator import Placing
-from taichi_mrf.methods.mrf.memory_budget import Room
+from taichi_mrf.methods.mrf.keyframe_allocator import KeyframeAllocator
+from taichi_mrf.methods.mrf.memory_budget import MemoryBudget
 from taichi_mrf.methods.mrf.storage import contents_of, read_contents, write_contents
 from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.extract import extract_voxels
@@ -85,16 +85,18 @@ class MRFMap:
         self._pool = BrickPool(prior_log_odds, self.config.volume.memory_limit_gb)
         topology = create_topology(runtime.active() or "cpu", self.config.volume.dense_bricks)
         weakref.finalize(self, recycle, topology)
-        self._book = BrickBook(topology, self._pool, self.voxel_size)
-        lister = RayLister(self.voxel_size, inference)
-        whereabouts = Whereabouts()
+        self._registry = BrickRegistry(topology, self._pool, self.voxel_size)
+        bundler = RayBundler(self.voxel_size, inference)
+        bounds = KeyframeBounds()
         parts = (self.sensor, inference, self.config.volume)
         self._keyframes: dict[int, Keyframe] = {}
-        room = Room(self._pool, inference.message_precision)
-        self._placing = Placing(self._book, lister, *parts, whereabouts, room)
+        budget = MemoryBudget(self._pool, inference.message_precision)
+        self._allocator = KeyframeAllocator(self._registry, bundler, *parts, bounds, budget)
         self._sweeper = Sweeper(self.voxel_size, self.sensor, inference, self.config.volume)
-        kept = (self._placing.look_again, self._placing.refresh)
-        self._renewal = Renewal(self._pool, self._sweeper, whereabouts, *kept, inference.renew_tolerance)
+        kept = (self._allocator.look_again, self._allocator.refresh)
+        self._incremental = IncrementalInference(
+            self._pool, self._sweeper, bounds, *kept, inference.renew_tolerance
+        )
         self.view = View(self._pool, self.voxel_size, self.config.volume)
         self.aligner = Aligner(self.view, KeyframeSurfels(self.voxel_size, max_depth))
         self._frozen: dict[int, str] = {}
@@ -132,7 +134,7 @@ class MRFMap:
         """
         T = as_pose(T_world_camera)
         image = self._upload(depth_m, camera)
-        keyframe = self._placing.place(self._next_id, name or f"keyframe {self._next_id}", image, T)
+        keyframe = self._allocator.place(self._next_id, name or f"keyframe {self._next_id}", image, T)
         self._keyframes[keyframe.id] = keyframe
         self._next_id += 1
         return keyframe.id
@@ -141,7 +143,7 @@ class MRFMap:
         """Take a keyframe out, with all that it has said, and the bricks that only it wanted."""
         keyframe = self._find(id)
         self._restore_messages()
-        self._placing.take_out(keyframe)
+        self._allocator.take_out(keyframe)
         del self._keyframes[id]
 
     def move_keyframe(self, id: int, T_world_camera: ArrayLike) -> None:
@@ -149,11 +151,11 @@ class MRFMap:
         keyframe = self._find(id)
         T = as_pose(T_world_camera)
         self._restore_messages()
-        self._placing.take_out(keyframe)
+        self._allocator.take_out(keyframe)
         try:
-            self._keyframes[id] = self._placing.place(id, keyframe.name, keyframe.image, T)
+            self._keyframes[id] = self._allocator.place(id, keyframe.name, keyframe.image, T)
         except Exception:
-            self._keyframes[id] = self._placing.put_back(keyframe)
+            self._keyframes[id] = self._allocator.put_back(keyframe)
             raise
 
     def refine_pose(
@@ -165,7 +167,7 @@ class MRFMap:
         keyframe = self._find(id)
         self._restore_messages()
         if keyframe.messages is not None:
-            self._placing.refresh(keyframe)
+            self._allocator.refresh(keyframe)
         poses = [as_pose(T) for T in guesses]
         refined = self.aligner.refine(keyframe, self._keyframes, config or PoseConfig(), poses)
         if refined.accepted:
@@ -184,7 +186,7 @@ class MRFMap:
             raise KeyframeError(
                 f"keyframe {id} ({keyframe.name}) has no messages to freeze: call infer first"
             )
-        self._placing.freeze(keyframe)
+        self._allocator.freeze(keyframe)
         self.aligner.surface.freeze(keyframe)
         self._frozen[id] = keyframe.name
         del self._keyframes[id]
@@ -215,15 +217,18 @@ class MRFMap:
             self._pool.restart()
             for keyframe in chosen:
                 # A ray that starts further out rounds otherwise, so what earlier sweeps learnt must not show.
-                keyframe.begins, keyframe.begins_known = unknown_begins(keyframe.ray_list), False
+                keyframe.entry_depths, keyframe.entry_depths_known = (
+                    unknown_entry_depths(keyframe.ray_list),
+                    False,
+                )
                 keyframe.messages = None
-                self._placing.refresh(keyframe)
+                self._allocator.refresh(keyframe)
             self._messages_lost = False
         else:
             chosen = [self._find(id) for id in dict.fromkeys(keyframes)]
             self._restore_messages()
             for keyframe in chosen:
-                self._placing.refresh(keyframe)
+                self._allocator.refresh(keyframe)
         for keyframe in chosen:
             self._pool.touch(keyframe.visible.slots)
         return run_sweeps(chosen, self._pool, self._sweeper, sweeps, tolerance, progress)
@@ -248,7 +253,7 @@ class MRFMap:
         self._restore_messages()
         if tolerance is None:
             tolerance = self.config.inference.renew_tolerance
-        return self._renewal.run(self._keyframes, first, tolerance, seconds, progress)
+        return self._incremental.run(self._keyframes, first, tolerance, seconds, progress)
 
     def factor_graph(self, every: int = 1, memory_limit_gb: float = 0.0) -> FactorGraph:
         """The factor graph without average messages, for factor_graph.solve: a factor for each ray of every
@@ -256,7 +261,7 @@ class MRFMap:
         Raises CapacityError, which names its size, if it does not fit."""
         keyframes = sorted(self._keyframes.values(), key=content_key)
         for keyframe in keyframes:
-            self._placing.refresh(keyframe)
+            self._allocator.refresh(keyframe)
         parts = (self.sensor, self.config.inference, self.config.volume)
         return depth_graph(keyframes, self._pool, self.voxel_size, *parts, every, memory_limit_gb)
 
@@ -265,7 +270,7 @@ class MRFMap:
         self._pool.restart()
         for keyframe in self._keyframes.values():
             keyframe.messages = None
-        self._placing.count_silent(self._keyframes.values())
+        self._allocator.mark_without_messages(self._keyframes.values())
         self._pool.write("belief", self._pool.in_use, log_odds.reshape(-1, VOXELS).astype(np.float32))
         self._pool.touch(self._pool.in_use)
         self._messages_lost = bool(self._keyframes)
@@ -278,13 +283,13 @@ class MRFMap:
         """Go back to a checkpoint, since which only :meth:`infer` was called."""
         go_back(checkpoint, self._pool, self._keyframes.values())
         self._messages_lost = checkpoint.messages_lost
-        self._placing.count_silent(self._keyframes.values())
+        self._allocator.mark_without_messages(self._keyframes.values())
 
     def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
         """How many keyframes say something of each voxel of some bricks of the pool, (n,) -> (n, 512); all
         that are frozen count as one, and 255 means so many or more."""
         spoken = [(k.visible, k.messages) for k in self._keyframes.values() if k.messages is not None]
-        return count_voices(slots, spoken, self._pool)
+        return count_observations(slots, spoken, self._pool)
 
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
         """Marginal probability of occupied at (N, 3) points in metres, (N,) float32; the prior where
@@ -331,23 +336,23 @@ class MRFMap:
         keyframes = list(self._keyframes.values())
         stored = [StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera) for k in keyframes]
         header = MapHeader(self.config, self.noise, stored, self._next_id)
-        write_contents(Path(path), contents_of(header, self._book, keyframes, self._frozen))
+        write_contents(Path(path), contents_of(header, self._registry, keyframes, self._frozen))
 
     @classmethod
     def load(cls, path: str | Path, memory_limit_gb: float | None = None) -> "MRFMap":
         """Read a map that can be queried at once and extended; ``memory_limit_gb`` takes the place of its
-        own. Raises MapFileError, or CapacityError if there is no room for it."""
+        own. Raises MapFileError, or CapacityError if there is no budget for it."""
         contents = read_contents(Path(path))
         header, bricks = contents.header, contents.bricks
         with naming(Path(path)):
             m = cls._with(header.limited_to(memory_limit_gb), header.noise)
             if len(bricks):
-                slots = m._book.restore(bricks, contents.frozen_owners)
-            m._book.see_for_good(contents.frozen_crossed)
+                slots = m._registry.restore(bricks, contents.frozen_owners)
+            m._registry.see_for_good(contents.frozen_crossed)
             m._frozen = dict(contents.frozen)
             for stored in header.keyframes:
                 image = m._upload(stored.depth_m, stored.camera)
-                m._keyframes[stored.id] = m._placing.place(
+                m._keyframes[stored.id] = m._allocator.place(
                     stored.id, stored.name, image, stored.T_world_camera
                 )
         if len(bricks):
@@ -360,7 +365,7 @@ class MRFMap:
 
     def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
         seen_free = self._pool.prior_log_odds - self.config.inference.message_clamp
-        return point_log_odds(points, self.voxel_size, self._book.topology, self._pool, seen_free)
+        return point_log_odds(points, self.voxel_size, self._registry.topology, self._pool, seen_free)
 
     def _find(self, id: int) -> Keyframe:
         if id in self._frozen:

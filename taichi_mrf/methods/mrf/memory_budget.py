@@ -1,4 +1,4 @@
-"""Whether there is room for the keyframes of a map: asked as each is added, so that inference, which takes
+"""Whether there is memory for the keyframes of a map: asked as each is added, so that inference, which takes
 most of the memory, does not end for the lack of it what took hours.
 
 A keyframe's bricks are those that it saw when it was added: what comes later in its view adds a little. What
@@ -21,7 +21,7 @@ class _Share:
     image: int
 
 
-class Room:
+class MemoryBudget:
     """What the keyframes of a map take, and whether one more fits."""
 
     def __init__(self, pool: BrickPool, precision: str) -> None:
@@ -51,7 +51,7 @@ class Room:
         share = _Share(len(keyframe.visible.slots) * self._bytes_per_brick, keyframe.image_bytes)
         self._shares[keyframe.id] = share
         self._messages, self._images = self._messages + share.messages, self._images + share.image
-        self.has_fallen_silent(keyframe.id)
+        self.mark_unallocated(keyframe.id)
 
     def has_spoken(self, id: int) -> None:
         """Note that the memory for a keyframe's messages has been taken."""
@@ -59,7 +59,7 @@ class Room:
             self._silent.remove(id)
             self._to_come -= self._shares[id].messages
 
-    def has_fallen_silent(self, id: int) -> None:
+    def mark_unallocated(self, id: int) -> None:
         """Note that a keyframe has no messages, and will want them."""
         if id not in self._silent:
             self._silent.add(id)

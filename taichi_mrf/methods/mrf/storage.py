@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.map_file import MapHeader, open_map_file, read_bricks, read_header
-from taichi_mrf.methods.mrf.brick_registry import BrickBook
+from taichi_mrf.methods.mrf.brick_registry import BrickRegistry
 from taichi_mrf.system.atomic import write_npz
 from taichi_mrf.voxels.layout import VOXELS
 
@@ -35,21 +35,21 @@ class MapContents:
 
 
 def contents_of(
-    header: MapHeader, book: BrickBook, keyframes: Iterable[Keyframe], frozen: dict[int, str]
+    header: MapHeader, registry: BrickRegistry, keyframes: Iterable[Keyframe], frozen: dict[int, str]
 ) -> MapContents:
     """What is to be stored of a map; ``keyframes`` are those that can still be moved."""
-    pool = book.pool
+    pool = registry.pool
     slots = pool.in_order
     live = np.zeros(pool.capacity, np.int32)
     for keyframe in keyframes:
-        live[book.topology.slots(keyframe.footprint.window.bricks_of(keyframe.footprint.surface))] += 1
+        live[registry.topology.slots(keyframe.footprint.window.bricks_of(keyframe.footprint.surface))] += 1
     return MapContents(
         header,
         pool.bricks[slots],
         pool.read("belief", slots),
         None if pool.evidence is None else pool.read("evidence", slots),
         pool.owners[slots] - live[slots],
-        book.frozen_crossed,
+        registry.frozen_crossed,
         frozen,
     )
 

@@ -11,7 +11,7 @@ from taichi_mrf.config.schema import InferenceConfig, SensorConfig, VisibilityCo
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.footprint import find_footprint
 from taichi_mrf.inference.keyframe import DepthImage, Footprint
-from taichi_mrf.inference.ray_list import RayLister
+from taichi_mrf.inference.ray_list import RayBundler
 from taichi_mrf.methods.visibility import scan as visibility_scan
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import check_memory
@@ -35,7 +35,7 @@ class VisibilityIntegrator:
         # A depth is never more than its range, so what lies deeper need not be looked at.
         self.sensor = dataclasses.replace(sensor, max_depth=min(sensor.max_depth, self.max_range))
         self.index = WindowIndex()
-        self.lister = RayLister(voxel_size, InferenceConfig(ray_density=0.0))  # every pixel
+        self.bundler = RayBundler(voxel_size, InferenceConfig(ray_density=0.0))  # every pixel
         self.occluded = ti.ndarray(ti.f32, VOXELS)
         self.visible = ti.ndarray(ti.i32, VOXELS)
         self.inside = ti.ndarray(ti.i32, VOXELS)
@@ -53,7 +53,7 @@ class VisibilityIntegrator:
         to_its_end = InferenceConfig(end_sigmas=visibility_scan.SURE_SIGMAS)
         beyond_m = visibility_scan.BEYOND_VOXELS * self.voxel_size
         footprint = find_footprint(
-            image, self.lister.rays_of(image), T_world_camera, self.voxel_size, self.sensor, to_its_end,
+            image, self.bundler.rays_of(image), T_world_camera, self.voxel_size, self.sensor, to_its_end,
             self.volume, beyond_m,
         )  # fmt: skip
         voxels = len(footprint.crossed) * VOXELS

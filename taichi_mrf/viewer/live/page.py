@@ -20,7 +20,7 @@ from taichi_mrf.viewer.scene.keyframe_layer import KeyframeLayer, Placement
 from taichi_mrf.viewer.scene.look import up_of
 from taichi_mrf.viewer.scene.map_scene import MapScene
 from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
-from taichi_mrf.viewer.scene.viewpoint import Eye
+from taichi_mrf.viewer.scene.viewpoint import ViewpointController
 from taichi_mrf.viewer.transport.downloads import Downloads
 from taichi_mrf.viewer.transport.inbox import Inbox, Item
 
@@ -40,7 +40,7 @@ class Page:
         self._panel = Panel(server.gui, server.scene, self.inbox.put)
         self._downloads = Downloads(server, lambda text: self.inbox.put(m.Notice(text, "error")))
         self._keyframes = KeyframeLayer(server.scene)
-        self._eye = Eye(server)
+        self._eye = ViewpointController(server)
         self._map: MapScene | None = None
         self._voxel_size = 0.0
         self._two = False
@@ -68,7 +68,7 @@ class Page:
             return
         elif isinstance(item, m.Bricks):
             self._map.take(item)
-        elif isinstance(item, m.Keyframe):
+        elif isinstance(item, m.KeyframeInfo):
             self._take_keyframe(item)
         elif isinstance(item, m.CurrentCamera):
             self._keyframes.show_camera(item)
@@ -106,7 +106,7 @@ class Page:
         self._panel.show_hello(hello)
         self._panel.show_keyframes({}, None)
 
-    def _take_keyframe(self, keyframe: m.Keyframe) -> None:
+    def _take_keyframe(self, keyframe: m.KeyframeInfo) -> None:
         if not self._keyframes.keyframes:
             self._eye.set_up(up_of(keyframe.T_world_camera))
             self._keyframes.chosen = keyframe.id

@@ -9,7 +9,7 @@ import viser
 
 from taichi_mrf.viewer.events import Chosen, Event, OptionsMoved, Pressed
 from taichi_mrf.viewer.live.options import ViewOptions
-from taichi_mrf.viewer.messages import Hello, Images, Keyframe, Notice, Status
+from taichi_mrf.viewer.messages import Hello, Images, KeyframeInfo, Notice, Status
 from taichi_mrf.viewer.notices import notices_html
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
 from taichi_mrf.viewer.widgets import OptionWidgets
@@ -135,7 +135,7 @@ class Panel:
         """The scale of the colours."""
         self._legend.content = legend_html
 
-    def show_keyframes(self, keyframes: dict[int, Keyframe], chosen: int | None) -> None:
+    def show_keyframes(self, keyframes: dict[int, KeyframeInfo], chosen: int | None) -> None:
         """List the keyframes and what is chosen among them."""
         listed = [keyframes[id] for id in sorted(keyframes)]
         self._names = {f"{each.id}: {each.name} ({each.state})": each.id for each in listed}

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.viewer.messages import CurrentCamera, Keyframe
-from taichi_mrf.viewer.scene.shown_keyframes import Roster
+from taichi_mrf.viewer.messages import CurrentCamera, KeyframeInfo
+from taichi_mrf.viewer.scene.shown_keyframes import ShownKeyframes
 
 FRUSTUM_M = 0.15
 """Distance of a frustum's picture from its camera, metres."""
@@ -46,7 +46,7 @@ class KeyframeLayer:
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._scene = scene
-        self.roster = Roster()
+        self.roster = ShownKeyframes()
         self.chosen: int | None = None
         self.gizmo: viser.TransformControlsHandle | None = None
         self._frusta: dict[int, viser.CameraFrustumHandle] = {}
@@ -56,11 +56,11 @@ class KeyframeLayer:
         self._pictures = True
 
     @property
-    def keyframes(self) -> dict[int, Keyframe]:
+    def keyframes(self) -> dict[int, KeyframeInfo]:
         """Those that are known, by number."""
         return self.roster.keyframes
 
-    def put(self, keyframe: Keyframe) -> None:
+    def put(self, keyframe: KeyframeInfo) -> None:
         """Show a keyframe that is new or has changed."""
         forgotten = self.roster.put(keyframe)
         for id in forgotten:
@@ -136,12 +136,12 @@ class KeyframeLayer:
         self._frusta.clear()
         self._places.clear()
         self._free_places.clear()
-        self.roster = Roster()
+        self.roster = ShownKeyframes()
         self.chosen = None
         for name in ("/way", "/camera"):
             self._scene.remove_by_name(name)
 
-    def _draw(self, keyframe: Keyframe) -> None:
+    def _draw(self, keyframe: KeyframeInfo) -> None:
         place = Placement.of(keyframe.T_world_camera)
         fov, aspect = _view_angles(keyframe.camera)
         is_chosen = keyframe.id == self.chosen

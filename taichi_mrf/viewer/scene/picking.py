@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.viewer.messages import Keyframe
+from taichi_mrf.viewer.messages import KeyframeInfo
 from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M
 
 
@@ -41,7 +41,7 @@ def first_voxel(
     return centres[first], float(range_m[first])
 
 
-def first_pixel(origin: ArrayLike, direction: ArrayLike, keyframes: Iterable[Keyframe]) -> Pixel | None:
+def first_pixel(origin: ArrayLike, direction: ArrayLike, keyframes: Iterable[KeyframeInfo]) -> Pixel | None:
     """The nearest picture of a keyframe that a ray meets, and the pixel there."""
     start = np.asarray(origin, np.float64)
     along = np.asarray(direction, np.float64)
@@ -50,7 +50,7 @@ def first_pixel(origin: ArrayLike, direction: ArrayLike, keyframes: Iterable[Key
     return min(hits, key=lambda hit: hit.range_m, default=None)
 
 
-def _pixel(start: NDArray[np.float64], along: NDArray[np.float64], keyframe: Keyframe) -> Pixel | None:
+def _pixel(start: NDArray[np.float64], along: NDArray[np.float64], keyframe: KeyframeInfo) -> Pixel | None:
     """Where the ray goes through the picture, which stands FRUSTUM_M before the keyframe's camera."""
     R, t = keyframe.T_world_camera[:3, :3], keyframe.T_world_camera[:3, 3]
     origin, direction = R.T @ (start - t), R.T @ along

@@ -5,24 +5,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.viewer.messages import Keyframe
+from taichi_mrf.viewer.messages import KeyframeInfo
 
 MOST_FROZEN = 50
 MOST_WAYPOINTS = 2000
 
 
-class Roster:
+class ShownKeyframes:
     """Keyframes by number, and the camera's way through all there ever were."""
 
     def __init__(self) -> None:
-        self.keyframes: dict[int, Keyframe] = {}
+        self.keyframes: dict[int, KeyframeInfo] = {}
         self.recorded: dict[int, Pose] = {}
         """Where each keyframe was before anybody moved it."""
         self._old_way: list[NDArray[np.float64]] = []
         self._old_crossed = np.zeros((0, 3), np.int32)
         self._every, self._forgotten = 1, 0
 
-    def put(self, keyframe: Keyframe) -> list[int]:
+    def put(self, keyframe: KeyframeInfo) -> list[int]:
         """Remember a keyframe that is new or has changed; returns the numbers of those that are forgotten."""
         self.keyframes[keyframe.id] = keyframe
         home = keyframe.T_home

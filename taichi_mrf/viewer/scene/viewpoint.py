@@ -17,7 +17,7 @@ right."""
 _BEHIND_M, _ABOVE_M, _AHEAD_M = 1.5, 0.7, 2.0
 
 
-class Eye:
+class ViewpointController:
     """Owns the cameras of the browsers, as far as the page moves them."""
 
     def __init__(self, server: viser.ViserServer) -> None:

@@ -18,7 +18,7 @@ from taichi_mrf.viewer.scene.coloring import Scale, legend_html
 from taichi_mrf.viewer.scene.keyframe_layer import KeyframeLayer
 from taichi_mrf.viewer.scene.look import up_of
 from taichi_mrf.viewer.scene.map_scene import MapScene
-from taichi_mrf.viewer.scene.viewpoint import Eye
+from taichi_mrf.viewer.scene.viewpoint import ViewpointController
 from taichi_mrf.viewer.transport.downloads import Downloads
 from taichi_mrf.viewer.transport.inbox import Inbox
 from taichi_mrf.viewer.tune import messages as t
@@ -37,7 +37,7 @@ class TunePage:
         self._panel = TunePanel(server.gui, self._config, self.inbox.put)
         self._downloads = Downloads(server, lambda text: self.inbox.put(m.Notice(text, "error")))
         self._keyframes = KeyframeLayer(server.scene)
-        self._eye = Eye(server)
+        self._eye = ViewpointController(server)
         self._map: MapScene | None = None
         self._hello: m.Hello | None = None
         self._scale: Scale | None = None
@@ -73,7 +73,7 @@ class TunePage:
             self._keyframes.clear()
         elif isinstance(item, m.Bricks):
             self._take_bricks(item)
-        elif isinstance(item, m.Keyframe):
+        elif isinstance(item, m.KeyframeInfo):
             self._take_keyframe(item)
         elif isinstance(item, t.Activity):
             self._panel.show_activity(item)
@@ -125,7 +125,7 @@ class TunePage:
         if self._map is not None:
             self._map.take(bricks)
 
-    def _take_keyframe(self, keyframe: m.Keyframe) -> None:
+    def _take_keyframe(self, keyframe: m.KeyframeInfo) -> None:
         if not self._keyframes.keyframes:
             up = up_of(keyframe.T_world_camera)
             if up != self._eye.up or self._map is None or self._scale is None:

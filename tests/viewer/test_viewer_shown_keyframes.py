@@ -3,25 +3,25 @@
 import numpy as np
 
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.viewer.messages import Keyframe, KeyframeState
-from taichi_mrf.viewer.scene.shown_keyframes import MOST_FROZEN, MOST_WAYPOINTS, Roster
+from taichi_mrf.viewer.messages import KeyframeInfo, KeyframeState
+from taichi_mrf.viewer.scene.shown_keyframes import MOST_FROZEN, MOST_WAYPOINTS, ShownKeyframes
 
 CAMERA = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
 
 
-def keyframe(id: int, state: KeyframeState = "on") -> Keyframe:
+def keyframe(id: int, state: KeyframeState = "on") -> KeyframeInfo:
     T = np.eye(4)
     T[0, 3] = id
     crossed = np.array([[id, 0, 0], [id + 1, 0, 0]], np.int32)
-    return Keyframe(id, f"frame {id}", T, CAMERA, 1, state, np.zeros((2, 2, 3), np.uint8), crossed)
+    return KeyframeInfo(id, f"frame {id}", T, CAMERA, 1, state, np.zeros((2, 2, 3), np.uint8), crossed)
 
 
-def bricks(roster: Roster) -> set[tuple[int, ...]]:
+def bricks(roster: ShownKeyframes) -> set[tuple[int, ...]]:
     return {tuple(brick) for each in roster.crossed() for brick in each.tolist()}
 
 
 def test_frozen_keyframes_are_forgotten_but_not_what_they_saw_nor_where_they_were() -> None:
-    roster, forgotten = Roster(), []
+    roster, forgotten = ShownKeyframes(), []
     for id in range(3 * MOST_FROZEN):
         roster.put(keyframe(id))
         forgotten += roster.put(keyframe(id, "frozen"))
@@ -33,14 +33,14 @@ def test_frozen_keyframes_are_forgotten_but_not_what_they_saw_nor_where_they_wer
 
 
 def test_what_can_be_changed_is_never_forgotten() -> None:
-    roster = Roster()
+    roster = ShownKeyframes()
     for id in range(4 * MOST_FROZEN):
         assert roster.put(keyframe(id)) == []
     assert len(roster.keyframes) == 4 * MOST_FROZEN
 
 
 def test_a_long_way_keeps_its_ends_and_its_order() -> None:
-    roster = Roster()
+    roster = ShownKeyframes()
     count = 3 * MOST_WAYPOINTS
     for id in range(count):
         roster.put(keyframe(id, "frozen"))
@@ -53,7 +53,7 @@ def test_a_long_way_keeps_its_ends_and_its_order() -> None:
 
 
 def test_a_keyframe_that_is_off_has_seen_nothing_and_remembers_where_it_was() -> None:
-    roster = Roster()
+    roster = ShownKeyframes()
     roster.put(keyframe(1))
     moved = keyframe(1, "off")
     moved.T_world_camera[1, 3] = 5.0

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from taichi_mrf.inference.incremental import moved_share
-from taichi_mrf.inference.keyframe_bounds import Whereabouts
+from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.voxels.window import Window
@@ -44,17 +44,17 @@ size = st.tuples(*[st.integers(1, 12)] * 3)
 def test_those_whose_box_meets_the_bricks_are_near(
     boxes: list, dropped: set[int], low: tuple, extent: tuple
 ) -> None:
-    whereabouts, oracle = Whereabouts(), {}
+    bounds, oracle = KeyframeBounds(), {}
     for id, lowest, shape in boxes:
-        whereabouts.put(id, Window(lowest, shape, 1.0))
+        bounds.put(id, Window(lowest, shape, 1.0))
         oracle[id] = (np.array(lowest), np.array(lowest) + shape)
     for id in dropped & oracle.keys():
-        whereabouts.drop(id)
+        bounds.drop(id)
         del oracle[id]
     bricks = np.array([low, np.array(low) + extent - 1])
     meets = {id for id, (a, b) in oracle.items() if (a <= bricks[1]).all() and (b > bricks[0]).all()}
-    assert whereabouts.near(bricks.astype(np.int32)) == meets
-    assert whereabouts.near(bricks[:0].astype(np.int32)) == set()
+    assert bounds.near(bricks.astype(np.int32)) == meets
+    assert bounds.near(bricks[:0].astype(np.int32)) == set()
 
 
 @pytest.mark.parametrize("tolerance", [0.2, 0.05])
@@ -160,7 +160,7 @@ def test_a_keyframe_that_is_named_twice_is_swept_once() -> None:
     ids = [[small_room.add(each, small_room.frames()[i]) for i in ROOM[:3]] for each in (m, twin)]
     m.infer(keyframes=[ids[0][0], ids[0][1], ids[0][0]], sweeps=1)
     twin.infer(keyframes=ids[1][:2], sweeps=1)
-    np.testing.assert_array_equal(m._pool.stirred, twin._pool.stirred)
+    np.testing.assert_array_equal(m._pool.change_count, twin._pool.change_count)
 
 
 def test_what_moved_counts_even_if_progress_raises() -> None:
@@ -174,8 +174,8 @@ def test_what_moved_counts_even_if_progress_raises() -> None:
 
     with pytest.raises(RuntimeError, match="enough"):
         m.infer(keyframes=ids, sweeps=1, progress=progress)
-    assert m._pool.stirred.sum() > 0
-    assert [m.keyframes[id].heard is not None for id in ids] == [True, True, False]
+    assert m._pool.change_count.sum() > 0
+    assert [m.keyframes[id].change_count_at_last_sweep is not None for id in ids] == [True, True, False]
 
 
 def test_a_call_that_tolerates_much_does_not_make_others_forgotten() -> None:
