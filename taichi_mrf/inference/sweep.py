@@ -159,7 +159,7 @@ class Sweeper:
 
     def take_moved(self, keyframe: Keyframe, pool: BrickPool) -> NDArray[np.int32]:
         """How many voxels of each visible brick moved in the keyframe's last sweep, (n,). The pool adds
-        them to its change counts, which the keyframe remembers. Keyframes are asked in the order of their sweeps."""
+        them to its change counts, which the keyframe keeps. Ask keyframes in the order of their sweeps."""
         visible = keyframe.visible
         moved = np.array(on_host(visible.on_device().moved))
         pool.count_changes(visible.slots, moved)

@@ -252,11 +252,11 @@ def page_chosen(page: LivePage) -> str:
 
 def test_octomaps_way_is_shown_beside_the_map(page: LivePage) -> None:
     before = page.look()
-    page.tick("BaselineOverlay")
+    page.tick("Beside")
     seen = page.until(lambda seen: seen.settled and seen.beside > 1000, "the other map")
     assert seen.voxels == before.voxels
     page.screenshot("beside")
-    page.tick("BaselineOverlay", on=False)
+    page.tick("Beside", on=False)
     page.until(lambda seen: seen.agrees and seen.said_beside == 0, "the map alone")
 
 
