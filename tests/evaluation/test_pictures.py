@@ -13,7 +13,7 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
-from taichi_mrf.evaluation.pictures.room_views import Room, top_view
+from taichi_mrf.evaluation.pictures.room_views import DrawnMap, top_view
 from taichi_mrf.evaluation.pictures.run_pictures import depth_comparison, write_pictures
 from taichi_mrf.evaluation.pictures.surfaces import level_rotation, seen_surfaces, up_direction
 from taichi_mrf.evaluation.pictures.viewpoint import faces_viewer, overview_pose
@@ -195,12 +195,12 @@ def test_level_rotation(seed: int) -> None:
     np.testing.assert_allclose(level_rotation(np.array([0.0, 0.0, -1.0])) @ [0, 0, -1], [0, 0, 1])
 
 
-def _as_room(m: VoxelMap) -> Room:
+def _as_room(m: VoxelMap) -> DrawnMap:
     surfaces = seen_surfaces(m)
     poses = [keyframe.T_world_camera for keyframe in m.keyframes.values()]
     normals = surfaces.thickened().normals_at(m.centres)
     up = up_direction(poses, surfaces.normals)
-    return Room(m.centres, m.probability, normals, m.voxel_size, up, poses)
+    return DrawnMap(m.centres, m.probability, normals, m.voxel_size, up, poses)
 
 
 def test_top_view_looks_through_the_ceiling(room: VoxelMap) -> None:

@@ -13,7 +13,7 @@ from taichi_mrf.tune.outbox import TuneOutbox
 from taichi_mrf.tune.search import Search
 from taichi_mrf.tune.session import Policy, TuneSession
 from taichi_mrf.tune.trial import run_trial
-from taichi_mrf.viewer.messages import Bricks, File, Hello, Keyframe, Notice, Quit, Request, Update
+from taichi_mrf.viewer.messages import Bricks, File, Hello, KeyframeInfo, Notice, Quit, Request, Update
 from taichi_mrf.viewer.tune.messages import (
     Activity,
     ChooseFrames,
@@ -70,7 +70,7 @@ def test_a_session_begins_with_a_try_of_where_it_stands() -> None:
     assert (tried.number, tried.config, tried.by) == (0, CONFIG, "start")
     assert link.of_type(Pinned) == [Pinned(0)]
     assert link.of_type(Chosen)[0].number == link.of_type(Residuals)[0].number == 0
-    assert len(link.of_type(Keyframe)) == 6
+    assert len(link.of_type(KeyframeInfo)) == 6
     direct = run_trial(CONFIG, session.frames)
     assert direct is not None
     same = dataclasses.replace(tried.scores, seconds=direct.scores.seconds)
