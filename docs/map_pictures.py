@@ -83,7 +83,7 @@ def cuts(run: Path) -> Image.Image:
 
     figure = new_figure(13.0, 5.0)
     first, second = figure.subplots(1, 2)
-    first.set_title(f"slice_map at z = {cut.at_m:.2f} m, find_frontiers (magenta)")
+    first.set_title(f"slice_map at {cut.axis} = {cut.at_m:.2f} m, find_frontiers (magenta)")
     second.set_title("distance_field in the same layer")
     for axes, values, colors, most, label in (
         (first, cut.occupancy, "viridis", 1.0, "marginal occupancy"),

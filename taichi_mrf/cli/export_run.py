@@ -11,7 +11,7 @@ from rich.console import Console
 from taichi_mrf.cli.export import Export
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.chunk_store import SUFFIX
-from taichi_mrf.export.formats import ExportedMap, export_map, writer_of
+from taichi_mrf.export.formats import ExportedMap, export_map, export_note, writer_of
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import take_part
 from taichi_mrf.methods.registry import load_map
@@ -41,6 +41,9 @@ def run_export(options: Export) -> int:
             written.append({"file": str(file), "bytes": _size(file), "seconds": seconds})
             if not options.json:
                 _tell(console, file, seconds)
+        note = export_note(m, path, options.options)
+        if note is not None and not options.json:
+            console.print(f"{path.name}: {note}", markup=False, highlight=False, soft_wrap=True)
     if options.json:
         print(json.dumps(written, indent=2))
     return 0

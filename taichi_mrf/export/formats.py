@@ -20,6 +20,7 @@ from taichi_mrf.export.octomap import write_bt, write_ot
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.export.ply import write_voxels
 from taichi_mrf.export.surface import smooth_surface, voxel_surface
+from taichi_mrf.geometry.up import Up, plan_axes, up_from_name, up_name, up_of_first, y_up
 from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN
 
@@ -67,6 +68,25 @@ def extensions() -> Sequence[str]:
     return tuple(_WRITERS)
 
 
+def export_note(m: ExportedMap, path: str | Path, options: ExportOptions = _DEFAULTS) -> str | None:
+    """What a user should be told about a file that was written: how a floor plan lies in the world."""
+    if _WRITERS.get(Path(path).suffix.lower()) is not _level_map:
+        return None
+    reason = "--up" if options.up != "auto" else "the first keyframe's image"
+    if options.up == "auto" and not m.keyframes:
+        reason = "the map has no keyframes to tell; --up sets another"
+    return f"{_plan_note(_up(m, options))} ({reason})"
+
+
+def _up(m: ExportedMap, options: ExportOptions) -> Up:
+    return up_of_first(m.keyframes.values()) if options.up == "auto" else up_from_name(options.up)
+
+
+def _plan_note(up: Up) -> str:
+    right, forwards = ("xyz"[axis] for axis in plan_axes(up))
+    return f"up is {up_name(up)}: columns run along {right}, rows from the bottom along {forwards}"
+
+
 def _points_or_surface(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
     if options.cubes or options.mesh:
         return _surface(m, path, options)
@@ -79,11 +99,7 @@ def _surface(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
     surface = make(m, options.threshold)
     if not len(surface.triangles):
         raise ConfigError(f"{path}: no voxel has a probability of {options.threshold:g}: there is no surface")
-    T_gltf_world = None
-    if path.suffix.lower() == ".glb":
-        from taichi_mrf.export.upright import up_of_map, y_up  # viser takes a second to import
-
-        T_gltf_world = y_up(up_of_map(m))
+    T_gltf_world = y_up(_up(m, options)) if path.suffix.lower() == ".glb" else None
     write_mesh(path, surface, m.voxel_size, T_gltf_world)
     return [path]
 
@@ -99,9 +115,11 @@ def _octomap(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
 
 
 def _level_map(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
-    found = level_map(m, options.z_min, options.z_max, options.occupied_from, options.free_below)
+    up = _up(m, options)
+    found = level_map(m, options.z_min, options.z_max, options.occupied_from, options.free_below, up)
     image = grey_image(found.state == OCCUPIED, found.state != UNKNOWN)
-    return write_map_server(path.parent, image, found.cell_size, found.lower_x_y, path.stem)
+    note = _plan_note(up)
+    return write_map_server(path.parent, image, found.cell_size, found.lower_corner_m, path.stem, note)
 
 
 def _arrays(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
@@ -115,9 +133,9 @@ def _chunks(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
 
 
 def _page(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
-    from taichi_mrf.export.page import write_page  # as above
+    from taichi_mrf.export.page import write_page  # viser takes a second to import
 
-    write_page(path, m, options.threshold)
+    write_page(path, m, options.threshold, _up(m, options))
     return [path]
 
 

@@ -24,12 +24,14 @@ def write_map_server(
     folder: Path,
     image: NDArray[np.uint8],
     cell_size: float,
-    lower_x_y: tuple[float, float],
+    lower_corner_m: tuple[float, float],
     name: str = "map",
+    note: str | None = None,
 ) -> list[Path]:
     """Write ``map.pgm`` and ``map.yaml``, or of another name; returns their paths. Raises MapFileError.
 
-    ``lower_x_y`` is the outer corner of the image's lower left pixel, in metres, as is ``cell_size``.
+    ``lower_corner_m`` is the outer corner of the image's lower left pixel, in metres, as is ``cell_size``.
+    ``note`` becomes a comment in the YAML file.
     """
     pgm, description = folder / f"{name}.pgm", folder / f"{name}.yaml"
     height, width = image.shape
@@ -38,10 +40,11 @@ def write_map_server(
     values = {
         "image": pgm.name,
         "resolution": float(cell_size),
-        "origin": [float(lower_x_y[0]), float(lower_x_y[1]), 0.0],
+        "origin": [float(lower_corner_m[0]), float(lower_corner_m[1]), 0.0],
         "negate": 0,
         "occupied_thresh": OCCUPIED_THRESHOLD,
         "free_thresh": FREE_THRESHOLD,
     }
-    write_text(description, yaml.safe_dump(values, sort_keys=False, default_flow_style=None))
+    comment = "" if note is None else f"# {note}\n"
+    write_text(description, comment + yaml.safe_dump(values, sort_keys=False, default_flow_style=None))
     return [pgm, description]

@@ -2,8 +2,10 @@
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.geometry.up import UpName
 
 
 @dataclass(frozen=True)
@@ -20,10 +22,14 @@ class ExportOptions:
     """Write a .ply as a mesh by marching cubes, like .glb, .obj and .stl, not as points."""
 
     z_min: float | None = None
-    """Lower end in metres of the band of heights that a .pgm shows."""
+    """Lower end in metres of the band of heights that a .pgm shows; heights count along up."""
 
     z_max: float | None = None
     """Upper end in metres of the band of heights that a .pgm shows."""
+
+    up: Literal["auto"] | UpName = "auto"
+    """The world axis that is up in .pgm, .glb and .html. auto takes it from the first keyframe's image, or z
+    if the map has no keyframes."""
 
     occupied_from: float = 0.5
     """A cell of a .pgm is occupied if a voxel in the band has at least this probability."""

@@ -1,19 +1,17 @@
 """Level and upright cuts through a map, as images."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.geometry.up import plan_axes, up_of_first
 from taichi_mrf.queries.box import FARTHEST_VOXEL, map_extent, voxel_box, voxels_of_box
 from taichi_mrf.queries.known_bricks import QueriedMap
 
 Axis = Literal["x", "y", "z"]
-
-_ACROSS_AND_UP = {"x": (1, 2), "y": (0, 2), "z": (0, 1)}
-"""The axes of the world that run across and up in the image of a cut, by the axis that it is square to."""
 
 
 @dataclass(frozen=True)
@@ -21,8 +19,8 @@ class MapSlice:
     """One layer of voxels as an image whose first row is the lowest (``origin="lower"`` of imshow).
 
     ``occupancy`` (rows, columns) float32 and ``state`` (rows, columns) int8; ``extent`` is (left, right,
-    bottom, top) in metres, along the world's axes ``across`` and ``up``; ``at_m`` is where the layer's middle
-    lies along the axis that is left.
+    bottom, top) in metres, along the world's axes ``across`` and ``up`` (bottom > top if that axis points
+    down); ``at_m`` is where the layer's middle lies along the world's axis ``axis``.
     """
 
     occupancy: NDArray[np.float32]
@@ -30,44 +28,64 @@ class MapSlice:
     extent: tuple[float, float, float, float]
     across: Axis
     up: Axis
+    axis: Axis
     at_m: float
 
 
 def slice_map(
-    m: QueriedMap, at: float, axis: Axis = "z", lower: ArrayLike | None = None, upper: ArrayLike | None = None
+    m: QueriedMap,
+    at: float,
+    axis: Literal["up"] | Axis = "up",
+    lower: ArrayLike | None = None,
+    upper: ArrayLike | None = None,
 ) -> MapSlice:
-    """The layer of voxels at ``at`` metres along ``axis``: "z" cuts level, "x" and "y" upright.
+    """The layer of voxels at ``at`` metres: at this height with "up", else at this place along the axis.
 
-    It shows the whole map, or the part between ``lower`` and ``upper``, (2,) in metres along the image's two
-    axes. Raises ConfigError for another axis, for corners that make no box and for an empty map,
-    CapacityError if the layer does not fit memory.
+    Up is the world's axis that is up in the first keyframe's image (z without keyframes). The layer shows the
+    whole map, or the part between ``lower`` and ``upper``, (2,) in metres along the image's two axes. A level
+    layer is seen from above; in an upright one, up is up. Raises ConfigError for another axis, for corners
+    that make no box and for an empty map, CapacityError if the layer does not fit memory.
     """
-    if axis not in _ACROSS_AND_UP:
-        raise ConfigError(f"axis must be x, y or z, not {axis!r}")
+    if axis not in ("up", *get_args(Axis)):
+        raise ConfigError(f"axis must be up, x, y or z, not {axis!r}")
     if not np.isfinite(at):
         raise ConfigError(f"a slice needs a finite place along {axis}, not {at}")
-    across, up = _ACROSS_AND_UP[axis]
-    number = "xyz".index(axis)
+    up_axis, sign = up_of_first(m.keyframes.values())
+    number = up_axis if axis == "up" else "xyz".index(axis)
+    place_m = sign * at if axis == "up" else at
+    if number == up_axis:
+        across, upwards = plan_axes((up_axis, sign))
+        flipped = False
+    else:
+        across, upwards = 3 - number - up_axis, up_axis
+        flipped = sign < 0
     low, high = np.zeros(3), np.full(3, m.voxel_size)
     if lower is None or upper is None:
         whole = map_extent(m)
-        low[[across, up]], high[[across, up]] = whole[0][[across, up]], whole[1][[across, up]]
+        low[[across, upwards]], high[[across, upwards]] = (ends[[across, upwards]] for ends in whole)
     for given, corner in ((lower, low), (upper, high)):
         if given is not None:
             values = np.asarray(given, np.float64)
             if values.shape != (2,):
                 raise ConfigError(f"the corners of a slice are two numbers, not {values.shape}")
-            corner[[across, up]] = values
+            corner[[across, upwards]] = values
     first, after = voxels_of_box(low, high, m.voxel_size)
-    first[number] = np.floor(np.clip(at / m.voxel_size, -FARTHEST_VOXEL, FARTHEST_VOXEL))
+    first[number] = np.floor(np.clip(place_m / m.voxel_size, -FARTHEST_VOXEL, FARTHEST_VOXEL))
     after[number] = first[number] + 1
     found = voxel_box(m, first, after)
-    from_m, to_m = found.lower_m, found.upper_m
+    left_right = float(found.lower_m[across]), float(found.upper_m[across])
+    bottom_top = float(found.lower_m[upwards]), float(found.upper_m[upwards])
+
+    def image(values: NDArray) -> NDArray:
+        rows_columns = values.transpose(upwards, across, number)[..., 0]
+        return np.ascontiguousarray(rows_columns[::-1] if flipped else rows_columns)
+
     return MapSlice(
-        np.ascontiguousarray(found.occupancy.squeeze(number).T),
-        np.ascontiguousarray(found.state.squeeze(number).T),
-        (float(from_m[across]), float(to_m[across]), float(from_m[up]), float(to_m[up])),
+        image(found.occupancy),
+        image(found.state),
+        (*left_right, *(bottom_top[::-1] if flipped else bottom_top)),
         "xyz"[across],  # type: ignore[arg-type]
-        "xyz"[up],  # type: ignore[arg-type]
+        "xyz"[upwards],  # type: ignore[arg-type]
+        "xyz"[number],  # type: ignore[arg-type]
         float(found.centres(number)[0]),
     )

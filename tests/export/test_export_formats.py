@@ -3,7 +3,9 @@
 import base64
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -13,11 +15,11 @@ import trimesh
 import tyro
 import yaml
 from browser import LivePage, chromium, missing
-from queried_maps import map_of, room_map
+from queried_maps import hand_map, map_of, room_map
 
 from taichi_mrf.cli.export import Export
 from taichi_mrf.errors import ConfigError, MapFileError
-from taichi_mrf.export.formats import export_map, extensions
+from taichi_mrf.export.formats import export_map, export_note, extensions
 from taichi_mrf.export.level_map import level_map
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.methods.log_odds.map import LogOddsMap
@@ -121,6 +123,29 @@ def test_cells_between_the_thresholds_are_unknown(backend: str) -> None:
     np.testing.assert_array_equal(found.state, np.tile([1, 0, 2, 0, 1, 1, 1, 1], (8, 1)))
     assert found.highest[0, 2] == pytest.approx(1 / (1 + np.exp(-2.0)))
     assert (level_map(m, 0.1, 0.3).state[0, :4] == [1, 2, 2, 0]).all()
+
+
+def test_the_2d_map_of_a_world_whose_y_points_down_is_a_floor_plan(backend: str, tmp_path: Path) -> None:
+    m = replace(hand_map(backend), keyframes={0: SimpleNamespace(T_world_camera=np.eye(4))})
+    export_map(m, tmp_path / "floor.pgm", ExportOptions(z_min=-1.6, z_max=-1.0))
+    image = cv2.imread(str(tmp_path / "floor.pgm"), cv2.IMREAD_UNCHANGED)
+    text = (tmp_path / "floor.yaml").read_text()
+    assert text.startswith("# up is -y: columns run along x, rows from the bottom along z\n")
+    described, size = yaml.safe_load(text), m.voxel_size
+    rows, columns = image.shape
+    x = described["origin"][0] + (np.arange(columns) + 0.5) * size
+    z = described["origin"][1] + (rows - np.arange(rows) - 0.5) * size
+    y = np.arange(1.0 + size / 2, 1.6, size)
+    points = np.stack(np.meshgrid(z, x, y, indexing="ij"), axis=-1)[..., [1, 2, 0]].reshape(-1, 3)
+    state = m.state(points).reshape(rows, columns, len(y))
+    occupied = m.occupancy(points).reshape(state.shape) >= 0.5
+    wanted = np.where((occupied & (state > 0)).any(axis=2), 0, np.where((state > 0).any(axis=2), 254, 205))
+    np.testing.assert_array_equal(image, wanted)
+    assert {0, 254} <= set(np.unique(image))
+    sideways = ExportOptions(z_min=-1.6, z_max=-1.0, up="z")
+    assert "(--up)" in str(export_note(m, "floor.pgm", sideways))
+    assert "the first keyframe's image" in str(export_note(m, "floor.pgm"))
+    assert export_note(m, "map.glb") is None
 
 
 def test_a_2d_map_needs_a_band_in_which_something_is_known(tmp_path: Path) -> None:

@@ -1,5 +1,8 @@
 """Boxes, slices and the bricks that a map knows, against the voxels that were written and brute force."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hand_made import BRICK_M, VOXEL
@@ -18,7 +21,7 @@ from taichi_mrf.queries.known_bricks import (
     seen_free_bricks,
 )
 from taichi_mrf.queries.points import FREE
-from taichi_mrf.queries.slices import slice_map
+from taichi_mrf.queries.slices import MapSlice, slice_map
 from taichi_mrf.voxels.layout import BRICK
 
 
@@ -138,6 +141,31 @@ def test_slices_are_layers_of_the_map(hand: HandMap, axis: str, order: str) -> N
     assert (left, right) == pytest.approx([corner["xyz".index(cut.across)] for corner in whole])
 
 
+def test_cuts_of_a_map_whose_y_points_down(backend: str) -> None:
+    flipped = replace(hand_map(backend), keyframes={0: SimpleNamespace(T_world_camera=np.eye(4))})
+    level, below = slice_map(flipped, -1.42), slice_map(flipped, 1.42, "y")
+    assert (level.across, level.up, level.axis) == ("x", "z", "y")
+    assert level.at_m == below.at_m == pytest.approx(1.425)
+    points = cell_centres(level)
+    np.testing.assert_array_equal(level.state.ravel(), flipped.state(points))
+    upright = slice_map(flipped, -1.31, "x")
+    assert (upright.across, upright.up) == ("z", "y")
+    assert upright.extent[2] > upright.extent[3]  # the first row is the lowest: it has the largest y
+    np.testing.assert_array_equal(upright.state.ravel(), flipped.state(cell_centres(upright)))
+
+
+def cell_centres(cut: MapSlice) -> np.ndarray:
+    """The centres (rows * columns, 3) of a cut's voxels, row by row, from its extent."""
+    rows, columns = cut.state.shape
+    left, right, bottom, top = cut.extent
+    across = left + (np.arange(columns) + 0.5) * (right - left) / columns
+    up = bottom + (np.arange(rows) + 0.5) * (top - bottom) / rows
+    points = np.full((rows, columns, 3), cut.at_m)
+    points[..., "xyz".index(cut.across)] = across
+    points[..., "xyz".index(cut.up)] = up[:, None]
+    return points.reshape(-1, 3)
+
+
 def test_a_part_of_a_slice(hand: HandMap) -> None:
     cut = slice_map(hand, -0.33, "z", (-1.6, 1.0), (-1.2, 1.5))
     assert cut.extent == pytest.approx((-1.6, -1.2, 1.0, 1.5))
@@ -145,9 +173,9 @@ def test_a_part_of_a_slice(hand: HandMap) -> None:
 
 
 def test_slices_that_cannot_be(hand: HandMap) -> None:
-    with pytest.raises(ConfigError, match="axis must be x, y or z, not 'w'"):
+    with pytest.raises(ConfigError, match="axis must be up, x, y or z, not 'w'"):
         slice_map(hand, 0.0, "w")  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="finite place along z"):
+    with pytest.raises(ConfigError, match="finite place along up"):
         slice_map(hand, np.nan)
     with pytest.raises(ConfigError, match="two numbers"):
         slice_map(hand, 0.0, "z", (0, 0, 0), (1, 1, 1))

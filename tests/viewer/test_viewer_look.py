@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from taichi_mrf.geometry.poses import as_pose
+from taichi_mrf.geometry.up import up_of, up_vector
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.viewer.live.options import ColorBy, ViewOptions
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, KeyframeInfo, RayAnswer, pack_log_odds
 from taichi_mrf.viewer.scene.coloring import legend_html, scale_of, voxel_colors
 from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, Placement
-from taichi_mrf.viewer.scene.look import look_of, up_of, up_vector
+from taichi_mrf.viewer.scene.look import look_of
 from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
 from taichi_mrf.viewer.scene.ray_plot import curves
 from taichi_mrf.viewer.scene.voxel_store import Shown, VoxelStore, facing

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import viser
 
+from taichi_mrf.geometry.up import up_of
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.events import Chosen, Clicked, Dragged, Event, Joined, OptionsMoved, Pressed
 from taichi_mrf.viewer.live.options import ViewOptions
@@ -17,7 +18,6 @@ from taichi_mrf.viewer.live.panel import CHOSEN_KEYFRAME, POSITION_STEP_M, SPEED
 from taichi_mrf.viewer.notices import pop_up
 from taichi_mrf.viewer.scene.coloring import Scale, legend_html
 from taichi_mrf.viewer.scene.keyframe_layer import KeyframeLayer, Placement
-from taichi_mrf.viewer.scene.look import up_of
 from taichi_mrf.viewer.scene.map_scene import MapScene
 from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
 from taichi_mrf.viewer.scene.viewpoint import ViewpointController

@@ -1,30 +1,14 @@
-"""From view options to what a chunk looks like, and which way is up."""
+"""From view options to what a chunk looks like."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.geometry.up import Up
 from taichi_mrf.viewer.live.options import ViewOptions
 from taichi_mrf.viewer.scene.coloring import scale_of
 from taichi_mrf.viewer.scene.cut_plane import cut_voxel
 from taichi_mrf.viewer.scene.voxel_layer import Look
 from taichi_mrf.viewer.scene.voxel_store import VoxelStore
 from taichi_mrf.voxels.layout import BRICK
-
-Up = tuple[int, int]
-"""An axis of the world, and 1 or -1 for its direction."""
-
-
-def up_of(T_world_camera: Pose) -> Up:
-    """The axis of the world nearest to a camera's upward direction (its image's -y)."""
-    upwards = -T_world_camera[:3, 1]
-    axis = int(np.argmax(np.abs(upwards)))
-    return axis, 1 if upwards[axis] > 0 else -1
-
-
-def up_vector(up: Up) -> NDArray[np.float64]:
-    """The unit vector that points up."""
-    return up[1] * np.eye(3)[up[0]]
 
 
 def look_of(options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float) -> Look:

@@ -10,12 +10,13 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from taichi_mrf.geometry.up import Up
 from taichi_mrf.viewer.live.options import ViewOptions
 from taichi_mrf.viewer.messages import Bricks, Hello, Layer
 from taichi_mrf.viewer.scene.brick_lines import BrickLines
 from taichi_mrf.viewer.scene.coloring import Scale
 from taichi_mrf.viewer.scene.cut_plane import CutPlane, cut_picture
-from taichi_mrf.viewer.scene.look import Look, Up, look_of
+from taichi_mrf.viewer.scene.look import Look, look_of
 from taichi_mrf.viewer.scene.voxel_layer import VoxelLayer
 from taichi_mrf.viewer.scene.voxel_store import ChunkKey, VoxelStore
 from taichi_mrf.voxels.layout import BRICK

@@ -5,7 +5,7 @@ import viser
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.viewer.scene.look import Up, up_vector
+from taichi_mrf.geometry.up import Up, up_vector
 
 _GROWTH = 1.2
 """The first view is chosen anew when the map has grown by this factor."""

@@ -10,13 +10,13 @@ import viser
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.geometry.up import up_of
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.events import Chosen, Event, Joined, KnobMoved, OptionsMoved, Pressed
 from taichi_mrf.viewer.live.options import ViewOptions
 from taichi_mrf.viewer.notices import pop_up
 from taichi_mrf.viewer.scene.coloring import Scale, legend_html
 from taichi_mrf.viewer.scene.keyframe_layer import KeyframeLayer
-from taichi_mrf.viewer.scene.look import up_of
 from taichi_mrf.viewer.scene.map_scene import MapScene
 from taichi_mrf.viewer.scene.viewpoint import ViewpointController
 from taichi_mrf.viewer.transport.downloads import Downloads
