@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from calibration_boards import BOARD_FLAGS, CAMERA_TEXT, captured, write_poses, write_recording
 from calibration_scenes import CAMERA, Planes, Tables, random_tables
+from console import assert_refused, taichi_mrf
 from numpy.polynomial.polynomial import polyval
-from test_cli import assert_refused, taichi_mrf
 
 from taichi_mrf.cli.main import main
 from taichi_mrf.config import schema as config

@@ -1,6 +1,5 @@
 """The console program as a person runs it: a process, its exit status, its files and its words."""
 
-import json
 import os
 import pty
 import resource
@@ -14,39 +13,12 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from console import COARSE, FAST, ROOM, assert_refused, mapped, report_of, taichi_mrf
 
 from taichi_mrf.config.schema import load
 
-ROOM = "synthetic:room?frames=12&width=160&height=120"
-COARSE = ("--voxel-size", "0.1", "--runtime.arch", "cpu")
-FAST = (*COARSE, "--no-pictures")
 FILES = {"map.npz", "voxels.ply", "config.yaml", "report.json"}
 PICTURES = {"top_view.png", "depth.png", "perspective.png"}
-
-
-def taichi_mrf(
-    *arguments: str | Path, options: tuple[str, ...] = (), before: Callable[[], None] | None = None
-) -> subprocess.CompletedProcess[str]:
-    """Run the program from the source tree; ``options`` are the interpreter's."""
-    return subprocess.run(
-        [sys.executable, *options, "-m", "taichi_mrf", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        check=False,
-        preexec_fn=before,
-    )
-
-
-def mapped(*arguments: str | Path) -> str:
-    """Run ``map``, which must succeed without complaints; returns what it printed."""
-    done = taichi_mrf("map", *arguments)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    return done.stdout
-
-
-def report_of(out: Path) -> dict:
-    return json.loads((out / "report.json").read_text(encoding="utf-8"))
 
 
 def marginals(out: Path) -> dict[tuple[float, ...], float]:
@@ -54,15 +26,6 @@ def marginals(out: Path) -> dict[tuple[float, ...], float]:
     cloud = trimesh.load(out / "voxels.ply")
     occupancy = cloud.metadata["_ply_raw"]["vertex"]["data"]["occupancy"]
     return {tuple(np.round(c, 3)): float(p) for c, p in zip(cloud.vertices, occupancy, strict=True)}
-
-
-def assert_refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
-    """Exit status 2, and one line on stderr with all these words."""
-    assert done.returncode == 2, done.stderr
-    assert done.stderr.count("\n") == 1, done.stderr
-    for word in words:
-        assert word in done.stderr
-    assert done.stdout == ""
 
 
 @pytest.fixture(scope="module")

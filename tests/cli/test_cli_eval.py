@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from console import FAST, ROOM, assert_refused, mapped, report_of, taichi_mrf
 from small_scenes import make_data
-from test_cli import FAST, ROOM, assert_refused, mapped, report_of, taichi_mrf
 
 from taichi_mrf.experiments.table3 import PAPER
 from taichi_mrf.experiments.tables import entry_text

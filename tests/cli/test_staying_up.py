@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import small_room
 from killed_runs import OPTIONS, SOURCE, Run, disturbed, keyframes_of
-from test_pipeline import ALL_FRAMES, CAMERA, SlidingCamera, StopAfter, names, sequence
+from sliding_camera import ALL_FRAMES, CAMERA, SlidingCamera, StopAfter, names, sequence
 
 from taichi_mrf.cli.map_keep import Keeper, resumed_map
 from taichi_mrf.config.schema import Config, VolumeConfig

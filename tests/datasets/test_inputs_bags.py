@@ -8,54 +8,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 from datasets_recordings import stamped_line
-from inputs_bags import START, Bag, Kind, writing
+from inputs_bags import (
+    BODY,
+    CAMERA,
+    COUNT,
+    FRAME,
+    START,
+    Bag,
+    Kind,
+    T_body_camera,
+    images,
+    mounted,
+    odometry,
+    plain,
+    stamp,
+    steps,
+    world_body,
+    writing,
+)
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import DatasetError, FrameError
-from taichi_mrf.geometry.poses import Pose, look_at
+from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 
-CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
-COUNT = 5
-FRAME, BODY = "camera_depth_optical_frame", "base_link"
-T_body_camera = look_at([0.1, 0.2, 0.3], [1.0, 0.0, 0.0])
 KINDS: tuple[Kind, ...] = ("ros1", "sqlite", "mcap")
-
-
-def steps(i: int) -> np.ndarray:
-    image = np.random.default_rng(i).integers(400, 9000, (12, 16)).astype(np.uint16)
-    image[0, 0] = 0
-    return image
-
-
-def world_body(i: int) -> Pose:
-    return look_at([0.1 * i, 0.2, 0.0], [3.0, 0.1 * i, 0.2])
-
-
-def stamp(i: int) -> float:
-    return 1.0 + 0.1 * i
-
-
-def images(bag: Bag, topic: str = "/camera/depth/image_raw", info: bool = True) -> None:
-    if info:
-        bag.camera_info(topic.rpartition("/")[0] + "/camera_info", FRAME, CAMERA)
-    for i in range(COUNT):
-        bag.image(topic, stamp(i), FRAME, steps(i), "16UC1")
-
-
-def odometry(bag: Bag, topic: str = "/odom", child: str = BODY) -> None:
-    for i in range(COUNT):
-        bag.odometry(topic, stamp(i), "odom", child, world_body(i))
-
-
-def mounted(bag: Bag) -> None:
-    bag.tf("/tf_static", 0.0, BODY, FRAME, T_body_camera)
-
-
-def plain(bag: Bag) -> None:
-    images(bag)
-    odometry(bag)
-    mounted(bag)
 
 
 Write = Callable[[Bag], None]

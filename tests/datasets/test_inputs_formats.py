@@ -6,23 +6,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 from datasets_recordings import (
+    CAMERA,
     CAMERA_TXT,
+    INTRINSIC,
     Content,
+    K,
+    arrays,
+    column_by_column,
     row_of,
-    text_of,
-    write_image,
     write_log,
+    write_npz,
     write_numbered,
+    write_replica,
+    write_scannet,
 )
 
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import inverse
 from taichi_mrf.live.open_source import open_source
-from taichi_mrf.sensor.camera import PinholeCamera
-
-CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
-K = np.array([[14.0, 0, 7.5], [0, 15.0, 5.5], [0, 0, 1]])
 
 
 @pytest.fixture
@@ -46,19 +48,6 @@ def refused(source: Path, **options: object) -> str:
         open_dataset(source, **options)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
     return str(caught.value)
-
-
-def write_scannet(folder: Path, content: Content) -> Path:
-    """Numbers without leading zeros, of which the tenth comes after the second."""
-    for i in range(content.count):
-        write_image(folder / f"depth/{5 * i}.png", content.depth[i])
-        (folder / "pose").mkdir(exist_ok=True)
-        (folder / f"pose/{5 * i}.txt").write_text(text_of(content.poses[i]))
-    (folder / "intrinsic").mkdir()
-    wide = np.eye(4)
-    wide[:3, :3] = K
-    (folder / "intrinsic/intrinsic_depth.txt").write_text(text_of(wide))
-    return folder
 
 
 def test_scannet(tmp_path: Path, content: Content) -> None:
@@ -92,16 +81,6 @@ def test_scannets_own_camera_is_assumed_without_a_file(tmp_path: Path, content: 
     assert any("assumed the camera of ScanNet" in note for note in dataset.notes)
 
 
-def write_replica(folder: Path, content: Content, parameters: Path) -> Path:
-    for i in range(content.count):
-        write_image(folder / f"results/depth{i:06d}.png", content.depth[i])
-        write_image(folder / f"results/frame{i:06d}.png", content.color[i])
-    (folder / "traj.txt").write_text("\n".join(row_of(pose) for pose in content.poses))
-    camera = {"w": 16, "h": 12, "fx": 14.0, "fy": 15.0, "cx": 7.5, "cy": 5.5, "scale": 6553.5}
-    parameters.write_text(json.dumps({"camera": camera}))
-    return folder
-
-
 @pytest.mark.parametrize("place", [".", ".."], ids=["beside", "above"])
 def test_replica(tmp_path: Path, content: Content, place: str) -> None:
     folder = tmp_path / "room0"
@@ -123,13 +102,6 @@ def test_replica_that_is_not_whole(tmp_path: Path, content: Content) -> None:
     assert "one for each depth image, found 1 poses" in refused(folder)
     (folder / "traj.txt").unlink()
     assert "traj.txt: is missing" in refused(folder)
-
-
-def column_by_column(matrix: np.ndarray) -> list[float]:
-    return [float(x) for x in matrix.T.reshape(-1)]
-
-
-INTRINSIC = {"width": 16, "height": 12, "intrinsic_matrix": column_by_column(K)}
 
 
 def test_open3d_with_a_log(tmp_path: Path, content: Content) -> None:
@@ -180,21 +152,6 @@ def test_open3d_files_that_make_no_sense(
         write_log(folder / "trajectory.log", content.poses)
     (folder / name).write_text(text)
     assert said in refused(folder)
-
-
-def arrays(content: Content) -> dict[str, np.ndarray]:
-    return {
-        "depth_m": np.stack(content.depth) / np.float32(1000),
-        "T_world_camera": np.stack(content.poses),
-        "K": K,
-        "stamp": np.arange(content.count) * 0.5,
-        "color": np.stack(content.color),
-    }
-
-
-def write_npz(path: Path, values: dict[str, np.ndarray]) -> Path:
-    np.savez_compressed(path, **values)  # type: ignore[arg-type]
-    return path
 
 
 def test_npz(tmp_path: Path, content: Content) -> None:

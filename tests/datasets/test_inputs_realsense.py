@@ -7,7 +7,6 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 from datasets_recordings import stamped_line
-from test_realsense import STEPS
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import DatasetError, FrameError
@@ -17,6 +16,8 @@ from taichi_mrf.sensor.camera import PinholeCamera
 COUNT = 6
 FIRST = 1000.0
 """Seconds of the first image; they come at 10 Hz."""
+
+STEPS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
 
 
 def stamp(i: int) -> float:

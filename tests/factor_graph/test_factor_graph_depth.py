@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
+from one_pixel import EXACT, ONE_PIXEL, VOXEL, allocated, image, look_along, marginals, well_cut
 from oracles import inference as reference
 from oracles.forward import Noise
-from test_sum_product import EXACT, ONE_PIXEL, VOXEL, allocated, image, look_along, marginals, well_cut
 
 from taichi_mrf.config.schema import InferenceConfig
 from taichi_mrf.datasets.registry import open_dataset

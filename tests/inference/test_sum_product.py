@@ -7,6 +7,7 @@ import pytest
 import small_room
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
+from one_pixel import EXACT, ONE_PIXEL, VOXEL, allocated, image, look_along, marginals, random_pose, well_cut
 from oracles import inference as reference
 from oracles.forward import Noise
 
@@ -20,64 +21,12 @@ from taichi_mrf.sensor.noise import PolynomialNoise
 
 pytestmark = pytest.mark.usefixtures("backend")
 
-VOXEL = 0.1
-ONE_PIXEL = PinholeCamera(1, 1, 100.0, 100.0, 0.0, 0.0)
-EXACT = {
-    "segment_lengths": False,
-    "message_precision": "float32",
-    "message_clamp": 25.0,
-    "cavity_clamp": 25.0,
-    "free_share": 0.0,
-    "min_length": 0.0,
-}
-
-
-def random_pose(rng: np.random.Generator, reach: float = 2.0) -> np.ndarray:
-    Q, R = np.linalg.qr(rng.normal(size=(3, 3)))
-    Q *= np.sign(np.diag(R))
-    if np.linalg.det(Q) < 0:
-        Q[:, 0] *= -1
-    T = np.eye(4)
-    T[:3, :3] = Q
-    T[:3, 3] = rng.uniform(-reach, reach, 3)
-    return T
-
-
-def look_along(origin: np.ndarray, direction: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A camera whose only pixel looks along ``direction``."""
-    z = direction / np.linalg.norm(direction)
-    x = np.cross(z, rng.normal(size=3))
-    x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    T[:3, 3] = origin
-    return T
-
-
-def image(depth: float) -> np.ndarray:
-    return np.full((1, 1), depth, np.float32)
-
-
-def allocated(m: MRFMap) -> set[reference.Voxel]:
-    centres, _ = m.voxels(0.0)
-    return {tuple(v) for v in np.floor(centres / VOXEL).astype(int).tolist()}
-
-
-def marginals(m: MRFMap, voxels: list[reference.Voxel]) -> np.ndarray:
-    return m.occupancy((np.array(voxels) + 0.5) * VOXEL).astype(np.float64)
-
 
 # A sigma wide enough that every voxel of the short ray lies in a brick near the measured surface.
 wide = st.floats(0.25, 0.6)
 shallow = st.floats(0.3, 0.7)
 seeds = st.integers(0, 2**32 - 1)
 priors = st.floats(0.02, 0.6)
-
-
-def well_cut(rays: list[reference.Ray], longest: int) -> bool:
-    """No corner is grazed (float32 may take the other way round it), and few enough voxels to enumerate."""
-    cells = [s for ray in rays for s in ray.segments]
-    return all(s.length > 0.02 for s in cells) and all(len(ray.segments) <= longest for ray in rays)
 
 
 @settings(max_examples=60)

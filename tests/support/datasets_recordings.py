@@ -1,5 +1,6 @@
 """Writes small recordings in every folder format, for the tests of their readers."""
 
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose, look_at
+from taichi_mrf.sensor.camera import PinholeCamera
 
 SIZE = (12, 16)
 """(height, width) of the images."""
@@ -115,4 +117,55 @@ def write_log(path: Path, poses: list[Pose], first: int = 0) -> Path:
     """Choi's layout."""
     blocks = (f"{first + i} {first + i} {first + i + 1}\n{text_of(pose)}" for i, pose in enumerate(poses))
     path.write_text("\n".join(blocks))
+    return path
+
+
+CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
+
+
+K = np.array([[14.0, 0, 7.5], [0, 15.0, 5.5], [0, 0, 1]])
+
+
+def write_scannet(folder: Path, content: Content) -> Path:
+    """Numbers without leading zeros, of which the tenth comes after the second."""
+    for i in range(content.count):
+        write_image(folder / f"depth/{5 * i}.png", content.depth[i])
+        (folder / "pose").mkdir(exist_ok=True)
+        (folder / f"pose/{5 * i}.txt").write_text(text_of(content.poses[i]))
+    (folder / "intrinsic").mkdir()
+    wide = np.eye(4)
+    wide[:3, :3] = K
+    (folder / "intrinsic/intrinsic_depth.txt").write_text(text_of(wide))
+    return folder
+
+
+def write_replica(folder: Path, content: Content, parameters: Path) -> Path:
+    for i in range(content.count):
+        write_image(folder / f"results/depth{i:06d}.png", content.depth[i])
+        write_image(folder / f"results/frame{i:06d}.png", content.color[i])
+    (folder / "traj.txt").write_text("\n".join(row_of(pose) for pose in content.poses))
+    camera = {"w": 16, "h": 12, "fx": 14.0, "fy": 15.0, "cx": 7.5, "cy": 5.5, "scale": 6553.5}
+    parameters.write_text(json.dumps({"camera": camera}))
+    return folder
+
+
+def column_by_column(matrix: np.ndarray) -> list[float]:
+    return [float(x) for x in matrix.T.reshape(-1)]
+
+
+INTRINSIC = {"width": 16, "height": 12, "intrinsic_matrix": column_by_column(K)}
+
+
+def arrays(content: Content) -> dict[str, np.ndarray]:
+    return {
+        "depth_m": np.stack(content.depth) / np.float32(1000),
+        "T_world_camera": np.stack(content.poses),
+        "K": K,
+        "stamp": np.arange(content.count) * 0.5,
+        "color": np.stack(content.color),
+    }
+
+
+def write_npz(path: Path, values: dict[str, np.ndarray]) -> Path:
+    np.savez_compressed(path, **values)  # type: ignore[arg-type]
     return path

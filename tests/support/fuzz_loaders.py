@@ -14,21 +14,25 @@ from pathlib import Path
 
 import numpy as np
 from datasets_recordings import (
+    INTRINSIC,
     Content,
+    arrays,
+    column_by_column,
     stamped_line,
     write_image,
     write_log,
+    write_npz,
     write_numbered,
+    write_replica,
+    write_scannet,
     write_seven_scenes,
     write_tum,
 )
-from inputs_bags import Kind, writing
+from inputs_bags import Kind, plain, writing
+from kitti_street import write_kitti
 from laser_logs import ODOMETRY, flaser, robotlaser
 from laser_logs import write_npz as write_scans
-from test_inputs_bags import plain
-from test_inputs_formats import INTRINSIC, arrays, column_by_column, write_npz, write_replica, write_scannet
-from test_inputs_stereo import write as write_stereo_file
-from test_stereo_pairs import write_kitti
+from stereo_rig import write as write_stereo_file
 
 from taichi_mrf.calibration.depth_files import DepthFiles
 from taichi_mrf.calibration.image_stamps import read_stamps

@@ -15,7 +15,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 
 Kind = Literal["ros1", "sqlite", "mcap"]
@@ -198,3 +198,54 @@ def writing(path: Path, kind: Kind) -> Iterator[Bag]:
         writer = Writer2(path, version=9, storage_plugin=plugin)
     with writer:
         yield Bag(kind, writer)
+
+
+CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
+
+
+COUNT = 5
+
+
+FRAME = "camera_depth_optical_frame"
+
+
+BODY = "base_link"
+
+
+T_body_camera = look_at([0.1, 0.2, 0.3], [1.0, 0.0, 0.0])
+
+
+def steps(i: int) -> np.ndarray:
+    image = np.random.default_rng(i).integers(400, 9000, (12, 16)).astype(np.uint16)
+    image[0, 0] = 0
+    return image
+
+
+def world_body(i: int) -> Pose:
+    return look_at([0.1 * i, 0.2, 0.0], [3.0, 0.1 * i, 0.2])
+
+
+def stamp(i: int) -> float:
+    return 1.0 + 0.1 * i
+
+
+def images(bag: Bag, topic: str = "/camera/depth/image_raw", info: bool = True) -> None:
+    if info:
+        bag.camera_info(topic.rpartition("/")[0] + "/camera_info", FRAME, CAMERA)
+    for i in range(COUNT):
+        bag.image(topic, stamp(i), FRAME, steps(i), "16UC1")
+
+
+def odometry(bag: Bag, topic: str = "/odom", child: str = BODY) -> None:
+    for i in range(COUNT):
+        bag.odometry(topic, stamp(i), "odom", child, world_body(i))
+
+
+def mounted(bag: Bag) -> None:
+    bag.tf("/tf_static", 0.0, BODY, FRAME, T_body_camera)
+
+
+def plain(bag: Bag) -> None:
+    images(bag)
+    odometry(bag)
+    mounted(bag)
