@@ -8,8 +8,9 @@ from typing import Annotated, Literal, get_args
 
 import tyro
 
+from taichi_mrf.config.files import read_yaml
 from taichi_mrf.config.schema import RuntimeConfig
-from taichi_mrf.config.values import from_dict, read_yaml
+from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.factor_graph.config import LaserConfig, Method
 

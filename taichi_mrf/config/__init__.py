@@ -1,4 +1,4 @@
 """Every parameter of the program, defined once as typed dataclasses, with YAML and help text made from them.
 
-Uses no package but the errors, and needs no Taichi.
+Uses `system`, and needs no Taichi.
 """

@@ -13,8 +13,9 @@ from typing import Any, Literal, get_args, get_type_hints
 
 import yaml
 
+from taichi_mrf.config.files import find_config, read_yaml
 from taichi_mrf.config.poses import KeyframeConfig, PoseConfig
-from taichi_mrf.config.values import check_field, from_dict, read_yaml
+from taichi_mrf.config.values import check_field, from_dict
 
 Arch = Literal["auto", "cuda", "vulkan", "cpu"]
 Method = Literal["mrf", "log_odds", "visibility"]
@@ -335,8 +336,9 @@ class Config:
 
 
 def load(path: str | Path) -> Config:
-    """Read a YAML file. Table paths in it are relative to its folder. Raises ConfigError."""
-    path = Path(path)
+    """Read a YAML file, or the shipped one of that name, such as ``kinect1``. Table paths in it are relative
+    to its folder. Raises ConfigError, which names the file and the parameter."""
+    path = find_config(path)
     return with_absolute_tables(from_dict(Config, read_yaml(path), str(path)), path.parent)
 
 

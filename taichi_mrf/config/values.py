@@ -9,12 +9,9 @@ import difflib
 import reprlib
 import types
 import typing
-from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-import yaml
-
-from taichi_mrf.errors import ConfigError, said
+from taichi_mrf.errors import ConfigError
 
 T = TypeVar("T")
 
@@ -24,9 +21,9 @@ _LARGEST_INTEGER = 2**63 - 1
 def unknown_key(key: object, known: typing.Iterable[str], where: str) -> ConfigError:
     """The error for a parameter that does not exist: it names the nearest one that does."""
     known = list(known)
-    near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(str(key)[:100], known, n=1, cutoff=0.5)
     hint = f"did you mean '{near[0]}'?" if near else f"known are: {', '.join(known)}"
-    return ConfigError(f"{where}: unknown parameter '{key}'; {hint}")
+    return ConfigError(f"{where}: unknown parameter {shown(key)}; {hint}")
 
 
 def overridden(config: T, overrides: dict[str, Any], where: str) -> T:
@@ -48,16 +45,6 @@ _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 100
 
 
-def read_yaml(path: Path) -> Any:
-    """The plain values of a YAML file. Raises ConfigError, which names the file."""
-    try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: the 31st of February
-        raise ConfigError(f"{path}: not valid YAML: {said(error)}") from error
-
-
 def from_dict(cls: type[T], values: Any, where: str) -> T:
     """Build a configuration dataclass from parsed YAML.
 
@@ -67,7 +54,7 @@ def from_dict(cls: type[T], values: Any, where: str) -> T:
     if values is None:
         values = {}
     if not isinstance(values, dict):
-        raise ConfigError(f"{where}: expected a mapping of parameters, not {values!r}")
+        raise ConfigError(f"{where}: expected a mapping of parameters, not {shown(values)}")
     hints = typing.get_type_hints(cls)
     arguments = {}
     for key, value in values.items():

@@ -5,8 +5,8 @@ from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
-import yaml
 
+from taichi_mrf.config.files import parse_yaml
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.datasets.base import ReadOptions
 from taichi_mrf.datasets.formats.open3d_json import read_intrinsics
@@ -92,8 +92,8 @@ def _camera_from_numbers(numbers: list[float]) -> PinholeCamera:
 
 def _camera_from_yaml(text: str, path: Path) -> PinholeCamera:
     try:
-        values = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: the 31st of February
+        values = parse_yaml(text)
+    except ValueError as error:  # ValueError: the 31st of February
         raise DatasetError(f"{path}: not valid YAML: {said(error)}") from error
     wanted = [field.name for field in fields(PinholeCamera)]
     if isinstance(values, dict):

@@ -2,8 +2,7 @@
 
 from typing import TypeVar, get_type_hints
 
-import yaml
-
+from taichi_mrf.config.files import parse_yaml
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import ConfigError, DatasetError
 
@@ -22,8 +21,8 @@ def parse_options(cls: type[T], query: str, source: str) -> T:
     for option in query.split("&") if query else ():
         name, equals, text = option.partition("=")
         try:
-            values[name] = text if name in texts else yaml.safe_load(text)
-        except yaml.YAMLError:
+            values[name] = text if name in texts else parse_yaml(text)
+        except ValueError:
             equals = ""
         if not (name and equals):
             raise DatasetError(f"{source}?{query}: options are written name=value, with & between them")

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf.config.files import parse_yaml
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import ConfigError, MapFileError, said
@@ -23,8 +23,8 @@ _BYTES_PER_VOXEL = 9
 
 def _config_of(store: ChunkStore) -> Config:
     try:
-        return from_dict(Config, yaml.safe_load(store.header.config), str(store.path))
-    except (yaml.YAMLError, ValueError, AttributeError, RecursionError) as error:
+        return from_dict(Config, parse_yaml(store.header.config), str(store.path))
+    except ValueError as error:
         raise MapFileError(
             f"{store.path}: damaged: its configuration cannot be read: {said(error)}"
         ) from error

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
+from taichi_mrf.config.files import parse_yaml
 from taichi_mrf.config.schema import Config, Method, to_yaml
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import CapacityError, MapFileError, TaichiMRFError, said
@@ -154,8 +154,8 @@ def read_bricks(path: Path, file: NpzFile) -> tuple[NDArray[np.int32], NDArray[n
 
 def _config(path: Path, file: NpzFile) -> Config:
     try:
-        return from_dict(Config, yaml.safe_load(file.scalar("config", "U")), str(path))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        return from_dict(Config, parse_yaml(file.scalar("config", "U")), str(path))
+    except ValueError as error:
         raise MapFileError(f"{path}: damaged: config cannot be read: {said(error)}") from error
 
 

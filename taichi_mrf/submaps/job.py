@@ -5,8 +5,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from taichi_mrf.config.files import parse_yaml
 from taichi_mrf.config.schema import Config, to_yaml
 from taichi_mrf.config.text import differences
 from taichi_mrf.config.values import from_dict
@@ -71,13 +70,13 @@ class Job:
             submaps = [Submap(tuple(s["cell"]), tuple(s["keyframes"])) for s in plan["submaps"]]
             return Job(
                 Sequence(**content["sequence"]),
-                from_dict(Config, yaml.safe_load(content["config"]), str(path)),
+                from_dict(Config, parse_yaml(content["config"]), str(path)),
                 content["submap_size"],
                 Plan(plan["chunks_across"], tuple(submaps)),
                 {int(index): tuple(centre) for index, centre in content["centres_m"].items()},
                 content["skipped"],
             )
-        except (OSError, ValueError, LookupError, TypeError, AttributeError, yaml.YAMLError) as error:
+        except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             raise MapFileError(f"{path}: not a readable plan of submaps: {said(error)}") from error
 
     def differences(self, sequence: Sequence, config: Config, submap_size: float) -> list[str]:

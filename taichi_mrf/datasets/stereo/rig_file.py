@@ -22,7 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.config.values import from_dict, read_yaml
+from taichi_mrf.config.files import read_yaml
+from taichi_mrf.config.values import from_dict
 from taichi_mrf.datasets.base import Dataset, ReadOptions
 from taichi_mrf.datasets.stereo.kitti_pairs import (
     RecordedPair,
