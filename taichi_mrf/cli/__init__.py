@@ -1,5 +1,5 @@
-"""The commands of the console program, one small file each: a dataclass of options with ``run()``.
+"""The console program: it parses the command line, calls the library and prints.
 
-The dataclasses are read to print the help, so that these files import nothing slow at their top; Taichi
-and what needs it are imported when a command runs.
+`commands.py` lists the commands, `options/` holds the dataclass of each, and the other modules carry them
+out. A command's module is imported when the command runs, so that the help needs neither Taichi nor NumPy.
 """

@@ -1,76 +1,184 @@
-"""``taichi-mrf calibrate``: learn a depth camera's bias and sigma from depth whose true value is known."""
+"""What ``taichi-mrf calibrate`` does: find the ground truth, learn, write the files, print the report."""
 
-from dataclasses import dataclass, field
+import json
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
-import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
 
-from taichi_mrf.calibration.options import CalibrationConfig
-from taichi_mrf.errors import ConfigError
+from taichi_mrf.calibration.coverage import Coverage
+from taichi_mrf.calibration.depth_files import DepthFiles
+from taichi_mrf.calibration.learning import calibrate
+from taichi_mrf.calibration.report import calibration_report, remarks
+from taichi_mrf.calibration.results import CONFIG_FILE, write_noise, write_pictures
+from taichi_mrf.calibration.truth_sources import (
+    GroundTruth,
+    from_chessboard,
+    from_motion_capture,
+    from_true_depth,
+)
+from taichi_mrf.cli.options.calibrate import Calibrate
+from taichi_mrf.cli.shared.output import output_folder
+from taichi_mrf.datasets.base import ReadOptions
+from taichi_mrf.datasets.intrinsics import CAMERA_FILES, PRIMESENSE, find_camera
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system.atomic import write_text
+
+REPORT_FILE = "report.json"
+_MM = 1e3
 
 
-@dataclass(frozen=True)
-class Calibrate:
-    """Learn a depth camera's bias and sigma for each patch of pixels.
+class _Bar:
+    """One progress bar that stages share; silent where the output is no terminal."""
 
-    The true depth comes from --true-depth, or from a chessboard in --images, or from the motion capture of
-    camera and board in --camera-poses and --board-poses (with --images). docs/calibration.md tells how to
-    record. Example: taichi-mrf calibrate depth/ --true-depth true/ --out sensor/
-    """
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._task = progress.add_task("")
 
-    depth: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DEPTH")]
-    """A folder of measured depth (16-bit PNG, .npy, .npz stacks), or one stack."""
+    def show(self, stage: str, done: int, total: int) -> None:
+        self._progress.update(self._task, description=stage, completed=done, total=total)
 
-    out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
-    """Folder for the results; it is made if need be."""
 
-    true_depth: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """True depth images of the same names as the measured ones, or one stack."""
-
-    images: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Images of a chessboard, of the same names as the depth: infrared of the same camera, or colour
-    registered to it."""
-
-    camera_poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Motion capture of the camera: lines of stamp tx ty tz qx qy qz qw. One line is a camera on a tripod."""
-
-    board_poses: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Motion capture of the board, in the same world."""
-
-    stamps: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Lines of stamp and file name for the depth images; without it their names are stamps in seconds."""
-
-    camera: Annotated[
-        tuple[float, float, float, float, float, float] | None,
-        tyro.conf.arg(metavar="WIDTH HEIGHT FX FY CX CY"),
-    ] = None
-    """Intrinsics of the depth camera in pixels; else a camera.txt or the like beside the depth tells."""
-
-    depth_scale: float = 1000.0
-    """Steps of the measured depth's whole numbers per metre."""
-
-    true_depth_scale: float | None = None
-    """The same for the true depth, where it differs."""
-
-    pictures: bool = True
-    """Draw bias and sigma against depth and over the image, and what was covered."""
-
-    settings: Annotated[CalibrationConfig, tyro.conf.arg(name="")] = field(default_factory=CalibrationConfig)
-    """Parameters."""
-
-    def __post_init__(self) -> None:
-        if (self.camera_poses is None) != (self.board_poses is None):
-            raise ConfigError("--camera-poses and --board-poses go together")
-        if (self.true_depth is None) == (self.images is None):
-            raise ConfigError(
-                "the true depth comes either from --true-depth or from a chessboard in --images"
+def run_calibrate(options: Calibrate) -> int:
+    """Carry out the command; returns the exit status. Raises TaichiMRFError."""
+    console = Console()
+    with output_folder(options.out):
+        depth = DepthFiles(options.depth, options.depth_scale)
+        camera, notes = _camera(options, depth)
+        columns = (
+            TextColumn("{task.description:15}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+        )
+        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+            bar = _Bar(progress)
+            truth = _ground_truth(options, depth, camera, bar)
+            total = 2 * len(truth.source.names)
+            calibration = calibrate(
+                truth.source, camera, options.settings, lambda done: bar.show("Learning", done, total)
             )
-        if self.camera_poses is not None and self.images is None:
-            raise ConfigError("--camera-poses needs the chessboard's --images, which give the time lag")
+            coverage = Coverage(calibration.noise.cells, calibration.noise.covered)
+            written = write_noise(options.out, calibration.noise)
+            if options.pictures:
+                bar.show("Drawing", 0, 1)
+                written += write_pictures(options.out, calibration.noise, coverage)
+        report = {
+            "depth": str(options.depth),
+            "ground_truth": truth.facts,
+            **calibration_report(calibration, coverage),
+            "notes": [*notes, *truth.notes, *remarks(calibration)],
+        }
+        write_text(options.out / REPORT_FILE, json.dumps(report, indent=2, allow_nan=False) + "\n")
+        _print_report(console, report, [*written, options.out / REPORT_FILE])
+        console.print(
+            f"Map with it: taichi-mrf map SOURCE --out DIR --config {options.out / CONFIG_FILE}",
+            markup=False,
+            highlight=False,
+            soft_wrap=True,
+        )
+    return 0
 
-    def run(self) -> int:
-        """Learn, write everything, and print the report. Raises TaichiMRFError."""
-        from taichi_mrf.cli.calibrate_run import run_calibrate
 
-        return run_calibrate(self)
+def _camera(options: Calibrate, depth: DepthFiles) -> tuple[PinholeCamera, list[str]]:
+    """The depth camera, and a note if its intrinsics were assumed, which only --true-depth allows for."""
+    given = None
+    if options.camera is not None:
+        width, height, *intrinsics = options.camera
+        if not (width.is_integer() and height.is_integer()):
+            raise DatasetError(f"--camera: the image size {width} x {height} is not in whole pixels")
+        given = PinholeCamera(int(width), int(height), *intrinsics)
+    height_px, width_px = depth.read(depth.names[0]).shape
+    scale = width_px / PRIMESENSE.width
+    default = PinholeCamera(
+        width_px,
+        height_px,
+        PRIMESENSE.fx * scale,
+        PRIMESENSE.fy * scale,
+        (width_px - 1) / 2,
+        (height_px - 1) / 2,
+    )
+    folder = options.depth if options.depth.is_dir() else options.depth.parent
+    files = (depth.file(name) for name in depth.names)
+    camera, notes = find_camera(folder, ReadOptions(camera=given), default, "a PrimeSense camera", files)
+    if notes and options.images is not None:
+        raise DatasetError(
+            f"{folder}: a chessboard needs the camera's intrinsics: give --camera, or one of "
+            f"{', '.join(CAMERA_FILES)} beside the depth images"
+        )
+    return camera, [f"{note}; it matters for the pictures only" for note in notes]
+
+
+def _ground_truth(options: Calibrate, depth: DepthFiles, camera: PinholeCamera, bar: _Bar) -> GroundTruth:
+    if options.true_depth is not None:
+        steps = options.true_depth_scale or options.depth_scale
+        return from_true_depth(depth, DepthFiles(options.true_depth, steps), camera)
+    assert options.images is not None
+
+    def progress(done: int, total: int) -> None:
+        bar.show("Finding boards", done, total)
+
+    if options.camera_poses is None or options.board_poses is None:
+        return from_chessboard(depth, options.images, camera, options.settings, progress)
+    return from_motion_capture(
+        depth,
+        options.images,
+        options.camera_poses,
+        options.board_poses,
+        options.stamps,
+        camera,
+        options.settings,
+        progress,
+    )
+
+
+def _print_report(console: Console, report: dict[str, Any], written: list[Path]) -> None:
+    table = Table(show_header=False, title=f"Noise learnt from {report['depth']}", title_justify="left")
+    table.add_column(style="bold")
+    table.add_column()
+    for name, text in _rows(report):
+        table.add_row(name, text)
+    console.print(table)
+    console.print(_noise_table(report["noise"]))
+    for sentence in report["not_covered"]:
+        console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+    for note in report["notes"]:
+        console.print(f"Note: {note}", markup=False, highlight=False, soft_wrap=True)
+    for path in written:
+        console.print(str(path), markup=False, highlight=False, soft_wrap=True)
+
+
+def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
+    truth = report["ground_truth"]
+    rows = [("ground truth", truth["kind"])]
+    if "boards_found" in truth:
+        found = f"{truth['boards_found']} of {truth['images']} images"
+        rows.append(("boards", f"{found}, corners {truth['median_reprojection_px']:.2f} pixels off (median)"))
+    if "lag_s" in truth:
+        lag = f"{_MM * truth['lag_s']:.1f} ± {_MM * truth['lag_standard_error_s']:.1f} ms after the images"
+        rows.append(("time lag", f"{lag}, speeds correlate by {truth['speed_correlation']:.2f}"))
+        rows.append(("alignment", f"{truth['aligned_reprojection_px']:.2f} pixels (RMS)"))
+    share = report["outliers"] / max(report["samples"], 1)
+    borrowed, patches = report["patches_that_borrowed"], report["patches"]
+    depths = f"{report['covered_from']:.2f} to {report['covered_to']:.2f} m"
+    rows += [
+        ("samples", f"{report['samples']:,} in {report['images']} images, {share:.2%} outliers"),
+        ("patches", f"{patches}, {borrowed} of them with too little data of their own"),
+        ("covered", f"{depths}; {report['covered_cells']:.0%} of all cells"),
+    ]
+    if report["misfit"] is not None:
+        rows.append(("misfit", f"{report['misfit']:.2f} (1 if independent samples follow the polynomials)"))
+    return rows
+
+
+def _noise_table(noise: list[dict[str, float]]) -> Table:
+    table = Table(title="Median patch, and mean of the image's centre, in mm", title_justify="left")
+    for name in ("depth", "bias", "centre", "sigma", "centre"):
+        table.add_column(name, justify="right")
+    for row in noise:
+        values = [row[f"{name}_{which}"] for name in ("bias", "sigma") for which in ("median", "centre")]
+        table.add_row(f"{row['depth']:.2f} m", *(f"{_MM * value:.2f}" for value in values))
+    return table

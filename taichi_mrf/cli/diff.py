@@ -1,39 +1,78 @@
-"""``taichi-mrf diff``: what differs between two saved maps."""
+"""What ``taichi-mrf diff`` does: load two maps, compare them, write the changes, print a table."""
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
+import json
+from typing import Any
 
-import tyro
+from rich.console import Console
+from rich.table import Table
 
-from taichi_mrf.config.schema import Arch
+from taichi_mrf.cli.options.diff import Diff
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.export.changes import write_changes
+from taichi_mrf.methods.registry import load_map
+from taichi_mrf.queries.change import STATES, MapChange, compare_maps
+from taichi_mrf.system import runtime
 
 
-@dataclass(frozen=True)
-class Diff:
-    """Compare two saved maps voxel by voxel: which states have changed, and by how much probabilities differ.
+def run_diff(options: Diff) -> int:
+    """Carry out the command; returns the exit status. Raises TaichiMRFError."""
+    if options.out is not None and options.out.suffix.lower() != ".ply":
+        raise ConfigError(f"{options.out}: changes are written as a .ply")
+    runtime.init(options.arch)
+    a, b = load_map(options.a), load_map(options.b)
+    found = compare_maps(a, b)
+    report = diff_report(found, str(options.a), str(options.b), a.voxel_size)
+    if options.out is not None:
+        report["changes"] = {
+            "file": str(options.out),
+            "points": write_changes(options.out, found, a.voxel_size),
+        }
+    if options.json:
+        print(json.dumps(report, indent=2))
+    else:
+        _print(report)
+    return 0
 
-    The maps can be of different methods, but their voxels must be of one size. The exit status is 0 whether
-    they differ or not. Example: taichi-mrf diff monday.npz tuesday.npz --out changes.ply
-    """
 
-    a: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]
-    """The map before."""
+def diff_report(found: MapChange, a: str, b: str, voxel_size: float) -> dict[str, Any]:
+    """The comparison as plain values; ``voxels`` by state in a, then by state in b."""
+    return {
+        "a": a,
+        "b": b,
+        "voxel_size": voxel_size,
+        "known_in_both": found.in_both,
+        "only_in_a": found.only_in_a,
+        "only_in_b": found.only_in_b,
+        "changed_state": found.changed,
+        "mean_difference": found.mean_difference,
+        "mean_difference_known_in_either": found.mean_difference_known,
+        "voxels": {
+            before: {after: int(found.counts[i, j]) for j, after in enumerate(STATES)}
+            for i, before in enumerate(STATES)
+        },
+    }
 
-    b: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="B")]
-    """The map after."""
 
-    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """A .ply for the changes: the voxels that are occupied in one map only, coloured by which."""
-
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print the comparison as JSON."""
-
-    arch: Arch = "auto"
-    """Backend to read the maps on."""
-
-    def run(self) -> int:
-        """Compare, write, and print. Raises TaichiMRFError."""
-        from taichi_mrf.cli.diff_run import run_diff
-
-        return run_diff(self)
+def _print(report: dict[str, Any]) -> None:
+    console = Console()
+    table = Table("voxels", *(f"{state} in B" for state in STATES), title_justify="left")
+    for before, row in report["voxels"].items():
+        # Nobody can count what neither map knows.
+        cells = ["" if before == after == STATES[0] else f"{count:,}" for after, count in row.items()]
+        table.add_row(f"{before} in A", *cells)
+    lines = [
+        f"A is {report['a']}, B is {report['b']}; voxels of {report['voxel_size']:g} m",
+        table,
+        f"{report['known_in_both']:,} voxels known in both, {report['only_in_a']:,} in A only, "
+        f"{report['only_in_b']:,} in B only",
+        f"{report['changed_state']:,} of those known in both have changed between free and occupied",
+        f"mean |difference| of probability {report['mean_difference']:.4f} over those known in both, "
+        f"{report['mean_difference_known_in_either']:.4f} over those known in either",
+    ]
+    if "changes" in report:
+        lines.append(f"{report['changes']['file']} ({report['changes']['points']:,} points)")
+    for line in lines:
+        if isinstance(line, str):
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
+        else:
+            console.print(line)

@@ -1,70 +1,83 @@
-"""``taichi-mrf eval``: the papers' evaluations, each from one command."""
+"""``taichi-mrf eval``: run experiments of the papers, show the progress, print their tables.
 
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated, Literal
+The experiments are a package of their own, which is imported by name when the command runs.
+"""
 
-import tyro
+import importlib
+from typing import Any
 
-from taichi_mrf.config.schema import RuntimeConfig
-from taichi_mrf.errors import ConfigError
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-Name = Literal[
-    "table1", "table2", "table3", "fig7", "fig10", "stereo", "exact", "poses",
-    "rays", "endless", "submaps", "all",
-]  # fmt: skip
+from taichi_mrf.cli.options.eval import Eval
+from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
+from taichi_mrf.cli.shared.output import output_folder
+from taichi_mrf.cli.shared.print_table import print_table
+from taichi_mrf.config.values import nearest
+from taichi_mrf.errors import ConfigError, DatasetError, TaichiMRFError
+from taichi_mrf.system import runtime
+
+LABORATORY = "taichi_mrf.experiments.run"
+"""The module that has EXPERIMENTS and run_experiment."""
+
+ALL = "all"
 
 
-@dataclass(frozen=True)
-class Eval:
-    """Repeat an evaluation of the papers, and print it beside what they report.
+def run_eval(options: Eval) -> int:
+    """Carry out the command; returns the exit status. Raises TaichiMRFError."""
+    console = Console()
+    laboratory = importlib.import_module(LABORATORY)
+    known: dict[str, Any] = laboratory.EXPERIMENTS
+    if options.experiment not in (*known, ALL):
+        hint = nearest(options.experiment, [*known, ALL])
+        raise ConfigError(f"unknown experiment '{options.experiment}'; {hint}")
+    names = list(known) if options.experiment == ALL else [options.experiment]
+    if any(known[name].needs_data for name in names) and not options.data.is_dir():
+        raise DatasetError(f"{options.data}: there is no such folder; --data names the one with the scenes")
+    with (
+        output_folder(options.out),
+        stop_on_signals(lambda text: console.print(text, style="yellow")) as request,
+    ):
+        runtime.init(options.runtime.arch, options.runtime.threads, options.runtime.debug)
+        failed = 0
+        for name in names:
+            try:
+                tables, paths = _run(laboratory, name, options, console, request)
+            except _StoppedError:
+                console.print("Stopped before the end; the same command goes on from here.", style="yellow")
+                return 128 + (request.signal or 0)
+            except TaichiMRFError as error:
+                if len(names) == 1:
+                    raise
+                # One experiment that lacks its data or an extra does not keep the others from running.
+                console.print(f"{name}: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
+                failed += 1
+                continue
+            for table in tables:
+                print_table(console, table)
+            for path in paths:
+                console.print(str(path), markup=False, highlight=False, soft_wrap=True)
+    if failed:
+        raise TaichiMRFError(f"{failed} of {len(names)} experiments could not be run")
+    return 0
 
-    Tables are written as CSV, LaTeX and PNG, with the configuration of every map. A run that was
-    interrupted goes on where it was when it is started again with the same --out.
-    Example: taichi-mrf eval table1 --data scenes/ --voxel-sizes 0.05 --limit 3
-    """
 
-    experiment: Annotated[Name, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERIMENT")]
-    """table1, table2, table3, fig7 and fig10 of MRFMap (Shankar and Michael 2020), stereo of Schauwecker and
-    Zell 2014, exact, which compares MRFMap with the factor graph that it approximates, poses, which disturbs
-    poses and takes the error back, rays, which asks how many rays a voxel needs,
-    endless, which freezes what has left the view for an hour, submaps, which
-    maps the built-in corridor in parts and compares that with the map of a single machine, or all."""
+class _StoppedError(Exception):
+    """The user wants the run to end; what was found is kept."""
 
-    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("runs/eval")
-    """Folder for the results; it is made if need be."""
 
-    data: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("../shared/data")
-    """Folder with the scenes, as data/README.md describes them."""
+def _run(laboratory: Any, name: str, options: Eval, console: Console, should_stop: StopRequest) -> Any:
+    """The tables and the files of one experiment, with a progress bar on a terminal."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task(name, total=None)
 
-    voxel_sizes: tuple[float, ...] = ()
-    """Voxel sizes in metres, instead of the experiment's own."""
+        def report(what: str, done: int, total: int) -> None:
+            # Between two maps. An exception raised by the signal itself could be lost in a finaliser.
+            if should_stop():
+                raise _StoppedError
+            progress.update(task, description=f"{name}: {what}", completed=done, total=total)
 
-    seeds: tuple[int, ...] = (0, 1, 2, 3)
-    """Draws of the simulated noise: the first for every method, the others for the spread of MRFMap."""
-
-    limit: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Use no more than N views or folds, for a quick look."""
-
-    runtime: RuntimeConfig = field(default_factory=RuntimeConfig)
-    """Where the kernels run."""
-
-    def __post_init__(self) -> None:
-        if isinstance(self.limit, int) and self.limit < 1:
-            raise ConfigError(f"--limit must be at least 1, not {self.limit}")
-        if not self.seeds:
-            raise ConfigError("--seeds needs at least one number")
-        if min(self.seeds) < 0:
-            raise ConfigError(f"--seeds must not be negative, not {min(self.seeds)}")
-        for name, values in (("seeds", self.seeds), ("voxel-sizes", self.voxel_sizes)):
-            if len(set(values)) < len(values):
-                raise ConfigError(f"--{name} must differ from each other, not {values}")
-        for size in self.voxel_sizes:
-            if not 0 < size < float("inf"):
-                raise ConfigError(f"--voxel-sizes must be positive numbers of metres, not {size}")
-
-    def run(self) -> int:
-        """Run the experiment, print its tables, write its files. Raises TaichiMRFError."""
-        from taichi_mrf.cli.eval_run import run_eval
-
-        return run_eval(self)
+        return laboratory.run_experiment(
+            name, options.data, options.out, options.voxel_sizes, options.seeds, options.limit, report
+        )

@@ -1,50 +1,69 @@
-"""``taichi-mrf export``: a saved map in, files for other programs out."""
+"""What ``taichi-mrf export`` does: look at the names, load the map, write each file, say what was written."""
 
-from dataclasses import dataclass, field
+import json
+import os
+import time
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
-import tyro
+from rich.console import Console
 
-from taichi_mrf.config.schema import Arch
-from taichi_mrf.export.options import ExportOptions
+from taichi_mrf.cli.options.export import Export
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.export.chunk_store import SUFFIX
+from taichi_mrf.export.formats import ExportedMap, export_map, export_note, writer_of
+from taichi_mrf.methods.chunked import ChunkedMap
+from taichi_mrf.methods.chunked_part import take_part
+from taichi_mrf.methods.registry import load_map
+from taichi_mrf.system import runtime
 
 
-@dataclass(frozen=True)
-class Export:
-    """Write a saved map for other programs, in the formats that the files' extensions say.
+def run_export(options: Export) -> int:
+    """Carry out the command; returns the exit status. Raises TaichiMRFError.
 
-    .ply points, cubes or a mesh; .glb, .obj, .stl a mesh; .bt, .ot OctoMap; .pgm with .yaml a 2D map for
-    ROS's map_server; .npz arrays; .html a page that any browser opens; .zarr chunks of 64^3 voxels. Example:
-    taichi-mrf export out/map.npz --to room.ply room.bt floor.pgm --z-min 0.1 --z-max 1.5
+    All names are looked at before the map is read, which can take long.
     """
+    if not options.to:
+        raise ConfigError("--to needs at least one file")
+    for path in options.to:
+        writer_of(path)
+        if os.path.realpath(path) == os.path.realpath(options.map):
+            raise ConfigError(f"{path}: the map itself would be overwritten")
+    runtime.init(options.arch)
+    console = Console()
+    m = _opened(options)
+    written: list[dict[str, Any]] = []
+    for path in options.to:
+        begin = time.perf_counter()
+        files = export_map(m, path, options.options)
+        seconds = round(time.perf_counter() - begin, 3)
+        for file in files:
+            written.append({"file": str(file), "bytes": _size(file), "seconds": seconds})
+            if not options.json:
+                _tell(console, file, seconds)
+        note = export_note(m, path, options.options)
+        if note is not None and not options.json:
+            console.print(f"{path.name}: {note}", markup=False, highlight=False, soft_wrap=True)
+    if options.json:
+        print(json.dumps(written, indent=2))
+    return 0
 
-    map: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MAP")]
-    """A file of MRFMap.save, LogOddsMap.save or VisibilityMap.save, such as the map.npz of a run, or a map in
-    chunks, such as the map.zarr of a run with --submap-size."""
 
-    to: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE [FILE ...]")]
-    """The files to write."""
+def _opened(options: Export) -> ExportedMap:
+    """The map, or the part of a map in chunks that was asked for."""
+    if options.map.suffix == SUFFIX:
+        return take_part(ChunkedMap.open(options.map), options.lower, options.upper)
+    if options.lower is not None or options.upper is not None:
+        raise ConfigError(f"--lower and --upper take a part of a map in chunks; {options.map} is none")
+    return load_map(options.map)
 
-    lower: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
-    """Lowest corner, in metres, of the box to take out of a map in chunks; without it, all from its begin."""
 
-    upper: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
-    """Highest corner of that box."""
+def _size(path: Path) -> int:
+    """Bytes of a file, or of all files in a folder."""
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
 
-    options: Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.FlagCreatePairsOff] = field(
-        default_factory=ExportOptions
-    )
-    """What the files hold."""
 
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print what was written as JSON."""
-
-    arch: Arch = "auto"
-    """Backend to read the map on."""
-
-    def run(self) -> int:
-        """Write all files and print their names. Raises TaichiMRFError."""
-        from taichi_mrf.cli.export_run import run_export
-
-        return run_export(self)
+def _tell(console: Console, file: Path, seconds: float) -> None:
+    size = f"{_size(file) / 1e6:.2f} MB, {seconds:.1f} s"
+    console.print(f"{file} ({size})", markup=False, highlight=False, soft_wrap=True)

@@ -1,31 +1,58 @@
-"""``taichi-mrf import``: a file of OctoMap's in, a map of this program out."""
+"""What ``taichi-mrf import`` does: read a file of OctoMap's, write it as a LogOddsMap, say what was in it."""
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
+import dataclasses
+import json
 
-import tyro
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from taichi_mrf.cli.options.import_map import Import
+from taichi_mrf.config.schema import Config
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.export.octomap_reader import read_octomap
+from taichi_mrf.methods.map_file import MapHeader
+from taichi_mrf.methods.recursive_storage import RecursiveContents, write_recursive
+from taichi_mrf.methods.recursive_update import LEAST_LOG_ODDS, UNKNOWN_LOG_ODDS
+from taichi_mrf.sensor.noise import PolynomialNoise
 
 
-@dataclass(frozen=True)
-class Import:
-    """Make a map of a file of OctoMap's (.bt or .ot), with its voxels and log-odds.
+def run_import(options: Import) -> int:
+    """Carry out the command; returns the exit status. Raises TaichiMRFError."""
+    if options.out.suffix.lower() != ".npz":
+        raise ConfigError(f"{options.out}: a map is an .npz file")
+    leaves = read_octomap(options.file)
+    leaves = dataclasses.replace(leaves, log_odds=_known(leaves.log_odds))
+    bricks, log_odds = leaves.bricks()
+    config = Config(leaves.voxel_size, "log_odds")
+    noise = PolynomialNoise(config.sensor.sigma, config.sensor.bias)
+    contents = RecursiveContents(MapHeader(config, noise, [], 0), bricks, log_odds, stale=False)
+    write_recursive(options.out, contents)
+    facts = {
+        "source": str(options.file),
+        "map": str(options.out),
+        "voxel_size": leaves.voxel_size,
+        "leaves": len(leaves.code),
+        "bricks": len(bricks),
+        "occupied": int((log_odds > 0).sum()),
+        "free": int((log_odds < 0).sum()),
+    }
+    if options.json:
+        print(json.dumps(facts, indent=2))
+        return 0
+    console = Console()
+    text = (
+        f"{facts['leaves']:,} leaves of OctoMap's: {facts['occupied']:,} occupied and {facts['free']:,} free "
+        f"voxels of {leaves.voxel_size:g} m in {facts['bricks']:,} bricks"
+    )
+    for line in (text, str(options.out)):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    return 0
 
-    The map is a LogOddsMap without keyframes: it can be asked, compared, exported and added to.
-    Example: taichi-mrf import building.bt --out building.npz
-    """
 
-    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """A .bt or .ot."""
-
-    out: Annotated[Path, tyro.conf.arg(metavar="MAP")]
-    """The map to write, an .npz file."""
-
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print what was read as JSON."""
-
-    def run(self) -> int:
-        """Read, write, and print what was read. Raises TaichiMRFError."""
-        from taichi_mrf.cli.import_run import run_import
-
-        return run_import(self)
+def _known(log_odds: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Log-odds that mark no voxel as unknown, as methods/recursive_update.py has them: OctoMap knows a node
+    of log-odds 0, and counts it as occupied."""
+    return np.where(
+        np.abs(log_odds - UNKNOWN_LOG_ODDS) < LEAST_LOG_ODDS, np.float32(LEAST_LOG_ODDS), log_odds
+    )

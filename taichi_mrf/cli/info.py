@@ -3,59 +3,38 @@ frames."""
 
 import json
 import shlex
-from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any
+from dataclasses import asdict
+from typing import Any
 
-import tyro
+from rich.console import Console
+from rich.table import Table
 
+from taichi_mrf.cli.options.info import Info
 from taichi_mrf.config.schema import Arch
+from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets.registry import bag_path, format_name, is_rendered
+from taichi_mrf.datasets.ros.summary import BagSummary
+from taichi_mrf.datasets.ros.summary import summarise as summarise_bag
 from taichi_mrf.datasets.source_flags import SourceFlags
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from taichi_mrf.datasets import Dataset
-    from taichi_mrf.datasets.ros.summary import BagSummary
+from taichi_mrf.datasets.summary import summarise
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.system import runtime
 
 
-@dataclass(frozen=True)
-class Info:
-    """Show the backend that runs here and why, what each backend can do, and versions; or, with SOURCE, what
-    is in a recording and how to map it.
-
-    Example: taichi-mrf info walk.bag
-    """
-
-    source: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
-    """A recording, as map takes it. Of a bag, all topics are listed too."""
-
-    arch: Arch = "auto"
-    """Backend to start."""
-
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print the facts as JSON instead of tables."""
-
-    reading: Annotated[SourceFlags, tyro.conf.arg(name="")] = field(default_factory=SourceFlags)
-    """How SOURCE is read."""
-
-    def run(self) -> int:
-        """Print the tables. Raises BackendError, DatasetError."""
-        from rich.console import Console
-
-        console = Console(soft_wrap=False)
-        if self.json:
-            facts = _backend_facts(self.arch) if self.source is None else _source_facts(self)
-            print(json.dumps(facts, indent=2))
-        elif self.source is None:
-            _print_backends(console, self.arch)
-        else:
-            _print_source(console, self.source, self.arch, self.reading)
-        return 0
+def run_info(options: Info) -> int:
+    """Carry out the command; returns the exit status. Raises TaichiMRFError."""
+    console = Console(soft_wrap=False)
+    if options.json:
+        facts = _backend_facts(options.arch) if options.source is None else _source_facts(options)
+        print(json.dumps(facts, indent=2))
+    elif options.source is None:
+        _print_backends(console, options.arch)
+    else:
+        _print_source(console, options.source, options.arch, options.reading)
+    return 0
 
 
 def _backend_facts(arch: Arch) -> dict[str, Any]:
-    from taichi_mrf.system import runtime
-
     runtime.init(arch)
     choice = runtime.choice()
     assert choice is not None
@@ -70,12 +49,6 @@ def _backend_facts(arch: Arch) -> dict[str, Any]:
 
 
 def _source_facts(options: Info) -> dict[str, Any]:
-    from taichi_mrf.datasets import open_dataset
-    from taichi_mrf.datasets.registry import bag_path, format_name, is_rendered
-    from taichi_mrf.datasets.ros.summary import summarise as summarise_bag
-    from taichi_mrf.datasets.summary import summarise
-    from taichi_mrf.system import runtime
-
     assert options.source is not None
     facts: dict[str, Any] = {"source": options.source}
     path = bag_path(options.source)
@@ -91,10 +64,7 @@ def _source_facts(options: Info) -> dict[str, Any]:
     return facts | {"format": format_name(options.source)} | asdict(summarise(dataset)) | {"notes": notes}
 
 
-def _print_backends(console: "Console", arch: Arch) -> None:
-    from rich.table import Table
-
-    from taichi_mrf.system import runtime
+def _print_backends(console: Console, arch: Arch) -> None:
 
     runtime.init(arch)
     choice = runtime.choice()
@@ -111,13 +81,7 @@ def _print_backends(console: "Console", arch: Arch) -> None:
         console.print(f"{name} {version}", highlight=False)
 
 
-def _print_source(console: "Console", source: str, arch: Arch, reading: SourceFlags) -> None:
-    from taichi_mrf.datasets import open_dataset
-    from taichi_mrf.datasets.registry import bag_path, format_name, is_rendered
-    from taichi_mrf.datasets.ros.summary import summarise as summarise_bag
-    from taichi_mrf.errors import DatasetError
-    from taichi_mrf.system import runtime
-
+def _print_source(console: Console, source: str, arch: Arch, reading: SourceFlags) -> None:
     path = bag_path(source)
     if path is not None:
         bag = summarise_bag(path)
@@ -138,9 +102,7 @@ def _print_source(console: "Console", source: str, arch: Arch, reading: SourceFl
             _say(console, f"taichi-mrf map {shlex.quote(source)} --out DIR")
 
 
-def _print_topics(console: "Console", bag: "BagSummary") -> None:
-    from rich.table import Table
-
+def _print_topics(console: Console, bag: BagSummary) -> None:
     table = Table(title=f"Topics in {bag.duration:.1f} s", title_justify="left")
     for heading in ("topic", "type", "messages", "Hz", "holds"):
         table.add_column(heading, overflow="fold")
@@ -153,10 +115,7 @@ def _print_topics(console: "Console", bag: "BagSummary") -> None:
         _say(console, f"tf {transform}")
 
 
-def _print_frames(console: "Console", format_name: str, dataset: "Dataset") -> None:
-    from rich.table import Table
-
-    from taichi_mrf.datasets.summary import summarise
+def _print_frames(console: Console, format_name: str, dataset: Dataset) -> None:
 
     found, camera = summarise(dataset), dataset.camera
     table = Table(show_header=False, title=dataset.name, title_justify="left")
@@ -181,5 +140,5 @@ def _print_frames(console: "Console", format_name: str, dataset: "Dataset") -> N
         _say(console, f"Note: {note}")
 
 
-def _say(console: "Console", text: str) -> None:
+def _say(console: Console, text: str) -> None:
     console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -1,86 +1,115 @@
-"""``taichi-mrf live``: watch a map grow in the browser, and change it there."""
+"""What ``taichi-mrf live`` does: start the page, map, and leave the files when it ends."""
 
-from dataclasses import dataclass, field
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
 
-import tyro
+from rich.console import Console
 
-from taichi_mrf.cli.pose_flags import PoseFlags
-from taichi_mrf.config.schema import Config
-from taichi_mrf.datasets.source_flags import SourceFlags
-from taichi_mrf.errors import ConfigError
+from taichi_mrf.cli.options.live import Live
+from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
+from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
+from taichi_mrf.cli.shared.serving import Say, let_the_page_go_first, tell_address, warn_of_host
+from taichi_mrf.config.schema import with_absolute_tables
+from taichi_mrf.errors import TaichiMRFError
+from taichi_mrf.live.link import ViewerLink
+from taichi_mrf.viewer.messages import Listening
+
+SHORTEST_LIFE_SECONDS = 30.0
+"""A viewer that ends sooner than this is not started once more."""
 
 
-@dataclass(frozen=True)
-class Live:
-    """Map a sequence or a camera, and show the map in the browser while it grows.
+def run_live(options: Live) -> int:
+    """Carry out the command; returns the exit status. Raises TaichiMRFError."""
+    console = Console()
 
-    Keyframes can be switched off and on, moved and frozen there, and rays asked what they meet. Ctrl-C ends
-    it and, with --out, keeps what is mapped (exit status 130). Example: taichi-mrf live recording/ --out
-    runs/desk --open
-    """
+    def say(text: str) -> None:
+        console.print(text, highlight=False, soft_wrap=True, markup=False)
 
-    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = "synthetic:room"
-    """A folder, whose format is recognised, a built-in sequence, a camera (realsense:), or a saved map
-    (map.npz)."""
+    settings = with_absolute_tables(options.poses.parameters(options.settings), Path.cwd())
+    with ExitStack() as stack:
+        if options.out is not None:
+            stack.enter_context(output_folder(options.out))
+        request = stack.enter_context(stop_on_signals(say))
+        warn_of_host(options.host, options.port, "watch and change the map", say)
+        page = _Page(options, say, stack)
+        let_the_page_go_first()
+        # Imported late: the page starts meanwhile, in a process of its own.
+        from taichi_mrf.live.files import write_all
+        from taichi_mrf.live.open_source import open_source
+        from taichi_mrf.live.run import Policy
+        from taichi_mrf.live.session import Session
 
-    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Folder for map.npz, voxels.ply, config.yaml and, where poses are tracked, trajectory.txt; it is made if
-    need be."""
+        source, notes = open_source(
+            options.source,
+            settings,
+            every=options.every,
+            limit=options.limit,
+            speed=options.speed,
+            loop=options.loop,
+            reading=options.reading,
+            track=options.poses.track_poses,
+        )
+        for note in notes:
+            say(note)
+        policy = Policy(options.keep_live, options.out, options.exit_when_done)
+        session = Session(source, page.link, policy, page.listening)
+        problem = _run(session.run, session.reconnect, page, request)
+        if options.out is not None:
+            track = session.state.track if source.tracked else None
+            if track is not None:
+                say(f"tracking: {len(track.frames)} frames found, {track.lost} lost")
+            for path in write_all(session.state.mapper.map, source.config, options.out, track):
+                say(f"wrote {path}")
+    if problem is not None:
+        raise TaichiMRFError(problem)
+    if request.signal is not None:
+        return 128 + request.signal
+    if session.state.full is not None:
+        print(f"taichi-mrf: {session.state.full}; what did fit is mapped", file=sys.stderr)
+        return DID_NOT_FIT
+    return 0
 
-    config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
-    """A YAML file of parameters, such as those in configs/."""
 
-    every: Annotated[int, tyro.conf.arg(metavar="N")] = 1
-    """Look at every N-th frame only."""
+class _Page:
+    """The viewer of the moment, and what is told of it on the terminal."""
 
-    limit: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Look at no more than N frames."""
+    def __init__(self, options: Live, say: Say, stack: ExitStack) -> None:
+        self._options, self._say, self._stack = options, say, stack
+        self._wanted_port = options.port
+        self.start()
 
-    speed: Annotated[float, tyro.conf.arg(metavar="X")] = 0.0
-    """Replay at X times the recording's own pace; 0 is as fast as it goes."""
+    def start(self) -> None:
+        """Start a viewer; it is closed with the stack."""
+        self.has_listened, self.started = False, time.monotonic()
+        self.link = self._stack.enter_context(ViewerLink(self._options.host, self._wanted_port))
 
-    loop: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Begin again when the sequence has ended, with the frames as new keyframes."""
+    def listening(self, where: Listening) -> None:
+        """Tell the user where the page is."""
+        wants_browser = self._options.open and not self.has_listened
+        tell_address(where, "The map", self._wanted_port, wants_browser, self._say)
+        self.has_listened, self._wanted_port = True, where.port
 
-    keep_live: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Freeze keyframes when there are more than N that could still be changed, first those that have left the
-    view, so that an endless run needs no more and more memory."""
 
-    exit_when_done: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """End once the sequence is mapped."""
-
-    host: str = "127.0.0.1"
-    """Address to serve the page at; others than this one let everybody in who can reach it."""
-
-    port: int = 8080
-    """Port to serve the page at; the next free one is taken if it is busy."""
-
-    open: bool = False
-    """Open the page in a browser on this machine."""
-
-    reading: Annotated[SourceFlags, tyro.conf.arg(name="")] = field(default_factory=SourceFlags)
-    """How SOURCE is read."""
-
-    poses: Annotated[PoseFlags, tyro.conf.arg(name="")] = field(default_factory=PoseFlags)
-    """What becomes of SOURCE's poses."""
-
-    settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
-    """Parameters."""
-
-    def __post_init__(self) -> None:
-        for name in ("every", "limit", "keep_live"):
-            value = getattr(self, name)
-            if isinstance(value, int) and value < 1:
-                raise ConfigError(f"--{name.replace('_', '-')} must be at least 1, not {value}")
-        if not 0 <= self.speed < float("inf"):
-            raise ConfigError(f"--speed must be 0 or a positive number, not {self.speed:g}")
-        if not 0 <= self.port <= 65535:
-            raise ConfigError(f"--port must lie between 0 and 65535, not {self.port}")
-
-    def run(self) -> int:
-        """Map and show until told to stop. Raises TaichiMRFError."""
-        from taichi_mrf.cli.live_run import run_live
-
-        return run_live(self)
+def _run(
+    run: Callable[[StopRequest], None],
+    reconnect: Callable[[ViewerLink], None],
+    page: _Page,
+    request: StopRequest,
+) -> str | None:
+    """Map to the end; a viewer that was killed is started once more. Returns what has ended the run, if that
+    was not meant to be."""
+    while True:
+        run(request)
+        lost = page.link.lost
+        if lost is None or request():
+            return None
+        lives_long = time.monotonic() - page.started > SHORTEST_LIFE_SECONDS
+        if not (page.has_listened and lives_long):
+            return lost
+        print(f"taichi-mrf: {lost}; starting another", file=sys.stderr)
+        page.link.close()
+        page.start()
+        reconnect(page.link)

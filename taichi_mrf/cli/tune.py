@@ -1,111 +1,118 @@
-"""``taichi-mrf tune``: find parameters for a sensor and a scene, in the browser or by a search."""
+"""What ``taichi-mrf tune`` does: start the page, try parameters, and leave the files when it ends."""
 
-from dataclasses import dataclass, field
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING
 
-import tyro
+from rich.console import Console
 
-from taichi_mrf.config.schema import Config
-from taichi_mrf.datasets.source_flags import SourceFlags
-from taichi_mrf.errors import ConfigError
+from taichi_mrf.cli.options.tune import FRAMES_BY_HAND, FRAMES_TO_SEARCH, Tune
+from taichi_mrf.cli.shared.interrupt import stop_on_signals
+from taichi_mrf.cli.shared.output import output_folder
+from taichi_mrf.cli.shared.serving import Say, let_the_page_go_first, tell_address, warn_of_host
+from taichi_mrf.config.schema import with_absolute_tables
+from taichi_mrf.errors import TaichiMRFError
+from taichi_mrf.live.link import ViewerLink
+from taichi_mrf.system.atomic import write_text
+from taichi_mrf.tune.link import NoPage, start_page
+from taichi_mrf.viewer.tune.messages import FrameChoice
 
-FRAMES_BY_HAND, FRAMES_TO_SEARCH = 12, 30
+if TYPE_CHECKING:
+    from taichi_mrf.tune.history import Attempt
+    from taichi_mrf.tune.search import Search
+    from taichi_mrf.tune.session import TuneSession
 
 
-@dataclass(frozen=True)
-class Tune:
-    """Tune parameters on a few frames of a sequence, and see at once what they do.
+def run_tune(options: Tune) -> int:
+    """Carry out the command; returns the exit status. Raises TaichiMRFError."""
+    console = Console()
 
-    The page has sliders for the parameters; after each change a fresh map is made of some frames and scored
-    on others. With --auto a search does it. Ctrl-C ends it and, with --out, keeps what is found (exit
-    status 130). Example: taichi-mrf tune recording/ --auto 60 --out runs/tuned
-    """
+    def say(text: str) -> None:
+        console.print(text, highlight=False, soft_wrap=True, markup=False)
 
-    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
-    """A folder, whose format is recognised, or a built-in sequence such as synthetic:room."""
+    settings = with_absolute_tables(options.settings, Path.cwd())
+    with ExitStack() as stack:
+        if options.out is not None:
+            stack.enter_context(output_folder(options.out))
+        request = stack.enter_context(stop_on_signals(say))
+        link = _page(options, say, stack) if options.viewer else NoPage()
+        # Imported late: the page starts meanwhile, in a process of its own.
+        from taichi_mrf.datasets import open_dataset
+        from taichi_mrf.errors import DatasetError
+        from taichi_mrf.system import runtime
+        from taichi_mrf.tune.search import DEFAULT_SEARCH, Search
+        from taichi_mrf.tune.session import Policy, TuneSession
 
-    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Folder for tries.csv and the YAML files that are saved, and with --auto for best.yaml; it is made if
-    need be."""
+        search = None
+        if options.auto is not None:
+            search = Search(settings, options.names or DEFAULT_SEARCH, options.auto, options.seed)
+        runtime.init(settings.runtime.arch, settings.runtime.threads, settings.runtime.debug)
+        dataset = open_dataset(options.source, color=False, **options.reading.keywords())
+        if dataset.tracked:
+            raise DatasetError(f"{options.source}: tune needs poses: map it, and give poses=trajectory.txt")
+        told: set[int] = set()
+        count = options.frames or (FRAMES_TO_SEARCH if search else FRAMES_BY_HAND)
+        session = TuneSession(
+            dataset,
+            settings,
+            FrameChoice(options.first, options.stride, count, options.hold_out),
+            link,
+            Policy(options.out, options.search_stride, leave_when_done=not options.viewer),
+            search=search,
+            listening=lambda where: tell_address(where, "The page", options.port, options.open, say),
+            tried=lambda attempt: _tell_try(attempt, session.search, told, say),
+        )
+        for note in dataset.notes:
+            say(note)
+        frames = session.frames
+        say(
+            f"{len(frames.training)} frames of {frames.source} make the map, {len(frames.held_out)} score it"
+            + (f", {len(frames.unseen)} are kept back for the end" if frames.unseen else "")
+            + f" (from frame {frames.choice.first} on, {frames.choice.stride} apart)"
+        )
+        session.run(request)
+        _finish(session, options, say)
+        lost = link.lost
+    if lost is not None and not request():
+        raise TaichiMRFError(lost)
+    return 0 if request.signal is None else 128 + request.signal
 
-    config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
-    """A YAML file of parameters to begin with, such as those in configs/."""
 
-    frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """How many frames to take, those that are held out included; 12 by default, 30 with --auto."""
+def _page(options: Tune, say: Say, stack: ExitStack) -> ViewerLink:
+    """Start the page, which may compute before the tries do."""
+    warn_of_host(options.host, options.port, "use it", say)
+    link = stack.enter_context(start_page(options.host, options.port))
+    let_the_page_go_first()
+    return link
 
-    first: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Index of the first frame to take."""
 
-    stride: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Take every N-th frame from there; 0 spreads them evenly over the sequence, at most 10 apart."""
+def _finish(session: "TuneSession", options: Tune, say: Say) -> None:
+    """Print what the search was worth, and leave the files."""
+    from taichi_mrf.tune.files import BEST_FILE, TABLE_FILE
+    from taichi_mrf.tune.verdict import verdict_lines
 
-    hold_out: Annotated[int, tyro.conf.arg(metavar="N")] = 3
-    """One frame in N is kept out of the map, to score it. With --auto every second of these is kept back
-    from the search as well, for the final scores."""
+    verdict = verdict_lines(session.verdict, len(session.frames.unseen)) if session.verdict else []
+    for line in verdict:
+        say(line)
+    if options.out is None or not session.history.attempts:
+        return
+    write_text(options.out / TABLE_FILE, session.history.to_csv())
+    say(f"wrote {options.out / TABLE_FILE}")
+    best = session.search.best if session.search is not None else None
+    attempt = next((each for each in session.history.attempts if each.config == best), None)
+    if attempt is not None:
+        write_text(options.out / BEST_FILE, session.history.to_yaml(attempt.number, tuple(verdict)))
+        say(f"wrote {options.out / BEST_FILE}")
 
-    auto: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Search for parameters, in N tries, under which held-out measurements are likelier (needs the extra
-    auto: Optuna)."""
 
-    search: Annotated[str, tyro.conf.arg(metavar="NAME,...")] = ""
-    """Parameters to search, with commas between them; sensor.sigma_scale stands for all coefficients of
-    sensor.sigma together. By default prior, outlier floor, message clamp, free share and sigma's scale."""
-
-    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Starts the random numbers of the search."""
-
-    search_stride: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """The search maps and judges every N-th pixel along both sides; 0 takes so many that 160 columns are
-    left. Final scores are of all pixels."""
-
-    viewer: bool = True
-    """Serve the page; without it only --auto makes sense."""
-
-    host: str = "127.0.0.1"
-    """Address to serve the page at; others than this one let everybody in who can reach it."""
-
-    port: int = 8080
-    """Port to serve the page at; the next free one is taken if it is busy."""
-
-    open: bool = False
-    """Open the page in a browser on this machine."""
-
-    reading: Annotated[SourceFlags, tyro.conf.arg(name="")] = field(default_factory=SourceFlags)
-    """How SOURCE is read."""
-
-    settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
-    """Parameters to begin with."""
-
-    def __post_init__(self) -> None:
-        least = {
-            "frames": 3,
-            "first": 0,
-            "stride": 0,
-            "hold_out": 2,
-            "auto": 1,
-            "seed": 0,
-            "search_stride": 0,
-        }
-        for name, lowest in least.items():
-            value = getattr(self, name)
-            if isinstance(value, int) and value < lowest:
-                raise ConfigError(f"--{name.replace('_', '-')} must be at least {lowest}, not {value}")
-        if not 0 <= self.port <= 65535:
-            raise ConfigError(f"--port must lie between 0 and 65535, not {self.port}")
-        if self.search and self.auto is None:
-            raise ConfigError("--search says what --auto searches: add --auto N")
-        if not self.viewer and self.auto is None:
-            raise ConfigError("--no-viewer leaves nothing to do: add --auto N")
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The parameters to search, none for the default ones."""
-        return tuple(name.strip() for name in self.search.split(",") if name.strip())
-
-    def run(self) -> int:
-        """Tune until told to stop, or until the search has ended without a page. Raises TaichiMRFError."""
-        from taichi_mrf.cli.tune_run import run_tune
-
-        return run_tune(self)
+def _tell_try(attempt: "Attempt", search: "Search | None", told: set[int], say: Say) -> None:
+    """One line for each try of the search, once; tries by hand are on the page."""
+    if attempt.by != "search" or search is None or attempt.number in told:
+        return
+    told.add(attempt.number)
+    scores = attempt.scores
+    best = " *" if attempt.config == search.best else ""
+    say(
+        f"try {attempt.number:3}  log-likelihood {scores.log_likelihood:+.3f}  "
+        f"right {scores.accuracy_sigma:.1%}  median {1000 * scores.median_abs_m:.1f} mm{best}"
+    )

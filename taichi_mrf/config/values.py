@@ -9,6 +9,7 @@ import difflib
 import reprlib
 import types
 import typing
+from collections.abc import Sequence
 from typing import Any, Literal, TypeVar
 
 from taichi_mrf.errors import ConfigError
@@ -20,10 +21,14 @@ _LARGEST_INTEGER = 2**63 - 1
 
 def unknown_key(key: object, known: typing.Iterable[str], where: str) -> ConfigError:
     """The error for a parameter that does not exist: it names the nearest one that does."""
-    known = list(known)
-    near = difflib.get_close_matches(str(key)[:100], known, n=1, cutoff=0.5)
-    hint = f"did you mean '{near[0]}'?" if near else f"known are: {', '.join(known)}"
+    hint = nearest(str(key)[:100], list(known))
     return ConfigError(f"{where}: unknown parameter {shown(key)}; {hint}")
+
+
+def nearest(name: str, known: Sequence[str]) -> str:
+    """A hint for an unknown name: the known one that it is most like, or all of them."""
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"did you mean '{near[0]}'?" if near else f"known are: {', '.join(known)}"
 
 
 def overridden(config: T, overrides: dict[str, Any], where: str) -> T:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.geometry.up import UpName
 
 
 @dataclass(frozen=True)
@@ -27,7 +26,7 @@ class ExportOptions:
     z_max: float | None = None
     """Upper end in metres of the band of heights that a .pgm shows."""
 
-    up: Literal["auto"] | UpName = "auto"
+    up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
     """The world axis that is up in .pgm, .glb and .html. auto takes it from the first keyframe's image, or z
     if the map has no keyframes."""
 

@@ -1,5 +1,6 @@
 """The console program as a person runs it: a process, its exit status, its files and its words."""
 
+import importlib
 import os
 import pty
 import resource
@@ -15,6 +16,7 @@ import pytest
 import trimesh
 from console import COARSE, FAST, ROOM, assert_refused, mapped, report_of, taichi_mrf
 
+from taichi_mrf.cli.commands import COMMANDS
 from taichi_mrf.config.schema import load
 
 FILES = {"map.npz", "voxels.ply", "config.yaml", "report.json"}
@@ -55,6 +57,19 @@ def test_help_is_printed_without_loading_taichi_or_numpy() -> None:
     imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
     assert "taichi_mrf.cli.main" in imported
     assert not imported & {"taichi", "numpy", "cv2", "viser", "matplotlib"}
+
+
+def test_every_command_names_a_function_that_exists() -> None:
+    for command in COMMANDS.values():
+        module, _, name = command.function.partition(":")
+        assert callable(getattr(importlib.import_module(module), name))
+
+
+@pytest.mark.parametrize(
+    ("word", "hint"), [("exprot", "did you mean 'export'?"), ("xyz", "known are: map, live")]
+)
+def test_an_unknown_command_gets_a_suggestion(word: str, hint: str) -> None:
+    assert_refused(taichi_mrf(word, "map.npz"), f"unknown command '{word}'", hint)
 
 
 def test_the_help_of_map_shows_every_parameter() -> None:

@@ -14,8 +14,10 @@ import pytest
 import yaml
 from laser_logs import flaser
 
-from taichi_mrf.cli.laser import Laser, load_laser_config
-from taichi_mrf.cli.main import BAD_INPUT, main, parse
+from taichi_mrf.cli.main import BAD_INPUT, main
+from taichi_mrf.cli.options.config_file import load_laser_config
+from taichi_mrf.cli.options.laser import Laser
+from taichi_mrf.cli.parser import parse
 from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.solve import METHODS
 
@@ -148,7 +150,9 @@ def test_the_configuration_is_read_back_and_repeats_the_run(one: tuple[Path, str
 
 def test_a_flag_goes_before_the_file(one: tuple[Path, str], tmp_path: Path) -> None:
     config = one[0] / "config.yaml"
-    options = parse(["laser", SMALL, "--out", str(tmp_path), "--config", str(config), "--cell-size", "0.5"])
+    _, options = parse(
+        ["laser", SMALL, "--out", str(tmp_path), "--config", str(config), "--cell-size", "0.5"]
+    )
     assert isinstance(options, Laser)
     assert options.settings == LaserConfig(method="bp", cell_size=0.5, iterations=8)
 

@@ -15,7 +15,7 @@ import small_room
 from killed_runs import OPTIONS, SOURCE, Run, disturbed, keyframes_of
 from sliding_camera import ALL_FRAMES, CAMERA, SlidingCamera, StopAfter, names, sequence
 
-from taichi_mrf.cli.map_keep import Keeper, resumed_map
+from taichi_mrf.cli.map.keep import Keeper, resumed_map
 from taichi_mrf.config.schema import Config, VolumeConfig
 from taichi_mrf.errors import CapacityError, ConfigError, DatasetError
 from taichi_mrf.mapping.pipeline import KeyframeAdded, MappingResult, map_sequence
@@ -152,7 +152,7 @@ def test_what_cannot_be_kept_on_the_way_does_not_end_the_run(tmp_path: Path) -> 
 
 def test_saving_takes_its_share_of_the_time_at_most(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = 0.0
-    monkeypatch.setattr("taichi_mrf.cli.map_keep.time.perf_counter", lambda: now)
+    monkeypatch.setattr("taichi_mrf.cli.map.keep.time.perf_counter", lambda: now)
     saved: list[float] = []
 
     class SlowMap:

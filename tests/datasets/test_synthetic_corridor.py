@@ -5,9 +5,8 @@ import json
 
 import numpy as np
 import pytest
-import tyro
+from console import carry_out
 
-from taichi_mrf.cli.info import Info
 from taichi_mrf.config.schema import EvaluationConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.registry import format_name
@@ -126,7 +125,7 @@ def test_a_depth_scale_has_no_meaning_here() -> None:
 
 
 def test_info_tells_of_it(backend: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert tyro.cli(Info, args=[SMALL, "--json", "--arch", backend]).run() == 0
+    assert carry_out("info", SMALL, "--json", "--arch", backend) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["frames"] == 40
     assert facts["depth_range"] is not None

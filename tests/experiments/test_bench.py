@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import small_room
 
-from taichi_mrf.cli.bench import Bench
+from taichi_mrf.cli.options.bench import Bench
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.experiments.speed.bandwidth import copy_bandwidth

@@ -12,12 +12,11 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-import tyro
 import yaml
 from browser import LivePage, chromium, missing
+from console import carry_out
 from queried_maps import hand_map, map_of, room_map
 
-from taichi_mrf.cli.export import Export
 from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.export.formats import export_map, export_note, extensions
 from taichi_mrf.export.level_map import level_map
@@ -44,7 +43,7 @@ def saved(backend: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, P
 
 def run_export(*arguments: object) -> int:
     arch = runtime.active() or "cpu"
-    return tyro.cli(Export, args=[*(str(each) for each in arguments), "--arch", arch]).run()
+    return carry_out("export", *arguments, "--arch", arch)
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -7,11 +7,10 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-import tyro
+from console import carry_out
 from hand_made import PRIOR, VOXEL
 from queried_maps import HandMap, hand_map, map_of, room_map
 
-from taichi_mrf.cli.import_map import Import
 from taichi_mrf.errors import CapacityError, ConfigError, MapFileError
 from taichi_mrf.export.octomap import write_bt, write_ot
 from taichi_mrf.export.octomap_reader import OctomapLeaves, read_octomap
@@ -183,7 +182,7 @@ def test_a_map_beyond_octomaps_reach() -> None:
 
 
 def run_import(*arguments: object) -> int:
-    return tyro.cli(Import, args=[str(each) for each in arguments]).run()
+    return carry_out("import", *arguments)
 
 
 @pytest.mark.parametrize("name", ["map.ot", "map.bt"])

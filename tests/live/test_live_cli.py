@@ -26,7 +26,7 @@ linux_only = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="ne
 PROGRAM = ("-m", "taichi_mrf")
 EVER_YOUNG = (
     "-c",
-    "import sys; from taichi_mrf.cli import live_run; live_run.SHORTEST_LIFE_SECONDS = 1e9; "
+    "import sys; from taichi_mrf.cli import live; live.SHORTEST_LIFE_SECONDS = 1e9; "
     "from taichi_mrf.cli.main import main; sys.exit(main(sys.argv[1:]))",
 )
 """The program, for which no viewer has lived long enough to be started again, however slow the machine."""

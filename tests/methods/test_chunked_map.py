@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-import tyro
+from console import carry_out
 from queried_maps import room_map
 
-from taichi_mrf.cli.export import Export
 from taichi_mrf.errors import ConfigError, MapFileError, TaichiMRFError
 from taichi_mrf.export.chunk_blocks import write_chunks
 from taichi_mrf.export.chunk_store import CHUNK_BYTES, ChunkStore, StoreHeader, new_store
@@ -122,7 +121,7 @@ def test_the_command_takes_a_box_out(stores: dict[str, Path], tmp_path: Path) ->
     arch = runtime.active() or "cpu"
     box = ["--lower", "-1", "-1", "-1", "--upper", "1", "2", "1"]
     arguments = [str(stores["mrf"]), "--to", str(tmp_path / "part.ply"), "--arch", arch, *box]
-    assert tyro.cli(Export, args=arguments).run() == 0
+    assert carry_out("export", *arguments) == 0
     found = np.asarray(trimesh.load(tmp_path / "part.ply").vertices)
     brick = 8 * room_map("mrf").voxel_size
     assert len(found)
@@ -130,7 +129,7 @@ def test_the_command_takes_a_box_out(stores: dict[str, Path], tmp_path: Path) ->
     assert (found < np.array([1, 2, 1]) + brick).all()
     room_map("mrf").save(tmp_path / "map.npz")
     with pytest.raises(ConfigError, match="is none"):
-        tyro.cli(Export, args=[str(tmp_path / "map.npz"), *arguments[1:]]).run()
+        carry_out("export", tmp_path / "map.npz", *arguments[1:])
 
 
 def test_a_folder_that_is_something_else_is_left_alone(tmp_path: Path) -> None:

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-import tyro
+from console import carry_out
 from hand_made import VOXEL
 from queried_maps import hand_map, map_of, room, room_map
 
-from taichi_mrf.cli.diff import Diff
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.queries.change import compare_maps
@@ -70,7 +69,7 @@ def two_maps(backend: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pa
 
 
 def diff(*arguments: object) -> int:
-    return tyro.cli(Diff, args=[*map(str, arguments), "--arch", runtime.active() or "cpu"]).run()
+    return carry_out("diff", *arguments, "--arch", runtime.active() or "cpu")
 
 
 def test_the_command_prints_a_table(two_maps: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:

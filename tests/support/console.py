@@ -6,6 +6,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from taichi_mrf.cli.parser import parse
+
 ROOM = "synthetic:room?frames=12&width=160&height=120"
 
 
@@ -47,3 +49,10 @@ def assert_refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
     for word in words:
         assert word in done.stderr
     assert done.stdout == ""
+
+
+def carry_out(*arguments: object) -> int:
+    """Parse the arguments and run the command in this process; returns the exit status. Its exceptions reach
+    the test."""
+    command, options = parse([str(argument) for argument in arguments])
+    return command.run(options)

@@ -118,10 +118,10 @@ def disturbed(folder: Path, draw: random.Random, steps: int, options: tuple[str,
 
 def _tell_steps(pipe: int) -> None:
     """Have the program say each of its steps."""
-    from taichi_mrf.cli import map_keep
-    from taichi_mrf.cli.progress import ProgressBar
+    from taichi_mrf.cli.map import keep
+    from taichi_mrf.cli.shared.progress import ProgressBar
 
-    advance, write_text = ProgressBar.advance, map_keep.write_text
+    advance, write_text = ProgressBar.advance, keep.write_text
 
     def told_advance(self: ProgressBar, stage: str, *rest: int) -> None:
         os.write(pipe, f"{stage}\n".encode())
@@ -132,7 +132,7 @@ def _tell_steps(pipe: int) -> None:
         write_text(path, text)
 
     ProgressBar.advance = told_advance  # type: ignore[method-assign]
-    map_keep.write_text = told_write
+    keep.write_text = told_write
 
 
 if __name__ == "__main__":

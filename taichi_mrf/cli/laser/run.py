@@ -10,14 +10,14 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeElapsedColumn
 
-from taichi_mrf.cli.interrupt import StopRequest, stop_on_signals
-from taichi_mrf.cli.laser import Laser
-from taichi_mrf.cli.laser_files import Outcome, write_comparison, write_energies, write_outcome
-from taichi_mrf.cli.laser_report import comparison_table, laser_report
-from taichi_mrf.cli.output import output_folder
-from taichi_mrf.cli.print_table import print_table
-from taichi_mrf.cli.progress import TransientBar
-from taichi_mrf.cli.report import report_json
+from taichi_mrf.cli.laser.files import Outcome, write_comparison, write_energies, write_outcome
+from taichi_mrf.cli.laser.report import comparison_table, laser_report
+from taichi_mrf.cli.map.report import report_json
+from taichi_mrf.cli.options.laser import Laser
+from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
+from taichi_mrf.cli.shared.output import output_folder
+from taichi_mrf.cli.shared.print_table import print_table
+from taichi_mrf.cli.shared.progress import TransientBar
 from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets.laser.beams import beams_of
 from taichi_mrf.datasets.laser.plan_image import read_floor_plan

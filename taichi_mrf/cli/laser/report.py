@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import taichi_mrf
-from taichi_mrf.cli.laser_files import Outcome
+from taichi_mrf.cli.laser.files import Outcome
 from taichi_mrf.datasets.laser.scans import LaserScans
 from taichi_mrf.evaluation.laser.floor_plan_frame import Registration
 from taichi_mrf.evaluation.laser.floor_plan_scores import CellScores

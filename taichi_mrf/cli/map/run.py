@@ -11,12 +11,13 @@ from typing import Any
 
 from rich.console import Console
 
-from taichi_mrf.cli.interrupt import StopRequest, stop_on_signals
-from taichi_mrf.cli.map import CONFIG_FILE, Map
-from taichi_mrf.cli.map_keep import MAP_FILE, REPORT_FILE, Keeper, resumed_map, skipped_before
-from taichi_mrf.cli.output import DID_NOT_FIT, output_folder
-from taichi_mrf.cli.progress import ProgressBar
-from taichi_mrf.cli.report import print_report, report_json, run_report, unfinished_report
+from taichi_mrf.cli.map.keep import MAP_FILE, REPORT_FILE, Keeper, resumed_map, skipped_before
+from taichi_mrf.cli.map.report import print_report, report_json, run_report, unfinished_report
+from taichi_mrf.cli.options.config_file import CONFIG_FILE
+from taichi_mrf.cli.options.map import Map
+from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
+from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
+from taichi_mrf.cli.shared.progress import ProgressBar
 from taichi_mrf.config.schema import Config, with_absolute_tables
 from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets import Dataset, open_dataset

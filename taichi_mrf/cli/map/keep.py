@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from taichi_mrf.cli.map import CONFIG_FILE
+from taichi_mrf.cli.options.config_file import CONFIG_FILE
 from taichi_mrf.config.schema import Config, load
 from taichi_mrf.config.text import commented_yaml, differences
 from taichi_mrf.errors import ConfigError, MapFileError, said

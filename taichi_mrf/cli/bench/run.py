@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.progress import Progress, TaskID
 from rich.table import Table
 
-from taichi_mrf.cli.bench import Bench
-from taichi_mrf.cli.bench_tables import bench_table, growth_table, profile_tables, viewer_table
+from taichi_mrf.cli.bench.tables import bench_table, growth_table, profile_tables, viewer_table
+from taichi_mrf.cli.options.bench import Bench
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.experiments.speed.bandwidth import copy_bandwidth

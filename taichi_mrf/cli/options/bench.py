@@ -62,9 +62,3 @@ class Bench:
             raise ConfigError("--plot has nothing to draw of --viewer")
         if self.plot is not None and self.plot.suffix not in (".png", ".svg", ".pdf"):
             raise ConfigError(f"--plot {self.plot}: the file must end in .png, .svg or .pdf")
-
-    def run(self) -> int:
-        """Measure, print and write. Raises TaichiMRFError."""
-        from taichi_mrf.cli.bench_run import run_bench
-
-        return run_bench(self)

@@ -1,16 +1,13 @@
 """``taichi-mrf laser``: scans of a 2D laser scanner in, a floor map out."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 import tyro
 
-from taichi_mrf.config.files import read_yaml
 from taichi_mrf.config.schema import RuntimeConfig
-from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.factor_graph.config import LaserConfig, Method
 
@@ -112,29 +109,3 @@ class Laser:
                 ) from None
             runs[f"dd-step-{step:g}"] = replace(self.settings, method="dd", step=step)
         return runs
-
-    def run(self) -> int:
-        """Map, write everything, and print the report. Raises TaichiMRFError."""
-        from taichi_mrf.cli.laser_run import run_laser
-
-        return run_laser(self)
-
-
-@dataclass(frozen=True)
-class _Files:
-    """The flag that says which file the other flags change."""
-
-    config: Path | None = None
-
-
-def laser_settings(arguments: Sequence[str]) -> LaserConfig:
-    """The parameters before any flag: those of --config. Raises ConfigError if that file cannot be read."""
-    if {"-h", "--help"} & set(arguments):
-        return LaserConfig()
-    files, _ = tyro.cli(_Files, args=list(arguments), return_unknown_args=True, add_help=False)
-    return LaserConfig() if files.config is None else load_laser_config(files.config)
-
-
-def load_laser_config(path: Path) -> LaserConfig:
-    """Read a YAML file of parameters. Raises ConfigError."""
-    return from_dict(LaserConfig, read_yaml(path), str(path))

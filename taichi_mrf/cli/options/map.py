@@ -1,21 +1,15 @@
 """``taichi-mrf map``: sequences in, for each a folder with the map, a report and pictures out."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from taichi_mrf.cli.pose_flags import PoseFlags
-from taichi_mrf.config import schema as configuration
+from taichi_mrf.cli.options.pose_flags import PoseFlags
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError
-
-CONFIG_FILE = "config.yaml"
-"""Name of the effective configuration in the folder of a run."""
-
 
 _SOURCES = tyro.conf.arg(metavar="SOURCE...", help_behavior_hint="(required)")
 
@@ -97,38 +91,3 @@ class Map:
             raise ConfigError("map needs a SOURCE")
         if not self.keep_every >= 0:
             raise ConfigError(f"--keep-every must be a number of seconds, not {self.keep_every}")
-
-    def run(self) -> int:
-        """Map, write everything, and print the report. Raises TaichiMRFError."""
-        if self.submap_size is not None:
-            from taichi_mrf.cli.map_submaps import run_submaps
-
-            return run_submaps(self, self.submap_size)
-        from taichi_mrf.cli.map_many import run_many
-        from taichi_mrf.cli.map_run import run_map
-
-        return run_map(self) if len(self.sources) == 1 and self.scheduler is None else run_many(self)
-
-
-@dataclass(frozen=True)
-class _Files:
-    """The flags that say which file the other flags change."""
-
-    config: Path | None = None
-    out: Path | None = None
-    resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-
-
-def file_settings(arguments: Sequence[str]) -> Config:
-    """The parameters before any flag: those of --config, or of the run that --resume goes on with.
-
-    Raises ConfigError if that file cannot be read.
-    """
-    if {"-h", "--help"} & set(arguments):
-        return Config()
-    files, _ = tyro.cli(_Files, args=list(arguments), return_unknown_args=True, add_help=False)
-    if files.config is not None:
-        return configuration.load(files.config)
-    if files.resume and files.out is not None and (files.out / CONFIG_FILE).is_file():
-        return configuration.load(files.out / CONFIG_FILE)
-    return Config()

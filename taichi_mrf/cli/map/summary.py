@@ -9,8 +9,8 @@ from typing import Any
 
 from rich.console import Console
 
-from taichi_mrf.cli.map_process import Outcome
-from taichi_mrf.cli.print_table import print_table
+from taichi_mrf.cli.map.process import Outcome
+from taichi_mrf.cli.shared.print_table import print_table
 from taichi_mrf.experiments.tables import Table
 
 

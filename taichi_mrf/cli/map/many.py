@@ -9,12 +9,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
 
 import taichi_mrf
-from taichi_mrf.cli.interrupt import StopRequest, interrupt_on_signals
-from taichi_mrf.cli.map import CONFIG_FILE, Map
-from taichi_mrf.cli.map_keep import REPORT_FILE, refuse_changes
-from taichi_mrf.cli.map_process import Outcome, finished_before, map_in_process
-from taichi_mrf.cli.map_run import MapTask, exit_status, map_task, print_run
-from taichi_mrf.cli.map_summary import (
+from taichi_mrf.cli.map.keep import REPORT_FILE, refuse_changes
+from taichi_mrf.cli.map.process import Outcome, finished_before, map_in_process
+from taichi_mrf.cli.map.run import MapTask, exit_status, map_task, print_run
+from taichi_mrf.cli.map.source_names import folder_names
+from taichi_mrf.cli.map.summary import (
     Row,
     accuracy_text,
     print_summary,
@@ -23,9 +22,11 @@ from taichi_mrf.cli.map_summary import (
     summary_line,
     summary_row,
 )
-from taichi_mrf.cli.output import DID_NOT_FIT, output_folder
-from taichi_mrf.cli.progress import TransientBar
-from taichi_mrf.cli.source_names import folder_names
+from taichi_mrf.cli.options.config_file import CONFIG_FILE
+from taichi_mrf.cli.options.map import Map
+from taichi_mrf.cli.shared.interrupt import StopRequest, interrupt_on_signals
+from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
+from taichi_mrf.cli.shared.progress import TransientBar
 from taichi_mrf.cluster.choose import open_runner
 from taichi_mrf.config.schema import load
 from taichi_mrf.config.text import commented_yaml, differences

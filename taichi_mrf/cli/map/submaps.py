@@ -7,13 +7,14 @@ from rich.console import Console
 from rich.table import Table
 
 import taichi_mrf
-from taichi_mrf.cli.interrupt import interrupt_on_signals
-from taichi_mrf.cli.map import CONFIG_FILE, Map
-from taichi_mrf.cli.map_keep import REPORT_FILE
-from taichi_mrf.cli.map_run import exit_status
-from taichi_mrf.cli.output import output_folder
-from taichi_mrf.cli.progress import ProgressBar
-from taichi_mrf.cli.report import report_json
+from taichi_mrf.cli.map.keep import REPORT_FILE
+from taichi_mrf.cli.map.report import report_json
+from taichi_mrf.cli.map.run import exit_status
+from taichi_mrf.cli.options.config_file import CONFIG_FILE
+from taichi_mrf.cli.options.map import Map
+from taichi_mrf.cli.shared.interrupt import interrupt_on_signals
+from taichi_mrf.cli.shared.output import output_folder
+from taichi_mrf.cli.shared.progress import ProgressBar
 from taichi_mrf.cluster.choose import open_runner
 from taichi_mrf.config.schema import with_absolute_tables
 from taichi_mrf.config.text import commented_yaml

@@ -1,0 +1,1 @@
+"""What `taichi-mrf bench` does."""

@@ -1,0 +1,73 @@
+"""The table of commands: what each is called, its options, and the function that carries it out.
+
+Options are light dataclasses. The function is named, not imported: what it needs is loaded when it runs.
+"""
+
+import importlib
+from collections.abc import Callable, Sequence
+from dataclasses import MISSING, dataclass, fields
+from typing import Any
+
+import tyro
+
+from taichi_mrf.cli.options.bench import Bench
+from taichi_mrf.cli.options.calibrate import Calibrate
+from taichi_mrf.cli.options.config_file import laser_parameters, mapping_parameters
+from taichi_mrf.cli.options.diff import Diff
+from taichi_mrf.cli.options.eval import Eval
+from taichi_mrf.cli.options.export import Export
+from taichi_mrf.cli.options.import_map import Import
+from taichi_mrf.cli.options.info import Info
+from taichi_mrf.cli.options.laser import Laser
+from taichi_mrf.cli.options.live import Live
+from taichi_mrf.cli.options.map import Map
+from taichi_mrf.cli.options.tune import Tune
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command.
+
+    ``options`` is the dataclass of its options, ``function`` "module:function", which takes them and returns
+    the exit status. ``parameters`` reads the parameters that hold before any flag, if a file may name them.
+    """
+
+    options: type[Any]
+    function: str
+    parameters: Callable[[Sequence[str]], Any] | None = None
+
+    def defaults(self, arguments: Sequence[str]) -> Any:
+        """The options before any flag; what the user must give is tyro.MISSING.
+
+        Raises ConfigError if the file that the arguments name cannot be read.
+        """
+        required = {
+            field.name: tyro.MISSING
+            for field in fields(self.options)
+            if field.default is field.default_factory is MISSING
+        }
+        if self.parameters is None:
+            return self.options() if not required else tyro.MISSING_NONPROP
+        return self.options(**required, settings=self.parameters(arguments))
+
+    def run(self, options: Any) -> int:
+        """Import the function and call it. Raises TaichiMRFError."""
+        module, _, name = self.function.partition(":")
+        function: Callable[[Any], int] = getattr(importlib.import_module(module), name)
+        return function(options)
+
+
+COMMANDS = {
+    "map": Command(Map, "taichi_mrf.cli.map.command:run", mapping_parameters),
+    "live": Command(Live, "taichi_mrf.cli.live:run_live", mapping_parameters),
+    "tune": Command(Tune, "taichi_mrf.cli.tune:run_tune", mapping_parameters),
+    "export": Command(Export, "taichi_mrf.cli.export:run_export"),
+    "import": Command(Import, "taichi_mrf.cli.import_map:run_import"),
+    "diff": Command(Diff, "taichi_mrf.cli.diff:run_diff"),
+    "info": Command(Info, "taichi_mrf.cli.info:run_info"),
+    "bench": Command(Bench, "taichi_mrf.cli.bench.run:run_bench"),
+    "calibrate": Command(Calibrate, "taichi_mrf.cli.calibrate:run_calibrate"),
+    "eval": Command(Eval, "taichi_mrf.cli.eval:run_eval"),
+    "laser": Command(Laser, "taichi_mrf.cli.laser.run:run_laser", laser_parameters),
+}
+"""Every command by name, in the order of the help."""

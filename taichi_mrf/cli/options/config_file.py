@@ -1,0 +1,56 @@
+"""The parameters that a command has before any flag: those of --config, or of the run to resume.
+
+Flags change them, so that this file is read before the command line is parsed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from taichi_mrf.config.files import read_yaml
+from taichi_mrf.config.schema import Config, load
+from taichi_mrf.config.values import from_dict
+from taichi_mrf.factor_graph.config import LaserConfig
+
+CONFIG_FILE = "config.yaml"
+"""Name of the effective configuration in the folder of a run."""
+
+
+@dataclass(frozen=True)
+class _Files:
+    """The flags that name the file."""
+
+    config: Path | None = None
+    out: Path | None = None
+    resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+
+
+def mapping_parameters(arguments: Sequence[str]) -> Config:
+    """The parameters of --config, with --resume those of the run in --out, else the defaults.
+
+    Raises ConfigError.
+    """
+    files = _files(arguments)
+    if files.config is not None:
+        return load(files.config)
+    if files.resume and files.out is not None and (files.out / CONFIG_FILE).is_file():
+        return load(files.out / CONFIG_FILE)
+    return Config()
+
+
+def laser_parameters(arguments: Sequence[str]) -> LaserConfig:
+    """The parameters of --config, else the defaults. Raises ConfigError."""
+    files = _files(arguments)
+    return LaserConfig() if files.config is None else load_laser_config(files.config)
+
+
+def load_laser_config(path: Path) -> LaserConfig:
+    """Read a YAML file of parameters. Raises ConfigError."""
+    return from_dict(LaserConfig, read_yaml(path), str(path))
+
+
+def _files(arguments: Sequence[str]) -> _Files:
+    return tyro.cli(_Files, args=list(arguments), return_unknown_args=True, add_help=False)[0]

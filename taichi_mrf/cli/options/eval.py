@@ -1,0 +1,59 @@
+"""``taichi-mrf eval``: the papers' evaluations, each from one command."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from taichi_mrf.config.schema import RuntimeConfig
+from taichi_mrf.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Repeat an evaluation of the papers, and print it beside what they report.
+
+    Tables are written as CSV, LaTeX and PNG, with the configuration of every map. A run that was
+    interrupted goes on where it was when it is started again with the same --out.
+    Example: taichi-mrf eval table1 --data scenes/ --voxel-sizes 0.05 --limit 3
+    """
+
+    experiment: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERIMENT")]
+    """table1, table2, table3, fig7 and fig10 of MRFMap (Shankar and Michael 2020), stereo of Schauwecker and
+    Zell 2014, exact, which compares MRFMap with the factor graph that it approximates, poses, which disturbs
+    poses and takes the error back, rays, which asks how many rays a voxel needs,
+    endless, which freezes what has left the view for an hour, submaps, which
+    maps the built-in corridor in parts and compares that with the map of a single machine, or all."""
+
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("runs/eval")
+    """Folder for the results; it is made if need be."""
+
+    data: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("../shared/data")
+    """Folder with the scenes, as data/README.md describes them."""
+
+    voxel_sizes: tuple[float, ...] = ()
+    """Voxel sizes in metres, instead of the experiment's own."""
+
+    seeds: tuple[int, ...] = (0, 1, 2, 3)
+    """Draws of the simulated noise: the first for every method, the others for the spread of MRFMap."""
+
+    limit: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Use no more than N views or folds, for a quick look."""
+
+    runtime: RuntimeConfig = field(default_factory=RuntimeConfig)
+    """Where the kernels run."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.limit, int) and self.limit < 1:
+            raise ConfigError(f"--limit must be at least 1, not {self.limit}")
+        if not self.seeds:
+            raise ConfigError("--seeds needs at least one number")
+        if min(self.seeds) < 0:
+            raise ConfigError(f"--seeds must not be negative, not {min(self.seeds)}")
+        for name, values in (("seeds", self.seeds), ("voxel-sizes", self.voxel_sizes)):
+            if len(set(values)) < len(values):
+                raise ConfigError(f"--{name} must differ from each other, not {values}")
+        for size in self.voxel_sizes:
+            if not 0 < size < float("inf"):
+                raise ConfigError(f"--voxel-sizes must be positive numbers of metres, not {size}")

@@ -1,0 +1,44 @@
+"""``taichi-mrf export``: a saved map in, files for other programs out."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from taichi_mrf.config.schema import Arch
+from taichi_mrf.export.options import ExportOptions
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a saved map for other programs, in the formats that the files' extensions say.
+
+    .ply points, cubes or a mesh; .glb, .obj, .stl a mesh; .bt, .ot OctoMap; .pgm with .yaml a 2D map for
+    ROS's map_server; .npz arrays; .html a page that any browser opens; .zarr chunks of 64^3 voxels. Example:
+    taichi-mrf export out/map.npz --to room.ply room.bt floor.pgm --z-min 0.1 --z-max 1.5
+    """
+
+    map: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MAP")]
+    """A file of MRFMap.save, LogOddsMap.save or VisibilityMap.save, such as the map.npz of a run, or a map in
+    chunks, such as the map.zarr of a run with --submap-size."""
+
+    to: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE [FILE ...]")]
+    """The files to write."""
+
+    lower: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
+    """Lowest corner, in metres, of the box to take out of a map in chunks; without it, all from its begin."""
+
+    upper: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
+    """Highest corner of that box."""
+
+    options: Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.FlagCreatePairsOff] = field(
+        default_factory=ExportOptions
+    )
+    """What the files hold."""
+
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print what was written as JSON."""
+
+    arch: Arch = "auto"
+    """Backend to read the map on."""

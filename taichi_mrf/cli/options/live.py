@@ -1,0 +1,80 @@
+"""``taichi-mrf live``: watch a map grow in the browser, and change it there."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from taichi_mrf.cli.options.pose_flags import PoseFlags
+from taichi_mrf.config.schema import Config
+from taichi_mrf.datasets.source_flags import SourceFlags
+from taichi_mrf.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Live:
+    """Map a sequence or a camera, and show the map in the browser while it grows.
+
+    Keyframes can be switched off and on, moved and frozen there, and rays asked what they meet. Ctrl-C ends
+    it and, with --out, keeps what is mapped (exit status 130). Example: taichi-mrf live recording/ --out
+    runs/desk --open
+    """
+
+    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = "synthetic:room"
+    """A folder, whose format is recognised, a built-in sequence, a camera (realsense:), or a saved map
+    (map.npz)."""
+
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Folder for map.npz, voxels.ply, config.yaml and, where poses are tracked, trajectory.txt; it is made if
+    need be."""
+
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
+    """A YAML file of parameters, such as those in configs/."""
+
+    every: Annotated[int, tyro.conf.arg(metavar="N")] = 1
+    """Look at every N-th frame only."""
+
+    limit: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Look at no more than N frames."""
+
+    speed: Annotated[float, tyro.conf.arg(metavar="X")] = 0.0
+    """Replay at X times the recording's own pace; 0 is as fast as it goes."""
+
+    loop: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Begin again when the sequence has ended, with the frames as new keyframes."""
+
+    keep_live: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Freeze keyframes when there are more than N that could still be changed, first those that have left the
+    view, so that an endless run needs no more and more memory."""
+
+    exit_when_done: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """End once the sequence is mapped."""
+
+    host: str = "127.0.0.1"
+    """Address to serve the page at; others than this one let everybody in who can reach it."""
+
+    port: int = 8080
+    """Port to serve the page at; the next free one is taken if it is busy."""
+
+    open: bool = False
+    """Open the page in a browser on this machine."""
+
+    reading: Annotated[SourceFlags, tyro.conf.arg(name="")] = field(default_factory=SourceFlags)
+    """How SOURCE is read."""
+
+    poses: Annotated[PoseFlags, tyro.conf.arg(name="")] = field(default_factory=PoseFlags)
+    """What becomes of SOURCE's poses."""
+
+    settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
+    """Parameters."""
+
+    def __post_init__(self) -> None:
+        for name in ("every", "limit", "keep_live"):
+            value = getattr(self, name)
+            if isinstance(value, int) and value < 1:
+                raise ConfigError(f"--{name.replace('_', '-')} must be at least 1, not {value}")
+        if not 0 <= self.speed < float("inf"):
+            raise ConfigError(f"--speed must be 0 or a positive number, not {self.speed:g}")
+        if not 0 <= self.port <= 65535:
+            raise ConfigError(f"--port must lie between 0 and 65535, not {self.port}")

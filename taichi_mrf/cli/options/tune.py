@@ -1,0 +1,105 @@
+"""``taichi-mrf tune``: find parameters for a sensor and a scene, in the browser or by a search."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from taichi_mrf.config.schema import Config
+from taichi_mrf.datasets.source_flags import SourceFlags
+from taichi_mrf.errors import ConfigError
+
+FRAMES_BY_HAND, FRAMES_TO_SEARCH = 12, 30
+
+
+@dataclass(frozen=True)
+class Tune:
+    """Tune parameters on a few frames of a sequence, and see at once what they do.
+
+    The page has sliders for the parameters; after each change a fresh map is made of some frames and scored
+    on others. With --auto a search does it. Ctrl-C ends it and, with --out, keeps what is found (exit
+    status 130). Example: taichi-mrf tune recording/ --auto 60 --out runs/tuned
+    """
+
+    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    """A folder, whose format is recognised, or a built-in sequence such as synthetic:room."""
+
+    out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """Folder for tries.csv and the YAML files that are saved, and with --auto for best.yaml; it is made if
+    need be."""
+
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
+    """A YAML file of parameters to begin with, such as those in configs/."""
+
+    frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """How many frames to take, those that are held out included; 12 by default, 30 with --auto."""
+
+    first: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Index of the first frame to take."""
+
+    stride: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Take every N-th frame from there; 0 spreads them evenly over the sequence, at most 10 apart."""
+
+    hold_out: Annotated[int, tyro.conf.arg(metavar="N")] = 3
+    """One frame in N is kept out of the map, to score it. With --auto every second of these is kept back
+    from the search as well, for the final scores."""
+
+    auto: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Search for parameters, in N tries, under which held-out measurements are likelier (needs the extra
+    auto: Optuna)."""
+
+    search: Annotated[str, tyro.conf.arg(metavar="NAME,...")] = ""
+    """Parameters to search, with commas between them; sensor.sigma_scale stands for all coefficients of
+    sensor.sigma together. By default prior, outlier floor, message clamp, free share and sigma's scale."""
+
+    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Starts the random numbers of the search."""
+
+    search_stride: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """The search maps and judges every N-th pixel along both sides; 0 takes so many that 160 columns are
+    left. Final scores are of all pixels."""
+
+    viewer: bool = True
+    """Serve the page; without it only --auto makes sense."""
+
+    host: str = "127.0.0.1"
+    """Address to serve the page at; others than this one let everybody in who can reach it."""
+
+    port: int = 8080
+    """Port to serve the page at; the next free one is taken if it is busy."""
+
+    open: bool = False
+    """Open the page in a browser on this machine."""
+
+    reading: Annotated[SourceFlags, tyro.conf.arg(name="")] = field(default_factory=SourceFlags)
+    """How SOURCE is read."""
+
+    settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
+    """Parameters to begin with."""
+
+    def __post_init__(self) -> None:
+        least = {
+            "frames": 3,
+            "first": 0,
+            "stride": 0,
+            "hold_out": 2,
+            "auto": 1,
+            "seed": 0,
+            "search_stride": 0,
+        }
+        for name, lowest in least.items():
+            value = getattr(self, name)
+            if isinstance(value, int) and value < lowest:
+                raise ConfigError(f"--{name.replace('_', '-')} must be at least {lowest}, not {value}")
+        if not 0 <= self.port <= 65535:
+            raise ConfigError(f"--port must lie between 0 and 65535, not {self.port}")
+        if self.search and self.auto is None:
+            raise ConfigError("--search says what --auto searches: add --auto N")
+        if not self.viewer and self.auto is None:
+            raise ConfigError("--no-viewer leaves nothing to do: add --auto N")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters to search, none for the default ones."""
+        return tuple(name.strip() for name in self.search.split(",") if name.strip())

@@ -1,0 +1,75 @@
+"""From the words of the command line to the options of a command, and the overview of all commands."""
+
+import inspect
+import sys
+from collections.abc import Sequence
+from functools import reduce
+from operator import or_
+from typing import Annotated, Any
+
+import tyro
+
+from taichi_mrf.cli.commands import COMMANDS, Command
+from taichi_mrf.cli.shared.flags import registry
+from taichi_mrf.config.values import nearest
+from taichi_mrf.errors import ConfigError
+
+PROGRAM = "taichi-mrf"
+
+_HELP = ("-h", "--help")
+_ABOUT = "Probabilistic occupancy maps from depth cameras."
+_COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
+
+
+def parse(arguments: Sequence[str]) -> tuple[Command, Any]:
+    """The command that the arguments name, and its options.
+
+    Help ends the program with status 0, arguments that cannot be parsed with status 2. Raises ConfigError
+    for an unknown command and for values that are out of range.
+    """
+    if arguments and arguments[0] in _COMPLETION:
+        _print_completion(arguments)
+    if not arguments:
+        print(overview(), file=sys.stderr)
+        raise SystemExit(2)
+    if arguments[0] in _HELP:
+        print(overview())
+        raise SystemExit(0)
+    name, *rest = arguments
+    if name not in COMMANDS:
+        raise ConfigError(f"unknown command '{name}'; {nearest(name, list(COMMANDS))}")
+    command = COMMANDS[name]
+    wants_help = bool({*_HELP} & set(rest))
+    options = tyro.cli(
+        command.options,
+        prog=f"{PROGRAM} {name}",
+        args=rest,
+        default=command.defaults([] if wants_help else rest),
+        registry=registry,
+    )
+    return command, options
+
+
+def overview() -> str:
+    """What the program is, and every command with the first sentence of its help."""
+    width = max(map(len, COMMANDS))
+    lines = [f"usage: {PROGRAM} COMMAND ...", "", _ABOUT, "", "commands:"]
+    lines += [f"  {name:{width}}  {_first_sentence(command.options)}" for name, command in COMMANDS.items()]
+    lines += ["", f"'{PROGRAM} COMMAND --help' explains a command, '{PROGRAM} --version' names the version."]
+    return "\n".join(lines)
+
+
+def _first_sentence(options: type) -> str:
+    text = " ".join((inspect.getdoc(options) or "").split())
+    return text.partition(". ")[0].rstrip(".")
+
+
+def _print_completion(arguments: Sequence[str]) -> None:
+    """Print what teaches a shell to complete the commands and their flags, and end the program."""
+    commands: list[Any] = []
+    for name, command in COMMANDS.items():
+        default = command.defaults([])
+        commands.append(
+            Annotated[command.options, tyro.conf.subcommand(name, default=default, prefix_name=False)]
+        )
+    tyro.cli(reduce(or_, commands), prog=PROGRAM, args=arguments, registry=registry)

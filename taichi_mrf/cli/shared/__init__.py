@@ -1,0 +1,1 @@
+"""What several commands need: signals, the folder of a run, tables, progress."""

@@ -1,0 +1,108 @@
+"""The experiments by name, and how one is run: its ledger, its parameters beside the results.
+
+This is what `taichi-mrf eval` uses. An experiment's module is imported when it runs.
+"""
+
+import importlib
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+import taichi_mrf
+from taichi_mrf.config.schema import Config, to_yaml
+from taichi_mrf.experiments.folds import Experiment
+from taichi_mrf.experiments.ledger import Ledger
+from taichi_mrf.experiments.tables import Table
+from taichi_mrf.system import runtime
+from taichi_mrf.system.atomic import write_text
+
+Progress = Callable[[str, int, int], None]
+"""Called between two maps with what is done, how many parts are done, and how many there are."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One experiment: "module:function", its own voxel sizes in metres, whether it reads the scenes."""
+
+    function: str
+    voxel_sizes: tuple[float, ...]
+    needs_data: bool = True
+
+
+_HERE = __name__.rpartition(".")[0]
+
+EXPERIMENTS = {
+    "table1": Entry("table1:run_table1", (0.05, 0.02, 0.01)),
+    "table2": Entry("table2:run_table2", (0.05, 0.02)),
+    "table3": Entry("table3:run_table3", (0.05, 0.02, 0.01)),
+    "fig7": Entry("fig7:run_fig7", (0.05, 0.02)),
+    "fig10": Entry("fig10:run_fig10", (0.05, 0.02, 0.01)),
+    "stereo": Entry("stereo.maps:run_stereo", (0.2,)),
+    "exact": Entry("exact:run_exact", (0.05,)),
+    "poses": Entry("poses:run_poses", (0.05,)),
+    "rays": Entry("rays:run_rays", (0.05, 0.02, 0.01)),
+    "endless": Entry("endless:run_endless", (0.1,)),
+    "submaps": Entry("submaps.corridor:run_submaps", (0.05,), needs_data=False),
+}
+
+
+def run_experiment(
+    name: str,
+    data: Path,
+    out: Path,
+    voxel_sizes: tuple[float, ...],
+    seeds: tuple[int, ...],
+    limit: int | None,
+    progress: Progress,
+) -> tuple[list[Table], list[Path]]:
+    """Run one of EXPERIMENTS and write its files into ``out``; returns its tables and the files.
+
+    Without ``voxel_sizes`` the experiment's own are used. What an earlier run with the same ``out`` has found
+    is not computed again. Raises TaichiMRFError, and what ``progress`` raises.
+    """
+    entry = EXPERIMENTS[name]
+    sizes = voxel_sizes or entry.voxel_sizes
+    configuration = out / f"{name}_config.yaml"
+    write_text(configuration, _configuration(name, sizes, seeds, limit))
+    experiment = Experiment(
+        data, out, Ledger(out / f"{name}.jsonl", _made_with(data)), sizes, seeds, limit, progress
+    )
+    module, _, function = entry.function.partition(":")
+    run = getattr(importlib.import_module(f"{_HERE}.{module}"), function)
+    with warnings.catch_warnings():
+        # Learnt tables have patches whose sigma falls below zero far away; the tables' notes say so.
+        warnings.filterwarnings("ignore", message="sigma of patch")
+        tables, paths = run(experiment)
+    return tables, [*paths, configuration]
+
+
+def _made_with(data: Path) -> dict[str, Any]:
+    """What results depend on beside their keys: the scenes, and the device, on which times depend."""
+    choice = runtime.choice()
+    return {
+        "version": taichi_mrf.__version__,
+        "backend": choice.name if choice else None,
+        "device": choice.device if choice else None,
+        "data": str(data.resolve()),
+    }
+
+
+def _configuration(name: str, sizes: tuple[float, ...], seeds: tuple[int, ...], limit: int | None) -> str:
+    """The exact parameters: those of the experiment, and those that every map has but for its method's."""
+    head = {
+        "experiment": name,
+        "voxel_sizes": list(sizes),
+        "seeds": list(seeds),
+        "limit": limit,
+        "version": taichi_mrf.__version__,
+    }
+    return (
+        "# How this evaluation was run, and the parameters of its maps where the experiment sets none.\n"
+        + yaml.safe_dump({"evaluation": head}, sort_keys=False)
+        + "maps:\n"
+        + "".join(f"  {line}\n" for line in to_yaml(Config()).splitlines())
+    )
