@@ -24,6 +24,7 @@ from taichi_mrf.experiments.scenes import Scene, SceneView, house_scene, kitchen
 from taichi_mrf.experiments.tables import Entry, Spread, Table, write_table
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.mapping.refinement import PoseRefiner
+from taichi_mrf.mapping.rounds import AlignmentRounds, PlainMover
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
@@ -147,7 +148,7 @@ def build_and_judge(case: Case, scene: Scene, voxel_size: float) -> Result:
         if case.refined:
             refiner.place(keyframe)
     if case.refined:
-        refiner.rounds(lambda round, number, keyframes: True)
+        AlignmentRounds(refiner, PlainMover(m), lambda step: True).run()
     m.infer()
     seconds = time.perf_counter() - begin
     errors = [tangent_norms(a, k.T_world_camera) for a, k in zip(true, m.keyframes.values(), strict=True)]

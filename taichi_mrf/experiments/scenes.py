@@ -16,7 +16,7 @@ from taichi_mrf.config.schema import KeyframeConfig, VolumeConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import DatasetError, TaichiMRFError
 from taichi_mrf.geometry.poses import Pose, as_pose
-from taichi_mrf.mapping.keyframe_selector import KeyframeSelector
+from taichi_mrf.mapping.selection import KeyframeSelector
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
 from taichi_mrf.sensor.simulate import KINECT_1_LATERAL, simulate, simulate_model

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
-from taichi_mrf.mapping.pipeline import is_held_out
+from taichi_mrf.mapping.selection import is_held_out
 from taichi_mrf.sensor.frame import Frame
 
 

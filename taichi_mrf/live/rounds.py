@@ -12,7 +12,8 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.live.live_keyframes import Entry
 from taichi_mrf.live.mapper import Mapper
-from taichi_mrf.mapping.refinement import PoseRefiner, has_settled, is_worse
+from taichi_mrf.mapping.refinement import PoseRefiner
+from taichi_mrf.mapping.rounds import has_settled, is_worse
 from taichi_mrf.methods.mrf.map import MRFMap
 
 GoOn = Callable[[str, float], bool]

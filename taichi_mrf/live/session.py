@@ -26,7 +26,7 @@ from taichi_mrf.live.replay import BrokenFrame, Replay
 from taichi_mrf.live.requests import EDITS, Requests, goes_on
 from taichi_mrf.live.rounds import Rounds
 from taichi_mrf.live.run import Policy, Run, Source
-from taichi_mrf.mapping.keyframe_selector import KeyframeSelector
+from taichi_mrf.mapping.selection import KeyframeSelector
 from taichi_mrf.mapping.tracking import keyframe_steps
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.viewer.messages import Listening, Notice, Request

@@ -10,8 +10,7 @@ from taichi_mrf.cluster.runner import TaskRunner
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose, as_pose
-from taichi_mrf.mapping.keyframe_selector import KeyframeSelector
-from taichi_mrf.mapping.pipeline import is_held_out
+from taichi_mrf.mapping.selection import KeyframeSelector, is_held_out
 from taichi_mrf.submaps.job import Sequence
 from taichi_mrf.submaps.partial_map import PartialMap
 from taichi_mrf.submaps.plan import SeenKeyframe

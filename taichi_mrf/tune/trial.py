@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from taichi_mrf.config.schema import Config
 from taichi_mrf.evaluation.accuracy import JudgedView, judge_view
 from taichi_mrf.evaluation.depth_error import pooled_depth_error
-from taichi_mrf.mapping.keyframe_selector import KeyframeSelector
+from taichi_mrf.mapping.selection import KeyframeSelector
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.sensor.frame import Frame

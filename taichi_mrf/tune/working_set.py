@@ -11,7 +11,7 @@ import numpy as np
 
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
-from taichi_mrf.mapping.pipeline import is_held_out
+from taichi_mrf.mapping.selection import is_held_out
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.tune.voxel_truth import VoxelTruth, truth_of

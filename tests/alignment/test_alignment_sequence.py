@@ -20,7 +20,8 @@ from taichi_mrf.experiments.poses import DISTURBED_M, DISTURBED_RAD, halved, run
 from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.inference.keyframe import DepthImage
-from taichi_mrf.mapping.pipeline import Event, KeyframeAdded, KeyframeRefined, KeyframeSwept, map_sequence
+from taichi_mrf.mapping.intake import Added
+from taichi_mrf.mapping.pipeline import Event, FrameOffered, KeyframeRefined, KeyframeSwept, map_sequence
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
@@ -120,7 +121,7 @@ def test_the_pipeline_corrects_poses_and_tells_both() -> None:
     assert (errors(refined) < 0.5 * errors(wrong)).all()
     assert "refining" in result.seconds
     kinds = [type(event) for event in events]
-    assert kinds.index(KeyframeAdded) < kinds.index(KeyframeRefined) < kinds.index(KeyframeSwept)
+    assert kinds.index(FrameOffered) < kinds.index(KeyframeRefined) < kinds.index(KeyframeSwept)
     asked = [(e.round, e.rounds, e.number, e.keyframes) for e in events if isinstance(e, KeyframeRefined)]
     assert asked == [(1, 1, number, COUNT) for number in range(1, COUNT + 1)]
     # The map is that of the refined poses, whatever was done on the way.
@@ -137,7 +138,7 @@ def test_a_stopped_run_goes_on_with_the_recorded_poses_of_its_keyframes() -> Non
     left = [3]
 
     def listen(event: Event) -> None:
-        left[0] -= isinstance(event, KeyframeAdded)
+        left[0] -= isinstance(event, FrameOffered) and isinstance(event.answer, Added)
 
     part = map_sequence(WrongPoses(wrong), REFINE, listen, should_stop=lambda: left[0] <= 0)
     assert part.interrupted

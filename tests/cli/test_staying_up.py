@@ -18,7 +18,9 @@ from sliding_camera import ALL_FRAMES, CAMERA, SlidingCamera, StopAfter, names, 
 from taichi_mrf.cli.map.keep import Keeper, resumed_map
 from taichi_mrf.config.schema import Config, VolumeConfig
 from taichi_mrf.errors import CapacityError, ConfigError, DatasetError
-from taichi_mrf.mapping.pipeline import KeyframeAdded, MappingResult, map_sequence
+from taichi_mrf.mapping.intake import Added
+from taichi_mrf.mapping.pipeline import map_sequence
+from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.atomic import atomic_path, remove_leftovers
@@ -123,7 +125,7 @@ class FartherWall(SlidingCamera):
 
 def kept(folder: Path, count: int, config: Config) -> MappingResult:
     """What a run has kept that was stopped after some keyframes."""
-    stop = StopAfter(KeyframeAdded, count)
+    stop = StopAfter(Added, count)
     keeper = Keeper(folder, config, 0.0, lambda result: '{"interrupted": true}')
     return map_sequence(sequence(), config, stop.listen, should_stop=stop, keep=keeper)
 
@@ -134,7 +136,7 @@ def test_a_run_goes_on_with_what_it_kept_of_the_same_frames_and_parameters_only(
     assert previous is not None
     assert 0 < len(names(previous)) <= 3
     another = FartherWall("sliding", CAMERA)
-    with pytest.raises(DatasetError, match=r"is of another recording than sliding: frame frame . differs"):
+    with pytest.raises(DatasetError, match=r"cannot resume: frame frame . of sliding differs"):
         map_sequence(another, ALL_FRAMES, resume_from=previous)
     other = replace(ALL_FRAMES, voxel_size=0.2)
     with pytest.raises(ConfigError, match=r"config\.yaml: made with another voxel_size"):

@@ -22,7 +22,7 @@ from taichi_mrf.datasets.synthetic.corridor_plan import (
 from taichi_mrf.datasets.synthetic.room_furniture import HEIGHT, LENGTH, WALL, WIDTH
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import as_pose, tangent_norms
-from taichi_mrf.mapping.pipeline import is_held_out
+from taichi_mrf.mapping.selection import is_held_out
 
 SMALL = "synthetic:corridor?rooms=3&frames=40&width=80&height=60"
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 from taichi_mrf.live.replay import BrokenFrame, Replay
-from taichi_mrf.mapping.pipeline import is_held_out
+from taichi_mrf.mapping.selection import is_held_out
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from taichi_mrf.config.schema import KeyframeConfig
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.mapping.keyframe_selector import KeyframeSelector
+from taichi_mrf.mapping.selection import KeyframeSelector
 
 
 def pose(x: float = 0.0, yaw: float = 0.0) -> Pose:

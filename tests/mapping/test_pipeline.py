@@ -9,12 +9,10 @@ from sliding_camera import ALL_FRAMES, CAMERA, WALL_M, SlidingCamera, StopAfter,
 from taichi_mrf.config.schema import EvaluationConfig, KeyframeConfig
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.evaluation.held_out import check_held_out
+from taichi_mrf.mapping.intake import Added, Passed, Skipped
 from taichi_mrf.mapping.pipeline import (
     Event,
-    FrameEvent,
-    FramePassed,
-    FrameSkipped,
-    KeyframeAdded,
+    FrameOffered,
     KeyframeSwept,
     map_sequence,
 )
@@ -73,18 +71,12 @@ def test_listeners_hear_every_frame_and_every_swept_keyframe() -> None:
     events: list[Event] = []
     config = replace(ALL_FRAMES, evaluation=EvaluationConfig(hold_out=4))
     result = map_sequence(sequence(5, broken=[3], blind=[4]), config, events.append, skip_bad_frames=True)
-    frames = [event for event in events if isinstance(event, FrameEvent)]
+    frames = [event for event in events if isinstance(event, FrameOffered)]
     assert [event.number for event in frames] == [1, 2, 3, 4, 5]
-    assert [type(event) for event in frames] == [
-        KeyframeAdded,
-        KeyframeAdded,
-        FramePassed,
-        FrameSkipped,
-        FramePassed,
-    ]
-    added = [event for event in events if isinstance(event, KeyframeAdded)]
-    assert [event.keyframe for event in added] == list(result.map.keyframes)
-    assert all(event.rays == CAMERA.width * CAMERA.height for event in added)
+    assert [type(event.answer) for event in frames] == [Added, Added, Passed, Skipped, Passed]
+    added = [event.answer for event in frames if isinstance(event.answer, Added)]
+    assert [answer.keyframe for answer in added] == list(result.map.keyframes)
+    assert all(answer.rays == CAMERA.width * CAMERA.height for answer in added)
     swept = [(e.sweep, e.number, e.keyframes) for e in events if isinstance(e, KeyframeSwept)]
     assert swept == [(sweep, number, 2) for sweep in (1, 2, 3) for number in (1, 2)]
 
@@ -101,7 +93,7 @@ def test_a_broken_frame_ends_the_run_or_is_reported() -> None:
     ("dataset", "words"),
     [
         (sequence(0), "has no frame to map"),
-        (sequence(2, broken=[0, 1]), "2 are broken, the first: frame 0: the image is damaged"),
+        (sequence(2, broken=[0, 1]), "2 could not be used, the first: frame 0: the image is damaged"),
         (sequence(2, blind=[0, 1]), "has no frame to map"),
     ],
 )
@@ -111,7 +103,7 @@ def test_a_map_without_keyframes_is_an_error(dataset: SlidingCamera, words: str)
 
 
 def test_a_stop_while_adding_leaves_a_usable_map() -> None:
-    stop = StopAfter(KeyframeAdded, 2)
+    stop = StopAfter(Added, 2)
     result = map_sequence(sequence(), ALL_FRAMES, stop.listen, should_stop=stop)
     assert result.interrupted
     assert names(result.map) == ["frame 0", "frame 1"]
@@ -155,7 +147,7 @@ def test_a_resumed_run_ends_in_the_map_of_an_undisturbed_one(stop_after: int) ->
         evaluation=EvaluationConfig(hold_out=5),
     )
     whole = map_sequence(sequence(12), config)
-    stop = StopAfter(KeyframeAdded, stop_after)
+    stop = StopAfter(Added, stop_after)
     part = map_sequence(sequence(12), config, stop.listen, should_stop=stop)
     assert len(part.map.keyframes) == stop_after
     resumed = map_sequence(sequence(12), config, resume_from=part.map)
@@ -169,5 +161,5 @@ def test_a_resumed_run_ends_in_the_map_of_an_undisturbed_one(stop_after: int) ->
 def test_a_map_of_another_recording_is_not_resumed() -> None:
     part = map_sequence(sequence(4), ALL_FRAMES)
     other = replace(sequence(2), name="other")
-    with pytest.raises(DatasetError, match="has a keyframe 'frame 2', which other has not"):
+    with pytest.raises(DatasetError, match="keyframe 'frame 2' is not in other"):
         map_sequence(other, ALL_FRAMES, resume_from=part.map)

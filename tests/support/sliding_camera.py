@@ -54,13 +54,14 @@ def names(m: MRFMap) -> list[str]:
 
 
 class StopAfter:
-    """A listener and a stop request in one: asks to stop once ``count`` events of a kind were heard."""
+    """A listener and a stop request in one: asks to stop once there were ``count`` events, or frames'
+    answers, of a kind."""
 
-    def __init__(self, kind: type[Event], count: int) -> None:
+    def __init__(self, kind: type, count: int) -> None:
         self.kind, self.left = kind, count
 
     def listen(self, event: Event) -> None:
-        self.left -= isinstance(event, self.kind)
+        self.left -= isinstance(event, self.kind) or isinstance(getattr(event, "answer", None), self.kind)
 
     def __call__(self) -> bool:
         return self.left <= 0

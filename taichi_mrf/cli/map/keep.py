@@ -16,7 +16,7 @@ from taichi_mrf.cli.options.config_file import CONFIG_FILE
 from taichi_mrf.config.schema import Config, load
 from taichi_mrf.config.text import commented_yaml, differences
 from taichi_mrf.errors import ConfigError, MapFileError, said
-from taichi_mrf.mapping.pipeline import MappingResult
+from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.system.atomic import write_text

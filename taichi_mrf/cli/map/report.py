@@ -12,8 +12,8 @@ from rich.table import Table
 import taichi_mrf
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.evaluation.held_out import HeldOutCheck
-from taichi_mrf.mapping.pipeline import MappingResult
 from taichi_mrf.mapping.refinement import PoseChange
+from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.mapping.tracking import Track
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import peak_memory_mb

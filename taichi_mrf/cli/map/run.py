@@ -28,7 +28,8 @@ from taichi_mrf.evaluation.held_out import HeldOutCheck, check_held_out
 from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
 from taichi_mrf.export.ply import write_voxels
 from taichi_mrf.export.trajectory import write_trajectory
-from taichi_mrf.mapping.pipeline import MappingResult, map_sequence
+from taichi_mrf.mapping.pipeline import map_sequence
+from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import write_text

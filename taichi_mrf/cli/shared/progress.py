@@ -16,7 +16,8 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from taichi_mrf.mapping.pipeline import Event, FrameEvent, KeyframeAdded, KeyframeRefined, KeyframeSwept
+from taichi_mrf.mapping.intake import Added
+from taichi_mrf.mapping.pipeline import Event, FrameOffered, KeyframeRefined, KeyframeSwept
 
 Bar = TypeVar("Bar", bound="TransientBar")
 
@@ -71,8 +72,8 @@ class ProgressBar(TransientBar):
 
     def listen(self, event: Event) -> None:
         """Show what the pipeline has just done."""
-        if isinstance(event, FrameEvent):
-            self.advance("Adding", event.number, event.frames, int(isinstance(event, KeyframeAdded)))
+        if isinstance(event, FrameOffered):
+            self.advance("Adding", event.number, event.frames, int(isinstance(event.answer, Added)))
         elif isinstance(event, KeyframeSwept):
             done = (event.sweep - 1) * event.keyframes + event.number
             self.advance("Inferring", done, event.sweeps * event.keyframes, 1)

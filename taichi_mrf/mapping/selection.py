@@ -1,7 +1,14 @@
-"""Which frames become keyframes: those that were taken from somewhere new (MRFMap, section V)."""
+"""Which frames become keyframes: not the held-out ones, and only those taken far enough from other keyframes
+(MRFMap, section V)."""
 
 from taichi_mrf.config.schema import KeyframeConfig
 from taichi_mrf.geometry.poses import Pose, tangent_norms
+
+
+def is_held_out(number: int, hold_out: int) -> bool:
+    """Whether the ``number``-th frame (from 1) is held out: the middle one of each ``hold_out``, none with
+    0."""
+    return hold_out > 0 and (number - 1) % hold_out == hold_out // 2
 
 
 class KeyframeSelector:
@@ -17,14 +24,14 @@ class KeyframeSelector:
         self._accepted: list[Pose] = []
 
     def wants(self, T_world_camera: Pose) -> bool:
-        """Whether a frame with this pose, (4, 4), should become a keyframe. Remembers nothing."""
+        """Whether a frame with this pose, (4, 4), should become a keyframe. Does not change the selector."""
         if self._config.rotation == 0 and self._config.translation == 0:
             return True
         compared = self._accepted if self._config.against == "all" else self._accepted[-1:]
         return all(self._is_far(T_world_keyframe, T_world_camera) for T_world_keyframe in compared)
 
     def accept(self, T_world_camera: Pose) -> None:
-        """Remember the pose of a frame that has become a keyframe."""
+        """Note the pose of a frame that has become a keyframe."""
         self._accepted.append(T_world_camera)
 
     def _is_far(self, T_world_keyframe: Pose, T_world_camera: Pose) -> bool:

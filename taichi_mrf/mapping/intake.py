@@ -1,0 +1,200 @@
+"""The way from a frame to a keyframe: hold-out, tracking, selection, adding, alignment on arrival.
+
+Batch runs, live runs and trials of parameters offer their frames here one by one and get a typed answer; what
+follows from it (a progress bar, a notice, the end of the run) is up to them.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from taichi_mrf.config.schema import Config
+from taichi_mrf.datasets import Dataset
+from taichi_mrf.errors import CapacityError, LostFrameError
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.mapping.refinement import refiner_of
+from taichi_mrf.mapping.result import MappingResult
+from taichi_mrf.mapping.selection import KeyframeSelector, is_held_out
+from taichi_mrf.mapping.tracking import Track, keyframe_steps, tracker_of
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.sensor.frame import Frame
+
+
+@dataclass(frozen=True)
+class UnreadableFrame:
+    """A frame that could not be read. ``last``: nor can any after it, as with a camera that was unplugged."""
+
+    name: str
+    problem: str
+    last: bool = False
+
+
+@dataclass(frozen=True)
+class Added:
+    """The frame, at the pose that was found for it, is keyframe ``keyframe`` of the map, with ``rays``
+    measured pixels. Its marginals are not inferred yet, unless the intake sweeps on arrival."""
+
+    frame: Frame
+    keyframe: int
+    rays: int
+
+
+@dataclass(frozen=True)
+class Passed:
+    """The frame is no keyframe, for ``reason``; ``frame`` has its pose, if the frame was read."""
+
+    reason: str
+    frame: Frame | None = None
+
+
+@dataclass(frozen=True)
+class Lost:
+    """Tracking found no pose for the frame, nor for those before it: ``in_a_row`` frames in all."""
+
+    problem: str
+    in_a_row: int
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """The frame could not be read."""
+
+    problem: str
+
+
+@dataclass(frozen=True)
+class Full:
+    """There is not enough memory for the frame. The map is what it was before; ``error`` is what it
+    raised."""
+
+    problem: str
+    error: CapacityError
+
+
+Answer = Added | Passed | Lost | Skipped | Full
+
+HELD_OUT = Passed("held out to check the map")
+
+
+class Intake:
+    """Takes frames into one map; :attr:`result` says what has become of them."""
+
+    def __init__(
+        self,
+        m: OccupancyMap,
+        config: Config,
+        *,
+        tracked: bool = False,
+        hold_out: int = 0,
+        sweep_on_arrival: bool = False,
+        remember_frames: bool = True,
+        before_adding: Callable[[Frame], None] = lambda frame: None,
+    ) -> None:
+        """``tracked``: the poses of frames are found by tracking. ``hold_out``: one frame in so many is held
+        out. ``sweep_on_arrival``: each keyframe is swept once as it comes, so that the map can be looked at;
+        with ``config.poses.refine`` that is always done. ``remember_frames``: the result lists skipped frames
+        and tracked poses, which grow with the run. ``before_adding`` is called with each frame that is about
+        to be added. Raises ConfigError if poses are to be refined or tracked in a map whose method cannot."""
+        self.map = m
+        self.result = MappingResult(m)
+        self.refiner = refiner_of(m, config.poses)
+        self.tracker = tracker_of(m, config.poses) if tracked else None
+        if self.tracker is not None:
+            self.result.track = Track()
+        self._selector = KeyframeSelector(keyframe_steps(config.keyframes) if tracked else config.keyframes)
+        self._hold_out, self._sweeps = hold_out, sweep_on_arrival
+        self._remembers, self._before_adding = remember_frames, before_adding
+
+    def passes_unread(self, number: int, index: int) -> bool:
+        """Whether the ``number``-th frame (from 1) is held out without being read, which the result notes by
+        its dataset ``index``. Frames whose poses are tracked are all read."""
+        held_out = self.tracker is None and is_held_out(number, self._hold_out)
+        if held_out:
+            self.result.held_out.append(index)
+        return held_out
+
+    def offer(self, frame: Frame | UnreadableFrame, number: int = 0, index: int = 0) -> Answer:
+        """Take the next frame, the ``number``-th (from 1) of its run, ``index`` in its dataset.
+
+        Raises what the map raises but for CapacityError; the map is then what it was before.
+        """
+        if isinstance(frame, UnreadableFrame):
+            self._note_skipped(frame.name, frame.problem)
+            return Skipped(frame.problem)
+        if self.tracker is not None:
+            located = self._located(frame, index)
+            if isinstance(located, Lost):
+                return located
+            frame = located
+            if is_held_out(number, self._hold_out):
+                self.result.held_out.append(index)
+                return Passed(HELD_OUT.reason, frame)
+        if not self._selector.wants(frame.T_world_camera):
+            return Passed("too near to a keyframe", frame)
+        if not (frame.depth_m > 0).any():
+            return Passed("no pixel holds a measurement", frame)
+        self._before_adding(frame)
+        try:
+            keyframe = self._added(frame)
+        except CapacityError as error:
+            return Full(f"frame {frame.name} does not fit: {error}", error)
+        if self.tracker is not None:
+            tracked = self.tracker.took(keyframe)
+            if self._remembers and self.result.track is not None:
+                self.result.track.frames[index] = tracked
+        self._selector.accept(frame.T_world_camera)
+        return Added(frame, keyframe, self.map.keyframes[keyframe].rays)
+
+    def go_on_from(self, keyframe: int, T_recorded: Pose) -> None:
+        """Go on after a keyframe that the map of an earlier run has brought along."""
+        T_world_camera = self.map.keyframes[keyframe].T_world_camera
+        if self.tracker is not None:
+            self.tracker.resume(keyframe)
+        if self.refiner is not None:
+            T_world_camera = T_recorded
+            self.refiner.know(keyframe, T_recorded)
+        self._selector.accept(T_world_camera)
+
+    def _located(self, frame: Frame, index: int) -> Frame | Lost:
+        """The frame at the pose where it was taken."""
+        assert self.tracker is not None
+        assert self.result.track is not None
+        with self.result.timed("tracking"):
+            try:
+                found, tracked = self.tracker.follow(frame)
+            except LostFrameError as error:
+                self.result.track.lost += 1
+                self._note_skipped(frame.name, str(error))
+                return Lost(str(error), self.tracker.lost)
+        if self._remembers:
+            self.result.track.frames[index] = tracked
+        return found
+
+    def _added(self, frame: Frame) -> int:
+        """Add a frame as a keyframe and align it, or leave nothing of it; returns its number."""
+        with self.result.timed("adding"):
+            keyframe = self.map.add_keyframe(
+                frame.depth_m, frame.T_world_camera, frame.camera, name=frame.name
+            )
+        try:
+            if self.refiner is not None:
+                with self.result.timed("refining"):
+                    self.refiner.place(keyframe)
+            elif self._sweeps:
+                with self.result.timed("inferring"):
+                    self.map.infer(sweeps=1, keyframes=[keyframe])
+        except BaseException:
+            if self.refiner is not None:
+                self.refiner.forget(keyframe)
+            self.map.remove_keyframe(keyframe)
+            raise
+        return keyframe
+
+    def _note_skipped(self, name: str, problem: str) -> None:
+        if self._remembers:
+            self.result.skipped[name] = problem
+
+
+def hold_out_of(dataset: Dataset, config: Config) -> int:
+    """One frame in so many of a dataset is held out; 0 for none. A camera's images cannot be read again, and
+    its poses are not known before they are tracked: nothing could be checked against them."""
+    return 0 if dataset.tracked and dataset.endless else config.evaluation.hold_out

@@ -1,0 +1,44 @@
+"""What a run of mapping has made of its frames: batch and live runs fill in the same record."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from taichi_mrf.mapping.refinement import PoseChange
+from taichi_mrf.mapping.tracking import Track
+from taichi_mrf.methods.protocol import OccupancyMap
+
+
+@dataclass
+class MappingResult:
+    """The map of a run and how it came about.
+
+    ``frames`` counts the frames that were looked at. ``skipped`` has the problem of each unreadable or lost
+    frame by name, ``held_out`` the dataset indices of the frames that check the map, ``seconds`` the time of
+    each stage. ``interrupted``: the run was stopped before its end; the map holds everything up to there.
+    ``poses`` are, if they were refined, the recorded and the refined pose of every keyframe; ``track`` has,
+    if poses were tracked, the pose of each frame. ``full`` names the frame that did not fit into memory and
+    says why; the map holds those before it.
+    """
+
+    map: OccupancyMap
+    frames: int = 0
+    held_out: list[int] = field(default_factory=list)
+    skipped: dict[str, str] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    sweeps: int = 0
+    residual: float | None = None
+    interrupted: bool = False
+    poses: list[PoseChange] = field(default_factory=list)
+    track: Track | None = None
+    full: str | None = None
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Add the time that the block takes to a stage."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
