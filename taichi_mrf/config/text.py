@@ -1,12 +1,13 @@
 """Configurations as text: the YAML that a run leaves beside its results, each field with its help.
 
-A field's help is the string under it in ``config.py``; it is read from there so that it is written once.
+A field's help is the string under it in the source, or its metadata where it is put together from several.
 """
 
 import ast
 import dataclasses
 import inspect
 import textwrap
+from functools import cache
 from typing import Any
 
 import yaml
@@ -16,6 +17,16 @@ _WIDTH = 100
 
 def field_help(cls: type) -> dict[str, str]:
     """The help text of each field of a configuration dataclass, as one line."""
+    texts = {f.name: f.metadata["help"] for f in dataclasses.fields(cls) if "help" in f.metadata}
+    for base in cls.__mro__:
+        if dataclasses.is_dataclass(base) and not texts.keys() >= base.__annotations__.keys():
+            texts |= _docstrings(base)
+    return {field.name: texts[field.name] for field in dataclasses.fields(cls) if field.name in texts}
+
+
+@cache
+def _docstrings(cls: type) -> dict[str, str]:
+    """The strings under the fields of one class in its source."""
     body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
     assert isinstance(body, ast.ClassDef)
     texts = {}

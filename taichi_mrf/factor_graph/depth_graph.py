@@ -19,7 +19,8 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf.config.schema import InferenceConfig, SensorConfig, VolumeConfig
+from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.factor_graph.beams import BrickCells
 from taichi_mrf.factor_graph.graph import FactorGraph, check_capacity

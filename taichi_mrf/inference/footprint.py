@@ -8,7 +8,8 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf.config.schema import InferenceConfig, SensorConfig, VolumeConfig
+from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import TILE, DepthImage, Footprint, RayList

@@ -11,7 +11,7 @@ import math
 import numpy as np
 import taichi as ti
 
-from taichi_mrf.config.schema import InferenceConfig
+from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.inference.keyframe import TILE, DepthImage, RayList
 from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array3, I32Array, Struct, Template
 from taichi_mrf.sensor.camera import PinholeCamera

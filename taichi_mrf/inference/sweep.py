@@ -7,7 +7,8 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf.config.schema import InferenceConfig, SensorConfig, VolumeConfig
+from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.accumulators import finest_scale
 from taichi_mrf.inference.keyframe import Keyframe, RayList

@@ -22,14 +22,7 @@ class BaselineOverlay:
 
     def __init__(self, config: Config, noise: NoiseModel) -> None:
         """An empty map with a configuration's parameters."""
-        self.map: OccupancyMap = LogOddsMap(
-            config.voxel_size,
-            noise,
-            log_odds=config.log_odds,
-            volume=config.volume,
-            min_depth=config.sensor.min_depth,
-            max_depth=config.sensor.max_depth,
-        )
+        self.map: OccupancyMap = LogOddsMap.with_noise(config, noise)
         self._publisher = Publisher(
             "beside",
             self.map.view.pool,

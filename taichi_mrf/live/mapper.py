@@ -20,9 +20,8 @@ from taichi_mrf.live.publish import Publisher
 from taichi_mrf.live.ray_answers import PosedDepthImage
 from taichi_mrf.mapping.freezing import surplus
 from taichi_mrf.mapping.refinement import refiner_of
-from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.capabilities import can_freeze, has_messages
 from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap
-from taichi_mrf.methods.recursive import RecursiveMap
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.viewer import messages
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
@@ -52,10 +51,10 @@ class Mapper:
         for id, keyframe in m.keyframes.items():
             self.roster.add(keyframe, keyframe.rays, thumbnail(keyframe.depth_m), id)
         self.publisher = Publisher(
-            "map", m.view.pool, m.seen_by, prior_is_unknown=isinstance(m, RecursiveMap), counting=False
+            "map", m.view.pool, m.seen_by, prior_is_unknown=m.METHOD.prior_is_unknown, counting=False
         )
         # A map from a file has beliefs but no messages, and edits would have to infer them first.
-        self.lacks_messages = bool(m.keyframes) and isinstance(m, MRFMap)
+        self.lacks_messages = bool(m.keyframes) and has_messages(m)
         self.unsettled, self.edited = self.lacks_messages or self.stale, False
         self.unaligned = False
         self.unanswered = False
@@ -63,12 +62,12 @@ class Mapper:
     @property
     def min_evidence(self) -> float:
         """Log-odds nearer to the prior than this are unknown, as they are published."""
-        return LOG_ODDS_STEP if isinstance(self.map, RecursiveMap) else self.map.config.volume.min_evidence
+        return LOG_ODDS_STEP if self.map.METHOD.prior_is_unknown else self.map.config.volume.min_evidence
 
     @property
     def stale(self) -> bool:
         """Whether the map shows nothing of the last edits until it is settled."""
-        return isinstance(self.map, RecursiveMap) and self.map.stale
+        return self.map.stale
 
     def take_in(self, frame: Frame) -> Entry:
         """Add a frame as a keyframe, align it if poses are refined, and sweep it once. Raises what the map
@@ -124,7 +123,7 @@ class Mapper:
         """Fold a keyframe into the map for good; returns the last that is to be said of it, because its image
         is forgotten. Raises KeyframeError."""
         entry = self._changeable(id)
-        if not isinstance(self.map, MRFMap):
+        if not can_freeze(self.map):
             raise KeyframeError(f"a map of the method {self.map.config.method} cannot freeze keyframes")
         if entry.state == "off":
             raise KeyframeError(f"keyframe {id} ({entry.name}) is off: switch it on to freeze it")
@@ -137,7 +136,7 @@ class Mapper:
 
     def renew(self) -> None:
         """Sweep the keyframes that have heard most, for RENEW_SECONDS at most; the rest waits."""
-        if self.stale or not isinstance(self.map, MRFMap):
+        if self.stale or not has_messages(self.map):
             self.unanswered = False
         else:
             self.unanswered = not self.map.renew(seconds=RENEW_SECONDS).complete
@@ -145,7 +144,7 @@ class Mapper:
     def surplus(self, newest: Entry, keep: int) -> list[Entry]:
         """Of more than ``keep`` keyframes that are on those to freeze: first what has left the view."""
         on = self.roster.with_state("on")
-        if not isinstance(self.map, MRFMap):
+        if not can_freeze(self.map):
             return on[: max(0, len(on) - keep)]
         entry_of = {self._map_id(entry): entry for entry in on}
         return [entry_of[id] for id in surplus(self.map, self._map_id(newest), keep)]
@@ -155,7 +154,7 @@ class Mapper:
         the map as it was before. If it returns False the map is that again; returns whether it was completed.
         """
         m, pool = self.map, self.map.view.pool
-        checkpoint = m.checkpoint() if isinstance(m, MRFMap) else None
+        checkpoint = m.checkpoint() if has_messages(m) else None
         before = checkpoint.pool if checkpoint is not None else pool.snapshot()
 
         def progress(step: InferProgress) -> bool:
@@ -169,7 +168,7 @@ class Mapper:
             self.unsettled = self.lacks_messages = False  # or it would be tried again without end
             raise
         finally:
-            if not complete and checkpoint is not None and isinstance(m, MRFMap):
+            if not complete and checkpoint is not None and has_messages(m):
                 m.restore(checkpoint)
         if complete:
             self.unsettled = self.edited = self.lacks_messages = False
@@ -183,10 +182,9 @@ class Mapper:
     def crossed(self, entry: Entry) -> NDArray[np.int32]:
         """The bricks that a keyframe's rays go through, (n, 3); none for one that is not on, and none in a
         map all of whose crossed bricks exist."""
-        if entry.state != "on" or not isinstance(self.map, MRFMap):
+        if entry.state != "on":
             return np.zeros((0, 3), np.int32)
-        footprint = self.map.keyframes[self._map_id(entry)].footprint
-        return footprint.window.bricks_of(footprint.crossed)
+        return self.map.crossed_bricks(self._map_id(entry))
 
     def depth_of(self, entry: Entry) -> NDArray[np.float32] | None:
         """A keyframe's depth image, (H, W) in metres; None once it is frozen."""

@@ -14,7 +14,6 @@ from taichi_mrf.live.live_keyframes import Entry
 from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.mapping.refinement import PoseRefiner
 from taichi_mrf.mapping.rounds import has_settled, is_worse
-from taichi_mrf.methods.mrf.map import MRFMap
 
 GoOn = Callable[[str, float], bool]
 """Told what is being done and how much of that is; says whether to go on."""
@@ -34,8 +33,7 @@ class Rounds:
         self, mapper: Mapper, refiner: PoseRefiner, go_on: GoOn, show: Callable[[Entry], None]
     ) -> None:
         """``show`` is called with each keyframe that was moved."""
-        assert isinstance(mapper.map, MRFMap)
-        self._mapper, self._map, self._refiner = mapper, mapper.map, refiner
+        self._mapper, self._map, self._refiner = mapper, refiner.map, refiner
         self._go_on, self._show = go_on, show
         self._entries = {e.map_id: e for e in mapper.roster.with_state("on") if e.map_id is not None}
         self._doing, self._share, self._asked = "", 0.0, float("-inf")

@@ -6,10 +6,10 @@ is folded into what inference starts from, and its image and messages are forgot
 
 import numpy as np
 
-from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.capabilities import FreezingMap
 
 
-def surplus(m: MRFMap, newest: int, keep: int) -> list[int]:
+def surplus(m: FreezingMap, newest: int, keep: int) -> list[int]:
     """The keyframes (ids) beyond ``keep`` that should be frozen, in that order: those first that share the
     smallest part of what they see with keyframe ``newest``, of equal ones the oldest. Never ``newest``."""
     others = [k for id, k in m.keyframes.items() if id != newest and k.messages is not None]

@@ -13,10 +13,11 @@ import numpy as np
 from taichi_mrf.alignment.joint import align_jointly
 from taichi_mrf.alignment.likelihood import log_likelihood, map_of_others
 from taichi_mrf.alignment.oriented_points import OrientedPoints, oriented_points
+from taichi_mrf.config.registry import methods_with
 from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose, inverse, tangent_norms
-from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.capabilities import AligningMap, can_refine_poses
 from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap
 
 
@@ -43,7 +44,7 @@ class PoseChange:
 class PoseRefiner:
     """Refines the keyframes of one map."""
 
-    def __init__(self, m: MRFMap, config: PoseConfig) -> None:
+    def __init__(self, m: AligningMap, config: PoseConfig) -> None:
         self.map, self.config = m, config
         self._recorded: dict[int, Pose] = {}
 
@@ -123,7 +124,7 @@ def refiner_of(m: OccupancyMap, config: PoseConfig) -> PoseRefiner | None:
     method cannot move keyframes."""
     if not config.refine:
         return None
-    if not isinstance(m, MRFMap):
-        method = m.config.method
-        raise ConfigError(f"poses.refine needs the method mrf; a map by {method} cannot move keyframes")
+    if not can_refine_poses(m):
+        able = methods_with("can_refine_poses")
+        raise ConfigError(f"poses.refine needs the method {able}; {m.METHOD.name} cannot align keyframes")
     return PoseRefiner(m, config)

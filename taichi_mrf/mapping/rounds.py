@@ -14,7 +14,7 @@ import numpy as np
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.inference.schedule import InferProgress, Progress
 from taichi_mrf.mapping.refinement import PoseRefiner
-from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.capabilities import AligningMap
 
 LOSS = 0.1
 """Log-likelihood per pixel that a round may cost. Keyframes that were aligned one after the other fit each
@@ -57,7 +57,7 @@ class KeyframeMover(Protocol):
 class PlainMover:
     """Moves keyframes of a map that nobody watches."""
 
-    def __init__(self, m: MRFMap) -> None:
+    def __init__(self, m: AligningMap) -> None:
         self._map = m
 
     def move(self, id: int, T_world_camera: Pose) -> None:
@@ -138,7 +138,7 @@ class AlignmentRounds:
             self._mover.move(id, T_world_camera)
 
 
-def has_settled(m: MRFMap, stood: Mapping[int, Pose]) -> bool:
+def has_settled(m: AligningMap, stood: Mapping[int, Pose]) -> bool:
     """Whether no keyframe has moved far from where it stood."""
     keyframes = m.keyframes
     moved_m = [tangent_norms(T, keyframes[id].T_world_camera)[1] for id, T in stood.items()]

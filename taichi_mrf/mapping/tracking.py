@@ -13,11 +13,12 @@ from dataclasses import dataclass, field, replace
 
 from taichi_mrf.alignment.locate import Locator
 from taichi_mrf.alignment.se3 import moved, twist
+from taichi_mrf.config.registry import methods_with
 from taichi_mrf.config.schema import KeyframeConfig, PoseConfig
 from taichi_mrf.errors import ConfigError, LostFrameError
 from taichi_mrf.geometry.poses import Pose, as_pose, inverse
 from taichi_mrf.inference.keyframe import DepthImage, checked_depth
-from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.capabilities import AligningMap, can_refine_poses
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.frame import Frame
 
@@ -79,7 +80,7 @@ class Track:
 class Tracker:
     """Follows the camera through one map, to which somebody else adds keyframes."""
 
-    def __init__(self, m: MRFMap, config: PoseConfig) -> None:
+    def __init__(self, m: AligningMap, config: PoseConfig) -> None:
         self._map = m
         self._config = replace(
             config,
@@ -175,8 +176,10 @@ def _ratio(ahead: float, observed: float) -> float:
 
 def tracker_of(m: OccupancyMap, config: PoseConfig) -> Tracker:
     """A tracker for a map. Raises ConfigError if the map's method cannot be tracked in."""
-    if not isinstance(m, MRFMap):
-        raise ConfigError(f"tracking needs the method mrf, not {m.config.method}")
+    if not can_refine_poses(m):
+        raise ConfigError(
+            f"tracking needs the method {methods_with('can_refine_poses')}, not {m.METHOD.name}"
+        )
     return Tracker(m, config)
 
 

@@ -14,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.config.files import parse_yaml
-from taichi_mrf.config.schema import Config, Method, to_yaml
+from taichi_mrf.config.registry import METHODS
+from taichi_mrf.config.schema import Config, to_yaml
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import CapacityError, MapFileError, TaichiMRFError, said
 from taichi_mrf.geometry.poses import Pose, as_pose
+from taichi_mrf.methods.sensor_section import describing
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
 from taichi_mrf.system.npz_file import NpzFile, open_npz
@@ -28,9 +30,6 @@ FORMAT = 2
 
 READABLE = (1, 2)
 """What is read."""
-
-CLASSES: dict[Method, str] = {"mrf": "MRFMap", "log_odds": "LogOddsMap", "visibility": "VisibilityMap"}
-"""Who reads a map of each method."""
 
 _CAMERA_VALUES = 6
 
@@ -82,7 +81,7 @@ class MapHeader:
 
 
 @contextmanager
-def open_map_file(path: Path, method: Method | None = None) -> Iterator[NpzFile]:
+def open_map_file(path: Path, method: str | None = None) -> Iterator[NpzFile]:
     """The arrays of a map's file, by name.
 
     Raises MapFileError naming the file and what is wrong with it, also for what goes wrong inside the
@@ -100,12 +99,12 @@ def open_map_file(path: Path, method: Method | None = None) -> Iterator[NpzFile]
         if format > 1:
             file.check_manifest()
         found = method_of(file)
-        if found not in CLASSES:
+        if found not in METHODS:
             raise MapFileError(f"{path}: a map of the method '{found}', which this version does not know")
         if method is not None and found != method:
             raise MapFileError(
-                f"{path}: a map of the method '{found}', which {CLASSES[found]}.load reads, "
-                f"not {CLASSES[method]}.load"
+                f"{path}: a map of the method '{found}', which {METHODS[found].class_name}.load reads, "
+                f"not {METHODS[method].class_name}.load"
             )
         yield file
 
@@ -121,7 +120,7 @@ def naming(path: Path) -> Iterator[None]:
         raise kind(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
 
 
-def method_of(file: NpzFile) -> Method:
+def method_of(file: NpzFile) -> str:
     """The mapping method of a map's file; the first maps did not say it, because there was only one."""
     return file.scalar("method", "U") if "method" in file else "mrf"
 
@@ -141,7 +140,10 @@ def read_header(path: Path, file: NpzFile) -> MapHeader:
     next_id = file.scalar("next_id", "i")
     if len(set(ids.tolist())) < n or not all(0 <= id < next_id for id in ids.tolist()):
         raise MapFileError(f"{path}: damaged: the numbers of its keyframes are not those of a map")
-    return MapHeader(_config(path, file), _noise(file), keyframes, next_id)
+    config, noise = _config(path, file), _noise(file)
+    # Maps of earlier versions saved the default sensor, whatever their noise.
+    config = replace(config, sensor=describing(noise, config.sensor))
+    return MapHeader(config, noise, keyframes, next_id)
 
 
 def read_bricks(path: Path, file: NpzFile) -> tuple[NDArray[np.int32], NDArray[np.float32]]:

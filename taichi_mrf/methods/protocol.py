@@ -2,11 +2,12 @@
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.schedule import InferReport, Progress
@@ -41,10 +42,13 @@ class MappedKeyframe(PosedDepth, Protocol):
 
 
 class OccupancyMap(Protocol):
-    """A probabilistic occupancy map of depth keyframes: MRFMap, LogOddsMap, VisibilityMap.
+    """A probabilistic occupancy map of depth keyframes, whatever its method.
 
     Between changes and :meth:`infer`, queries answer with what is known.
     """
+
+    METHOD: ClassVar[Method]
+    """The method's entry, which says what else the map can do (capabilities.py)."""
 
     config: Config
     sensor: SensorConfig
@@ -55,6 +59,15 @@ class OccupancyMap(Protocol):
 
     @property
     def keyframes(self) -> Mapping[int, MappedKeyframe]: ...
+
+    @property
+    def stale(self) -> bool:
+        """Whether queries miss the last removals and moves until :meth:`infer`."""
+        ...
+
+    def crossed_bricks(self, id: int) -> NDArray[np.int32]:
+        """The bricks that a keyframe's rays cross, (n, 3), if some of them may not exist; else none."""
+        ...
 
     def add_keyframe(
         self, depth_m: ArrayLike, T_world_camera: ArrayLike, camera: PinholeCamera, name: str = ""

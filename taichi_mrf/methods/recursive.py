@@ -8,38 +8,32 @@ the books are kept here.
 
 import dataclasses
 import time
-import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.config.schema import Config, Method
+from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.inference.keyframe import DepthImage, Footprint, checked_depth
 from taichi_mrf.inference.schedule import InferProgress, InferReport, Progress
+from taichi_mrf.methods.brick_map import BrickMap
 from taichi_mrf.methods.map_file import MapHeader, StoredKeyframe, naming
-from taichi_mrf.methods.mrf.brick_registry import BrickRegistry
 from taichi_mrf.methods.recursive_storage import RecursiveContents, read_recursive, write_recursive
 from taichi_mrf.methods.recursive_update import LEAST_LOG_ODDS, UNKNOWN_LOG_ODDS
 from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.extract import extract_voxels
 from taichi_mrf.queries.occlusion import Occlusion
-from taichi_mrf.queries.points import classify, point_log_odds, probability
-from taichi_mrf.queries.profile import RayProfile
-from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config, warn_of_bad_sigma
+from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import VOXELS
-from taichi_mrf.voxels.pool import BrickPool
-from taichi_mrf.voxels.topology import create_topology, recycle
 from taichi_mrf.voxels.window import Window
 
 FootprintT = TypeVar("FootprintT", bound=Footprint)
@@ -94,7 +88,7 @@ class Scan(Generic[FootprintT]):
         return self.footprint.crossed
 
 
-class RecursiveMap(ABC, Generic[FootprintT]):
+class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
     """A probabilistic occupancy map that integrates one depth image after the other.
 
     A voxel is unknown until the first scan says something of it, and free or occupied from then on, by
@@ -106,31 +100,14 @@ class RecursiveMap(ABC, Generic[FootprintT]):
     medium (eq. 15 of MRFMap) would stop every ray within a metre or two.
     """
 
-    METHOD: ClassVar[Method]
-    """How Config.method and a saved map's file call this method."""
-
-    view: View
-
-    def __init__(self, config: Config, noise: NoiseModel | None) -> None:
-        """``noise`` defaults to a Kinect 1."""
-        runtime.init()
-        self.config, self.sensor, self.voxel_size = config, config.sensor, config.voxel_size
-        self.noise = noise if noise is not None else PolynomialNoise(self.sensor.sigma, self.sensor.bias)
-        self._pool = BrickPool(UNKNOWN_LOG_ODDS, config.volume.memory_limit_gb)
-        topology = create_topology(runtime.active() or "cpu", config.volume.dense_bricks)
-        weakref.finalize(self, recycle, topology)
-        self._registry = BrickRegistry(topology, self._pool, self.voxel_size)
+    def _set_up(self, config: Config, noise: NoiseModel | None) -> None:
         any_evidence_counts = dataclasses.replace(config.volume, min_evidence=0.0)
         occlusion = Occlusion(unknown=UNKNOWN_LOG_ODDS, empty_below=0.0)
-        self.view = View(self._pool, self.voxel_size, any_evidence_counts, occlusion)
+        # Every brick that was seen exists, so no place is seen and has none.
+        self._make_bricks(config, noise, UNKNOWN_LOG_ODDS, UNKNOWN_LOG_ODDS, any_evidence_counts, occlusion)
         self._keyframes: dict[int, ScanRecord] = {}
         self._next_id = 0
         self._stale = False
-
-    @classmethod
-    @abstractmethod
-    def _create(cls: type[MapT], config: Config, noise: NoiseModel) -> MapT:
-        """An empty map with a configuration's parameters."""
 
     @abstractmethod
     def _reach(self, image: DepthImage, T_world_camera: Pose) -> FootprintT:
@@ -146,11 +123,6 @@ class RecursiveMap(ABC, Generic[FootprintT]):
     def _scratch_bytes(self) -> int:
         """Bytes that integration holds beside the voxels."""
 
-    @classmethod
-    def from_config(cls: type[MapT], config: Config, camera: PinholeCamera) -> MapT:
-        """A map with a configuration's parameters; ``camera`` is what its noise tables must fit."""
-        return cls._create(config, noise_from_config(config.sensor, camera))
-
     @property
     def keyframes(self) -> Mapping[int, ScanRecord]:
         """The keyframes by id, in the order in which they were added."""
@@ -160,6 +132,11 @@ class RecursiveMap(ABC, Generic[FootprintT]):
     def stale(self) -> bool:
         """Whether keyframes were removed or moved since the voxels were last worked out."""
         return self._stale
+
+    def crossed_bricks(self, id: int) -> NDArray[np.int32]:
+        """No brick, (0, 3): all that a scan's rays cross exist."""
+        self._find(id)
+        return np.zeros((0, 3), np.int32)
 
     def add_keyframe(
         self, depth_m: ArrayLike, T_world_camera: ArrayLike, camera: PinholeCamera, name: str = ""
@@ -223,14 +200,6 @@ class RecursiveMap(ABC, Generic[FootprintT]):
         self._stale = done < len(records)
         return InferReport(time.perf_counter() - begin, 0.0, int(done > 0), rays, complete)
 
-    def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Probability of occupied at (N, 3) points in metres, (N,) float32; 0.5 where nobody has looked."""
-        return probability(self._log_odds(points))
-
-    def state(self, points: ArrayLike) -> NDArray[np.int8]:
-        """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,) int8."""
-        return classify(self._log_odds(points), UNKNOWN_LOG_ODDS, 0.0)
-
     def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """All known voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
         if min_probability == 0.5:
@@ -239,16 +208,6 @@ class RecursiveMap(ABC, Generic[FootprintT]):
         centres, p = extract_voxels(self._pool, self.voxel_size, min_probability)
         known = p != 0.5  # LEAST_LOG_ODDS sees to that
         return centres[known], p[known]
-
-    def render_depth(self, camera: PinholeCamera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
-        """Axial depth of the likeliest surface seen by each pixel, (H, W) float32, NaN where none is."""
-        return self.view.render_depth(camera, as_pose(T_world_camera), self.sensor.max_depth)
-
-    def ray_profile(
-        self, origin: ArrayLike, direction: ArrayLike, max_range: float | None = None
-    ) -> RayProfile:
-        """Occupancy, visibility and omega (MRFMap, eqs. 15 to 18) along a ray, by range in metres."""
-        return self.view.ray_profile(origin, direction, max_range or self.sensor.max_depth)
 
     def statistics(self) -> MapStatistics:
         """How large the map is; no keyframe is ever frozen."""
@@ -282,20 +241,16 @@ class RecursiveMap(ABC, Generic[FootprintT]):
     def load(cls: type[MapT], path: str | Path, memory_limit_gb: float | None = None) -> MapT:
         """Read a map that can be queried at once and extended; ``memory_limit_gb`` takes the place of its
         own. Raises MapFileError, also for a map of another method, or CapacityError if there is no room."""
-        contents = read_recursive(Path(path), cls.METHOD)
+        contents = read_recursive(Path(path), cls.METHOD.name)
         header, bricks = contents.header, contents.bricks
         with naming(Path(path)):
-            m = cls._create(header.limited_to(memory_limit_gb), header.noise)
+            m = cls.with_noise(header.limited_to(memory_limit_gb), header.noise)
             if len(bricks):
                 m._pool.write("belief", m._registry.restore(bricks, 1), contents.belief)
         for k in header.keyframes:
             m._keyframes[k.id] = ScanRecord(k.id, k.name, k.depth_m, k.T_world_camera, k.camera)
         m._next_id, m._stale = header.next_id, contents.stale
         return m
-
-    def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
-        # Every brick that was seen exists, so there is no place that is seen and has none.
-        return point_log_odds(points, self.voxel_size, self._registry.topology, self._pool, UNKNOWN_LOG_ODDS)
 
     def _find(self, id: int) -> ScanRecord:
         if id not in self._keyframes:

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config.schema import Method
 from taichi_mrf.methods.map_file import MapHeader, open_map_file, read_bricks, read_header
 from taichi_mrf.system.atomic import write_npz
 
@@ -37,7 +36,7 @@ def write_recursive(path: Path, contents: RecursiveContents) -> None:
     write_npz(path, arrays, manifest=True)
 
 
-def read_recursive(path: Path, method: Method) -> RecursiveContents:
+def read_recursive(path: Path, method: str) -> RecursiveContents:
     """Read a map of a method back. Raises MapFileError naming the file and what is wrong with it."""
     with open_map_file(path, method) as file:
         return RecursiveContents(

@@ -5,11 +5,9 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config.schema import Config
 from taichi_mrf.inference.messages import withdraw_messages
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.queries.known_bricks import sorted_bricks
-from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system import runtime
 
 Bricks = NDArray[np.int32]
@@ -19,13 +17,6 @@ Bricks = NDArray[np.int32]
 class PartialMap(MRFMap):
     """Rounds of exchange need two things more of a map: to be told what absent keyframes say, and to tell
     what others should hear."""
-
-    @classmethod
-    def from_config(cls, config: Config, camera: PinholeCamera) -> "PartialMap":
-        """See MRFMap."""
-        m = super().from_config(config, camera)
-        assert isinstance(m, cls)
-        return m
 
     def assume(self, bricks: Bricks, evidence: NDArray[np.float32]) -> None:
         """Start inference in these bricks from these log-odds, (n, 512): the prior and what keyframes say
@@ -64,7 +55,7 @@ class PartialMap(MRFMap):
         ]
         return sorted_bricks(np.concatenate([np.zeros((0, 3), np.int32), *found]))
 
-    def crossed_bricks(self) -> Bricks:
+    def all_crossed_bricks(self) -> Bricks:
         """The bricks that any ray crosses, whether they exist or not; ascending."""
         found = [k.footprint.window.bricks_of(k.footprint.crossed) for k in self._keyframes.values()]
         return sorted_bricks(np.concatenate([np.zeros((0, 3), np.int32), *found]))

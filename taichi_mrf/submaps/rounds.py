@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from taichi_mrf.cluster.runner import TaskRunner
+from taichi_mrf.config.registry import METHODS, methods_with
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import ConfigError, MapFileError
@@ -97,8 +98,8 @@ def map_in_submaps(
 
 
 def _check(config: Config, rounds: int) -> None:
-    if config.method != "mrf":
-        raise ConfigError(f"submaps need the method mrf, not {config.method}")
+    if not METHODS[config.method].has_messages:
+        raise ConfigError(f"submaps need the method {methods_with('has_messages')}, not {config.method}")
     if config.poses.refine:
         raise ConfigError("poses.refine does not go with submaps: no task sees all keyframes")
     if rounds < 0:

@@ -64,7 +64,7 @@ def survey_frames(task: SurveyTask) -> list[SurveyedFrame]:
         measured = bool((frame.depth_m > 0).any())
         if measured:
             id = m.add_keyframe(frame.depth_m, T_world_camera, frame.camera, name)
-            chunks = np.unique(m.crossed_bricks() // CHUNK, axis=0)
+            chunks = np.unique(m.all_crossed_bricks() // CHUNK, axis=0)
             m.remove_keyframe(id)
         found.append(SurveyedFrame(index, name, T_world_camera, chunks, measured))
     return found

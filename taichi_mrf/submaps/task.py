@@ -92,7 +92,7 @@ def _inferred(task: SubmapTask, job: Job, progress: Callable[[InferProgress], bo
     reset_peak_memory()
     m, id_of = _with_keyframes(job, task.submap)
     core = _core(job, task.submap, m.bricks())
-    crossed = _core(job, task.submap, m.crossed_bricks())
+    crossed = _core(job, task.submap, m.all_crossed_bricks())
     free = crossed[~np.isin(grid_keys(crossed), grid_keys(core))]
     heard, inferring = 0, 0.0
     halos: dict[int, Halo] = {}

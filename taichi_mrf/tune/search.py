@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin
 
 from taichi_mrf.config.schema import Config
+from taichi_mrf.config.sliders import Range
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.system.libraries import library
-from taichi_mrf.viewer.ranges import Range
 from taichi_mrf.viewer.tune.knobs import KNOBS, Knob
 
 SIGMA_SCALE = "sensor.sigma_scale"
@@ -23,16 +23,7 @@ SIGMA_SCALE = "sensor.sigma_scale"
 
 SIGMA_SCALES = Range(0.25, 16.0, 0.0)
 
-LOGARITHMIC = ("inference.surface_density", "voxel_size")
-"""Searched by factors and not by steps, beside those whose sliders stand for powers of ten."""
-
-DEFAULT_SEARCH = (
-    "inference.surface_density",
-    "inference.outlier_floor",
-    "inference.message_clamp",
-    "inference.free_share",
-    SIGMA_SCALE,
-)
+DEFAULT_SEARCH = (*(knob.name for knob in KNOBS if knob.searched), SIGMA_SCALE)
 """What is searched unless told: what depends on the sensor and the scene more than on the map's purpose."""
 
 Scalar = float | int | str | bool
@@ -138,7 +129,7 @@ def _dimension(name: str, start: Config) -> Dimension:
     if knob.decades:
         return Dimension(name, 10.0**least, 10.0**most, log=True)
     whole = knob.parameter.hint is int
-    return Dimension(name, least, most, log=name in LOGARITHMIC, whole=whole)
+    return Dimension(name, least, most, log=knob.by_factors, whole=whole)
 
 
 def _knob(name: str) -> Knob:

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import viser
 
+from taichi_mrf.config.sliders import Range
 from taichi_mrf.config.text import field_help
-from taichi_mrf.viewer.ranges import Range
 
 T = TypeVar("T")
 

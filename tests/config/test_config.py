@@ -12,22 +12,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import (
     Config,
     EvaluationConfig,
-    InferenceConfig,
     KeyframeConfig,
-    LogOddsConfig,
     PoseConfig,
     RuntimeConfig,
     SensorConfig,
-    VisibilityConfig,
     VolumeConfig,
     load,
     to_yaml,
 )
 from taichi_mrf.config.text import commented_yaml, differences, field_help
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.methods.log_odds.plug import LogOddsConfig
+from taichi_mrf.methods.visibility.plug import VisibilityConfig
 
 SECTIONS = (
     Config,

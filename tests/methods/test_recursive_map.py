@@ -9,7 +9,7 @@ import small_room
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from taichi_mrf.config.schema import Config, Method, SensorConfig, VisibilityConfig
+from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.errors import KeyframeError, MapFileError
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.methods.log_odds.map import LogOddsMap
@@ -17,6 +17,7 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.recursive import RecursiveMap
 from taichi_mrf.methods.registry import create_map, load_map
 from taichi_mrf.methods.visibility.map import VisibilityMap
+from taichi_mrf.methods.visibility.plug import VisibilityConfig
 from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.atomic import write_npz
@@ -24,16 +25,16 @@ from taichi_mrf.system.npz_file import MANIFEST
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 
-METHODS: dict[Method, type[RecursiveMap]] = {"log_odds": LogOddsMap, "visibility": VisibilityMap}
+METHODS: dict[str, type[RecursiveMap]] = {"log_odds": LogOddsMap, "visibility": VisibilityMap}
 CAMERA = PinholeCamera(40, 30, 40.0, 40.0, 19.5, 14.5)
 
 
 @pytest.fixture(params=METHODS)
-def method(request: pytest.FixtureRequest) -> Method:
+def method(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-def empty(method: Method) -> RecursiveMap:
+def empty(method: str) -> RecursiveMap:
     m = create_map(Config(small_room.VOXEL_SIZE, method), small_room.frames()[0].camera)
     assert isinstance(m, METHODS[method])
     return m
@@ -44,7 +45,7 @@ def add(m: RecursiveMap, number: int) -> int:
     return m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera, frame.name)
 
 
-def build(method: Method, numbers: list[int]) -> RecursiveMap:
+def build(method: str, numbers: list[int]) -> RecursiveMap:
     m = empty(method)
     for number in numbers:
         add(m, number)
@@ -58,7 +59,7 @@ def assert_same_map(a: RecursiveMap, b: RecursiveMap) -> None:
     assert a.statistics().bricks == b.statistics().bricks
 
 
-def test_a_scan_is_integrated_when_it_is_added(method: Method) -> None:
+def test_a_scan_is_integrated_when_it_is_added(method: str) -> None:
     m = build(method, [0])
     centre = small_room.frames()[0].T_world_camera[:3, 3]
     assert m.state([centre])[0] == FREE
@@ -68,7 +69,7 @@ def test_a_scan_is_integrated_when_it_is_added(method: Method) -> None:
     np.testing.assert_array_equal(m.occupancy(small_room.probes()), before)
 
 
-def wall(method: Method) -> RecursiveMap:
+def wall(method: str) -> RecursiveMap:
     """A wall at 2.05 m, seen often and by a sensor good enough for VisibilityMap to get there too."""
     m = create_map(Config(0.1, method, visibility=VisibilityConfig(hit_if_free=0.2)), CAMERA)
     assert isinstance(m, RecursiveMap)
@@ -83,7 +84,7 @@ def around_the_wall() -> np.ndarray:
     return (np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) + 0.5) * 0.1
 
 
-def test_unknown_free_and_occupied(method: Method) -> None:
+def test_unknown_free_and_occupied(method: str) -> None:
     m, probes = wall(method), around_the_wall()
     p, state = m.occupancy(probes), m.state(probes)
     np.testing.assert_array_equal(state == UNKNOWN, p == 0.5)
@@ -92,7 +93,7 @@ def test_unknown_free_and_occupied(method: Method) -> None:
     assert min((state == which).sum() for which in (UNKNOWN, FREE, OCCUPIED)) > 100
 
 
-def test_voxels_are_those_that_are_known(method: Method) -> None:
+def test_voxels_are_those_that_are_known(method: str) -> None:
     m, probes = wall(method), around_the_wall()
     centres, p = m.voxels(0.0)
     assert 0 < len(centres) < m.statistics().voxels
@@ -112,7 +113,7 @@ steps = st.lists(
 @pytest.mark.parametrize("each", METHODS)
 @settings(max_examples=10)
 @given(history=steps)
-def test_any_history_ends_in_the_map_of_the_final_scans(each: Method, history: list[tuple[str, int]]) -> None:
+def test_any_history_ends_in_the_map_of_the_final_scans(each: str, history: list[tuple[str, int]]) -> None:
     """In the order in which they were first added, bit for bit."""
     room = small_room.frames()
     m = empty(each)
@@ -139,7 +140,7 @@ def test_any_history_ends_in_the_map_of_the_final_scans(each: Method, history: l
     assert_same_map(m, anew)
 
 
-def test_until_inferred_a_changed_map_answers_with_what_it_knew(method: Method) -> None:
+def test_until_inferred_a_changed_map_answers_with_what_it_knew(method: str) -> None:
     m = build(method, [0, 1])
     first, second = m.keyframes
     before = m.occupancy(small_room.probes())
@@ -153,7 +154,7 @@ def test_until_inferred_a_changed_map_answers_with_what_it_knew(method: Method) 
     assert_same_map(m, build(method, [0, 2]))
 
 
-def test_inference_can_be_watched_stopped_and_finished(method: Method) -> None:
+def test_inference_can_be_watched_stopped_and_finished(method: str) -> None:
     m = build(method, [0, 1, 2])
     (first, *_) = m.keyframes
     m.move_keyframe(first, small_room.frames()[0].T_world_camera)
@@ -174,7 +175,7 @@ def test_inference_can_be_watched_stopped_and_finished(method: Method) -> None:
     assert_same_map(m, build(method, [0, 1, 2]))
 
 
-def test_removing_everything_leaves_nothing(method: Method) -> None:
+def test_removing_everything_leaves_nothing(method: str) -> None:
     m = build(method, [0, 1])
     for id in list(m.keyframes):
         m.remove_keyframe(id)
@@ -185,7 +186,7 @@ def test_removing_everything_leaves_nothing(method: Method) -> None:
     assert np.isnan(m.render_depth(camera, T)).all()
 
 
-def test_rays_pass_the_unknown(method: Method) -> None:
+def test_rays_pass_the_unknown(method: str) -> None:
     """A wall is seen from a place that no scan has looked at, through bricks that exist."""
     m = wall(method)
     aside = np.eye(4)
@@ -199,7 +200,7 @@ def test_rays_pass_the_unknown(method: Method) -> None:
     assert abs(profile.distance[np.argmax(profile.omega)] - 2.05) < 0.1
 
 
-def test_moving_everything_by_whole_bricks_moves_the_map(method: Method) -> None:
+def test_moving_everything_by_whole_bricks_moves_the_map(method: str) -> None:
     """Also far away and to negative coordinates, on whose float32 the map must not depend."""
     shift = np.array([-160.0, 80.0, -8.0]) * 8 * small_room.VOXEL_SIZE
     m, moved = empty(method), empty(method)
@@ -213,14 +214,14 @@ def test_moving_everything_by_whole_bricks_moves_the_map(method: Method) -> None
     assert differ.sum() <= 1e-4 * (m.state(probes) != UNKNOWN).sum()
 
 
-def test_a_map_without_measurements_is_unknown(method: Method) -> None:
+def test_a_map_without_measurements_is_unknown(method: str) -> None:
     m = create_map(Config(0.1, method), CAMERA)
     m.add_keyframe(np.full(CAMERA.shape, np.nan, np.float32), np.eye(4), CAMERA)
     assert m.state([[0.0, 0.0, 1.0]])[0] == UNKNOWN
     assert len(m.voxels(0.0)[0]) == 0
 
 
-def test_bad_input_is_refused_and_changes_nothing(method: Method) -> None:
+def test_bad_input_is_refused_and_changes_nothing(method: str) -> None:
     m = build(method, [0])
     with pytest.raises(KeyframeError, match=r"shape \(10, 10\)"):
         m.add_keyframe(np.ones((10, 10), np.float32), np.eye(4), CAMERA)
@@ -242,7 +243,7 @@ def test_bad_input_is_refused_and_changes_nothing(method: Method) -> None:
     assert_same_map(m, build(method, [0]))
 
 
-def test_a_loaded_map_is_the_saved_one_and_goes_on(method: Method, tmp_path: Path) -> None:
+def test_a_loaded_map_is_the_saved_one_and_goes_on(method: str, tmp_path: Path) -> None:
     m = build(method, [0, 1])
     m.save(tmp_path / "map.npz")
     loaded = load_map(tmp_path / "map.npz")
@@ -259,7 +260,7 @@ def test_a_loaded_map_is_the_saved_one_and_goes_on(method: Method, tmp_path: Pat
     assert_same_map(loaded, m)
 
 
-def test_a_stale_map_is_stale_when_it_comes_back(method: Method, tmp_path: Path) -> None:
+def test_a_stale_map_is_stale_when_it_comes_back(method: str, tmp_path: Path) -> None:
     m = build(method, [0, 1])
     (first, *_) = m.keyframes
     m.remove_keyframe(first)

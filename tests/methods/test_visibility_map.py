@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from oracles import visibility as reference
 from oracles.forward import Noise
 
-from taichi_mrf.config.schema import VisibilityConfig, VolumeConfig
+from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.errors import CapacityError, ConfigError
 from taichi_mrf.methods.visibility.map import VisibilityMap
+from taichi_mrf.methods.visibility.plug import VisibilityConfig
 from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PatchNoise, PolynomialNoise

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import visibility as reference
 
-from taichi_mrf.config.schema import VisibilityConfig
 from taichi_mrf.kernels.types import F32, AnyArray, F32Array, I32Array, Vec4
 from taichi_mrf.methods.visibility import scan
+from taichi_mrf.methods.visibility.plug import VisibilityConfig
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.window import Window, WindowIndex
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from taichi_mrf.config.schema import Config, InferenceConfig, SensorConfig, load
+from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.schema import Config, SensorConfig, load
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.tune.files import csv_file, yaml_file
 from taichi_mrf.tune.history import History

@@ -8,7 +8,8 @@ import pytest
 from live_scene import FakeLink, shown
 from tune_scene import CHOICE, CONFIG, room, working_set
 
-from taichi_mrf.config.schema import Config, InferenceConfig, SensorConfig, VolumeConfig, load
+from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig, load
 from taichi_mrf.tune.outbox import TuneOutbox
 from taichi_mrf.tune.search import Search
 from taichi_mrf.tune.session import Policy, TuneSession

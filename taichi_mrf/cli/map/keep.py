@@ -29,8 +29,6 @@ MAY_CHANGE = ("inference.sweeps", "inference.tolerance", "runtime.", "volume.mem
 MOST_OF_THE_TIME = 0.05
 """Share of a run's time that saving the map on the way may take."""
 
-_SECTION = {"mrf": "inference.", "log_odds": "log_odds.", "visibility": "visibility."}
-
 
 class Keeper:
     """Saves the map of a run when it is called and enough time has gone by: ``every_s`` seconds, and so long
@@ -75,7 +73,7 @@ def resumed_map(folder: Path, settings: Config) -> OccupancyMap | None:
         "sensor.min_depth",
         "sensor.max_depth",
         "volume.",
-        _SECTION[m.config.method],
+        f"{m.METHOD.section}.",
     )
     refuse_changes(
         folder / MAP_FILE, [name for name in differences(m.config, settings) if name.startswith(known)]

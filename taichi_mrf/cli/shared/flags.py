@@ -7,10 +7,16 @@ from tyro.constructors import ConstructorRegistry, StructConstructorSpec, Struct
 
 from taichi_mrf.calibration import options as calibration_options
 from taichi_mrf.config import schema as config
+from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.text import field_help
 from taichi_mrf.factor_graph import config as factor_graph_config
 
-DEFINITIONS = (config.__name__, calibration_options.__name__, factor_graph_config.__name__)
+DEFINITIONS = (
+    config.__name__,
+    *(method.section_class.__module__ for method in METHODS.values()),
+    calibration_options.__name__,
+    factor_graph_config.__name__,
+)
 """The modules whose dataclasses are parameters."""
 
 registry = ConstructorRegistry()

@@ -6,10 +6,12 @@ octree equal voxels share a node; here they are kept one by one, which changes n
 
 from typing import Any, ClassVar
 
-from taichi_mrf.config.schema import Config, LogOddsConfig, Method, SensorConfig, VolumeConfig
+from taichi_mrf.config.method import Method
+from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
 from taichi_mrf.config.values import overridden
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import DepthImage
+from taichi_mrf.methods.log_odds.plug import METHOD, LogOddsConfig
 from taichi_mrf.methods.log_odds.scan import RayFootprint, ScanIntegrator
 from taichi_mrf.methods.recursive import RecursiveMap, Scan
 from taichi_mrf.sensor.noise import NoiseModel
@@ -18,7 +20,7 @@ from taichi_mrf.sensor.noise import NoiseModel
 class LogOddsMap(RecursiveMap[RayFootprint]):
     """A map that integrates scans as OctoMap does (Hornung et al. 2013)."""
 
-    METHOD: ClassVar[Method] = "log_odds"
+    METHOD: ClassVar[Method] = METHOD
 
     def __init__(
         self,
@@ -38,23 +40,16 @@ class LogOddsMap(RecursiveMap[RayFootprint]):
         """
         config = Config(
             voxel_size,
-            self.METHOD,
-            SensorConfig(min_depth=min_depth, max_depth=max_depth),
+            sensor=SensorConfig(min_depth=min_depth, max_depth=max_depth),
             log_odds=overridden(log_odds or LogOddsConfig(), parameters, "LogOddsMap"),
             volume=volume or VolumeConfig(),
         )
-        super().__init__(config, noise)
-        self._integrator = ScanIntegrator(voxel_size, max_depth, config.log_odds, config.volume)
+        self._set_up(config, noise)
 
-    @classmethod
-    def _create(cls, config: Config, noise: NoiseModel) -> "LogOddsMap":
-        return cls(
-            config.voxel_size,
-            noise,
-            log_odds=config.log_odds,
-            volume=config.volume,
-            min_depth=config.sensor.min_depth,
-            max_depth=config.sensor.max_depth,
+    def _set_up(self, config: Config, noise: NoiseModel | None) -> None:
+        super()._set_up(config, noise)
+        self._integrator = ScanIntegrator(
+            self.voxel_size, self.sensor.max_depth, config.log_odds, config.volume
         )
 
     def _reach(self, image: DepthImage, T_world_camera: Pose) -> RayFootprint:

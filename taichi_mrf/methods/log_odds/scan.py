@@ -13,7 +13,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf.config.schema import LogOddsConfig, VolumeConfig
+from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.accumulators import low_half
 from taichi_mrf.inference.footprint import visible_box, window_around
@@ -31,6 +31,7 @@ from taichi_mrf.kernels.types import (
     Vec3,
     Vec4,
 )
+from taichi_mrf.methods.log_odds.plug import LogOddsConfig
 from taichi_mrf.methods.ray_ends import HIT, end_of, ray_ends
 from taichi_mrf.methods.recursive_update import updated
 from taichi_mrf.system import runtime

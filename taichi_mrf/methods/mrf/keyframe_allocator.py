@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from taichi_mrf.config.schema import InferenceConfig, SensorConfig, VolumeConfig
+from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.footprint import find_footprint

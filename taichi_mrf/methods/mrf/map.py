@@ -5,19 +5,20 @@ them, which keyframes see them. The computation itself is inference/sum_product.
 """
 
 import math
-import weakref
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.alignment.keyframe_surfels import KeyframeSurfels
 from taichi_mrf.alignment.refine import Aligner, RefinedPose
-from taichi_mrf.config.schema import Config, InferenceConfig, PoseConfig, SensorConfig, VolumeConfig
+from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.method import Method
+from taichi_mrf.config.schema import Config, PoseConfig, SensorConfig, VolumeConfig
 from taichi_mrf.config.values import overridden
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.factor_graph.depth_graph import depth_graph
@@ -31,31 +32,29 @@ from taichi_mrf.inference.prior import prior_probability
 from taichi_mrf.inference.ray_list import RayBundler
 from taichi_mrf.inference.schedule import InferReport, Progress, content_key, run_sweeps
 from taichi_mrf.inference.sweep import Sweeper, unknown_entry_depths
+from taichi_mrf.methods.brick_map import BrickMap
 from taichi_mrf.methods.map_file import MapHeader, StoredKeyframe, naming
-from taichi_mrf.methods.mrf.brick_registry import BrickRegistry
 from taichi_mrf.methods.mrf.checkpoint import Checkpoint, go_back, take_checkpoint
 from taichi_mrf.methods.mrf.keyframe_allocator import KeyframeAllocator
 from taichi_mrf.methods.mrf.memory_budget import MemoryBudget
+from taichi_mrf.methods.mrf.plug import METHOD
 from taichi_mrf.methods.mrf.storage import contents_of, read_contents, write_contents
 from taichi_mrf.methods.statistics import MapStatistics, measure
-from taichi_mrf.queries.extract import extract_voxels
-from taichi_mrf.queries.points import classify, point_log_odds, probability
-from taichi_mrf.queries.profile import RayProfile
-from taichi_mrf.queries.view import View
+from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config, warn_of_bad_sigma
+from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import VOXELS
-from taichi_mrf.voxels.pool import BrickPool
-from taichi_mrf.voxels.topology import create_topology, recycle
 
 
-class MRFMap:
+class MRFMap(BrickMap):
     """A probabilistic occupancy map of any set of depth keyframes.
 
     Keyframes can be added, removed, moved and frozen in any order; after :meth:`infer` the map is the
     one that the final set gives. Between changes and :meth:`infer`, queries answer with what is known.
     """
+
+    METHOD: ClassVar[Method] = METHOD
 
     def __init__(
         self,
@@ -75,17 +74,16 @@ class MRFMap:
         runtime.init()
         self.sensor = SensorConfig(min_depth=min_depth, max_depth=max_depth)
         inference = overridden(inference or InferenceConfig(), parameters, "MRFMap")
-        self.config = Config(
-            voxel_size, sensor=self.sensor, inference=inference, volume=volume or VolumeConfig()
-        )
-        self.noise = noise if noise is not None else PolynomialNoise(self.sensor.sigma, self.sensor.bias)
-        self.voxel_size = self.config.voxel_size
-        self.prior = prior_probability(inference, self.voxel_size)
+        sensor = SensorConfig(min_depth=min_depth, max_depth=max_depth)
+        config = Config(voxel_size, sensor=sensor, inference=inference, volume=volume or VolumeConfig())
+        self._set_up(config, noise)
+
+    def _set_up(self, config: Config, noise: NoiseModel | None) -> None:
+        inference = config.inference
+        self.prior = prior_probability(inference, config.voxel_size)
         prior_log_odds = math.log(self.prior / (1 - self.prior))
-        self._pool = BrickPool(prior_log_odds, self.config.volume.memory_limit_gb)
-        topology = create_topology(runtime.active() or "cpu", self.config.volume.dense_bricks)
-        weakref.finalize(self, recycle, topology)
-        self._registry = BrickRegistry(topology, self._pool, self.voxel_size)
+        seen_free_log_odds = prior_log_odds - inference.message_clamp
+        self._make_bricks(config, noise, prior_log_odds, seen_free_log_odds, config.volume, Occlusion())
         bundler = RayBundler(self.voxel_size, inference)
         bounds = KeyframeBounds()
         parts = (self.sensor, inference, self.config.volume)
@@ -93,30 +91,27 @@ class MRFMap:
         budget = MemoryBudget(self._pool, inference.message_precision)
         self._allocator = KeyframeAllocator(self._registry, bundler, *parts, bounds, budget)
         self._sweeper = Sweeper(self.voxel_size, self.sensor, inference, self.config.volume)
-        kept = (self._allocator.look_again, self._allocator.refresh)
-        self._incremental = IncrementalInference(
-            self._pool, self._sweeper, bounds, *kept, inference.renew_tolerance
-        )
-        self.view = View(self._pool, self.voxel_size, self.config.volume)
-        self.aligner = Aligner(self.view, KeyframeSurfels(self.voxel_size, max_depth))
+        kept = (bounds, self._allocator.look_again, self._allocator.refresh)
+        self._incremental = IncrementalInference(self._pool, self._sweeper, *kept, inference.renew_tolerance)
+        self.aligner = Aligner(self.view, KeyframeSurfels(self.voxel_size, self.sensor.max_depth))
         self._frozen: dict[int, str] = {}
         self._next_id = 0
         self._messages_lost = False  # a loaded map has beliefs, but no messages
-
-    @classmethod
-    def from_config(cls, config: Config, camera: PinholeCamera) -> "MRFMap":
-        """A map with a configuration's parameters; ``camera`` is what its noise tables must fit."""
-        return cls._with(config, noise_from_config(config.sensor, camera))
-
-    @classmethod
-    def _with(cls, config: Config, noise: NoiseModel) -> "MRFMap":
-        depths = {"min_depth": config.sensor.min_depth, "max_depth": config.sensor.max_depth}
-        return cls(config.voxel_size, noise, inference=config.inference, volume=config.volume, **depths)
 
     @property
     def keyframes(self) -> Mapping[int, Keyframe]:
         """The keyframes that can still be moved and removed, by id."""
         return MappingProxyType(self._keyframes)
+
+    @property
+    def stale(self) -> bool:
+        """Never: a change shows at once."""
+        return False
+
+    def crossed_bricks(self, id: int) -> NDArray[np.int32]:
+        """The bricks that a keyframe's rays cross, (n, 3), whether they exist or not."""
+        footprint = self._find(id).footprint
+        return footprint.window.bricks_of(footprint.crossed)
 
     @property
     def frozen(self) -> Mapping[int, str]:
@@ -161,9 +156,8 @@ class MRFMap:
     def refine_pose(
         self, id: int, config: PoseConfig | None = None, guesses: Sequence[ArrayLike] = ()
     ) -> RefinedPose:
-        """Move a keyframe to the pose under which its depth is most likely in the map of the others, if that
-        is near and better; its messages then begin anew. The search begins at its pose, or at that one of
-        ``guesses``, (4, 4) each, that fits better. Raises KeyframeError if there is no such keyframe."""
+        """Move a keyframe to the pose near by under which its depth is most likely in the map of the others.
+        The search starts at its pose or at one of ``guesses``, (4, 4) each. Raises KeyframeError."""
         keyframe = self._find(id)
         self._restore_messages()
         if keyframe.messages is not None:
@@ -217,10 +211,8 @@ class MRFMap:
             self._pool.restart()
             for keyframe in chosen:
                 # A ray that starts further out rounds otherwise, so what earlier sweeps learnt must not show.
-                keyframe.entry_depths, keyframe.entry_depths_known = (
-                    unknown_entry_depths(keyframe.ray_list),
-                    False,
-                )
+                keyframe.entry_depths = unknown_entry_depths(keyframe.ray_list)
+                keyframe.entry_depths_known = False
                 keyframe.messages = None
                 self._allocator.refresh(keyframe)
             self._messages_lost = False
@@ -240,14 +232,13 @@ class MRFMap:
         seconds: float | None = None,
         progress: Progress | None = None,
     ) -> InferReport:
-        """Bring the marginals up to date without beginning anew: sweep ``keyframes`` (ids), new ones for
-        instance, then those to whom others have said something new, the most affected first, until no
-        keyframe has had more than ``tolerance`` of its voxels' marginals moved since its last sweep.
+        """Bring the marginals up to date without starting over. Sweeps ``keyframes`` (ids) first, then those
+        whose cavity changed, most changed first, until each has had at most the share ``tolerance`` of its
+        voxels' marginals moved since its last sweep (default: ``inference.renew_tolerance``).
 
-        Begins no further sweep after ``seconds``; what is left is done by the next call. The report's
-        ``residual`` is the largest share left, its ``sweeps`` count keyframes. ``tolerance`` defaults to
-        ``inference.renew_tolerance``. The map then depends a little on the order of events, which
-        :meth:`infer` does not.
+        Starts no sweep after ``seconds``; the next call continues. The report's ``residual`` is the largest
+        share left, its ``sweeps`` count keyframes. The result depends slightly on the order of changes;
+        that of :meth:`infer` does not.
         """
         first = [self._find(id).id for id in keyframes]
         self._restore_messages()
@@ -291,29 +282,6 @@ class MRFMap:
         spoken = [(k.visible, k.messages) for k in self._keyframes.values() if k.messages is not None]
         return count_observations(slots, spoken, self._pool)
 
-    def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Marginal probability of occupied at (N, 3) points in metres, (N,) float32; the prior where
-        nobody has looked."""
-        return probability(self._log_odds(points))
-
-    def state(self, points: ArrayLike) -> NDArray[np.int8]:
-        """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,) int8."""
-        return classify(self._log_odds(points), self._pool.prior_log_odds, self.config.volume.min_evidence)
-
-    def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """All allocated voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
-        return extract_voxels(self._pool, self.voxel_size, min_probability)
-
-    def render_depth(self, camera: PinholeCamera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
-        """Axial depth of the likeliest surface seen by each pixel, (H, W) float32, NaN where none is."""
-        return self.view.render_depth(camera, as_pose(T_world_camera), self.sensor.max_depth)
-
-    def ray_profile(
-        self, origin: ArrayLike, direction: ArrayLike, max_range: float | None = None
-    ) -> RayProfile:
-        """Occupancy, visibility and omega (eqs. 15 to 18) along a ray, by range in metres."""
-        return self.view.ray_profile(origin, direction, max_range or self.sensor.max_depth)
-
     @property
     def last_voxel_steps(self) -> int:
         """Voxels that the rays of the last keyframe swept have crossed, each ray's counted."""
@@ -345,16 +313,14 @@ class MRFMap:
         contents = read_contents(Path(path))
         header, bricks = contents.header, contents.bricks
         with naming(Path(path)):
-            m = cls._with(header.limited_to(memory_limit_gb), header.noise)
+            m = cls.with_noise(header.limited_to(memory_limit_gb), header.noise)
             if len(bricks):
                 slots = m._registry.restore(bricks, contents.frozen_owners)
             m._registry.see_for_good(contents.frozen_crossed)
             m._frozen = dict(contents.frozen)
-            for stored in header.keyframes:
-                image = m._upload(stored.depth_m, stored.camera)
-                m._keyframes[stored.id] = m._allocator.place(
-                    stored.id, stored.name, image, stored.T_world_camera
-                )
+            for k in header.keyframes:
+                image = m._upload(k.depth_m, k.camera)
+                m._keyframes[k.id] = m._allocator.place(k.id, k.name, image, k.T_world_camera)
         if len(bricks):
             m._pool.write("belief", slots, contents.belief)
             if contents.evidence is not None:
@@ -362,10 +328,6 @@ class MRFMap:
         m._next_id = header.next_id
         m._messages_lost = bool(m._keyframes)
         return m
-
-    def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
-        seen_free = self._pool.prior_log_odds - self.config.inference.message_clamp
-        return point_log_odds(points, self.voxel_size, self._registry.topology, self._pool, seen_free)
 
     def _find(self, id: int) -> Keyframe:
         if id in self._frozen:
@@ -383,7 +345,7 @@ class MRFMap:
     def _use(self, method: str) -> None:
         """Infer by this method from now on: no keyframe has sent its messages by it yet."""
         inference = overridden(self.config.inference, {"method": method}, "MRFMap.infer")
-        self.config = replace(self.config, inference=inference)
+        self.config = replace(self.config, **{self.METHOD.section: inference})
         self._sweeper.inference = inference
         for keyframe in self._keyframes.values():
             keyframe.revision = -1

@@ -7,12 +7,14 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf.config.schema import InferenceConfig, SensorConfig, VisibilityConfig, VolumeConfig
+from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.footprint import find_footprint
 from taichi_mrf.inference.keyframe import DepthImage, Footprint
 from taichi_mrf.inference.ray_list import RayBundler
 from taichi_mrf.methods.visibility import scan as visibility_scan
+from taichi_mrf.methods.visibility.plug import VisibilityConfig
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import VOXELS

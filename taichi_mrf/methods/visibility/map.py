@@ -7,12 +7,14 @@ voxels far, and the mapped space grows scan by scan.
 
 from typing import Any, ClassVar
 
-from taichi_mrf.config.schema import Config, Method, SensorConfig, VisibilityConfig, VolumeConfig
+from taichi_mrf.config.method import Method
+from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
 from taichi_mrf.config.values import overridden
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import DepthImage, Footprint
 from taichi_mrf.methods.recursive import RecursiveMap, Scan
 from taichi_mrf.methods.visibility.integrator import VisibilityIntegrator
+from taichi_mrf.methods.visibility.plug import METHOD, VisibilityConfig
 from taichi_mrf.sensor.noise import NoiseModel
 
 
@@ -22,7 +24,7 @@ class VisibilityMap(RecursiveMap[Footprint]):
     What a scan adds depends on what the map knew before it, so the order of the keyframes matters.
     """
 
-    METHOD: ClassVar[Method] = "visibility"
+    METHOD: ClassVar[Method] = METHOD
 
     def __init__(
         self,
@@ -44,23 +46,16 @@ class VisibilityMap(RecursiveMap[Footprint]):
         """
         config = Config(
             voxel_size,
-            self.METHOD,
-            SensorConfig(min_depth=min_depth, max_depth=max_depth),
+            sensor=SensorConfig(min_depth=min_depth, max_depth=max_depth),
             visibility=overridden(visibility or VisibilityConfig(), parameters, "VisibilityMap"),
             volume=volume or VolumeConfig(),
         )
-        super().__init__(config, noise)
-        self._integrator = VisibilityIntegrator(voxel_size, config.sensor, config.visibility, config.volume)
+        self._set_up(config, noise)
 
-    @classmethod
-    def _create(cls, config: Config, noise: NoiseModel) -> "VisibilityMap":
-        return cls(
-            config.voxel_size,
-            noise,
-            visibility=config.visibility,
-            volume=config.volume,
-            min_depth=config.sensor.min_depth,
-            max_depth=config.sensor.max_depth,
+    def _set_up(self, config: Config, noise: NoiseModel | None) -> None:
+        super()._set_up(config, noise)
+        self._integrator = VisibilityIntegrator(
+            self.voxel_size, self.sensor, config.visibility, config.volume
         )
 
     def _reach(self, image: DepthImage, T_world_camera: Pose) -> Footprint:

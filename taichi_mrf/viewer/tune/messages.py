@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.config.schema import Config
+from taichi_mrf.config.sliders import Range
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.viewer.ranges import Range
 from taichi_mrf.viewer.tune.scores import Scores
 
 By = Literal["start", "hand", "search"]

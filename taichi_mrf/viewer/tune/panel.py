@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 import viser
 
+from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
 from taichi_mrf.viewer.events import Chosen, Event, KnobMoved, OptionsMoved, Pressed
 from taichi_mrf.viewer.live.options import ViewOptions
 from taichi_mrf.viewer.messages import Notice
 from taichi_mrf.viewer.notices import notices_html
 from taichi_mrf.viewer.tune.knob_widgets import KnobWidgets
-from taichi_mrf.viewer.tune.knobs import KNOBS, Section
+from taichi_mrf.viewer.tune.knobs import KNOBS
 from taichi_mrf.viewer.tune.messages import Activity, FrameChoice, HeldOutView, Tried, Tuning
 from taichi_mrf.viewer.tune.noise_plot import NoisePlot
 from taichi_mrf.viewer.tune.score_board import score_board_html
@@ -31,14 +32,8 @@ MAP_OPTIONS = (
     "color_by", "threshold", "size", "shade", "cut_axis", "cut_at", "bricks", "pictures", "dark",
 )  # fmt: skip
 
-_FOLDERS: dict[Section, str] = {
-    "map": "Map",
-    "inference": "Inference (mrf)",
-    "log_odds": "Log-odds (OctoMap)",
-    "visibility": "Visibility (Schauwecker & Zell)",
-    "keyframes": "Keyframes",
-}
-_FOLDED: tuple[Section, ...] = ("keyframes",)
+_FOLDERS = {"map": "Map", **{m.section: m.title for m in METHODS.values()}, "keyframes": "Keyframes"}
+_FOLDED = ("keyframes",)
 _MOST_NOTICES = 8
 _MOST_TRIES = 200
 """So many of the latest tries can be chosen."""
@@ -53,7 +48,7 @@ class TunePanel:
         self._names: dict[str, int] = {}
         self._last_shown: int | None = None
         self._knobs: list[KnobWidgets] = []
-        self._folders: dict[Section, Any] = {}
+        self._folders: dict[str, Any] = {}
         self._activity = gui.add_markdown("Starting …")
         self._progress: Any = gui.add_progress_bar(0.0, animated=True)
         self._stop = gui.add_button("Stop the search", visible=False)
@@ -107,10 +102,10 @@ class TunePanel:
         """Show what belongs to a configuration: its method's sliders, its noise curves."""
         for each in self._knobs:
             each.follow(config)
-        for section, method in (("inference", "mrf"), ("log_odds", "log_odds"), ("visibility", "visibility")):
-            folder = self._folders[section]  # type: ignore[index]
-            if folder.visible != (config.method == method):
-                folder.visible = config.method == method
+        for method in METHODS.values():
+            folder = self._folders[method.section]
+            if folder.visible != (config.method == method.name):
+                folder.visible = config.method == method.name
         self.noise.follow(config.sensor)
 
     def show_tuning(self, tuning: Tuning) -> None:
@@ -194,7 +189,7 @@ class TunePanel:
         self._notices = [notice, *self._notices][:_MOST_NOTICES]
         self._list_notices()
 
-    def _add_knobs(self, section: Section, config: Config) -> None:
+    def _add_knobs(self, section: str, config: Config) -> None:
         knobs = [knob for knob in KNOBS if knob.section == section]
         self._knobs.append(KnobWidgets(self._gui, knobs, config, lambda name: self._tell(KnobMoved(name))))
 

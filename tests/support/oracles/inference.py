@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from oracles.forward import Noise
 from oracles.traversal import segments
-from taichi_mrf.config.schema import InferenceConfig
+from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.sensor.camera import PinholeCamera
 
 Voxel = tuple[int, int, int]

@@ -1,0 +1,63 @@
+"""What the rest of the program needs to know of a mapping method: one entry, made in the method's own folder.
+
+Kept apart from the list of entries (registry.py), because each method's folder imports this.
+"""
+
+import importlib
+from dataclasses import dataclass
+from typing import Any
+
+from taichi_mrf.config.sliders import Slider
+
+
+@dataclass(frozen=True)
+class Method:
+    """A mapping method: its names, its section of the configuration, its class and what its maps can do."""
+
+    name: str
+    """What ``Config.method``, ``--method`` and map files call it."""
+
+    summary: str
+    """The method in a few words, for the help of ``--method``."""
+
+    title: str
+    """The heading of its sliders on the tuning page."""
+
+    section: str
+    """The field of ``Config`` that holds its parameters."""
+
+    section_class: type
+    """The dataclass of that section. All its fields have defaults."""
+
+    section_help: str
+    """The help text of the section, one sentence."""
+
+    map_class: str
+    """Where the class of its maps is, ``package.module:Class``. It is imported when the first map is made,
+    because it brings Taichi and its kernels."""
+
+    sliders: tuple[Slider, ...] = ()
+    """The parameters of its section that the tuning page offers, in the order of the page."""
+
+    has_messages: bool = False
+    """Keyframes keep messages (methods.protocol.MessageMap): a change is renewed without starting over, and
+    inference that was stopped can be undone. A map that was loaded has to infer before it can be edited."""
+
+    can_freeze: bool = False
+    """Keyframes can be folded into the map for good (methods.protocol.FreezingMap)."""
+
+    can_refine_poses: bool = False
+    """Keyframes can be aligned with the map (methods.protocol.AligningMap): pose refinement and tracking."""
+
+    prior_is_unknown: bool = False
+    """A voxel is unknown exactly if it still holds the prior. Otherwise ``volume.min_evidence`` decides."""
+
+    @property
+    def class_name(self) -> str:
+        """The name of the map's class, without its module."""
+        return self.map_class.partition(":")[2]
+
+    def load_class(self) -> Any:
+        """The class of the method's maps, imported now."""
+        module, _, name = self.map_class.partition(":")
+        return getattr(importlib.import_module(module), name)

@@ -1,0 +1,107 @@
+"""What all maps share: the configuration, the bricks, and the answers to queries.
+
+A method adds how keyframes change the voxels. Each voxel holds one number, its log-odds of being occupied,
+in a pool of bricks that a registry allocates.
+"""
+
+import dataclasses
+import weakref
+from typing import ClassVar, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf.config.method import Method
+from taichi_mrf.config.schema import Config, VolumeConfig
+from taichi_mrf.geometry.poses import as_pose
+from taichi_mrf.methods.mrf.brick_registry import BrickRegistry
+from taichi_mrf.methods.sensor_section import describing
+from taichi_mrf.queries.extract import extract_voxels
+from taichi_mrf.queries.occlusion import Occlusion
+from taichi_mrf.queries.points import classify, point_log_odds, probability
+from taichi_mrf.queries.profile import RayProfile
+from taichi_mrf.queries.view import View
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config
+from taichi_mrf.system import runtime
+from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.topology import create_topology, recycle
+
+MapT = TypeVar("MapT", bound="BrickMap")
+
+
+class BrickMap:
+    """An empty map of bricks that answers queries; a method's map subclasses it and says how to fill it.
+
+    ``config`` is the whole configuration that the map was made with, ``view`` follows rays through the map.
+    """
+
+    METHOD: ClassVar[Method]
+    """The entry of the map's method."""
+
+    def _set_up(self, config: Config, noise: NoiseModel | None) -> None:
+        """Make the empty map of a whole configuration, which describes the noise unless it is given. Every
+        constructor ends here; subclasses extend it."""
+        raise NotImplementedError
+
+    def _make_bricks(
+        self,
+        config: Config,
+        noise: NoiseModel | None,
+        prior_log_odds: float,
+        seen_free_log_odds: float,
+        shown: VolumeConfig,
+        occlusion: Occlusion,
+    ) -> None:
+        """Allocate the grid. ``seen_free_log_odds`` is what a place holds that was seen but has no brick;
+        ``shown`` and ``occlusion`` are the View's."""
+        runtime.init()
+        self.sensor = describing(noise, config.sensor)
+        self.config = dataclasses.replace(config, method=self.METHOD.name, sensor=self.sensor)
+        self.voxel_size = config.voxel_size
+        self.noise = noise if noise is not None else PolynomialNoise(self.sensor.sigma, self.sensor.bias)
+        self._pool = BrickPool(prior_log_odds, config.volume.memory_limit_gb)
+        topology = create_topology(runtime.active() or "cpu", config.volume.dense_bricks)
+        weakref.finalize(self, recycle, topology)
+        self._registry = BrickRegistry(topology, self._pool, self.voxel_size)
+        self._seen_free_log_odds = seen_free_log_odds
+        self.view = View(self._pool, self.voxel_size, shown, occlusion)
+
+    @classmethod
+    def from_config(cls: type[MapT], config: Config, camera: PinholeCamera) -> MapT:
+        """A map with a configuration's parameters; ``camera`` is what its noise tables must fit."""
+        return cls.with_noise(config, noise_from_config(config.sensor, camera))
+
+    @classmethod
+    def with_noise(cls: type[MapT], config: Config, noise: NoiseModel) -> MapT:
+        """A map with a configuration's parameters but for its noise, which is given."""
+        m = cls.__new__(cls)
+        m._set_up(config, noise)
+        return m
+
+    def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
+        """Probability of occupied at (N, 3) points in metres, (N,) float32; the prior where nothing was
+        measured."""
+        return probability(self._log_odds(points))
+
+    def state(self, points: ArrayLike) -> NDArray[np.int8]:
+        """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,) int8."""
+        return classify(self._log_odds(points), self._pool.prior_log_odds, self.view.volume.min_evidence)
+
+    def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+        """All allocated voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
+        return extract_voxels(self._pool, self.voxel_size, min_probability)
+
+    def render_depth(self, camera: PinholeCamera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
+        """Axial depth of the likeliest surface seen by each pixel, (H, W) float32, NaN where none is."""
+        return self.view.render_depth(camera, as_pose(T_world_camera), self.sensor.max_depth)
+
+    def ray_profile(
+        self, origin: ArrayLike, direction: ArrayLike, max_range: float | None = None
+    ) -> RayProfile:
+        """Occupancy, visibility and omega (MRFMap, eqs. 15 to 18) along a ray, by range in metres."""
+        return self.view.ray_profile(origin, direction, max_range or self.sensor.max_depth)
+
+    def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
+        topology, pool = self._registry.topology, self._pool
+        return point_log_odds(points, self.voxel_size, topology, pool, self._seen_free_log_odds)

@@ -1,0 +1,82 @@
+"""What maps of some methods can do beyond OccupancyMap, and the questions that tell which map can.
+
+The rest of the program asks these questions instead of naming a class: the answer comes from the method's
+entry, and a type checker then knows the verbs.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Protocol, TypeGuard
+
+from numpy.typing import ArrayLike
+
+from taichi_mrf.alignment.refine import Aligner, RefinedPose
+from taichi_mrf.config.schema import PoseConfig
+from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.inference.schedule import InferReport, Progress
+from taichi_mrf.methods.mrf.checkpoint import Checkpoint
+from taichi_mrf.methods.protocol import OccupancyMap
+
+
+class MessageMap(OccupancyMap, Protocol):
+    """A map whose keyframes keep the messages that they sent."""
+
+    @property
+    def keyframes(self) -> Mapping[int, Keyframe]: ...
+
+    def renew(
+        self,
+        keyframes: Iterable[int] = (),
+        tolerance: float | None = None,
+        seconds: float | None = None,
+        progress: Progress | None = None,
+    ) -> InferReport:
+        """Bring the marginals up to date without starting over."""
+        ...
+
+    def checkpoint(self) -> Checkpoint:
+        """What :meth:`restore` needs to undo an :meth:`infer` that was stopped."""
+        ...
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go back to a checkpoint; since then only :meth:`infer` may have been called."""
+        ...
+
+
+class FreezingMap(MessageMap, Protocol):
+    """A map that can fold keyframes into itself for good."""
+
+    @property
+    def frozen(self) -> Mapping[int, str]:
+        """Names of the frozen keyframes, by id."""
+        ...
+
+    def freeze_keyframe(self, id: int) -> None:
+        """Keep what a keyframe has contributed, and drop its image. Raises KeyframeError."""
+        ...
+
+
+class AligningMap(FreezingMap, Protocol):
+    """A map that finds the poses of its keyframes."""
+
+    aligner: Aligner
+
+    def refine_pose(
+        self, id: int, config: PoseConfig | None = None, guesses: Sequence[ArrayLike] = ()
+    ) -> RefinedPose:
+        """Move a keyframe to the pose near by under which its depth is most likely."""
+        ...
+
+
+def has_messages(m: OccupancyMap) -> TypeGuard[MessageMap]:
+    """Whether a map's keyframes keep messages."""
+    return m.METHOD.has_messages
+
+
+def can_freeze(m: OccupancyMap) -> TypeGuard[FreezingMap]:
+    """Whether a map can freeze keyframes."""
+    return m.METHOD.can_freeze
+
+
+def can_refine_poses(m: OccupancyMap) -> TypeGuard[AligningMap]:
+    """Whether a map can align keyframes, and so be tracked in."""
+    return m.METHOD.can_refine_poses

@@ -1,0 +1,38 @@
+"""The entry of the method mrf; its parameters are config/inference.py. No Taichi here: this is imported for a
+--help."""
+
+from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.method import Method
+from taichi_mrf.config.sliders import Range, Slider
+
+METHOD = Method(
+    name="mrf",
+    summary="MRFMap, belief propagation on rays",
+    title="Inference (mrf)",
+    section="inference",
+    section_class=InferenceConfig,
+    section_help="How the marginals are computed.",
+    map_class="taichi_mrf.methods.mrf.map:MRFMap",
+    sliders=(
+        Slider("method"),
+        Slider(
+            "surface_density",
+            Range(0.1, 12.0, 0.1),
+            "per m",
+            counts=lambda section: section.prior is None,
+            by_factors=True,
+            searched=True,
+        ),
+        Slider("prior", Range(0.005, 0.6, 0.005), counts=lambda section: section.prior is not None),
+        Slider("sweeps", Range(1, 6, 1)),
+        Slider("likelihood"),
+        Slider("outlier_floor", Range(-9.0, 0.0, 0.25), "per m", decades=True, searched=True),
+        Slider("message_clamp", Range(0.5, 14.0, 0.1), "log-odds", searched=True),
+        Slider("cavity_clamp", Range(0.5, 20.0, 0.1), "log-odds"),
+        Slider("free_share", Range(0.0, 1.0, 0.01), searched=True),
+        Slider("ray_density", Range(0.0, 10.0, 0.5), "per cm"),
+    ),
+    has_messages=True,
+    can_freeze=True,
+    can_refine_poses=True,
+)

@@ -1,0 +1,56 @@
+"""A mapping method is a plug: one entry says all that the rest of the program needs to know of it."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from taichi_mrf.config.method import Method
+from taichi_mrf.config.plugs import PLUGS
+from taichi_mrf.config.registry import METHODS
+from taichi_mrf.config.schema import Config
+
+
+@pytest.mark.parametrize("method", METHODS.values(), ids=lambda method: method.name)
+def test_an_entry_fits_its_class_and_its_section(method: Method) -> None:
+    assert method.load_class().METHOD is method
+    assert getattr(Config(), method.section) == method.section_class()
+    assert {slider.name for slider in method.sliders} <= set(vars(method.section_class()))
+
+
+def test_plugs_load_without_taichi() -> None:
+    imports = "; ".join(f"import {plug}" for plug in PLUGS)
+    subprocess.run(
+        [sys.executable, "-c", f"{imports}; import sys; assert 'taichi' not in sys.modules"], check=True
+    )
+
+
+def test_a_fourth_method_needs_its_folder_and_one_line(tmp_path: Path, repository: Path) -> None:
+    support = repository / "tests" / "support"
+    path = os.pathsep.join([str(support), str(repository), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, support / "toy_method" / "program.py", tmp_path],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout.splitlines()[-1])
+    keys = found.pop("yaml_keys")
+    assert keys[:2] == ["voxel_size", "method"]
+    assert keys.index("toy") == keys.index("visibility") + 1
+    assert found == {
+        "yaml": "toy",
+        "method": "toy",
+        "boldness": 0.8,
+        "sliders": ["toy.boldness"],
+        "refused": "a map of the method toy cannot freeze keyframes",
+        "stale": True,
+        "settled": True,
+        "loaded": "ToyMap",
+        "loaded_boldness": 0.8,
+        "keyframes": 1,
+    }
