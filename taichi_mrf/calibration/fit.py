@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.calibration.curves import Curves, Prior
+from taichi_mrf.calibration.curves import Curves, Prior, kept_above
 from taichi_mrf.calibration.least_squares import Fit, Sums, fit_curves
 from taichi_mrf.calibration.options import CalibrationConfig
-from taichi_mrf.calibration.positive import kept_above
 from taichi_mrf.calibration.samples import Cells, Moments
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.noise import PatchNoise

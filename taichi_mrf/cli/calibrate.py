@@ -21,8 +21,8 @@ from taichi_mrf.calibration.truth_sources import (
 )
 from taichi_mrf.cli.options.calibrate import Calibrate
 from taichi_mrf.cli.shared.output import output_folder
-from taichi_mrf.datasets.base import ReadOptions
 from taichi_mrf.datasets.intrinsics import CAMERA_FILES, PRIMESENSE, find_camera
+from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.atomic import write_text

@@ -8,12 +8,13 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from taichi_mrf.datasets.base import Dataset, ReadOptions
+    from taichi_mrf.datasets.base import Dataset
+    from taichi_mrf.datasets.options import ReadOptions
     from taichi_mrf.datasets.registry import open_dataset
 
 _PLACES = {
     "Dataset": "taichi_mrf.datasets.base",
-    "ReadOptions": "taichi_mrf.datasets.base",
+    "ReadOptions": "taichi_mrf.datasets.options",
     "open_dataset": "taichi_mrf.datasets.registry",
 }
 

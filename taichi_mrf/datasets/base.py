@@ -1,21 +1,14 @@
-"""What every source of frames looks like to the program, and the options that all of them take."""
+"""What every source of frames offers, and how a source is registered."""
 
-import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
-from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
-
-DISTORTION_COUNTS = (4, 5, 8)
-"""How many distortion coefficients a lens may have; OpenCV's other models are not for depth cameras."""
-
-
-TRACK = "track"
-"""In place of a file of poses: find them from the images."""
 
 
 def start_pose() -> Pose:
@@ -24,64 +17,33 @@ def start_pose() -> Pose:
 
 
 @dataclass(frozen=True)
-class ReadOptions:
-    """What a caller may say about a recording that its files do not say, or say wrongly."""
+class Format:
+    """A kind of recording in a folder or a file: its entry in the registry (registry.py)."""
 
-    camera: PinholeCamera | None = None
-    """Takes the place of the recording's or the format's intrinsics."""
+    name: str
 
-    depth_scale: float | None = None
-    """Steps of the depth images per metre; takes the place of the format's own."""
+    looks_for: str
+    """The files that make a folder or a file one of this format, as error messages list them."""
 
-    color: bool = True
-    """Read the colour images too, where there are any."""
+    recognises: Callable[[Path], bool]
+    """Whether a folder or a file is of this format, even if some of its files are missing or damaged."""
 
-    max_time_gap: float | None = None
-    """Largest difference in seconds between a depth image and the poses that its own comes from; None leaves
-    it to the format."""
+    open: Callable[[Path, ReadOptions], "Dataset"]
+    """List the frames. Raises DatasetError, which names the file."""
 
-    intrinsics: tuple[float, float, float, float] | None = None
-    """fx, fy, cx, cy in pixels: as ``camera``, for images of whatever size the recording has."""
+    open_with_query: Callable[[Path, str, ReadOptions], "Dataset"] | None = None
+    """The same with options after a question mark in the source's name; None if the format has none."""
 
-    undistort: tuple[float, ...] | None = None
-    """OpenCV's coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]] of the recorded images, which are undistorted
-    as they are read. They take the place of the recording's own; zeros leave the images as they are."""
 
-    image_scale: float = 1.0
-    """Reads 1/n of the rows and columns: 1, 1/2, 1/3, ..."""
+@dataclass(frozen=True)
+class BuiltIn:
+    """A source that is no file: its entry in the registry. ``open`` gets the text after the name's question
+    mark, or after a name that ends in a colon."""
 
-    track: bool = False
-    """The recording's poses, if it has any, are of no interest: who maps it finds them from the images."""
-
-    def __post_init__(self) -> None:
-        scale = self.depth_scale
-        if scale is not None and not (math.isfinite(scale) and scale > 0):
-            raise DatasetError(f"depth_scale must be a positive number of steps per metre, not {scale}")
-        gap = self.max_time_gap
-        if gap is not None and not (math.isfinite(gap) and gap >= 0):
-            raise DatasetError(f"max_time_gap must be a number of seconds, not {gap}")
-        if self.camera is not None and self.intrinsics is not None:
-            raise DatasetError("camera and intrinsics say the same thing: give one of them")
-        if self.intrinsics is not None:
-            try:
-                PinholeCamera(1, 1, *self.intrinsics)
-            except ConfigError as error:
-                raise DatasetError(str(error)) from error
-        if self.undistort is not None:
-            count, finite = len(self.undistort), all(map(math.isfinite, self.undistort))
-            if count not in DISTORTION_COUNTS or not finite:
-                raise DatasetError(
-                    "undistort takes k1,k2,p1,p2, k1,k2,p1,p2,k3 or k1,k2,p1,p2,k3,k4,k5,k6, "
-                    f"not {', '.join(f'{k:g}' for k in self.undistort)}"
-                )
-        scale = self.image_scale
-        if not (0 < scale <= 1 and abs(scale * round(1 / scale) - 1) < 0.01):
-            raise DatasetError(f"image_scale must be 1, 0.5, 0.333, 0.25 or another 1/n, not {scale:g}")
-
-    @property
-    def stride(self) -> int:
-        """One in so many rows and columns is read."""
-        return round(1 / self.image_scale)
+    name: str
+    open: Callable[[str, ReadOptions], "Dataset"]
+    rendered: bool = False
+    """Whether Taichi renders its frames, so that it must have been started before they are read."""
 
 
 @dataclass

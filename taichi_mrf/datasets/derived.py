@@ -1,9 +1,12 @@
-"""What datasets have in common that show the frames of another one in another way."""
+"""Datasets that show the frames of another one in another way."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.errors import LostFrameError
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.frame import Frame
 
 
 @dataclass
@@ -22,3 +25,21 @@ class Derived(Dataset):
     def frame_names(self) -> Sequence[str]:
         """The source's."""
         return self.source.frame_names
+
+
+@dataclass
+class Reposed(Derived):
+    """The frames of ``source``, each (by index) at its pose of ``poses``, (4, 4) T_world_camera."""
+
+    poses: Mapping[int, Pose] = field(kw_only=True)
+
+    def read(self, index: int) -> Frame:
+        """The source's frame. Raises LostFrameError if it has no pose, and what the source raises."""
+        if index not in self.poses:
+            raise LostFrameError(f"{self.frame_names[index]}: where it was taken is not known")
+        return replace(self.source.read(index), T_world_camera=self.poses[index])
+
+
+def reposed(dataset: Dataset, poses: Mapping[int, Pose]) -> Reposed:
+    """A dataset's frames at other poses."""
+    return Reposed(dataset.name, dataset.camera, dataset.notes, dataset.dropped, source=dataset, poses=poses)

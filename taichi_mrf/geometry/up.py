@@ -1,7 +1,7 @@
 """Which way is up in a world frame: an axis and a sign, taken from how a camera was held."""
 
 from collections.abc import Iterable
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +10,6 @@ from taichi_mrf.geometry.poses import Pose
 
 Up = tuple[int, int]
 """An axis of the world (0, 1, 2), and 1 or -1 for its direction."""
-
-UpName = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 Z_UP: Up = (2, 1)
 
@@ -41,12 +39,12 @@ def up_vector(up: Up) -> NDArray[np.float64]:
     return up[1] * np.eye(3)[up[0]]
 
 
-def up_name(up: Up) -> UpName:
+def up_name(up: Up) -> str:
     """``z`` or ``-y``, for example."""
-    return f"{'' if up[1] > 0 else '-'}{'xyz'[up[0]]}"  # type: ignore[return-value]
+    return f"{'' if up[1] > 0 else '-'}{'xyz'[up[0]]}"
 
 
-def up_from_name(name: UpName) -> Up:
+def up_from_name(name: str) -> Up:
     """The inverse of :func:`up_name`."""
     return "xyz".index(name[-1]), -1 if name.startswith("-") else 1
 

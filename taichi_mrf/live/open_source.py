@@ -33,7 +33,7 @@ def open_source(
     """
     runtime.init(config.runtime.arch, config.runtime.threads, config.runtime.debug)
     path = Path(name)
-    if path.suffix == ".npz" and path.is_file() and not frames_npz.recognises_file(path):
+    if path.suffix == ".npz" and path.is_file() and not frames_npz.FORMAT.recognises(path):
         with open_map_file(path) as file:
             header = read_header(path, file)
         parameters = dataclasses.replace(header.config, runtime=config.runtime)

@@ -9,9 +9,8 @@ from calibration_boards import BOARD, CAMERA, board_motion, captured, ideal_view
 from hypothesis import given
 from hypothesis import strategies as st
 
-from taichi_mrf.calibration.hand_eye import hand_eye
 from taichi_mrf.calibration.image_stamps import stamps_of
-from taichi_mrf.calibration.motion_capture import Alignment, align
+from taichi_mrf.calibration.motion_capture import Alignment, align, hand_eye
 from taichi_mrf.calibration.options import BoardConfig, MotionCaptureConfig
 from taichi_mrf.calibration.pose_stream import (
     PoseStream,

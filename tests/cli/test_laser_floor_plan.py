@@ -7,11 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from taichi_mrf.datasets.laser.beams import beams_of
 from taichi_mrf.datasets.laser.floor_plan import Building, building, way
 from taichi_mrf.datasets.laser.floor_plan_scans import FloorPlanOptions, poses_along, simulate_scans
 from taichi_mrf.datasets.laser.readers import open_scans
-from taichi_mrf.datasets.laser.scans import LaserScans
+from taichi_mrf.datasets.laser.scans import LaserScans, beams_of
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.evaluation.laser.floor_plan_frame import end_points
 

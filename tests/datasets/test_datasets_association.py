@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from taichi_mrf.datasets.association import associate
+from taichi_mrf.datasets.formats.tum_rgbd import associate
 
 # No subnormal numbers: Taichi's kernels make the processor take them for zero.
 stamps = st.lists(st.floats(0, 2, allow_subnormal=False), max_size=30)

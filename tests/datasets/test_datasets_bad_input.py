@@ -59,16 +59,16 @@ def test_a_folder_of_something_else(tmp_path: Path) -> None:
 def test_a_file_in_place_of_a_folder(folder: Path) -> None:
     text = refused(folder / "camera.txt")
     assert str(folder / "camera.txt") in text
-    assert "is a file" in text
+    assert "unsupported file type; for a recording of many files pass its folder" in text
 
 
 def test_a_folder_of_recordings_names_them(folder: Path) -> None:
-    assert "office" in refused(folder.parent).split("name one: ")[1]
+    assert "office" in refused(folder.parent).split("contains several recordings; pass one of: ")[1]
 
 
 def test_a_built_in_that_does_not_exist() -> None:
     assert "did you mean 'synthetic:room'" in refused("synthetic:rooms")
-    assert "built in are: synthetic:room" in refused("nonsense:whatever")
+    assert "built-in sources are: synthetic:room" in refused("nonsense:whatever")
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])

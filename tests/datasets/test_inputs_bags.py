@@ -401,4 +401,4 @@ def test_without_its_library_one_line_says_what_to_install(
 def test_a_folder_of_bags_names_them(make: Callable[..., Path], tmp_path: Path) -> None:
     make(plain)
     make(plain, kind="mcap", name="second")
-    assert refused(tmp_path).endswith("name one: second, walk.bag")
+    assert refused(tmp_path).endswith("pass one of: second, walk.bag")

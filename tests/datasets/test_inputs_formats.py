@@ -253,9 +253,10 @@ def test_a_damaged_npz_is_named(tmp_path: Path, content: Content, share: float) 
 
 def test_other_files_are_not_taken_for_frames(tmp_path: Path) -> None:
     path = write_npz(tmp_path / "other.npz", {"values": np.zeros(3)})
-    assert "none that is known here" in refused(path)
+    assert "unsupported file type" in refused(path)
     assert "no such folder or file" in refused(tmp_path / "nowhere.npz")
-    assert "takes no options after a question mark" in refused(f"{path}?depth=/camera")  # type: ignore[arg-type]
+    frames = write_npz(tmp_path / "frames.npz", {"depth_m": np.zeros((3, 4))})
+    assert "takes no options after a question mark" in refused(f"{frames}?depth=/camera")  # type: ignore[arg-type]
 
 
 def test_live_takes_frames_for_frames_and_not_for_a_map(

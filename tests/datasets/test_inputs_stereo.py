@@ -8,8 +8,8 @@ from datasets_recordings import stamped_line, write_log, write_rows
 from stereo_rig import BASELINE, CAMERA, COUNT, pairs, pose, write
 
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.stereo.kitti_pairs import StereoPairs
 from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX, StereoMatching, stereo_depth
+from taichi_mrf.datasets.stereo.pairs import StereoPairs
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.sensor.camera import PinholeCamera
 

@@ -9,8 +9,8 @@ from kitti_street import BASELINE, CAMERA, COUNT, P0, P1, pairs, poses, write_ki
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.stereo.kitti_pairs import StereoPairs
 from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX, StereoMatching, stereo_depth
+from taichi_mrf.datasets.stereo.pairs import StereoPairs
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera

@@ -19,10 +19,9 @@ from taichi_mrf.cli.shared.output import output_folder
 from taichi_mrf.cli.shared.print_table import print_table
 from taichi_mrf.cli.shared.progress import TransientBar
 from taichi_mrf.config.text import commented_yaml
-from taichi_mrf.datasets.laser.beams import beams_of
 from taichi_mrf.datasets.laser.plan_image import read_floor_plan
 from taichi_mrf.datasets.laser.readers import open_scans
-from taichi_mrf.datasets.laser.scans import LaserScans
+from taichi_mrf.datasets.laser.scans import LaserScans, beams_of
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.evaluation.laser.floor_plan_frame import Registration, register
 from taichi_mrf.evaluation.laser.floor_plan_scores import floor_plan_scores, true_cells

@@ -21,7 +21,7 @@ from taichi_mrf.cli.shared.progress import ProgressBar
 from taichi_mrf.config.schema import Config, with_absolute_tables
 from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets import Dataset, open_dataset
-from taichi_mrf.datasets.reposed import reposed
+from taichi_mrf.datasets.derived import reposed
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import FrameError
 from taichi_mrf.evaluation.held_out import HeldOutCheck, check_held_out

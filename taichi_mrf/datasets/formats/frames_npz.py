@@ -16,15 +16,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, ReadOptions, start_pose
+from taichi_mrf.datasets.base import Dataset, Format, start_pose
+from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeError
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.npz_file import NpzFile, open_npz
 
-NAME = "npz"
-LOOKS_FOR = "*.npz with depth_m, T_world_camera and K"
 DEPTH, POSE, MATRIX, STAMP, COLOR, SCALE = "depth_m", "T_world_camera", "K", "stamp", "color", "depth_scale"
 FRAMES_PER_SECOND = 30.0
 
@@ -96,13 +95,10 @@ class FramesNpz(Dataset):
         return self._loaded[1], self._loaded[2]
 
 
-def recognises(folder: Path) -> bool:
-    """Whether the first npz file of a folder holds frames."""
-    return recognises_file(next(iter(sorted(folder.glob("*.npz"))), folder))
-
-
-def recognises_file(path: Path) -> bool:
-    """Whether a file is an npz file of frames, and not a map or something else."""
+def recognises(path: Path) -> bool:
+    """Whether an npz file, or the first of a folder, holds frames, and not a map or something else."""
+    if path.is_dir():
+        path = next(iter(sorted(path.glob("*.npz"))), path)
     if path.suffix != ".npz" or not path.is_file():
         return False
     try:
@@ -112,18 +108,12 @@ def recognises_file(path: Path) -> bool:
         return path.suffix == ".npz"
 
 
-def open_folder(folder: Path, options: ReadOptions) -> Dataset:
-    """Open all files of a folder as one sequence."""
-    return _open(folder.name, sorted(folder.glob("*.npz")), options)
-
-
-def open_file(path: Path, options: ReadOptions) -> Dataset:
-    """Open one file. Raises DatasetError, whose text names the file and the field."""
-    return _open(path.stem, [path], options)
-
-
-def _open(name: str, paths: Sequence[Path], options: ReadOptions) -> FramesNpz:
-    parts = [_read_part(path, options) for path in paths]
+def open_npz_frames(path: Path, options: ReadOptions) -> FramesNpz:
+    """Open one file, or all files of a folder as one sequence. Raises DatasetError, whose text names the file
+    and the field."""
+    paths = sorted(path.glob("*.npz")) if path.is_dir() else [path]
+    name = path.name if path.is_dir() else path.stem
+    parts = [_read_part(each, options) for each in paths]
     camera = options.camera or parts[0].camera
     for part in parts:
         if part.camera != parts[0].camera:
@@ -218,3 +208,11 @@ def _number(file: NpzFile, path: Path, name: str) -> float:
     if found.size != 1:
         raise DatasetError(f"{path}: {name} is {found.shape}; expected one number")
     return float(found.reshape(-1)[0])
+
+
+FORMAT = Format(
+    name="npz",
+    looks_for="*.npz with depth_m, T_world_camera and K",
+    recognises=recognises,
+    open=open_npz_frames,
+)

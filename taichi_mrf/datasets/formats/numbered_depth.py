@@ -20,9 +20,10 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.datasets.base import Dataset, ReadOptions
+from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.formats.open3d_json import is_trajectory_json, read_trajectory_json
 from taichi_mrf.datasets.intrinsics import PRIMESENSE, find_camera
+from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.recording import RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory, is_trajectory, read_trajectory
 from taichi_mrf.errors import DatasetError
@@ -149,3 +150,11 @@ def _read_pose(path: Path, pose: RecordedPose | None, mirror: bool) -> Pose:
         raise DatasetError(f"{path}: has no pose for this image")
     T_world_camera = pose.T_world_camera()
     return _MIRROR_Y @ T_world_camera @ _MIRROR_Y if mirror else T_world_camera
+
+
+FORMAT = Format(
+    name=NAME,
+    looks_for=LOOKS_FOR,
+    recognises=recognises,
+    open=open_folder,
+)

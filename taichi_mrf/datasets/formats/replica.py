@@ -9,15 +9,15 @@ import json
 import re
 from pathlib import Path
 
-from taichi_mrf.datasets.base import Dataset, ReadOptions
+from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.intrinsics import find_camera
+from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.recording import RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose, read_trajectory
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 
 NAME = "Replica (NICE-SLAM)"
-LOOKS_FOR = "results/depthNNNNNN.png and traj.txt"
 CAMERA = PinholeCamera(width=1200, height=680, fx=600.0, fy=600.0, cx=599.5, cy=339.5)
 STEPS_PER_METRE = 6553.5
 PARAMETERS, POSES = "cam_params.json", "traj.txt"
@@ -87,3 +87,11 @@ def _read_parameters(path: Path) -> tuple[PinholeCamera, float]:
     if not 0 < scale < float("inf"):
         raise DatasetError(f"{path}: scale must be a positive number of steps per metre, not {scale:g}")
     return camera, scale
+
+
+FORMAT = Format(
+    name=NAME,
+    looks_for="results/depthNNNNNN.png and traj.txt",
+    recognises=recognises,
+    open=open_folder,
+)

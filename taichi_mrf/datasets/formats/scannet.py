@@ -8,15 +8,15 @@ camera's 4 x 4 matrix. Colour images are of another size than depth, and not rea
 from functools import partial
 from pathlib import Path
 
-from taichi_mrf.datasets.base import Dataset, ReadOptions
+from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.intrinsics import find_camera, read_camera
+from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.recording import RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import read_matrix_file
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 
 NAME = "ScanNet"
-LOOKS_FOR = "depth/N.png and pose/N.txt"
 CAMERA = PinholeCamera(width=640, height=480, fx=577.870605, fy=577.870605, cx=319.5, cy=239.5)
 """That of most of its scenes."""
 
@@ -77,3 +77,11 @@ def _lost(pose_file: Path) -> bool:
         return LOST in pose_file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
         return False
+
+
+FORMAT = Format(
+    name=NAME,
+    looks_for="depth/N.png and pose/N.txt",
+    recognises=recognises,
+    open=open_folder,
+)

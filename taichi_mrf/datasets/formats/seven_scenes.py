@@ -9,14 +9,14 @@ import re
 from functools import partial
 from pathlib import Path
 
-from taichi_mrf.datasets.base import Dataset, ReadOptions
+from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.intrinsics import find_camera
+from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.recording import RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import read_matrix_file
 from taichi_mrf.sensor.camera import PinholeCamera
 
 NAME = "7-Scenes"
-LOOKS_FOR = "frame-NNNNNN.depth.png and frame-NNNNNN.pose.txt"
 CAMERA = PinholeCamera(width=640, height=480, fx=585.0, fy=585.0, cx=320.0, cy=240.0)
 STEPS_PER_METRE = 1000.0
 NO_DEPTH = 65535
@@ -27,7 +27,7 @@ _FILE = re.compile(r"(frame-(\d+))\.(depth\.png|pose\.txt)")
 
 def recognises(folder: Path) -> bool:
     """Whether the folder holds at least one depth image or pose with such a name."""
-    return any(_FILE.fullmatch(path.name) for path in folder.iterdir())
+    return folder.is_dir() and any(_FILE.fullmatch(path.name) for path in folder.iterdir())
 
 
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
@@ -62,3 +62,11 @@ def _frame(folder: Path, name: str, number: int) -> RecordedFrame:
         pose_source=str(pose_file),
         color_file=next((path for path in colors if path.is_file()), None),
     )
+
+
+FORMAT = Format(
+    name=NAME,
+    looks_for="frame-NNNNNN.depth.png and frame-NNNNNN.pose.txt",
+    recognises=recognises,
+    open=open_folder,
+)

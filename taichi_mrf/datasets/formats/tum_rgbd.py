@@ -8,18 +8,20 @@ and counted.
 
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
-from taichi_mrf.datasets.association import associate
-from taichi_mrf.datasets.base import Dataset, ReadOptions
+import numpy as np
+
+from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.intrinsics import PRIMESENSE, find_camera
+from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.recording import RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose, read_trajectory
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 
 NAME = "TUM RGB-D"
-LOOKS_FOR = "depth.txt and groundtruth.txt"
 STEPS_PER_METRE = 5000.0
 LARGEST_GAP = 0.02
 """Seconds between a depth image and its pose if nothing else is said."""
@@ -80,6 +82,33 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     )
 
 
+def associate(stamps: Sequence[float], others: Sequence[float], largest_gap: float) -> list[int | None]:
+    """For each stamp (seconds) the index of its partner in ``others``, or None.
+
+    No pair is further apart than ``largest_gap``, no partner is given twice, and the closest pairs are
+    made first. Neither list needs to be sorted.
+    """
+    order = np.argsort(others, kind="stable")
+    ordered = np.asarray(others, dtype=np.float64)[order]
+    pairs = []
+    for i, stamp in enumerate(stamps):
+        # A little wider than the gap, so that the rounding of stamp +- gap decides nothing.
+        window = largest_gap + 2 * np.spacing(abs(stamp) + largest_gap)
+        first = np.searchsorted(ordered, stamp - window, side="left")
+        last = np.searchsorted(ordered, stamp + window, side="right")
+        for j in range(first, last):
+            gap = abs(stamp - ordered[j])
+            if gap <= largest_gap:
+                pairs.append((gap, i, int(order[j])))
+    partner: list[int | None] = [None] * len(stamps)
+    taken = set()
+    for _, i, j in sorted(pairs):
+        if partner[i] is None and j not in taken:
+            partner[i] = j
+            taken.add(j)
+    return partner
+
+
 def _frame(stamp: float, depth_file: Path, pose: RecordedPose, color_file: Path | None) -> RecordedFrame:
     return RecordedFrame(
         name=depth_file.stem,
@@ -131,3 +160,11 @@ def _read_list(path: Path) -> list[tuple[float, Path]]:
     if not entries:
         raise DatasetError(f"{path}: lists no image")
     return sorted(entries)
+
+
+FORMAT = Format(
+    name=NAME,
+    looks_for="depth.txt and groundtruth.txt",
+    recognises=recognises,
+    open=open_folder,
+)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.laser.floor_plan import building, way
 from taichi_mrf.datasets.laser.scans import LaserScans
-from taichi_mrf.datasets.query_options import parse_options
+from taichi_mrf.datasets.options import parse_options
 from taichi_mrf.errors import ConfigError, DatasetError
 
 NAME = "synthetic:floor-plan"

@@ -1,7 +1,7 @@
 """``realsense:``: depth images from an Intel RealSense camera that is plugged in, or from a recording of one.
 
 ``realsense:width=848&height=480&fps=30`` is a camera, as long as it is plugged in; ``realsense:FILE`` is what
-its library has recorded (realsense_file.py). ``?poses=FILE`` gives the poses of the depth camera in TUM's
+its library has recorded (recorded.py). ``?poses=FILE`` gives the poses of the depth camera in TUM's
 layout, by the stamps of its images; ``?poses=track`` leaves them to be found by whoever maps the frames.
 Without either the camera is taken to stand still: its pose is one and the same for all frames, at the origin,
 level, looking along x.
@@ -15,9 +15,9 @@ from typing import Any, overload
 
 import numpy as np
 
-from taichi_mrf.datasets.base import TRACK, Dataset, ReadOptions, start_pose
-from taichi_mrf.datasets.query_options import parse_options
-from taichi_mrf.datasets.realsense.recorded import Player, RealSenseFile
+from taichi_mrf.datasets.base import BuiltIn, Dataset, start_pose
+from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
+from taichi_mrf.datasets.realsense.recorded import Player, RealSenseRecording
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
@@ -72,7 +72,7 @@ class _EndlessNames(Sequence[str]):
 
 
 @dataclass
-class RealSense(Dataset):
+class RealSenseCamera(Dataset):
     """A RealSense camera. ``pipeline`` is pyrealsense2's, started; ``depth_scale`` is metres a step."""
 
     pipeline: Any = None
@@ -134,7 +134,7 @@ def open_realsense(text: str, options: ReadOptions) -> Dataset:
     trajectory = read_timed_poses(Path(wanted.poses)) if wanted.poses and not tracked else None
     rs = library("pyrealsense2", f"{NAME} needs", "realsense", DatasetError)
     gap = INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
-    source: RealSense | RealSenseFile
+    source: RealSenseCamera | RealSenseRecording
     if file:
         source = _open_recording(rs, Path(file), trajectory, gap, options)
     else:
@@ -156,7 +156,7 @@ def _file_and_options(text: str) -> tuple[str, RealSenseOptions]:
 
 def _open_camera(
     rs: Any, wanted: RealSenseOptions, trajectory: TimedPoses | None, gap: float, options: ReadOptions
-) -> RealSense:
+) -> RealSenseCamera:
     pipeline, config = rs.pipeline(), rs.config()
     config.enable_stream(rs.stream.depth, wanted.width, wanted.height, rs.format.z16, wanted.fps)
     try:
@@ -165,7 +165,7 @@ def _open_camera(
         raise DatasetError(f"{NAME} cannot be started: {error}") from error
     stream = profile.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
     camera = PinholeCamera(stream.width, stream.height, stream.fx, stream.fy, stream.ppx, stream.ppy)
-    source = RealSense(
+    source = RealSenseCamera(
         NAME,
         options.camera or camera,
         notes=[ENDLESS],
@@ -180,7 +180,7 @@ def _open_camera(
 
 def _open_recording(
     rs: Any, path: Path, trajectory: TimedPoses | None, gap: float, options: ReadOptions
-) -> RealSenseFile:
+) -> RealSenseRecording:
     if not path.is_file():
         raise DatasetError(f"{NAME}{path}: there is no such file")
     player = Player(rs, path)
@@ -199,7 +199,7 @@ def _open_recording(
     notes = []
     if dropped:
         notes.append(f"{dropped} of {len(images)} images dropped: no poses within {gap:g} s on both sides")
-    source = RealSenseFile(
+    source = RealSenseRecording(
         path.stem,
         options.camera or player.camera,
         notes=notes,
@@ -210,3 +210,6 @@ def _open_recording(
     )
     weakref.finalize(source, player.close)
     return source
+
+
+BUILT_IN = BuiltIn(NAME, open_realsense)

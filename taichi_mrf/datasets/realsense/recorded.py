@@ -24,7 +24,7 @@ for."""
 
 
 @dataclass(frozen=True)
-class Listed:
+class RecordedImage:
     """A depth image of a recording: the number that the camera gave it, and its stamp in seconds."""
 
     number: int
@@ -40,14 +40,14 @@ class Player:
         self._pipeline: Any = None
         self._start()
 
-    def images(self) -> Iterator[tuple[Listed, Any]]:
+    def images(self) -> Iterator[tuple[RecordedImage, Any]]:
         """The depth images that are still to come."""
         while True:
             try:
                 image = self._pipeline.wait_for_frames(END_MS).get_depth_frame()
             except RuntimeError:
                 return
-            yield Listed(image.get_frame_number(), image.get_timestamp() / 1000.0), image
+            yield RecordedImage(image.get_frame_number(), image.get_timestamp() / 1000.0), image
 
     def rewind(self) -> None:
         """Begin anew."""
@@ -79,11 +79,11 @@ class Player:
 
 
 @dataclass
-class RealSenseFile(Dataset):
+class RealSenseRecording(Dataset):
     """The depth images of a recording, ``listed`` with their ``poses``."""
 
     player: Player = field(kw_only=True)
-    listed: Sequence[Listed] = field(kw_only=True)
+    listed: Sequence[RecordedImage] = field(kw_only=True)
     poses: Sequence[Pose] = field(kw_only=True)
 
     def __post_init__(self) -> None:

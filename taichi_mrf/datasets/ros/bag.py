@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from taichi_mrf.datasets.base import TRACK, Dataset, ReadOptions
-from taichi_mrf.datasets.query_options import parse_options
+from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.poses import BagPoses, PoseChoice, find_poses
 from taichi_mrf.datasets.ros.reader import METADATA, SUFFIXES, Entry, RosReader, is_bag
@@ -24,8 +24,6 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 
-NAME = "ROS bag"
-LOOKS_FOR = f"{METADATA} of a ROS 2 bag"
 REALSENSE = "/device_0/sensor_"
 """How topics begin in the files of Intel's library, whose messages are not quite those of ROS."""
 
@@ -80,21 +78,6 @@ class RosBag(Dataset):
                 f"the camera {self.camera.width} x {self.camera.height}"
             )
         return Frame(depth_m, self.poses[index], self.camera, self.entries[index].stamp, name)
-
-
-def recognises(folder: Path) -> bool:
-    """Whether a folder is a ROS 2 bag."""
-    return is_bag(folder)
-
-
-def recognises_file(path: Path) -> bool:
-    """Whether a file is called as a bag is."""
-    return path.suffix in SUFFIXES
-
-
-def open_folder(folder: Path, options: ReadOptions) -> Dataset:
-    """Open a ROS 2 bag with no options of its own."""
-    return open_bag(folder, "", options)
 
 
 def open_bag(path: Path, query: str, options: ReadOptions) -> RosBag:
@@ -206,3 +189,12 @@ def _without_poses(
         f"{reader.path}: none of {len(entries)} images of {depth.name} ({entries[0].stamp:.3f} to "
         f"{entries[-1].stamp:.3f} s) has poses within {gap:g} s on both sides ({found.source})"
     )
+
+
+FORMAT = Format(
+    name="ROS bag",
+    looks_for=f"{', '.join(SUFFIXES)} or the folder of a ROS 2 bag with {METADATA}",
+    recognises=is_bag,
+    open=lambda path, options: open_bag(path, "", options),
+    open_with_query=open_bag,
+)

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import DISTORTION_COUNTS
 from taichi_mrf.datasets.images import PNG_SIGNATURE, decode_16_bit
+from taichi_mrf.datasets.options import DISTORTION_COUNTS
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.geometry.poses import Pose

@@ -24,28 +24,22 @@ import numpy as np
 
 from taichi_mrf.config.files import read_yaml
 from taichi_mrf.config.values import from_dict
-from taichi_mrf.datasets.base import Dataset, ReadOptions
-from taichi_mrf.datasets.stereo.kitti_pairs import (
-    RecordedPair,
-    StereoPairs,
-    first_size,
-    noise_note,
-    read_times,
-)
+from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.stereo.matching import StereoMatching, StereoRig
+from taichi_mrf.datasets.stereo.pairs import RecordedPair, StereoPairs, first_size, noise_note, read_times
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
 from taichi_mrf.datasets.trajectories import RecordedPose, read_trajectory
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 
-NAME = "stereo pairs"
 SUFFIXES = (".yaml", ".yml")
 SECONDS_PER_PAIR = 0.1
 _NANOSECOND_DIGITS = 16
 
 
 @dataclass(frozen=True)
-class StereoFile:
+class RigFile:
     """What the file says. Paths are relative to it."""
 
     fx: float
@@ -104,14 +98,14 @@ def open_file(path: Path, options: ReadOptions) -> Dataset:
     )
 
 
-def _read(path: Path) -> StereoFile:
+def _read(path: Path) -> RigFile:
     try:
         values = read_yaml(path)
-        for known in fields(StereoFile):
+        for known in fields(RigFile):
             needed = known.default is MISSING and known.default_factory is MISSING
             if needed and isinstance(values, dict) and known.name not in values:
                 raise DatasetError(f"{path}: {known.name} is missing in this description of stereo pairs")
-        return from_dict(StereoFile, values if isinstance(values, dict) else str(values), str(path))
+        return from_dict(RigFile, values if isinstance(values, dict) else str(values), str(path))
     except ConfigError as error:
         raise DatasetError(str(error)) from error
 
@@ -126,7 +120,7 @@ def _images(path: Path, side: str, pattern: str) -> list[Path]:
     return found
 
 
-def _rig(path: Path, described: StereoFile, left: Sequence[Path], options: ReadOptions) -> StereoRig:
+def _rig(path: Path, described: RigFile, left: Sequence[Path], options: ReadOptions) -> StereoRig:
     try:
         if options.camera is not None:
             return StereoRig(options.camera, described.baseline)
@@ -138,7 +132,7 @@ def _rig(path: Path, described: StereoFile, left: Sequence[Path], options: ReadO
         raise DatasetError(f"{path}: {error}") from error
 
 
-def _stamps(folder: Path, described: StereoFile, left: Sequence[Path]) -> list[float] | None:
+def _stamps(folder: Path, described: RigFile, left: Sequence[Path]) -> list[float] | None:
     """Each pair's stamp in seconds, None if neither a file nor the names tell it."""
     if described.times is not None:
         stamps = read_times(folder / described.times)
@@ -212,3 +206,11 @@ def _interpolated(
         else []
     )
     return pairs, notes, dropped
+
+
+FORMAT = Format(
+    name="stereo pairs",
+    looks_for=".yaml that describes stereo pairs",
+    recognises=lambda path: path.is_file() and path.suffix in SUFFIXES,
+    open=open_file,
+)

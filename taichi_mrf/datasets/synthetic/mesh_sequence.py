@@ -14,9 +14,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, ReadOptions
+from taichi_mrf.datasets.base import BuiltIn, Dataset
 from taichi_mrf.datasets.intrinsics import PRIMESENSE
-from taichi_mrf.datasets.query_options import parse_options
+from taichi_mrf.datasets.options import ReadOptions, parse_options
 from taichi_mrf.datasets.synthetic.mesh_scene import MeshScene, load_mesh
 from taichi_mrf.datasets.trajectories import Trajectory, read_trajectory
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeError
@@ -145,3 +145,6 @@ def open_mesh(source: str, options: ReadOptions) -> MeshSequence:
         trajectory=trajectory,
         options=chosen,
     )
+
+
+BUILT_IN = BuiltIn(NAME, open_mesh)

@@ -7,8 +7,8 @@ fields of :class:`RoomOptions` are all there are.
 from dataclasses import dataclass
 from functools import cached_property
 
-from taichi_mrf.datasets.base import ReadOptions
-from taichi_mrf.datasets.query_options import parse_options
+from taichi_mrf.datasets.base import BuiltIn
+from taichi_mrf.datasets.options import ReadOptions, parse_options
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene
 from taichi_mrf.datasets.synthetic.rendered_sequence import RenderedSequence, RenderOptions
 from taichi_mrf.datasets.synthetic.room_furniture import camera_pose, room_scene
@@ -50,3 +50,6 @@ def open_synthetic_room(query: str, options: ReadOptions) -> SyntheticRoom:
         raise DatasetError(f"{NAME}: has no depth_scale, its depth is in metres")
     room = parse_options(RoomOptions, query, NAME)
     return SyntheticRoom(NAME, options.camera or room.camera(), options=room, color=options.color)
+
+
+BUILT_IN = BuiltIn(NAME, open_synthetic_room, rendered=True)

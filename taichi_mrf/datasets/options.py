@@ -1,0 +1,102 @@
+"""What can be said of a source beside its name: how it is read, and the options after a question mark."""
+
+import math
+from dataclasses import dataclass
+from typing import TypeVar, get_type_hints
+
+from taichi_mrf.config.files import parse_yaml
+from taichi_mrf.config.values import from_dict
+from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.sensor.camera import PinholeCamera
+
+DISTORTION_COUNTS = (4, 5, 8)
+"""How many distortion coefficients a lens may have; OpenCV's other models are not for depth cameras."""
+
+TRACK = "track"
+"""In place of a file of poses: find them from the images."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """What a caller may say about a recording that its files do not say, or say wrongly."""
+
+    camera: PinholeCamera | None = None
+    """Takes the place of the recording's or the format's intrinsics."""
+
+    depth_scale: float | None = None
+    """Steps of the depth images per metre; takes the place of the format's own."""
+
+    color: bool = True
+    """Read the colour images too, where there are any."""
+
+    max_time_gap: float | None = None
+    """Largest difference in seconds between a depth image and the poses that its own comes from; None leaves
+    it to the format."""
+
+    intrinsics: tuple[float, float, float, float] | None = None
+    """fx, fy, cx, cy in pixels: as ``camera``, for images of whatever size the recording has."""
+
+    undistort: tuple[float, ...] | None = None
+    """OpenCV's coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]] of the recorded images, which are undistorted
+    as they are read. They take the place of the recording's own; zeros leave the images as they are."""
+
+    image_scale: float = 1.0
+    """Reads 1/n of the rows and columns: 1, 1/2, 1/3, ..."""
+
+    track: bool = False
+    """The recording's poses, if it has any, are of no interest: who maps it finds them from the images."""
+
+    def __post_init__(self) -> None:
+        scale = self.depth_scale
+        if scale is not None and not (math.isfinite(scale) and scale > 0):
+            raise DatasetError(f"depth_scale must be a positive number of steps per metre, not {scale}")
+        gap = self.max_time_gap
+        if gap is not None and not (math.isfinite(gap) and gap >= 0):
+            raise DatasetError(f"max_time_gap must be a number of seconds, not {gap}")
+        if self.camera is not None and self.intrinsics is not None:
+            raise DatasetError("camera and intrinsics say the same thing: give one of them")
+        if self.intrinsics is not None:
+            try:
+                PinholeCamera(1, 1, *self.intrinsics)
+            except ConfigError as error:
+                raise DatasetError(str(error)) from error
+        if self.undistort is not None:
+            count, finite = len(self.undistort), all(map(math.isfinite, self.undistort))
+            if count not in DISTORTION_COUNTS or not finite:
+                raise DatasetError(
+                    "undistort takes k1,k2,p1,p2, k1,k2,p1,p2,k3 or k1,k2,p1,p2,k3,k4,k5,k6, "
+                    f"not {', '.join(f'{k:g}' for k in self.undistort)}"
+                )
+        scale = self.image_scale
+        if not (0 < scale <= 1 and abs(scale * round(1 / scale) - 1) < 0.01):
+            raise DatasetError(f"image_scale must be 1, 0.5, 0.333, 0.25 or another 1/n, not {scale:g}")
+
+    @property
+    def stride(self) -> int:
+        """One in so many rows and columns is read."""
+        return round(1 / self.image_scale)
+
+
+def parse_options(cls: type[T], query: str, source: str) -> T:
+    """What stands after the question mark, as a dataclass whose fields are all options that there are.
+
+    A field of type str takes its text as it stands, such as a path. Raises DatasetError, whose text names
+    the source, for an option that does not exist (naming the nearest), a value of the wrong type or out of
+    range, and for a text that is not made of name=value.
+    """
+    texts = {field for field, hint in get_type_hints(cls).items() if hint is str}
+    values = {}
+    for option in query.split("&") if query else ():
+        name, equals, text = option.partition("=")
+        try:
+            values[name] = text if name in texts else parse_yaml(text)
+        except ValueError:
+            equals = ""
+        if not (name and equals):
+            raise DatasetError(f"{source}?{query}: options are written name=value, with & between them")
+    try:
+        return from_dict(cls, values, source)
+    except ConfigError as error:
+        raise DatasetError(str(error)) from error
