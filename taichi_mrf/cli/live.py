@@ -32,7 +32,7 @@ def run_live(options: Live) -> int:
     with ExitStack() as stack:
         if options.out is not None:
             stack.enter_context(output_folder(options.out))
-        request = stack.enter_context(stop_on_signals(say))
+        request = stack.enter_context(stop_on_signals(say, keeps=options.out is not None))
         warn_of_host(options.host, options.port, "watch and change the map", say)
         page = _Page(options, say, stack)
         let_the_page_go_first()

@@ -34,7 +34,7 @@ def run_tune(options: Tune) -> int:
     with ExitStack() as stack:
         if options.out is not None:
             stack.enter_context(output_folder(options.out))
-        request = stack.enter_context(stop_on_signals(say))
+        request = stack.enter_context(stop_on_signals(say, keeps=options.out is not None))
         link = _page(options, say, stack) if options.viewer else NoPage()
         # Imported late: the page starts meanwhile, in a process of its own.
         from taichi_mrf.datasets import open_dataset

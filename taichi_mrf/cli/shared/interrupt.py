@@ -1,27 +1,69 @@
-"""Ctrl-C that keeps the work: the first press asks a run to finish early, the second aborts it."""
+"""Signals that stop a run and keep its work.
 
+The first Ctrl-C asks a run to finish early, the second aborts it. SIGTERM asks it to end within seconds, as
+containers and schedulers give it only those: what is only nice to have (pictures, scores) is left out then.
+SIGHUP, which a broken connection or a closed terminal sends, means the same, however often it comes.
+"""
+
+import contextlib
+import os
 import signal
+import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+INFER_SECONDS = 3.0
+"""How long after SIGTERM a map may still be inferred: containers kill after 10 s, and it has to be saved."""
+
+_HANG_UP = getattr(signal, "SIGHUP", None)  # not on Windows
+
 
 class StopRequest:
-    """Whether, and by which signal, the run was asked to stop; and whether it was told to abort then."""
+    """Whether the run was asked to stop, and how; an instance is called to ask."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
+        """The signal that came first."""
         self.aborted = False
+        """Whether the user wants the run to end at once, without its results."""
+        self._hurried_at: float | None = None
 
     def __call__(self) -> bool:
         return self.signal is not None
 
+    @property
+    def hurried(self) -> bool:
+        """Whether the run has to end within seconds (SIGTERM, SIGHUP)."""
+        return self._hurried_at is not None
+
+    def out_of_time(self) -> bool:
+        """Whether computing has to end now, so that there is time to save."""
+        return self._hurried_at is not None and time.monotonic() - self._hurried_at > INFER_SECONDS
+
+    def take(self, number: int) -> bool:
+        """Note a signal; returns whether it is news. Raises KeyboardInterrupt if it means to abort."""
+        if number == _HANG_UP:
+            _let_go_of_the_terminal()
+        hurries = number != signal.SIGINT
+        repeated = self() and (self.hurried or not hurries)
+        if repeated and number != _HANG_UP:
+            self.aborted = True
+            raise KeyboardInterrupt
+        if hurries and not self.hurried:
+            self._hurried_at = time.monotonic()
+        if self.signal is not None:
+            return False
+        self.signal = number
+        return True
+
 
 @contextmanager
-def stop_on_signals(tell: Callable[[str], None]) -> Iterator[StopRequest]:
-    """While the block runs, SIGINT and SIGTERM only set the yielded request and tell so; a second one
-    raises KeyboardInterrupt."""
-    with _handled(tell, raise_at_once=False) as request:
+def stop_on_signals(tell: Callable[[str], None], keeps: bool = True) -> Iterator[StopRequest]:
+    """While the block runs, SIGINT, SIGTERM and SIGHUP only set the yielded request and tell so; a second
+    SIGINT or SIGTERM raises KeyboardInterrupt. ``keeps`` says whether the run saves what is done."""
+    with _handled(tell, keeps, raise_at_once=False) as request:
         yield request
 
 
@@ -29,26 +71,45 @@ def stop_on_signals(tell: Callable[[str], None]) -> Iterator[StopRequest]:
 def interrupt_on_signals(tell: Callable[[str], None]) -> Iterator[StopRequest]:
     """The same for work that other processes do: already the first signal raises KeyboardInterrupt, for the
     waiting to end."""
-    with _handled(tell, raise_at_once=True) as request:
+    with _handled(tell, keeps=True, raise_at_once=True) as request:
         yield request
 
 
 @contextmanager
-def _handled(tell: Callable[[str], None], raise_at_once: bool) -> Iterator[StopRequest]:
+def _handled(tell: Callable[[str], None], keeps: bool, raise_at_once: bool) -> Iterator[StopRequest]:
     request = StopRequest()
+    fate = "What is done so far is saved." if keeps else "Nothing is saved: there is no --out."
 
     def handle(number: int, frame: FrameType | None) -> None:
-        if request():
-            request.aborted = True
-            raise KeyboardInterrupt
-        request.signal = number
-        tell("Stopping: what is done so far will be kept. Once more to abort.")
+        if not request.take(number):
+            return
+        with contextlib.suppress(OSError):  # the terminal may be gone
+            tell(f"Stopping. {fate} Press Ctrl-C again to abort.")
         if raise_at_once:
             raise KeyboardInterrupt
 
-    saved = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    # Under nohup, SIGHUP is ignored, and stays so.
+    numbers = [number for number in (signal.SIGINT, signal.SIGTERM, _HANG_UP) if _is_taken(number)]
+    saved = {number: signal.signal(number, handle) for number in numbers if number is not None}
     try:
         yield request
     finally:
         for number, handler in saved.items():
             signal.signal(number, handler)
+
+
+def _is_taken(number: int | None) -> bool:
+    return number is not None and (number != _HANG_UP or signal.getsignal(number) != signal.SIG_IGN)
+
+
+def _let_go_of_the_terminal() -> None:
+    """Printing to a terminal that is gone is an error, which must not end a run before it has saved."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(ValueError, AttributeError):  # a stream of a test has no descriptor
+            descriptor = stream.fileno()
+            try:
+                os.write(descriptor, b"")
+            except OSError:
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                os.dup2(nowhere, descriptor)
+                os.close(nowhere)

@@ -1,0 +1,66 @@
+"""What signals mean to a run."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from taichi_mrf.cli.shared import interrupt
+from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
+
+
+def received(*numbers: int) -> tuple[StopRequest, list[str]]:
+    """The request after these signals, and what the user was told."""
+    told: list[str] = []
+    with stop_on_signals(told.append) as request:
+        for number in numbers:
+            os.kill(os.getpid(), number)
+    return request, told
+
+
+def test_ctrl_c_asks_once_and_leaves_time() -> None:
+    request, told = received(signal.SIGINT)
+    assert (request.signal, request.hurried, request.out_of_time()) == (signal.SIGINT, False, False)
+    assert told == ["Stopping. What is done so far is saved. Press Ctrl-C again to abort."]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_sigterm_and_sighup_leave_seconds(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    request, told = received(number)
+    assert (request.signal, request.hurried, request.out_of_time()) == (number, True, False)
+    assert len(told) == 1
+    monkeypatch.setattr(interrupt, "INFER_SECONDS", 0.0)
+    assert request.out_of_time()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_second_of_them_aborts(number: int) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        received(number, number)
+
+
+def test_a_closed_terminal_may_hang_up_twice_and_sigterm_hurries_a_stopping_run() -> None:
+    request, told = received(signal.SIGHUP, signal.SIGHUP)
+    assert (request.signal, request.aborted, len(told)) == (signal.SIGHUP, False, 1)
+    request, told = received(signal.SIGINT, signal.SIGTERM)
+    assert (request.signal, request.hurried, request.aborted) == (signal.SIGINT, True, False)
+    assert len(told) == 1
+
+
+def test_what_nobody_saves_is_not_called_saved() -> None:
+    told: list[str] = []
+    with stop_on_signals(told.append, keeps=False):
+        os.kill(os.getpid(), signal.SIGINT)
+    assert told == ["Stopping. Nothing is saved: there is no --out. Press Ctrl-C again to abort."]
+
+
+def test_nohup_is_respected() -> None:
+    code = (
+        "import os, signal\nfrom taichi_mrf.cli.shared.interrupt import stop_on_signals\n"
+        "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+        "with stop_on_signals(print) as request:\n    os.kill(os.getpid(), signal.SIGHUP)\n    print(request())"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout == "False\n", done.stderr
