@@ -75,6 +75,7 @@ def map_sequence(
     limit: int | None = None,
     skip_bad_frames: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
+    out_of_time: Callable[[], bool] = lambda: False,
     resume_from: OccupancyMap | None = None,
     keep: Callable[[MappingResult], None] = lambda result: None,
 ) -> MappingResult:
@@ -84,9 +85,10 @@ def map_sequence(
     aligned with those before it as it is added, and all with each other before the marginals are inferred.
     Frames of a tracked dataset, those that are held out included, are first aligned with the map so far.
     ``should_stop`` is asked between keyframes. A run that it ends makes one sweep over the keyframes there
-    are if it has not yet, so that the map is usable. ``resume_from`` is the map of such a run, of this
-    dataset: its keyframes are kept and the frames after the last of them are added, which ends in the map
-    of an undisturbed run. ``keep`` is called after each keyframe, and may save what there is for such a run.
+    are if it has not yet, so that the map is usable; ``out_of_time`` ends that sweep too. ``resume_from`` is
+    the map of such a run, of this dataset: its keyframes are kept and the frames after the last of them are
+    added, which ends in the map of an undisturbed run. ``keep`` is called after each keyframe, and may save
+    what there is for such a run.
     A frame for which there is not enough memory ends the adding: the map of those before it is inferred.
 
     Raises FrameError for an unreadable frame unless ``skip_bad_frames``, DatasetError if no frame became a
@@ -102,7 +104,7 @@ def map_sequence(
     intake = Intake(m, config, tracked=dataset.tracked, hold_out=hold_out_of(dataset, config))
     if intake.refiner is not None and resume_from is not None:
         intake.refiner.repeat(resume_from.keyframes.values())
-    run = _BatchRun(dataset, indices, intake, listener, should_stop, keep, skip_bad_frames)
+    run = _BatchRun(dataset, indices, intake, listener, should_stop, out_of_time, keep, skip_bad_frames)
     run.add_keyframes()
     if not m.keyframes:
         raise DatasetError(_why_empty(dataset, intake.result))
@@ -120,6 +122,7 @@ class _BatchRun:
     intake: Intake
     listener: Listener
     should_stop: Callable[[], bool]
+    out_of_time: Callable[[], bool]
     keep: Callable[[MappingResult], None]
     skip_bad_frames: bool
 
@@ -178,15 +181,18 @@ class _BatchRun:
         self.result.poses = refiner.changes()
 
     def infer(self) -> None:
-        """Run the sweeps. The first always runs to its end, so that every keyframe has sent its messages; a
-        run that was told to stop makes no other."""
+        """Run the sweeps. The first always runs to its end, so that every keyframe has sent its messages,
+        unless there is no time; a run that was told to stop makes no other."""
 
         def progress(step: InferProgress) -> bool:
             self.listener(KeyframeSwept(step.sweep, step.sweeps, step.keyframe, step.keyframes, step.rays))
             self.result.interrupted = self.result.interrupted or self.should_stop()
             first_is_done = step.sweep > 1 or step.keyframe == step.keyframes
-            return not (self.result.interrupted and first_is_done)
+            return not (self.result.interrupted and (first_is_done or self.out_of_time()))
 
+        if self.out_of_time():
+            self.result.interrupted = True
+            return
         sweeps = 1 if self.result.interrupted else None
         try:
             with self.result.timed("inferring"):

@@ -260,12 +260,15 @@ def test_a_full_disk_names_the_file_and_leaves_no_half(
     assert not out.exists()
 
 
-def interrupted_run(out: Path, number: int, presses: int = 1) -> int:
-    """Start a run on a terminal, stop it once it shows progress, and return its exit status."""
+def interrupted_run(out: Path, number: int, presses: int = 1, flags: tuple[str, ...] = FAST) -> int:
+    """Start a run on a terminal, stop it once it shows progress, and return its exit status.
+
+    SIGHUP comes with the end of the terminal, as when a connection breaks.
+    """
     main_end, program_end = pty.openpty()
     source = "synthetic:room?frames=300&width=160&height=120"
     with subprocess.Popen(
-        [sys.executable, "-m", "taichi_mrf", "map", source, "--out", out, *FAST],
+        [sys.executable, "-m", "taichi_mrf", "map", source, "--out", out, *flags],
         stdin=program_end,
         stdout=program_end,
         stderr=program_end,
@@ -281,6 +284,8 @@ def interrupted_run(out: Path, number: int, presses: int = 1) -> int:
             if sent == 0 and b"Adding" in shown:
                 process.send_signal(number)
                 sent = 1
+                if number == signal.SIGHUP:
+                    break
             elif 0 < sent < presses and b"Stopping" in shown:
                 process.send_signal(number)
                 sent += 1
@@ -288,11 +293,22 @@ def interrupted_run(out: Path, number: int, presses: int = 1) -> int:
     return process.returncode
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_keeps_what_is_mapped_and_resume_goes_on(tmp_path: Path, number: signal.Signals) -> None:
-    assert interrupted_run(tmp_path / "out", number) == 128 + number
+def test_ctrl_c_keeps_what_is_mapped(tmp_path: Path) -> None:
+    assert interrupted_run(tmp_path / "out", signal.SIGINT) == 130
     report = report_of(tmp_path / "out")
     assert report["interrupted"] is True
+    assert 0 < report["keyframes"] < 270
+    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_sigterm_saves_the_map_and_leaves_out_pictures_and_scores(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    assert interrupted_run(tmp_path / "out", number, flags=COARSE) == 128 + number
+    report = report_of(tmp_path / "out")
+    assert report["interrupted"] is True
+    assert report["accuracy"] is None
     assert 0 < report["keyframes"] < 270
     assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
 

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from taichi_mrf.cli.shared import interrupt
-from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
+from taichi_mrf.cli.shared.interrupt import CutShortError, StopRequest, stop_on_signals
 
 
 def received(*numbers: int) -> tuple[StopRequest, list[str]]:
@@ -60,7 +60,24 @@ def test_nohup_is_respected() -> None:
     code = (
         "import os, signal\nfrom taichi_mrf.cli.shared.interrupt import stop_on_signals\n"
         "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
-        "with stop_on_signals(print) as request:\n    os.kill(os.getpid(), signal.SIGHUP)\n    print(request())"
+        "with stop_on_signals(print) as request:\n    os.kill(os.getpid(), signal.SIGHUP)\n"
+        "    print(request())"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout == "False\n", done.stderr
+
+
+def test_a_part_that_may_be_left_out_is_left_at_once() -> None:
+    reached = []
+    with stop_on_signals(lambda text: None) as request:
+        for _ in range(2):
+            with pytest.raises(CutShortError):
+                leave_out(request, reached)
+    assert (request.signal, reached) == (signal.SIGTERM, ["begin"])
+
+
+def leave_out(request: StopRequest, reached: list[str]) -> None:
+    with request.cutting_short():
+        reached.append("begin")
+        os.kill(os.getpid(), signal.SIGTERM)
+        reached.append("end")

@@ -47,7 +47,7 @@ def run_report(
         "peak_memory_mb": peak_memory_mb(),
         "sweeps": result.sweeps,
         "residual": result.residual,
-        "seconds": {stage: round(seconds, 3) for stage, seconds in result.seconds.items()},
+        "seconds": rounded(result.seconds),
         "accuracy": None if check is None else {"frames": check.frames, **dataclasses.asdict(check.error)},
         "tracking": None if result.track is None else _tracking(result.track),
         "poses": [_pose_report(change) for change in result.poses],
@@ -55,6 +55,11 @@ def run_report(
         "dropped_frames": dataset.dropped,
         "notes": [*dataset.notes, *_pose_notes(result, check is not None)],
     }
+
+
+def rounded(seconds: dict[str, float]) -> dict[str, float]:
+    """The seconds of each stage, to milliseconds."""
+    return {stage: round(value, 3) for stage, value in seconds.items()}
 
 
 def _tracking(track: Track) -> dict[str, int]:

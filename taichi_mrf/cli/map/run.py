@@ -3,7 +3,7 @@
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +12,10 @@ from typing import Any
 from rich.console import Console
 
 from taichi_mrf.cli.map.keep import MAP_FILE, REPORT_FILE, Keeper, resumed_map, skipped_before
-from taichi_mrf.cli.map.report import print_report, report_json, run_report, unfinished_report
+from taichi_mrf.cli.map.report import print_report, report_json, rounded, run_report, unfinished_report
 from taichi_mrf.cli.options.config_file import CONFIG_FILE
 from taichi_mrf.cli.options.map import Map
-from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
+from taichi_mrf.cli.shared.interrupt import CutShortError, StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
 from taichi_mrf.cli.shared.progress import ProgressBar
 from taichi_mrf.config.schema import Config, with_absolute_tables
@@ -33,6 +33,7 @@ from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import write_text
+from taichi_mrf.system.memory import peak_memory_mb
 
 VOXEL_FILE, TRAJECTORY_FILE = "voxels.ply", "trajectory.txt"
 
@@ -117,11 +118,12 @@ def print_run(console: Console, options: Map, report: dict[str, Any], written: l
 
 
 def map_to_folder(
-    task: MapTask, progress: ProgressBar, should_stop: Callable[[], bool]
+    task: MapTask, progress: ProgressBar, request: StopRequest
 ) -> tuple[dict[str, Any], list[Path]]:
     """Map one sequence and write its files, the report last; returns the report and the files.
 
-    A run that ``should_stop`` ended says so in its report. Raises TaichiMRFError.
+    A run that the ``request`` stopped says so in its report; one that has to end within seconds is neither
+    checked nor drawn. Raises TaichiMRFError.
     """
     with output_folder(task.out):
         start = time.perf_counter()
@@ -144,17 +146,20 @@ def map_to_folder(
                 every=task.every,
                 limit=task.limit,
                 skip_bad_frames=task.skip_bad_frames,
-                should_stop=should_stop,
+                should_stop=request,
+                out_of_time=request.out_of_time,
                 resume_from=previous,
                 keep=Keeper(task.out, settings, task.keep_every, report_so_far),
             )
             result.seconds = {"opening": opening, **result.seconds}
             posed = dataset if result.track is None else reposed(dataset, result.track.poses(result.map))
-            check = _check(result, posed, progress)
+            check = _check(result, posed, progress, request)
             written = _write_map(task.out, result, settings, progress)
+            report = run_report(result, dataset, task.source, check)
             if task.pictures:
-                written += _write_pictures(task.out, result, posed, progress)
-        report = run_report(result, dataset, task.source, check)
+                written += _write_pictures(task.out, result, posed, progress, request)
+        # Computed before the pictures, which may be left half-way through a kernel's launch.
+        report |= {"seconds": rounded(result.seconds), "peak_memory_mb": peak_memory_mb()}
         report["notes"] += [str(warning.message) for warning in warned]
         report["skipped_frames"] = skipped | report["skipped_frames"]
         report |= task.choice()
@@ -171,16 +176,23 @@ def _collected_warnings() -> Iterator[list[warnings.WarningMessage]]:
         yield warned
 
 
-def _check(result: MappingResult, dataset: Dataset, progress: ProgressBar) -> HeldOutCheck | None:
-    if not result.held_out:
+def _check(
+    result: MappingResult, dataset: Dataset, progress: ProgressBar, request: StopRequest
+) -> HeldOutCheck | None:
+    """None if no frame was held out, or if the run has to end before the check does."""
+    if not result.held_out or request.hurried:
         return None
-    with result.timed("checking"):
-        check = check_held_out(
-            result.map,
-            dataset,
-            result.held_out,
-            lambda number: progress.advance("Checking", number, len(result.held_out)),
-        )
+
+    def checked(number: int) -> None:
+        if request.hurried:
+            raise CutShortError
+        progress.advance("Checking", number, len(result.held_out))
+
+    try:
+        with result.timed("checking"):
+            check = check_held_out(result.map, dataset, result.held_out, checked)
+    except CutShortError:
+        return None
     result.skipped.update(check.skipped)
     return check
 
@@ -203,12 +215,16 @@ def _write_map(folder: Path, result: MappingResult, settings: Config, progress: 
 
 
 def _write_pictures(
-    folder: Path, result: MappingResult, dataset: Dataset, progress: ProgressBar
+    folder: Path, result: MappingResult, dataset: Dataset, progress: ProgressBar, request: StopRequest
 ) -> list[Path]:
+    """The pictures, or none if the run has to end before they are drawn: all else is written by then."""
     progress.advance("Drawing", 0, 1)
-    with result.timed("pictures"):
-        frames = _readable(dataset, _spread(result.held_out, _PICTURED_FRAMES))
-        pictures = write_pictures(folder, result.map, frames)
+    try:
+        with result.timed("pictures"), request.cutting_short():
+            frames = _readable(dataset, _spread(result.held_out, _PICTURED_FRAMES))
+            pictures = write_pictures(folder, result.map, frames)
+    except CutShortError:
+        return []
     progress.advance("Drawing", 1, 1)
     return pictures
 

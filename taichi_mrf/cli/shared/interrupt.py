@@ -20,6 +20,10 @@ INFER_SECONDS = 3.0
 _HANG_UP = getattr(signal, "SIGHUP", None)  # not on Windows
 
 
+class CutShortError(Exception):
+    """The run has to end within seconds, and this part of it is left out."""
+
+
 class StopRequest:
     """Whether the run was asked to stop, and how; an instance is called to ask."""
 
@@ -29,6 +33,7 @@ class StopRequest:
         self.aborted = False
         """Whether the user wants the run to end at once, without its results."""
         self._hurried_at: float | None = None
+        self._cuts_short = False
 
     def __call__(self) -> bool:
         return self.signal is not None
@@ -42,6 +47,18 @@ class StopRequest:
         """Whether computing has to end now, so that there is time to save."""
         return self._hurried_at is not None and time.monotonic() - self._hurried_at > INFER_SECONDS
 
+    @contextmanager
+    def cutting_short(self) -> Iterator[None]:
+        """For a block that may be left at any point: CutShortError is raised in it as soon as the run has to
+        end within seconds."""
+        self._cuts_short = True
+        try:
+            if self.hurried:
+                raise CutShortError
+            yield
+        finally:
+            self._cuts_short = False
+
     def take(self, number: int) -> bool:
         """Note a signal; returns whether it is news. Raises KeyboardInterrupt if it means to abort."""
         if number == _HANG_UP:
@@ -53,6 +70,9 @@ class StopRequest:
             raise KeyboardInterrupt
         if hurries and not self.hurried:
             self._hurried_at = time.monotonic()
+            if self._cuts_short:
+                self.signal = self.signal or number
+                raise CutShortError
         if self.signal is not None:
             return False
         self.signal = number
