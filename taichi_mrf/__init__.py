@@ -5,13 +5,13 @@ command line can print its help without starting Taichi.
 """
 
 import importlib
-import os
 from typing import Any
+
+from taichi_mrf.system import taichi_environment
 
 __version__ = "0.1.0"
 
-# Taichi prints a banner when it is imported, whoever imports it.
-os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+taichi_environment.prepare()
 
 _PUBLIC = {
     "init": "taichi_mrf.system.runtime",

@@ -24,13 +24,14 @@ from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config
 from taichi_mrf.system import runtime
+from taichi_mrf.system.owner import Owned, owned_attribute
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import create_topology, recycle
 
 MapT = TypeVar("MapT", bound="BrickMap")
 
 
-class BrickMap:
+class BrickMap(Owned):
     """An empty map of bricks that answers queries; a method's map subclasses it and says how to fill it.
 
     ``config`` is the whole configuration that the map was made with, ``view`` follows rays through the map.
@@ -38,6 +39,8 @@ class BrickMap:
 
     METHOD: ClassVar[Method]
     """The entry of the map's method."""
+
+    view: View = owned_attribute()
 
     def _set_up(self, config: Config, noise: NoiseModel | None) -> None:
         """Make the empty map of a whole configuration, which describes the noise unless it is given. Every

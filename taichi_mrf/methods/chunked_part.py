@@ -14,6 +14,7 @@ from taichi_mrf.queries.known_bricks import Placed
 from taichi_mrf.queries.points import checked_points
 from taichi_mrf.queries.view import View
 from taichi_mrf.system import runtime
+from taichi_mrf.system.owner import owned_attribute
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 
@@ -26,7 +27,7 @@ class MapPart:
     source: ChunkedMap
     lowest: NDArray[np.int64]
     after: NDArray[np.int64]
-    view: View
+    view: View = owned_attribute()  # noqa: RUF009, a descriptor and no default
     keyframes: Mapping[int, Placed] = field(default_factory=dict)
     voxel_size: float = field(init=False)
 

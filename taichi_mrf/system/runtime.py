@@ -11,14 +11,14 @@ import logging
 import os
 import platform
 import sys
-import warnings
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import taichi_mrf
 from taichi_mrf.errors import BackendError
-from taichi_mrf.system import devices
+from taichi_mrf.system import devices, owner, taichi_environment
 
 BACKENDS = ("cuda", "vulkan", "cpu")
 """In the order in which "auto" tries them."""
@@ -56,6 +56,7 @@ class BackendStatus:
 
 
 _chosen: Backend | None = None
+_starting = threading.Lock()
 _log = logging.getLogger(__name__)
 
 
@@ -65,21 +66,25 @@ def init(arch: str = "auto", threads: int = 0, debug: bool = False, profile: boo
     ``arch`` is "cuda", "vulkan", "cpu", or "auto" for the first of these that there is. A software
     Vulkan device is taken only for arch="vulkan". ``threads`` limits the CPU backend (0 = all cores),
     ``debug`` checks array bounds, ``profile`` lets Taichi time each kernel (experiments/speed/profile.py).
-    Once Taichi runs, "auto" or the same arch change nothing.
+    Once Taichi runs, "auto" or the same arch change nothing. The calling thread becomes the owner of
+    Taichi: maps can be used in no other thread (system/owner.py).
 
-    Raises BackendError if the wanted backend is not to be had or another one already runs; there is no
-    fallback from a backend that was asked for.
+    Raises BackendError if the requested backend is not available or another one already runs, and in another
+    thread or a forked process. A backend that was asked for is never replaced by another one.
     """
     global _chosen
     if arch not in ("auto", *BACKENDS):
         raise BackendError(f"unknown backend '{arch}'; known are auto, {', '.join(BACKENDS)}")
-    _chosen = _chosen or _already_running()
-    if _chosen is None:
-        _chosen = _started(arch, threads, debug, profile)
-        _log.info("Taichi runs on %s (%s), %s", _chosen.name, _chosen.device, _chosen.reason)
-        for name, why in _chosen.rejected.items():
-            _log.info("Taichi does not run on %s: %s", name, why)
-    elif arch not in ("auto", _chosen.name):
+    with _starting:
+        if _chosen is not None:
+            owner.check_owner()
+        else:
+            _chosen = _already_running() or _started(arch, threads, debug, profile)
+            owner.claim()
+            _log.info("Taichi runs on %s (%s), %s", _chosen.name, _chosen.device, _chosen.reason)
+            for name, why in _chosen.rejected.items():
+                _log.info("Taichi does not run on %s: %s", name, why)
+    if arch not in ("auto", _chosen.name):
         raise BackendError(
             f"Taichi already runs on {_chosen.name}: a process has one backend, {arch} needs another process"
         )
@@ -135,7 +140,11 @@ def versions() -> dict[str, str]:
 
 
 def _started(arch: str, threads: int, debug: bool, profile: bool) -> Backend:
-    """Start the wanted backend, or for "auto" the first that starts."""
+    """Start the requested backend, or for "auto" the first that starts."""
+    if problem := taichi_environment.cache_problem():
+        raise BackendError(problem)
+    if taichi_environment.cache_note:
+        _log.warning("%s", taichi_environment.cache_note)
     rejected: dict[str, str] = {}
     for name in BACKENDS if arch == "auto" else (arch,):
         try:
@@ -197,11 +206,8 @@ def _already_running() -> Backend | None:
 
 
 def _quiet_taichi() -> Any:
-    """Taichi, imported without its banner and its warnings about Python's own deprecations."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        taichi = importlib.import_module("taichi")
-    warnings.filterwarnings("ignore", category=DeprecationWarning, module="taichi")
+    """Taichi, told to log errors only."""
+    taichi = importlib.import_module("taichi")
     taichi.set_logging_level(taichi.ERROR)
     return taichi
 

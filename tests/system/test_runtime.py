@@ -3,11 +3,8 @@
 A process can start Taichi once, so that most of these tests run a program of their own.
 """
 
-import os
-import subprocess
-import sys
-
 import pytest
+from new_interpreter import output
 
 from taichi_mrf.errors import BackendError
 from taichi_mrf.system import devices, runtime
@@ -16,21 +13,6 @@ from taichi_mrf.system.devices import VulkanDevice
 LAVAPIPE = VulkanDevice(0, "llvmpipe", "software")
 LAPTOP = VulkanDevice(1, "Laptop Graphics", "integrated GPU")
 WORKSTATION = VulkanDevice(2, "Workstation Graphics", "discrete GPU")
-
-
-def python(program: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run a program in a new interpreter."""
-    environment = {**os.environ, **environment}
-    return subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False, env=environment
-    )
-
-
-def output(program: str, **environment: str) -> str:
-    done = python(program, **environment)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    return done.stdout.strip()
 
 
 @pytest.fixture

@@ -1,0 +1,80 @@
+"""The environment that Taichi needs before it is loaded: no banner, and a writable cache folder.
+
+Taichi 1.7.4 aborts on import if neither HOME nor XDG_CACHE_HOME is set, and ends in a segmentation fault if
+its cache cannot be written, even when the cache is switched off (TI_OFFLINE_CACHE=0).
+"""
+
+import contextlib
+import os
+import stat
+import warnings
+
+_CACHE = "TI_OFFLINE_CACHE_FILE_PATH"
+_BASE = "XDG_CACHE_HOME"
+
+cache_note: str | None = None
+"""Why Taichi's compiled kernels are not in the usual folder, and where they are."""
+
+
+def prepare() -> None:
+    """Set what has to be set before Taichi is imported, whoever imports it."""
+    os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+    warnings.filterwarnings("ignore", category=DeprecationWarning, module=r"taichi(\.|$)")
+    if os.name != "nt":  # on Windows Taichi needs no variable
+        _choose_cache()
+
+
+def cache_folder() -> str | None:
+    """The folder of compiled kernels that the environment names, None if it names none."""
+    if chosen := os.environ.get(_CACHE):
+        return chosen
+    base = os.environ.get(_BASE) or (os.path.join(home, ".cache") if (home := os.environ.get("HOME")) else "")
+    return os.path.join(base, "taichi", "ticache") if base else None
+
+
+def cache_problem() -> str | None:
+    """Why Taichi must not be started, if its cache has no folder that can be written to."""
+    folder = cache_folder()
+    if os.name == "nt" or (folder is not None and _is_writable(folder)):
+        return None
+    return f"no folder can be written to for Taichi's compiled kernels: set {_CACHE}"
+
+
+def _choose_cache() -> None:
+    """Where the usual folder cannot be used, take a private one among the temporary files."""
+    global cache_note
+    usual = cache_folder()
+    if usual is None or not _is_writable(usual):
+        chosen = _private_folder()
+        why = "HOME is not set" if usual is None else f"{usual} cannot be written to"
+        if chosen is not None:
+            cache_note = f"{why}: Taichi keeps its compiled kernels in {chosen}"
+            os.environ[_CACHE] = chosen
+    if not os.environ.get(_BASE) and (_BASE in os.environ or not os.environ.get("HOME")):
+        # Taichi takes an empty name for the root of the file system, and aborts without any.
+        home = os.environ.get("HOME")
+        os.environ[_BASE] = os.path.join(home, ".cache") if home else os.environ.get(_CACHE) or os.devnull
+
+
+def _is_writable(folder: str) -> bool:
+    """Whether a folder can be written to, or made."""
+    path = os.path.abspath(folder)
+    while not os.path.lexists(path):
+        path = os.path.dirname(path)
+    return os.path.isdir(path) and os.access(path, os.W_OK | os.X_OK)
+
+
+def _private_folder() -> str | None:
+    """A folder that no other user can write to: the kernels in it are run. None if none can be made."""
+    import tempfile  # rarely needed, and slow to import
+
+    try:
+        folder = os.path.join(tempfile.gettempdir(), f"taichi-mrf-{os.getuid()}")
+        with contextlib.suppress(FileExistsError):
+            os.mkdir(folder, 0o700)
+        found = os.lstat(folder)
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022:
+            return folder
+        return tempfile.mkdtemp(prefix="taichi-mrf-")
+    except OSError:
+        return None
