@@ -35,6 +35,8 @@ class Command:
     options: type[Any]
     function: str
     parameters: Callable[[Sequence[str]], Any] | None = None
+    brief: tuple[str, ...] = ()
+    """The flags that --help explains; --help-all explains all. If it is empty, --help does so too."""
 
     def defaults(self, arguments: Sequence[str]) -> Any:
         """The options before any flag; what the user must give is tyro.MISSING.
@@ -47,7 +49,7 @@ class Command:
             if field.default is field.default_factory is MISSING
         }
         if self.parameters is None:
-            return self.options() if not required else tyro.MISSING_NONPROP
+            return tyro.MISSING_NONPROP if required else self.options()
         return self.options(**required, settings=self.parameters(arguments))
 
     def run(self, options: Any) -> int:
@@ -57,15 +59,31 @@ class Command:
         return function(options)
 
 
+_COMMON = ("out", "voxel-size", "method", "config", "every", "limit")
+_MAP_FLAGS = (*_COMMON, "resume", "jobs", "pictures", "track-poses")
+_LIVE_FLAGS = (*_COMMON, "speed", "track-poses", "port", "open")
+_TUNE_FLAGS = ("out", "voxel-size", "config", "frames", "first", "stride", "auto", "search", "port", "open")
+_BENCH_FLAGS = (
+    "voxel-sizes",
+    "frames",
+    "octomap",
+    "profile",
+    "growth",
+    "viewer",
+    "json",
+    "plot",
+    "runtime.arch",
+)
+
 COMMANDS = {
-    "map": Command(Map, "taichi_mrf.cli.map.command:run", mapping_parameters),
-    "live": Command(Live, "taichi_mrf.cli.live:run_live", mapping_parameters),
-    "tune": Command(Tune, "taichi_mrf.cli.tune:run_tune", mapping_parameters),
+    "map": Command(Map, "taichi_mrf.cli.map.command:run", mapping_parameters, _MAP_FLAGS),
+    "live": Command(Live, "taichi_mrf.cli.live:run_live", mapping_parameters, _LIVE_FLAGS),
+    "tune": Command(Tune, "taichi_mrf.cli.tune:run_tune", mapping_parameters, _TUNE_FLAGS),
     "export": Command(Export, "taichi_mrf.cli.export:run_export"),
     "import": Command(Import, "taichi_mrf.cli.import_map:run_import"),
     "diff": Command(Diff, "taichi_mrf.cli.diff:run_diff"),
     "info": Command(Info, "taichi_mrf.cli.info:run_info"),
-    "bench": Command(Bench, "taichi_mrf.cli.bench.run:run_bench"),
+    "bench": Command(Bench, "taichi_mrf.cli.bench.run:run_bench", None, _BENCH_FLAGS),
     "calibrate": Command(Calibrate, "taichi_mrf.cli.calibrate:run_calibrate"),
     "eval": Command(Eval, "taichi_mrf.cli.eval:run_eval"),
     "laser": Command(Laser, "taichi_mrf.cli.laser.run:run_laser", laser_parameters),

@@ -3,6 +3,7 @@
 import inspect
 import sys
 from collections.abc import Sequence
+from difflib import get_close_matches
 from functools import reduce
 from operator import or_
 from typing import Annotated, Any
@@ -10,13 +11,14 @@ from typing import Annotated, Any
 import tyro
 
 from taichi_mrf.cli.commands import COMMANDS, Command
+from taichi_mrf.cli.flag_list import brief_help, flags_of
 from taichi_mrf.cli.shared.flags import registry
 from taichi_mrf.config.values import nearest
 from taichi_mrf.errors import ConfigError
 
 PROGRAM = "taichi-mrf"
 
-_HELP = ("-h", "--help")
+_HELP, _HELP_ALL = ("-h", "--help"), "--help-all"
 _ABOUT = "Probabilistic occupancy maps from depth cameras."
 _COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
 
@@ -38,16 +40,33 @@ def parse(arguments: Sequence[str]) -> tuple[Command, Any]:
     name, *rest = arguments
     if name not in COMMANDS:
         raise ConfigError(f"unknown command '{name}'; {nearest(name, list(COMMANDS))}")
-    command = COMMANDS[name]
+    command, program = COMMANDS[name], f"{PROGRAM} {name}"
+    if command.brief and {*_HELP} & set(rest):
+        print(brief_help(program, command.options, command.brief))
+        raise SystemExit(0)
+    rest = ["--help" if word == _HELP_ALL else word for word in rest]
     wants_help = bool({*_HELP} & set(rest))
+    if not wants_help:
+        _refuse_unknown_flags(program, command, rest)
     options = tyro.cli(
         command.options,
-        prog=f"{PROGRAM} {name}",
+        prog=program,
         args=rest,
         default=command.defaults([] if wants_help else rest),
         registry=registry,
     )
     return command, options
+
+
+def _refuse_unknown_flags(program: str, command: Command, arguments: Sequence[str]) -> None:
+    """Raise ConfigError for a flag that the command does not have; the text names the nearest that it has."""
+    known = [name for flag in flags_of(command.options) for name in (flag.name, flag.negative) if name]
+    for word in arguments:
+        flag = word.partition("=")[0].replace("_", "-")
+        if flag.startswith("--") and flag not in known:
+            near = get_close_matches(flag, known, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"'{program} {_HELP_ALL}' explains all flags"
+            raise ConfigError(f"{program.removeprefix(PROGRAM).strip()}: unknown flag {flag}; {hint}")
 
 
 def overview() -> str:
