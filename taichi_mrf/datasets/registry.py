@@ -6,10 +6,12 @@ first entry that recognises a folder or a file opens it.
 
 import difflib
 import re
+import shlex
 from pathlib import Path
 
 from taichi_mrf.datasets.base import BuiltIn, Dataset, Format
 from taichi_mrf.datasets.formats import frames_npz, numbered_depth, replica, scannet, seven_scenes, tum_rgbd
+from taichi_mrf.datasets.laser.readers import holds_scans
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.realsense import device
 from taichi_mrf.datasets.resampled import resampled
@@ -136,6 +138,11 @@ def _open_path(source: str, options: ReadOptions) -> Dataset:
 
 def _not_recognised(path: Path) -> str:
     """Why a path cannot be opened, and what to do."""
+    if holds_scans(path):
+        return (
+            f"{path}: contains scans of a 2D laser scanner, not depth images; "
+            f"map them with: taichi-mrf laser {shlex.quote(str(path))} --out DIR"
+        )
     looked_for = "; ".join(f"{each.name}: {each.looks_for}" for each in FORMATS)
     if path.is_file():
         return (

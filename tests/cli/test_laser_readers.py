@@ -47,7 +47,8 @@ def test_a_log_is_read_back(
     assert read.pose_x_y_theta.tolist() == [list(pose) for _, pose in scans]
     assert read.hit.tolist() == [[r < 49.5 for r in ranges] for ranges, _ in scans]
     assert not read.no_return_is_free
-    assert read.notes == ()
+    (note,) = read.notes
+    assert note.startswith("no return: ranges of 49.50 m and more")
 
 
 @pytest.mark.parametrize(
@@ -89,6 +90,55 @@ def test_the_newer_line_says_where_its_beams_go(
     assert read.angle_rad == pytest.approx(start + step * np.arange(len(ranges)))
     limit = np.float32(min(max_range, 49.5))
     assert read.hit.tolist() == [[bool(np.float32(r) < limit) for r in ranges]]
+
+
+def corridor_log(path: Path, nothing_m: float, scans: int = 60) -> Path:
+    """A robot that drives along a corridor: walls at the sides, nothing straight ahead."""
+    lines = []
+    for scan in range(scans):
+        side = 2.0 + 0.01 * (scan % 7)
+        ahead = [min(30.0, 25.0 - 0.1 * scan) if scan % 2 else nothing_m, nothing_m]
+        lines.append(flaser([side, 2 * side, *ahead, 2.1 * side, side], (0.1 * scan, 0.0, 0.0)))
+    path.write_text("\n".join(lines))
+    return path
+
+
+@pytest.mark.parametrize("nothing_m", [8.0, 32.77, 50.0, 81.83])
+def test_the_range_that_means_no_return_is_found(tmp_path: Path, nothing_m: float) -> None:
+    read = open_scans(corridor_log(tmp_path / "walk.log", nothing_m))
+    if nothing_m < 25:  # real surfaces lie beyond: the peak is not at the end of what is measured
+        assert "49.50 m and more" in read.notes[0]
+        return
+    assert (read.range_m[~read.hit] == np.float32(nothing_m)).all()
+    assert (~read.hit).sum() == (read.range_m == np.float32(nothing_m)).sum() == 90
+    assert "25.00% of the beams (found in the log" in read.notes[0]
+
+
+def test_the_range_that_means_no_return_can_be_given(tmp_path: Path) -> None:
+    path = corridor_log(tmp_path / "walk.log", 8.0)
+    read = open_scans(path, no_return_m=8.0)
+    assert read.hit.tolist() == (read.range_m < 8).tolist()
+    assert read.notes[0].startswith("no return: ranges of 8.00 m and more")
+    assert read.notes[0].endswith("(set by --no-return-range)")
+
+
+def test_a_robot_that_stands_before_a_wall_measures_the_wall(tmp_path: Path) -> None:
+    path = tmp_path / "still.log"
+    path.write_text("\n".join([flaser([2.0, 30.0, 30.0, 2.0], (0, 0, 0))] * 100))
+    assert open_scans(path).hit.all()
+
+
+def test_an_npz_file_without_hits_is_doubted(tmp_path: Path) -> None:
+    log = open_scans(corridor_log(tmp_path / "walk.log", 32.77))
+    changes = {
+        "range_m": log.range_m,
+        "angle_rad": log.angle_rad,
+        "pose_x_y_theta": log.pose_x_y_theta,
+        "hit": np.ones_like(log.hit),
+    }
+    path = write_npz(tmp_path / "scans.npz", **changes)
+    assert "25.00% of the beams have ranges of 32.6" in open_scans(path).notes[0]
+    np.testing.assert_array_equal(open_scans(path, no_return_m=32.0).hit, log.hit)
 
 
 GOOD = flaser([1.0, 2.0, 3.0], (0.5, 0.25, 0.125))
@@ -245,7 +295,7 @@ def test_a_truncated_npz_file_is_named(tmp_path: Path, kept: int) -> None:
 
 
 def test_sources_that_do_not_exist_are_named(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match=r"nowhere\.log: there is no such file"):
+    with pytest.raises(DatasetError, match=r"nowhere\.log: no such file"):
         open_scans(tmp_path / "nowhere.log")
     with pytest.raises(DatasetError, match=r"holds no scans\.npz"):
         open_scans(tmp_path)
@@ -269,4 +319,6 @@ def test_the_real_recordings_are_read(shared_data: Path, place: str, scans: int,
     assert read.angle_rad[0] == pytest.approx(-math.pi / 2)
     assert 0.9 < read.hit.mean() < 1
     assert read.range_m[read.hit].max() < 49.5
-    assert read.notes == ()
+    assert [note.startswith("no return: ranges of 81.") for note in read.notes] == [True] * (
+        "carmen" in place
+    )

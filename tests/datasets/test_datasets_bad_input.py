@@ -1,5 +1,6 @@
 """What is wrong with a source or a frame is said in one line that names it; other frames stay readable."""
 
+import gzip
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from datasets_recordings import (
     write_seven_scenes,
     write_tum,
 )
+from laser_logs import write_npz
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import DatasetError, FrameError
@@ -60,6 +62,20 @@ def test_a_file_in_place_of_a_folder(folder: Path) -> None:
     text = refused(folder / "camera.txt")
     assert str(folder / "camera.txt") in text
     assert "unsupported file type; for a recording of many files pass its folder" in text
+
+
+@pytest.mark.parametrize("name", ["walk.log", "walk.log.gz", "scans.npz", "folder"])
+def test_laser_scans_name_the_command_that_maps_them(tmp_path: Path, name: str) -> None:
+    line = b"PARAM laser 1\nFLASER 3 1.0 2.0 3.0 0 0 0 0 0 0 1.5 host 1.5\n"
+    path = tmp_path / name
+    if name.endswith(".npz"):
+        write_npz(path)
+    elif name == "folder":
+        path.mkdir()
+        write_npz(path / "scans.npz")
+    else:
+        path.write_bytes(gzip.compress(line) if name.endswith("gz") else line)
+    assert f"taichi-mrf laser {path} --out DIR" in refused(path)
 
 
 def test_a_folder_of_recordings_names_them(folder: Path) -> None:

@@ -48,7 +48,12 @@ def run_laser(options: Laser) -> int:
     ):
         seconds: dict[str, float] = {}
         with _timed(seconds, "reading"):
-            scans = _some(open_scans(options.scans, skip_bad_scans=options.skip_bad_scans), options)
+            read = open_scans(
+                options.scans,
+                skip_bad_scans=options.skip_bad_scans,
+                no_return_m=options.no_return_range,
+            )
+            scans = _some(read, options)
             registration = _floor_plan(options, scans)
             beams = beams_of(scans, options.settings.max_range, _NO_RETURN_IS_FREE[options.no_returns])
             if len(beams) == 0:

@@ -56,6 +56,10 @@ class Laser:
     """What a beam that did not come back says: that its way is free, or nothing (ignore). auto ignores those
     of CARMEN logs, most of which met glass or something dark, and believes the others."""
 
+    no_return_range: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
+    """Beams of at least this range did not come back. Without it the range is found in a CARMEN log, where it
+    stands out, and an npz file says it itself."""
+
     memory_limit_gb: float = 0.0
     """Most memory for the factor graph in GB; 0 means what the machine has free."""
 
@@ -73,6 +77,8 @@ class Laser:
             value = getattr(self, name)
             if isinstance(value, int) and value < 1:
                 raise ConfigError(f"--{name} must be at least 1, not {value}")
+        if self.no_return_range is not None and not 0 < self.no_return_range < math.inf:
+            raise ConfigError(f"--no-return-range must be a positive number, not {self.no_return_range}")
         if not 0 <= self.memory_limit_gb < math.inf:
             raise ConfigError(f"--memory-limit-gb must be 0 or a positive number, not {self.memory_limit_gb}")
         if (self.truth is None) != (self.truth_size is None):

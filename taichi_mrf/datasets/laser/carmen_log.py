@@ -18,14 +18,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.laser.no_return import DEFAULT_M, find_no_return_m
 from taichi_mrf.datasets.laser.scans import LaserScans, problem_of_scan, skipped_note
 from taichi_mrf.errors import DatasetError, said
 
-NO_RETURN_M = 49.5
-"""A scanner that saw nothing reports its greatest range, about 50 m or 81.9 m. Indoors, where such logs come
-from, nothing is measured as far away as that."""
-
-_GZIP_MAGIC = b"\x1f\x8b"
+GZIP_MAGIC = b"\x1f\x8b"
+SCAN_LINES = (b"FLASER", b"RLASER", b"ROBOTLASER1")
 _OLD, _NEW = ("FLASER", "RLASER"), "ROBOTLASER1"
 
 
@@ -34,18 +32,23 @@ class _Scan:
     range_m: NDArray[np.float64]
     pose_x_y_theta: NDArray[np.float64]
     angle_rad: NDArray[np.float64]
-    no_return_m: float
+    greatest_range_m: float
+    """The scanner's own, infinity where the log does not give it."""
 
 
 class _BadLineError(Exception):
     """What is wrong with a line, without its place."""
 
 
-def read_carmen_log(path: Path, *, skip_bad_scans: bool = False) -> LaserScans:
+def read_carmen_log(
+    path: Path, *, skip_bad_scans: bool = False, no_return_m: float | None = None
+) -> LaserScans:
     """Read all scans of a log. Raises DatasetError, which names the file and the line.
 
-    Beams that did not come back say nothing (``no_return_is_free`` is False): in the logs that this was
-    measured on, 59% (Intel) and 95% (Freiburg 079) of them would go through a wall within 5 m.
+    A beam of at least ``no_return_m`` metres has no return. Without it the range is found in the log
+    (no_return.py); a line of ROBOTLASER1 also gives the scanner's greatest range. Beams without a return
+    carry no evidence (``no_return_is_free`` is False): in the logs that this was measured on, 59% (Intel) and
+    95% (Freiburg 079) of them would go through a wall within 5 m.
     """
     scans: list[_Scan] = []
     problems: list[str] = []
@@ -71,16 +74,31 @@ def read_carmen_log(path: Path, *, skip_bad_scans: bool = False) -> LaserScans:
             problems[0] if problems else f"{path}: holds no scans, which are lines of {wanted}"
         )
     range_m = np.stack([scan.range_m for scan in scans]).astype(np.float32)
-    limit = np.array([scan.no_return_m for scan in scans], dtype=np.float32)
+    pose = np.stack([scan.pose_x_y_theta for scan in scans])
+    found_m = find_no_return_m(range_m, pose) if no_return_m is None else None
+    least_m = next(each for each in (no_return_m, found_m, DEFAULT_M) if each is not None)
+    greatest_m = np.array([math.inf if no_return_m else scan.greatest_range_m for scan in scans])
+    hit = range_m < np.minimum(greatest_m, least_m).astype(np.float32)[:, None]
     return LaserScans(
         name=path.name.split(".")[0],
         range_m=range_m,
         angle_rad=scans[0].angle_rad,
-        pose_x_y_theta=np.stack([scan.pose_x_y_theta for scan in scans]),
-        hit=range_m < limit[:, None],
+        pose_x_y_theta=pose,
+        hit=hit,
         no_return_is_free=False,
-        notes=skipped_note(problems),
+        notes=(*skipped_note(problems), _no_return_note(hit, least_m, found_m, no_return_m)),
     )
+
+
+def _no_return_note(
+    hit: NDArray[np.bool_], least_m: float, found_m: float | None, given_m: float | None
+) -> str:
+    why = "set by --no-return-range"
+    if given_m is None:
+        why = "found in the log, where so many beams have this range that it can be no surface"
+        if found_m is None:
+            why = "assumed, since no range stands out in the log; --no-return-range sets another"
+    return f"no return: ranges of {least_m:.2f} m and more, {(~hit).mean():.2%} of the beams ({why})"
 
 
 def field_of_view_angles(beams: int) -> NDArray[np.float64]:
@@ -96,11 +114,11 @@ def field_of_view_angles(beams: int) -> NDArray[np.float64]:
 def _scan_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """The lines that are scans, in words, with their numbers from 1 on."""
     with open(path, "rb") as raw:
-        packed = raw.read(len(_GZIP_MAGIC)) == _GZIP_MAGIC
+        packed = raw.read(len(GZIP_MAGIC)) == GZIP_MAGIC
     with gzip.open(path, "rb") if packed else open(path, "rb") as file:
         for number, line in enumerate(file, start=1):
             # Cheaper than splitting the odometry, which is most of the lines.
-            if line.lstrip().startswith((b"FLASER", b"RLASER", b"ROBOTLASER1")):
+            if line.lstrip().startswith(SCAN_LINES):
                 words = line.decode("ascii", errors="replace").split()
                 if words[0] in _OLD or words[0] == _NEW:
                     yield number, words
@@ -109,7 +127,7 @@ def _scan_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
 def _laser(words: list[str]) -> _Scan:
     count = _count(words, 1, "ranges")
     range_m, pose = _numbers(words, 2, count, "ranges"), _pose(words, 2 + count)
-    return _Scan(range_m, pose, field_of_view_angles(count), NO_RETURN_M)
+    return _Scan(range_m, pose, field_of_view_angles(count), math.inf)
 
 
 def _robotlaser(words: list[str]) -> _Scan:
@@ -120,7 +138,7 @@ def _robotlaser(words: list[str]) -> _Scan:
     pose = _pose(words, 10 + count + remissions)
     if not (math.isfinite(start) and math.isfinite(step) and max_range > 0):
         raise _BadLineError("the scanner's start angle, step or greatest range is not a usable number")
-    return _Scan(range_m, pose, start + step * np.arange(count), min(max_range, NO_RETURN_M))
+    return _Scan(range_m, pose, start + step * np.arange(count), max_range)
 
 
 def _count(words: list[str], at: int, what: str) -> int:

@@ -1,21 +1,28 @@
 """Which reader opens a source of 2D laser scans: a file is recognised by its first bytes."""
 
+import gzip
 import re
+import zlib
 from pathlib import Path
 
 from taichi_mrf.datasets.laser import carmen_log, floor_plan_scans, scan_npz
 from taichi_mrf.datasets.laser.scans import LaserScans
 from taichi_mrf.errors import DatasetError
 
-__all__ = ["LaserScans", "open_scans"]
+__all__ = ["LaserScans", "holds_scans", "open_scans"]
+
+_LOOKED_AT_BYTES = 1 << 16
 
 
-def open_scans(source: str | Path, *, skip_bad_scans: bool = False) -> LaserScans:
+def open_scans(
+    source: str | Path, *, skip_bad_scans: bool = False, no_return_m: float | None = None
+) -> LaserScans:
     """Read a CARMEN log (plain or gzip), an npz file or a folder that holds ``scans.npz``, or make the
     scans of a built-in source such as ``synthetic:floor-plan?scans=200``.
 
-    Raises DatasetError, whose text names the file and the line or the scan, for whatever cannot be read and
-    for beams with a NaN, negative or infinite range. With ``skip_bad_scans`` broken scans are left out and
+    Beams of at least ``no_return_m`` metres have no return; None leaves it to the reader. Raises
+    DatasetError, which names the file and the line or the scan, if something cannot be read, and for beams
+    with a NaN, negative or infinite range. With ``skip_bad_scans`` broken scans are left out and
     counted in the notes, as long as one is left.
     """
     path = Path(source)
@@ -24,14 +31,32 @@ def open_scans(source: str | Path, *, skip_bad_scans: bool = False) -> LaserScan
     if path.is_dir():
         path = path / scan_npz.FILE_NAME
         if not path.exists():
-            raise DatasetError(f"{source}: the folder holds no {scan_npz.FILE_NAME}; a log is named itself")
+            raise DatasetError(f"{source}: the folder holds no {scan_npz.FILE_NAME}; pass a log by its name")
     if not path.exists():
         raise DatasetError(
-            f"{source}: there is no such file, nor built-in scans of that name ({floor_plan_scans.NAME})"
+            f"{source}: no such file, and no built-in scans of that name ({floor_plan_scans.NAME})"
         )
     try:
         if scan_npz.recognises(path):
-            return scan_npz.read_scan_npz(path, skip_bad_scans=skip_bad_scans)
-        return carmen_log.read_carmen_log(path, skip_bad_scans=skip_bad_scans)
+            return scan_npz.read_scan_npz(path, skip_bad_scans=skip_bad_scans, no_return_m=no_return_m)
+        return carmen_log.read_carmen_log(path, skip_bad_scans=skip_bad_scans, no_return_m=no_return_m)
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def holds_scans(path: Path) -> bool:
+    """Whether a file, or a folder with ``scans.npz``, holds 2D laser scans, whatever state they are in."""
+    if path.is_dir():
+        path = path / scan_npz.FILE_NAME
+    if not path.is_file():
+        return False
+    if path.suffix == ".npz":
+        return scan_npz.holds_ranges(path)
+    try:
+        with open(path, "rb") as file:
+            head = file.read(_LOOKED_AT_BYTES)
+        if head[:2] == carmen_log.GZIP_MAGIC:
+            head = zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(head, _LOOKED_AT_BYTES)
+    except (OSError, zlib.error, gzip.BadGzipFile):
+        return False
+    return any(line.lstrip().startswith(carmen_log.SCAN_LINES) for line in head.splitlines())

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.laser.no_return import find_no_return_m
 from taichi_mrf.datasets.laser.scans import LaserScans, problem_of_scan, skipped_note
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.system.npz_file import open_npz
@@ -22,8 +23,20 @@ def recognises(path: Path) -> bool:
         return file.read(len(_ZIP_MAGIC)) == _ZIP_MAGIC or path.suffix == ".npz"
 
 
-def read_scan_npz(path: Path, *, skip_bad_scans: bool = False) -> LaserScans:
-    """Read a file of scans; ``hit`` is 0 where nothing came back. Raises DatasetError."""
+def holds_ranges(path: Path) -> bool:
+    """Whether an npz file has an array of ranges, whatever state the others are in."""
+    try:
+        with open_npz(path, DatasetError, "an npz file that can be read") as file:
+            return "range_m" in file
+    except DatasetError:
+        return False
+
+
+def read_scan_npz(
+    path: Path, *, skip_bad_scans: bool = False, no_return_m: float | None = None
+) -> LaserScans:
+    """Read a file of scans; ``hit`` is 0 where nothing came back, and so are ranges of at least
+    ``no_return_m`` metres. Raises DatasetError."""
     arrays = _arrays(path)
     range_m = arrays["range_m"].astype(np.float32)
     pose = arrays["pose_x_y_theta"].astype(np.float64)
@@ -40,13 +53,23 @@ def read_scan_npz(path: Path, *, skip_bad_scans: bool = False) -> LaserScans:
         problems.append(problem)
     if not keep.any():
         raise DatasetError(problems[0] if problems else f"{path}: holds no scans")
+    range_m, pose, hit = range_m[keep], pose[keep], (arrays["hit"] != 0)[keep]
+    notes = skipped_note(problems)
+    if no_return_m is not None:
+        hit &= range_m < no_return_m
+    elif hit.all() and (found_m := find_no_return_m(range_m, pose)) is not None:
+        share = (range_m >= found_m).mean()
+        notes += (
+            f"hit is 1 everywhere, but {share:.2%} of the beams have ranges of {found_m:.2f} m and more, "
+            f"which looks like no return: --no-return-range {found_m:.2f} marks them",
+        )
     return LaserScans(
         name=path.parent.name if path.name == FILE_NAME else path.stem,
-        range_m=range_m[keep],
+        range_m=range_m,
         angle_rad=arrays["angle_rad"].astype(np.float64),
-        pose_x_y_theta=pose[keep],
-        hit=(arrays["hit"] != 0)[keep],
-        notes=skipped_note(problems),
+        pose_x_y_theta=pose,
+        hit=hit,
+        notes=notes,
     )
 
 
