@@ -61,3 +61,8 @@ def said(error: BaseException) -> str:
 
 
 _LONGEST = 200
+
+
+class CutShortError(Exception):
+    """The run has to end within seconds (SIGTERM), and this part of it is left out. No error for a user: the
+    caller goes on with the next part."""

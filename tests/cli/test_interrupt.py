@@ -8,7 +8,8 @@ import sys
 import pytest
 
 from taichi_mrf.cli.shared import interrupt
-from taichi_mrf.cli.shared.interrupt import CutShortError, StopRequest, stop_on_signals
+from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
+from taichi_mrf.errors import CutShortError
 
 
 def received(*numbers: int) -> tuple[StopRequest, list[str]]:

@@ -126,7 +126,7 @@ class FartherWall(SlidingCamera):
 def kept(folder: Path, count: int, config: Config) -> MappingResult:
     """What a run has kept that was stopped after some keyframes."""
     stop = StopAfter(Added, count)
-    keeper = Keeper(folder, config, 0.0, lambda result: '{"interrupted": true}')
+    keeper = Keeper(folder, config, 0.0, lambda result: {"interrupted": True})
     return map_sequence(sequence(), config, stop.listen, should_stop=stop, keep=keeper)
 
 
@@ -147,7 +147,7 @@ def test_a_run_goes_on_with_what_it_kept_of_the_same_frames_and_parameters_only(
 
 
 def test_what_cannot_be_kept_on_the_way_does_not_end_the_run(tmp_path: Path) -> None:
-    keeper = Keeper(tmp_path / "gone", ALL_FRAMES, 0.0, lambda result: "{}")
+    keeper = Keeper(tmp_path / "gone", ALL_FRAMES, 0.0, lambda result: {})
     with pytest.warns(UserWarning, match="nothing could be kept on the way: .*gone"):
         assert len(names(map_sequence(sequence(), ALL_FRAMES, keep=keeper).map)) == 6
 
@@ -164,7 +164,7 @@ def test_saving_takes_its_share_of_the_time_at_most(tmp_path: Path, monkeypatch:
             now += 10.0
 
     result = MappingResult(SlowMap())  # type: ignore[arg-type]
-    keeper = Keeper(tmp_path, Config(), 30.0, lambda result: "{}")
+    keeper = Keeper(tmp_path, Config(), 30.0, lambda result: {})
     while now < 1000.0:
         now += 1.0
         keeper(result)

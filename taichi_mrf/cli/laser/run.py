@@ -12,7 +12,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, Tim
 
 from taichi_mrf.cli.laser.files import Outcome, write_comparison, write_energies, write_outcome
 from taichi_mrf.cli.laser.report import comparison_table, laser_report
-from taichi_mrf.cli.map.report import report_json
 from taichi_mrf.cli.options.laser import Laser
 from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.output import output_folder
@@ -30,6 +29,7 @@ from taichi_mrf.experiments.tables import write_table
 from taichi_mrf.factor_graph.beams import Grid
 from taichi_mrf.factor_graph.graph import FactorGraph, build_graph
 from taichi_mrf.factor_graph.solve import Solution, Step, solve
+from taichi_mrf.runs.report import report_json
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import write_text
 

@@ -12,16 +12,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from taichi_mrf.cli.options.config_file import CONFIG_FILE
 from taichi_mrf.config.schema import Config, load
 from taichi_mrf.config.text import commented_yaml, differences
 from taichi_mrf.errors import ConfigError, MapFileError, said
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import load_map
+from taichi_mrf.runs.folder import CONFIG_FILE, MAP_FILE, REPORT_FILE
+from taichi_mrf.runs.report import report_json
 from taichi_mrf.system.atomic import write_text
-
-MAP_FILE, REPORT_FILE = "map.npz", "report.json"
 
 MAY_CHANGE = ("inference.sweeps", "inference.tolerance", "runtime.", "volume.memory_limit_gb")
 """Parameters (or groups) that may differ from those of the run that --resume goes on with."""
@@ -32,13 +31,17 @@ MOST_OF_THE_TIME = 0.05
 
 class Keeper:
     """Saves the map of a run when it is called and enough time has gone by: ``every_s`` seconds, and so long
-    that saving takes no more than its share. ``report_text`` is the report of an unfinished run."""
+    that saving takes no more than its share. ``report`` makes the report of an unfinished run."""
 
     def __init__(
-        self, folder: Path, settings: Config, every_s: float, report_text: Callable[[MappingResult], str]
+        self,
+        folder: Path,
+        settings: Config,
+        every_s: float,
+        report: Callable[[MappingResult], dict[str, Any]],
     ) -> None:
         self._folder, self._settings, self._every_s = folder, settings, every_s
-        self._report_text = report_text
+        self._report = report
         self._last, self._cost = time.perf_counter(), 0.0
 
     def __call__(self, result: MappingResult) -> None:
@@ -49,7 +52,7 @@ class Keeper:
             return
         with result.timed("keeping"):
             try:
-                write_text(self._folder / REPORT_FILE, self._report_text(result))
+                write_text(self._folder / REPORT_FILE, report_json(self._report(result)))
                 write_text(self._folder / CONFIG_FILE, commented_yaml(self._settings))
                 result.map.save(self._folder / MAP_FILE)
             except MapFileError as error:

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
 
 import taichi_mrf
-from taichi_mrf.cli.map.keep import REPORT_FILE, refuse_changes
+from taichi_mrf.cli.map.keep import refuse_changes
 from taichi_mrf.cli.map.process import Outcome, finished_before, map_in_process
 from taichi_mrf.cli.map.run import MapTask, exit_status, map_task, print_run
 from taichi_mrf.cli.map.source_names import folder_names
@@ -22,7 +22,6 @@ from taichi_mrf.cli.map.summary import (
     summary_line,
     summary_row,
 )
-from taichi_mrf.cli.options.config_file import CONFIG_FILE
 from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.shared.interrupt import StopRequest, interrupt_on_signals
 from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
@@ -32,6 +31,7 @@ from taichi_mrf.config.schema import load
 from taichi_mrf.config.text import commented_yaml, differences
 from taichi_mrf.errors import ClusterError, TaichiMRFError
 from taichi_mrf.evaluation.pictures.contact_sheet import Tile, write_contact_sheet
+from taichi_mrf.runs.folder import CONFIG_FILE, REPORT_FILE
 from taichi_mrf.system.atomic import write_text
 
 SUMMARY_JSON, SUMMARY_CSV, SUMMARY_PICTURE = "summary.json", "summary.csv", "summary.png"

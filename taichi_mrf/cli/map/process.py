@@ -9,14 +9,13 @@ from typing import Any, Literal
 
 from rich.console import Console
 
-from taichi_mrf.cli.map.keep import MAP_FILE, REPORT_FILE
-from taichi_mrf.cli.map.run import VOXEL_FILE, MapTask, map_to_folder
-from taichi_mrf.cli.options.config_file import CONFIG_FILE
+from taichi_mrf.cli.map.run import MapTask, map_to_folder
 from taichi_mrf.cli.shared.interrupt import stop_on_signals
 from taichi_mrf.cli.shared.progress import ProgressBar
 from taichi_mrf.config.schema import load
 from taichi_mrf.config.text import differences
 from taichi_mrf.errors import MapFileError, TaichiMRFError
+from taichi_mrf.runs.folder import CONFIG_FILE, MAP_FILE, REPORT_FILE, VOXEL_FILE
 
 Status = Literal["mapped", "finished before", "stopped", "failed", "not done"]
 

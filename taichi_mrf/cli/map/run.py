@@ -11,37 +11,23 @@ from typing import Any
 
 from rich.console import Console
 
-from taichi_mrf.cli.map.keep import MAP_FILE, REPORT_FILE, Keeper, resumed_map, skipped_before
-from taichi_mrf.cli.map.report import print_report, report_json, rounded, run_report, unfinished_report
-from taichi_mrf.cli.options.config_file import CONFIG_FILE
+from taichi_mrf.cli.map.keep import Keeper, resumed_map, skipped_before
+from taichi_mrf.cli.map.report import print_report
 from taichi_mrf.cli.options.map import Map
-from taichi_mrf.cli.shared.interrupt import CutShortError, StopRequest, stop_on_signals
+from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
 from taichi_mrf.cli.shared.progress import ProgressBar
 from taichi_mrf.config.schema import Config, with_absolute_tables
-from taichi_mrf.config.text import commented_yaml
-from taichi_mrf.datasets import Dataset, open_dataset
-from taichi_mrf.datasets.derived import reposed
+from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.source_flags import SourceFlags
-from taichi_mrf.errors import FrameError
-from taichi_mrf.evaluation.held_out import HeldOutCheck, check_held_out
-from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
-from taichi_mrf.export.ply import write_voxels
-from taichi_mrf.export.trajectory import write_trajectory
 from taichi_mrf.mapping.pipeline import map_sequence
-from taichi_mrf.mapping.result import MappingResult
-from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.runs.folder import MAP_FILE, RunFacts, write_run
+from taichi_mrf.runs.report import report_json
 from taichi_mrf.system import runtime
-from taichi_mrf.system.atomic import write_text
-from taichi_mrf.system.memory import peak_memory_mb
-
-VOXEL_FILE, TRAJECTORY_FILE = "voxels.ply", "trajectory.txt"
 
 LOOK_AT_PICTURES = "Look at the .png files, or open"
 OPEN_VOXELS = "voxels.ply in MeshLab, CloudCompare or Blender."
 LIVE_VIEW = "shows the map in the browser."
-
-_PICTURED_FRAMES = 3
 
 
 @dataclass(frozen=True)
@@ -134,11 +120,8 @@ def map_to_folder(
         dataset = open_dataset(task.source, color=False, track=task.track_poses, **task.reading.keywords())
         opening = time.perf_counter() - start
 
-        def report_so_far(result: MappingResult) -> str:
-            report = unfinished_report(result, dataset, task.source, skipped)
-            return report_json(report | task.choice())
-
         with _collected_warnings() as warned:
+            facts = RunFacts(task.source, settings, dataset, task.choice(), skipped, warned)
             result = map_sequence(
                 dataset,
                 settings,
@@ -149,22 +132,12 @@ def map_to_folder(
                 should_stop=request,
                 out_of_time=request.out_of_time,
                 resume_from=previous,
-                keep=Keeper(task.out, settings, task.keep_every, report_so_far),
+                keep=Keeper(task.out, settings, task.keep_every, facts.unfinished),
             )
             result.seconds = {"opening": opening, **result.seconds}
-            posed = dataset if result.track is None else reposed(dataset, result.track.poses(result.map))
-            check = _check(result, posed, progress, request)
-            written = _write_map(task.out, result, settings, progress)
-            report = run_report(result, dataset, task.source, check)
-            if task.pictures:
-                written += _write_pictures(task.out, result, posed, progress, request)
-        # Computed before the pictures, which may be left half-way through a kernel's launch.
-        report |= {"seconds": rounded(result.seconds), "peak_memory_mb": peak_memory_mb()}
-        report["notes"] += [str(warning.message) for warning in warned]
-        report["skipped_frames"] = skipped | report["skipped_frames"]
-        report |= task.choice()
-        write_text(task.out / REPORT_FILE, report_json(report))
-    return report, [*written, task.out / REPORT_FILE]
+            return write_run(
+                task.out, result, facts, pictures=task.pictures, haste=request, advance=progress.advance
+            )
 
 
 @contextmanager
@@ -174,76 +147,6 @@ def _collected_warnings() -> Iterator[list[warnings.WarningMessage]]:
         warnings.simplefilter("ignore")
         warnings.filterwarnings("always", category=UserWarning, module="taichi_mrf")
         yield warned
-
-
-def _check(
-    result: MappingResult, dataset: Dataset, progress: ProgressBar, request: StopRequest
-) -> HeldOutCheck | None:
-    """None if no frame was held out, or if the run has to end before the check does."""
-    if not result.held_out or request.hurried:
-        return None
-
-    def checked(number: int) -> None:
-        if request.hurried:
-            raise CutShortError
-        progress.advance("Checking", number, len(result.held_out))
-
-    try:
-        with result.timed("checking"):
-            check = check_held_out(result.map, dataset, result.held_out, checked)
-    except CutShortError:
-        return None
-    result.skipped.update(check.skipped)
-    return check
-
-
-def _write_map(folder: Path, result: MappingResult, settings: Config, progress: ProgressBar) -> list[Path]:
-    """The map first: it is what the time went into."""
-    progress.advance("Writing", 0, 2)
-    with result.timed("writing"):
-        result.map.save(folder / MAP_FILE)
-        write_text(folder / CONFIG_FILE, commented_yaml(settings))
-        progress.advance("Writing", 1, 2)
-        centres, probability = result.map.voxels(min_probability=0.5)
-        write_voxels(folder / VOXEL_FILE, centres, probability, result.map.voxel_size)
-        progress.advance("Writing", 2, 2)
-        written = [folder / MAP_FILE, folder / VOXEL_FILE, folder / CONFIG_FILE]
-        if result.track is not None:
-            write_trajectory(folder / TRAJECTORY_FILE, result.track.trajectory(result.map))
-            written.append(folder / TRAJECTORY_FILE)
-    return written
-
-
-def _write_pictures(
-    folder: Path, result: MappingResult, dataset: Dataset, progress: ProgressBar, request: StopRequest
-) -> list[Path]:
-    """The pictures, or none if the run has to end before they are drawn: all else is written by then."""
-    progress.advance("Drawing", 0, 1)
-    try:
-        with result.timed("pictures"), request.cutting_short():
-            frames = _readable(dataset, _spread(result.held_out, _PICTURED_FRAMES))
-            pictures = write_pictures(folder, result.map, frames)
-    except CutShortError:
-        return []
-    progress.advance("Drawing", 1, 1)
-    return pictures
-
-
-def _spread(indices: list[int], count: int) -> list[int]:
-    """Up to ``count`` of the indices, evenly spread."""
-    if len(indices) <= count:
-        return indices
-    return [indices[(2 * k + 1) * len(indices) // (2 * count)] for k in range(count)]
-
-
-def _readable(dataset: Dataset, indices: list[int]) -> list[Frame]:
-    frames = []
-    for index in indices:
-        try:
-            frames.append(dataset.read(index))
-        except FrameError:  # named in the report since the map was checked
-            continue
-    return frames
 
 
 def exit_status(request: StopRequest, did_not_fit: str | None = None) -> int:

@@ -7,10 +7,7 @@ from rich.console import Console
 from rich.table import Table
 
 import taichi_mrf
-from taichi_mrf.cli.map.keep import REPORT_FILE
-from taichi_mrf.cli.map.report import report_json
 from taichi_mrf.cli.map.run import exit_status
-from taichi_mrf.cli.options.config_file import CONFIG_FILE
 from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.shared.interrupt import interrupt_on_signals
 from taichi_mrf.cli.shared.output import output_folder
@@ -21,6 +18,8 @@ from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets.registry import absolute_source
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.methods.chunked import ChunkedMap
+from taichi_mrf.runs.folder import CONFIG_FILE, REPORT_FILE
+from taichi_mrf.runs.report import report_json
 from taichi_mrf.submaps.job import Sequence
 from taichi_mrf.submaps.picture import write_submap_picture
 from taichi_mrf.submaps.rounds import SubmapsResult, map_in_submaps

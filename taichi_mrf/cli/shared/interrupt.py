@@ -14,14 +14,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from taichi_mrf.errors import CutShortError
+
 INFER_SECONDS = 3.0
 """How long after SIGTERM a map may still be inferred: containers kill after 10 s, and it has to be saved."""
 
 _HANG_UP = getattr(signal, "SIGHUP", None)  # not on Windows
-
-
-class CutShortError(Exception):
-    """The run has to end within seconds, and this part of it is left out."""
 
 
 class StopRequest:

@@ -1,0 +1,185 @@
+"""Writing the folder of a run. Every run that has made a map leaves the same files, written here."""
+
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from taichi_mrf.config.schema import Config
+from taichi_mrf.config.text import commented_yaml
+from taichi_mrf.datasets import Dataset
+from taichi_mrf.datasets.derived import reposed
+from taichi_mrf.errors import CutShortError, FrameError
+from taichi_mrf.evaluation.held_out import HeldOutCheck, check_held_out
+from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
+from taichi_mrf.export.ply import write_voxels
+from taichi_mrf.export.trajectory import write_trajectory
+from taichi_mrf.mapping.result import MappingResult
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.runs.report import report_json, rounded, run_report, unfinished_report
+from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.system.atomic import write_text
+from taichi_mrf.system.memory import peak_memory_mb
+
+MAP_FILE, VOXEL_FILE, CONFIG_FILE = "map.npz", "voxels.ply", "config.yaml"
+REPORT_FILE, TRAJECTORY_FILE = "report.json", "trajectory.txt"
+
+PICTURED_FRAMES = 3
+"""Held-out frames in the picture of measured and rendered depth, at most."""
+
+Advance = Callable[[str, int, int], None]
+"""Called with the name of a stage, the number of its steps that are done, and how many there are."""
+
+
+class Haste(Protocol):
+    """Whether a run has to end within seconds, as after SIGTERM."""
+
+    @property
+    def hurried(self) -> bool:
+        """Whether it has to."""
+        ...
+
+    def cutting_short(self) -> AbstractContextManager[None]:
+        """A block in which CutShortError is raised as soon as it has to; the block may be left at any
+        point."""
+        ...
+
+
+class _NoHaste:
+    hurried = False
+
+    def cutting_short(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+
+NO_HASTE: Haste = _NoHaste()
+
+
+@dataclass
+class RunFacts:
+    """What a run's report says besides its result: the ``source`` as it was asked for, the parameters, the
+    recording (None for a saved map), further entries (``choice``), the unreadable frames of the run that this
+    one resumes, and warnings to be listed as notes."""
+
+    source: str
+    config: Config
+    dataset: Dataset | None
+    choice: dict[str, Any] = field(default_factory=dict)
+    skipped_before: dict[str, str] = field(default_factory=dict)
+    warned: list[warnings.WarningMessage] = field(default_factory=list)
+
+    def report(self, result: MappingResult, check: HeldOutCheck | None) -> dict[str, Any]:
+        """The report of the finished run."""
+        report = run_report(result, self.dataset, self.source, check)
+        report["notes"] += [str(warning.message) for warning in self.warned]
+        report["skipped_frames"] = self.skipped_before | report["skipped_frames"]
+        return report | self.choice
+
+    def unfinished(self, result: MappingResult) -> dict[str, Any]:
+        """The report of a run that is not finished."""
+        return unfinished_report(result, self.dataset, self.source, self.skipped_before) | self.choice
+
+
+def write_run(
+    folder: Path,
+    result: MappingResult,
+    facts: RunFacts,
+    *,
+    check: bool = True,
+    pictures: bool = True,
+    haste: Haste = NO_HASTE,
+    advance: Advance = lambda stage, done, total: None,
+) -> tuple[dict[str, Any], list[Path]]:
+    """Write all files of a run to a folder that exists: the map first, because the time went into it, the
+    report last. With ``check`` the held-out frames are compared with the map, with ``pictures`` it is drawn;
+    both are left out in ``haste``.
+
+    Returns the report and the paths. Raises MapFileError.
+    """
+    written = _write_map(folder, result, facts.config, advance)
+    posed = facts.dataset
+    if posed is not None and result.track is not None:
+        posed = reposed(posed, result.track.poses(result.map))
+    found = _check(result, posed, haste, advance) if check and posed is not None else None
+    # Computed before the pictures, which may be left half-way through the launch of a kernel.
+    report = facts.report(result, found)
+    if pictures:
+        written += _write_pictures(folder, result, posed, haste, advance)
+    report |= {"seconds": rounded(result.seconds), "peak_memory_mb": peak_memory_mb()}
+    write_text(folder / REPORT_FILE, report_json(report))
+    return report, [*written, folder / REPORT_FILE]
+
+
+def write_voxel_file(path: Path, m: OccupancyMap) -> None:
+    """Write the voxels that are more likely occupied than free. Raises MapFileError."""
+    centres, probability = m.voxels(min_probability=0.5)
+    write_voxels(path, centres, probability, m.voxel_size)
+
+
+def _write_map(folder: Path, result: MappingResult, config: Config, advance: Advance) -> list[Path]:
+    advance("Writing", 0, 2)
+    with result.timed("writing"):
+        result.map.save(folder / MAP_FILE)
+        write_text(folder / CONFIG_FILE, commented_yaml(config))
+        advance("Writing", 1, 2)
+        write_voxel_file(folder / VOXEL_FILE, result.map)
+        advance("Writing", 2, 2)
+        written = [folder / MAP_FILE, folder / VOXEL_FILE, folder / CONFIG_FILE]
+        if result.track is not None:
+            write_trajectory(folder / TRAJECTORY_FILE, result.track.trajectory(result.map))
+            written.append(folder / TRAJECTORY_FILE)
+    return written
+
+
+def _check(result: MappingResult, dataset: Dataset, haste: Haste, advance: Advance) -> HeldOutCheck | None:
+    """None if no frame was held out, or if the run has to end before the check does."""
+    if not result.held_out or haste.hurried:
+        return None
+
+    def checked(number: int) -> None:
+        if haste.hurried:
+            raise CutShortError
+        advance("Checking", number, len(result.held_out))
+
+    try:
+        with result.timed("checking"):
+            check = check_held_out(result.map, dataset, result.held_out, checked)
+    except CutShortError:
+        return None
+    result.skipped.update(check.skipped)
+    return check
+
+
+def _write_pictures(
+    folder: Path, result: MappingResult, dataset: Dataset | None, haste: Haste, advance: Advance
+) -> list[Path]:
+    """The pictures; none if the run has to end before they are drawn."""
+    advance("Drawing", 0, 1)
+    try:
+        with result.timed("pictures"), haste.cutting_short():
+            held_out = _spread(result.held_out, PICTURED_FRAMES)
+            frames = [] if dataset is None else _readable(dataset, held_out)
+            pictures = write_pictures(folder, result.map, frames)
+    except CutShortError:
+        return []
+    advance("Drawing", 1, 1)
+    return pictures
+
+
+def _spread(indices: Sequence[int], count: int) -> Sequence[int]:
+    """Up to ``count`` of the indices, evenly spread."""
+    if len(indices) <= count:
+        return indices
+    return [indices[(2 * k + 1) * len(indices) // (2 * count)] for k in range(count)]
+
+
+def _readable(dataset: Dataset, indices: Sequence[int]) -> list[Frame]:
+    frames = []
+    for index in indices:
+        try:
+            frames.append(dataset.read(index))
+        except FrameError:  # the report names it since the check
+            continue
+    return frames
