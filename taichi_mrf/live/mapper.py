@@ -39,7 +39,8 @@ class Mapper:
     ``unsettled`` says that keyframes have come, gone or moved since the last full inference, ``edited`` that
     some of them by a user's hand, and ``unaligned``, if poses are refined, that keyframes have come since all
     were aligned with each other. ``unanswered`` says that keyframes may have heard something new
-    that they have not been swept for.
+    that they have not been swept for. ``saved_unsettled`` says that the map comes from a file that was saved
+    before its inference was complete.
     """
 
     def __init__(self, m: OccupancyMap, first_id: int = 0, poses: PoseConfig | None = None) -> None:
@@ -56,6 +57,7 @@ class Mapper:
         # A map from a file has beliefs but no messages, and edits would have to infer them first.
         self.lacks_messages = bool(m.keyframes) and has_messages(m)
         self.unsettled, self.edited = self.lacks_messages or self.stale, False
+        self.saved_unsettled = bool(m.keyframes) and not m.settled
         self.unaligned = False
         self.unanswered = False
 

@@ -9,7 +9,7 @@ from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.formats import frames_npz
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.live.replay import Replay
-from taichi_mrf.live.run import Source
+from taichi_mrf.live.run import Source, saved_unsettled
 from taichi_mrf.methods.map_file import open_map_file, read_header
 from taichi_mrf.methods.registry import create_map, load_map
 from taichi_mrf.system import runtime
@@ -37,8 +37,10 @@ def open_source(
         with open_map_file(path) as file:
             header = read_header(path, file)
         parameters = dataclasses.replace(header.config, runtime=config.runtime)
-        note = f"{path.name} is a saved map: its own parameters are in force."
-        return Source(path.name, parameters, lambda: load_map(path)), [note]
+        notes = [f"{path.name} is a saved map: its own parameters are in force."]
+        if not header.settled:
+            notes.append(saved_unsettled(path.name))
+        return Source(path.name, parameters, lambda: load_map(path)), notes
     dataset = open_dataset(name, color=False, track=track, **(reading or SourceFlags()).keywords())
 
     def new_replay() -> Replay:

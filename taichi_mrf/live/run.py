@@ -21,6 +21,14 @@ from taichi_mrf.viewer.messages import CurrentCamera, Hello, KeyframeInfo, Notic
 WAY_BACK = "bring the camera back to where it was then, or to where it started"
 
 
+def saved_unsettled(name: str) -> str:
+    """What a user is told of a saved map whose inference was interrupted."""
+    return (
+        f"{name} was saved before its inference was complete. It is shown as it was saved; "
+        "inference over all keyframes now completes it."
+    )
+
+
 @dataclass(frozen=True)
 class Source:
     """What is mapped: how to make its map (an empty one, or one from a file), and how to replay its frames,
@@ -95,6 +103,8 @@ class Run:
                 parameters=to_yaml(self.source.config),
             )
         )
+        if self.mapper.saved_unsettled and self.mapper.unsettled:
+            self.send(Notice(saved_unsettled(self.source.name), "warning"))
         for entry in self.mapper.roster.entries.values():
             self.send(self.mapper.describe(entry))
         if self.current is not None:

@@ -47,12 +47,14 @@ class StoredKeyframe:
 
 @dataclass(frozen=True)
 class MapHeader:
-    """What every map has; ``config.method`` says of which method it is."""
+    """What the files of all methods hold; ``config.method`` names the method. ``settled`` says whether the
+    voxels are those that a full inference of these keyframes gives."""
 
     config: Config
     noise: NoiseModel
     keyframes: list[StoredKeyframe]
     next_id: int
+    settled: bool = True
 
     def limited_to(self, memory_limit_gb: float | None) -> Config:
         """The parameters, with another limit of memory unless it is None."""
@@ -73,6 +75,7 @@ class MapHeader:
             "keyframe_T_world_camera": np.array([k.T_world_camera for k in keyframes]).reshape(-1, 4, 4),
             "keyframe_cameras": np.array([_camera_row(k.camera) for k in keyframes]).reshape(-1, 6),
             "next_id": np.asarray(self.next_id),
+            "settled": np.asarray(self.settled),
             **_noise_arrays(self.noise),
         }
         for number, keyframe in enumerate(keyframes):
@@ -143,7 +146,8 @@ def read_header(path: Path, file: NpzFile) -> MapHeader:
     config, noise = _config(path, file), _noise(file)
     # Maps of earlier versions saved the default sensor, whatever their noise.
     config = replace(config, sensor=describing(noise, config.sensor))
-    return MapHeader(config, noise, keyframes, next_id)
+    settled = file.scalar("settled", "b") if "settled" in file else True  # earlier versions did not save it
+    return MapHeader(config, noise, keyframes, next_id, settled)
 
 
 def read_bricks(path: Path, file: NpzFile) -> tuple[NDArray[np.int32], NDArray[np.float32]]:

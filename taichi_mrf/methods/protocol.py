@@ -65,6 +65,11 @@ class OccupancyMap(Protocol):
         """Whether queries miss the last removals and moves until :meth:`infer`."""
         ...
 
+    @property
+    def settled(self) -> bool:
+        """Whether the map is the one that its keyframes give, which a full :meth:`infer` would not change."""
+        ...
+
     def crossed_bricks(self, id: int) -> NDArray[np.int32]:
         """The bricks that a keyframe's rays cross, (n, 3), if some of them may not exist; else none."""
         ...

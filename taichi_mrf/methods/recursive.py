@@ -133,6 +133,11 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         """Whether keyframes were removed or moved since the voxels were last worked out."""
         return self._stale
 
+    @property
+    def settled(self) -> bool:
+        """Whether the voxels are those that the keyframes give."""
+        return not self._stale
+
     def crossed_bricks(self, id: int) -> NDArray[np.int32]:
         """No brick, (0, 3): all that a scan's rays cross exist."""
         self._find(id)
@@ -233,7 +238,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
             StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera)
             for k in self._keyframes.values()
         ]
-        header = MapHeader(self.config, self.noise, keyframes, self._next_id)
+        header = MapHeader(self.config, self.noise, keyframes, self._next_id, self.settled)
         belief = self._pool.read("belief", slots)
         write_recursive(Path(path), RecursiveContents(header, self._pool.bricks[slots], belief, self._stale))
 

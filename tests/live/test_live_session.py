@@ -28,10 +28,10 @@ from taichi_mrf.config.schema import Config, VolumeConfig
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.live.open_source import open_source
-from taichi_mrf.live.run import Policy
+from taichi_mrf.live.run import Policy, Source
 from taichi_mrf.live.session import Session
 from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.methods.registry import create_map
+from taichi_mrf.methods.registry import create_map, load_map
 from taichi_mrf.viewer.messages import (
     Bricks,
     File,
@@ -111,6 +111,29 @@ def test_full_inference_answers_from_the_map_as_it_was(request_: Request, kind: 
     assert any(isinstance(update, kind) for update in between)
     assert not any(isinstance(update, Bricks) for update in between), "nothing half-done is published"
     assert marginals(m) == marginals(built(range(4)))
+
+
+def test_a_map_whose_inference_was_stopped_is_shown_as_saved_and_a_notice_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    m = built(range(3))
+    whole = map_voxels(m)
+    m.infer(sweeps=1)
+    m.save(path)
+    saved = map_voxels(m)
+    assert saved != whole
+    link = FakeLink()
+    opened = Source("map.npz", CONFIG, lambda: load_map(path))
+    session = Session(opened, link, Policy(leave_when_done=True))
+    (notice,) = link.of_type(Notice)
+    assert notice.text.startswith("map.npz was saved before its inference was complete")
+    assert shown(link.sent).voxels() == saved
+    session.run(never)
+    assert shown(link.sent).voxels() == whole
+    m.infer()
+    m.save(path)
+    link = FakeLink()
+    Session(opened, link, Policy(leave_when_done=True))
+    assert not link.of_type(Notice)
 
 
 def test_a_map_saved_during_inference_is_the_one_that_is_shown(tmp_path: Path) -> None:

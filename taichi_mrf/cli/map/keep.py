@@ -69,7 +69,7 @@ def resumed_map(folder: Path, settings: Config) -> OccupancyMap | None:
     if (folder / CONFIG_FILE).exists():
         refuse_changes(folder / CONFIG_FILE, differences(load(folder / CONFIG_FILE), settings))
     m = load_map(folder / MAP_FILE, settings.volume.memory_limit_gb)
-    # A map knows only what it needs, and of a sensor's noise only the numbers.
+    # Maps of earlier versions saved only these parameters.
     known = (
         "voxel_size",
         "method",

@@ -24,14 +24,18 @@ class Checkpoint:
     pool: PoolSnapshot
     messages: dict[int, "tuple[VisibleBricks, ti.Ndarray | None, NDArray[np.int64] | None]"]
     messages_lost: bool
+    settled: bool
 
 
-def take_checkpoint(pool: BrickPool, keyframes: Iterable[Keyframe], messages_lost: bool) -> Checkpoint:
+def take_checkpoint(
+    pool: BrickPool, keyframes: Iterable[Keyframe], messages_lost: bool, settled: bool
+) -> Checkpoint:
     """Copy the beliefs. The messages need no copy: full inference begins with new arrays."""
     return Checkpoint(
         pool.snapshot(),
         {k.id: (k.visible, k.messages, k.change_count_at_last_sweep) for k in keyframes},
         messages_lost,
+        settled,
     )
 
 

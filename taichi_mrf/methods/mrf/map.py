@@ -43,7 +43,6 @@ from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
-from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import VOXELS
 
 
@@ -71,8 +70,6 @@ class MRFMap(BrickMap):
 
         ``noise`` defaults to a Kinect 1. Raises ConfigError for an unknown or impossible parameter.
         """
-        runtime.init()
-        self.sensor = SensorConfig(min_depth=min_depth, max_depth=max_depth)
         inference = overridden(inference or InferenceConfig(), parameters, "MRFMap")
         sensor = SensorConfig(min_depth=min_depth, max_depth=max_depth)
         config = Config(voxel_size, sensor=sensor, inference=inference, volume=volume or VolumeConfig())
@@ -97,6 +94,7 @@ class MRFMap(BrickMap):
         self._frozen: dict[int, str] = {}
         self._next_id = 0
         self._messages_lost = False  # a loaded map has beliefs, but no messages
+        self._settled = True
 
     @property
     def keyframes(self) -> Mapping[int, Keyframe]:
@@ -107,6 +105,12 @@ class MRFMap(BrickMap):
     def stale(self) -> bool:
         """Never: a change shows at once."""
         return False
+
+    @property
+    def settled(self) -> bool:
+        """Whether the marginals are those that a full :meth:`infer` gives: none of the keyframes has changed
+        since, and it was not stopped."""
+        return self._settled
 
     def crossed_bricks(self, id: int) -> NDArray[np.int32]:
         """The bricks that a keyframe's rays cross, (n, 3), whether they exist or not."""
@@ -132,6 +136,7 @@ class MRFMap(BrickMap):
         keyframe = self._allocator.place(self._next_id, name or f"keyframe {self._next_id}", image, T)
         self._keyframes[keyframe.id] = keyframe
         self._next_id += 1
+        self._settled = False
         return keyframe.id
 
     def remove_keyframe(self, id: int) -> None:
@@ -140,6 +145,7 @@ class MRFMap(BrickMap):
         self._restore_messages()
         self._allocator.take_out(keyframe)
         del self._keyframes[id]
+        self._settled = False
 
     def move_keyframe(self, id: int, T_world_camera: ArrayLike) -> None:
         """Give a keyframe another pose, as a SLAM back-end does; its messages begin anew."""
@@ -147,6 +153,7 @@ class MRFMap(BrickMap):
         T = as_pose(T_world_camera)
         self._restore_messages()
         self._allocator.take_out(keyframe)
+        self._settled = False
         try:
             self._keyframes[id] = self._allocator.place(id, keyframe.name, keyframe.image, T)
         except Exception:
@@ -184,6 +191,7 @@ class MRFMap(BrickMap):
         self.aligner.surface.freeze(keyframe)
         self._frozen[id] = keyframe.name
         del self._keyframes[id]
+        self._settled = False
 
     def infer(
         self,
@@ -223,7 +231,14 @@ class MRFMap(BrickMap):
                 self._allocator.refresh(keyframe)
         for keyframe in chosen:
             self._pool.touch(keyframe.visible.slots)
-        return run_sweeps(chosen, self._pool, self._sweeper, sweeps, tolerance, progress)
+        as_configured = keyframes is None and (sweeps, tolerance) == (config.sweeps, config.tolerance)
+        complete = False
+        try:
+            report = run_sweeps(chosen, self._pool, self._sweeper, sweeps, tolerance, progress)
+            complete = report.complete
+        finally:
+            self._settled = complete and as_configured
+        return report
 
     def renew(
         self,
@@ -244,6 +259,7 @@ class MRFMap(BrickMap):
         self._restore_messages()
         if tolerance is None:
             tolerance = self.config.inference.renew_tolerance
+        self._settled = False
         return self._incremental.run(self._keyframes, first, tolerance, seconds, progress)
 
     def factor_graph(self, every: int = 1, memory_limit_gb: float = 0.0) -> FactorGraph:
@@ -264,16 +280,16 @@ class MRFMap(BrickMap):
         self._allocator.mark_without_messages(self._keyframes.values())
         self._pool.write("belief", self._pool.in_use, log_odds.reshape(-1, VOXELS).astype(np.float32))
         self._pool.touch(self._pool.in_use)
-        self._messages_lost = bool(self._keyframes)
+        self._messages_lost, self._settled = bool(self._keyframes), False
 
     def checkpoint(self) -> Checkpoint:
         """What :meth:`restore` needs to undo a full :meth:`infer` that ``progress`` has stopped."""
-        return take_checkpoint(self._pool, self._keyframes.values(), self._messages_lost)
+        return take_checkpoint(self._pool, self._keyframes.values(), self._messages_lost, self._settled)
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go back to a checkpoint, since which only :meth:`infer` was called."""
         go_back(checkpoint, self._pool, self._keyframes.values())
-        self._messages_lost = checkpoint.messages_lost
+        self._messages_lost, self._settled = checkpoint.messages_lost, checkpoint.settled
         self._allocator.mark_without_messages(self._keyframes.values())
 
     def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
@@ -303,7 +319,7 @@ class MRFMap(BrickMap):
         """Write the map to one .npz file, beside it first and then into place. Raises MapFileError."""
         keyframes = list(self._keyframes.values())
         stored = [StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera) for k in keyframes]
-        header = MapHeader(self.config, self.noise, stored, self._next_id)
+        header = MapHeader(self.config, self.noise, stored, self._next_id, self._settled)
         write_contents(Path(path), contents_of(header, self._registry, keyframes, self._frozen))
 
     @classmethod
@@ -326,7 +342,7 @@ class MRFMap(BrickMap):
             if contents.evidence is not None:
                 m._pool.write("evidence", slots, contents.evidence)
         m._next_id = header.next_id
-        m._messages_lost = bool(m._keyframes)
+        m._messages_lost, m._settled = bool(m._keyframes), header.settled
         return m
 
     def _find(self, id: int) -> Keyframe:
