@@ -4,8 +4,11 @@ Taichi can be started once in a process, so each backend is a run of its own: ``
 runs only the tests that use the ``backend`` fixture, on Vulkan (a software device will do).
 """
 
+import multiprocessing.process
 import os
+import subprocess
 from pathlib import Path
+from typing import Any, NoReturn
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -32,9 +35,19 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
     parser.addoption("--part", default="1/1", help="1/2 or 2/2: every second test file (default: all)")
 
+    parser.addoption(
+        "--quick",
+        action="store_true",
+        help="leave out tests that start Taichi or a process, but run the smoke test of each mapping method",
+    )
+
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     _take_a_part(config, items)
+    if config.getoption("--quick"):
+        left_out = [item for item in items if _uses(item, "backend") and not _is_smoke(item)]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in set(left_out)]
     if config.getoption("--arch") == "cpu":
         return
     used = [item for item in items if _is_for_every_backend(item)]
@@ -54,8 +67,30 @@ def _take_a_part(config: pytest.Config, items: list[pytest.Item]) -> None:
 
 
 def _is_for_every_backend(item: pytest.Item) -> bool:
-    fixtures = getattr(item, "fixturenames", ())
-    return "backend" in fixtures and "one_backend" not in fixtures
+    return _uses(item, "backend") and not _uses(item, "one_backend")
+
+
+def _uses(item: pytest.Item, fixture: str) -> bool:
+    return fixture in getattr(item, "fixturenames", ())
+
+
+def _is_smoke(item: pytest.Item) -> bool:
+    return item.get_closest_marker("smoke") is not None
+
+
+@pytest.fixture(autouse=True)
+def quick_guard(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With --quick, skip a test at the point where it starts Taichi or a process."""
+    if not request.config.getoption("--quick"):
+        return
+
+    def skip(*args: Any, **kwargs: Any) -> NoReturn:
+        pytest.skip("left out by --quick: it starts Taichi or a process")
+
+    monkeypatch.setattr(subprocess.Popen, "__init__", skip)
+    monkeypatch.setattr(multiprocessing.process.BaseProcess, "start", skip)
+    if not _is_smoke(request.node):
+        monkeypatch.setattr(runtime, "init", skip)
 
 
 def _take_fewer_examples(item: pytest.Item) -> None:

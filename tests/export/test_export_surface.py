@@ -10,12 +10,12 @@ import pytest
 import trimesh
 from hand_made import VOXEL
 from queried_maps import HandMap, hand_map, map_of, room_map
-from taichi_mrf.export.upright import y_up
 
 from taichi_mrf.errors import ConfigError, TaichiMRFError
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.export.surface import smooth_surface, voxel_surface
+from taichi_mrf.geometry.up import y_up
 from taichi_mrf.voxels.colors import marginal_colors
 
 pytestmark = pytest.mark.usefixtures("backend")
