@@ -1,12 +1,11 @@
 """``taichi-mrf map --refine-poses`` as a person runs it, on poses that were disturbed."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from console import taichi_mrf
 
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.datasets import open_dataset
@@ -38,10 +37,9 @@ def test_poses_come_nearer_to_the_true_ones_and_the_report_has_both(
 ) -> None:
     path, true = recording
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "taichi_mrf", "map", path, "--out", out, "--voxel-size", "0.1", "--json"]
     flags = ["--refine-poses", "--no-pictures", "--evaluation.hold-out", "0", "--keyframes.rotation", "0"]
     flags += ["--keyframes.translation", "0", "--runtime.arch", "cpu"]
-    done = subprocess.run([*map(str, command), *flags], capture_output=True, text=True, check=False)
+    done = taichi_mrf("map", path, "--out", out, "--voxel-size", "0.1", "--json", *flags)
     assert done.returncode == 0, done.stderr
     poses = json.loads(done.stdout)["poses"]
     assert len(poses) == FRAMES
@@ -54,11 +52,8 @@ def test_poses_come_nearer_to_the_true_ones_and_the_report_has_both(
 
 def test_maps_that_cannot_refine_say_so(recording: tuple[Path, np.ndarray], tmp_path: Path) -> None:
     path, _ = recording
-    command = [sys.executable, "-m", "taichi_mrf", "map", path, "--out", tmp_path / "out", "--refine-poses"]
-    done = subprocess.run(
-        [*map(str, command), "--method", "log_odds", "--runtime.arch", "cpu"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    flags = ("--refine-poses", "--method", "log_odds", "--runtime.arch", "cpu")
+    done = taichi_mrf("map", path, "--out", tmp_path / "out", *flags)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert "poses.refine" in done.stderr

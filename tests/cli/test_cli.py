@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from console import COARSE, FAST, ROOM, assert_refused, mapped, report_of, taichi_mrf
+from console import as_process, COARSE, FAST, ROOM, assert_refused, mapped, report_of, taichi_mrf
 
 from taichi_mrf.cli.commands import COMMANDS
 from taichi_mrf.cli.flag_list import flags_of
@@ -124,7 +124,7 @@ def test_the_applications_are_the_commands(name: str, repository: Path) -> None:
 
 
 def test_the_shell_is_told_how_to_complete() -> None:
-    done = taichi_mrf("--tyro-print-completion", "bash")
+    done = as_process("--tyro-print-completion", "bash")
     assert done.returncode == 0
     for name in ("map", "tune", "export", "laser"):
         assert name in done.stdout

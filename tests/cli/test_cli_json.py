@@ -1,19 +1,16 @@
 """``--json``: the same facts for programs, and nothing else on stdout."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
+
+from console import taichi_mrf
 
 SMALL = "synthetic:room?frames=3&width=80&height=60"
 
 
 def said(*arguments: str | Path) -> Any:
-    done = subprocess.run(
-        [sys.executable, "-m", "taichi_mrf", *map(str, arguments), "--json"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    done = taichi_mrf(*arguments, "--json")
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 

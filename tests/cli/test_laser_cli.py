@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from console import taichi_mrf
 from laser_logs import flaser
 
 from taichi_mrf.cli.main import BAD_INPUT, main
@@ -35,12 +36,7 @@ COMPARISON = {
 
 
 def laser(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "taichi_mrf", "laser", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    return taichi_mrf("laser", *arguments)
 
 
 def mapped(*arguments: str | Path) -> str:

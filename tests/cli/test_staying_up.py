@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import small_room
+from console import taichi_mrf
 from killed_runs import OPTIONS, SOURCE, Run, disturbed, keyframes_of
 from sliding_camera import ALL_FRAMES, CAMERA, SlidingCamera, StopAfter, names, sequence
 
@@ -51,8 +52,7 @@ def test_what_does_not_fit_into_memory_is_named_and_the_rest_is_kept(
     out = tmp_path / "out"
 
     def run(*options: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "taichi_mrf", "map", SOURCE, "--out", str(out), *OPTIONS, *options]
-        return subprocess.run(command, capture_output=True, text=True, check=False)
+        return taichi_mrf("map", SOURCE, "--out", out, *OPTIONS, *options)
 
     done = run("--volume.memory-limit-gb", "0.001")
     assert done.returncode == 3, done.stderr

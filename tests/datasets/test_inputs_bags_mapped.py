@@ -3,14 +3,13 @@ themselves."""
 
 import json
 import shlex
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from console import taichi_mrf
 from inputs_bags import Bag, Kind, writing
 from inputs_frames import Frames, moved, room
 
@@ -127,8 +126,7 @@ def test_a_bag_becomes_the_map_of_its_frames(
     with writing(tmp_path / name, kind) as bag:
         write(bag, frames)
     settings = f"--voxel-size {VOXEL_SIZE} --evaluation.hold-out 0 --runtime.arch cpu --no-pictures"
-    command = [sys.executable, "-m", "taichi_mrf", "map", f"{tmp_path / name}{rest}", *shlex.split(settings)]
-    done = subprocess.run([*command, "--out", tmp_path / "out"], capture_output=True, text=True, check=False)
+    done = taichi_mrf("map", f"{tmp_path / name}{rest}", *shlex.split(settings), "--out", tmp_path / "out")
     assert (done.returncode, done.stderr) == (0, ""), done.stderr
     report = json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
     assert report["keyframes"] == len(frames)

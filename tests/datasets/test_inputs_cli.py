@@ -5,12 +5,11 @@ import io
 import json
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from console import taichi_mrf
 from datasets_recordings import Content, write_seven_scenes
 from inputs_bags import Bag, writing
 
@@ -134,13 +133,12 @@ def test_bad_sources_and_values_end_in_one_line(tmp_path: Path, arguments: list[
 
 
 def test_map_reads_as_its_flags_say(tmp_path: Path) -> None:
-    """Half the pixels, half the depth, undistorted: the flags reach the reader, in a process of its own."""
+    """Half the pixels, half the depth, undistorted: the flags reach the reader."""
     folder = write_seven_scenes(tmp_path / "office", Content())
     flags = "--image-scale 0.5 --depth-scale 2000 --camera 20,20,8,6 --undistort=-0.1,0,0,0"
     settings = "--voxel-size 0.2 --evaluation.hold-out 0 --runtime.arch cpu --no-pictures --limit 1"
-    command = [sys.executable, "-m", "taichi_mrf", "map", folder, "--out", tmp_path / "out"]
-    command += shlex.split(flags) + shlex.split(settings)
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    words = shlex.split(flags) + shlex.split(settings)
+    done = taichi_mrf("map", folder, "--out", tmp_path / "out", *words)
     assert (done.returncode, done.stderr) == (0, ""), done.stderr
     report = json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
     told = open_dataset(

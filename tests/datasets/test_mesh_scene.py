@@ -1,11 +1,11 @@
 """Meshes as scenes: what is rendered is where the triangles are, and what is wrong with a file is said."""
 
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from console import taichi_mrf
 from datasets_recordings import row_of
 from numpy.typing import NDArray
 
@@ -156,8 +156,7 @@ def test_noise_depends_on_seed_and_frame_alone(files: tuple[Path, Path], noise: 
 
 def test_the_command_line_maps_a_mesh(files: tuple[Path, Path], tmp_path: Path) -> None:
     source = f"mesh:{files[0]}?poses={files[1]}&width=80&height=60"
-    command = [sys.executable, "-m", "taichi_mrf", "map", source, "--out", str(tmp_path / "out")]
-    done = subprocess.run([*command, "--voxel-size", "0.2"], capture_output=True, text=True)
+    done = taichi_mrf("map", source, "--out", tmp_path / "out", "--voxel-size", "0.2", "--no-pictures")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "out" / "map.npz").is_file()
 

@@ -3,13 +3,12 @@
 import cProfile
 import json
 import pstats
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import small_room
+from console import taichi_mrf
 
 from taichi_mrf.cli.options.bench import Bench
 from taichi_mrf.config.schema import Config
@@ -27,11 +26,10 @@ TINY = "synthetic:room?width=64&height=48&frames=8"
 
 
 def bench(*flags: str, out: Path) -> tuple[list[dict], str]:
-    """The rows and the output of the command, run as users run it."""
+    """The rows and the output of the command, as users run it."""
     command = ["bench", TINY, "--voxel-sizes", "0.1", "--runtime.arch", "cpu", "--json", str(out), *flags]
-    done = subprocess.run(
-        [sys.executable, "-m", "taichi_mrf", *command], capture_output=True, text=True, check=True
-    )
+    done = taichi_mrf(*command)
+    assert done.returncode == 0, done.stderr
     return json.loads(out.read_text(encoding="utf-8"))["rows"], done.stdout
 
 

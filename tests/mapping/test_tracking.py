@@ -1,14 +1,13 @@
 """Poses that were not recorded: frames of a carried camera, each aligned with the map of those before it."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tracked_room
+from console import taichi_mrf
 from tracked_room import CONFIG, COUNT, errors, frames, nowhere, walk
 
 from taichi_mrf.config.schema import KeyframeConfig, PoseConfig
@@ -197,9 +196,8 @@ def test_the_command_line_tracks_and_leaves_the_trajectory(tmp_path: Path) -> No
     camera = frames()[0].camera
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     np.savez(path, depth_m=np.stack([f.depth_m for f in frames()[:12]]), K=K, stamp=np.arange(12) / 10)
-    command = [sys.executable, "-m", "taichi_mrf", "map", path, "--out", out, "--voxel-size", "0.1"]
     flags = ["--track-poses", "--json", "--no-pictures", "--runtime.arch", "cpu"]
-    done = subprocess.run([*map(str, command), *flags], capture_output=True, text=True, check=False)
+    done = taichi_mrf("map", path, "--out", out, "--voxel-size", "0.1", *flags)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert report["tracking"] == {"frames": 12, "lost": 0, "unsure": 0}

@@ -1,26 +1,55 @@
-"""The console program as a process, and what its tests share."""
+"""The console program, in this process or in one of its own, and what its tests share."""
 
+import io
 import json
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
+from contextlib import ExitStack, redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import Any
 
+from taichi_mrf.cli.main import main
 from taichi_mrf.cli.parser import parse
+from taichi_mrf.system import runtime
+
+Done = subprocess.CompletedProcess[str]
 
 ROOM = "synthetic:room?frames=12&width=160&height=120"
-
-
 COARSE = ("--voxel-size", "0.1", "--runtime.arch", "cpu")
-
-
 FAST = (*COARSE, "--no-pictures")
 
 
 def taichi_mrf(
     *arguments: str | Path, options: tuple[str, ...] = (), before: Callable[[], None] | None = None
-) -> subprocess.CompletedProcess[str]:
-    """Run the program from the source tree; ``options`` are the interpreter's."""
+) -> Done:
+    """Run the program and return its exit status and what it printed.
+
+    It runs in this process, whose kernels are compiled, unless the interpreter's ``options`` or a call
+    ``before`` the program starts need a new one.
+    """
+    if options or before is not None:
+        return as_process(*arguments, options=options, before=before)
+    runtime.init("cpu")
+    out, err = io.StringIO(), io.StringIO()
+    with ExitStack() as stack:
+        stack.enter_context(redirect_stdout(out))
+        stack.enter_context(redirect_stderr(err))
+        stack.enter_context(warnings.catch_warnings())
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = _show_warning
+        try:
+            status = main([str(argument) for argument in arguments])
+        except SystemExit as stop:
+            status = stop.code if isinstance(stop.code, int) else 1
+    return subprocess.CompletedProcess(list(arguments), status, out.getvalue(), err.getvalue())
+
+
+def as_process(
+    *arguments: str | Path, options: tuple[str, ...] = (), before: Callable[[], None] | None = None
+) -> Done:
+    """Run the program as a process of its own; ``options`` are the interpreter's."""
     return subprocess.run(
         [sys.executable, *options, "-m", "taichi_mrf", *map(str, arguments)],
         capture_output=True,
@@ -28,6 +57,13 @@ def taichi_mrf(
         check=False,
         preexec_fn=before,
     )
+
+
+def _show_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, *_: Any
+) -> None:
+    """As a process shows a warning; pytest puts its own function in place of Python's."""
+    sys.stderr.write(warnings.formatwarning(message, category, filename, lineno))
 
 
 def mapped(*arguments: str | Path) -> str:
