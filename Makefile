@@ -1,6 +1,8 @@
 # Two commands do everything on a machine that has Python 3.10 to 3.13 and make:
 #   make run    install, map the built-in room, show the results
 #   make test   install what the tests need, then lint, type-check and test on every backend there is
+# While working, `make check` lints, type-checks and runs all tests that start neither Taichi nor a process, and one
+# test with kernels for each mapping method.
 
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -13,10 +15,13 @@ CANDIDATES := python3.13 python3.12 python3.11 python3.10 python3 python
 PYTHON ?= $(shell for python in $(CANDIDATES); do \
 	$$python -c "$(USABLE)" >/dev/null 2>&1 && { echo $$python; break; }; done)
 
-.PHONY: run test lint clean
+.PHONY: run check test lint clean
 
 run: $(VENV)/.installed
 	@$(BIN)/taichi-mrf map "$(SOURCE)" --out "$(OUT)"
+
+check: lint
+	@$(BIN)/python -m pytest --quick --quiet
 
 test: lint
 	@$(BIN)/python tests/backends.py

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from console import as_process, COARSE, FAST, ROOM, assert_refused, mapped, report_of, taichi_mrf
+from console import COARSE, FAST, ROOM, as_process, assert_refused, mapped, report_of, taichi_mrf
 
 from taichi_mrf.cli.commands import COMMANDS
 from taichi_mrf.cli.flag_list import flags_of
@@ -192,7 +192,7 @@ def test_a_second_run_takes_the_place_of_the_first(tmp_path: Path) -> None:
         ([ROOM, "--every", "0"], ["--every must be at least 1"]),
         ([ROOM, "--limit", "0"], ["--limit must be at least 1"]),
         ([ROOM, "--inference.damping", "1.5"], ["inference.damping must be at least 0 and less than 1"]),
-        ([ROOM, "--config", "no.yaml"], ["no.yaml", "No such file"]),
+        ([ROOM, "--config", "no.yaml"], ["no.yaml", "no such file"]),
         ([ROOM, "--voxel-size", "0.00002", "--runtime.arch", "cpu"], ["GB"]),
     ],
 )
