@@ -81,14 +81,14 @@ def live_beside(page: LivePage) -> Image.Image:
     page.tab("Map")
     page.select("Cut axis", "z")
     page.slide("Cut at", 0.6)
-    page.tick("Beside")
+    page.tick("Show baseline")
     page.until(lambda seen: seen.beside, "the other map")
     counts: list[int] = []
     while len(counts) < 2 or counts[-1] != counts[-2]:  # it grows for as long as keyframes come
         page.pause(STEADY_S)
         counts.append(page.until(lambda seen: seen.settled, "the other map").beside)
     picture = shot(page)
-    page.tick("Beside", on=False)
+    page.tick("Show baseline", on=False)
     page.select("Cut axis", "none")
     page.until(lambda seen: seen.settled and not seen.beside, "one map")
     return picture
@@ -101,7 +101,7 @@ def make_tries(page: LivePage) -> None:
         page.slide(label, value)
         page.until(lambda seen, n=number: seen.settled and f"Try {n}" in page.text(), f"try {number} at rest")
     page.tab("Tries")
-    page.select("Try", re.compile("^1: "))
+    page.select("Selected try", re.compile("^1: "))
     page.press("Pin")
     page.until(lambda seen: "against try 1" in page.text(), "the reference")
 

@@ -4,6 +4,7 @@ circle, every package says what it is for, and no file grows past 400 lines."""
 import ast
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -66,6 +67,33 @@ def test_packages_import_only_what_the_table_allows() -> None:
         and room(name) not in {room(module), *OPEN_TO_ALL, *FLOORS[room(module)]["uses"]}
     ]
     assert not wrong
+
+
+def test_rooms_of_a_package_import_only_the_rooms_that_the_table_allows() -> None:
+    wrong = [
+        f"{module} imports {name}"
+        for package, floor in FLOORS.items()
+        for module, names in imports().items()
+        for name in names
+        if room(module) == room(name) == package
+        and (inner := inner_room(name, floor))
+        and inner not in {inner_room(module, floor), *floor["rooms"].get(inner_room(module, floor), ())}
+    ]
+    assert not wrong
+
+
+def inner_room(module: str, floor: dict[str, Any]) -> str | None:
+    """The room of its package that a module stands in; None for one of the package's own modules."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 and parts[1] in floor.get("rooms", {}) else None
+
+
+def test_the_table_of_rooms_has_no_cycle() -> None:
+    for package, floor in FLOORS.items():
+        seen: set[str] = set()
+        for name, uses in floor.get("rooms", {}).items():
+            assert set(uses) <= seen, f"{package}.{name} uses what stands below it in docs/floors.yaml"
+            seen.add(name)
 
 
 def test_the_table_allows_nothing_that_nobody_uses() -> None:

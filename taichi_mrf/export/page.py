@@ -10,9 +10,9 @@ import numpy as np
 from taichi_mrf.geometry.up import Up, up_of_first
 from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap
 from taichi_mrf.system.atomic import write_text
-from taichi_mrf.viewer.live.options import ViewOptions
 from taichi_mrf.viewer.messages import pack_log_odds
 from taichi_mrf.viewer.scene.look import look_of
+from taichi_mrf.viewer.scene.options import ViewOptions
 from taichi_mrf.viewer.scene.viewpoint import ViewpointController
 from taichi_mrf.viewer.scene.voxel_layer import VoxelLayer
 from taichi_mrf.viewer.transport.server import start_server

@@ -21,9 +21,9 @@ from taichi_mrf.geometry.up import up_of
 from taichi_mrf.live.publish import Publisher
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.viewer.live.options import ViewOptions
 from taichi_mrf.viewer.messages import Bricks, Hello
 from taichi_mrf.viewer.scene.map_scene import MapScene
+from taichi_mrf.viewer.scene.options import ViewOptions
 from taichi_mrf.viewer.transport.server import start_server
 
 _QUIET_S = 0.3

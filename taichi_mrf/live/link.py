@@ -155,6 +155,7 @@ def _interrupts_ignored() -> Iterator[None]:
 def _serve_page(connection: Connection, host: str, port: int) -> None:
     """What runs in the viewer's process. Imported late: the page's libraries are of no use to mapping."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    from taichi_mrf.viewer.live.page import Page
     from taichi_mrf.viewer.transport.process import run_viewer
 
-    run_viewer(connection, host, port)
+    run_viewer(connection, host, port, Page)

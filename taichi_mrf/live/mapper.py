@@ -197,7 +197,7 @@ class Mapper:
         depth_m = self.depth_of(entry)
         if depth_m is None:
             raise KeyframeError(f"keyframe {entry.id} ({entry.name}) is frozen: its image is forgotten")
-        return PosedDepthImage(entry.name, entry.T_world_camera, entry.camera, depth_m)
+        return PosedDepthImage(entry.name, entry.T_world_camera, entry.camera, depth_m, entry.id)
 
     def seers_near(self, point: NDArray[np.float64]) -> Iterator[PosedDepthImage]:
         """All keyframes that are on, the nearest to a point first."""

@@ -1,5 +1,6 @@
 """What the ray of a pixel, or through a point in the map, meets: the answer to a click."""
 
+import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -25,6 +26,8 @@ class PosedDepthImage:
     T_world_camera: Pose
     camera: PinholeCamera
     depth_m: NDArray[np.float32]
+    keyframe: int | None = None
+    """The viewer's number of the keyframe, if it is one."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,8 @@ def _answer(
         noise = PixelNoise(depth * range_per_depth, bias * range_per_depth, sigma * range_per_depth)
     title = f"{seer.name}, pixel ({column}, {row})"
     start, turned = seer.T_world_camera[:3, 3], seer.T_world_camera[:3, :3] @ along
-    return _profiled(m, title, start, turned, noise)
+    answer = _profiled(m, title, start, turned, noise)
+    return dataclasses.replace(answer, keyframe=seer.keyframe, pixel=(column, row))
 
 
 def _profiled(

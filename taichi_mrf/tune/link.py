@@ -32,6 +32,7 @@ class NoPage:
 def _serve_page(connection: Connection, host: str, port: int) -> None:
     """What runs in the page's process. Imported late: its libraries are of no use to mapping."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    from taichi_mrf.viewer.tune.process import run_tune_viewer
+    from taichi_mrf.viewer.transport.process import run_viewer
+    from taichi_mrf.viewer.tune.page import TunePage
 
-    run_tune_viewer(connection, host, port)
+    run_viewer(connection, host, port, TunePage)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.viewer.tune.messages import TuneRequest, TuneUpdate
 
 LOG_ODDS_STEP = 1 / 512
 """Log-odds travel as int16 multiples of this, rounded down, so that their sign, and with it the threshold
@@ -31,8 +30,16 @@ def pack_log_odds(log_odds: NDArray[np.float32]) -> NDArray[np.int16]:
     return np.clip(steps, -32768, 32767, out=steps).astype(np.int16)
 
 
+class Update:
+    """Base of what the mapping process tells its viewer; the tuning page adds its own."""
+
+
+class Request:
+    """Base of what a viewer asks of the mapping process; the tuning page adds its own."""
+
+
 @dataclass(frozen=True)
-class Hello:
+class Hello(Update):
     """The first update, and again after a reset: what is mapped, and with which parameters."""
 
     source: str
@@ -47,7 +54,7 @@ class Hello:
 
 
 @dataclass(frozen=True)
-class Bricks:
+class Bricks(Update):
     """Bricks whose voxels may have changed, and bricks that are gone.
 
     ``bricks`` (n, 3) int32 brick coordinates; ``log_odds`` (n, 512) int16, see :data:`LOG_ODDS_STEP`;
@@ -63,7 +70,7 @@ class Bricks:
 
 
 @dataclass(frozen=True)
-class KeyframeInfo:
+class KeyframeInfo(Update):
     """A keyframe that is new or has changed.
 
     ``picture`` is the depth image in colours, (h, w, 3) uint8 and small; ``crossed`` (n, 3) int32 are the
@@ -83,7 +90,7 @@ class KeyframeInfo:
 
 
 @dataclass(frozen=True)
-class CurrentCamera:
+class CurrentCamera(Update):
     """Where the frame that was read last was taken, keyframe or not."""
 
     name: str
@@ -92,7 +99,7 @@ class CurrentCamera:
 
 
 @dataclass(frozen=True)
-class Status:
+class Status(Update):
     """How the work stands. ``activity`` says in words what the worker is doing, ``share`` how much of that
     is done (0 to 1), ``pending`` whether edits have not reached the map yet, ``speed`` the multiple of the
     recording's pace (0: as fast as it goes)."""
@@ -114,7 +121,7 @@ class Status:
 
 
 @dataclass(frozen=True)
-class Notice:
+class Notice(Update):
     """Something that the user should know, in one sentence."""
 
     text: str
@@ -122,7 +129,7 @@ class Notice:
 
 
 @dataclass(frozen=True)
-class RayAnswer:
+class RayAnswer(Update):
     """What a ray meets, all (n,) by range in metres; see queries.profile.RayProfile.
 
     ``measured_m`` is the range that the keyframe measured there, None without a measurement; ``bias_m``
@@ -140,10 +147,14 @@ class RayAnswer:
     measured_m: float | None
     bias_m: float
     sigma_m: float
+    keyframe: int | None = None
+    """The keyframe whose pixel's ray this is, None for a ray from the viewpoint."""
+    pixel: tuple[int, int] | None = None
+    """Column and row of that pixel."""
 
 
 @dataclass(frozen=True)
-class Images:
+class Images(Update):
     """Pictures of one view, (h, w, 3) uint8 each; ``score`` is the sentence below them."""
 
     title: str
@@ -154,7 +165,7 @@ class Images:
 
 
 @dataclass(frozen=True)
-class File:
+class File(Update):
     """A file for the browser of the client that asked."""
 
     name: str
@@ -162,13 +173,8 @@ class File:
     client: int
 
 
-Update = (
-    Hello | Bricks | KeyframeInfo | CurrentCamera | Status | Notice | RayAnswer | Images | File | TuneUpdate
-)
-
-
 @dataclass(frozen=True)
-class Listening:
+class Listening(Request):
     """The viewer's first word: where its page is. ``port`` may not be the one that was asked for."""
 
     host: str
@@ -176,31 +182,31 @@ class Listening:
 
 
 @dataclass(frozen=True)
-class Pause:
+class Pause(Request):
     """Pause the replay, or go on."""
 
     on: bool
 
 
 @dataclass(frozen=True)
-class Step:
+class Step(Request):
     """Take one more keyframe, then pause."""
 
 
 @dataclass(frozen=True)
-class Speed:
+class Speed(Request):
     """Replay at this multiple of the recording's own pace; 0 is as fast as it goes."""
 
     factor: float
 
 
 @dataclass(frozen=True)
-class Reset:
+class Reset(Request):
     """Forget the map and begin the source anew."""
 
 
 @dataclass(frozen=True)
-class Switch:
+class Switch(Request):
     """Take a keyframe out of the map, or bring it back."""
 
     keyframe: int
@@ -208,14 +214,14 @@ class Switch:
 
 
 @dataclass(frozen=True)
-class Freeze:
+class Freeze(Request):
     """Fold a keyframe into the map for good."""
 
     keyframe: int
 
 
 @dataclass(frozen=True)
-class Move:
+class Move(Request):
     """Give a keyframe another pose."""
 
     keyframe: int
@@ -223,7 +229,7 @@ class Move:
 
 
 @dataclass(frozen=True)
-class RayThrough:
+class RayThrough(Request):
     """Show the ray of a camera through a point, (x, y, z) in metres; of ``keyframe`` if that sees the point,
     else of one that does, else of the eye."""
 
@@ -233,7 +239,7 @@ class RayThrough:
 
 
 @dataclass(frozen=True)
-class PixelRay:
+class PixelRay(Request):
     """Show the ray of a keyframe's pixel; ``u`` and ``v`` in pixels, (0, 0) is the first one's centre."""
 
     keyframe: int
@@ -242,7 +248,7 @@ class PixelRay:
 
 
 @dataclass(frozen=True)
-class Watch:
+class Watch(Request):
     """Which extras to keep up to date: images of ``view`` (a keyframe, or None for the current camera),
     OctoMap's way beside the map, and the ``counts`` of keyframes that see each voxel (else told as 0)."""
 
@@ -253,7 +259,7 @@ class Watch:
 
 
 @dataclass(frozen=True)
-class Save:
+class Save(Request):
     """Make a file for a client, and put it in the run's folder if it has one."""
 
     kind: Literal["map", "ply"]
@@ -261,23 +267,5 @@ class Save:
 
 
 @dataclass(frozen=True)
-class Quit:
+class Quit(Request):
     """The viewer has ended or must end."""
-
-
-Request = (
-    Listening
-    | Pause
-    | Step
-    | Speed
-    | Reset
-    | Switch
-    | Freeze
-    | Move
-    | RayThrough
-    | PixelRay
-    | Watch
-    | Save
-    | Quit
-    | TuneRequest
-)

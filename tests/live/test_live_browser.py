@@ -207,7 +207,7 @@ def test_the_ray_of_a_pixel_is_that_of_its_measurement(page: LivePage) -> None:
     page.select("Keyframe", f"3: {frame.name} (on)")
     page.tab("Ray")
     page.fill("Pixel (u, v)", u, v)
-    page.press("Ray of pixel")
+    page.press("Show the ray")
     page.until(lambda seen: f"{frame.name}, pixel ({u}, {v})" in page.text(), "that pixel's ray")
     assert f"measured {expected_m:.3f} m" in wait_for_the_plot(page)
 
@@ -250,13 +250,13 @@ def page_chosen(page: LivePage) -> str:
     return page.input("Keyframe").input_value().split()[1]
 
 
-def test_octomaps_way_is_shown_beside_the_map(page: LivePage) -> None:
+def test_the_baseline_is_shown_beside_the_map(page: LivePage) -> None:
     before = page.look()
-    page.tick("Beside")
+    page.tick("Show baseline")
     seen = page.until(lambda seen: seen.settled and seen.beside > 1000, "the other map")
     assert seen.voxels == before.voxels
     page.screenshot("beside")
-    page.tick("Beside", on=False)
+    page.tick("Show baseline", on=False)
     page.until(lambda seen: seen.agrees and seen.said_beside == 0, "the map alone")
 
 
@@ -282,10 +282,16 @@ def test_two_viewers_in_a_wide_and_a_narrow_window(
         assert narrow.problems == []
 
 
+def reset(page: LivePage) -> None:
+    """Press Reset, and confirm it."""
+    page.press("Reset")
+    page.press("Delete the map and start again")
+
+
 def test_the_view_follows_the_camera(page: LivePage) -> None:
     away = np.linalg.norm(np.subtract(page.position(), page.position("/camera")))
     page.tick("Follow")
-    page.press("Reset")
+    reset(page)
     places = set()
 
     def followed(seen: Seen) -> bool:

@@ -186,7 +186,7 @@ class LivePage:
         found = self.page.evaluate(_LOOK)
         words = found.pop("counts").replace(",", "").split()
         said = int(words[0]) if words else 0
-        said_beside = int(words[words.index("beside") - 1]) if "beside" in words else 0
+        said_beside = int(words[words.index("baseline") - 3]) if "baseline" in words else 0
         return Seen(said=said, said_beside=said_beside, nodes=tuple(found.pop("nodes")), **found)
 
     def until(self, condition: Callable[[Seen], object], what: str) -> Seen:

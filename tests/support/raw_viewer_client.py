@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 import viser
 import zstandard
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 DEADLINE_S = 60.0
@@ -23,8 +24,20 @@ class RawClient:
         self.connection = connection
         self._heard: deque[dict[str, Any]] = deque()
 
-    def say(self, message: dict[str, Any] | bytes | str) -> None:
+    def say(self, message: dict[str, Any] | bytes | str | list[bytes]) -> None:
+        """A list is sent as the fragments of one message."""
         self.connection.send(msgspec.msgpack.encode(message) if isinstance(message, dict) else message)
+
+    def end_after(self, *messages: dict[str, Any] | bytes | str | list[bytes]) -> int | None:
+        """The code with which the server closes the connection after these messages; None if its close frame
+        was lost behind what was still being sent. Raises TimeoutError if it stays open."""
+        try:
+            for message in messages:
+                self.say(message)
+            self.hear_type("never")
+        except ConnectionClosed as closed:
+            return None if closed.rcvd is None else closed.rcvd.code
+        raise AssertionError("unreachable: nothing has the type 'never'")
 
     def hear(self, matches: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         """The next message for which ``matches`` holds, with what comes before it thrown away."""

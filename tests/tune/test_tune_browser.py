@@ -97,7 +97,7 @@ def test_a_method_brings_its_own_sliders(page: LivePage) -> None:
 def test_restore_brings_sliders_scores_and_map_back(page: LivePage) -> None:
     likelihood = {2: score(page, "log-likelihood")}
     page.tab("Tries")
-    page.select("Try", re.compile(r"^1: "))
+    page.select("Selected try", re.compile(r"^1: "))
     page.press("Restore")
     rests(page, 1)
     assert score(page, "log-likelihood") != likelihood[2]
@@ -120,7 +120,7 @@ def test_the_curves_follow_the_sigma_slider_and_the_residuals_stay(page: LivePag
 
 def test_a_pinned_try_is_what_others_are_compared_with(page: LivePage) -> None:
     page.tab("Tries")
-    page.select("Try", re.compile(r"^1: "))
+    page.select("Selected try", re.compile(r"^1: "))
     page.press("Pin")
     page.until(lambda seen: "against try 1" in page.text(), "the other reference")
     page.screenshot("tune_tries")
@@ -134,7 +134,7 @@ def test_a_pinned_try_is_what_others_are_compared_with(page: LivePage) -> None:
 
 def test_what_is_saved_is_accepted_and_has_its_scores(page: LivePage, tmp_path: Path) -> None:
     page.tab("Tries")
-    page.select("Try", re.compile(r"^1: "))
+    page.select("Selected try", re.compile(r"^1: "))
     page.download("Save YAML").save_as(tmp_path / "try.yaml")
     saved = config.load(tmp_path / "try.yaml")
     assert saved.inference.surface_density == 5.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from typing import TYPE_CHECKING, Any
@@ -16,9 +17,16 @@ from hypothesis import strategies as st
 from raw_viewer_client import RawClient, camera_message, raw_client, wait_for, widget_message
 from viser._messages import FileTransferStartUpload, ShareUrlDisconnect, ShareUrlRequest
 from websockets.exceptions import ConnectionClosedError
+from websockets.protocol import State
 
 from taichi_mrf.viewer.transport.client_messages import AnyClientMessage, Undecodable, decode
-from taichi_mrf.viewer.transport.connection import CAMERA_INTERVAL_S, MESSAGES_PER_SECOND, Budget
+from taichi_mrf.viewer.transport.connection import (
+    CAMERA_INTERVAL_S,
+    LARGEST_MESSAGE,
+    MESSAGES_PER_SECOND,
+    TYPING_REST_S,
+    Budget,
+)
 
 if TYPE_CHECKING:
     from guarded_page import GuardedPage
@@ -325,13 +333,34 @@ def test_what_is_no_message_ends_the_connection(guarded: GuardedPage, said: str 
         assert closed.value.rcvd.code == code
 
 
-def test_large_messages_are_dropped(guarded: GuardedPage, stranger: RawClient) -> None:
+def unasked_picture(size: int) -> dict[str, Any]:
+    return {"type": "GetRenderResponseMessage", "payload": b"x" * size, "render_uuid": "r"}
+
+
+@pytest.mark.parametrize("kind", ["text", "no message", "picture", "fragments", "just too large"])
+def test_a_large_message_ends_the_connection_before_it_is_complete(
+    guarded: GuardedPage, stranger: RawClient, kind: str
+) -> None:
     before = guarded.state()
-    stranger.say(widget_message(guarded.uuid("text"), "x" * 2_000_000))
-    stranger.say(b"\x91" * 2_000_000)
-    stranger.say({"type": "GetRenderResponseMessage", "payload": b"x" * 2_000_000, "render_uuid": "r"})
-    guarded.settle(stranger)
+    whole = {
+        "text": widget_message(guarded.uuid("text"), "x" * 2_000_000),
+        "no message": b"\x91" * 2_000_000,
+        "picture": unasked_picture(2_000_000),
+        "fragments": [bytes(60_000)] * 40,
+        "just too large": unasked_picture(LARGEST_MESSAGE),
+    }[kind]
+    assert stranger.end_after(whole) in (1009, None)
     assert guarded.state() == before
+
+
+def test_an_incomplete_message_takes_no_memory(guarded: GuardedPage, stranger: RawClient) -> None:
+    """The header says 30 MB; the rest would never come."""
+    connection = next(reversed(guarded.server._websock_server._live_connections.values()))
+    header = b"\x82\xff" + (30 * 2**20).to_bytes(8, "big") + bytes(4)
+    with contextlib.suppress(OSError):
+        stranger.connection.socket.sendall(header + bytes(2 * 2**20))
+    wait_for(lambda: connection.protocol.state is not State.OPEN, "the end of the connection")
+    assert len(connection.protocol.reader.buffer) == 0
 
 
 def test_a_picture_that_was_asked_for_arrives(guarded: GuardedPage, stranger: RawClient) -> None:
@@ -342,12 +371,46 @@ def test_a_picture_that_was_asked_for_arrives(guarded: GuardedPage, stranger: Ra
     )
     uuid = stranger.hear_type("GetRenderRequestMessage")["render_uuid"]
     before = guarded.state()
-    stranger.say(widget_message(guarded.uuid("text"), "x" * 100_000))
-    guarded.settle(stranger)
-    assert guarded.state() == before
     payload = imageio.v3.imwrite("<bytes>", picture, extension=".png")
     stranger.say({"type": "GetRenderResponseMessage", "payload": payload, "render_uuid": uuid})
     np.testing.assert_array_equal(asked.result(), picture)
+    assert guarded.state() == before
+
+
+def test_a_large_picture_arrives_once(guarded: GuardedPage, stranger: RawClient) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (300, 300, 4), np.uint8)
+    payload = imageio.v3.imwrite("<bytes>", noise, extension=".png")
+    assert len(payload) > 3 * LARGEST_MESSAGE
+    handle = guarded.server.get_clients()[max(guarded.server.get_clients())]
+    for _ in range(2):
+        asked = guarded.server._thread_executor.submit(
+            handle.get_render, height=300, width=300, transport_format="png", timeout=60.0
+        )
+        uuid = stranger.hear_type("GetRenderRequestMessage")["render_uuid"]
+        stranger.say({"type": "GetRenderResponseMessage", "payload": payload, "render_uuid": uuid})
+        np.testing.assert_array_equal(asked.result(), noise)
+        guarded.settle(stranger)
+    assert stranger.end_after(unasked_picture(len(payload))) in (1009, None)
+
+
+def test_only_one_picture_comes_for_one_request(guarded: GuardedPage, stranger: RawClient) -> None:
+    handle = guarded.server.get_clients()[max(guarded.server.get_clients())]
+    asked = guarded.server._thread_executor.submit(
+        handle.get_render, height=100, width=200, transport_format="png", timeout=60.0
+    )
+    stranger.hear_type("GetRenderRequestMessage")
+    assert stranger.end_after(*[unasked_picture(4 * 2**20)] * 20) in (1009, None)
+    assert asked.exception() is not None
+
+
+def test_a_number_that_is_being_typed_is_not_clamped(guarded: GuardedPage, stranger: RawClient) -> None:
+    """0.8 is typed as 0, then 0., then 0.8; the slider begins at 0.1."""
+    for typed in (0, 0, 0.8):
+        stranger.say(widget_message(guarded.uuid("slider"), typed))
+    guarded.settle(stranger)
+    time.sleep(1.5 * TYPING_REST_S)
+    guarded.settle(stranger)
+    assert guarded.events == [("slider", 0.8)]
 
 
 def test_a_known_command_runs(guarded: GuardedPage, stranger: RawClient) -> None:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -10,11 +10,11 @@ import pytest
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.geometry.up import up_of, up_vector
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.viewer.live.options import ColorBy, ViewOptions
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, KeyframeInfo, RayAnswer, pack_log_odds
 from taichi_mrf.viewer.scene.coloring import legend_html, scale_of, voxel_colors
 from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, Placement
 from taichi_mrf.viewer.scene.look import look_of
+from taichi_mrf.viewer.scene.options import ColorBy, ViewOptions
 from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
 from taichi_mrf.viewer.scene.ray_plot import curves
 from taichi_mrf.viewer.scene.voxel_store import Shown, VoxelStore, facing
@@ -94,10 +94,28 @@ def test_looks_that_differ_only_in_unused_heights_are_the_same() -> None:
     large.put(np.array([[5, 5, 5]], np.int32), np.zeros((1, 512), np.int16), np.zeros((1, 512), np.uint8))
     by_marginal, by_height = ViewOptions(), ViewOptions(color_by="height")
     up = (2, 1)
-    assert look_of(by_marginal, small, up, 0.05).same_everywhere(look_of(by_marginal, large, up, 0.05))
-    assert not look_of(by_height, small, up, 0.05).same_everywhere(look_of(by_height, large, up, 0.05))
-    moved = dataclasses.replace(by_marginal, threshold=0.6)
-    assert not look_of(by_marginal, large, up, 0.05).same_everywhere(look_of(moved, large, up, 0.05))
+    assert look_of(by_marginal, small, up, 0.05) == look_of(by_marginal, large, up, 0.05)
+    assert look_of(by_height, small, up, 0.05) != look_of(by_height, large, up, 0.05)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"threshold": 0.6},
+        {"cut_axis": "x"},
+        {"size": 0.5},
+        {"shade": False},
+        {"color_by": "uncertainty"},
+    ],
+    ids=str,
+)
+def test_every_option_of_the_voxels_makes_another_look(changes: dict[str, Any]) -> None:
+    store = VoxelStore()
+    store.put(np.array([[5, 5, 5]], np.int32), np.zeros((1, 512), np.int16), np.zeros((1, 512), np.uint8))
+    options = ViewOptions()
+    before = look_of(options, store, (2, 1), 0.05)
+    assert look_of(dataclasses.replace(options, **changes), store, (2, 1), 0.05) != before
+    assert look_of(options, store, (2, -1), 0.05) != before
 
 
 CAMERA = PinholeCamera(64, 48, 50.0, 55.0, 30.0, 25.0)

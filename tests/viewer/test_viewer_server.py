@@ -18,11 +18,12 @@ import viser
 from raw_viewer_client import camera_message, raw_client, wait_for
 from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
-from websockets.exceptions import InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.http11 import Request, Response
 
 from taichi_mrf.errors import TaichiMRFError
 from taichi_mrf.viewer.transport import server as viewer_server
+from taichi_mrf.viewer.transport import viser_internals
 from taichi_mrf.viewer.transport.origin import answer_page, refusal
 from taichi_mrf.viewer.transport.server import start_server
 
@@ -127,6 +128,11 @@ def test_the_page_is_served_unframed_and_unsniffed(server: viser.ViserServer) ->
         assert status == 200
         assert b"X-Frame-Options: DENY" in head
         assert b"X-Content-Type-Options: nosniff" in head
+        policy = head.partition(b"Content-Security-Policy: ")[2].partition(b"\r\n")[0]
+        assert b"default-src 'none'" in policy
+        scripts = next(each for each in policy.split(b"; ") if each.startswith(b"script-src"))
+        assert scripts.count(b"'sha256-") == 2
+        assert b"unsafe-inline" not in scripts
         assert body == (CLIENT_BUILD / "index.html").read_bytes()
 
 
@@ -232,6 +238,23 @@ def test_an_address_that_cannot_be_had_is_said(host: str, port: int) -> None:
         start_server(host, port, "Nowhere")
 
 
+def test_no_more_browsers_connect_than_there_is_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(viewer_server, "MOST_CLIENTS", 1)
+    running = start_server("127.0.0.1", 0, "Full")
+    try:
+        with raw_client(running.get_port()) as first:
+            first.hear_type("SetGuiPanelLabelMessage")
+            with pytest.raises(ConnectionClosed) as closed, raw_client(running.get_port()) as second:
+                second.hear_type("never")
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.code == 1013
+        wait_for(lambda: not running.get_clients(), "the end of the first one")
+        with raw_client(running.get_port()) as third:
+            third.hear_type("SetGuiPanelLabelMessage")
+    finally:
+        running.stop()
+
+
 def test_visers_environment_variable_is_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         elsewhere = listener.getsockname()[1]
@@ -257,14 +280,14 @@ def test_there_is_no_share_button_and_no_tunnel(server: viser.ViserServer) -> No
 def test_an_unknown_viser_is_not_run_unguarded(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
-    monkeypatch.setitem(viewer_server.VISER_INTERNALS, "gui._handles_by_name", dict)
-    with pytest.raises(TaichiMRFError, match=r"cannot guard viser .*gui\._handles_by_name"):
+    monkeypatch.setitem(viser_internals.SERVER, "gui._handles_by_name", dict)
+    with pytest.raises(TaichiMRFError, match=r"cannot guard viser .*gui\._handles_by_name.*viser_internals"):
         start_server("127.0.0.1", port, "Unknown")
     socket.create_server(("127.0.0.1", port)).close()
 
 
 def test_a_viser_that_starts_by_itself_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewer_server, "_replaced_serve", lambda door: nullcontext())
+    monkeypatch.setattr(viser_internals, "serving_by", lambda serve: nullcontext())
     with pytest.raises(TaichiMRFError, match="does not call websockets' serve"):
         start_server("127.0.0.1", 0, "By itself")
 

@@ -1,15 +1,15 @@
 """Colours of voxels: what is shown, and the scale beside it. All scales are perceptually uniform."""
 
 import base64
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.viewer.live.options import ColorBy
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
+from taichi_mrf.viewer.scene.options import ColorBy
 from taichi_mrf.viewer.scene.voxel_store import Shown
 from taichi_mrf.voxels.colors import LOWEST
 
@@ -34,25 +34,22 @@ _SHADES = np.where(
 class Scale:
     """A colour scale: 256 colours (256, 3), the values at both ends, and what they are.
 
-    ``table`` gives the colour's number for what the scale is of: for each int16 of log-odds, seen as
-    uint16, or for each number of keyframes; a height has none.
+    ``table`` gives the colour's index for each int16 of log-odds, viewed as uint16, or for each count of
+    keyframes; heights have none. Colours and table follow from the other fields, so scales that agree in
+    those are equal.
     """
 
     color_by: ColorBy
-    colors: NDArray[np.uint8]
+    colors: NDArray[np.uint8] = field(compare=False)
     low: float
     high: float
     label: str
-    table: NDArray[np.uint8] | None = None
+    table: NDArray[np.uint8] | None = field(default=None, compare=False)
 
     @cached_property
     def shaded(self) -> NDArray[np.uint8]:
         """The colours, darkened for each way to face, (27 * 256, 3)."""
         return (self.colors * _SHADES[:, None, None] + 0.5).astype(np.uint8).reshape(-1, 3)
-
-    def legend(self) -> tuple[str, float, float]:
-        """What tells one scale from another."""
-        return self.label, self.low, self.high
 
 
 def scale_of(

@@ -1,4 +1,4 @@
-"""Keyframes in the scene: small frusta with their depth images, the camera's way, the camera itself."""
+"""Keyframes in the scene: small frusta with their depth images, the camera's path, the current camera."""
 
 from dataclasses import dataclass
 
@@ -34,7 +34,7 @@ class Placement:
         return Placement(wxyz, T_world_camera[:3, 3])
 
     def pose(self) -> Pose:
-        """The same as (4, 4)."""
+        """The pose as a (4, 4) matrix."""
         T = np.eye(4)
         T[:3, :3] = vtf.SO3(np.asarray(self.wxyz, np.float64)).as_matrix()
         T[:3, 3] = self.position
@@ -49,6 +49,8 @@ class KeyframeLayer:
         self.roster = ShownKeyframes()
         self.chosen: int | None = None
         self.gizmo: viser.TransformControlsHandle | None = None
+        self.held = False
+        """Whether a user is dragging the gizmo."""
         self._frusta: dict[int, viser.CameraFrustumHandle] = {}
         # viser remembers each name that was ever removed, so names are used again.
         self._places: dict[int, int] = {}
@@ -57,7 +59,7 @@ class KeyframeLayer:
 
     @property
     def keyframes(self) -> dict[int, KeyframeInfo]:
-        """Those that are known, by number."""
+        """The known keyframes, by number."""
         return self.roster.keyframes
 
     def put(self, keyframe: KeyframeInfo) -> None:
@@ -71,30 +73,32 @@ class KeyframeLayer:
             self.chosen = min(self.keyframes)
         if keyframe.id in self.keyframes:
             self._draw(keyframe)
+        if keyframe.id == self.chosen:
+            self._place_gizmo(keyframe)
 
     def choose(self, id: int | None) -> None:
-        """Mark a keyframe as the one that buttons act on."""
+        """Mark a keyframe as the one that the buttons change."""
         before, self.chosen = self.chosen, id
         for each in (before, id):
             if each in self._frusta:
                 self._draw(self.keyframes[each])
 
     def show_pictures(self, on: bool) -> None:
-        """Show the depth images in the frusta, or leave them out."""
+        """Show the depth images in the frusta, or hide them."""
         if on != self._pictures:
             self._pictures = on
             for id in list(self._frusta):
                 self._draw(self.keyframes[id])
 
     def draw_way(self) -> None:
-        """Draw the camera's way through all keyframes, in the order of their numbers."""
+        """Draw the camera's path through all keyframes, in the order of their numbers."""
         points = self.roster.way_m()
         if len(points) > 1:
             segments = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
             self._scene.add_line_segments("/way", segments, _WAY, thickness=2.0, thickness_units="screen")
 
     def show_camera(self, camera: CurrentCamera) -> None:
-        """Show where the frame was taken that was read last."""
+        """Show the camera of the latest frame."""
         place = Placement.of(camera.T_world_camera)
         fov, aspect = _view_angles(camera.camera)
         self._scene.add_camera_frustum(
@@ -111,11 +115,10 @@ class KeyframeLayer:
             position=place.position,
         )
 
-    def grab(self) -> viser.TransformControlsHandle | None:
-        """Put a gizmo on the chosen keyframe; None if none is chosen."""
+    def grab(self) -> viser.TransformControlsHandle:
+        """Put a gizmo on the chosen keyframe. There must be one."""
         self.release()
-        if self.chosen is None:
-            return None
+        assert self.chosen is not None
         place = Placement.of(self.keyframes[self.chosen].T_world_camera)
         self.gizmo = self._scene.add_transform_controls(
             "/gizmo", scale=0.5, depth_test=False, wxyz=place.wxyz, position=place.position
@@ -124,9 +127,20 @@ class KeyframeLayer:
 
     def release(self) -> None:
         """Take the gizmo away."""
+        self.held = False
         if self.gizmo is not None:
             self.gizmo.remove()
             self.gizmo = None
+
+    def _place_gizmo(self, keyframe: KeyframeInfo) -> None:
+        """The gizmo stays on its keyframe wherever that is put, but never jumps out of a user's hand."""
+        if self.gizmo is None or self.held:
+            return
+        if keyframe.state == "frozen":
+            self.release()
+            return
+        place = Placement.of(keyframe.T_world_camera)
+        self.gizmo.wxyz, self.gizmo.position = place.wxyz, place.position
 
     def clear(self) -> None:
         """Forget all keyframes."""

@@ -3,9 +3,9 @@
 import numpy as np
 
 from taichi_mrf.geometry.up import Up
-from taichi_mrf.viewer.live.options import ViewOptions
 from taichi_mrf.viewer.scene.coloring import scale_of
 from taichi_mrf.viewer.scene.cut_plane import cut_voxel
+from taichi_mrf.viewer.scene.options import ViewOptions
 from taichi_mrf.viewer.scene.voxel_layer import Look
 from taichi_mrf.viewer.scene.voxel_store import VoxelStore
 from taichi_mrf.voxels.layout import BRICK

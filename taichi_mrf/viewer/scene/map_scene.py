@@ -11,12 +11,12 @@ import viser
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.up import Up
-from taichi_mrf.viewer.live.options import ViewOptions
 from taichi_mrf.viewer.messages import Bricks, Hello, Layer
 from taichi_mrf.viewer.scene.brick_lines import BrickLines
 from taichi_mrf.viewer.scene.coloring import Scale
 from taichi_mrf.viewer.scene.cut_plane import CutPlane, cut_picture
 from taichi_mrf.viewer.scene.look import Look, look_of
+from taichi_mrf.viewer.scene.options import ViewOptions
 from taichi_mrf.viewer.scene.voxel_layer import VoxelLayer
 from taichi_mrf.viewer.scene.voxel_store import ChunkKey, VoxelStore
 from taichi_mrf.voxels.layout import BRICK
@@ -29,7 +29,7 @@ _GAP_M = 0.5
 """Between the map and the one beside it."""
 
 
-_NAMES: dict[Layer, str] = {"map": "this map", "beside": "OctoMap's way"}
+_NAMES: dict[Layer, str] = {"map": "this map", "beside": "baseline (OctoMap)"}
 
 
 class MapScene:
@@ -119,7 +119,7 @@ class MapScene:
         rested = time.monotonic() >= self._news_at + REST_S
         look = look_of(options, self.store, up, self._hello.voxel_size)
         # A scale of heights or a cut that moves with the map's size changes every chunk.
-        everything = self._all_dirty or (self._look is not None and not look.same_everywhere(self._look))
+        everything = self._all_dirty or (self._look is not None and look != self._look)
         map_changed = everything or bool(self._dirty["map"])
         any_changed = map_changed or bool(self._dirty["beside"])
         for name, layer in self.layers.items():

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from viser import uplot
 
 from taichi_mrf.viewer.messages import RayAnswer
+from taichi_mrf.viewer.scene.safe_text import in_markdown
 
 Curves = tuple[NDArray[np.float64], ...]
 
@@ -21,8 +22,8 @@ _SERIES = (
     uplot.Series(label="measured ± sigma", stroke="#e69f00", fill="#e69f0055", width=1),
     uplot.Series(label="measured", stroke="#d55e00", width=2),
     uplot.Series(label="visibility", stroke="#404788", width=2),
-    uplot.Series(label="omega / largest", stroke="#e6007e", width=2),
-    uplot.Series(label="p occupied", stroke="#1f968b", width=2),
+    uplot.Series(label="omega (scaled to 1)", stroke="#e6007e", width=2),
+    uplot.Series(label="p(occupied)", stroke="#1f968b", width=2),
 )
 
 
@@ -45,7 +46,7 @@ class RayPlot:
         """Draw an answer, and the ray in the scene."""
         self._plot.data = curves(answer)
         self._plot.visible = True
-        self._text.content = f"**{answer.title}**\n\n{_sentence(answer)}"
+        self._text.content = f"**{in_markdown(answer.title)}**\n\n{in_markdown(_sentence(answer))}"
         start = np.array(answer.origin)
         end = start + np.array(answer.direction) * _end_m(answer)
         self._scene.add_line_segments(
@@ -57,7 +58,7 @@ class RayPlot:
         )
 
     def clear(self) -> None:
-        """Back to nothing."""
+        """Hide the plot and the ray."""
         self._plot.visible = False
         self._text.content = "Click a voxel, or the picture of a keyframe."
         self._scene.remove_by_name("/ray")

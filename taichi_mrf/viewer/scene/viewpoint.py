@@ -1,4 +1,4 @@
-"""From where browsers look at the map: a sensible first view, and the view that follows the camera."""
+"""The viewpoint of the browsers: a view of the whole map at first, and a view that follows the camera."""
 
 import numpy as np
 import viser
@@ -24,50 +24,47 @@ class ViewpointController:
         self._server = server
         self.up: Up = (2, 1)
         self._camera: Pose | None = None
+        self._following = False
         self._seen_size = 0.0
         self._view: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self._placed: dict[int, NDArray[np.float64]] = {}
 
     def set_up(self, up: Up) -> None:
-        """Which way is up, from the first keyframe on."""
+        """Set which way is up, from the first keyframe on."""
         self.up = up
         self._seen_size, self._view = 0.0, None
         self._server.scene.set_up_direction(up_vector(up))
 
     def joined(self, client: int) -> None:
-        """Give a new browser the view that the others began with, once there is one."""
+        """Give a new browser the view that the others have: behind the camera, or of the whole map."""
         handle = self._server.get_clients().get(client)
-        if handle is not None:
-            self._placed[client] = handle.camera.position
-            if self._view is not None:
-                self._point(handle, *self._view)
-
-    def camera_moved(self, T_world_camera: Pose, follow: bool) -> None:
-        """Remember the mapping camera, and look over its shoulder if ``follow``."""
-        self._camera = T_world_camera
-        if follow:
-            self.follow()
-
-    def follow(self) -> None:
-        """Look over the mapping camera's shoulder, if there is one."""
-        if self._camera is None:
+        if handle is None:
             return
-        T_world_camera = self._camera
-        position, forward = T_world_camera[:3, 3], T_world_camera[:3, 2]
-        up = up_vector(self.up)
-        eye, target = position - _BEHIND_M * forward + _ABOVE_M * up, position + _AHEAD_M * forward
-        for client in self._server.get_clients().values():
-            self._point(client, eye, target)
+        self._placed[client] = handle.camera.position
+        view = self._behind_camera() if self._following else None
+        if view is None:
+            view = self._view
+        if view is not None:
+            self._point(handle, *view)
+
+    def camera_moved(self, T_world_camera: Pose) -> None:
+        """Remember the camera's pose, and follow it if that is wanted."""
+        self._camera = T_world_camera
+        self._follow()
+
+    def set_following(self, on: bool) -> None:
+        """Keep every browser's view behind the camera from now on, or leave it to the user."""
+        if on != self._following:
+            self._following = on
+            self._follow()
 
     def look_at_everything(self) -> None:
-        """Choose the view anew, for everybody: what there is to see has changed."""
+        """Choose the view anew when the map's box is told next; a view that a user has chosen stays."""
         self._seen_size = 0.0
-        for id, client in self._server.get_clients().items():
-            self._placed[id] = client.camera.position
 
     def map_grew(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
-        """Look at the whole box from ``low`` to ``high`` (metres): those who come later, and those who have
-        not moved their view yet."""
+        """Look at the whole box from ``low`` to ``high`` (metres, world): browsers that connect later, and
+        those whose user has not moved the view. While the view follows the camera it stays there."""
         size = float(np.linalg.norm(high - low))
         if size < _GROWTH * self._seen_size:
             return
@@ -86,9 +83,25 @@ class ViewpointController:
         self._view = eye, target
         start = self._server.initial_camera
         start.position, start.look_at = eye, target
+        if self._following:
+            return
         for id, client in self._server.get_clients().items():
             if np.allclose(client.camera.position, self._placed.get(id, np.inf), atol=1e-3):
                 self._point(client, eye, target)
+
+    def _follow(self) -> None:
+        view = self._behind_camera() if self._following else None
+        if view is not None:
+            for client in self._server.get_clients().values():
+                self._point(client, *view)
+
+    def _behind_camera(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """Eye and target that look over the camera's shoulder; None before the first frame."""
+        if self._camera is None:
+            return None
+        position, forward = self._camera[:3, 3], self._camera[:3, 2]
+        eye = position - _BEHIND_M * forward + _ABOVE_M * up_vector(self.up)
+        return eye, position + _AHEAD_M * forward
 
     def _point(
         self, client: viser.ClientHandle, eye: NDArray[np.float64], target: NDArray[np.float64]

@@ -16,7 +16,7 @@ NOTICEABLE = 12
 
 @dataclass(frozen=True)
 class Look:
-    """What decides how a chunk looks."""
+    """What decides how a chunk looks: with equal looks, a voxel that has not changed looks the same."""
 
     log_odds: float
     cut: Cut | None
@@ -26,14 +26,6 @@ class Look:
     shade: bool
     up: tuple[int, int]
     """The axis that points up, and 1 or -1 for its direction."""
-
-    def same_everywhere(self, other: "Look") -> bool:
-        """Whether a voxel that has not changed looks the same."""
-        mine, others = (
-            (look.log_odds, look.cut, look.point_size, look.shade, look.up, look.scale.legend())
-            for look in (self, other)
-        )
-        return mine == others
 
 
 @dataclass

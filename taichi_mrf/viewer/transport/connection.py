@@ -1,6 +1,7 @@
-"""A client's websocket, heard through the gate.
+"""A client's websocket behind the gate.
 
-viser asks a connection for its next message; this one answers with the next message that may pass.
+viser asks a connection for its next message; this one answers with the next message that may pass. What a
+client may send is bounded in size before it is parsed, and in number.
 """
 
 import asyncio
@@ -10,22 +11,37 @@ from typing import Any
 
 from websockets.asyncio.server import ServerConnection
 from websockets.frames import CloseCode
+from websockets.protocol import State
 
-from taichi_mrf.viewer.transport.client_messages import AnyClientMessage, Camera, Picture, Undecodable, encode
+from taichi_mrf.viewer.transport.client_messages import (
+    AnyClientMessage,
+    Camera,
+    Picture,
+    Undecodable,
+    WidgetUpdate,
+    encode,
+)
 from taichi_mrf.viewer.transport.client_messages import decode as decode_message
 from taichi_mrf.viewer.transport.guard import Gate
 
 MESSAGES_PER_SECOND = 200.0
-"""What one client may say for long; the stock client stays below 100."""
+"""The rate at which one client may send for long; the stock client stays below 100."""
 
 LARGEST_MESSAGE = 64 * 1024
-"""Bytes of anything but a picture that was asked for."""
+"""Bytes of any message but a picture that was asked for."""
+
+LARGEST_PICTURE = 18 * 2**20
+"""Bytes; downloads.MOST_PIXELS without compression take less."""
 
 CAMERA_INTERVAL_S = 0.02
 """Cameras that come faster replace each other."""
 
+TYPING_REST_S = 1.0
+"""A number outside its range is taken, clamped, if nothing else was typed for so long: whoever types 0.8 into
+a range that begins at 0.02 sends 0 first."""
+
 CLOSE_TIMEOUT_S = 0.5
-"""How long a client may take to answer a goodbye."""
+"""How long a client may take to answer a close frame."""
 
 
 @dataclass
@@ -49,46 +65,87 @@ class Budget:
 class GuardedConnection(ServerConnection):
     """A websocket that gives only what ``gate`` admits, and cameras at a steady pace.
 
-    Whoever opens the door to a connection sets its gate; without one it gives nothing.
+    The server sets the gate when it opens; without one the connection gives nothing.
     """
 
-    gate: Gate
+    gate: Gate | None = None
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._budget = Budget(MESSAGES_PER_SECOND, MESSAGES_PER_SECOND, monotonic())
         self._reading: asyncio.Task[str | bytes] | None = None
-        self._camera: Camera | None = None
+        self._held: dict[str, tuple[float, AnyClientMessage]] = {}
+        """Messages that are admitted later unless others replace them, with the time when they are due."""
         self._camera_due = 0.0
+        self._picture_begun = self._picture_arrived = False
+
+    def data_received(self, data: bytes) -> None:
+        """Take in bytes; a client whose next message is already too large loses its connection."""
+        super().data_received(data)
+        if self.protocol.state is State.OPEN and not self._is_within_size():
+            self.protocol.fail(CloseCode.MESSAGE_TOO_BIG, "the message is too large")
+            self.send_data()
 
     async def recv(self, decode: bool | None = None) -> bytes:  # type: ignore[override]
         """The next message that may pass.
 
-        Raises websockets' ConnectionClosed, also after this side has closed because what came cannot be
-        from a viewer's page.
+        Raises websockets' ConnectionClosed, also after this side has closed because the client cannot be a
+        viewer's page.
         """
         while True:
-            now = monotonic()
-            if self._camera is not None and now >= self._camera_due:
-                camera, self._camera = self._camera, None
-                self._camera_due = now + CAMERA_INTERVAL_S
-                return encode(camera)
-            heard = await self._hear(None if self._camera is None else self._camera_due - now)
-            message = None if heard is None else await self._understand(heard)
-            if isinstance(message, Camera):
-                self._camera = message
-            elif message is not None:
-                return encode(message)
+            message = self._due_message()
+            if message is None:
+                received = await self._receive(self._patience_s())
+                message = None if received is None else await self._understand(received)
+            client_id = None if self.gate is None else self.gate.client_id(self)
+            if message is not None and self.gate is not None and client_id is not None:
+                admitted = self.gate.admit(client_id, message)
+                if admitted is not None:
+                    return encode(admitted)
 
     async def close(self, code: CloseCode | int = CloseCode.NORMAL_CLOSURE, reason: str = "") -> None:
-        """Close, or cut off a client that takes nothing in: a full buffer keeps back even the goodbye."""
+        """Close, or cut off a client that reads nothing: a full buffer keeps back even the close frame."""
         cut_off = self.loop.call_later(2 * CLOSE_TIMEOUT_S, self.transport.abort)
         try:
             await super().close(code, reason)
         finally:
             cut_off.cancel()
 
-    async def _hear(self, timeout_s: float | None) -> str | bytes | None:
+    def _is_within_size(self) -> bool:
+        """Whether the message that is arriving has not outgrown its bound. A picture that was asked for may
+        be large, once."""
+        size = len(self.protocol.reader.buffer) + (self.protocol.current_size or 0)
+        if size <= LARGEST_MESSAGE and not self._picture_begun and not self._picture_arrived:
+            return True
+        client_id = None if self.gate is None else self.gate.client_id(self)
+        if self.gate is None or client_id is None or not self.gate.awaits_picture(client_id):
+            self._picture_begun = self._picture_arrived = False
+            return size <= LARGEST_MESSAGE
+        if size <= LARGEST_MESSAGE:
+            self._picture_arrived |= self._picture_begun
+            self._picture_begun = False
+            return True
+        self._picture_begun = True
+        return size <= LARGEST_PICTURE and not self._picture_arrived
+
+    def _due_message(self) -> AnyClientMessage | None:
+        """A message that was held back and whose time has come."""
+        now = monotonic()
+        for key, (due, message) in self._held.items():
+            if due <= now:
+                del self._held[key]
+                if isinstance(message, Camera):
+                    self._camera_due = now + CAMERA_INTERVAL_S
+                return message
+        return None
+
+    def _patience_s(self) -> float | None:
+        """Seconds until a message that is held back is due; None if there is none."""
+        if not self._held:
+            return None
+        return max(0.0, min(due for due, _ in self._held.values()) - monotonic())
+
+    async def _receive(self, timeout_s: float | None) -> str | bytes | None:
         """The next message as it came; None if there is none in time."""
         if self._reading is None:
             self._reading = asyncio.create_task(super().recv())
@@ -102,22 +159,34 @@ class GuardedConnection(ServerConnection):
         reading, self._reading = self._reading, None
         return reading.result()
 
-    async def _understand(self, heard: str | bytes) -> AnyClientMessage | None:
-        """What the gate makes of it. Closes the connection where it is not viser's language at all."""
-        client_id = self.gate.client_id(self)
-        if isinstance(heard, str):
+    async def _understand(self, received: str | bytes) -> AnyClientMessage | None:
+        """The message, unless it is refused or held back. Closes the connection if it is none of viser's."""
+        if isinstance(received, str):
             await self.close(CloseCode.UNSUPPORTED_DATA)
-        elif client_id is not None and (len(heard) <= LARGEST_MESSAGE or self.gate.awaits_picture(client_id)):
-            try:
-                message = decode_message(heard)
-            except Undecodable:
-                await self.close(CloseCode.INVALID_DATA)
+            return None
+        client_id = None if self.gate is None else self.gate.client_id(self)
+        if self.gate is None or client_id is None:
+            return None
+        is_large = len(received) > LARGEST_MESSAGE
+        if is_large and not self.gate.awaits_picture(client_id):
+            await self.close(CloseCode.MESSAGE_TOO_BIG)
+            return None
+        try:
+            message = decode_message(received)
+        except Undecodable:
+            await self.close(CloseCode.INVALID_DATA)
+            return None
+        if message is None or (is_large and not isinstance(message, Picture)):
+            return None
+        if isinstance(message, Camera):  # costs nothing: never more than one of them waits
+            if self.gate.admit(client_id, message) is not None:
+                self._held["camera"] = self._camera_due, message
+            return None
+        if not self._budget.spend(monotonic()):
+            return None
+        if isinstance(message, WidgetUpdate):
+            self._held.pop(message.uuid, None)
+            if self.gate.may_be_unfinished(client_id, message):
+                self._held[message.uuid] = monotonic() + TYPING_REST_S, message
                 return None
-            too_large = len(heard) > LARGEST_MESSAGE and not isinstance(message, Picture)
-            if message is not None and not too_large and self._can_afford(message):
-                return self.gate.admit(client_id, message)
-        return None
-
-    def _can_afford(self, message: AnyClientMessage) -> bool:
-        """Cameras cost nothing: there is never more than one of them waiting."""
-        return isinstance(message, Camera) or self._budget.spend(monotonic())
+        return message

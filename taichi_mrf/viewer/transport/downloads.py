@@ -1,5 +1,6 @@
 """Files that a browser gets from the page: pictures, standalone pages, recordings."""
 
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -9,16 +10,27 @@ import cv2
 import numpy as np
 import viser
 
-_PICTURE_TIMEOUT_S = 20.0
-_MOST_PIXELS = 2560
+PICTURE_TIMEOUT_S = 30.0
+"""How long a browser may take to draw and send a picture."""
+
+PICTURES_AT_ONCE = 8
+"""Of as many browsers pictures are awaited at the same time, one of each."""
+
+MOST_PIXELS = 2560 * 1600
+"""Of a picture; larger windows are scaled down."""
 
 
 class Downloads:
-    """Makes files beside the page's owner, which must not wait for a browser or a compressor."""
+    """Makes files on threads of their own: the page's thread must not wait for a browser or for
+    compression."""
 
     def __init__(self, server: viser.ViserServer, problem: Callable[[str], None]) -> None:
+        """``problem`` takes a sentence that says what failed, on any thread."""
         self._server, self._problem = server, problem
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="downloads")
+        self._lock = threading.Lock()
+        self._awaited: set[int] = set()
+        """Clients that were asked for a picture and have not sent it."""
         self._recording: Any = None
         self._recorded_to = 0.0
 
@@ -34,16 +46,31 @@ class Downloads:
             handle.send_file_download(name, content, save_immediately=True)
 
     def picture(self, client: int) -> None:
-        """What that browser shows, as PNG."""
-        self._later("picture", lambda: self._picture(client))
+        """Give a browser what it shows, as PNG. A browser that does not answer keeps nobody else waiting."""
+        with self._lock:
+            if client in self._awaited:
+                return
+            if len(self._awaited) >= PICTURES_AT_ONCE:
+                self._problem(f"{PICTURES_AT_ONCE} pictures are being made; try again in a moment")
+                return
+            self._awaited.add(client)
+
+        def picture() -> None:
+            try:
+                self._guarded("picture", lambda: self._picture(client))
+            finally:
+                with self._lock:
+                    self._awaited.discard(client)
+
+        threading.Thread(target=picture, name=f"picture of client {client}", daemon=True).start()
 
     def page(self, client: int, dark: bool) -> None:
-        """The scene as one HTML file."""
+        """Give a browser the scene as one HTML file."""
         scene = self._server.get_scene_serializer()
         self._later("page", lambda: self.send(client, "map.html", scene.as_html(dark).encode()))
 
     def toggle_recording(self, client: int) -> None:
-        """Begin to record, or end it and give the browser the file."""
+        """Start to record, or stop and give the browser the file."""
         if self._recording is None:
             self._recording, self._recorded_to = self._server.get_scene_serializer(), time.monotonic()
             return
@@ -52,7 +79,7 @@ class Downloads:
         self._later("recording", lambda: self.send(client, "map.viser", recording.serialize()))
 
     def tick(self) -> None:
-        """Tell the recording how much time has gone by; call it before each change of the scene."""
+        """Tell the recording how much time has passed; call it before each change of the scene."""
         if self._recording is not None:
             now = time.monotonic()
             self._recording.insert_sleep(now - self._recorded_to)
@@ -63,18 +90,21 @@ class Downloads:
         if handle is None:
             return
         height, width = handle.camera.image_height, handle.camera.image_width
-        shrink = max(1.0, max(height, width) / _MOST_PIXELS)
+        shrink = max(1.0, (height * width / MOST_PIXELS) ** 0.5)
         rendered = handle.get_render(
-            int(height / shrink), int(width / shrink), transport_format="png", timeout=_PICTURE_TIMEOUT_S
+            max(1, int(height / shrink)),
+            max(1, int(width / shrink)),
+            transport_format="png",
+            timeout=PICTURE_TIMEOUT_S,
         )
         bgra = rendered[..., [2, 1, 0, 3]] if rendered.shape[2] == 4 else rendered[..., ::-1]
         self.send(client, "view.png", cv2.imencode(".png", np.ascontiguousarray(bgra))[1].tobytes())
 
     def _later(self, what: str, work: Callable[[], None]) -> None:
-        def guarded() -> None:
-            try:
-                work()
-            except Exception as error:  # a browser that leaves or hangs is its own affair
-                self._problem(f"The {what} could not be made: {error or type(error).__name__}")
+        self._pool.submit(self._guarded, what, work)
 
-        self._pool.submit(guarded)
+    def _guarded(self, what: str, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except Exception as error:  # a browser that leaves or hangs must not end the page
+            self._problem(f"The {what} could not be made: {error or type(error).__name__}")

@@ -1,12 +1,39 @@
-"""The inbox of a page: everything that happens goes in, and the page's own thread takes it out.
+"""The inbox of a page: updates and events go in, and the page's own thread takes them out.
 
-Updates come from the mapping process, events from the browsers; None says that it is time to end.
+Updates come from the mapping process, events from the browsers; None ends the page. viser runs callbacks on a
+pool of threads: a callback only puts an event into the inbox.
 """
 
 import queue
+from dataclasses import dataclass
+from enum import Enum
 
-from taichi_mrf.viewer.events import Event
 from taichi_mrf.viewer.messages import Update
+
+
+class Event:
+    """Base of what a user or a browser does; the pages add their own."""
+
+
+@dataclass(frozen=True)
+class Joined(Event):
+    """A browser has connected."""
+
+    client: int
+
+
+@dataclass(frozen=True)
+class OptionsMoved(Event):
+    """A widget of the view options was used; the latest values count."""
+
+
+@dataclass(frozen=True)
+class Used(Event):
+    """A client used the widget of an action: it pressed the button, or changed the value."""
+
+    action: Enum
+    client: int
+
 
 Item = Update | Event | None
 
@@ -18,12 +45,12 @@ class Inbox:
         self._queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
 
     def put(self, item: Item) -> None:
-        """Add one thing; returns at once."""
+        """Add one item; returns at once."""
         self._queue.put(item)
 
     def wait(self, patience_s: float | None) -> list[Item]:
-        """All that is there; if nothing is, the first thing that comes, or nothing after so many seconds
-        (None: however long it takes)."""
+        """All items in the queue. Waits for the first one for at most ``patience_s`` seconds (None: without
+        limit), and returns an empty list if none has come by then."""
         try:
             batch = [self._queue.get(timeout=patience_s)]
         except queue.Empty:

@@ -16,8 +16,18 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
+from taichi_mrf.viewer.transport.viser_internals import page_script_hashes
+
 PAGE_HEADERS = {"X-Frame-Options": "DENY", "X-Content-Type-Options": "nosniff"}
-"""No foreign page may hold ours in a frame, and no browser may guess what kind of file it got."""
+"""No other page may hold this one in a frame, and no browser may guess the type of a file."""
+
+POLICY = (
+    "default-src 'none'; script-src 'wasm-unsafe-eval' {scripts}; worker-src blob:; "
+    "style-src 'unsafe-inline'; img-src 'self' data: blob:; font-src data:; connect-src 'self' data: blob:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+"""The content security policy: the page runs its own scripts and no others, whatever texts it shows, and
+talks to this server alone."""
 
 Pages = Callable[[ServerConnection, Request], Response | None]
 """What serves the client's files; None where a request is for a websocket."""
@@ -84,8 +94,8 @@ def _is_address(name: str) -> bool:
 def answer_page(connection: ServerConnection, request: Request, pages: Pages) -> Response | None:
     """What ``pages`` answers to a request for a file, made safe; None where it sees a websocket's request.
 
-    Paths that are not plain never reach ``pages``, and whatever it makes of the others comes with
-    :data:`PAGE_HEADERS`.
+    Paths that are not plain never reach ``pages``. Every answer comes with :data:`PAGE_HEADERS` and
+    :data:`POLICY`.
     """
     if _PLAIN_PATH.fullmatch(request.path.partition("?")[0]):
         try:
@@ -96,6 +106,7 @@ def answer_page(connection: ServerConnection, request: Request, pages: Pages) ->
             return None
     else:
         response = connection.respond(http.HTTPStatus.NOT_FOUND, "Not found.\n")
-    for name, value in PAGE_HEADERS.items():
+    policy = POLICY.format(scripts=" ".join(page_script_hashes()))
+    for name, value in {**PAGE_HEADERS, "Content-Security-Policy": policy}.items():
         response.headers[name] = value
     return response

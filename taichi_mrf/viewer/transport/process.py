@@ -1,6 +1,6 @@
-"""The viewer's process: the page on its main thread, and a thread that listens to the mapper.
+"""The viewer's process: a page on its main thread, and a thread that reads what the mapping process sends.
 
-It is spawned by whoever maps, and ends when told to or when that process is gone.
+The mapping process spawns it. It ends when it is told to or when the mapping process is gone.
 """
 
 import signal
@@ -12,7 +12,6 @@ from typing import Any, Protocol
 import viser
 
 from taichi_mrf.errors import ViewerError
-from taichi_mrf.viewer.live.page import Page
 from taichi_mrf.viewer.messages import Listening, Notice, Quit, Request
 from taichi_mrf.viewer.transport.inbox import Inbox
 from taichi_mrf.viewer.transport.server import start_server
@@ -21,7 +20,7 @@ TITLE = "taichi_mrf"
 
 
 class AnyPage(Protocol):
-    """What owns the scene and the widgets: of live, or of tune."""
+    """The live page or the tuning page."""
 
     inbox: Inbox
 
@@ -29,18 +28,17 @@ class AnyPage(Protocol):
         """Serve until None is put into the inbox."""
 
 
-def run_viewer(
-    connection: "Connection[Any, Any]",
-    host: str,
-    port: int,
-    new_page: Callable[[viser.ViserServer, Callable[[Request], None]], AnyPage] = Page,
-) -> None:
-    """Serve the page until the mapper says Quit or is gone.
+NewPage = Callable[[viser.ViserServer, Callable[[Request], None]], AnyPage]
+"""Makes a page from the server and the function that sends a request to the mapping process."""
 
-    The first message back is Listening, or a Notice that says why there is no page. ``new_page`` makes the
-    page, given the server and what sends a request to the mapper.
+
+def run_viewer(connection: "Connection[Any, Any]", host: str, port: int, new_page: NewPage) -> None:
+    """Serve a page until the mapping process sends Quit or is gone.
+
+    The first message back is Listening, or a Notice that says why there is no page.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the mapper hears it too, and says when to end
+    # The mapping process gets these signals too, and tells this one when to end.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     try:
         server = start_server(host, port, TITLE)
@@ -58,15 +56,15 @@ def run_viewer(
 
     page = new_page(server, ask)
     ask(Listening(server.get_host(), server.get_port()))
-    threading.Thread(target=_listen, args=(connection, page), daemon=True, name="listener").start()
+    threading.Thread(target=_read, args=(connection, page), daemon=True, name="reader").start()
     try:
         page.run()
     finally:
         server.stop()
 
 
-def _listen(connection: "Connection[Any, Any]", page: AnyPage) -> None:
-    """Put what the mapper says into the page's inbox, to the end."""
+def _read(connection: "Connection[Any, Any]", page: AnyPage) -> None:
+    """Put all updates into the page's inbox until the connection ends."""
     try:
         while True:
             update = connection.recv()

@@ -1,4 +1,4 @@
-"""Which value a widget takes on when a client writes one: of its own type, in its range, on its grid."""
+"""The value that a widget takes when a client writes one: of its own type, in its range, on its grid."""
 
 import math
 from collections.abc import Sequence
@@ -6,24 +6,21 @@ from itertools import pairwise
 from typing import Any
 
 import viser
-from viser._gui_handles import _GuiInputHandle
 
 from taichi_mrf.viewer.transport.client_messages import WidgetValue
+from taichi_mrf.viewer.transport.viser_internals import Widget
 
 LONGEST_TEXT = 200
-"""Characters of a text field; nothing on the page needs more."""
+"""Characters of a text field; no widget of the pages needs more."""
 
 LARGEST_NUMBER = 2**53
-"""Beyond this a browser's numbers are no whole numbers any more, and msgpack ends at 2^64."""
-
-Widget = _GuiInputHandle[Any]
-"""What viser keeps among its inputs; not all of it is for a client to write."""
+"""Beyond this a browser's numbers cannot hold every integer, and msgpack ends at 2^64."""
 
 Bounds = tuple[float | None, float | None]
 
 
 def value_to_set(widget: Widget, sent: WidgetValue) -> Any | None:
-    """The value that ``widget`` takes on when ``sent`` arrives; None if it must not change.
+    """The value that ``widget`` takes when ``sent`` arrives; None if it must not change.
 
     Numbers are clamped and rounded, text is cut; a value of the wrong type, a choice that is not offered
     or the wrong count of numbers is refused.
@@ -49,6 +46,14 @@ def value_to_set(widget: Widget, sent: WidgetValue) -> Any | None:
         case viser.GuiVector2Handle() | viser.GuiVector3Handle():
             return _vector_value(widget, sent)
     return None
+
+
+def is_out_of_range(widget: Widget, sent: WidgetValue) -> bool:
+    """Whether ``sent`` is a number that the slider or field cannot show."""
+    if not isinstance(widget, viser.GuiSliderHandle | viser.GuiNumberHandle) or not _is_number(sent):
+        return False
+    assert isinstance(sent, int | float)
+    return _clamp(sent, (widget.min, widget.max)) != sent
 
 
 def is_same(sent: Any, taken: Any) -> bool:

@@ -11,8 +11,8 @@ from typing import Annotated, Any
 import viser
 
 from taichi_mrf.config.schema import Config
+from taichi_mrf.viewer.scene.widgets import add_widget
 from taichi_mrf.viewer.tune.knobs import Knob
-from taichi_mrf.viewer.widgets import add_widget
 
 LEAST_DECADE = 1e-300
 """Stands for 0 where a slider shows powers of ten."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.sliders import Range
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.viewer.messages import Request, Update
 from taichi_mrf.viewer.tune.scores import Scores
 
 By = Literal["start", "hand", "search"]
@@ -38,7 +39,7 @@ class FrameChoice:
 
 
 @dataclass(frozen=True)
-class Tuning:
+class Tuning(Update):
     """The first update, and again with another working set: what is tuned, on which frames. The table of
     tries begins anew. ``config`` is where tuning begins; ``held_out`` names the frames that score."""
 
@@ -54,7 +55,7 @@ class Tuning:
 
 
 @dataclass(frozen=True)
-class Activity:
+class Activity(Update):
     """What is being done, in words, and how much of it is (0 to 1)."""
 
     text: str
@@ -63,7 +64,7 @@ class Activity:
 
 
 @dataclass(frozen=True)
-class Tried:
+class Tried(Update):
     """A try and its scores. The same ``number`` again brings better ones: first some of the pixels are
     mapped and judged, then all."""
 
@@ -74,14 +75,14 @@ class Tried:
 
 
 @dataclass(frozen=True)
-class Pinned:
+class Pinned(Update):
     """This try is the one that others are compared with."""
 
     number: int
 
 
 @dataclass(frozen=True)
-class Chosen:
+class Chosen(Update):
     """The map, the pictures and the plot are now those of this try, and the sliders shall stand where it had
     them."""
 
@@ -90,7 +91,7 @@ class Chosen:
 
 
 @dataclass(frozen=True)
-class Residuals:
+class Residuals(Update):
     """Measured minus expected depth at pixels of the held-out frames, in metres, (n,) each, by depth; and
     over bins of the depth ``bin_m`` (b,) their ``median`` and ``spread``, half the width of their middle
     68%."""
@@ -104,7 +105,7 @@ class Residuals:
 
 
 @dataclass(frozen=True)
-class HeldOutView:
+class HeldOutView(Update):
     """Where the map is right in one held-out view, beside the reference if there is one; and what became
     right or wrong between the two. Pictures are (h, w, 3) uint8."""
 
@@ -118,39 +119,36 @@ class HeldOutView:
     change_title: str
 
 
-TuneUpdate = Tuning | Activity | Tried | Pinned | Chosen | Residuals | HeldOutView
-
-
 @dataclass(frozen=True)
-class Try:
+class Try(Request):
     """Map with these parameters; whatever was being tried before is abandoned."""
 
     config: Config
 
 
 @dataclass(frozen=True)
-class Pin:
+class Pin(Request):
     """Compare with this try from now on."""
 
     number: int
 
 
 @dataclass(frozen=True)
-class LookAt:
+class LookAt(Request):
     """Show this held-out view, by its place among them."""
 
     view: int
 
 
 @dataclass(frozen=True)
-class ChooseFrames:
+class ChooseFrames(Request):
     """Tune on other frames."""
 
     choice: FrameChoice
 
 
 @dataclass(frozen=True)
-class SaveTries:
+class SaveTries(Request):
     """Make a file for a client: a try's parameters (yaml), or the table of all tries (csv)."""
 
     kind: Literal["yaml", "csv"]
@@ -159,8 +157,5 @@ class SaveTries:
 
 
 @dataclass(frozen=True)
-class StopSearch:
+class StopSearch(Request):
     """End the automatic search; what it has found stays."""
-
-
-TuneRequest = Try | Pin | LookAt | ChooseFrames | SaveTries | StopSearch

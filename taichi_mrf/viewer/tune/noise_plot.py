@@ -11,6 +11,7 @@ from viser import uplot
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.sensor.noise import LEAST_SIGMA_M, evaluate, patch_coefficients
+from taichi_mrf.viewer.scene.safe_text import in_markdown
 from taichi_mrf.viewer.tune.messages import Residuals
 
 SPREADS_SHOWN = 4.0
@@ -41,7 +42,7 @@ _SERIES = (
 @dataclass(frozen=True)
 class NoiseCurves:
     """Bias and sigma in force: coefficients in ascending powers of depth, a row for each patch of an image.
-    ``note`` says where they come from, if not from the page's own sliders."""
+    ``note`` (markdown) says where they come from, if not from the page's own sliders."""
 
     sigma: NDArray[np.float64]
     bias: NDArray[np.float64]
@@ -57,7 +58,7 @@ class NoiseCurves:
             coefficients = patch_coefficients(sensor)
         except ConfigError as error:
             nowhere = np.full((1, 1), np.nan)
-            return cls(nowhere, nowhere, f"The curves are not drawn: {error}.")
+            return cls(nowhere, nowhere, in_markdown(f"The curves are not drawn: {error}."))
         names = " and ".join(tables)
         return cls(
             *coefficients, f"For {names} the curves are the mean over the patches of the table in force."

@@ -1,9 +1,9 @@
 """The scores of the try that is looked at: numbers, how they differ from the reference, and sparklines."""
 
-import html
 import math
 from collections.abc import Sequence
 
+from taichi_mrf.viewer.scene.safe_text import in_html
 from taichi_mrf.viewer.tune.messages import Tried
 from taichi_mrf.viewer.tune.scores import KINDS, ScoreKind
 
@@ -33,7 +33,7 @@ def score_board_html(tries: Sequence[Tried], shown: int | None, pinned: int | No
     against = "" if reference is None or reference is here else f", against try {reference.number}"
     head = (
         f'<tr><td colspan="4"><b>Try {here.number}</b>'
-        f'<span style="opacity:0.65">{html.escape(coarse + against)}</span></td></tr>'
+        f'<span style="opacity:0.65">{in_html(coarse + against)}</span></td></tr>'
     )
     return _table(head + "".join(rows))
 
@@ -85,7 +85,7 @@ def _row(kind: ScoreKind, tries: Sequence[Tried], here: Tried, reference: Tried 
     shown = next((i for i, each in enumerate(latest) if each is here), -1)
     line = sparkline_svg(values, shown, against)
     cells = (
-        f'<td style="white-space:nowrap">{html.escape(kind.label)}</td>'
+        f'<td style="white-space:nowrap">{in_html(kind.label)}</td>'
         f'<td style="text-align:right;white-space:nowrap"><b>{kind.text(here.scores)}</b></td>'
         f'<td style="text-align:right;white-space:nowrap;color:{color}">{change}</td>'
         f"<td>{line}</td>"

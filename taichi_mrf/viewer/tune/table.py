@@ -1,11 +1,11 @@
 """The table of all tries as the page shows it: the newest first, with what each changed and how it did."""
 
 import dataclasses
-import html
 from collections.abc import Sequence
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import differences
+from taichi_mrf.viewer.scene.safe_text import in_html
 from taichi_mrf.viewer.tune.messages import Tried
 from taichi_mrf.viewer.tune.scores import KINDS
 
@@ -43,7 +43,7 @@ def table_html(tries: Sequence[Tried], shown: int | None, pinned: int | None) ->
             f"{_MARKS[each.by]}</td>{numbers}</tr>"
             f'<tr style="{shade}"><td></td>'
             f'<td colspan="{len(_COLUMNS)}" style="opacity:0.7;padding-bottom:3px">'
-            f"{html.escape(changes(tries[0].config, each.config))}</td></tr>"
+            f"{in_html(changes(tries[0].config, each.config))}</td></tr>"
         )
     key = "▸ shown · A reference · ★ likeliest · ◆ by the search · ~ some of the pixels"
     return (

@@ -1,0 +1,46 @@
+"""What a user can do on the live page, as events for the page."""
+
+from dataclasses import dataclass
+from enum import Enum, auto
+
+from taichi_mrf.viewer.transport.inbox import Event
+
+
+class Action(Enum):
+    """A button, or a widget whose value asks the mapping process for something."""
+
+    PLAY = auto()
+    PAUSE = auto()
+    STEP = auto()
+    SPEED = auto()
+    RESET = auto()
+    RESET_CONFIRMED = auto()
+    RESET_CANCELLED = auto()
+    CHOOSE_KEYFRAME = auto()
+    SWITCH = auto()
+    FREEZE = auto()
+    TOGGLE_GIZMO = auto()
+    PUT_BACK = auto()
+    SET_POSITION = auto()
+    SHOW_PIXEL_RAY = auto()
+    WATCH_IMAGES = auto()
+    SAVE_MAP = auto()
+    SAVE_VOXELS = auto()
+    SAVE_PICTURE = auto()
+    SAVE_PAGE = auto()
+    RECORD = auto()
+
+
+@dataclass(frozen=True)
+class Clicked(Event):
+    """A click into the scene: the ray from the viewpoint, in the world frame, metres."""
+
+    origin: tuple[float, float, float]
+    direction: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Dragged(Event):
+    """The gizmo was grabbed, or let go where it is now."""
+
+    holding: bool

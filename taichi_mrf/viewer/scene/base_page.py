@@ -1,0 +1,156 @@
+"""What the live page and the tuning page share: one inbox, one thread, one scene.
+
+All updates from the mapping process and all events from browsers go into one inbox and are handled on one
+thread, so no two threads ever change the same node. A page registers a handler for each kind of item and for
+each action.
+"""
+
+import time
+from collections.abc import Callable
+from enum import Enum
+from typing import Any, ClassVar, Generic, Literal, TypeVar
+
+import viser
+
+from taichi_mrf.viewer import messages as m
+from taichi_mrf.viewer.scene.base_panel import BasePanel
+from taichi_mrf.viewer.scene.coloring import Scale, legend_html
+from taichi_mrf.viewer.scene.keyframe_layer import KeyframeLayer
+from taichi_mrf.viewer.scene.map_scene import MapScene
+from taichi_mrf.viewer.scene.notices import pop_up
+from taichi_mrf.viewer.scene.options import ViewOptions
+from taichi_mrf.viewer.scene.viewpoint import ViewpointController
+from taichi_mrf.viewer.transport.downloads import Downloads
+from taichi_mrf.viewer.transport.inbox import Inbox, Item, Joined, OptionsMoved, Used
+
+P = TypeVar("P", bound=BasePanel)
+
+_HEAD_START_S = 0.01
+"""Delay that lets the new count reach the browser before the voxel data: a browser that draws by software is
+busy with the voxels for half a second."""
+
+_ONLY_THE_LATEST = (m.Status, m.CurrentCamera, m.Images, OptionsMoved)
+"""Of several of these that wait, only the latest is handled."""
+
+
+class BasePage(Generic[P]):
+    """One page for all browsers that show it; owns the scene, the panel and the inbox."""
+
+    control_width: ClassVar[Literal["small", "medium", "large"]] = "medium"
+
+    def __init__(
+        self, server: viser.ViserServer, ask: Callable[[m.Request], None], inbox: Inbox, panel: P
+    ) -> None:
+        """``ask`` sends a request to the mapping process and does not wait; ``panel`` puts events into
+        ``inbox``."""
+        self.server, self.ask, self.inbox, self.panel = server, ask, inbox, panel
+        self.options = ViewOptions()
+        self.downloads = Downloads(server, lambda text: inbox.put(m.Notice(text, "error")))
+        self.keyframes = KeyframeLayer(server.scene)
+        self.viewpoint = ViewpointController(server)
+        self.map: MapScene | None = None
+        self._scale: Scale | None = None
+        self._with_baseline = False
+        self.actions: dict[Enum, Callable[[int], None]] = {}
+        """What each action does, given the client that asked for it."""
+        self.handlers: dict[type, Callable[[Any], None]] = {
+            m.Notice: self.notify,
+            m.File: lambda file: self.downloads.send(file.client, file.name, file.content),
+            OptionsMoved: lambda moved: self._take_options(),
+            Used: lambda used: self.actions[used.action](used.client),
+            Joined: lambda joined: self.viewpoint.joined(joined.client),
+        }
+        """What is done with each kind of update and event; other kinds are ignored."""
+        self._show_theme()
+        server.scene.configure_default_lights(cast_shadow=False)
+        server.on_client_connect(lambda client: inbox.put(Joined(client.client_id)))
+
+    def run(self) -> None:
+        """Serve until None is put into the inbox."""
+        while True:
+            batch = self.inbox.wait(None if self.map is None else self.map.patience())
+            self.downloads.tick()
+            for item in _latest(batch):
+                if item is None:
+                    return
+                handler = self.handlers.get(type(item))
+                if handler is not None:
+                    handler(item)
+            self.batch_done()
+            self._flush()
+
+    def batch_done(self) -> None:
+        """Called when all items that waited have been handled, before the scene is updated."""
+
+    def options_changed(self, before: ViewOptions) -> None:
+        """Called when the view options differ from ``before``, before the scene is updated."""
+
+    def begin_map(self, hello: m.Hello) -> None:
+        """Replace the map in the scene by an empty one."""
+        if self.map is not None:
+            self.map.clear()
+        self.map = MapScene(self.server, hello)
+
+    def notify(self, notice: m.Notice) -> None:
+        """Show a notice in the list and over the page."""
+        self.panel.show_notice(notice)
+        pop_up(self.server, notice)
+
+    def show_counts(self) -> None:
+        """Show how many voxels the page shows, or will show in a moment."""
+        if self.map is not None:
+            shown = {name: layer.voxels_shown for name, layer in self.map.layers.items()}
+            self.panel.show_counts(shown, self.downloads.is_recording)
+
+    def _announce(self) -> None:
+        self.show_counts()
+        self.server.flush()
+        time.sleep(_HEAD_START_S)
+
+    def _take_options(self) -> None:
+        before, self.options = self.options, self.panel.options()
+        if self.options.dark != before.dark:
+            self._show_theme()
+        self.options_changed(before)
+        self.keyframes.show_pictures(self.options.pictures)
+        if self.map is not None:
+            self.map.look_changed()
+
+    def _show_theme(self) -> None:
+        self.server.gui.configure_theme(
+            control_width=self.control_width,
+            dark_mode=self.options.dark,
+            show_share_button=False,
+            show_logo=False,
+        )
+
+    def _flush(self) -> None:
+        """Draw what has changed of the map, if it is time."""
+        if self.map is None:
+            return
+        crossed = self.keyframes.roster.crossed()
+        if not self.map.flush(self.options, self.viewpoint.up, crossed, self._announce):
+            return
+        with_baseline = bool(self.map.layers["beside"].store.chunks)
+        if with_baseline != self._with_baseline:
+            self._with_baseline = with_baseline
+            self.viewpoint.look_at_everything()
+        box = self.map.box_m()
+        if box is not None:
+            self.viewpoint.map_grew(*box)
+        if self.map.scale is not None and self.map.scale != self._scale:
+            self._scale = self.map.scale
+            self.panel.show_legend(legend_html(self._scale))
+
+
+def _latest(batch: list[Item]) -> list[Item]:
+    """The batch without the items that a later one makes superfluous."""
+    kept: list[Item] = []
+    seen: set[type] = set()
+    for item in reversed(batch):
+        if isinstance(item, _ONLY_THE_LATEST):
+            if type(item) in seen:
+                continue
+            seen.add(type(item))
+        kept.append(item)
+    return kept[::-1]

@@ -1,0 +1,104 @@
+"""The widgets that both pages have: what is being done, counts, legend, notices; and how widgets of an action
+are added."""
+
+from collections.abc import Callable, Mapping
+from enum import Enum
+from typing import Any
+
+import viser
+
+from taichi_mrf.viewer.messages import Layer, Notice
+from taichi_mrf.viewer.scene.notices import notices_html
+from taichi_mrf.viewer.scene.options import ViewOptions
+from taichi_mrf.viewer.scene.safe_text import in_html, in_markdown
+from taichi_mrf.viewer.transport.inbox import Event, OptionsMoved, Used
+
+Tell = Callable[[Event], None]
+
+_MOST_NOTICES = 8
+
+
+class BasePanel:
+    """Adds widgets where the GUI stands; whatever a user does with them goes to ``tell`` as an event."""
+
+    def __init__(self, gui: viser.GuiApi, tell: Tell) -> None:
+        """The first widgets of the panel; a subclass adds its own, ``add_legend`` and ``add_notices``."""
+        self.gui, self._tell = gui, tell
+        self._notices: list[Notice] = []
+        self._activity = gui.add_markdown("Starting …")
+        self._progress: Any = gui.add_progress_bar(0.0, animated=True)
+
+    def options(self) -> ViewOptions:
+        """The view options as the widgets stand."""
+        raise NotImplementedError
+
+    def options_moved(self) -> None:
+        """What widgets of view options call when one of them was used."""
+        self._tell(OptionsMoved())
+
+    def add_counts(self) -> None:
+        """Add the line that says how many voxels the page shows."""
+        self._shown = self.gui.add_markdown("0 voxels shown")
+
+    def add_legend(self) -> None:
+        """Add the scale of the colours."""
+        self._legend = self.gui.add_html("")
+
+    def add_notices(self) -> None:
+        """Add the list of the latest notices."""
+        self._notice_list = self.gui.add_html("")
+
+    def add_button(self, label: str, action: Enum, hint: str | None = None, **options: Any) -> Any:
+        """Add a button."""
+        button = self.gui.add_button(label, hint=hint, **options)
+        button.on_click(lambda event: self._used(event, action))
+        return button
+
+    def add_buttons(self, label: str, actions: Mapping[str, Enum]) -> Any:
+        """Add a row of buttons: what is written on each, and its action."""
+        group = self.gui.add_button_group(label, tuple(actions))
+        group.on_click(lambda event: self._used(event, actions[event.target.value]))
+        return group
+
+    def watch(self, widget: Any, action: Enum) -> None:
+        """Take each change of a widget's value by a user as this action; the page's own changes are none."""
+        widget.on_update(lambda event: self._used(event, action))
+
+    def show_activity(self, text: str, share: float, moving: bool) -> None:
+        """Show what is being done and how much of it is, 0 to 1; ``moving`` animates the bar."""
+        self._activity.content = in_markdown(text)
+        self._progress.value = 100.0 * min(max(share, 0.0), 1.0)
+        self._progress.animated = moving
+
+    def show_counts(self, voxels: Mapping[Layer, int], recording: bool) -> None:
+        """Show how many voxels of each layer the page shows, and whether the scene is being recorded."""
+        baseline = voxels["beside"]
+        text = f"{voxels['map']:,} voxels shown" + (f", {baseline:,} of the baseline" if baseline else "")
+        self._shown.content = text + (" · recording" if recording else "")
+
+    def show_legend(self, legend_html: str) -> None:
+        """Show the scale of the colours."""
+        self._legend.content = legend_html
+
+    def show_notice(self, notice: Notice) -> None:
+        """Put a notice at the head of the list."""
+        self._notices = [notice, *self._notices][:_MOST_NOTICES]
+        self._notice_list.content = notices_html(self._notices)
+
+    def clear_notices(self) -> None:
+        """Empty the list."""
+        self._notices.clear()
+        self._notice_list.content = notices_html([])
+
+    def _used(self, event: viser.GuiEvent, action: Enum) -> None:
+        if event.client_id is not None:
+            self._tell(Used(action, event.client_id))
+
+
+def rows_html(rows: Mapping[str, str]) -> str:
+    """A table of two columns; both hold plain text."""
+    cells = "".join(
+        f'<tr><td style="vertical-align:top">{in_html(name)}</td><td>{in_html(value)}</td></tr>'
+        for name, value in rows.items()
+    )
+    return f'<table style="margin:0 0.75em;font-size:0.85em;border-spacing:0.5em 0">{cells}</table>'
