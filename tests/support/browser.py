@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from live_program import DEADLINE_S, wait_for
 
 if TYPE_CHECKING:  # an extra that only these tests need
-    from playwright.sync_api import Browser, ConsoleMessage, Download, Locator
+    from playwright.sync_api import Browser, Download, Locator
 
 ARTIFACTS = Path(__file__).resolve().parents[2] / "test-artifacts"
 """Where screenshots go; git ignores it."""
@@ -34,9 +34,12 @@ FLAGS = [
     "--enable-unsafe-swiftshader",
 ]
 
-HARMLESS = ("Failed to load resource: the server responded with a status of 404",)
-"""Beginnings of error messages that say nothing about the page: the icon that browsers ask for by
-themselves."""
+HARMLESS = (
+    "Failed to load resource: the server responded with a status of 404",
+    "Evaluating a string as JavaScript violates",
+)
+"""Beginnings of error messages that mean no harm: the icon that browsers ask for by themselves; and the
+sorter of Gaussian splats in viser's page, which may not compile code, and which nothing here needs."""
 
 _LOOK = """() => {
   const mutable = window.__viserMutable;
@@ -176,8 +179,8 @@ class LivePage:
         self.page = browser.new_page(viewport={"width": width, "height": height}, accept_downloads=True)
         self.page.set_default_timeout(1000 * DEADLINE_S)
         self.problems: list[str] = []
-        self.page.on("console", self._heard)
-        self.page.on("pageerror", lambda error: self.problems.append(str(error)))
+        self.page.on("console", lambda message: self._note(message.text) if message.type == "error" else None)
+        self.page.on("pageerror", lambda error: self._note(str(error)))
         self.page.goto(address if address.startswith("file:") else f"{address}/?fixedDpr=1")
         self.page.wait_for_function("() => window.__viserMutable?.scene != null")
 
@@ -285,9 +288,9 @@ class LivePage:
         """Leave."""
         self.page.close()
 
-    def _heard(self, message: "ConsoleMessage") -> None:
-        if message.type == "error" and not message.text.startswith(HARMLESS):
-            self.problems.append(message.text)
+    def _note(self, problem: str) -> None:
+        if not problem.startswith(HARMLESS):
+            self.problems.append(problem)
 
     def __enter__(self) -> "LivePage":
         return self

@@ -1,0 +1,241 @@
+"""The live page without a mapping process and without a browser: what updates and users' actions do."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from raw_viewer_client import RawClient, camera_message, raw_client, wait_for
+
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.viewer import messages as m
+from taichi_mrf.viewer.live.actions import Action, Dragged
+from taichi_mrf.viewer.live.page import Page
+from taichi_mrf.viewer.scene.options import ViewOptions
+from taichi_mrf.viewer.transport import downloads
+from taichi_mrf.viewer.transport.inbox import Joined
+from taichi_mrf.viewer.transport.server import start_server
+
+CAMERA = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
+HELLO = m.Hello("a recording", "cpu", "a device", "mrf", 0.1, -2.0, 0.1, "voxel_size: 0.1")
+
+
+def keyframe(id: int, x: float = 0.0, state: m.KeyframeState = "on") -> m.KeyframeInfo:
+    T = np.eye(4)
+    T[0, 3] = x
+    picture, crossed = np.zeros((2, 2, 3), np.uint8), np.zeros((0, 3), np.int32)
+    return m.KeyframeInfo(id, f"frame {id}", T, CAMERA, 1, state, picture, crossed)
+
+
+class HandledPage:
+    """A page whose items are handled here, one by one; ``asked`` is what it asked of the mapping process."""
+
+    def __init__(self) -> None:
+        self.server = start_server("127.0.0.1", 0, "Handled")
+        self.asked: list[m.Request] = []
+        self.page = Page(self.server, self.asked.append)
+        self.take(HELLO, keyframe(0), keyframe(1, 1.0))
+
+    def take(self, *items: Any) -> None:
+        for item in items:
+            self.page.handlers[type(item)](item)
+
+    def act(self, action: Action, client: int = 0) -> None:
+        self.page.actions[action](client)
+
+    def client_id(self) -> int:
+        """The number of the only client, once it counts."""
+        wait_for(lambda: len(self.server.get_clients()) == 1, "the client")
+        return next(iter(self.server.get_clients()))
+
+
+@pytest.fixture
+def handled() -> Iterator[HandledPage]:
+    running = HandledPage()
+    yield running
+    running.server.stop()
+
+
+@pytest.fixture
+def browser(handled: HandledPage) -> Iterator[RawClient]:
+    with raw_client(handled.server.get_port()) as client:
+        client.say(camera_message())
+        yield client
+
+
+def gizmo_x(handled: HandledPage) -> float:
+    gizmo = handled.page.keyframes.gizmo
+    assert gizmo is not None
+    return float(gizmo.position[0])
+
+
+def test_the_gizmo_goes_where_its_keyframe_is_put(handled: HandledPage) -> None:
+    handled.act(Action.TOGGLE_GIZMO)
+    assert gizmo_x(handled) == 0.0
+    handled.take(keyframe(0, 3.0))
+    assert gizmo_x(handled) == 3.0
+    handled.take(keyframe(1, 5.0))
+    assert gizmo_x(handled) == 3.0
+
+
+def test_the_gizmo_does_not_jump_out_of_a_users_hand(handled: HandledPage) -> None:
+    handled.act(Action.TOGGLE_GIZMO)
+    handled.take(Dragged(True), keyframe(0, 3.0))
+    assert gizmo_x(handled) == 0.0
+    handled.take(Dragged(False), keyframe(0, 4.0))
+    assert gizmo_x(handled) == 4.0
+    assert [type(request) for request in handled.asked] == [m.Move]
+
+
+def test_a_frozen_keyframe_cannot_be_changed(handled: HandledPage) -> None:
+    page = handled.page
+    handled.act(Action.TOGGLE_GIZMO)
+    handled.take(keyframe(0, state="frozen"))
+    assert page.keyframes.gizmo is None
+    widgets = (page.panel.position, page.panel.pixel)
+    assert [widget.disabled for widget in widgets] == [True, True]
+    edits = (
+        Action.SWITCH, Action.FREEZE, Action.TOGGLE_GIZMO, Action.PUT_BACK, Action.SET_POSITION,
+        Action.SHOW_PIXEL_RAY,
+    )  # fmt: skip
+    for action in edits:  # a press may have been on its way
+        handled.act(action)
+    assert handled.asked == []
+    handled.take(keyframe(0, state="on"))
+    assert [widget.disabled for widget in widgets] == [False, False]
+    handled.act(Action.SWITCH)
+    assert handled.asked == [m.Switch(0, on=False)]
+
+
+def test_reset_asks_before_it_deletes_a_map(handled: HandledPage, browser: RawClient) -> None:
+    client = handled.client_id()
+    handled.act(Action.RESET, client)
+    question = browser.hear_type("GuiModalMessage")["uuid"]
+    browser.hear_type("GuiButtonMessage", container_uuid=question)
+    handled.act(Action.RESET, client)
+    browser.hear_type("GuiCloseModalMessage", uuid=question)
+    question = browser.hear_type("GuiModalMessage")["uuid"]
+    assert handled.asked == []
+    handled.act(Action.RESET_CANCELLED, client)
+    browser.hear_type("GuiCloseModalMessage", uuid=question)
+    assert handled.asked == []
+    handled.act(Action.RESET, client)
+    handled.act(Action.RESET_CONFIRMED, client)
+    assert handled.asked == [m.Reset()]
+
+
+def test_an_empty_map_is_reset_at_once(handled: HandledPage, browser: RawClient) -> None:
+    handled.take(HELLO)
+    handled.act(Action.RESET, handled.client_id())
+    assert handled.asked == [m.Reset()]
+
+
+def answer(keyframe: int | None, pixel: tuple[int, int] | None) -> m.RayAnswer:
+    some = np.ones(1, np.float32)
+    return m.RayAnswer(
+        "a ray", (0, 0, 0), (1, 0, 0), some, some, some, some, some, 1.0, 0.0, 0.01, keyframe, pixel
+    )
+
+
+def test_a_ray_fills_in_its_keyframe_and_its_pixel(handled: HandledPage) -> None:
+    handled.take(answer(1, (3, 4)))
+    assert handled.page.keyframes.chosen == 1
+    assert handled.page.panel.pixel.value == (3.0, 4.0)
+    handled.act(Action.SHOW_PIXEL_RAY)
+    assert handled.asked == [m.PixelRay(1, 3.0, 4.0)]
+    handled.take(answer(None, None), answer(77, (1, 1)))
+    assert handled.page.panel.pixel.value == (3.0, 4.0)
+
+
+def test_a_ray_of_another_keyframe_leaves_the_gizmo_alone(handled: HandledPage) -> None:
+    handled.act(Action.TOGGLE_GIZMO)
+    handled.take(answer(1, (3, 4)))
+    assert handled.page.keyframes.chosen == 0
+    assert handled.page.keyframes.gizmo is not None
+    assert handled.page.panel.pixel.value == (0.0, 0.0)
+
+
+def follow(handled: HandledPage, on: bool = True) -> None:
+    handled.page.panel._page_options.handles["follow"].value = on
+    before, handled.page.options = handled.page.options, handled.page.panel.options()
+    handled.page.options_changed(before)
+
+
+def test_a_browser_that_connects_while_the_view_follows_follows_too(
+    handled: HandledPage, browser: RawClient
+) -> None:
+    handled.take(m.CurrentCamera("frame 1", keyframe(1, 1.0).T_world_camera, CAMERA))
+    follow(handled)
+    client = handled.client_id()
+    handled.take(Joined(client))
+    target = browser.hear_type("SetCameraLookAtMessage")["look_at"]
+    np.testing.assert_allclose(target, [1.0, 0.0, 2.0])
+    handled.page.viewpoint.map_grew(np.zeros(3), np.full(3, 9.0))
+    np.testing.assert_allclose(handled.server.get_clients()[client].camera.look_at, [1.0, 0.0, 2.0])
+
+
+def test_the_baseline_does_not_discard_the_viewpoint(handled: HandledPage, browser: RawClient) -> None:
+    client = handled.client_id()
+    handled.take(Joined(client))
+    handled.page.viewpoint.map_grew(np.zeros(3), np.ones(3))
+    browser.say(camera_message(position=[7, 7, 7]))
+    camera = handled.server.get_clients()[client].camera
+    wait_for(lambda: camera.position[0] == 7.0, "the user's viewpoint")
+    bricks, log_odds = np.zeros((1, 3), np.int32), np.full((1, 512), 900, np.int16)
+    seen = np.ones((1, 512), np.uint8)
+    handled.page.options = replace(ViewOptions(), show_baseline=True)
+    for layer in ("map", "beside"):
+        handled.take(m.Bricks(layer, bricks, log_odds, seen, np.zeros((0, 3), np.int32)))
+    handled.page._flush()
+    assert handled.page._with_baseline
+    np.testing.assert_array_equal(camera.position, [7.0, 7.0, 7.0])
+
+
+def test_a_browser_that_sends_no_picture_keeps_nobody_waiting(
+    handled: HandledPage, browser: RawClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither the other browsers, nor its own other downloads; and it is asked once."""
+    monkeypatch.setattr(downloads, "PICTURE_TIMEOUT_S", 3600.0)
+    silent = handled.client_id()
+    for _ in range(6):
+        handled.act(Action.SAVE_PICTURE, silent)
+    browser.hear_type("GetRenderRequestMessage")
+    with raw_client(handled.server.get_port()) as other:
+        other.say(camera_message(image_width=40, image_height=30))
+        wait_for(lambda: len(handled.server.get_clients()) == 2, "the other client")
+        handled.act(Action.SAVE_PICTURE, max(handled.server.get_clients()))
+        request = other.hear_type("GetRenderRequestMessage")
+        picture = {"type": "GetRenderResponseMessage", "payload": png(30, 40)}
+        other.say({**picture, "render_uuid": request["render_uuid"]})
+        assert other.hear_type("FileTransferStartDownload")["filename"] == "view.png"
+    handled.act(Action.SAVE_PAGE, silent)
+    assert browser.hear(in_turn("FileTransferStartDownload", "GetRenderRequestMessage"))["type"].startswith(
+        "File"
+    )
+    assert [notice for notice in drained(handled) if isinstance(notice, m.Notice)] == []
+
+
+def png(height: int, width: int) -> bytes:
+    return cv2.imencode(".png", np.zeros((height, width, 4), np.uint8))[1].tobytes()
+
+
+def in_turn(*kinds: str) -> Any:
+    """Matches the first message of any of these kinds."""
+    return lambda message: message["type"] in kinds
+
+
+def drained(handled: HandledPage) -> list[Any]:
+    return handled.page.inbox.wait(0.0)
+
+
+def test_so_many_pictures_are_awaited_and_no_more(
+    handled: HandledPage, browser: RawClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(downloads, "PICTURE_TIMEOUT_S", 3600.0)
+    monkeypatch.setattr(downloads, "PICTURES_AT_ONCE", 1)
+    handled.act(Action.SAVE_PICTURE, handled.client_id())
+    handled.act(Action.SAVE_PICTURE, 1234)
+    notices = [item for item in drained(handled) if isinstance(item, m.Notice)]
+    assert ["try again" in notice.text for notice in notices] == [True]
