@@ -98,7 +98,8 @@ class BasePanel:
 def rows_html(rows: Mapping[str, str]) -> str:
     """A table of two columns; both hold plain text."""
     cells = "".join(
-        f'<tr><td style="vertical-align:top">{in_html(name)}</td><td>{in_html(value)}</td></tr>'
+        f'<tr><td style="vertical-align:top">{in_html(name)}</td>'
+        f'<td style="overflow-wrap:anywhere">{in_html(value)}</td></tr>'
         for name, value in rows.items()
     )
     return f'<table style="margin:0 0.75em;font-size:0.85em;border-spacing:0.5em 0">{cells}</table>'
