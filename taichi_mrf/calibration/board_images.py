@@ -9,6 +9,7 @@ from taichi_mrf.calibration.options import BoardConfig
 from taichi_mrf.datasets.images import read_color
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system.files import is_folder
 
 FORMATS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 
@@ -24,7 +25,7 @@ class FoundBoards:
 
 def image_files(folder: Path) -> dict[str, Path]:
     """Name without suffix -> file, in the order of the names. Raises DatasetError if there is none."""
-    if not folder.is_dir():
+    if not is_folder(folder):
         raise DatasetError(f"{folder}: is not a folder of images")
     files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in FORMATS}
     if not files:

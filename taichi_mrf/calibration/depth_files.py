@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.images import read_depth
 from taichi_mrf.errors import DatasetError, said
+from taichi_mrf.system.files import is_file, is_folder
 from taichi_mrf.system.npz_file import open_npz, read_npy
 
 FORMATS = (".png", ".npy", ".npz")
@@ -37,9 +38,9 @@ class DepthFiles:
         self.path = path
         self._steps_per_metre = steps_per_metre
         self._stack: tuple[Path, NDArray] | None = None
-        if path.is_dir():
+        if is_folder(path):
             self._places = self._of_folder(path)
-        elif path.suffix in (".npy", ".npz") and path.is_file():
+        elif path.suffix in (".npy", ".npz") and is_file(path):
             self._places = self._of_stack(path, "")
         else:
             raise DatasetError(f"{path}: is neither a folder nor a .npy or .npz file of depth images")

@@ -7,6 +7,7 @@ import numpy as np
 
 from taichi_mrf.calibration import board_images, depth_files
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.system.files import read_text
 
 SUFFIXES = (*board_images.FORMATS, *depth_files.FORMATS)
 """Ends of a file's name that are no part of the image's."""
@@ -17,10 +18,7 @@ def read_stamps(path: Path) -> dict[str, float]:
 
     Raises DatasetError naming the file and the line.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    lines = read_text(path, DatasetError).splitlines()
     stamps = {}
     for number, line in enumerate(lines, start=1):
         words = line.split("#")[0].replace(",", " ").split()

@@ -26,6 +26,7 @@ from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.atomic import write_text
+from taichi_mrf.system.files import is_folder
 
 REPORT_FILE = "report.json"
 _MM = 1e3
@@ -101,7 +102,7 @@ def _camera(options: Calibrate, depth: DepthFiles) -> tuple[PinholeCamera, list[
         (width_px - 1) / 2,
         (height_px - 1) / 2,
     )
-    folder = options.depth if options.depth.is_dir() else options.depth.parent
+    folder = options.depth if is_folder(options.depth) else options.depth.parent
     files = (depth.file(name) for name in depth.names)
     camera, notes = find_camera(folder, ReadOptions(camera=given), default, "a PrimeSense camera", files)
     if notes and options.images is not None:

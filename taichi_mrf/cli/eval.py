@@ -16,6 +16,7 @@ from taichi_mrf.cli.shared.print_table import print_table
 from taichi_mrf.config.values import nearest
 from taichi_mrf.errors import ConfigError, DatasetError, TaichiMRFError
 from taichi_mrf.system import runtime
+from taichi_mrf.system.files import is_folder
 
 LABORATORY = "taichi_mrf.experiments.run"
 """The module that has EXPERIMENTS and run_experiment."""
@@ -32,7 +33,7 @@ def run_eval(options: Eval) -> int:
         hint = nearest(options.experiment, [*known, ALL])
         raise ConfigError(f"unknown experiment '{options.experiment}'; {hint}")
     names = list(known) if options.experiment == ALL else [options.experiment]
-    if any(known[name].needs_data for name in names) and not options.data.is_dir():
+    if any(known[name].needs_data for name in names) and not is_folder(options.data):
         raise DatasetError(f"{options.data}: there is no such folder; --data names the one with the scenes")
     with (
         output_folder(options.out),

@@ -9,44 +9,50 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system.files import read_bytes
 from taichi_mrf.system.npz_file import DEFLATE_RATIO
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
-def read_depth(path: Path, steps_per_metre: float, sentinel: int | None = None) -> NDArray[np.float32]:
+def read_depth(
+    path: Path, steps_per_metre: float, sentinel: int | None = None, camera: PinholeCamera | None = None
+) -> NDArray[np.float32]:
     """Axial depth in metres, (H, W) float32, from a 16-bit grey image; 0 means no measurement.
 
-    ``sentinel`` is a second value that means no measurement. Raises DatasetError, whose text names
-    the file, for one that is missing, damaged, or no 16-bit grey image.
+    ``sentinel`` is a second value that means no measurement. Raises DatasetError, whose text names the file,
+    for an image that is missing, damaged, no 16-bit grey image, or of another size than the camera's.
     """
-    image = decode_16_bit(_bytes(path), str(path))
+    image = decode_16_bit(_image_file(path), str(path), camera)
     depth_m = image.astype(np.float32) / np.float32(steps_per_metre)
     if sentinel is not None:
         depth_m[image == sentinel] = 0.0
     return depth_m
 
 
-def read_color(path: Path) -> NDArray[np.uint8]:
-    """An (H, W, 3) uint8 RGB image. Raises DatasetError, whose text names the file."""
-    return cv2.cvtColor(_decode(_bytes(path), str(path), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+def read_color(path: Path, camera: PinholeCamera | None = None) -> NDArray[np.uint8]:
+    """An (H, W, 3) uint8 RGB image. Raises DatasetError, whose text names the file, also for one of another
+    size than the camera's."""
+    image = _decode(_image_file(path), str(path), cv2.IMREAD_COLOR, camera)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
     """An (H, W) uint8 grey image. Raises DatasetError, whose text names the file."""
-    return _decode(_bytes(path), str(path), cv2.IMREAD_GRAYSCALE)
+    return _decode(_image_file(path), str(path), cv2.IMREAD_GRAYSCALE)
 
 
 def image_size(path: Path) -> tuple[int, int]:
     """(width, height) of an image file. Raises DatasetError, whose text names the file."""
-    height, width = _decode(_bytes(path), str(path), cv2.IMREAD_UNCHANGED).shape[:2]
+    height, width = _decode(_image_file(path), str(path), cv2.IMREAD_UNCHANGED).shape[:2]
     return width, height
 
 
-def decode_16_bit(data: bytes, where: str) -> NDArray[np.uint16]:
+def decode_16_bit(data: bytes, where: str, camera: PinholeCamera | None = None) -> NDArray[np.uint16]:
     """The grey values, (H, W) uint16, of an encoded image. Raises DatasetError, whose text begins with
-    ``where``, if it is damaged or no 16-bit grey image."""
-    image = _decode(data, where, cv2.IMREAD_UNCHANGED)
+    ``where``, if it is damaged, no 16-bit grey image, or of another size than the camera's."""
+    image = _decode(data, where, cv2.IMREAD_UNCHANGED, camera)
     if image.ndim != 2 or image.dtype != np.uint16:
         channels = 1 if image.ndim == 2 else image.shape[2]
         raise DatasetError(
@@ -56,18 +62,14 @@ def decode_16_bit(data: bytes, where: str) -> NDArray[np.uint16]:
     return image
 
 
-def _bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise DatasetError(f"{path}: the image is missing") from None
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValueError as error:  # a zero byte in its name
-        raise DatasetError(f"{path}: is no name of a file: {error}") from error
+def _image_file(path: Path) -> bytes:
+    return read_bytes(path, DatasetError, "the image is missing")
 
 
-def _decode(data: bytes, where: str, flags: int) -> NDArray:
+def _decode(data: bytes, where: str, flags: int, camera: PinholeCamera | None = None) -> NDArray:
+    claimed = _claimed_size(data)  # before any of it is unpacked
+    if claimed is not None:
+        _check_size(where, *claimed, camera)
     problem = _png_damage(data) if data.startswith(PNG_SIGNATURE) else None
     if problem:
         raise DatasetError(f"{where}: {problem}")
@@ -77,7 +79,31 @@ def _decode(data: bytes, where: str, flags: int) -> NDArray:
         image = None
     if image is None:
         raise DatasetError(f"{where}: not a readable image{'' if data else ' (the file is empty)'}")
+    _check_size(where, image.shape[1], image.shape[0], camera)
     return image
+
+
+def _check_size(where: str, width: int, height: int, camera: PinholeCamera | None) -> None:
+    if camera is not None and (height, width) != camera.shape:
+        raise DatasetError(
+            f"{where}: the image has {width} x {height} pixels, the camera {camera.width} x {camera.height}"
+        )
+    if width * height > _MOST_PIXELS:
+        raise DatasetError(f"{where}: {width} x {height} pixels; at most {_MOST_PIXELS:,} are read")
+
+
+def _claimed_size(data: bytes) -> tuple[int, int] | None:
+    """(width, height) by the header of a PNG or JPEG, None for other formats and damaged headers."""
+    if data.startswith(PNG_SIGNATURE) and data[12:16] == b"IHDR" and len(data) >= 24:
+        width, height = struct.unpack_from(">II", data, 16)
+        return width, height
+    position = 2
+    while data.startswith(b"\xff\xd8") and position + 9 <= len(data) and data[position] == 0xFF:
+        if data[position + 1] in _JPEG_FRAMES:
+            height, width = struct.unpack_from(">HH", data, position + 5)
+            return width, height
+        position += 2 + struct.unpack_from(">H", data, position + 2)[0]
+    return None
 
 
 def _png_damage(data: bytes) -> str | None:
@@ -129,6 +155,12 @@ def _png_content_damage(data: bytes, packed: bytes) -> str | None:
         return f"the image is {than} than {width} x {height}"
     return None
 
+
+_MOST_PIXELS = 1 << 27
+"""Far more than a camera has; a packed image of a few megabytes may claim a hundred times as many."""
+
+_JPEG_FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}
+"""Markers of a JPEG's segments that begin with its size."""
 
 _CHUNK_BYTES = 12
 _PIECE = 1 << 20

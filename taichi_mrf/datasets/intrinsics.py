@@ -13,6 +13,7 @@ from taichi_mrf.datasets.images import image_size
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.errors import ConfigError, DatasetError, said
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system.files import read_text
 
 PRIMESENSE = PinholeCamera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
 """What drivers of PrimeSense cameras (Kinect 1, Xtion) assume, and ROS with them."""
@@ -62,7 +63,7 @@ def read_camera(path: Path, default: PinholeCamera, depth_files: Iterable[Path])
     if path.suffix == ".json":
         return read_intrinsics(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, DatasetError)
         if path.suffix == ".yaml":
             return _camera_from_yaml(text, path)
         numbers = [float(word) for line in text.splitlines() for word in line.split("#")[0].split()]
@@ -74,8 +75,6 @@ def read_camera(path: Path, default: PinholeCamera, depth_files: Iterable[Path])
             return _camera_from_matrix(K, default, depth_files)
     except ConfigError as error:
         raise DatasetError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:
         raise DatasetError(f"{path}: holds something that is not a number: {said(error)}") from error
     raise DatasetError(

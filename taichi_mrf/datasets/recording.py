@@ -70,18 +70,9 @@ class Recording(Dataset):
             raise FrameError(f"frame {recorded.name}: {error}") from error
         color = None
         try:
-            depth_m = read_depth(recorded.depth_file, self.steps_per_metre, self.sentinel)
-            self._check_size(recorded.depth_file, depth_m.shape)
+            depth_m = read_depth(recorded.depth_file, self.steps_per_metre, self.sentinel, self.camera)
             if self.color and recorded.color_file is not None:
-                color = read_color(recorded.color_file)
-                self._check_size(recorded.color_file, color.shape)
+                color = read_color(recorded.color_file, self.camera)
         except DatasetError as error:
             raise FrameError(f"frame {recorded.name}: {error}") from error
         return Frame(depth_m, T_world_camera, self.camera, recorded.stamp, recorded.name, color)
-
-    def _check_size(self, path: Path, shape: tuple[int, ...]) -> None:
-        if shape[:2] != self.camera.shape:
-            raise DatasetError(
-                f"{path}: the image has {shape[1]} x {shape[0]} pixels, "
-                f"the camera {self.camera.width} x {self.camera.height}"
-            )

@@ -20,6 +20,7 @@ from taichi_mrf.datasets.stereo import kitti, rig_file
 from taichi_mrf.datasets.synthetic import corridor, mesh_sequence, room
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system.files import exists, is_file, is_folder
 
 FORMATS: tuple[Format, ...] = (
     seven_scenes.FORMAT,
@@ -59,7 +60,7 @@ def open_dataset(
     path = Path(source)
     scheme = re.match(r"([a-z][a-z0-9_]+):", str(source))  # two letters at least: C:\ is a folder
     try:
-        if scheme and not path.exists():
+        if scheme and not exists(path):
             dataset = _open_built_in(str(source), options)
         else:
             dataset = _open_path(str(source), options)
@@ -76,7 +77,7 @@ def recognise(path: Path) -> Format | None:
 def format_name(source: str | Path) -> str:
     """The name of a source's format, for a source that can be opened."""
     path, _ = _path_and_query(str(source))
-    if path.exists():
+    if exists(path):
         found = recognise(path)
         return found.name if found is not None else "unknown"
     return str(source).partition("?")[0]
@@ -85,7 +86,7 @@ def format_name(source: str | Path) -> str:
 def absolute_source(source: str) -> str:
     """The same source for a process that works in another folder."""
     path, query = _path_and_query(source)
-    if not path.exists():
+    if not exists(path):
         return source
     return f"{path.resolve()}?{query}" if query else str(path.resolve())
 
@@ -115,19 +116,19 @@ def _as_asked(dataset: Dataset, options: ReadOptions) -> Dataset:
 def _path_and_query(source: str) -> tuple[Path, str]:
     """A path and what follows a question mark in its name, unless that is part of the path."""
     path, mark, query = source.rpartition("?")
-    return (Path(path), query) if mark and not Path(source).exists() else (Path(source), "")
+    return (Path(path), query) if mark and not exists(Path(source)) else (Path(source), "")
 
 
 def _open_path(source: str, options: ReadOptions) -> Dataset:
     path, query = _path_and_query(source)
-    if not path.exists():
+    if not exists(path):
         raise DatasetError(
             f"{path}: no such folder or file, and no built-in source of that name ({', '.join(BUILT_IN)})"
         )
     found = recognise(path)
     if found is None:
         raise DatasetError(_not_recognised(path))
-    if path.is_dir():
+    if is_folder(path):
         path = path.resolve()
     if not query:
         return found.open(path, options)
@@ -144,7 +145,7 @@ def _not_recognised(path: Path) -> str:
             f"map them with: taichi-mrf laser {shlex.quote(str(path))} --out DIR"
         )
     looked_for = "; ".join(f"{each.name}: {each.looks_for}" for each in FORMATS)
-    if path.is_file():
+    if is_file(path):
         return (
             f"{path}: unsupported file type; for a recording of many files pass its folder. "
             f"Looked for {looked_for}"
@@ -159,7 +160,7 @@ def _not_recognised(path: Path) -> str:
 
 
 def _is_recording(path: Path) -> bool:
-    return path.is_dir() and recognise(path) is not None
+    return is_folder(path) and recognise(path) is not None
 
 
 def _open_built_in(source: str, options: ReadOptions) -> Dataset:

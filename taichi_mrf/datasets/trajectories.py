@@ -10,6 +10,7 @@ once; a pose whose values make no rigid transform is one when that pose is asked
 with one bad pose can still be used.
 """
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
+from taichi_mrf.system.files import is_file, open_regular, read_text
 
 Layout = Literal["stamped", "rows", "log"]
 Line = tuple[int, list[float]]
@@ -77,9 +79,11 @@ def read_trajectory(path: Path) -> Trajectory:
 def is_trajectory(path: Path) -> bool:
     """Whether the first lines of a text file look like one of the layouts."""
     try:
-        with path.open(encoding="utf-8") as file:
-            head = [_numbers(line) for line in file.readlines(4096) if _content(line)][:5]
-    except (OSError, ValueError):
+        with open_regular(path, DatasetError) as file:
+            # Of a file without line ends, no more than this is read either.
+            lines = [line.decode("utf-8") for line in io.BytesIO(file.read(1 << 16)).readlines(4096)]
+        head = [_numbers(line) for line in lines if _content(line)][:5]
+    except (DatasetError, ValueError):
         return False
     columns = [len(numbers) for numbers in head]
     return columns == [3, 4, 4, 4, 4] or (bool(columns) and columns[0] in (8, 12, 16))
@@ -91,7 +95,7 @@ def read_matrix_file(path: Path) -> Pose:
     Raises DatasetError if the file is missing or holds no such matrix, KeyframeError if that is no
     rigid transform.
     """
-    if not path.is_file():
+    if not is_file(path):
         raise DatasetError(f"{path}: the pose is missing")
     numbers = [number for _, row in _read_numbers(path) for number in row]
     if len(numbers) not in (12, 16):
@@ -154,12 +158,7 @@ def _expect(path: Path, line: Line, count: int) -> None:
 
 
 def _read_numbers(path: Path) -> list[Line]:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValueError:  # also a zero byte in the file's name
-        raise DatasetError(f"{path}: not a text file") from None
+    text = read_text(path, DatasetError)
     lines = []
     for number, line in enumerate(text.splitlines(), start=1):
         if _content(line):

@@ -22,6 +22,7 @@ import taichi_mrf
 from taichi_mrf.config.schema import Config, to_yaml
 from taichi_mrf.errors import MapFileError, said
 from taichi_mrf.system.atomic import temporary_name
+from taichi_mrf.system.files import exists, is_file, is_folder
 from taichi_mrf.system.libraries import library
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
@@ -101,7 +102,7 @@ class ChunkStore:
         """A store that there is. Raises MapFileError, naming what is wrong, TaichiMRFError without zarr."""
         zarr = library("zarr", "maps in chunks need", "store")
         path = Path(path)
-        if not path.is_dir():
+        if not is_folder(path):
             raise MapFileError(f"{path}: there is no such folder")
         try:
             group = zarr.open_group(store=str(path), mode="r+")
@@ -153,20 +154,20 @@ def new_store(path: str | Path) -> Iterator[Path]:
     Raises MapFileError if something other than a map in chunks stands there, or if it cannot be written.
     """
     path = Path(path)
-    if not path.parent.is_dir():  # zarr would make it, as no other format does
+    if not is_folder(path.parent):  # zarr would make it, as no other format does
         raise MapFileError(f"{path}: cannot be written: No such file or directory")
-    if path.exists() and not _is_store(path):
+    if exists(path) and not _is_store(path):
         raise MapFileError(f"{path}: exists, and is no map in chunks; it is left alone")
     temporary, old = temporary_name(path), temporary_name(path)
     try:
         yield temporary
         # A folder cannot take another one's place: for a moment there is none, but never half of one.
-        if path.exists():
+        if exists(path):
             os.replace(path, old)
         try:
             os.replace(temporary, path)
         except BaseException:
-            if old.exists():
+            if exists(old):
                 os.replace(old, path)
             raise
     except OSError as error:
@@ -178,4 +179,4 @@ def new_store(path: str | Path) -> Iterator[Path]:
 
 def _is_store(path: Path) -> bool:
     header = path / "zarr.json"
-    return header.is_file() and "taichi_mrf_map" in header.read_text("utf-8", "replace")
+    return is_file(header) and "taichi_mrf_map" in header.read_text("utf-8", "replace")

@@ -23,6 +23,7 @@ from taichi_mrf.export.octree import (
     voxels_in_z_order,
 )
 from taichi_mrf.queries.known_bricks import Bricks
+from taichi_mrf.system.files import read_bytes
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import VOXELS
 
@@ -82,10 +83,7 @@ class OctomapLeaves:
 
 def read_octomap(path: str | Path) -> OctomapLeaves:
     """Read a ``.bt`` or ``.ot``, told apart by the first line. Raises MapFileError, which names the file."""
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise MapFileError(f"{path}: cannot be read: {error.strerror or error}") from error
+    content = read_bytes(path, MapFileError)
     header, data = _split(path, content)
     binary = header["#"] == BINARY_HEADER
     try:

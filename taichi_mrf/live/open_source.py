@@ -13,6 +13,7 @@ from taichi_mrf.live.run import Source, saved_unsettled
 from taichi_mrf.methods.map_file import open_map_file, read_header
 from taichi_mrf.methods.registry import create_map, load_map
 from taichi_mrf.system import runtime
+from taichi_mrf.system.files import is_file
 
 
 def open_source(
@@ -33,7 +34,7 @@ def open_source(
     """
     runtime.init(config.runtime.arch, config.runtime.threads, config.runtime.debug)
     path = Path(name)
-    if path.suffix == ".npz" and path.is_file() and not frames_npz.FORMAT.recognises(path):
+    if path.suffix == ".npz" and is_file(path) and not frames_npz.FORMAT.recognises(path):
         with open_map_file(path) as file:
             header = read_header(path, file)
         parameters = dataclasses.replace(header.config, runtime=config.runtime)

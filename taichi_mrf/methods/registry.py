@@ -9,6 +9,7 @@ from taichi_mrf.export.chunk_store import SUFFIX
 from taichi_mrf.methods.map_file import method_of, open_map_file
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system.files import is_folder
 
 
 def create_map(config: Config, camera: PinholeCamera) -> OccupancyMap:
@@ -20,7 +21,7 @@ def create_map(config: Config, camera: PinholeCamera) -> OccupancyMap:
 def load_map(path: str | Path, memory_limit_gb: float | None = None) -> OccupancyMap:
     """A saved map, whatever its method; ``memory_limit_gb`` takes the place of its own. Raises MapFileError,
     or CapacityError if there is not enough memory for it."""
-    if Path(path).is_dir() and Path(path).suffix == SUFFIX:
+    if is_folder(Path(path)) and Path(path).suffix == SUFFIX:
         raise MapFileError(f"{path}: a map in chunks; ChunkedMap.open reads it")
     with open_map_file(Path(path)) as file:
         method = METHODS[method_of(file)]

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
+from taichi_mrf.system.files import kind_of
 from taichi_mrf.system.npz_file import MANIFEST, manifest_lines
 
 
@@ -29,11 +30,12 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     The temporary path lies in the same folder (so that the move is a rename) and has the same suffix
     (so that writers that go by it work). If anything is raised inside the ``with`` block, ``path``
     stays as it was and the temporary file is removed. A symbolic link stays a link: the file that it
-    points to is replaced. An OSError is raised as a MapFileError that names ``path`` and the reason.
+    points to is replaced. Raises MapFileError, which names ``path`` and the reason, if it cannot be written,
+    and if a folder, a device or anything else that is no regular file is there.
     """
-    target = Path(os.path.realpath(path))
-    temporary = temporary_name(target)
     try:
+        target = _target_of(path)
+        temporary = temporary_name(target)
         try:
             yield temporary
             with open(temporary, "rb+") as file:
@@ -46,9 +48,28 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise MapFileError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
+def _target_of(path: str | Path) -> Path:
+    """The file that a path, or a link, stands for. Raises MapFileError for anything but a regular file."""
+    if "\0" in str(path):
+        raise MapFileError(f"{str(path)!r}: not the name of a file: it holds a zero byte")
+    target = Path(os.path.realpath(path))
+    try:
+        kind = kind_of(os.stat(target).st_mode)
+    except FileNotFoundError:
+        return target
+    if kind is not None:
+        raise MapFileError(f"{path}: cannot be written: it is {kind}, not a regular file")
+    return target
+
+
 def temporary_name(target: Path) -> Path:
     """A new name beside ``target`` that says whose it is, for :func:`remove_leftovers`."""
-    return target.with_name(f".{target.stem}.part-{os.getpid()}-{secrets.token_hex(4)}{target.suffix}")
+    # Shortened, so that the name is not too long where the target's is not.
+    begin = target.stem.encode()[:_LONGEST_STEM].decode("utf-8", "ignore")
+    return target.with_name(f".{begin}.part-{os.getpid()}-{secrets.token_hex(4)}{target.suffix}")
+
+
+_LONGEST_STEM = 100
 
 
 def remove_leftovers(folder: Path) -> None:

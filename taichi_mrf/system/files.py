@@ -11,10 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
-from taichi_mrf.errors import TaichiMRFError
 from taichi_mrf.system.memory import check_memory
 
-ErrorType = Callable[[str], TaichiMRFError]
+ErrorType = Callable[[str], Exception]
 """Makes the error to raise from its text."""
 
 _KINDS = {

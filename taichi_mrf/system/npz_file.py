@@ -5,6 +5,7 @@ numpy.load notices a wrong checksum only where a member is read to its end, take
 claims before it looks for the values, and lets through whatever its parsers stumble over.
 """
 
+import contextlib
 import sys
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError, TaichiMRFError, said
+from taichi_mrf.system.files import open_regular
 from taichi_mrf.system.memory import check_memory
 
 MANIFEST = "manifest"
@@ -124,15 +126,14 @@ class NpzFile:
 def open_npz(path: Path, error: ErrorType, what: str) -> Iterator[NpzFile]:
     """The arrays of a file, by name. Whatever is wrong with the file is raised as an ``error`` that names it;
     ``what`` it should be, such as "a readable map". Raises CapacityError if an array does not fit memory."""
-    try:
-        archive = zipfile.ZipFile(path)
-    except FileNotFoundError as problem:
-        raise error(f"{path}: there is no such file") from problem
-    except OSError as problem:
-        raise error(f"{path}: cannot be read: {problem.strerror or problem}") from problem
-    except Exception as problem:  # as above
-        raise error(f"{path}: not {what}: {said(problem)}") from problem
-    with archive:
+    with contextlib.ExitStack() as opened:
+        stream = opened.enter_context(open_regular(path, error))
+        try:
+            archive = opened.enter_context(zipfile.ZipFile(stream))
+        except OSError as problem:
+            raise error(f"{path}: cannot be read: {problem.strerror or problem}") from problem
+        except Exception as problem:  # as above
+            raise error(f"{path}: not {what}: {said(problem)}") from problem
         try:
             _compare_names(archive)
         except Exception as problem:
@@ -168,7 +169,7 @@ def manifest_lines(members: Iterator[zipfile.ZipInfo]) -> list[str]:
 def read_npy(path: Path) -> NDArray[Any]:
     """The array of a ``.npy`` file. Raises OSError, and ValueError for a file that holds anything but one
     array, to its last byte."""
-    with open(path, "rb") as stream:
+    with open_regular(path, OSError) as stream:
         size = stream.seek(0, 2)
         stream.seek(0)
         try:

@@ -134,7 +134,7 @@ def test_a_file_that_is_no_text_or_not_there(tmp_path: Path) -> None:
     binary.write_bytes(b"\xff\xfe\x00\x81")
     with pytest.raises(DatasetError, match=r"poses\.txt: not a text file"):
         read_trajectory(binary)
-    with pytest.raises(DatasetError, match=r"none\.txt: cannot be read"):
+    with pytest.raises(DatasetError, match=r"none\.txt: there is no such file"):
         read_trajectory(tmp_path / "none.txt")
     with pytest.raises(DatasetError, match=r"none\.txt: the pose is missing"):
         read_matrix_file(tmp_path / "none.txt")

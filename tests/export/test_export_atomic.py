@@ -1,5 +1,6 @@
 """Files are written whole or not at all."""
 
+import os
 import zipfile
 from pathlib import Path
 
@@ -134,3 +135,25 @@ def test_leftovers_of_killed_processes_are_removed_and_nothing_else(tmp_path: Pa
     remove_leftovers(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == set(kept)
     remove_leftovers(tmp_path / "not there")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="FIFOs and devices in the file system are a POSIX feature")
+def test_a_target_that_is_no_regular_file_is_left_alone(tmp_path: Path) -> None:
+    fifo, link = tmp_path / "fifo.npz", tmp_path / "link.npz"
+    os.mkfifo(fifo)
+    link.symlink_to("/dev/null")
+    for path, kind in ((fifo, "a FIFO"), (link, "a device"), (Path("/dev/null"), "a device")):
+        with pytest.raises(MapFileError, match=f"{path}: cannot be written: it is {kind}, not"):
+            write_npz(path, {"a": np.arange(3)})
+    assert fifo.is_fifo()
+    assert Path("/dev/null").is_char_device()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["fifo.npz", "link.npz"]
+
+
+def test_a_name_that_is_too_long_is_our_error_and_one_that_is_just_not_is_written(tmp_path: Path) -> None:
+    longest = tmp_path / ("ü" * 125 + ".txt")  # 254 bytes of the 255 that file systems take
+    write_text(longest, "x")
+    assert [path.name for path in tmp_path.iterdir()] == [longest.name]
+    for name in ("x" * 300, "x" * 5000, "a\0b"):
+        with pytest.raises(MapFileError, match=r"File name too long|not the name of a file"):
+            write_text(tmp_path / name, "x")

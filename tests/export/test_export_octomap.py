@@ -279,7 +279,7 @@ def test_files_that_cannot_be_read(tmp_path: Path, content: bytes, problem: str)
 
 
 def test_files_that_are_not_there_and_names_that_are_no_map(tmp_path: Path) -> None:
-    with pytest.raises(MapFileError, match=r"gone\.bt: cannot be read: No such file"):
+    with pytest.raises(MapFileError, match=r"gone\.bt: there is no such file"):
         read_octomap(tmp_path / "gone.bt")
     with pytest.raises(ConfigError, match=r"map\.bt: a map is an \.npz file"):
         run_import(tmp_path / "gone.bt", "--out", tmp_path / "map.bt")

@@ -24,6 +24,7 @@ from taichi_mrf.live.bench import bench_viewer
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import write_text
+from taichi_mrf.system.files import exists
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,7 +50,7 @@ class _Run:
         choice = runtime.choice()
         self.device = f"{choice.name}, {choice.device}" if choice else ""
         path = Path(options.source)
-        name = path.resolve().name if path.exists() else options.source
+        name = path.resolve().name if exists(path) else options.source
         self.title = f"{name}, {count} keyframes, on {self.device}"
 
     def each_size(self, what: str = "") -> Iterator[tuple[Config, Callable[[int], None]]]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.system.files import exists, is_folder
 
 
 def folder_names(sources: Sequence[str]) -> list[str]:
@@ -37,12 +38,12 @@ def folder_names(sources: Sequence[str]) -> list[str]:
 def _from_short_to_long(source: str) -> list[str]:
     """What the source could be called."""
     path, mark, _ = source.partition("?")
-    if Path(source).exists():
+    if exists(Path(source)):
         path, mark = source, ""
     folder = Path(path)
     if folder.name in ("", ".."):
         folder = folder.resolve()
-    last = folder.name if folder.is_dir() else folder.stem
+    last = folder.name if is_folder(folder) else folder.stem
     parts = [*(part for part in folder.parent.parts if part != ".."), last]
     names = [_plain("_".join(parts[-count:])) for count in range(1, len(parts) + 1)]
     return [*names, _plain(source)] if mark else names

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.system.atomic import atomic_path, remove_leftovers
+from taichi_mrf.system.files import exists, is_folder
 
 DID_NOT_FIT = 3
 """Exit status of a run for which memory was not enough: what did fit is mapped and kept."""
@@ -29,13 +30,13 @@ def output_folder(folder: Path) -> Iterator[None]:
         yield
     finally:
         for each in made:
-            if each.is_dir() and not any(each.iterdir()):
+            if is_folder(each) and not any(each.iterdir()):
                 each.rmdir()
 
 
 def _missing_folders(folder: Path) -> list[Path]:
     """The folder and its parents that do not exist yet, innermost first."""
-    return [each for each in (folder, *folder.parents) if not each.exists()]
+    return [each for each in (folder, *folder.parents) if not exists(each)]
 
 
 def _try_writing(folder: Path) -> None:

@@ -22,6 +22,7 @@ from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeErr
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.system.files import is_file, is_folder
 from taichi_mrf.system.npz_file import NpzFile, open_npz
 
 DEPTH, POSE, MATRIX, STAMP, COLOR, SCALE = "depth_m", "T_world_camera", "K", "stamp", "color", "depth_scale"
@@ -97,9 +98,9 @@ class FramesNpz(Dataset):
 
 def recognises(path: Path) -> bool:
     """Whether an npz file, or the first of a folder, holds frames, and not a map or something else."""
-    if path.is_dir():
+    if is_folder(path):
         path = next(iter(sorted(path.glob("*.npz"))), path)
-    if path.suffix != ".npz" or not path.is_file():
+    if path.suffix != ".npz" or not is_file(path):
         return False
     try:
         with zipfile.ZipFile(path) as archive:
@@ -111,8 +112,8 @@ def recognises(path: Path) -> bool:
 def open_npz_frames(path: Path, options: ReadOptions) -> FramesNpz:
     """Open one file, or all files of a folder as one sequence. Raises DatasetError, whose text names the file
     and the field."""
-    paths = sorted(path.glob("*.npz")) if path.is_dir() else [path]
-    name = path.name if path.is_dir() else path.stem
+    paths = sorted(path.glob("*.npz")) if is_folder(path) else [path]
+    name = path.name if is_folder(path) else path.stem
     parts = [_read_part(each, options) for each in paths]
     camera = options.camera or parts[0].camera
     for part in parts:

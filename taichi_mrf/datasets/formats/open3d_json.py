@@ -15,6 +15,7 @@ from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory
 from taichi_mrf.errors import ConfigError, DatasetError, KeyframeError, said
 from taichi_mrf.geometry.poses import as_pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system.files import read_text
 
 _LISTS = {"PinholeCameraTrajectory": "parameters", "PoseGraph": "nodes"}
 
@@ -76,9 +77,8 @@ def _camera(path: Path, values: Any) -> PinholeCamera:
 
 
 def _values(path: Path) -> Any:
+    text = read_text(path, DatasetError)
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
+        return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise DatasetError(f"{path}: not valid JSON: {said(error)}") from error

@@ -16,6 +16,7 @@ from taichi_mrf.datasets.recording import RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose, read_trajectory
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system.files import read_text
 
 NAME = "Replica (NICE-SLAM)"
 CAMERA = PinholeCamera(width=1200, height=680, fx=600.0, fy=600.0, cx=599.5, cy=339.5)
@@ -74,12 +75,11 @@ def _frame(path: Path, pose: RecordedPose) -> RecordedFrame:
 
 def _read_parameters(path: Path) -> tuple[PinholeCamera, float]:
     """The camera and the steps per metre of cam_params.json."""
+    text = read_text(path, DatasetError)
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))["camera"]
+        values = json.loads(text)["camera"]
         intrinsics = (float(values[name]) for name in ("fx", "fy", "cx", "cy"))
         camera, scale = PinholeCamera(int(values["w"]), int(values["h"]), *intrinsics), float(values["scale"])
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
     except ConfigError as error:
         raise DatasetError(f"{path}: {error}") from error
     except (KeyError, TypeError, ValueError, OverflowError, RecursionError):

@@ -15,6 +15,7 @@ from taichi_mrf.datasets.recording import RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import read_matrix_file
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system.files import read_text
 
 NAME = "ScanNet"
 CAMERA = PinholeCamera(width=640, height=480, fx=577.870605, fy=577.870605, cx=319.5, cy=239.5)
@@ -74,8 +75,8 @@ def _frame(folder: Path, path: Path) -> RecordedFrame:
 
 def _lost(pose_file: Path) -> bool:
     try:
-        return LOST in pose_file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
+        return LOST in read_text(pose_file, DatasetError)
+    except DatasetError:
         return False
 
 

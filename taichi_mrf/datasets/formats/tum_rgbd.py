@@ -20,6 +20,7 @@ from taichi_mrf.datasets.recording import RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose, read_trajectory
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system.files import is_file, read_text
 
 NAME = "TUM RGB-D"
 STEPS_PER_METRE = 5000.0
@@ -39,12 +40,12 @@ CAMERAS = {
 
 def recognises(folder: Path) -> bool:
     """Whether the folder has the list of depth images. That poses are missing is then said on opening."""
-    return (folder / DEPTH_LIST).is_file()
+    return is_file(folder / DEPTH_LIST)
 
 
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     """List the depth images that have a pose within the largest gap, by their stamps."""
-    if not (folder / POSES).is_file():
+    if not is_file(folder / POSES):
         raise DatasetError(f"{folder / POSES}: is missing; {DEPTH_LIST} lies beside it without poses")
     depth = _read_list(folder / DEPTH_LIST)
     trajectory = read_trajectory(folder / POSES)
@@ -122,7 +123,7 @@ def _frame(stamp: float, depth_file: Path, pose: RecordedPose, color_file: Path 
 
 def _colors(folder: Path, stamps: list[float], options: ReadOptions, gap: float) -> list[Path | None]:
     path = folder / COLOR_LIST
-    if not (options.color and path.is_file()):
+    if not (options.color and is_file(path)):
         return [None] * len(stamps)
     color = _read_list(path)
     partners = associate(stamps, [stamp for stamp, _ in color], gap)
@@ -138,10 +139,7 @@ def _default_camera(folder: Path) -> tuple[PinholeCamera, str]:
 
 def _read_list(path: Path) -> list[tuple[float, Path]]:
     """``stamp file`` lines, sorted by stamp; the files are relative to the list's folder."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    lines = read_text(path, DatasetError).splitlines()
     entries = []
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.lstrip().startswith("#"):

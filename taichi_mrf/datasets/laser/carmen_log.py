@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +22,11 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.laser.no_return import DEFAULT_M, find_no_return_m
 from taichi_mrf.datasets.laser.scans import LaserScans, problem_of_scan, skipped_note
 from taichi_mrf.errors import DatasetError, said
+from taichi_mrf.system.files import open_regular
 
 GZIP_MAGIC = b"\x1f\x8b"
 SCAN_LINES = (b"FLASER", b"RLASER", b"ROBOTLASER1")
+_LONGEST_LINE = 10_000_000
 _OLD, _NEW = ("FLASER", "RLASER"), "ROBOTLASER1"
 
 
@@ -113,15 +116,26 @@ def field_of_view_angles(beams: int) -> NDArray[np.float64]:
 
 def _scan_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """The lines that are scans, in words, with their numbers from 1 on."""
-    with open(path, "rb") as raw:
+    with open_regular(path, DatasetError) as raw:
         packed = raw.read(len(GZIP_MAGIC)) == GZIP_MAGIC
-    with gzip.open(path, "rb") if packed else open(path, "rb") as file:
-        for number, line in enumerate(file, start=1):
+        raw.seek(0)
+        file = gzip.GzipFile(fileobj=raw) if packed else raw
+        for number, line in enumerate(_lines(path, file), start=1):
             # Cheaper than splitting the odometry, which is most of the lines.
             if line.lstrip().startswith(SCAN_LINES):
                 words = line.decode("ascii", errors="replace").split()
                 if words[0] in _OLD or words[0] == _NEW:
                     yield number, words
+
+
+def _lines(path: Path, file: BinaryIO | gzip.GzipFile) -> Iterator[bytes]:
+    """The lines of a log. A packed log of a few kilobytes may hold a line that fills the memory."""
+    number = 0
+    while line := file.readline(_LONGEST_LINE):
+        number += 1
+        if len(line) == _LONGEST_LINE:
+            raise DatasetError(f"{path} line {number}: longer than {_LONGEST_LINE:,} bytes")
+        yield line
 
 
 def _laser(words: list[str]) -> _Scan:

@@ -8,6 +8,7 @@ from pathlib import Path
 from taichi_mrf.datasets.laser import carmen_log, floor_plan_scans, scan_npz
 from taichi_mrf.datasets.laser.scans import LaserScans
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.system.files import exists, is_folder
 
 __all__ = ["LaserScans", "holds_scans", "open_scans"]
 
@@ -26,13 +27,13 @@ def open_scans(
     counted in the notes, as long as one is left.
     """
     path = Path(source)
-    if re.match(r"[a-z][a-z0-9_]+:", str(source)) and not path.exists():
+    if re.match(r"[a-z][a-z0-9_]+:", str(source)) and not exists(path):
         return floor_plan_scans.open_floor_plan(str(source))
-    if path.is_dir():
+    if is_folder(path):
         path = path / scan_npz.FILE_NAME
-        if not path.exists():
+        if not exists(path):
             raise DatasetError(f"{source}: the folder holds no {scan_npz.FILE_NAME}; pass a log by its name")
-    if not path.exists():
+    if not exists(path):
         raise DatasetError(
             f"{source}: no such file, and no built-in scans of that name ({floor_plan_scans.NAME})"
         )

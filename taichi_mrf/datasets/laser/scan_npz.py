@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.laser.no_return import find_no_return_m
 from taichi_mrf.datasets.laser.scans import LaserScans, problem_of_scan, skipped_note
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.system.files import open_regular
 from taichi_mrf.system.npz_file import open_npz
 
 FILE_NAME = "scans.npz"
@@ -19,7 +20,7 @@ _ZIP_MAGIC = b"PK"
 
 def recognises(path: Path) -> bool:
     """Whether a file is of this format, whatever state it is in."""
-    with open(path, "rb") as file:
+    with open_regular(path, DatasetError) as file:
         return file.read(len(_ZIP_MAGIC)) == _ZIP_MAGIC or path.suffix == ".npz"
 
 

@@ -23,6 +23,7 @@ from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.system.files import exists, is_file
 from taichi_mrf.system.libraries import library
 
 NAME = "realsense:"
@@ -149,7 +150,7 @@ def _file_and_options(text: str) -> tuple[str, RealSenseOptions]:
     """What follows the colon, as a file's name and options; options alone may do without the question
     mark."""
     file, mark, query = text.partition("?")
-    if not mark and "=" in text and not Path(text).exists():
+    if not mark and "=" in text and not exists(Path(text)):
         file, query = "", text
     return file, parse_options(RealSenseOptions, query, f"{NAME}{file}")
 
@@ -181,7 +182,7 @@ def _open_camera(
 def _open_recording(
     rs: Any, path: Path, trajectory: TimedPoses | None, gap: float, options: ReadOptions
 ) -> RealSenseRecording:
-    if not path.is_file():
+    if not is_file(path):
         raise DatasetError(f"{NAME}{path}: there is no such file")
     player = Player(rs, path)
     images = [listed for listed, _ in player.images()]

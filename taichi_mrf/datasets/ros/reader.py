@@ -12,6 +12,7 @@ from typing import Any
 
 from taichi_mrf.datasets.ros.messages import header_ns
 from taichi_mrf.errors import DatasetError, said
+from taichi_mrf.system.files import check_regular, is_file, is_folder
 from taichi_mrf.system.libraries import library
 
 SUFFIXES = (".bag", ".mcap", ".db3")
@@ -51,6 +52,9 @@ class RosReader:
         known, and if rosbags is not installed.
         """
         self.path = path
+        for file in path.iterdir() if is_folder(path) else [path]:
+            if not is_folder(file):
+                check_regular(file, DatasetError)
         highlevel, typesys = _library("rosbags.highlevel"), _library("rosbags.typesys")
         try:
             # Before ROS Iron, bags hold no definitions of their messages; those read here never changed.
@@ -112,7 +116,7 @@ class RosReader:
 
 def is_bag(path: Path) -> bool:
     """Whether a path looks like a bag: a file by its name, a folder by its metadata."""
-    return path.suffix in SUFFIXES if path.is_file() else (path / METADATA).is_file()
+    return path.suffix in SUFFIXES if is_file(path) else is_file(path / METADATA)
 
 
 def _library(name: str) -> Any:

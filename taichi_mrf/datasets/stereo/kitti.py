@@ -21,6 +21,7 @@ from taichi_mrf.datasets.stereo.pairs import RecordedPair, StereoPairs, first_si
 from taichi_mrf.datasets.trajectories import read_trajectory
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system.files import read_text
 
 FOLDERS = (("image_l", "image_r"), ("image_0", "image_1"))
 CALIBRATION, POSES, TIMES = "calib.txt", "poses.txt", "times.txt"
@@ -129,10 +130,7 @@ def read_rig(path: Path, width: int, height: int) -> StereoRig:
 
 def _read_projections(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """P0 and P1, (3, 4) each."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    text = read_text(path, DatasetError)
     lines = [words for line in text.splitlines() if (words := line.split())]
     labelled = {words[0]: words[1:] for words in lines if words[0].endswith(":")}
     rows = labelled or {f"P{i}:": words for i, words in enumerate(lines)}

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.images import image_size, read_color
@@ -17,6 +16,7 @@ from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX, StereoMatching, Ster
 from taichi_mrf.datasets.trajectories import RecordedPose
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.system.files import read_text
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class StereoPairs(Dataset):
         name = pair.left_file.stem
         try:
             T_world_camera = pair.pose.T_world_camera()
-            left, right = self._read_image(pair.left_file), self._read_image(pair.right_file)
+            left, right = (read_color(path, self.camera) for path in (pair.left_file, pair.right_file))
         except KeyframeError as error:
             raise FrameError(f"frame {name}: {pair.pose.source}: {error}") from error
         except DatasetError as error:
@@ -71,15 +71,6 @@ class StereoPairs(Dataset):
         grey_left, grey_right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right))
         depth_m = stereo_depth(grey_left, grey_right, self.rig, self.matching)
         return Frame(depth_m, T_world_camera, self.camera, pair.stamp, name, left if self.color else None)
-
-    def _read_image(self, path: Path) -> NDArray[np.uint8]:
-        image = read_color(path)
-        if image.shape[:2] != self.camera.shape:
-            raise DatasetError(
-                f"{path}: the image has {image.shape[1]} x {image.shape[0]} pixels, "
-                f"the camera {self.camera.width} x {self.camera.height}"
-            )
-        return image
 
 
 def noise_note(rig: StereoRig, left: str, right: str) -> str:
@@ -107,7 +98,7 @@ def first_size(where: Path, images: Iterable[Path]) -> tuple[int, int]:
 def read_times(path: Path) -> list[float]:
     """A file with a stamp in seconds a line. Raises DatasetError, which names the file and the line."""
     stamps = []
-    for number, line in enumerate(_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_text(path, DatasetError).splitlines(), start=1):
         if not line.strip():
             continue
         try:
@@ -117,10 +108,3 @@ def read_times(path: Path) -> list[float]:
         if not np.isfinite(stamps[-1]):
             raise DatasetError(f"{path} line {number}: the stamp is not finite")
     return stamps
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:  # ValueError: no text, or a zero byte in the name
-        raise DatasetError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error

@@ -32,6 +32,7 @@ from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_
 from taichi_mrf.datasets.trajectories import RecordedPose, read_trajectory
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system.files import is_file
 
 SUFFIXES = (".yaml", ".yml")
 SECONDS_PER_PAIR = 0.1
@@ -211,6 +212,6 @@ def _interpolated(
 FORMAT = Format(
     name="stereo pairs",
     looks_for=".yaml that describes stereo pairs",
-    recognises=lambda path: path.is_file() and path.suffix in SUFFIXES,
+    recognises=lambda path: is_file(path) and path.suffix in SUFFIXES,
     open=open_file,
 )

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system.files import exists, is_file
 from taichi_mrf.system.libraries import library
 
 
@@ -69,8 +70,8 @@ def load_mesh(path: Path) -> TriangleMesh:
     cannot be read as a mesh, and for a mesh without triangles or with vertices that are not finite.
     """
     trimesh = _library("trimesh")
-    if not path.is_file():
-        raise DatasetError(f"{path}: {'is no file' if path.exists() else 'the mesh is missing'}")
+    if not is_file(path):
+        raise DatasetError(f"{path}: {'is no file' if exists(path) else 'the mesh is missing'}")
     try:
         loaded = trimesh.load_mesh(path, process=False)
         vertices = np.array(loaded.vertices, np.float64).reshape(-1, 3)
