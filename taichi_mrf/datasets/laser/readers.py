@@ -8,7 +8,7 @@ from pathlib import Path
 from taichi_mrf.datasets.laser import carmen_log, floor_plan_scans, scan_npz
 from taichi_mrf.datasets.laser.scans import LaserScans
 from taichi_mrf.errors import DatasetError
-from taichi_mrf.system.files import exists, is_folder
+from taichi_mrf.system.files import exists, is_file, is_folder, open_regular
 
 __all__ = ["LaserScans", "holds_scans", "open_scans"]
 
@@ -47,17 +47,17 @@ def open_scans(
 
 def holds_scans(path: Path) -> bool:
     """Whether a file, or a folder with ``scans.npz``, holds 2D laser scans, whatever state they are in."""
-    if path.is_dir():
+    if is_folder(path):
         path = path / scan_npz.FILE_NAME
-    if not path.is_file():
+    if not is_file(path):
         return False
     if path.suffix == ".npz":
         return scan_npz.holds_ranges(path)
     try:
-        with open(path, "rb") as file:
+        with open_regular(path, DatasetError) as file:
             head = file.read(_LOOKED_AT_BYTES)
         if head[:2] == carmen_log.GZIP_MAGIC:
             head = zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(head, _LOOKED_AT_BYTES)
-    except (OSError, zlib.error, gzip.BadGzipFile):
+    except (DatasetError, zlib.error, gzip.BadGzipFile):
         return False
     return any(line.lstrip().startswith(carmen_log.SCAN_LINES) for line in head.splitlines())
