@@ -9,6 +9,14 @@ class ConfigError(TaichiMRFError):
     """A parameter is unknown, of the wrong type or outside its range; the text names the field."""
 
 
+class ArgumentError(ConfigError, ValueError):
+    """An argument of a public function has an impossible value; the text names the argument."""
+
+
+class ArgumentTypeError(ConfigError, TypeError):
+    """An argument of a public function is of the wrong type; the text names the argument."""
+
+
 class BackendError(TaichiMRFError):
     """The wanted Taichi backend is not to be had, or Taichi already runs on another one."""
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import yaml
 
+from taichi_mrf.config.arguments import real
 from taichi_mrf.config.files import find_config, read_yaml
 from taichi_mrf.config.registry import METHODS, MethodName
 from taichi_mrf.config.values import check_field, from_dict
@@ -239,7 +240,7 @@ class Config(_Tail, _MethodSections, _Head):
     """
 
     def __post_init__(self) -> None:
-        ok = math.isfinite(self.voxel_size) and self.voxel_size > 0
+        ok = 0 < real(self.voxel_size, "voxel_size") < math.inf
         check_field(ok, "voxel_size", f"must be a positive number of metres, not {self.voxel_size}")
 
 

@@ -12,7 +12,9 @@ import typing
 from collections.abc import Sequence
 from typing import Any, Literal, TypeVar
 
-from taichi_mrf.errors import ConfigError
+import numpy as np
+
+from taichi_mrf.errors import ArgumentTypeError, ConfigError
 
 T = TypeVar("T")
 
@@ -32,12 +34,19 @@ def nearest(name: str, known: Sequence[str]) -> str:
 
 
 def overridden(config: T, overrides: dict[str, Any], where: str) -> T:
-    """A dataclass instance with some fields replaced; an unknown name is a ConfigError."""
+    """A dataclass instance with some fields replaced. Raises ConfigError for an unknown name or a value of
+    the wrong type."""
     names = [f.name for f in dataclasses.fields(config)]  # type: ignore[arg-type]
     for key in overrides:
         if key not in names:
             raise unknown_key(key, names, where)
-    return dataclasses.replace(config, **overrides)  # type: ignore[type-var]
+    hints = typing.get_type_hints(type(config))
+    values = {}
+    for key, value in overrides.items():
+        if isinstance(value, str) and float in (hints[key], *typing.get_args(hints[key])):
+            raise ArgumentTypeError(f"{where}: {key} must be a number, not {shown(value)}")
+        values[key] = _convert(value, hints[key], f"{where}: {key}")
+    return dataclasses.replace(config, **values)  # type: ignore[type-var]
 
 
 def shown(value: Any) -> str:
@@ -103,6 +112,8 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
             value = float(value)
         except ValueError:
             raise ConfigError(f"{where} must be a number, not {shown(value)}") from None
+    if isinstance(value, np.generic):
+        value = value.item()
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) > _LARGEST_INTEGER:
         raise ConfigError(f"{where} must be a number of a sensible size, not {shown(value)}")
     accepted = (int, float) if hint is float else hint

@@ -21,7 +21,7 @@ from taichi_mrf.evaluation.depth_error import DepthError, depth_error
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.queries.survey import SurfaceSurvey
 from taichi_mrf.queries.view import View
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import PinholeCamera, check_camera
 from taichi_mrf.sensor.noise import NoiseModel, NoiseTable, PolynomialNoise
 
 Tolerance = Literal["voxel", "1.5sigma", "5cm", "sensor"]
@@ -171,6 +171,7 @@ def judge_view(
     Raises FrameError if shapes do not fit or no pixel is left to judge.
     """
     depth = np.asarray(depth_m, np.float32)
+    check_camera(camera)
     if depth.shape != camera.shape:
         raise FrameError(
             f"a depth image has the shape {depth.shape}, but the camera has {camera.height} rows and "

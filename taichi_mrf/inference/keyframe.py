@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.resident import Resident, on_host, resident
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import PinholeCamera, check_camera
 from taichi_mrf.sensor.noise import NoiseModel, NoiseTable
 from taichi_mrf.voxels.window import Window
 
@@ -22,6 +22,7 @@ def checked_depth(depth_m: ArrayLike, camera: PinholeCamera, min_depth: float) -
 
     Raises KeyframeError if it does not have the camera's shape, or holds no floating-point metres.
     """
+    check_camera(camera)
     depth = np.asarray(depth_m)
     if depth.shape != camera.shape:
         raise KeyframeError(

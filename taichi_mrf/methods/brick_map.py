@@ -6,13 +6,16 @@ in a pool of bricks that a registry allocates.
 
 import dataclasses
 import weakref
-from typing import ClassVar, TypeVar
+from collections.abc import Iterable
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf.config.arguments import instance, iterable, real, whole
 from taichi_mrf.config.method import Method
-from taichi_mrf.config.schema import Config, VolumeConfig
+from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
+from taichi_mrf.config.values import overridden
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.methods.mrf.brick_registry import BrickRegistry
 from taichi_mrf.methods.sensor_section import describing
@@ -21,7 +24,7 @@ from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.queries.points import classify, point_log_odds, probability
 from taichi_mrf.queries.profile import RayProfile
 from taichi_mrf.queries.view import View
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import PinholeCamera, check_camera
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config
 from taichi_mrf.system import runtime
 from taichi_mrf.system.owner import Owned, owned_attribute
@@ -29,6 +32,37 @@ from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import create_topology, recycle
 
 MapT = TypeVar("MapT", bound="BrickMap")
+SectionT = TypeVar("SectionT")
+
+
+def own_parameters(
+    voxel_size: float, volume: VolumeConfig | None, min_depth: float, max_depth: float
+) -> dict[str, Any]:
+    """The arguments that the constructors of all methods share, checked, as fields of Config."""
+    sensor = SensorConfig(min_depth=real(min_depth, "min_depth"), max_depth=real(max_depth, "max_depth"))
+    volume = instance(volume or VolumeConfig(), VolumeConfig, "volume", "of type VolumeConfig")
+    return {"voxel_size": real(voxel_size, "voxel_size"), "sensor": sensor, "volume": volume}
+
+
+def own_section(
+    given: Any, cls: type[SectionT], parameters: dict[str, Any], name: str, where: str
+) -> SectionT:
+    """A method's section of the configuration, ``given`` or the default, with some parameters replaced."""
+    section = instance(cls() if given is None else given, cls, name, f"of type {cls.__name__}")
+    return overridden(section, parameters, where)
+
+
+def check_inference(
+    sweeps: int | None, tolerance: float | None, keyframes: Iterable[int] | None
+) -> list[int] | None:
+    """Check the arguments of ``infer``; returns ``keyframes`` as a list without repetitions."""
+    if sweeps is not None:
+        whole(sweeps, "sweeps")
+    if tolerance is not None:
+        real(tolerance, "tolerance", least=0)
+    if keyframes is None:
+        return None
+    return list(dict.fromkeys(iterable(keyframes, "keyframes", "a list of keyframe ids")))
 
 
 class BrickMap(Owned):
@@ -58,6 +92,8 @@ class BrickMap(Owned):
     ) -> None:
         """Allocate the grid. ``seen_free_log_odds`` is what a place holds that was seen but has no brick;
         ``shown`` and ``occlusion`` are the View's."""
+        if noise is not None:
+            instance(noise, NoiseModel, "noise", "a noise model such as PolynomialNoise")
         runtime.init()
         self.sensor = describing(noise, config.sensor)
         self.config = dataclasses.replace(config, method=self.METHOD.name, sensor=self.sensor)
@@ -93,16 +129,20 @@ class BrickMap(Owned):
 
     def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """All allocated voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
-        return extract_voxels(self._pool, self.voxel_size, min_probability)
+        return extract_voxels(self._pool, self.voxel_size, real(min_probability, "min_probability"))
 
     def render_depth(self, camera: PinholeCamera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
         """Axial depth of the likeliest surface seen by each pixel, (H, W) float32, NaN where none is."""
+        check_camera(camera)
         return self.view.render_depth(camera, as_pose(T_world_camera), self.sensor.max_depth)
 
     def ray_profile(
         self, origin: ArrayLike, direction: ArrayLike, max_range: float | None = None
     ) -> RayProfile:
-        """Occupancy, visibility and omega (MRFMap, eqs. 15 to 18) along a ray, by range in metres."""
+        """Occupancy, visibility and omega (MRFMap, eqs. 15 to 18) along a ray, by range in metres, up to
+        ``max_range`` (``sensor.max_depth`` by default)."""
+        if max_range is not None:
+            real(max_range, "max_range", above=0)
         return self.view.ray_profile(origin, direction, max_range or self.sensor.max_depth)
 
     def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:

@@ -18,17 +18,17 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf.config.arguments import instance
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.inference.keyframe import DepthImage, Footprint, checked_depth
 from taichi_mrf.inference.schedule import InferProgress, InferReport, Progress
-from taichi_mrf.methods.brick_map import BrickMap
+from taichi_mrf.methods.brick_map import BrickMap, check_inference
 from taichi_mrf.methods.map_file import MapHeader, StoredKeyframe, naming
 from taichi_mrf.methods.recursive_storage import RecursiveContents, read_recursive, write_recursive
 from taichi_mrf.methods.recursive_update import LEAST_LOG_ODDS, UNKNOWN_LOG_ODDS
 from taichi_mrf.methods.statistics import MapStatistics, measure
-from taichi_mrf.queries.extract import extract_voxels
 from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
@@ -152,7 +152,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         ``T_world_camera`` is (4, 4). Returns the keyframe's id.
         Raises KeyframeError for a wrong shape or pose, CapacityError if the map would not fit.
         """
-        T = as_pose(T_world_camera)
+        T, name = as_pose(T_world_camera), instance(name, str, "name", "a string")
         depth = checked_depth(depth_m, camera, self.sensor.min_depth)
         if not self._keyframes:
             warn_of_bad_sigma(self.noise.table(camera), self.sensor.min_depth, self.sensor.max_depth)
@@ -189,7 +189,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         stops, and leaves a map of the scans up to there that is still stale.
         Raises CapacityError if the map would not fit.
         """
-        for id in keyframes or ():
+        for id in check_inference(sweeps, tolerance, keyframes) or ():
             self._find(id)
         begin = time.perf_counter()
         records = list(self._keyframes.values()) if self._stale else []
@@ -210,7 +210,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         if min_probability == 0.5:
             # Leaves the unknown out before they are collected: there are far more of them than others.
             min_probability += 0.2 * LEAST_LOG_ODDS
-        centres, p = extract_voxels(self._pool, self.voxel_size, min_probability)
+        centres, p = super().voxels(min_probability)
         known = p != 0.5  # LEAST_LOG_ODDS sees to that
         return centres[known], p[known]
 

@@ -4,6 +4,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf.config.arguments import array
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.kernels.types import F32Array, I32Array
 from taichi_mrf.system import runtime
@@ -43,7 +44,7 @@ def point_log_odds(
 
 def checked_points(points: ArrayLike) -> NDArray[np.float64]:
     """Points as (N, 3) float64. Raises ConfigError for another shape or a value that is not finite."""
-    points_m = np.asarray(points, np.float64)
+    points_m = array(points, "points")
     if points_m.ndim != 2 or points_m.shape[1] != 3:
         raise ConfigError(f"points must be of shape (N, 3), not {points_m.shape}")
     if not np.isfinite(points_m).all():

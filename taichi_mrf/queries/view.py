@@ -6,6 +6,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf.config.arguments import array
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose
@@ -104,7 +105,7 @@ class View:
 
     def ray_profile(self, origin: ArrayLike, direction: ArrayLike, max_range: float) -> RayProfile:
         """Follow one ray; ``direction`` need not be normalised. Raises ConfigError if it is no direction."""
-        start, along = np.asarray(origin, np.float64), np.asarray(direction, np.float64)
+        start, along = array(origin, "origin"), array(direction, "direction")
         length = float(np.linalg.norm(along))
         if (
             start.shape != (3,)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.config.arguments import instance, real, whole
 from taichi_mrf.errors import ConfigError
 
 
@@ -25,8 +26,10 @@ class PinholeCamera:
     cy: float
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise ConfigError(f"camera size {self.width} x {self.height}: both must be at least 1")
+        for name in ("width", "height"):
+            whole(getattr(self, name), f"camera {name}", least=1)
+        for name in ("fx", "fy", "cx", "cy"):
+            real(getattr(self, name), f"camera {name}")
         for name in ("fx", "fy", "cx", "cy"):
             if not math.isfinite(getattr(self, name)):
                 raise ConfigError(f"camera {name} is not finite")
@@ -69,3 +72,8 @@ class PinholeCamera:
         x = max(abs(self.cx), abs(self.width - 1 - self.cx)) / self.fx
         y = max(abs(self.cy), abs(self.height - 1 - self.cy)) / self.fy
         return math.hypot(1.0, x, y)
+
+
+def check_camera(camera: object) -> None:
+    """Raise ArgumentTypeError for an argument ``camera`` that is none."""
+    instance(camera, PinholeCamera, "camera", "a PinholeCamera")

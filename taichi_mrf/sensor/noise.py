@@ -9,11 +9,12 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf.config.arguments import array
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.errors import ConfigError, said
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -46,6 +47,7 @@ class NoiseTable:
         return np.maximum(sigma, LEAST_SIGMA_M), bias
 
 
+@runtime_checkable
 class NoiseModel(Protocol):
     """What MRFMap asks of a noise model."""
 
@@ -58,8 +60,8 @@ class PolynomialNoise:
 
     def __init__(self, sigma: Sequence[float], bias: Sequence[float] = (0.0,)) -> None:
         """Coefficients in ascending powers of depth; metres."""
-        self.sigma = _padded(np.atleast_2d(np.asarray(sigma, np.float64)), "sigma")
-        self.bias = _padded(np.atleast_2d(np.asarray(bias, np.float64)), "bias")
+        self.sigma = _padded(np.atleast_2d(array(sigma, "sigma")), "sigma")
+        self.bias = _padded(np.atleast_2d(array(bias, "bias")), "bias")
 
     def table(self, camera: PinholeCamera) -> NoiseTable:
         """One patch that covers the image, whatever the camera."""
@@ -75,8 +77,8 @@ class PatchNoise:
 
         Raises ConfigError if the number of patches does not fit the camera.
         """
-        self.sigma = _padded(np.asarray(sigma, np.float64), "sigma")
-        self.bias = _padded(np.asarray(bias, np.float64), "bias")
+        self.sigma = _padded(array(sigma, "sigma"), "sigma")
+        self.bias = _padded(array(bias, "bias"), "bias")
         if patch < 1:
             raise ConfigError(f"the noise tables' patch must be at least 1 pixel, not {patch}")
         self.patch = patch

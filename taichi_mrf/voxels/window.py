@@ -12,6 +12,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf.errors import CapacityError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.resident import Resident
 from taichi_mrf.kernels.types import I32, I32Array, IVec3
@@ -19,6 +20,9 @@ from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS
 from taichi_mrf.voxels.numbering import flat
+
+LARGEST_CHUNK = 2**31 // CHUNK
+"""Bricks further out than this, in chunks, have no int32 coordinates."""
 
 Vector = NDArray[np.float64]
 
@@ -37,6 +41,12 @@ class Window:
         chunk_m = voxel_size * BRICK * CHUNK
         first = np.floor(np.asarray(lower_m, np.float64) / chunk_m)
         last = np.floor(np.asarray(upper_m, np.float64) / chunk_m)
+        if max(-first.min(), last.max() + 1) > LARGEST_CHUNK:
+            reach = LARGEST_CHUNK * chunk_m
+            raise CapacityError(
+                f"a place further than {reach:.3g} m from the world's origin is out of reach at a voxel size "
+                f"of {voxel_size:g} m"
+            )
         shape = (last - first + 1) * CHUNK
         # Three int32 for each brick: the footprint's mark, the cells that it finds, and the index.
         check_memory(12.0 * float(np.prod(shape)), f"a view at a voxel size of {voxel_size:g} m")

@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
-from taichi_mrf.config.values import overridden
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import DepthImage
+from taichi_mrf.methods.brick_map import own_parameters, own_section
 from taichi_mrf.methods.log_odds.plug import METHOD, LogOddsConfig
 from taichi_mrf.methods.log_odds.scan import RayFootprint, ScanIntegrator
 from taichi_mrf.methods.recursive import RecursiveMap, Scan
@@ -38,13 +38,9 @@ class LogOddsMap(RecursiveMap[RayFootprint]):
         ``noise`` (a Kinect 1 by default) is only asked for the bias, with ``correct_bias=True``.
         Raises ConfigError for an unknown or impossible parameter.
         """
-        config = Config(
-            voxel_size,
-            sensor=SensorConfig(min_depth=min_depth, max_depth=max_depth),
-            log_odds=overridden(log_odds or LogOddsConfig(), parameters, "LogOddsMap"),
-            volume=volume or VolumeConfig(),
-        )
-        self._set_up(config, noise)
+        section = own_section(log_odds, LogOddsConfig, parameters, "log_odds", "LogOddsMap")
+        shared = own_parameters(voxel_size, volume, min_depth, max_depth)
+        self._set_up(Config(**shared, log_odds=section), noise)
 
     def _set_up(self, config: Config, noise: NoiseModel | None) -> None:
         super()._set_up(config, noise)

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.alignment.keyframe_surfels import KeyframeSurfels
 from taichi_mrf.alignment.refine import Aligner, RefinedPose
+from taichi_mrf.config.arguments import instance, real
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, PoseConfig, SensorConfig, VolumeConfig
@@ -32,7 +33,7 @@ from taichi_mrf.inference.prior import prior_probability
 from taichi_mrf.inference.ray_list import RayBundler
 from taichi_mrf.inference.schedule import InferReport, Progress, content_key, run_sweeps
 from taichi_mrf.inference.sweep import Sweeper, unknown_entry_depths
-from taichi_mrf.methods.brick_map import BrickMap
+from taichi_mrf.methods.brick_map import BrickMap, check_inference, own_parameters, own_section
 from taichi_mrf.methods.map_file import MapHeader, StoredKeyframe, naming
 from taichi_mrf.methods.mrf.checkpoint import Checkpoint, go_back, take_checkpoint
 from taichi_mrf.methods.mrf.keyframe_allocator import KeyframeAllocator
@@ -70,10 +71,9 @@ class MRFMap(BrickMap):
 
         ``noise`` defaults to a Kinect 1. Raises ConfigError for an unknown or impossible parameter.
         """
-        inference = overridden(inference or InferenceConfig(), parameters, "MRFMap")
-        sensor = SensorConfig(min_depth=min_depth, max_depth=max_depth)
-        config = Config(voxel_size, sensor=sensor, inference=inference, volume=volume or VolumeConfig())
-        self._set_up(config, noise)
+        section = own_section(inference, InferenceConfig, parameters, "inference", "MRFMap")
+        shared = own_parameters(voxel_size, volume, min_depth, max_depth)
+        self._set_up(Config(**shared, inference=section), noise)
 
     def _set_up(self, config: Config, noise: NoiseModel | None) -> None:
         inference = config.inference
@@ -131,7 +131,7 @@ class MRFMap(BrickMap):
         ``T_world_camera`` is (4, 4). Returns the keyframe's id.
         Raises KeyframeError for a wrong shape or pose, CapacityError if the map would not fit.
         """
-        T = as_pose(T_world_camera)
+        T, name = as_pose(T_world_camera), instance(name, str, "name", "a string")
         image = self._upload(depth_m, camera)
         keyframe = self._allocator.place(self._next_id, name or f"keyframe {self._next_id}", image, T)
         self._keyframes[keyframe.id] = keyframe
@@ -209,12 +209,13 @@ class MRFMap(BrickMap):
         ``progress`` is called after each keyframe and stops inference by returning False. ``method`` takes
         the place of the configuration's, from now on. Raises ConfigError for one that there is not.
         """
+        chosen_ids = check_inference(sweeps, tolerance, keyframes)
         if method is not None and method != self.config.inference.method:
             self._use(method)
         config = self.config.inference
         sweeps = config.sweeps if sweeps is None else sweeps
         tolerance = config.tolerance if tolerance is None else tolerance
-        if keyframes is None:
+        if chosen_ids is None:
             chosen = sorted(self._keyframes.values(), key=content_key)
             self._pool.restart()
             for keyframe in chosen:
@@ -225,7 +226,7 @@ class MRFMap(BrickMap):
                 self._allocator.refresh(keyframe)
             self._messages_lost = False
         else:
-            chosen = [self._find(id) for id in dict.fromkeys(keyframes)]
+            chosen = [self._find(id) for id in chosen_ids]
             self._restore_messages()
             for keyframe in chosen:
                 self._allocator.refresh(keyframe)
@@ -255,7 +256,9 @@ class MRFMap(BrickMap):
         share left, its ``sweeps`` count keyframes. The result depends slightly on the order of changes;
         that of :meth:`infer` does not.
         """
-        first = [self._find(id).id for id in keyframes]
+        first = [self._find(id).id for id in check_inference(None, tolerance, keyframes) or ()]
+        if seconds is not None:
+            real(seconds, "seconds", least=0)
         self._restore_messages()
         if tolerance is None:
             tolerance = self.config.inference.renew_tolerance

@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
-from taichi_mrf.config.values import overridden
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import DepthImage, Footprint
+from taichi_mrf.methods.brick_map import own_parameters, own_section
 from taichi_mrf.methods.recursive import RecursiveMap, Scan
 from taichi_mrf.methods.visibility.integrator import VisibilityIntegrator
 from taichi_mrf.methods.visibility.plug import METHOD, VisibilityConfig
@@ -44,13 +44,9 @@ class VisibilityMap(RecursiveMap[Footprint]):
         the paper's sensor has not, is taken out of the measurements first.
         Raises ConfigError for an unknown or impossible parameter.
         """
-        config = Config(
-            voxel_size,
-            sensor=SensorConfig(min_depth=min_depth, max_depth=max_depth),
-            visibility=overridden(visibility or VisibilityConfig(), parameters, "VisibilityMap"),
-            volume=volume or VolumeConfig(),
-        )
-        self._set_up(config, noise)
+        section = own_section(visibility, VisibilityConfig, parameters, "visibility", "VisibilityMap")
+        shared = own_parameters(voxel_size, volume, min_depth, max_depth)
+        self._set_up(Config(**shared, visibility=section), noise)
 
     def _set_up(self, config: Config, noise: NoiseModel | None) -> None:
         super()._set_up(config, noise)
