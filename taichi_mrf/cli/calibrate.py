@@ -4,8 +4,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from taichi_mrf.calibration.coverage import Coverage
@@ -21,6 +19,8 @@ from taichi_mrf.calibration.truth_sources import (
 )
 from taichi_mrf.cli.options.calibrate import Calibrate
 from taichi_mrf.cli.shared.output import output_folder
+from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
+from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.datasets.intrinsics import CAMERA_FILES, PRIMESENSE, find_camera
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.errors import DatasetError
@@ -32,40 +32,22 @@ REPORT_FILE = "report.json"
 _MM = 1e3
 
 
-class _Bar:
-    """One progress bar that stages share; silent where the output is no terminal."""
-
-    def __init__(self, progress: Progress) -> None:
-        self._progress = progress
-        self._task = progress.add_task("")
-
-    def show(self, stage: str, done: int, total: int) -> None:
-        self._progress.update(self._task, description=stage, completed=done, total=total)
-
-
 def run_calibrate(options: Calibrate) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
-    console = Console()
+    console = open_terminal(options.printing)
     with output_folder(options.out):
         depth = DepthFiles(options.depth, options.depth_scale)
         camera, notes = _camera(options, depth)
-        columns = (
-            TextColumn("{task.description:15}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeRemainingColumn(),
-        )
-        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-            bar = _Bar(progress)
+        with ProgressBar(console, options.printing) as bar:
             truth = _ground_truth(options, depth, camera, bar)
             total = 2 * len(truth.source.names)
             calibration = calibrate(
-                truth.source, camera, options.settings, lambda done: bar.show("Learning", done, total)
+                truth.source, camera, options.settings, lambda done: bar.advance("Learning", done, total)
             )
             coverage = Coverage(calibration.noise.cells, calibration.noise.covered)
             written = write_noise(options.out, calibration.noise)
             if options.pictures:
-                bar.show("Drawing", 0, 1)
+                bar.advance("Drawing", 0, 1)
                 written += write_pictures(options.out, calibration.noise, coverage)
         report = {
             "depth": str(options.depth),
@@ -75,12 +57,7 @@ def run_calibrate(options: Calibrate) -> int:
         }
         write_text(options.out / REPORT_FILE, json.dumps(report, indent=2, allow_nan=False) + "\n")
         _print_report(console, report, [*written, options.out / REPORT_FILE])
-        console.print(
-            f"Map with it: taichi-mrf map SOURCE --out DIR --config {options.out / CONFIG_FILE}",
-            markup=False,
-            highlight=False,
-            soft_wrap=True,
-        )
+        console.say(f"Map with it: taichi-mrf map SOURCE --out DIR --config {options.out / CONFIG_FILE}")
     return 0
 
 
@@ -113,14 +90,16 @@ def _camera(options: Calibrate, depth: DepthFiles) -> tuple[PinholeCamera, list[
     return camera, [f"{note}; it matters for the pictures only" for note in notes]
 
 
-def _ground_truth(options: Calibrate, depth: DepthFiles, camera: PinholeCamera, bar: _Bar) -> GroundTruth:
+def _ground_truth(
+    options: Calibrate, depth: DepthFiles, camera: PinholeCamera, bar: ProgressBar
+) -> GroundTruth:
     if options.true_depth is not None:
         steps = options.true_depth_scale or options.depth_scale
         return from_true_depth(depth, DepthFiles(options.true_depth, steps), camera)
     assert options.images is not None
 
     def progress(done: int, total: int) -> None:
-        bar.show("Finding boards", done, total)
+        bar.advance("Finding boards", done, total)
 
     if options.camera_poses is None or options.board_poses is None:
         return from_chessboard(depth, options.images, camera, options.settings, progress)
@@ -136,7 +115,7 @@ def _ground_truth(options: Calibrate, depth: DepthFiles, camera: PinholeCamera, 
     )
 
 
-def _print_report(console: Console, report: dict[str, Any], written: list[Path]) -> None:
+def _print_report(console: Terminal, report: dict[str, Any], written: list[Path]) -> None:
     table = Table(show_header=False, title=f"Noise learnt from {report['depth']}", title_justify="left")
     table.add_column(style="bold")
     table.add_column()
@@ -145,11 +124,11 @@ def _print_report(console: Console, report: dict[str, Any], written: list[Path])
     console.print(table)
     console.print(_noise_table(report["noise"]))
     for sentence in report["not_covered"]:
-        console.print(sentence, markup=False, highlight=False, soft_wrap=True)
+        console.say(sentence)
     for note in report["notes"]:
-        console.print(f"Note: {note}", markup=False, highlight=False, soft_wrap=True)
+        console.say(f"Note: {note}")
     for path in written:
-        console.print(str(path), markup=False, highlight=False, soft_wrap=True)
+        console.say(str(path))
 
 
 def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:

@@ -3,10 +3,10 @@
 import json
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from taichi_mrf.cli.options.diff import Diff
+from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.changes import write_changes
 from taichi_mrf.methods.registry import load_map
@@ -54,7 +54,7 @@ def diff_report(found: MapChange, a: str, b: str, voxel_size: float) -> dict[str
 
 
 def _print(report: dict[str, Any]) -> None:
-    console = Console()
+    console = Terminal()
     table = Table("voxels", *(f"{state} in B" for state in STATES), title_justify="left")
     for before, row in report["voxels"].items():
         # Nobody can count what neither map knows.
@@ -73,6 +73,6 @@ def _print(report: dict[str, Any]) -> None:
         lines.append(f"{report['changes']['file']} ({report['changes']['points']:,} points)")
     for line in lines:
         if isinstance(line, str):
-            console.print(line, markup=False, highlight=False, soft_wrap=True)
+            console.say(line)
         else:
             console.print(line)

@@ -6,13 +6,12 @@ The experiments are a package of their own, which is imported by name when the c
 import importlib
 from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
 from taichi_mrf.cli.options.eval import Eval
 from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.output import output_folder
 from taichi_mrf.cli.shared.print_table import print_table
+from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
+from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.config.values import nearest
 from taichi_mrf.errors import ConfigError, DatasetError, TaichiMRFError
 from taichi_mrf.system import runtime
@@ -26,7 +25,7 @@ ALL = "all"
 
 def run_eval(options: Eval) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
-    console = Console()
+    console = open_terminal(options.printing)
     laboratory = importlib.import_module(LABORATORY)
     known: dict[str, Any] = laboratory.EXPERIMENTS
     if options.experiment not in (*known, ALL):
@@ -37,7 +36,7 @@ def run_eval(options: Eval) -> int:
         raise DatasetError(f"{options.data}: there is no such folder; --data names the one with the scenes")
     with (
         output_folder(options.out),
-        stop_on_signals(lambda text: console.print(text, style="yellow")) as request,
+        stop_on_signals(lambda text: console.say(text, "yellow")) as request,
     ):
         runtime.init(options.runtime.arch, options.runtime.threads, options.runtime.debug)
         failed = 0
@@ -45,19 +44,19 @@ def run_eval(options: Eval) -> int:
             try:
                 tables, paths = _run(laboratory, name, options, console, request)
             except _StoppedError:
-                console.print("Stopped before the end; the same command goes on from here.", style="yellow")
+                console.say("Stopped before the end; the same command continues from here.", "yellow")
                 return 128 + (request.signal or 0)
             except TaichiMRFError as error:
                 if len(names) == 1:
                     raise
                 # One experiment that lacks its data or an extra does not keep the others from running.
-                console.print(f"{name}: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
+                console.say(f"{name}: {error}", "red")
                 failed += 1
                 continue
             for table in tables:
                 print_table(console, table)
             for path in paths:
-                console.print(str(path), markup=False, highlight=False, soft_wrap=True)
+                console.say(str(path))
     if failed:
         raise TaichiMRFError(f"{failed} of {len(names)} experiments could not be run")
     return 0
@@ -67,17 +66,15 @@ class _StoppedError(Exception):
     """The user wants the run to end; what was found is kept."""
 
 
-def _run(laboratory: Any, name: str, options: Eval, console: Console, should_stop: StopRequest) -> Any:
+def _run(laboratory: Any, name: str, options: Eval, console: Terminal, should_stop: StopRequest) -> Any:
     """The tables and the files of one experiment, with a progress bar on a terminal."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task(name, total=None)
+    with ProgressBar(console, options.printing) as progress:
 
         def report(what: str, done: int, total: int) -> None:
             # Between two maps. An exception raised by the signal itself could be lost in a finaliser.
             if should_stop():
                 raise _StoppedError
-            progress.update(task, description=f"{name}: {what}", completed=done, total=total)
+            progress.advance(name, done, total, note=what)
 
         return laboratory.run_experiment(
             name, options.data, options.out, options.voxel_sizes, options.seeds, options.limit, report

@@ -6,9 +6,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from taichi_mrf.cli.options.export import Export
+from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.chunk_store import SUFFIX
 from taichi_mrf.export.formats import ExportedMap, export_map, export_note, writer_of
@@ -30,7 +29,7 @@ def run_export(options: Export) -> int:
         if os.path.realpath(path) == os.path.realpath(options.map):
             raise ConfigError(f"{path}: the map itself would be overwritten")
     runtime.init(options.arch)
-    console = Console()
+    console = Terminal()
     m = _opened(options)
     written: list[dict[str, Any]] = []
     for path in options.to:
@@ -43,7 +42,7 @@ def run_export(options: Export) -> int:
                 _tell(console, file, seconds)
         note = export_note(m, path, options.options)
         if note is not None and not options.json:
-            console.print(f"{path.name}: {note}", markup=False, highlight=False, soft_wrap=True)
+            console.say(f"{path.name}: {note}")
     if options.json:
         print(json.dumps(written, indent=2))
     return 0
@@ -64,6 +63,6 @@ def _size(path: Path) -> int:
     return sum(file.stat().st_size for file in files if file.is_file())
 
 
-def _tell(console: Console, file: Path, seconds: float) -> None:
+def _tell(console: Terminal, file: Path, seconds: float) -> None:
     size = f"{_size(file) / 1e6:.2f} MB, {seconds:.1f} s"
-    console.print(f"{file} ({size})", markup=False, highlight=False, soft_wrap=True)
+    console.say(f"{file} ({size})")

@@ -5,9 +5,9 @@ import json
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from taichi_mrf.cli.options.import_map import Import
+from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.octomap_reader import read_octomap
@@ -40,13 +40,13 @@ def run_import(options: Import) -> int:
     if options.json:
         print(json.dumps(facts, indent=2))
         return 0
-    console = Console()
+    console = Terminal()
     text = (
         f"{facts['leaves']:,} leaves of OctoMap's: {facts['occupied']:,} occupied and {facts['free']:,} free "
         f"voxels of {leaves.voxel_size:g} m in {facts['bricks']:,} bricks"
     )
     for line in (text, str(options.out)):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        console.say(line)
     return 0
 
 

@@ -6,10 +6,10 @@ import shlex
 from dataclasses import asdict
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from taichi_mrf.cli.options.info import Info
+from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.config.schema import Arch
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.registry import bag_path, format_name, is_rendered
@@ -23,7 +23,7 @@ from taichi_mrf.system import runtime
 
 def run_info(options: Info) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
-    console = Console(soft_wrap=False)
+    console = Terminal()
     if options.json:
         facts = _backend_facts(options.arch) if options.source is None else _source_facts(options)
         print(json.dumps(facts, indent=2))
@@ -64,7 +64,7 @@ def _source_facts(options: Info) -> dict[str, Any]:
     return facts | {"format": format_name(options.source)} | asdict(summarise(dataset)) | {"notes": notes}
 
 
-def _print_backends(console: Console, arch: Arch) -> None:
+def _print_backends(console: Terminal, arch: Arch) -> None:
 
     runtime.init(arch)
     choice = runtime.choice()
@@ -73,15 +73,15 @@ def _print_backends(console: Console, arch: Arch) -> None:
     for status in runtime.backends():
         here = status.device if status.problem is None else f"no: {status.problem}"
         table.add_row(status.name, here, status.ability)
-    console.print(f"Runs on [bold]{choice.name}[/]: {choice.device}, {choice.reason}.")
+    console.print(f"Runs on {choice.name}: {choice.device}, {choice.reason}.")
     for name, why in choice.rejected.items():
         console.print(f"Not on {name}: {why}.")
     console.print(table)
     for name, version in runtime.versions().items():
-        console.print(f"{name} {version}", highlight=False)
+        console.say(f"{name} {version}")
 
 
-def _print_source(console: Console, source: str, arch: Arch, reading: SourceFlags) -> None:
+def _print_source(console: Terminal, source: str, arch: Arch, reading: SourceFlags) -> None:
     path = bag_path(source)
     if path is not None:
         bag = summarise_bag(path)
@@ -93,16 +93,16 @@ def _print_source(console: Console, source: str, arch: Arch, reading: SourceFlag
     except DatasetError as error:
         if path is None:
             raise
-        _say(console, f"To be mapped it needs more: {error}")
+        console.say(f"To be mapped it needs more: {error}")
         for name in bag.sources:
-            _say(console, f"taichi-mrf map {shlex.quote(name)}{bag.flags} --out DIR")
+            console.say(f"taichi-mrf map {shlex.quote(name)}{bag.flags} --out DIR")
     else:
         _print_frames(console, format_name(source), dataset)
         if path is not None:
-            _say(console, f"taichi-mrf map {shlex.quote(source)} --out DIR")
+            console.say(f"taichi-mrf map {shlex.quote(source)} --out DIR")
 
 
-def _print_topics(console: Console, bag: BagSummary) -> None:
+def _print_topics(console: Terminal, bag: BagSummary) -> None:
     table = Table(title=f"Topics in {bag.duration:.1f} s", title_justify="left")
     for heading in ("topic", "type", "messages", "Hz", "holds"):
         table.add_column(heading, overflow="fold")
@@ -112,10 +112,10 @@ def _print_topics(console: Console, bag: BagSummary) -> None:
         table.add_row(topic.name, topic.type, str(topic.messages), hz, bag.remarks.get(topic.name, ""))
     console.print(table)
     for transform in bag.transforms:
-        _say(console, f"tf {transform}")
+        console.say(f"tf {transform}")
 
 
-def _print_frames(console: Console, format_name: str, dataset: Dataset) -> None:
+def _print_frames(console: Terminal, format_name: str, dataset: Dataset) -> None:
 
     found, camera = summarise(dataset), dataset.camera
     table = Table(show_header=False, title=dataset.name, title_justify="left")
@@ -137,8 +137,4 @@ def _print_frames(console: Console, format_name: str, dataset: Dataset) -> None:
         table.add_row("way", f"{', '.join(axes)} m")
     console.print(table)
     for note in [*dataset.notes, *([found.problem] if found.problem else [])]:
-        _say(console, f"Note: {note}")
-
-
-def _say(console: Console, text: str) -> None:
-    console.print(text, markup=False, highlight=False, soft_wrap=True)
+        console.say(f"Note: {note}")

@@ -1,21 +1,20 @@
 """What ``taichi-mrf live`` does: start the page, map, and leave the files when it ends."""
 
-import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-from rich.console import Console
-
 from taichi_mrf.cli.options.live import Live
 from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
+from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.serving import Say, let_the_page_go_first, tell_address, warn_of_host
+from taichi_mrf.cli.shared.terminal import tell_problem
 from taichi_mrf.config.schema import with_absolute_tables
 from taichi_mrf.errors import TaichiMRFError
 from taichi_mrf.live.link import ViewerLink
-from taichi_mrf.viewer.messages import Listening
+from taichi_mrf.viewer.messages import Listening, Status, Update
 
 SHORTEST_LIFE_SECONDS = 30.0
 """A viewer that ends sooner than this is not started once more."""
@@ -23,10 +22,8 @@ SHORTEST_LIFE_SECONDS = 30.0
 
 def run_live(options: Live) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
-    console = Console()
-
-    def say(text: str) -> None:
-        console.print(text, highlight=False, soft_wrap=True, markup=False)
+    console = open_terminal(options.printing)
+    say = console.say
 
     settings = with_absolute_tables(options.poses.parameters(options.settings), Path.cwd())
     with ExitStack() as stack:
@@ -34,7 +31,8 @@ def run_live(options: Live) -> int:
             stack.enter_context(output_folder(options.out))
         request = stack.enter_context(stop_on_signals(say, keeps=options.out is not None))
         warn_of_host(options.host, options.port, "watch and change the map", say)
-        page = _Page(options, say, stack)
+        bar = ProgressBar(console, options.printing)
+        page = _Page(options, say, bar, stack)
         let_the_page_go_first()
         # Imported late: the page starts meanwhile, in a process of its own.
         from taichi_mrf.live.files import write_all
@@ -56,7 +54,8 @@ def run_live(options: Live) -> int:
             say(note)
         policy = Policy(options.keep_live, options.out, options.exit_when_done)
         session = Session(source, page.link, policy, page.listening)
-        problem = _run(session.run, session.reconnect, page, request)
+        with bar:
+            problem = _run(session.run, session.reconnect, page, request)
         if options.out is not None:
             track = session.state.track if source.tracked else None
             if track is not None:
@@ -68,23 +67,40 @@ def run_live(options: Live) -> int:
     if request.signal is not None:
         return 128 + request.signal
     if session.state.full is not None:
-        print(f"taichi-mrf: {session.state.full}; what did fit is mapped", file=sys.stderr)
+        tell_problem(f"out of memory: {session.state.full}; the map of the frames before it is kept")
         return DID_NOT_FIT
     return 0
+
+
+class _ToldLink(ViewerLink):
+    """A link that shows on the terminal, too, how the work stands."""
+
+    def __init__(self, host: str, port: int, bar: ProgressBar) -> None:
+        super().__init__(host, port)
+        self._bar = bar
+        self._shown = (0, 0)
+
+    def send(self, update: Update) -> None:
+        """Pass an update on."""
+        super().send(update)
+        if isinstance(update, Status) and (update.frame, update.keyframes) != self._shown:
+            self._shown = update.frame, update.keyframes
+            note = f"{update.keyframes} keyframes, {update.keyframes_per_second:.1f} keyframes/s"
+            self._bar.advance("Frame", update.frame, update.frames or None, note=note)
 
 
 class _Page:
     """The viewer of the moment, and what is told of it on the terminal."""
 
-    def __init__(self, options: Live, say: Say, stack: ExitStack) -> None:
-        self._options, self._say, self._stack = options, say, stack
+    def __init__(self, options: Live, say: Say, bar: ProgressBar, stack: ExitStack) -> None:
+        self._options, self._say, self._bar, self._stack = options, say, bar, stack
         self._wanted_port = options.port
         self.start()
 
     def start(self) -> None:
         """Start a viewer; it is closed with the stack."""
         self.has_listened, self.started = False, time.monotonic()
-        self.link = self._stack.enter_context(ViewerLink(self._options.host, self._wanted_port))
+        self.link = self._stack.enter_context(_ToldLink(self._options.host, self._wanted_port, self._bar))
 
     def listening(self, where: Listening) -> None:
         """Tell the user where the page is."""
@@ -109,7 +125,7 @@ def _run(
         lives_long = time.monotonic() - page.started > SHORTEST_LIFE_SECONDS
         if not (page.has_listened and lives_long):
             return lost
-        print(f"taichi-mrf: {lost}; starting another", file=sys.stderr)
+        tell_problem(f"{lost}; starting another")
         page.link.close()
         page.start()
         reconnect(page.link)

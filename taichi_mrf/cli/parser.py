@@ -1,7 +1,6 @@
 """From the words of the command line to the options of a command, and the overview of all commands."""
 
 import inspect
-import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
 from functools import reduce
@@ -13,10 +12,9 @@ import tyro
 from taichi_mrf.cli.commands import COMMANDS, Command
 from taichi_mrf.cli.flag_list import brief_help, flags_of
 from taichi_mrf.cli.shared.flags import registry
+from taichi_mrf.cli.shared.terminal import PROGRAM
 from taichi_mrf.config.values import nearest
 from taichi_mrf.errors import ConfigError
-
-PROGRAM = "taichi-mrf"
 
 _HELP, _HELP_ALL = ("-h", "--help"), "--help-all"
 _ABOUT = "Probabilistic occupancy maps from depth cameras."
@@ -31,12 +29,9 @@ def parse(arguments: Sequence[str]) -> tuple[Command, Any]:
     """
     if arguments and arguments[0] in _COMPLETION:
         _print_completion(arguments)
-    if not arguments:
-        print(overview(), file=sys.stderr)
-        raise SystemExit(2)
-    if arguments[0] in _HELP:
+    if not arguments or arguments[0] in _HELP:
         print(overview())
-        raise SystemExit(0)
+        raise SystemExit(0 if arguments else 2)
     name, *rest = arguments
     if name not in COMMANDS:
         raise ConfigError(f"unknown command '{name}'; {nearest(name, list(COMMANDS))}")

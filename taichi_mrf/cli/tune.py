@@ -4,11 +4,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-
 from taichi_mrf.cli.options.tune import FRAMES_BY_HAND, FRAMES_TO_SEARCH, Tune
 from taichi_mrf.cli.shared.interrupt import stop_on_signals
 from taichi_mrf.cli.shared.output import output_folder
+from taichi_mrf.cli.shared.progress import open_terminal
 from taichi_mrf.cli.shared.serving import Say, let_the_page_go_first, tell_address, warn_of_host
 from taichi_mrf.config.schema import with_absolute_tables
 from taichi_mrf.errors import TaichiMRFError
@@ -25,10 +24,8 @@ if TYPE_CHECKING:
 
 def run_tune(options: Tune) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
-    console = Console()
-
-    def say(text: str) -> None:
-        console.print(text, highlight=False, soft_wrap=True, markup=False)
+    console = open_terminal(options.printing)
+    say = console.say
 
     settings = with_absolute_tables(options.settings, Path.cwd())
     with ExitStack() as stack:

@@ -7,12 +7,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.progress import Progress, TaskID
 from rich.table import Table
 
 from taichi_mrf.cli.bench.tables import bench_table, growth_table, profile_tables, viewer_table
 from taichi_mrf.cli.options.bench import Bench
+from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
+from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.experiments.speed.bandwidth import copy_bandwidth
@@ -36,15 +36,14 @@ Measured = tuple[list[Table], list[dict[str, Any]], "Callable[[], Figure] | None
 class _Run:
     """One run of the command: its frames, and the bar that shows how far it is."""
 
-    def __init__(self, options: Bench, console: Console, progress: Progress) -> None:
+    def __init__(self, options: Bench, console: Terminal, progress: ProgressBar) -> None:
         self.options, self.console, self.progress = options, console, progress
         dataset = open_dataset(options.source, color=False)
         count = min(options.frames, len(dataset))
-        reading = progress.add_task("reading", total=count)
         self.frames: list[Frame] = []
         for i in range(count):
             self.frames.append(dataset.read(i))
-            progress.advance(reading)
+            progress.advance("reading", i + 1, count)
         sizes = options.voxel_sizes
         self.configs = [dataclasses.replace(options.settings, voxel_size=size) for size in sizes]
         choice = runtime.choice()
@@ -56,14 +55,14 @@ class _Run:
     def each_size(self, what: str = "") -> Iterator[tuple[Config, Callable[[int], None]]]:
         """Each voxel size's parameters, and what is to be told the number of frames done."""
         for config in self.configs:
-            task = self.progress.add_task(f"{config.voxel_size:g} m{what}", total=len(self.frames))
-            yield config, partial(_advance, self.progress, task)
+            stage = f"{config.voxel_size:g} m{what}"
+            yield config, partial(_advance, self.progress, stage, len(self.frames))
 
     def stages(self) -> Measured:
         with_octomap = self.options.octomap and octomap_available()
         if self.options.octomap and not with_octomap:
             line = "OctoMap is left out: pip install 'taichi-mrf[bench]' brings it."
-            self.console.print(line, markup=False)
+            self.console.say(line)
         rows: list[BenchRow] = []
         for config, advance in self.each_size():
             rows.append(bench_mapping(self.frames, config, with_octomap, advance))
@@ -101,10 +100,10 @@ class _Run:
 
 def run_bench(options: Bench) -> int:
     """Measure, print, write and draw; always 0. Raises TaichiMRFError."""
-    console = Console()
+    console = open_terminal(options.printing)
     wanted = options.settings.runtime
     runtime.init(wanted.arch, wanted.threads, wanted.debug, options.profile)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+    with ProgressBar(console, options.printing) as progress:
         run = _Run(options, console, progress)
         mode = next((name for name in ("viewer", "profile", "growth") if getattr(options, name)), "stages")
         tables, figures, draw = getattr(run, mode)()
@@ -118,5 +117,5 @@ def run_bench(options: Bench) -> int:
     return 0
 
 
-def _advance(progress: Progress, task: TaskID, done: int) -> None:
-    progress.update(task, completed=done)
+def _advance(progress: ProgressBar, stage: str, total: int, done: int) -> None:
+    progress.advance(stage, done, total)

@@ -2,13 +2,11 @@
 
 import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeElapsedColumn
 
 from taichi_mrf.cli.laser.files import Outcome, write_comparison, write_energies, write_outcome
 from taichi_mrf.cli.laser.report import comparison_table, laser_report
@@ -16,7 +14,7 @@ from taichi_mrf.cli.options.laser import Laser
 from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.output import output_folder
 from taichi_mrf.cli.shared.print_table import print_table
-from taichi_mrf.cli.shared.progress import TransientBar
+from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets.laser.plan_image import read_floor_plan
 from taichi_mrf.datasets.laser.readers import open_scans
@@ -41,10 +39,10 @@ _NO_RETURN_IS_FREE = {"auto": None, "free": True, "ignore": False}
 
 def run_laser(options: Laser) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
-    console = Console(stderr=options.json)
+    console = open_terminal(options.printing, stderr=options.json)
     with (
         output_folder(options.out),
-        stop_on_signals(lambda text: console.print(f"[yellow]{text}[/]")) as request,
+        stop_on_signals(lambda text: console.say(text, "yellow")) as request,
     ):
         seconds: dict[str, float] = {}
         with _timed(seconds, "reading"):
@@ -61,7 +59,7 @@ def run_laser(options: Laser) -> int:
         with _timed(seconds, "graph"):
             runtime.init(options.runtime.arch, options.runtime.threads, options.runtime.debug)
             graph = build_graph(beams, options.settings.cell_size, options.memory_limit_gb)
-        with _timed(seconds, "inference"), _EnergyBar(console, options.settings.iterations) as bar:
+        with _timed(seconds, "inference"), ProgressBar(console, options.printing) as bar:
             outcomes = _solve_all(options, graph, scans, registration, bar, request)
         with _timed(seconds, "writing"):
             written = _write(options, scans, outcomes, registration)
@@ -76,14 +74,13 @@ def run_laser(options: Laser) -> int:
         console.print(
             f"{graph.beams:,} beams, {graph.edges:,} edges, {report['cells_seen']:,} cells of "
             f"{graph.grid.cell_size} m, {report['graph_memory_mb']:.0f} MB",
-            highlight=False,
         )
         for note in report["notes"]:
-            console.print(f"Note: {note}", markup=False, highlight=False, soft_wrap=True)
+            console.say(f"Note: {note}")
         if interrupted:
-            console.print("Stopped before the end.", style="yellow")
+            console.say("Stopped before the end.", "yellow")
         for path in [*written, options.out / REPORT_FILE]:
-            console.print(str(path), markup=False, highlight=False, soft_wrap=True)
+            console.say(str(path))
     return status
 
 
@@ -110,7 +107,7 @@ def _solve_all(
     graph: FactorGraph,
     scans: LaserScans,
     registration: Registration | None,
-    bar: "_EnergyBar",
+    bar: ProgressBar,
     request: StopRequest,
 ) -> dict[str, Outcome]:
     """Each run's outcome, until the run is to stop: that of the first is kept in any case."""
@@ -118,13 +115,8 @@ def _solve_all(
     for name, settings in options.runs().items():
         if outcomes and request():
             break
-        bar.begin(name)
 
-        def listen(step: Step) -> bool:
-            bar.show(step)
-            return not request()
-
-        solution = solve(graph, settings, listen)
+        solution = solve(graph, settings, _listener(name, settings.iterations, bar, request))
         laser_map = _laser_map(graph, solution)
         scores = None
         if registration is not None:
@@ -132,6 +124,18 @@ def _solve_all(
             scores = floor_plan_scores(laser_map, truth)
         outcomes[name] = Outcome(solution, laser_map, scores)
     return outcomes
+
+
+def _listener(name: str, iterations: int, bar: ProgressBar, request: StopRequest) -> Callable[[Step], bool]:
+    """What shows each step of a method, and tells it whether to go on."""
+
+    def listen(step: Step) -> bool:
+        done = min(step.iteration + 1, iterations)  # the descent at the end is one step more
+        bound = "" if step.dual is None else f", bound {step.dual:,.0f}"
+        bar.advance(name, done, iterations, note=f"energy {step.energy:,.0f}{bound}")
+        return not request()
+
+    return listen
 
 
 def _laser_map(graph: FactorGraph, solution: Solution) -> LaserMap:
@@ -173,32 +177,3 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     start = time.perf_counter()
     yield
     seconds[stage] = time.perf_counter() - start
-
-
-class _EnergyBar(TransientBar):
-    """A bar of the method that runs, with its energy; silent where the output is not a terminal."""
-
-    def __init__(self, console: Console, iterations: int) -> None:
-        super().__init__(
-            console,
-            TextColumn("{task.description:12}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[energy]}"),
-            TimeElapsedColumn(),
-        )
-        self._iterations = iterations
-        self._task: TaskID | None = None
-
-    def begin(self, method: str) -> None:
-        """Take the bar of the method before away."""
-        if self._task is not None:
-            self._progress.remove_task(self._task)
-        self._task = self._progress.add_task(method, total=self._iterations, energy="")
-
-    def show(self, step: Step) -> None:
-        """Move the bar."""
-        assert self._task is not None
-        dual = "" if step.dual is None else f", bound {step.dual:,.0f}"
-        done = min(step.iteration + 1, self._iterations)  # the descent at the end is a step more
-        self._progress.update(self._task, completed=done, energy=f"energy {step.energy:,.0f}{dual}")

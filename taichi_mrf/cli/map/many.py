@@ -5,9 +5,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
-
 import taichi_mrf
 from taichi_mrf.cli.map.keep import refuse_changes
 from taichi_mrf.cli.map.process import Outcome, finished_before, map_in_process
@@ -25,7 +22,8 @@ from taichi_mrf.cli.map.summary import (
 from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.shared.interrupt import StopRequest, interrupt_on_signals
 from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
-from taichi_mrf.cli.shared.progress import TransientBar
+from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
+from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.cluster.choose import open_runner
 from taichi_mrf.config.schema import load
 from taichi_mrf.config.text import commented_yaml, differences
@@ -60,7 +58,7 @@ class _Batch:
 def run_many(options: Map) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError, also after everything is written
     if a sequence has failed."""
-    console = Console(stderr=options.json)
+    console = open_terminal(options.printing, stderr=options.json)
     start = time.perf_counter()
     names = folder_names(options.sources)
     single = len(names) == 1
@@ -69,7 +67,7 @@ def run_many(options: Map) -> int:
     batch = _Batch(options, names, tasks)
     with (
         output_folder(options.out),
-        interrupt_on_signals(lambda text: console.print(f"[yellow]{text}[/]")) as request,
+        interrupt_on_signals(lambda text: console.say(text, "yellow")) as request,
     ):
         _map_all(batch, console, request)
         if single and 0 in batch.outcomes:
@@ -94,19 +92,18 @@ def _did_not_fit(outcome: Outcome | None) -> bool:
     return outcome is not None and outcome.report is not None and bool(outcome.report.get("did_not_fit"))
 
 
-def _map_all(batch: _Batch, console: Console, request: StopRequest) -> None:
+def _map_all(batch: _Batch, console: Terminal, request: StopRequest) -> None:
     """Fill in the outcomes, as far as nobody asks to stop."""
     count = len(batch.tasks)
-    columns = (TextColumn("Mapping"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with TransientBar(console, *columns) as bar:
+    with ProgressBar(console, batch.options.printing) as bar:
 
         def done(number: int, outcome: Outcome) -> None:
             batch.outcomes[number] = outcome
-            bar.count(len(batch.outcomes), count)
+            bar.advance("Mapping", len(batch.outcomes), count)
             line = f"[{len(batch.outcomes)}/{count}] {summary_line(batch.row(number))}"
-            console.print(line, highlight=False, markup=False, soft_wrap=True)
+            console.say(line)
 
-        bar.count(0, count)
+        bar.advance("Mapping", 0, count)
         waiting: list[int] = []
         try:
             with open_runner(batch.options.jobs, batch.options.scheduler) as runner:
@@ -143,14 +140,14 @@ def _waiting(batch: _Batch, done: Callable[[int, Outcome], None]) -> list[int]:
     return waiting
 
 
-def _tell_single(batch: _Batch, console: Console) -> None:
+def _tell_single(batch: _Batch, console: Terminal) -> None:
     outcome, out = batch.outcomes[0], batch.options.out
     if outcome.report is not None:
         written = sorted(path for path in out.iterdir() if path.is_file() and not path.name.startswith("."))
         print_run(console, batch.options, outcome.report, written)
 
 
-def _tell_all(batch: _Batch, console: Console, seconds: float) -> None:
+def _tell_all(batch: _Batch, console: Terminal, seconds: float) -> None:
     """Write and print the summary."""
     options, rows = batch.options, batch.rows()
     facts = {
@@ -171,9 +168,9 @@ def _tell_all(batch: _Batch, console: Console, seconds: float) -> None:
         return
     print_summary(console, rows)
     if any(row.status in ("stopped", "not done") for row in rows):
-        console.print("[yellow]Stopped before the end; --resume goes on from here.[/]")
+        console.say("Stopped before the end; --resume goes on from here.", "yellow")
     for path in written:
-        console.print(str(path), markup=False, highlight=False, soft_wrap=True)
+        console.say(str(path))
 
 
 def _tiles(rows: Sequence[Row], folders: Sequence[Path]) -> list[Tile]:

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from rich.console import Console
-
 from taichi_mrf.cli.map.run import MapTask, map_to_folder
 from taichi_mrf.cli.shared.interrupt import stop_on_signals
 from taichi_mrf.cli.shared.progress import ProgressBar
+from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.config.schema import load
 from taichi_mrf.config.text import differences
 from taichi_mrf.errors import MapFileError, TaichiMRFError
@@ -34,7 +33,7 @@ class Outcome:
 def map_in_process(task: MapTask) -> Outcome:
     """Map the sequence, unless it is finished already. A failure is an outcome too, so that it does not stop
     the other sequences."""
-    silent = ProgressBar(Console(quiet=True, force_terminal=False))
+    silent = ProgressBar(Terminal(quiet=True))
     with stop_on_signals(lambda text: None) as request:
         try:
             os.chdir(task.start)

@@ -3,11 +3,12 @@
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
+from taichi_mrf.cli.shared.terminal import Terminal
 
-def print_report(console: Console, report: dict[str, Any], written: list[Path]) -> None:
+
+def print_report(console: Terminal, report: dict[str, Any], written: list[Path]) -> None:
     """The report as a table, then what should be known besides, then where the files lie."""
     table = Table(show_header=False, title=f"Map of {report['source']}", title_justify="left")
     table.add_column(style="bold")
@@ -16,13 +17,13 @@ def print_report(console: Console, report: dict[str, Any], written: list[Path]) 
         table.add_row(name, text)
     console.print(table)
     for note in report["notes"]:
-        console.print(f"Note: {note}", markup=False, soft_wrap=True)
+        console.say(f"Note: {note}")
     for problem in report["skipped_frames"].values():
-        console.print(f"Skipped: {problem}", markup=False, soft_wrap=True)
+        console.say(f"Skipped: {problem}")
     if report["interrupted"]:
-        console.print("[yellow]Stopped before the end; --resume goes on from here.[/]")
+        console.say("Stopped before the end; --resume goes on from here.", "yellow")
     for path in written:
-        console.print(str(path), markup=False, highlight=False, soft_wrap=True)
+        console.say(str(path))
 
 
 def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:

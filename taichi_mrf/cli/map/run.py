@@ -1,6 +1,5 @@
 """What ``taichi-mrf map`` does: map a sequence, check the map, write the files, print the report."""
 
-import sys
 import time
 import warnings
 from collections.abc import Iterator
@@ -9,18 +8,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from taichi_mrf.cli.map.keep import Keeper, resumed_map, skipped_before
 from taichi_mrf.cli.map.report import print_report
 from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
-from taichi_mrf.cli.shared.progress import ProgressBar
+from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
+from taichi_mrf.cli.shared.terminal import Terminal, tell_problem
 from taichi_mrf.config.schema import Config, with_absolute_tables
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.source_flags import SourceFlags
-from taichi_mrf.mapping.pipeline import map_sequence
+from taichi_mrf.mapping.intake import Added
+from taichi_mrf.mapping.pipeline import (
+    Event,
+    FrameOffered,
+    KeyframeRefined,
+    KeyframeSwept,
+    Listener,
+    map_sequence,
+)
 from taichi_mrf.runs.folder import MAP_FILE, RunFacts, write_run
 from taichi_mrf.runs.report import report_json
 from taichi_mrf.system import runtime
@@ -80,19 +86,19 @@ def map_task(options: Map, source: str, out: Path) -> MapTask:
 
 def run_map(options: Map) -> int:
     """Carry out the command for one source; returns the exit status. Raises TaichiMRFError."""
-    console = Console(stderr=options.json)
+    console = open_terminal(options.printing, stderr=options.json)
     task = map_task(options, options.sources[0], options.out)
-    with stop_on_signals(lambda text: console.print(f"[yellow]{text}[/]")) as request:
-        with ProgressBar(console) as progress:
+    with stop_on_signals(lambda text: console.say(text, "yellow")) as request:
+        with ProgressBar(console, options.printing) as progress:
             report, written = map_to_folder(task, progress, request)
         print_run(console, options, report, written)
     if report["did_not_fit"] is not None and request.signal is None:
         kept = f"the map of {report['keyframes']} keyframes is kept; --resume with more memory goes on"
-        print(f"taichi-mrf: {report['did_not_fit']}; {kept}", file=sys.stderr)
+        tell_problem(f"{report['did_not_fit']}; {kept}")
     return exit_status(request, report["did_not_fit"])
 
 
-def print_run(console: Console, options: Map, report: dict[str, Any], written: list[Path]) -> None:
+def print_run(console: Terminal, options: Map, report: dict[str, Any], written: list[Path]) -> None:
     """Tell what one source has become."""
     if options.json:
         print(report_json(report), end="")
@@ -100,7 +106,7 @@ def print_run(console: Console, options: Map, report: dict[str, Any], written: l
     print_report(console, report, written)
     look = LOOK_AT_PICTURES if options.pictures else "Open"
     live = f"taichi-mrf live {options.out / MAP_FILE} {LIVE_VIEW}"
-    console.print(f"{look} {OPEN_VOXELS} {live}", highlight=False, markup=False)
+    console.print(f"{look} {OPEN_VOXELS} {live}")
 
 
 def map_to_folder(
@@ -125,7 +131,7 @@ def map_to_folder(
             result = map_sequence(
                 dataset,
                 settings,
-                progress.listen,
+                listener_of(progress),
                 every=task.every,
                 limit=task.limit,
                 skip_bad_frames=task.skip_bad_frames,
@@ -138,6 +144,22 @@ def map_to_folder(
             return write_run(
                 task.out, result, facts, pictures=task.pictures, haste=request, advance=progress.advance
             )
+
+
+def listener_of(progress: ProgressBar) -> Listener:
+    """What shows the events of the pipeline."""
+
+    def listen(event: Event) -> None:
+        if isinstance(event, FrameOffered):
+            progress.advance("Adding", event.number, event.frames, int(isinstance(event.answer, Added)))
+        elif isinstance(event, KeyframeSwept):
+            done = (event.sweep - 1) * event.keyframes + event.number
+            progress.advance("Inferring", done, event.sweeps * event.keyframes, 1)
+        elif isinstance(event, KeyframeRefined):
+            done = (event.round - 1) * event.keyframes + event.number
+            progress.advance("Aligning", done, event.rounds * event.keyframes, 1)
+
+    return listen
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 import taichi_mrf
@@ -11,7 +10,8 @@ from taichi_mrf.cli.map.run import exit_status
 from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.shared.interrupt import interrupt_on_signals
 from taichi_mrf.cli.shared.output import output_folder
-from taichi_mrf.cli.shared.progress import ProgressBar
+from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
+from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.cluster.choose import open_runner
 from taichi_mrf.config.schema import with_absolute_tables
 from taichi_mrf.config.text import commented_yaml
@@ -32,7 +32,7 @@ TASK_FOLDER, MAP_FOLDER, PICTURE_FILE = "submaps", "map.zarr", "submaps.png"
 
 def run_submaps(options: Map, submap_size: float) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
-    console = Console(stderr=options.json)
+    console = open_terminal(options.printing, stderr=options.json)
     if len(options.sources) != 1:
         raise ConfigError("--submap-size takes one SOURCE")
     if options.poses.track_poses:
@@ -43,14 +43,14 @@ def run_submaps(options: Map, submap_size: float) -> int:
     sequence = Sequence(source, options.reading.keywords(), options.every, options.limit)
     with (
         output_folder(options.out),
-        interrupt_on_signals(lambda text: console.print(f"[yellow]{text}[/]")) as request,
+        interrupt_on_signals(lambda text: console.say(text, "yellow")) as request,
     ):
         if not options.resume:  # which takes its parameters from here
             (options.out / REPORT_FILE).unlink(missing_ok=True)
             write_text(options.out / CONFIG_FILE, commented_yaml(settings))
         try:
             with (
-                ProgressBar(console) as progress,
+                ProgressBar(console, options.printing) as progress,
                 open_runner(options.jobs, options.scheduler) as runner,
             ):
                 result = map_in_submaps(
@@ -68,7 +68,7 @@ def run_submaps(options: Map, submap_size: float) -> int:
         except KeyboardInterrupt:
             if request.aborted or not request():
                 raise
-            console.print("[yellow]Stopped before the end; --resume goes on from here.[/]")
+            console.say("Stopped before the end; --resume goes on from here.", "yellow")
             return exit_status(request)
         _tell(console, options, result, _write(options, result))
     return exit_status(request)
@@ -120,7 +120,7 @@ def submaps_report(result: SubmapsResult) -> dict[str, Any]:
     }
 
 
-def _tell(console: Console, options: Map, result: SubmapsResult, written: list[Path]) -> None:
+def _tell(console: Terminal, options: Map, result: SubmapsResult, written: list[Path]) -> None:
     report = submaps_report(result)
     if options.json:
         print(report_json(report), end="")
@@ -143,11 +143,8 @@ def _tell(console: Console, options: Map, result: SubmapsResult, written: list[P
     table.add_row("seconds", seconds)
     console.print(table)
     for problem in report["skipped_frames"].values():
-        console.print(f"Skipped: {problem}", markup=False, soft_wrap=True)
+        console.say(f"Skipped: {problem}")
     for path in written:
-        console.print(str(path), markup=False, highlight=False, soft_wrap=True)
-    console.print(
-        f"taichi-mrf export {options.out / MAP_FOLDER} --to part.ply --lower X Y Z --upper X Y Z "
-        "takes a box out of it for other programs.",
-        markup=False, highlight=False, soft_wrap=True,
-    )  # fmt: skip
+        console.say(str(path))
+    console.say(f"taichi-mrf export {options.out / MAP_FOLDER} --to part.ply --lower X Y Z --upper X Y Z "
+        "takes a box out of it for other programs.")  # fmt: skip

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from rich.console import Console
-
 from taichi_mrf.cli.map.process import Outcome
 from taichi_mrf.cli.shared.print_table import print_table
+from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.experiments.tables import Table
 
 
@@ -79,7 +78,7 @@ def accuracy_text(row: Row) -> str:
     return "not checked" if row.median_abs is None else f"median error {100 * row.median_abs:.2f} cm"
 
 
-def print_summary(console: Console, rows: Sequence[Row]) -> None:
+def print_summary(console: Terminal, rows: Sequence[Row]) -> None:
     """The rows as a table, and below it why there are sequences without a map."""
     facts = ("seconds", "keyframes", "voxels", "map MB", "median cm", "RMS cm", "no answer %")
     cells = [

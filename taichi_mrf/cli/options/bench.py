@@ -6,6 +6,7 @@ from typing import Annotated
 
 import tyro
 
+from taichi_mrf.cli.options.verbosity import Verbosity
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
 
@@ -48,6 +49,9 @@ class Bench:
 
     plot: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Draw the figures to this file (.png, .svg or .pdf)."""
+
+    printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
+    """How much is printed."""
 
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
     """Parameters; the voxel size among them is not used."""

@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from taichi_mrf.calibration.options import CalibrationConfig
+from taichi_mrf.cli.options.verbosity import Verbosity
 from taichi_mrf.errors import ConfigError
 
 
@@ -55,6 +56,9 @@ class Calibrate:
 
     pictures: bool = True
     """Draw bias and sigma against depth and over the image, and what was covered."""
+
+    printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
+    """How much is printed."""
 
     settings: Annotated[CalibrationConfig, tyro.conf.arg(name="")] = field(default_factory=CalibrationConfig)
     """Parameters."""

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import tyro
 
+from taichi_mrf.cli.options.verbosity import Verbosity
 from taichi_mrf.config.schema import RuntimeConfig
 from taichi_mrf.errors import ConfigError
 
@@ -40,6 +41,9 @@ class Eval:
 
     limit: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Use no more than N views or folds, for a quick look."""
+
+    printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
+    """How much is printed."""
 
     runtime: RuntimeConfig = field(default_factory=RuntimeConfig)
     """Where the kernels run."""

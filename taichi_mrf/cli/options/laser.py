@@ -7,6 +7,7 @@ from typing import Annotated, Literal, get_args
 
 import tyro
 
+from taichi_mrf.cli.options.verbosity import Verbosity
 from taichi_mrf.config.schema import RuntimeConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.factor_graph.config import LaserConfig, Method
@@ -65,6 +66,9 @@ class Laser:
 
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the report as JSON, and nothing else, on stdout."""
+
+    printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
+    """How much is printed."""
 
     settings: Annotated[LaserConfig, tyro.conf.arg(name="")] = field(default_factory=LaserConfig)
     """Parameters."""

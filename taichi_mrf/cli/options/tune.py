@@ -6,6 +6,7 @@ from typing import Annotated
 
 import tyro
 
+from taichi_mrf.cli.options.verbosity import Verbosity
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError
@@ -74,6 +75,9 @@ class Tune:
 
     reading: Annotated[SourceFlags, tyro.conf.arg(name="")] = field(default_factory=SourceFlags)
     """How SOURCE is read."""
+
+    printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
+    """How much is printed."""
 
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
     """Parameters to begin with."""

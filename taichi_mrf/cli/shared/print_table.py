@@ -1,16 +1,16 @@
 """A table of results on the terminal."""
 
-from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table as RichTable
 
+from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.experiments.tables import Table, entry_text
 
 _WIDEST = 1000
 """Columns of text that no table needs."""
 
 
-def print_table(console: Console, table: Table) -> None:
+def print_table(console: Terminal, table: Table) -> None:
     """Print a table and its notes, as wide as its longest words need at least."""
     shown = RichTable(title=table.title, title_justify="left")
     cells = [[entry_text(entry, table.digits) for entry in row] for row in table.rows]
@@ -22,6 +22,6 @@ def print_table(console: Console, table: Table) -> None:
     # Chopped words and numbers cannot be read: rather let a narrow terminal wrap the lines of a wide table.
     needed = Measurement.get(console, console.options.update(max_width=_WIDEST), shown)
     width = needed.minimum if console.is_terminal else needed.maximum
-    Console(width=max(console.width, width)).print(shown)
+    console.print(shown, width=max(console.width, width), crop=False)
     for note in table.notes:
-        console.print(note, markup=False, highlight=False)
+        console.print(note)

@@ -1,48 +1,102 @@
-"""Progress bars, and that of a mapping run: a listener of the pipeline."""
+"""How far a command is: a bar on a terminal, elsewhere a line every few seconds."""
 
+import contextlib
+import logging
+import time
 from types import TracebackType
-from typing import TypeVar
 
-from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    ProgressColumn,
-    Task,
     TaskID,
     TextColumn,
     TimeRemainingColumn,
 )
-from rich.text import Text
 
-from taichi_mrf.mapping.intake import Added
-from taichi_mrf.mapping.pipeline import Event, FrameOffered, KeyframeRefined, KeyframeSwept
+from taichi_mrf.cli.options.verbosity import Verbosity
+from taichi_mrf.cli.shared.terminal import Terminal, printable
 
-Bar = TypeVar("Bar", bound="TransientBar")
-
-
-class _RateColumn(ProgressColumn):
-    """How many keyframes pass in a second."""
-
-    def render(self, task: Task) -> Text:
-        rate = task.fields["keyframes"] / task.elapsed if task.elapsed else 0.0
-        return Text(f"{rate:.1f} keyframes/s" if rate else "")
+LINE_SECONDS = 5.0
+"""Time between two lines where there is no terminal."""
 
 
-class TransientBar:
-    """A bar on a terminal that is gone when the block ends; silent where the output is not a terminal."""
+def open_terminal(verbosity: Verbosity, stderr: bool = False) -> Terminal:
+    """What a command prints to: nothing with --quiet, the library's log too with --verbose. ``stderr`` leaves
+    stdout to --json."""
+    terminal = Terminal(stderr=stderr, quiet=verbosity.quiet)
+    log = logging.getLogger("taichi_mrf")
+    for handler in [each for each in log.handlers if isinstance(each, _LogLines)]:
+        log.removeHandler(handler)
+    if verbosity.verbose:
+        log.addHandler(_LogLines(terminal))
+        log.setLevel(logging.INFO)
+    return terminal
 
-    def __init__(self, console: Console, *columns: ProgressColumn) -> None:
-        self._progress = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
-    def count(self, done: int, total: int) -> None:
-        """Move the bar of a run with a single stage."""
-        if not self._progress.tasks:
-            self._progress.add_task("", total=total)
-        self._progress.update(self._progress.tasks[0].id, completed=done, total=total)
+class _LogLines(logging.Handler):
+    """The library's log as lines on the terminal."""
 
-    def __enter__(self: Bar) -> Bar:
+    def __init__(self, terminal: Terminal) -> None:
+        super().__init__()
+        self._terminal = terminal
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print one record."""
+        self._terminal.say(record.getMessage())
+
+
+class ProgressBar:
+    """Shows one stage at a time; used as a context, at whose end the bar is gone.
+
+    On a terminal it is a bar. Elsewhere it is a line every few seconds, with --verbose a line for every step,
+    with --quiet nothing.
+    """
+
+    def __init__(self, terminal: Terminal, verbosity: Verbosity | None = None) -> None:
+        verbosity = verbosity or Verbosity()
+        self._terminal, self._verbose = terminal, verbosity.verbose
+        self._lines = not terminal.is_terminal or verbosity.verbose
+        self._progress = Progress(
+            TextColumn("{task.description:9}", markup=False),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[note]}", markup=False),
+            TimeRemainingColumn(),
+            console=terminal,
+            transient=True,
+            disable=self._lines or terminal.quiet,
+        )
+        self._task: TaskID | None = None
+        self._stage, self._keyframes = "", 0
+        self._begin = self._last_line = time.monotonic()
+
+    def advance(self, stage: str, done: int, total: int | None, keyframes: int = 0, note: str = "") -> None:
+        """``done`` of ``total`` steps of a stage are done; a new stage takes the place of the one before.
+
+        ``keyframes`` more have passed, of which the rate is shown, unless there is a ``note`` to show.
+        """
+        now = time.monotonic()
+        if stage != self._stage or self._task is None:
+            if self._task is not None:
+                self._progress.remove_task(self._task)
+            self._stage, self._keyframes, self._begin = stage, 0, now
+            self._task = self._progress.add_task(printable(stage), total=total, note="")
+        self._keyframes += keyframes
+        note = note or self._rate(now)
+        if not self._lines:
+            self._progress.update(self._task, completed=done, total=total, note=printable(note))
+        elif self._verbose or now - self._last_line >= LINE_SECONDS:
+            self._last_line = now
+            of = "" if total is None else f" of {total}"
+            with contextlib.suppress(OSError):  # whoever read the lines has seen enough: the run goes on
+                self._terminal.say(f"{stage} {done}{of}" + (f", {note}" if note else ""))
+
+    def _rate(self, now: float) -> str:
+        seconds = now - self._begin
+        return f"{self._keyframes / seconds:.1f} keyframes/s" if self._keyframes and seconds else ""
+
+    def __enter__(self) -> "ProgressBar":
         self._progress.start()
         return self
 
@@ -53,39 +107,3 @@ class TransientBar:
         traceback: TracebackType | None,
     ) -> None:
         self._progress.stop()
-
-
-class ProgressBar(TransientBar):
-    """Shows one stage at a time on a terminal; silent where the output is not one."""
-
-    def __init__(self, console: Console) -> None:
-        super().__init__(
-            console,
-            TextColumn("{task.description:9}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            _RateColumn(),
-            TimeRemainingColumn(),
-        )
-        self._stage = ""
-        self._task: TaskID | None = None
-
-    def listen(self, event: Event) -> None:
-        """Show what the pipeline has just done."""
-        if isinstance(event, FrameOffered):
-            self.advance("Adding", event.number, event.frames, int(isinstance(event.answer, Added)))
-        elif isinstance(event, KeyframeSwept):
-            done = (event.sweep - 1) * event.keyframes + event.number
-            self.advance("Inferring", done, event.sweeps * event.keyframes, 1)
-        elif isinstance(event, KeyframeRefined):
-            done = (event.round - 1) * event.keyframes + event.number
-            self.advance("Aligning", done, event.rounds * event.keyframes, 1)
-
-    def advance(self, stage: str, done: int, total: int, keyframes: int = 0) -> None:
-        """Move the bar of a stage, which takes the place of the stage before."""
-        if stage != self._stage or self._task is None:
-            if self._task is not None:
-                self._progress.remove_task(self._task)
-            self._stage, self._task = stage, self._progress.add_task(stage, total=total, keyframes=0)
-        counted = self._progress.tasks[0].fields["keyframes"] + keyframes
-        self._progress.update(self._task, completed=done, total=total, keyframes=counted)
