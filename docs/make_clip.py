@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(REPOSITORY / "tests"))  # the browser tests' hands and eyes serve here too
+sys.path.insert(0, str(REPOSITORY / "tests" / "support"))  # the driver of the browser tests serves here too
 
 from browser import LivePage, chromium  # noqa: E402
 from live_program import LiveProgram  # noqa: E402

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(REPOSITORY / "tests"))  # the browser tests' hands and eyes serve here too
+sys.path.insert(0, str(REPOSITORY / "tests" / "support"))  # the driver of the browser tests serves here too
 
 import map_pictures  # noqa: E402
 import page_pictures  # noqa: E402

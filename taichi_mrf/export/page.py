@@ -1,6 +1,6 @@
 """A map as one HTML file that any browser opens, without this program and without a network.
 
-It is the scene of the live page, drawn by the same classes, as viser writes it into a file.
+The file holds the scene of the live page, made by the same classes, as viser serializes it.
 """
 
 from pathlib import Path
@@ -30,7 +30,7 @@ def write_page(path: str | Path, m: QueriedMap, threshold: float = 0.5, up: Up |
         layer = VoxelLayer(server.scene, "/voxels", m.voxel_size)
         reader = BrickReader(m)
         for bricks, log_odds, _ in reader.batches(reader.bricks):
-            # Some maps say one half of what nobody has seen, which is not to be shown.
+            # Some maps give unseen voxels a probability of one half; those must not be shown.
             seen = np.where(log_odds == reader.pool.prior_log_odds, _NOT_SHOWN, log_odds)
             layer.store.put(bricks, pack_log_odds(seen), np.zeros((len(bricks), VOXELS), np.uint8))
         eye = ViewpointController(server)

@@ -66,5 +66,5 @@ class Progress:
 def sweeping(step: InferProgress) -> tuple[str, float]:
     """A step of full inference in words, and how much of it is done."""
     done = (step.sweep - 1) * step.keyframes + step.keyframe
-    sentence = f"sweeping keyframe {step.keyframe} of {step.keyframes}: {step.sweep} of {step.sweeps}"
+    sentence = f"sweeping keyframe {step.keyframe} of {step.keyframes} (sweep {step.sweep} of {step.sweeps})"
     return sentence, done / (step.sweeps * step.keyframes)

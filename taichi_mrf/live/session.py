@@ -106,7 +106,7 @@ class Session:
             self._extras.work(self._go_on)
             return True
         if mapper.unanswered and state.is_replaying:
-            self._tell("sweeping keyframes that have heard something new", 0.0)
+            self._tell("sweeping keyframes whose evidence has changed", 0.0)
             state.guarded(mapper.renew)
             state.publish()
             return True

@@ -1,8 +1,8 @@
-"""What the mapping process and the viewer's process tell each other.
+"""Messages between the mapping process and the viewer's process.
 
-The two share nothing: whoever maps owns Taichi and the map, whoever shows owns the page and a copy of
-what it was told. Everything here is plain data that can be pickled. Updates go one way, requests the
-other, and neither side waits for an answer.
+The two share no memory: the mapping process owns Taichi and the map, the viewer's process owns the page and a
+copy of what was published. Messages are plain data that can be pickled. Updates go to the viewer, requests
+come from it, and neither side waits for an answer.
 """
 
 from dataclasses import dataclass
@@ -15,17 +15,17 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 
 LOG_ODDS_STEP = 1 / 512
-"""Log-odds travel as int16 multiples of this, rounded down, so that their sign, and with it the threshold
-of one half, is exact; beyond +-64 they are cut off."""
+"""Log-odds are sent as int16 multiples of this. They are rounded down, so that their sign, and with it the
+threshold of one half, is exact; beyond +-64 they are clipped."""
 
 Layer = Literal["map", "beside"]
-"""The map itself, or OctoMap's way with the same frames, shown beside it."""
+"""The map itself, or the baseline beside it: OctoMap's log-odds update of the same keyframes."""
 
 KeyframeState = Literal["on", "off", "frozen"]
 
 
 def pack_log_odds(log_odds: NDArray[np.float32]) -> NDArray[np.int16]:
-    """Log-odds as they travel."""
+    """Log-odds (any shape) as they are sent."""
     steps = np.floor(log_odds * (1 / LOG_ODDS_STEP))
     return np.clip(steps, -32768, 32767, out=steps).astype(np.int16)
 
@@ -40,7 +40,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Hello(Update):
-    """The first update, and again after a reset: what is mapped, and with which parameters."""
+    """The first update, and the first after a reset: the source, the backend and the parameters."""
 
     source: str
     backend: str
@@ -55,10 +55,10 @@ class Hello(Update):
 
 @dataclass(frozen=True)
 class Bricks(Update):
-    """Bricks whose voxels may have changed, and bricks that are gone.
+    """Bricks whose voxels may have changed, and bricks that were removed.
 
     ``bricks`` (n, 3) int32 brick coordinates; ``log_odds`` (n, 512) int16, see :data:`LOG_ODDS_STEP`;
-    ``seen`` (n, 512) uint8, how many keyframes' rays went through each voxel (255: so many or more);
+    ``seen`` (n, 512) uint8, by how many keyframes' rays each voxel was crossed (255: 255 or more);
     ``removed`` (m, 3) int32.
     """
 
@@ -73,9 +73,9 @@ class Bricks(Update):
 class KeyframeInfo(Update):
     """A keyframe that is new or has changed.
 
-    ``picture`` is the depth image in colours, (h, w, 3) uint8 and small; ``crossed`` (n, 3) int32 are the
-    bricks that its rays go through, which are known to be free where the map has no voxels. ``T_home`` is
-    where *Put back* puts it; None means where the first message of it said.
+    ``picture`` is a small depth image in colours, (h, w, 3) uint8; ``crossed`` (n, 3) int32 are the bricks
+    that its rays cross, which are free where the map has no voxels. ``T_home`` is the pose that *Put back*
+    restores; None means the pose of the first message about this keyframe.
     """
 
     id: int
@@ -91,7 +91,7 @@ class KeyframeInfo(Update):
 
 @dataclass(frozen=True)
 class CurrentCamera(Update):
-    """Where the frame that was read last was taken, keyframe or not."""
+    """The camera of the latest frame, whether that became a keyframe or not."""
 
     name: str
     T_world_camera: Pose
@@ -100,9 +100,9 @@ class CurrentCamera(Update):
 
 @dataclass(frozen=True)
 class Status(Update):
-    """How the work stands. ``activity`` says in words what the worker is doing, ``share`` how much of that
-    is done (0 to 1), ``pending`` whether edits have not reached the map yet, ``speed`` the multiple of the
-    recording's pace (0: as fast as it goes)."""
+    """Progress and figures. ``activity`` says what is being done, ``share`` how much of it is done (0 to 1),
+    ``pending`` whether inference after an edit is not finished, ``speed`` is the multiple of the recording's
+    pace (0: as fast as possible)."""
 
     activity: str
     share: float
@@ -122,7 +122,7 @@ class Status(Update):
 
 @dataclass(frozen=True)
 class Notice(Update):
-    """Something that the user should know, in one sentence."""
+    """A sentence for the user."""
 
     text: str
     severity: Literal["info", "warning", "error"] = "info"
@@ -130,10 +130,10 @@ class Notice(Update):
 
 @dataclass(frozen=True)
 class RayAnswer(Update):
-    """What a ray meets, all (n,) by range in metres; see queries.profile.RayProfile.
+    """The voxels along a ray, (n,) each, by range in metres; see queries.profile.RayProfile.
 
-    ``measured_m`` is the range that the keyframe measured there, None without a measurement; ``bias_m``
-    and ``sigma_m`` are what the sensor's noise is there, along the ray.
+    ``measured_m`` is the range that the keyframe measured, None without a measurement; ``bias_m`` and
+    ``sigma_m`` are the sensor's noise at that range, along the ray.
     """
 
     title: str
@@ -155,7 +155,7 @@ class RayAnswer(Update):
 
 @dataclass(frozen=True)
 class Images(Update):
-    """Pictures of one view, (h, w, 3) uint8 each; ``score`` is the sentence below them."""
+    """Images of one view, (h, w, 3) uint8 each; ``score`` is the sentence that goes with them."""
 
     title: str
     measured: NDArray[np.uint8]
@@ -166,7 +166,7 @@ class Images(Update):
 
 @dataclass(frozen=True)
 class File(Update):
-    """A file for the browser of the client that asked."""
+    """A file for the browser of the client that asked for it."""
 
     name: str
     content: bytes
@@ -175,7 +175,8 @@ class File(Update):
 
 @dataclass(frozen=True)
 class Listening(Request):
-    """The viewer's first word: where its page is. ``port`` may not be the one that was asked for."""
+    """The viewer's first message: the address of its page. ``port`` may differ from the one that was asked
+    for."""
 
     host: str
     port: int
@@ -183,31 +184,31 @@ class Listening(Request):
 
 @dataclass(frozen=True)
 class Pause(Request):
-    """Pause the replay, or go on."""
+    """Pause the replay, or resume it."""
 
     on: bool
 
 
 @dataclass(frozen=True)
 class Step(Request):
-    """Take one more keyframe, then pause."""
+    """Read frames up to the next keyframe, then pause."""
 
 
 @dataclass(frozen=True)
 class Speed(Request):
-    """Replay at this multiple of the recording's own pace; 0 is as fast as it goes."""
+    """Replay at this multiple of the recording's pace; 0 is as fast as possible."""
 
     factor: float
 
 
 @dataclass(frozen=True)
 class Reset(Request):
-    """Forget the map and begin the source anew."""
+    """Delete the map and start the source again."""
 
 
 @dataclass(frozen=True)
 class Switch(Request):
-    """Take a keyframe out of the map, or bring it back."""
+    """Remove a keyframe from the map, or add it again."""
 
     keyframe: int
     on: bool
@@ -215,7 +216,7 @@ class Switch(Request):
 
 @dataclass(frozen=True)
 class Freeze(Request):
-    """Fold a keyframe into the map for good."""
+    """Make a keyframe's evidence permanent."""
 
     keyframe: int
 
@@ -230,8 +231,8 @@ class Move(Request):
 
 @dataclass(frozen=True)
 class RayThrough(Request):
-    """Show the ray of a camera through a point, (x, y, z) in metres; of ``keyframe`` if that sees the point,
-    else of one that does, else of the eye."""
+    """Show the ray of a camera through a point, (x, y, z) in metres, world: of ``keyframe`` if it sees the
+    point, else of another one that does, else of the viewpoint ``eye``."""
 
     point: tuple[float, float, float]
     eye: tuple[float, float, float]
@@ -240,7 +241,8 @@ class RayThrough(Request):
 
 @dataclass(frozen=True)
 class PixelRay(Request):
-    """Show the ray of a keyframe's pixel; ``u`` and ``v`` in pixels, (0, 0) is the first one's centre."""
+    """Show the ray of a keyframe's pixel; ``u`` and ``v`` in pixels, (0, 0) is the centre of the first
+    one."""
 
     keyframe: int
     u: float
@@ -249,8 +251,9 @@ class PixelRay(Request):
 
 @dataclass(frozen=True)
 class Watch(Request):
-    """Which extras to keep up to date: images of ``view`` (a keyframe, or None for the current camera),
-    OctoMap's way beside the map, and the ``counts`` of keyframes that see each voxel (else told as 0)."""
+    """Which extras the page shows and the mapping process must keep up to date: images of ``view`` (a
+    keyframe, or None for the current camera), the baseline beside the map, and the ``counts`` of keyframes
+    that see each voxel (else sent as 0)."""
 
     images: bool
     view: int | None
@@ -260,7 +263,7 @@ class Watch(Request):
 
 @dataclass(frozen=True)
 class Save(Request):
-    """Make a file for a client, and put it in the run's folder if it has one."""
+    """Send a file to a client, and write it to the run's folder if there is one."""
 
     kind: Literal["map", "ply"]
     client: int
@@ -268,4 +271,4 @@ class Save(Request):
 
 @dataclass(frozen=True)
 class Quit(Request):
-    """The viewer has ended or must end."""
+    """The viewer has ended, or must end."""

@@ -180,14 +180,18 @@ def test_going_on_does_not_wait_for_full_inference() -> None:
     def react(update: Update) -> list[Request]:
         if isinstance(update, KeyframeInfo) and update.id == 1:
             return [Pause(True)]
-        if isinstance(update, Status) and update.activity == "sweeping keyframe 1 of 2: 1 of 3" and asked:
+        if (
+            isinstance(update, Status)
+            and update.activity == "sweeping keyframe 1 of 2 (sweep 1 of 3)"
+            and asked
+        ):
             return [asked.pop()]
         return []
 
     link = FakeLink(react)
     assert marginals(finished(session_of(link))) == marginals(built(range(4)))
     activities = [status.activity for status in link.of_type(Status)]
-    broken_off = activities.index("sweeping keyframe 1 of 2: 1 of 3")
+    broken_off = activities.index("sweeping keyframe 1 of 2 (sweep 1 of 3)")
     assert activities[broken_off + 1] == "reading frame 3 of 4"
 
 

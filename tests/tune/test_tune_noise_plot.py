@@ -1,5 +1,6 @@
 """The curves of the noise plot of the tuning page: of polynomials, of tables, and where a table has gone."""
 
+import html
 from pathlib import Path
 
 import numpy as np
@@ -68,4 +69,4 @@ def test_a_table_that_has_gone_leaves_the_points_and_says_why(tabled: SensorConf
     Path(tabled.sigma_table).unlink()
     curves = NoiseCurves.of(tabled)
     assert np.isnan(plot_data(RESIDUALS, curves)[-1]).all()
-    assert "The curves are not drawn: sensor.sigma_table" in sentence(RESIDUALS, curves)
+    assert "The curves are not drawn: sensor.sigma_table" in html.unescape(sentence(RESIDUALS, curves))

@@ -1,7 +1,7 @@
 """The widgets of the live page. page.py decides what they do."""
 
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import viser
@@ -175,7 +175,8 @@ class Panel(BasePanel):
                 ("Delete the map and start again", Action.RESET_CONFIRMED),
                 ("Keep the map", Action.RESET_CANCELLED),
             ):
-                button = client.gui.add_button(label)
+                red: Literal["red"] | None = "red" if action is Action.RESET_CONFIRMED else None
+                button = client.gui.add_button(label, color=red)
                 button.on_click(partial(self._used, action=action))
 
     def answer_reset(self, client: int) -> None:

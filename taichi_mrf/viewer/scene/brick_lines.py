@@ -1,4 +1,4 @@
-"""The outlines of the bricks that exist, as lines."""
+"""The outlines of the map's bricks, as lines."""
 
 import numpy as np
 import viser
@@ -11,7 +11,8 @@ _NODE = "/bricks"
 
 
 def brick_edges(bricks: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Edges (n, 2, 3) of the bricks (m, 3), as lattice points; an edge that bricks share is there once."""
+    """Edges (n, 2, 3) of the bricks (m, 3), as lattice points; an edge that several bricks share is listed
+    once."""
     edges = []
     for axis in range(3):
         others = [other for other in range(3) if other != axis]
@@ -34,7 +35,7 @@ class BrickLines:
         self._node: viser.LineSegmentsHandle | None = None
 
     def show(self, bricks: NDArray[np.int64] | None) -> None:
-        """Draw the outlines of bricks (n, 3); none or None takes them away."""
+        """Draw the outlines of bricks (n, 3); no bricks, or None, remove them."""
         if bricks is None or not len(bricks):
             self.hide()
             return
@@ -44,7 +45,7 @@ class BrickLines:
         )
 
     def hide(self) -> None:
-        """Take the lines out of the scene, if there are any."""
+        """Remove the lines from the scene."""
         if self._node is not None:
             self._node.remove()
             self._node = None

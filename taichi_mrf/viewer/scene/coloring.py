@@ -1,4 +1,4 @@
-"""Colours of voxels: what is shown, and the scale beside it. All scales are perceptually uniform."""
+"""Colours of voxels, and the legend. All colour scales are perceptually uniform."""
 
 import base64
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ _MAPS = {
 
 
 _DARKENED = (0.75, 0.62, 1.0)
-"""The brightness of surfaces across x, y and z."""
+"""Brightness of surfaces perpendicular to x, y and z."""
 
 _ACROSS = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1)
 _SHADES = np.where(
@@ -32,7 +32,7 @@ _SHADES = np.where(
 
 @dataclass(frozen=True)
 class Scale:
-    """A colour scale: 256 colours (256, 3), the values at both ends, and what they are.
+    """A colour scale: 256 colours (256, 3), the values at both ends, and their name.
 
     ``table`` gives the colour's index for each int16 of log-odds, viewed as uint16, or for each count of
     keyframes; heights have none. Colours and table follow from the other fields, so scales that agree in
@@ -48,16 +48,16 @@ class Scale:
 
     @cached_property
     def shaded(self) -> NDArray[np.uint8]:
-        """The colours, darkened for each way to face, (27 * 256, 3)."""
+        """The colours, darkened for each of 27 directions of a surface, (27 * 256, 3)."""
         return (self.colors * _SHADES[:, None, None] + 0.5).astype(np.uint8).reshape(-1, 3)
 
 
 def scale_of(
     color_by: ColorBy, threshold: float, heights_m: tuple[float, float], most_keyframes: int = 1
 ) -> Scale:
-    """The scale of a mode; ``heights_m`` are the lowest and the highest voxel's, ``most_keyframes`` the
-    largest number that see a voxel. The scale of marginals begins at one half, or at 0 if voxels less
-    probable than that are shown; that of keyframes is logarithmic and ends at a power of two."""
+    """The scale of a mode. ``heights_m`` are the lowest and the highest height, ``most_keyframes`` is the
+    largest number of keyframes that see a voxel. Marginals begin at one half, or at 0 if less probable voxels
+    are shown; counts of keyframes are on a logarithmic scale that ends at a power of two."""
     ramp = np.arange(256, dtype=np.uint8)[:, None]
     colors = np.ascontiguousarray(cv2.applyColorMap(ramp, _MAPS[color_by])[:, 0, ::-1])
     if color_by == "height":
@@ -77,8 +77,8 @@ def scale_of(
 def voxel_colors(
     scale: Scale, shown: Shown, heights_m: NDArray[np.floating], facing: NDArray[np.uint8] | None = None
 ) -> NDArray[np.uint8]:
-    """Colours (n, 3) of a chunk's voxels, whose centres are at these heights (n,); darkened by the way they
-    face, if that is given."""
+    """Colours (n, 3) of a chunk's voxels with centres at these heights (n,), in metres; darkened by the
+    direction of their surface if ``facing`` is given."""
     if scale.table is None:
         span = max(scale.high - scale.low, 1e-6)
         numbers = _numbers((heights_m - scale.low) / span)
@@ -104,12 +104,12 @@ def legend_html(scale: Scale) -> str:
 
 
 def _numbers(share: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Shares of the way from the low to the high end, as numbers of colours."""
+    """Positions between the low end (0) and the high end (1), as indices of colours."""
     return np.rint(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
 
 
 def _probabilities() -> NDArray[np.float64]:
-    """The probability that belongs to each int16 of log-odds, seen as uint16."""
+    """The probability of each int16 of log-odds, viewed as uint16."""
     return 0.5 * (1.0 + np.tanh(0.5 * np.arange(65536, dtype=np.uint16).view(np.int16) * LOG_ODDS_STEP))
 
 

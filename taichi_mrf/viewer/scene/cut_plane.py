@@ -1,7 +1,7 @@
-"""The cut: what the map knows of a plane through it, as a picture that stands in the plane.
+"""The cut: a layer of voxels as a picture that stands in the cut's plane.
 
-Free voxels are blue, occupied ones yellow, and where nothing is known the picture is transparent, so
-that free and unknown are seen to be different things.
+Free voxels are blue, occupied ones yellow; unknown voxels are transparent, so that free and unknown space
+look different.
 """
 
 from collections.abc import Iterable
@@ -29,7 +29,8 @@ _AXES = ((1, 2), (2, 0), (0, 1))
 
 
 def cut_voxel(store: VoxelStore, axis: int, share: float) -> Cut | None:
-    """The cut at a share of the way through the map along ``axis``; None for an empty map."""
+    """The cut at a position between one end of the map (0) and the other (1) along ``axis``; None for an
+    empty map."""
     bounds = store.bounds()
     if bounds is None:
         return None
@@ -46,9 +47,9 @@ def cut_picture(
 ) -> NDArray[np.uint8]:
     """The layer of voxels at the cut, (rows, columns, 4) RGBA, one pixel a voxel.
 
-    Columns go along the first and rows along the second of the axes that follow the cut's; the picture covers
-    :meth:`VoxelStore.bounds`. ``crossed`` are bricks (n, 3) that rays went through, which are free unless
-    the store holds voxels there. What is free, occupied or unknown is as in queries.points.classify.
+    Columns follow the first and rows the second of the axes after the cut's; the picture covers
+    :meth:`VoxelStore.bounds`. ``crossed`` are bricks (n, 3) that rays cross; they are free unless the store
+    holds them. Free, occupied and unknown are defined as in queries.points.classify.
     """
     columns, rows = _AXES[cut.axis]
     bounds = store.bounds()
@@ -82,7 +83,7 @@ class CutPlane:
         self._node: viser.ImageHandle | None = None
 
     def show(self, store: VoxelStore, cut: Cut, picture: NDArray[np.uint8]) -> None:
-        """Put a :func:`cut_picture` where it belongs."""
+        """Show a :func:`cut_picture` in the plane of the cut."""
         bounds = store.bounds()
         assert bounds is not None
         low_m = bounds[0] * BRICK * self._voxel_size
@@ -109,7 +110,7 @@ class CutPlane:
         )
 
     def hide(self) -> None:
-        """Take the picture out of the scene, if there is one."""
+        """Remove the picture from the scene."""
         if self._node is not None:
             self._node.remove()
             self._node = None

@@ -12,7 +12,7 @@ from taichi_mrf.voxels.layout import BRICK
 
 
 def look_of(options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float) -> Look:
-    """What the voxels of a map shall look like."""
+    """How the voxels of a map look."""
     cut = None
     if options.cut_axis != "none":
         cut = cut_voxel(store, "xyz".index(options.cut_axis), options.cut_at)
@@ -32,7 +32,7 @@ def look_of(options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float) 
 
 
 def _heights_m(store: VoxelStore, up: Up, voxel_size: float) -> tuple[float, float]:
-    """Heights of the lowest and the highest brick's far sides."""
+    """Heights of the lower side of the lowest brick and of the upper side of the highest, in metres."""
     bounds = store.bounds()
     if bounds is None:
         return 0.0, 1.0

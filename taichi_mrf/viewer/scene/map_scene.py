@@ -1,6 +1,6 @@
-"""The map in the scene: voxels, the cut through them, the outlines of bricks, and another map beside it.
+"""The map in the scene: voxels, the cut, outlines of bricks, and the baseline's map beside it.
 
-Changes are collected, and sent at most :data:`UPDATES_PER_SECOND` times.
+Changes are collected, and sent at most :data:`UPDATES_PER_SECOND` times a second.
 """
 
 import time
@@ -23,10 +23,10 @@ from taichi_mrf.voxels.layout import BRICK
 
 UPDATES_PER_SECOND = 8
 REST_S = 0.5
-"""After so long without news from the mapper, colours that moved a little are brought up to date too."""
+"""Without updates for this long, small changes of colour are sent, too."""
 
 _GAP_M = 0.5
-"""Between the map and the one beside it."""
+"""Distance between the map and the baseline's map, in metres."""
 
 
 _NAMES: dict[Layer, str] = {"map": "this map", "beside": "baseline (OctoMap)"}
@@ -50,16 +50,16 @@ class MapScene:
 
     @property
     def store(self) -> VoxelStore:
-        """What is known of the map."""
+        """The copy of the map."""
         return self.layers["map"].store
 
     @property
     def scale(self) -> Scale | None:
-        """The colours in use; None before anything was drawn."""
+        """The colour scale in use; None before anything was drawn."""
         return None if self._look is None else self._look.scale
 
     def box_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Lowest and highest corner of all that is shown, in metres; None if that is nothing."""
+        """Lowest and highest corner of all maps that are shown, in metres, world; None if there is none."""
         corners = []
         for layer in self.layers.values():
             bounds = layer.store.bounds()
@@ -72,19 +72,19 @@ class MapScene:
         return every.min(axis=0), every.max(axis=0)
 
     def take(self, bricks: Bricks) -> None:
-        """Remember what the mapper says; it is drawn by :meth:`flush`."""
+        """Take in changed bricks; :meth:`flush` draws them."""
         store = self.layers[bricks.layer].store
         changed = store.put(bricks.bricks, bricks.log_odds, bricks.seen) | store.remove(bricks.removed)
         self._dirty[bricks.layer] |= changed
         self._news_at = time.monotonic()
 
     def look_changed(self) -> None:
-        """Draw everything anew, and do not wait for the next update's turn."""
+        """Draw everything again at the next :meth:`flush`, without waiting for its turn."""
         self._all_dirty = True
         self._sent_at = 0.0
 
     def clear(self) -> None:
-        """Take everything out of the scene."""
+        """Remove everything from the scene."""
         for layer in self.layers.values():
             layer.clear()
         self._cut_plane.hide()
@@ -93,7 +93,8 @@ class MapScene:
             self._server.scene.remove_by_name(f"/names/{name}")
 
     def patience(self) -> float | None:
-        """Seconds until :meth:`flush` has something to do if nothing happens; None: there is nothing."""
+        """Seconds until :meth:`flush` has something to do if no update comes; None if it has nothing to
+        do."""
         now = time.monotonic()
         if self._all_dirty or any(self._dirty.values()):
             return max(0.0, self._sent_at + 1 / UPDATES_PER_SECOND - now)
@@ -108,10 +109,10 @@ class MapScene:
         crossed: Iterable[NDArray[np.int32]],
         announce: Callable[[], None] = lambda: None,
     ) -> bool:
-        """Send what has changed, unless that was done a moment ago; returns whether it was.
+        """Send what has changed unless that was done a moment ago; returns whether anything was sent.
 
-        ``crossed`` are bricks (n, 3) that rays went through. ``announce`` is called before the voxels go out,
-        when it is known how many there will be: a browser that draws slowly then shows the number first.
+        ``crossed`` are bricks (n, 3) that rays cross. ``announce`` is called before the voxels are sent, when
+        their number is known: a browser that draws slowly then shows the number first.
         """
         waited = self.patience()
         if waited is None or waited > 0:
@@ -149,7 +150,7 @@ class MapScene:
         self._cut_plane.show(self.store, look.cut, picture)
 
     def _draw_names(self, up: Up) -> None:
-        """Say which map is which, above them, if there are two."""
+        """Put a label above each map if there are two."""
         two = bool(self.layers["beside"].store.chunks)
         for layer, text in _NAMES.items():
             if not two:
@@ -165,7 +166,7 @@ class MapScene:
             self._server.scene.add_label(f"/names/{layer}", text, position=above)
 
     def _beside_m(self, up: Up) -> NDArray[np.float64]:
-        """How far the other map is shifted: past this one, along a level axis."""
+        """The shift of the baseline's map, in metres: past the map, along a horizontal axis."""
         shift = np.zeros(3)
         bounds = self.store.bounds()
         if bounds is not None:

@@ -1,4 +1,4 @@
-"""What a click into the scene meets: a voxel, or a pixel of a keyframe's picture."""
+"""What a click into the scene hits: a voxel, or a pixel of a keyframe's picture."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M
 
 @dataclass(frozen=True)
 class Pixel:
-    """A pixel of a keyframe's picture, and its range from the eye in metres."""
+    """A pixel of a keyframe's picture, and its distance from the viewpoint in metres."""
 
     keyframe: int
     u: float
@@ -23,10 +23,11 @@ class Pixel:
 def first_voxel(
     origin: ArrayLike, direction: ArrayLike, centres: NDArray[np.float64], voxel_size: float
 ) -> tuple[NDArray[np.float64], float] | None:
-    """The nearest of the voxels with these centres (n, 3) that a ray meets, and its range.
+    """The centre of the nearest voxel that a ray hits, of voxels with these centres (n, 3), and its range in
+    metres.
 
-    A voxel counts as met if the ray passes its centre by no more than half a diagonal of a face, which is
-    about how far its point reaches on the screen.
+    The ray hits a voxel if it passes the centre at no more than half the diagonal of a face: about the size
+    of the voxel's point on the screen.
     """
     start = np.asarray(origin, np.float64)
     along = np.asarray(direction, np.float64)
@@ -42,7 +43,7 @@ def first_voxel(
 
 
 def first_pixel(origin: ArrayLike, direction: ArrayLike, keyframes: Iterable[KeyframeInfo]) -> Pixel | None:
-    """The nearest picture of a keyframe that a ray meets, and the pixel there."""
+    """The pixel that a ray hits first, of all pictures of keyframes."""
     start = np.asarray(origin, np.float64)
     along = np.asarray(direction, np.float64)
     along = along / np.linalg.norm(along)
@@ -51,7 +52,8 @@ def first_pixel(origin: ArrayLike, direction: ArrayLike, keyframes: Iterable[Key
 
 
 def _pixel(start: NDArray[np.float64], along: NDArray[np.float64], keyframe: KeyframeInfo) -> Pixel | None:
-    """Where the ray goes through the picture, which stands FRUSTUM_M before the keyframe's camera."""
+    """The pixel where the ray crosses the picture, which stands FRUSTUM_M in front of the keyframe's
+    camera."""
     R, t = keyframe.T_world_camera[:3, :3], keyframe.T_world_camera[:3, 3]
     origin, direction = R.T @ (start - t), R.T @ along
     if abs(direction[2]) < 1e-9:

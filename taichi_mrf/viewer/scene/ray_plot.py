@@ -1,4 +1,5 @@
-"""The curves along a ray (MRFMap, Fig. 7): p_occ, visibility and omega, with the measurement's band."""
+"""The ray plot (MRFMap, Fig. 7): p_occ, visibility and omega along a ray, with the measurement's one-sigma
+band."""
 
 import numpy as np
 import viser
@@ -11,10 +12,10 @@ from taichi_mrf.viewer.scene.safe_text import in_markdown
 Curves = tuple[NDArray[np.float64], ...]
 
 _STEP_M = 1e-6
-"""Width of a step's edge on the plot's axis."""
+"""Width of the edge of a step on the range axis."""
 
 _BEFORE_M = 0.75
-"""How far before the surface the plot begins."""
+"""The plot begins this far in front of the surface."""
 
 # What is drawn later lies on top.
 _SERIES = (
@@ -43,7 +44,7 @@ class RayPlot:
         )
 
     def show(self, answer: RayAnswer) -> None:
-        """Draw an answer, and the ray in the scene."""
+        """Show the curves of a ray, and the ray in the scene."""
         self._plot.data = curves(answer)
         self._plot.visible = True
         self._text.content = f"**{in_markdown(answer.title)}**\n\n{in_markdown(_sentence(answer))}"
@@ -65,8 +66,9 @@ class RayPlot:
 
 
 def curves(answer: RayAnswer) -> Curves:
-    """Range in metres, and over it the measurement's band, the measurement, visibility, omega and the
-    probability of occupied, all (n,); each voxel is a step. They begin a little before the surface."""
+    """Range in metres, then by range: the measurement's band, the measurement, visibility, omega and the
+    probability of being occupied, (n,) each. Each voxel is a step. The curves begin a little in front of the
+    surface."""
     begins = (answer.distance - answer.length / 2).astype(np.float64)
     ends = (answer.distance + answer.length / 2).astype(np.float64)
     band = _band_m(answer)
@@ -91,7 +93,7 @@ def curves(answer: RayAnswer) -> Curves:
 
 
 def _band_m(answer: RayAnswer) -> tuple[float, float] | None:
-    """Where the surface is, within one sigma, by the measurement alone."""
+    """The range of the surface within one sigma, from the measurement alone; None without one."""
     if answer.measured_m is None:
         return None
     middle = answer.measured_m - answer.bias_m
@@ -99,7 +101,7 @@ def _band_m(answer: RayAnswer) -> tuple[float, float] | None:
 
 
 def _surface_m(answer: RayAnswer) -> float:
-    """Where the map or the measurement has its surface, whichever is nearer."""
+    """The range of the surface in the map or in the measurement, whichever is nearer."""
     band = _band_m(answer)
     places = [] if band is None else [band[0]]
     if len(answer.omega):
@@ -108,7 +110,7 @@ def _surface_m(answer: RayAnswer) -> float:
 
 
 def _end_m(answer: RayAnswer) -> float:
-    """How far the plot goes: past the measurement, or to where next to nothing of the ray is left."""
+    """The end of the plot: behind the measurement, and where less than 1% of the ray is left."""
     seen = answer.distance[answer.visibility > 0.01]
     end = float(seen.max(initial=0.5)) + 2 * float(answer.length.max(initial=0.05))
     band = _band_m(answer)

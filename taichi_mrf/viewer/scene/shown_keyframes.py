@@ -1,5 +1,5 @@
-"""The keyframes that the page knows: all that can be changed, the latest of the frozen ones, and of those
-before only where they were and what they saw, so that an endless run needs no more and more memory."""
+"""The keyframes that the page keeps: all that can be changed, and the latest frozen ones. Of older frozen
+keyframes only positions and crossed bricks are kept, so that the memory of an endless run stays bounded."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,18 +12,19 @@ MOST_WAYPOINTS = 2000
 
 
 class ShownKeyframes:
-    """Keyframes by number, and the camera's way through all there ever were."""
+    """Keyframes by number, and the camera's path through all of them, forgotten ones included."""
 
     def __init__(self) -> None:
         self.keyframes: dict[int, KeyframeInfo] = {}
         self.recorded: dict[int, Pose] = {}
-        """Where each keyframe was before anybody moved it."""
+        """The pose of each keyframe that *Put back* restores."""
         self._old_way: list[NDArray[np.float64]] = []
         self._old_crossed = np.zeros((0, 3), np.int32)
         self._every, self._forgotten = 1, 0
 
     def put(self, keyframe: KeyframeInfo) -> list[int]:
-        """Remember a keyframe that is new or has changed; returns the numbers of those that are forgotten."""
+        """Keep a keyframe that is new or has changed; returns the numbers of keyframes that are forgotten for
+        it."""
         self.keyframes[keyframe.id] = keyframe
         home = keyframe.T_home
         if home is not None:
@@ -37,12 +38,12 @@ class ShownKeyframes:
         return forgotten
 
     def way_m(self) -> NDArray[np.float64]:
-        """The camera's way, (n, 3), oldest first; where it is long, only every so many-th of its points."""
+        """The camera's path, (n, 3) in metres, world, oldest first; a long path is thinned out."""
         known = [self.keyframes[id].T_world_camera[:3, 3] for id in sorted(self.keyframes)]
         return np.array([*self._old_way, *known]).reshape(-1, 3)
 
     def crossed(self) -> list[NDArray[np.int32]]:
-        """Bricks (n, 3) that the rays of keyframes went through, except those that are off."""
+        """Bricks (n, 3) that rays of keyframes cross; keyframes that are off are left out."""
         seen = [keyframe.crossed for keyframe in self.keyframes.values() if keyframe.state != "off"]
         return [self._old_crossed, *seen]
 

@@ -8,11 +8,11 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Up, up_vector
 
 _GROWTH = 1.2
-"""The first view is chosen anew when the map has grown by this factor."""
+"""The first view is chosen again when the map has grown by this factor."""
 
 _PANEL_SHARE = 0.2
-"""How far the map's middle lies left of the window's, as a share of the map's size: the panel covers the
-right."""
+"""Distance of the map's centre to the left of the window's, as a share of the map's size: the panel covers
+the right side."""
 
 _BEHIND_M, _ABOVE_M, _AHEAD_M = 1.5, 0.7, 2.0
 

@@ -1,4 +1,4 @@
-"""The voxels in the scene: one point cloud for each chunk, sent again only if what is to be seen changed."""
+"""The voxels in the scene: one point cloud for each chunk, sent again only if its visible voxels changed."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from taichi_mrf.viewer.scene.voxel_store import ChunkKey, Cut, VoxelStore, facin
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
 NOTICEABLE = 12
-"""A colour that moves by no more than this (of 255, in any channel) waits until the mapper rests."""
+"""A change of colour of at most this (of 255, in any channel) is not sent until no more updates come."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Look:
 
 @dataclass
 class _Sent:
-    """What the clients have of a chunk. ``exact`` is false where colours have moved since, unnoticeably."""
+    """What clients have of a chunk. ``exact`` is false if colours have changed a little since."""
 
     cells: NDArray[np.uint8]
     colors: NDArray[np.uint8]
@@ -57,24 +57,24 @@ class VoxelLayer:
 
     @property
     def voxels_shown(self) -> int:
-        """Voxels that the clients show once everything that is prepared has been sent."""
+        """Number of voxels that clients show once everything prepared has been sent."""
         ahead: dict[ChunkKey, _Sent | None] = {**self._sent, **self._prepared}
         return sum(len(each.cells) for each in ahead.values() if each is not None)
 
     def place(self, origin_m: NDArray[np.float64]) -> None:
-        """Put the whole layer somewhere else in the world."""
+        """Move the whole layer to another origin, (3,) in metres, world."""
         self.origin_m = origin_m
         for key, node in self._nodes.items():
             node.position = self._position(key)
 
     def prepare(self, chunks: set[ChunkKey], look: Look, exactly: bool = False) -> None:
-        """Work out what has to be sent of some chunks; :meth:`send` does it. Unless ``exactly``, colours that
-        moved a little are left for later."""
+        """Find out what must be sent of some chunks; :meth:`send` sends it. Unless ``exactly``, small changes
+        of colour are left for later."""
         for key in sorted(chunks):
             self._prepare_chunk(key, look, exactly)
 
     def send(self) -> None:
-        """Bring the scene to what was prepared."""
+        """Send what was prepared."""
         for key, now in self._prepared.items():
             if now is None:
                 self._take_out(key)
@@ -83,7 +83,7 @@ class VoxelLayer:
         self._prepared.clear()
 
     def inexact(self) -> set[ChunkKey]:
-        """The chunks that were left for later."""
+        """Chunks with small changes of colour that were left for later."""
         return {key for key, sent in self._sent.items() if not sent.exact}
 
     def all_chunks(self) -> set[ChunkKey]:
@@ -91,7 +91,7 @@ class VoxelLayer:
         return set(self.store.chunks) | set(self._sent)
 
     def clear(self) -> None:
-        """Take everything out of the scene, and forget the map."""
+        """Remove everything from the scene and from the store."""
         self.store = VoxelStore()
         self._prepared.clear()
         for key in list(self._sent):
@@ -150,5 +150,5 @@ class VoxelLayer:
         return f"{self._prefix}/{key[0]}_{key[1]}_{key[2]}"
 
     def _position(self, key: ChunkKey) -> NDArray[np.float64]:
-        """Of the centre of the chunk's first voxel, from which points are counted."""
+        """Position of the centre of the chunk's first voxel, the origin of its points, in metres, world."""
         return self.origin_m + (np.array(key) * CHUNK_VOXELS + 0.5) * self._voxel_size

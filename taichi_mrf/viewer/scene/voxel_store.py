@@ -1,7 +1,7 @@
-"""The viewer's copy of the map: what it was told of each voxel, by chunk.
+"""The viewer's copy of the map, by chunk.
 
-A chunk of 64^3 voxels is the unit that is drawn anew. It keeps the bricks that exist in it and answers,
-without asking the mapper, which of their voxels are to be seen.
+A chunk of 64^3 voxels is the unit that is sent to browsers. It holds its bricks and selects the voxels to
+show, without the mapping process.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ _BITS = VOXELS.bit_length() - 1
 
 _CODES = np.stack(np.unravel_index(np.arange(CHUNK**3), (CHUNK,) * 3), axis=1).astype(np.uint8)
 _CELLS = (_CODES[:, None] * BRICK + _IN_BRICK).reshape(-1, 3)
-"""Where each voxel of each brick of a chunk is in it, 0..63: (512 * 512, 3)."""
+"""Coordinates in the chunk, 0..63, of each voxel of each brick: (512 * 512, 3)."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class Cut:
 
 
 def facing(cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Which way the surface faces that each shown voxel (n, 3) of a chunk is part of, by the neighbours that
-    it lacks: (a * 3 + b) * 3 + c, (n,), where a, b, c = 0..2 are those missing along x, y, z. Neighbours in
-    other chunks count as there."""
+    """The direction of the surface at each shown voxel (n, 3) of a chunk, from its missing neighbours:
+    (a * 3 + b) * 3 + c, (n,), where a, b, c = 0..2 neighbours are missing along x, y, z. Neighbours in other
+    chunks count as present."""
     side = CHUNK_VOXELS + 2
     grid = np.ones((side,) * 3, np.uint8)
     grid[1:-1, 1:-1, 1:-1] = 0
@@ -76,7 +76,7 @@ class Chunk:
         return _CODES[self._codes].astype(np.int32)
 
     def put(self, codes: NDArray[np.int16], log_odds: NDArray[np.int16], seen: NDArray[np.uint8]) -> None:
-        """Set the voxels of some bricks, known by their numbers in the chunk."""
+        """Set the voxels of some bricks, given by their numbers in the chunk."""
         new = codes[self._row[codes] == _NOWHERE]
         if len(new):
             self._row[new] = np.arange(len(self), len(self) + len(new))
@@ -88,7 +88,7 @@ class Chunk:
         self.log_odds[rows], self.seen[rows] = log_odds, seen
 
     def remove(self, codes: NDArray[np.int16]) -> None:
-        """Forget some bricks; those that are not there are no error."""
+        """Remove some bricks; numbers of other bricks are ignored."""
         keep = ~np.isin(self._codes, codes)
         self._codes = self._codes[keep]
         self.log_odds, self.seen = self.log_odds[keep], self.seen[keep]
@@ -116,7 +116,7 @@ class Chunk:
 
 
 class VoxelStore:
-    """All chunks of a map that is shown."""
+    """All chunks of a map."""
 
     def __init__(self) -> None:
         self.chunks: dict[ChunkKey, Chunk] = {}
@@ -134,7 +134,7 @@ class VoxelStore:
         return changed
 
     def remove(self, bricks: NDArray[np.int32]) -> set[ChunkKey]:
-        """Forget bricks (n, 3); returns the chunks that have changed. A chunk without bricks is gone."""
+        """Remove bricks (n, 3); returns the chunks that have changed. A chunk without bricks is removed."""
         changed = set()
         for key, codes, _ in _by_chunk(bricks):
             if key in self.chunks:
@@ -171,7 +171,8 @@ class VoxelStore:
         return max((int(chunk.seen.max(initial=0)) for chunk in self.chunks.values()), default=0)
 
     def shown(self, key: ChunkKey, log_odds: float, cut: Cut | None) -> Shown:
-        """The voxels of a chunk that are at least so probable and not cut away; none if there is no chunk."""
+        """The voxels of a chunk with at least these log-odds that are not cut away; none if there is no such
+        chunk."""
         chunk = self.chunks.get(key)
         if chunk is None:
             return Chunk().at_least(log_odds)

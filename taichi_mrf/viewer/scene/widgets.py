@@ -36,14 +36,14 @@ class OptionWidgets(Generic[T]):
             self.handles[field.name] = handle
 
     def value(self) -> T:
-        """The options as the widgets stand."""
+        """The options with the values of the widgets."""
         values = {name: handle.value for name, handle in self.handles.items()}
         result: T = dataclasses.replace(self._options, **values)
         return result
 
 
 def label_of(name: str) -> str:
-    """How a field is called on the page."""
+    """The label of a field."""
     return name.replace("_", " ").capitalize()
 
 

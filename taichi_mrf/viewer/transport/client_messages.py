@@ -1,9 +1,9 @@
-"""What a browser may say to the viewer, word for word.
+"""The messages that a browser may send to the viewer.
 
-These are the messages that viser's stock client sends for what our page has: a camera, widgets, clicks,
-gizmos, pictures that were asked for, and commands. A message of another kind, with another field, a wrong
-type or a number that is not finite cannot be read, and so reaches nothing. The encoding is viser's own:
-one msgpack map a message, its kind under "type" (viser.infra.Message.deserialize).
+viser's stock client sends these for the parts of our pages: a camera, widgets, clicks, gizmos, pictures that
+were asked for, and commands. A message of another kind, with another field, a wrong type or a number that is
+not finite is refused. The encoding is viser's: one msgpack map per message, its kind under "type"
+(viser.infra.Message.deserialize).
 """
 
 from typing import Annotated, Literal
@@ -30,11 +30,11 @@ WidgetValue = bool | int | float | str | Annotated[list[int | float], Meta(max_l
 
 
 class ClientMessage(msgspec.Struct, tag_field="type", forbid_unknown_fields=True):
-    """Base of all that a client may say; the tag is the name of viser's message."""
+    """Base of all messages of clients; the tag is the name of viser's message."""
 
 
 class Camera(ClientMessage, tag="ViewerCameraMessage"):
-    """Where the viewer's eye is, T_world_camera in OpenCV's convention; ``fov`` is vertical, in radians."""
+    """The viewpoint: T_world_camera in OpenCV's convention; ``fov`` is vertical, in radians."""
 
     wxyz: Quaternion
     position: Point
@@ -61,7 +61,7 @@ class WidgetUpdate(ClientMessage, tag="GuiUpdateMessage"):
 
 
 class NodeClick(ClientMessage, tag="SceneNodeClickMessage"):
-    """Something in the scene was clicked; ``screen_pos`` is in parts of the canvas."""
+    """A node was clicked; ``screen_pos`` is relative to the canvas, 0 to 1."""
 
     name: Name
     instance_index: Annotated[int, Meta(ge=0, le=2**31)] | None
@@ -73,7 +73,7 @@ class NodeClick(ClientMessage, tag="SceneNodeClickMessage"):
 
 
 class SceneClick(ClientMessage, tag="ScenePointerMessage"):
-    """The scene was clicked somewhere."""
+    """The scene was clicked, at any place."""
 
     event_type: Literal["click"]
     ray_origin: Point
@@ -106,7 +106,7 @@ class GizmoRelease(ClientMessage, tag="TransformControlsDragEndMessage"):
 
 
 class Picture(ClientMessage, tag="GetRenderResponseMessage"):
-    """A picture of the page, as the server had asked for one."""
+    """A picture of the page that the server has asked for."""
 
     payload: bytes
     render_uuid: Name
@@ -127,13 +127,13 @@ _ENCODER = msgspec.msgpack.Encoder()
 
 
 class Undecodable(Exception):  # noqa: N818 - a finding about bytes, not a failure of ours
-    """The bytes are not a message at all, so whoever sent them is no viewer's page."""
+    """The bytes are no message, so the client is not a viewer's page."""
 
 
 def decode(encoded: bytes) -> AnyClientMessage | None:
-    """The message in these bytes; None if it is not one that a client may send.
+    """The message in these bytes; None if clients may not send it.
 
-    Raises :class:`Undecodable` where the bytes are no msgpack.
+    Raises :class:`Undecodable` if the bytes are no msgpack.
     """
     try:
         return _DECODER.decode(encoded)

@@ -1,8 +1,8 @@
-"""Who may talk to the viewer: which requests may become websockets, and what pages may be asked for.
+"""Which requests may become websockets, and which files are served.
 
-A browser lets any page open a websocket to any address, and a name can be made to point at this machine
-after the page was loaded (DNS rebinding). So the page that asks must come from the very address it talks
-to, and that address must be one that nobody else can hand out.
+A browser lets any page open a websocket to any address, and a host name can be made to point at this machine
+after a page was loaded (DNS rebinding). So the requesting page must come from the address that it connects
+to, and that address must not be one that a stranger can assign.
 """
 
 import http
@@ -30,12 +30,12 @@ POLICY = (
 talks to this server alone."""
 
 Pages = Callable[[ServerConnection, Request], Response | None]
-"""What serves the client's files; None where a request is for a websocket."""
+"""Serves the client's files; None if the request is for a websocket."""
 
 DEFAULT_PORTS = {"http": 80, "https": 443}
 
 _PLAIN_PATH = re.compile(r"(/[A-Za-z0-9_-][A-Za-z0-9._-]*)*/?", re.ASCII)
-"""All that the client build needs: no parent folder, percent, backslash or NUL can be spelled in this."""
+"""All paths of the client's build match this; none with a parent folder, percent, backslash or NUL does."""
 
 
 def refusal(headers: Headers, host: str) -> str | None:
@@ -63,10 +63,10 @@ def refusal(headers: Headers, host: str) -> str | None:
 
 
 def unknown_name(headers: Headers, host: str) -> str | None:
-    """Why the name in the Host header is none of ours; None if it is.
+    """Why the name in the Host header is refused; None if it is a name of this machine.
 
-    A stranger's name server can point any name at this machine, but no address, not localhost, and not
-    what this machine calls itself.
+    A stranger's name server can point any name at this machine, except an address, localhost, and this
+    machine's own host name.
     """
     hosts = headers.get_all("Host")
     try:
@@ -92,7 +92,7 @@ def _is_address(name: str) -> bool:
 
 
 def answer_page(connection: ServerConnection, request: Request, pages: Pages) -> Response | None:
-    """What ``pages`` answers to a request for a file, made safe; None where it sees a websocket's request.
+    """The answer of ``pages`` to a request for a file, made safe; None if the request is for a websocket.
 
     Paths that are not plain never reach ``pages``. Every answer comes with :data:`PAGE_HEADERS` and
     :data:`POLICY`.

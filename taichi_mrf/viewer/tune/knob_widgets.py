@@ -1,7 +1,6 @@
 """Sliders and boxes for parameters of the configuration, as the page shows them.
 
-A slider has steps and a configuration has not, so a widget never speaks for a parameter that nobody has
-touched: the page asks for the value of the one that was moved.
+A slider has steps and the configuration has not: only the widget that a user has moved changes its parameter.
 """
 
 import math
@@ -15,12 +14,12 @@ from taichi_mrf.viewer.scene.widgets import add_widget
 from taichi_mrf.viewer.tune.knobs import Knob
 
 LEAST_DECADE = 1e-300
-"""Stands for 0 where a slider shows powers of ten."""
+"""Shown in place of 0 by a slider of powers of ten."""
 
 
 class KnobWidgets:
-    """One widget for each of some knobs, added where the GUI stands; ``moved`` is told the name of one that a
-    client has used, on some thread."""
+    """One widget for each of some knobs, added where the GUI stands. ``moved`` is called, on any thread, with
+    the name of a knob that a user has moved."""
 
     def __init__(
         self, gui: viser.GuiApi, knobs: Sequence[Knob], config: Config, moved: Callable[[str], None]
@@ -43,8 +42,8 @@ class KnobWidgets:
         return name in self._knobs
 
     def applied(self, name: str, config: Config) -> Config:
-        """The configuration with one parameter as its widget stands. Raises ConfigError if they do not go
-        together."""
+        """The configuration with one parameter as its widget shows it. Raises ConfigError if the result is
+        not valid."""
         knob = self._knobs[name]
         return knob.parameter.replaced(config, config_value(knob, self._handles[name].value))
 
@@ -57,7 +56,7 @@ class KnobWidgets:
         self.follow(config)
 
     def follow(self, config: Config) -> None:
-        """Show the widgets that change something under a configuration, hide the others."""
+        """Show the widgets of parameters that have an effect under this configuration, hide the others."""
         for name, knob in self._knobs.items():
             visible = knob.applies(config)
             if self._handles[name].visible != visible:
@@ -65,7 +64,7 @@ class KnobWidgets:
 
 
 def shown_value(knob: Knob, config: Config) -> Any:
-    """What a knob's widget shows: the value itself, or its power of ten, brought into the range."""
+    """What a knob's widget shows: the value or its power of ten, clamped to the range."""
     value = knob.value_of(config)
     if knob.range is None:
         return value

@@ -1,4 +1,4 @@
-"""What tuning and its page tell each other, beside what every mapper and its page do (messages.py)."""
+"""Messages between the tuning process and its page, in addition to those of viewer/messages.py."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -13,24 +13,24 @@ from taichi_mrf.viewer.messages import Request, Update
 from taichi_mrf.viewer.tune.scores import Scores
 
 By = Literal["start", "hand", "search"]
-"""Who came up with a try: it was there at first, a person set it, the automatic search did."""
+"""Where the parameters of a try come from: the start, the user, or the automatic search."""
 
 
 @dataclass(frozen=True)
 class FrameChoice:
-    """The working set: which frames of a sequence parameters are tuned on."""
+    """The working set: the frames of a sequence that parameters are tuned on."""
 
     first: Annotated[int, Range(0, 10_000, 1)] = 0
     """Index of the first frame."""
 
     stride: Annotated[int, Range(0, 50, 1)] = 0
-    """Take every so many-th frame from there; 0 spreads them evenly, at most 10 apart."""
+    """Take every n-th frame from there; 0 spreads them evenly, at most 10 apart."""
 
     count: Annotated[int, Range(3, 60, 1)] = 12
-    """How many frames to take, those that are held out included."""
+    """Number of frames, including those that are held out."""
 
     hold_out: Annotated[int, Range(2, 10, 1)] = 3
-    """One frame in so many is kept out of the map, to score it."""
+    """Hold out one frame in n: it is not mapped but used to score the map."""
 
     def __post_init__(self) -> None:
         for name, least in (("first", 0), ("stride", 0), ("count", 2), ("hold_out", 2)):
@@ -40,8 +40,8 @@ class FrameChoice:
 
 @dataclass(frozen=True)
 class Tuning(Update):
-    """The first update, and again with another working set: what is tuned, on which frames. The table of
-    tries begins anew. ``config`` is where tuning begins; ``held_out`` names the frames that score."""
+    """The first update, and the first for another working set; the table of tries is emptied. ``config`` are
+    the first parameters; ``training``, ``held_out`` and ``unseen`` are the names of frames."""
 
     source: str
     backend: str
@@ -56,7 +56,7 @@ class Tuning(Update):
 
 @dataclass(frozen=True)
 class Activity(Update):
-    """What is being done, in words, and how much of it is (0 to 1)."""
+    """What is being done, and how much of it is done (0 to 1)."""
 
     text: str
     share: float
@@ -65,8 +65,8 @@ class Activity(Update):
 
 @dataclass(frozen=True)
 class Tried(Update):
-    """A try and its scores. The same ``number`` again brings better ones: first some of the pixels are
-    mapped and judged, then all."""
+    """A try and its scores. A later message with the same ``number`` has scores of more pixels: a first look
+    maps and scores some of them, then all are."""
 
     number: int
     config: Config
@@ -76,15 +76,14 @@ class Tried(Update):
 
 @dataclass(frozen=True)
 class Pinned(Update):
-    """This try is the one that others are compared with."""
+    """Other tries are compared with this one."""
 
     number: int
 
 
 @dataclass(frozen=True)
 class Chosen(Update):
-    """The map, the pictures and the plot are now those of this try, and the sliders shall stand where it had
-    them."""
+    """Map, pictures and plot are now those of this try, and the sliders show its parameters."""
 
     number: int
     config: Config
@@ -106,8 +105,8 @@ class Residuals(Update):
 
 @dataclass(frozen=True)
 class HeldOutView(Update):
-    """Where the map is right in one held-out view, beside the reference if there is one; and what became
-    right or wrong between the two. Pictures are (h, w, 3) uint8."""
+    """Where the map is right in one held-out view; the same for the reference, if there is one, and what
+    changed between the two. Pictures are (h, w, 3) uint8."""
 
     name: str
     measured: NDArray[np.uint8]
@@ -121,35 +120,35 @@ class HeldOutView(Update):
 
 @dataclass(frozen=True)
 class Try(Request):
-    """Map with these parameters; whatever was being tried before is abandoned."""
+    """Map with these parameters; the try in progress is abandoned."""
 
     config: Config
 
 
 @dataclass(frozen=True)
 class Pin(Request):
-    """Compare with this try from now on."""
+    """Compare other tries with this one."""
 
     number: int
 
 
 @dataclass(frozen=True)
 class LookAt(Request):
-    """Show this held-out view, by its place among them."""
+    """Show this held-out view, by its index among them."""
 
     view: int
 
 
 @dataclass(frozen=True)
 class ChooseFrames(Request):
-    """Tune on other frames."""
+    """Tune on another working set."""
 
     choice: FrameChoice
 
 
 @dataclass(frozen=True)
 class SaveTries(Request):
-    """Make a file for a client: a try's parameters (yaml), or the table of all tries (csv)."""
+    """Send a file to a client: the parameters of a try (yaml), or the table of all tries (csv)."""
 
     kind: Literal["yaml", "csv"]
     number: int
@@ -158,4 +157,4 @@ class SaveTries(Request):
 
 @dataclass(frozen=True)
 class StopSearch(Request):
-    """End the automatic search; what it has found stays."""
+    """End the automatic search and keep the best parameters."""

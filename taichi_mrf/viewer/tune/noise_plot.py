@@ -1,4 +1,4 @@
-"""The sensor's noise as the map sees it: residuals against depth, with the curves in force over them."""
+"""The noise plot: residuals of the held-out views against depth, and the curves of bias and sigma."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,8 +15,8 @@ from taichi_mrf.viewer.scene.safe_text import in_markdown
 from taichi_mrf.viewer.tune.messages import Residuals
 
 SPREADS_SHOWN = 4.0
-"""How far up and down the plot reaches: so many times the usual spread, or the usual sigma if that is more.
-Outliers would make it so high that the curves could not be told apart."""
+"""Half the height of the plot: this many times the median spread, or the median sigma if that is larger. With
+all outliers in the plot the curves could not be told apart."""
 
 _SERIES = (
     uplot.Series(label="depth (m)"),
@@ -41,8 +41,8 @@ _SERIES = (
 
 @dataclass(frozen=True)
 class NoiseCurves:
-    """Bias and sigma in force: coefficients in ascending powers of depth, a row for each patch of an image.
-    ``note`` (markdown) says where they come from, if not from the page's own sliders."""
+    """The current bias and sigma: coefficients in ascending powers of depth, a row for each patch of an
+    image. ``note`` (markdown) says where they come from, if not from the page's own sliders."""
 
     sigma: NDArray[np.float64]
     bias: NDArray[np.float64]
@@ -50,7 +50,8 @@ class NoiseCurves:
 
     @classmethod
     def of(cls, sensor: SensorConfig) -> "NoiseCurves":
-        """Those of a configuration. A table that has gone since the map was made is left out, and said so."""
+        """Those of a configuration. If a table cannot be read any more, ``note`` says so and nothing is
+        drawn."""
         tables = [name for name in ("sigma", "bias") if getattr(sensor, f"{name}_table") is not None]
         if not tables:
             return cls(*patch_coefficients(sensor))
@@ -71,7 +72,7 @@ class NoiseCurves:
 
 
 class NoisePlot:
-    """Owns the plot; curves follow the sliders at once, residuals come with each map."""
+    """Owns the plot. Curves follow the sliders at once; residuals come with each map."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._residuals: Residuals | None = None
@@ -90,12 +91,12 @@ class NoisePlot:
         self.text = gui.add_markdown("No map yet.")
 
     def show(self, residuals: Residuals) -> None:
-        """Residuals of another map."""
+        """Show the residuals of another map."""
         self._residuals = residuals
         self._draw()
 
     def follow(self, sensor: SensorConfig) -> None:
-        """Draw the curves of these coefficients."""
+        """Draw the curves of this sensor."""
         if sensor != self._sensor:
             self._sensor, self._curves = sensor, NoiseCurves.of(sensor)
             self._draw()
@@ -137,7 +138,7 @@ def plot_data(residuals: Residuals, curves: NoiseCurves) -> tuple[NDArray[np.flo
 
 
 def _reach_mm(residuals: Residuals, curves: NoiseCurves) -> float:
-    """The largest residual that the plot has room for."""
+    """The largest residual that the plot shows, in millimetres."""
     if not len(residuals.bin_m):
         return 100.0
     bias, sigma = (np.nan_to_num(curve) for curve in curves.at(residuals.bin_m))
@@ -147,9 +148,9 @@ def _reach_mm(residuals: Residuals, curves: NoiseCurves) -> float:
 
 
 def sentence(residuals: Residuals, curves: NoiseCurves) -> str:
-    """What the plot says, in words."""
+    """The text below the plot, markdown."""
     if not len(residuals.bin_m):
-        return "The map has no answer for the held-out views."
+        return "The map has no surface in the held-out views."
     points = "Grey: measured minus expected depth in held-out views, mm. Blue: its median and spread. "
     ratio = float(np.median(residuals.spread_m / curves.at(residuals.bin_m)[1]))
     if not np.isfinite(ratio):

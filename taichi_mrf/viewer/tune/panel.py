@@ -178,10 +178,10 @@ class TunePanel(BasePanel):
     def _views_tab(self) -> None:
         gui = self.gui
         self.view: Any = gui.add_dropdown(
-            "Held-out view", [NONE_YET], hint="Frames that no map has been made of; they score it."
+            "Held-out view", [NONE_YET], hint="A frame that is not in the map and scores it."
         )
         self.watch(self.view, Action.CHOOSE_VIEW)
-        gui.add_markdown("Right (blue), wrong (orange), no answer (light), not judged (dark).")
+        gui.add_markdown("Right (blue), wrong (orange), no surface (light), not evaluated (dark).")
         black = np.zeros((2, 2, 3), np.uint8)
         self._reference_text = gui.add_markdown("")
         self._reference = gui.add_image(black, visible=False)
@@ -201,6 +201,6 @@ class TunePanel(BasePanel):
         for name, (action, hint) in SAVE_BUTTONS.items():
             self.add_button(name, action, hint)
         gui.add_markdown(
-            "**Restore** sets the sliders to the try and maps with it again. **Pin** makes it the reference "
-            "(A) that scores and pictures are compared with."
+            "**Restore** sets the sliders to the selected try and maps with it again. **Pin** makes it the "
+            "reference (A): scores and pictures of other tries are compared with it."
         )

@@ -1,4 +1,4 @@
-"""The scores of the try that is looked at: numbers, how they differ from the reference, and sparklines."""
+"""The scores of the shown try: numbers, differences from the reference, and sparklines."""
 
 import math
 from collections.abc import Sequence
@@ -8,16 +8,16 @@ from taichi_mrf.viewer.tune.messages import Tried
 from taichi_mrf.viewer.tune.scores import KINDS, ScoreKind
 
 MOST_POINTS = 60
-"""So many of the latest tries are drawn."""
+"""Of the latest tries, how many a sparkline shows."""
 
 _WIDTH, _HEIGHT, _MARGIN = 84, 18, 2
 _GOOD, _BAD, _LINE, _REFERENCE = "#0072b2", "#d55e00", "#5c677d", "#a0a8b5"
 _SAME = 0.005
-"""Differences below this share of the spread over all tries are not worth a colour."""
+"""Differences below this share of the range over all tries get no colour."""
 
 
 def score_board_html(tries: Sequence[Tried], shown: int | None, pinned: int | None) -> str:
-    """A table with a line for each figure that any try has. ``shown`` and ``pinned`` are numbers of tries."""
+    """A table with a row for each figure that any try has. ``shown`` and ``pinned`` are numbers of tries."""
     by_number = {each.number: each for each in tries}
     here, reference = by_number.get(-1 if shown is None else shown), by_number.get(pinned or 0)
     if here is None:
@@ -39,8 +39,8 @@ def score_board_html(tries: Sequence[Tried], shown: int | None, pinned: int | No
 
 
 def sparkline_svg(values: Sequence[float], shown: int, reference: float) -> str:
-    """Values over the tries as a line, without those that are none; the one at the index ``shown`` as a dot,
-    the reference's height as a dashed line."""
+    """The finite values over the tries as a line; the value at the index ``shown`` as a dot, the reference as
+    a dashed line."""
     known = [value for value in values if math.isfinite(value)]
     if not known:
         return ""

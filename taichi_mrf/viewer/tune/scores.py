@@ -1,4 +1,4 @@
-"""The figures of one try: what they are called, which way is better, how they are written."""
+"""The scores of a try: their labels, which direction is better, their format."""
 
 import dataclasses
 import math
@@ -10,13 +10,13 @@ Better = Literal["higher", "lower", "neither"]
 
 @dataclass(frozen=True)
 class Scores:
-    """How a map of the training frames does on the held-out ones, all their pixels together.
+    """How well a map of the training frames predicts the held-out ones, over all their pixels.
 
-    ``pixel_stride`` says that only every so many-th pixel along both sides was mapped and judged.
+    With a ``pixel_stride`` of n only every n-th pixel along both sides was mapped and scored.
     """
 
     accuracy_voxel: float
-    """Share of pixels whose depth lies in the voxel of the likeliest surface; without an answer is wrong."""
+    """Share of pixels whose depth lies in the voxel of the likeliest surface; no surface counts as wrong."""
 
     accuracy_sigma: float
     """The same for depths within 1.5 sigma of that voxel's middle, sigma being the voxel size."""
@@ -25,23 +25,24 @@ class Scores:
     """The same for depths within 5 cm of it."""
 
     unanswered: float
-    """Share of pixels whose ray meets nothing."""
+    """Share of pixels whose ray meets no surface."""
 
     median_abs_m: float
-    """Median of the absolute difference of answer and measured depth, in metres."""
+    """Median absolute difference of expected and measured depth, in metres."""
 
     rms_m: float
-    """Root of its mean square, in metres."""
+    """Root mean square of the same difference, in metres."""
 
     log_likelihood: float
     """Mean log density, per metre, of the measurements under the map and the sensor's noise."""
 
     depth_calibration: float
-    """Mean difference between how often measurements fall into the map's central intervals of depth and how
-    often they ought to."""
+    """Mean difference between the share of measurements inside the map's central intervals of depth and the
+    nominal share."""
 
     voxel_calibration: float
-    """Expected calibration error of the voxels' probabilities, where the scene's truth is known, else NaN."""
+    """Expected calibration error of the voxels' probabilities where the scene's ground truth is known, else
+    NaN."""
 
     seconds: float
     """Time to make the map."""
@@ -57,7 +58,7 @@ class Scores:
 
 @dataclass(frozen=True)
 class ScoreKind:
-    """How one figure is shown: times ``factor``, as ``form`` says, with a unit."""
+    """How one score is shown: multiplied by ``factor``, formatted with ``form``, with a unit."""
 
     name: str
     label: str
@@ -67,15 +68,15 @@ class ScoreKind:
     unit: str = ""
 
     def text(self, scores: Scores) -> str:
-        """The figure in words."""
+        """The score as text."""
         return self.format(self.value(scores))
 
     def value(self, scores: Scores) -> float:
-        """The figure as it is stored, in SI units."""
+        """The score as it is stored, in SI units."""
         return float(getattr(scores, self.name))
 
     def format(self, value: float) -> str:
-        """A value of this kind in words; a dash for none."""
+        """A value of this kind as text; a dash for NaN."""
         if not math.isfinite(value):
             return "–"
         return f"{value * self.factor:{self.form}}" + (f" {self.unit}" if self.unit else "")
@@ -85,7 +86,7 @@ KINDS = (
     ScoreKind("accuracy_voxel", "right, in the voxel", "higher", 100, ".1f", "%"),
     ScoreKind("accuracy_sigma", "right, 1.5 sigma", "higher", 100, ".1f", "%"),
     ScoreKind("accuracy_5cm", "right, 5 cm", "higher", 100, ".1f", "%"),
-    ScoreKind("unanswered", "no answer", "lower", 100, ".1f", "%"),
+    ScoreKind("unanswered", "no surface", "lower", 100, ".1f", "%"),
     ScoreKind("median_abs_m", "median depth error", "lower", 1000, ".1f", "mm"),
     ScoreKind("rms_m", "RMS depth error", "lower", 1000, ".0f", "mm"),
     ScoreKind("log_likelihood", "log-likelihood", "higher", 1, "+.3f"),
@@ -95,11 +96,11 @@ KINDS = (
     ScoreKind("voxels", "voxels", "neither", 1, ",.0f"),
     ScoreKind("keyframes", "keyframes", "neither", 1, ".0f"),
 )
-"""In the order in which they are shown."""
+"""In the order of the page."""
 
 
 def scores_in_words(scores: Scores) -> list[str]:
-    """One line for each figure that there is."""
+    """One line for each score that is known."""
     lines = [f"{kind.label}: {kind.text(scores)}" for kind in KINDS if math.isfinite(kind.value(scores))]
     if scores.pixel_stride > 1:
         lines.append(f"of one pixel in {scores.pixel_stride**2} only")
@@ -107,5 +108,5 @@ def scores_in_words(scores: Scores) -> list[str]:
 
 
 def figures(scores: Scores) -> dict[str, float]:
-    """All figures by name."""
+    """All scores by name."""
     return dataclasses.asdict(scores)

@@ -1,4 +1,4 @@
-"""The table of all tries as the page shows it: the newest first, with what each changed and how it did."""
+"""The table of all tries, the newest first: what each changed, and its scores."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ _MARKS = {"search": "◆", "hand": "", "start": ""}
 
 
 def table_html(tries: Sequence[Tried], shown: int | None, pinned: int | None) -> str:
-    """A line of scores for each try and below it what it changed from the first."""
+    """A row of scores for each try, and below it what it changed from the first."""
     if not tries:
         return ""
     kinds = {kind.name: kind for kind in KINDS}
@@ -45,7 +45,7 @@ def table_html(tries: Sequence[Tried], shown: int | None, pinned: int | None) ->
             f'<td colspan="{len(_COLUMNS)}" style="opacity:0.7;padding-bottom:3px">'
             f"{in_html(changes(tries[0].config, each.config))}</td></tr>"
         )
-    key = "▸ shown · A reference · ★ likeliest · ◆ by the search · ~ some of the pixels"
+    key = "▸ shown · A reference · ★ highest likelihood · ◆ from the search · ~ some of the pixels"
     return (
         '<div style="max-height:22em;overflow:auto;margin:0 0.5em">'
         f'<table style="font-size:0.75em;border-spacing:0.4em 0;width:100%">{"".join(rows)}</table></div>'
@@ -54,10 +54,10 @@ def table_html(tries: Sequence[Tried], shown: int | None, pinned: int | None) ->
 
 
 def changes(first: Config, config: Config) -> str:
-    """In words, what a configuration changed from the first."""
+    """What a configuration changed from the first, as text."""
     names = differences(first, config)
     if not names:
-        return "as tuning began"
+        return "first parameters"
     return ", ".join(f"{name.split('.')[-1].replace('_', ' ')} {_short(config, name)}" for name in names)
 
 
