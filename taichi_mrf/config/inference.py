@@ -1,4 +1,4 @@
-"""The parameters of inference on rays (method mrf). They stand here, not in the method's folder, because
+"""The parameters of inference on rays (method mrf). They are here and not in the method's folder because
 inference/ and factor_graph/ read them too."""
 
 from dataclasses import dataclass
@@ -12,72 +12,74 @@ class InferenceConfig:
     """How the marginals are computed (MRFMap, sections III and IV)."""
 
     method: Literal["sum-product", "max-product"] = "sum-product"
-    """sum-product gives each voxel's marginal probability; max-product asks, for either state of a voxel, how
-    well the best explanation of all measurements does, and its odds are those of the two."""
+    """sum-product computes each voxel's marginal probability. max-product compares the best explanation of
+    all measurements with the voxel occupied to the best one with it free."""
 
     sweeps: int = 3
-    """Gauss-Seidel sweeps over all keyframes."""
+    """Number of sweeps over all keyframes. Each keyframe uses the newest messages of the others (Gauss-
+    Seidel)."""
 
     tolerance: float = 0.0
-    """Stop before the last sweep when no more than this share of the voxels moved by over 0.01."""
+    """Stop early once at most this share of the voxels changed its probability by more than 0.01 in a
+    sweep."""
 
     renew_tolerance: float = 0.35
-    """While frames come, a keyframe is swept again once others have moved more than this share of the
-    marginals that it sees by over 0.01 each. It does not touch full inference."""
+    """Live mapping: sweep a keyframe again once other keyframes have changed more than this share of the
+    marginals that it sees by more than 0.01 each. Full inference ignores this."""
 
     damping: float = 0.0
-    """Share of a keyframe's old message that is kept when it is renewed, 0 to below 1."""
+    """Share of the old message in a keyframe's new message, at least 0 and less than 1."""
 
     surface_density: float = 2.1
-    """Prior: surfaces met per metre of ray, so that it means the same at every voxel size
-    (2.1 is the paper's probability of 0.1 at 5 cm)."""
+    """Prior: expected number of surfaces per metre of ray. It means the same at every voxel size; 2.1 is the
+    paper's probability of 0.1 at 5 cm."""
 
     prior: float | None = None
-    """Prior probability of occupied for each voxel; takes the place of ``surface_density``."""
+    """Prior probability that a voxel is occupied. Overrides ``surface_density``."""
 
     likelihood: Literal["auto", "segment", "centre"] = "auto"
-    """Likelihood of the measurement given a surface in a voxel: averaged over the segment of the ray in
-    it, taken at the segment's centre, or (auto) averaged where sigma is less than the voxel size."""
+    """Likelihood of a measurement given a surface in a voxel: the average over the ray's segment in the
+    voxel, the value at the segment's centre, or (auto) the average where sigma is less than the voxel
+    size."""
 
     outlier_floor: float = 1e-6
-    """Added to both sides of every message (per metre of depth): the share of measurements that no
-    surface explains, so that one wild pixel cannot veto all the others."""
+    """Density of outliers per metre of depth, added to both sides of every message. It keeps a single wrong
+    pixel from overruling all others."""
 
     end_sigmas: float = 3.0
-    """A ray ends this many sigma beyond its measurement, and bricks exist this many around it."""
+    """A ray ends this many sigma behind its measurement. Bricks are allocated this many sigma around it."""
 
     segment_lengths: bool = True
-    """Weigh a voxel by the length that the ray spends in it (section IV-A). Without it every voxel
-    counts once, as eqs. 11 to 14 are printed."""
+    """Weight a voxel by the length of the ray's segment in it (section IV-A). If off, every voxel on a ray
+    has the weight 1, as eqs. 11 to 14 are printed."""
 
     ray_density: float = 2.5
-    """Rays that a keyframe casts at least at a voxel that faces it, for each centimetre of the voxel's side:
-    12.5 at 5 cm, 2.5 at 1 cm. Where a voxel covers more pixels, not each has a ray of its own. 0 casts
-    every pixel."""
+    """Minimum rays cast at a voxel facing the camera, per centimetre of voxel size: 12.5 rays at 5 cm, 2.5 at
+    1 cm. Pixels beyond that share rays. 0 casts a ray for every pixel."""
 
     ray_choice: Literal["bundle", "thin"] = "bundle"
-    """How pixels go without a ray: bundled with neighbours whose measurements agree, as one ray with their
-    mean that counts as many as they are, or (thin) left out but for every second, third, ... of them."""
+    """How pixels share rays: bundle casts one ray with the mean depth of neighbouring pixels that agree, with
+    their number as its weight; thin casts only every second, third, ... pixel."""
 
     average: Literal["probability", "log_odds"] = "log_odds"
-    """What is averaged, weighted by length, over a keyframe's rays through a voxel."""
+    """What a keyframe's message averages over its rays through a voxel, weighted by length."""
 
     min_length: float = 0.02
-    """A voxel that a keyframe's rays cross for less than this many voxel sizes in sum keeps its old
-    message."""
+    """A voxel keeps its old message if a keyframe's rays cross it for less than this length in total, in
+    voxel sizes."""
 
     message_clamp: float = 6.9
-    """Largest log-odds of a keyframe's message to a voxel (6.9 is a probability of 0.999)."""
+    """Bound on the log-odds of a keyframe's message to a voxel (6.9 is a probability of 0.999)."""
 
     cavity_clamp: float = 9.2
-    """Largest log-odds of a voxel as a keyframe's rays see it, without that keyframe's own message."""
+    """Bound on the log-odds of the cavity belief: a voxel's belief minus the keyframe's own message."""
 
     free_share: float = 0.25
-    """A voxel is never more surely free, as a keyframe's rays see it, than this share of its prior: what
-    others hold to be free may still stop a ray now and then. 0 leaves only the clamp."""
+    """Lower bound on a voxel's cavity probability, as a share of its prior: a voxel that other keyframes see
+    as free may still stop a ray. 0 leaves only ``cavity_clamp``."""
 
     message_precision: Literal["float16", "float32"] = "float16"
-    """How messages are stored. float16 halves the memory and moves beliefs by at most 0.006."""
+    """Storage of messages. float16 halves their memory and changes beliefs by at most 0.006."""
 
     def __post_init__(self) -> None:
         for name in ("method", "likelihood", "ray_choice", "average", "message_precision"):

@@ -24,7 +24,7 @@ Arch = Literal["auto", "cuda", "vulkan", "cpu"]
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """What is known of the sensor. Depths are axial depth in metres."""
+    """The sensor's noise and range. Depths are axial depth in metres."""
 
     sigma: tuple[float, ...] = (0.001504, -0.00152, 0.0019)
     """Standard deviation of the measured depth in metres: coefficients of a polynomial in depth, in
@@ -34,20 +34,20 @@ class SensorConfig:
     """Mean of measured minus true depth in metres: coefficients in ascending powers of the true depth."""
 
     sigma_table: str | None = None
-    """A .npy file of shape (patches, degree + 1) with one sigma polynomial for each pixel patch, row by
-    row. It takes the place of ``sigma``; a relative path starts at the YAML file's folder."""
+    """A .npy file of shape (patches, degree + 1) with a sigma polynomial for each pixel patch, row by row.
+    Overrides ``sigma``. A relative path starts at the YAML file's folder."""
 
     bias_table: str | None = None
-    """The same for the bias."""
+    """A .npy file of the same shape with a bias polynomial for each pixel patch. Overrides ``bias``."""
 
     patch: int = 20
-    """Side of a square pixel patch of the tables, in pixels."""
+    """Side of the tables' square pixel patches, in pixels."""
 
     min_depth: float = 0.1
-    """Measurements nearer than this (metres) are ignored."""
+    """Ignore measurements nearer than this (metres)."""
 
     max_depth: float = 10.0
-    """Rays end here (metres); a measurement beyond says only that the space up to here is free."""
+    """Rays end at this depth (metres). A measurement beyond it only marks the space up to it as free."""
 
     def __post_init__(self) -> None:
         check_field(len(self.sigma) >= 1, "sensor.sigma", "needs at least one coefficient")
@@ -61,19 +61,18 @@ class SensorConfig:
 
 @dataclass(frozen=True)
 class KeyframeConfig:
-    """Which frames become keyframes (section V): those that have moved enough."""
+    """Which frames become keyframes (section V): those taken far enough from the keyframes so far."""
 
     rotation: float = 0.0
-    """A frame that is rotated by more than this (radians, tangent norm) becomes a keyframe; 0 means that
-    rotation does not count."""
+    """A frame rotated by more than this (radians, tangent norm) becomes a keyframe. 0 ignores rotation."""
 
     translation: float = 0.0
-    """A frame that is translated by more than this (metres) becomes a keyframe; 0 means that translation
-    does not count. With both at 0 every frame is a keyframe."""
+    """A frame translated by more than this (metres) becomes a keyframe. 0 ignores translation. If rotation
+    and translation are both 0, every frame becomes a keyframe."""
 
     against: Literal["last", "all"] = "last"
-    """Compare with the last keyframe, as in the paper, or with all earlier ones, so that a place that is
-    visited again adds nothing."""
+    """Compare a frame with the last keyframe, as in the paper, or with all keyframes, so that a second visit
+    to a place adds none."""
 
     def __post_init__(self) -> None:
         check_field(self.rotation >= 0, "keyframes.rotation", "must not be negative")
@@ -82,30 +81,31 @@ class KeyframeConfig:
 
 @dataclass(frozen=True)
 class PoseConfig:
-    """Poses that are slightly wrong, and how far depth may move them (method mrf)."""
+    """Refinement of recorded poses by aligning depth images (methods that can align keyframes: mrf)."""
 
     refine: bool = False
-    """Align each new keyframe with those before it, and at the end all keyframes with each other. The first
-    keyframe stays where it is."""
+    """Align each new keyframe with the earlier ones, and at the end all keyframes with each other. The first
+    keyframe keeps its pose."""
 
     rounds: int = 2
-    """How often, at the end, every keyframe is aligned with all others."""
+    """Maximum number of rounds in which all keyframes are aligned with each other at the end."""
 
     translation_sigma: float = 0.03
-    """How wrong recorded poses are along each axis (metres, standard deviation). What depth does not tell
-    stays as it was recorded; what it tells badly is a compromise between the two."""
+    """Standard deviation of recorded positions along each axis (metres). It weighs recorded poses against
+    depth; directions that depth does not determine keep the recorded value."""
 
     rotation_sigma: float = 0.02
-    """How wrong recorded poses are about each axis (radians, standard deviation)."""
+    """Standard deviation of recorded orientations about each axis (radians)."""
 
     max_translation: float = 0.2
-    """A keyframe that fits only further away than this (metres) is not moved."""
+    """Do not move a keyframe further than this (metres)."""
 
     max_rotation: float = 0.1
-    """A keyframe that fits only when turned by more than this (radians) is not moved."""
+    """Do not turn a keyframe by more than this (radians)."""
 
     min_overlap: float = 0.3
-    """A keyframe with less than this share of its points near what others have measured is not moved."""
+    """Do not move a keyframe if less than this share of its points lies near surfaces that other keyframes
+    measured."""
 
     def __post_init__(self) -> None:
         check_field(self.rounds >= 0, "poses.rounds", "must not be negative")
@@ -118,23 +118,23 @@ class PoseConfig:
 
 @dataclass(frozen=True)
 class VolumeConfig:
-    """Where the map may be, and when it counts as known."""
+    """The space that the map may cover, its memory, and when a voxel counts as known."""
 
     lower: tuple[float, float, float] | None = None
-    """Lowest corner of the mapped box in metres (world frame); no box means an unbounded map."""
+    """Lowest corner of the mapped box in metres (world frame). Without a box the map is unbounded."""
 
     upper: tuple[float, float, float] | None = None
     """Highest corner of the mapped box in metres."""
 
     dense_bricks: int = 256
-    """Vulkan only, which has no sparse fields: bricks along each side of the volume, around the first
-    keyframe. 256 at 2 cm are 41 m and take 128 MB."""
+    """Vulkan only, because it has no sparse fields: bricks along each side of the volume around the first
+    keyframe. 256 bricks at 2 cm cover 41 m and need 128 MB."""
 
     memory_limit_gb: float = 0.0
-    """Most memory for the map in GB: its voxels, images and messages; 0 means what the machine has free."""
+    """Memory limit of the map in GB (voxels, images and messages). 0 means the free memory of the machine."""
 
     min_evidence: float = 0.1
-    """A voxel whose log-odds lie nearer than this to the prior counts as unknown."""
+    """A voxel counts as unknown if its log-odds differ from the prior by less than this."""
 
     def __post_init__(self) -> None:
         check_field((self.lower is None) == (self.upper is None), "volume.lower", "goes with volume.upper")
@@ -148,11 +148,11 @@ class VolumeConfig:
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """How a finished map is checked against frames that were kept out of it."""
+    """How a finished map is checked against frames that it was not built from."""
 
     hold_out: int = 10
-    """One frame in so many is kept out of the map; its depth is compared afterwards with the depth that
-    the map predicts. 0 maps all frames and checks nothing."""
+    """Keep every N-th frame out of the map and compare its depth with the map's prediction. 0 maps all frames
+    and checks nothing."""
 
     def __post_init__(self) -> None:
         ok = self.hold_out == 0 or self.hold_out >= 2
@@ -161,16 +161,16 @@ class EvaluationConfig:
 
 @dataclass(frozen=True)
 class RuntimeConfig:
-    """Where the kernels run."""
+    """The device that runs the kernels."""
 
     arch: Arch = "auto"
-    """Backend: cuda, vulkan, cpu, or auto for the first of these that there is."""
+    """Backend: cuda, vulkan, cpu, or auto for the first of these that is available."""
 
     threads: int = 0
     """CPU threads; 0 means all cores."""
 
     debug: bool = False
-    """Let Taichi check array bounds (slow)."""
+    """Check array bounds in kernels (slow)."""
 
     def __post_init__(self) -> None:
         check_field(self.threads >= 0, "runtime.threads", "must not be negative")
@@ -178,7 +178,7 @@ class RuntimeConfig:
 
 @dataclass(frozen=True)
 class _Head:
-    """What stands before the methods' sections in YAML and in help texts."""
+    """The fields before the methods' sections in YAML and in help texts."""
 
     voxel_size: float = 0.05
     """Side of a voxel in metres."""
@@ -191,27 +191,27 @@ class _Head:
     )
 
     sensor: SensorConfig = field(default_factory=SensorConfig)
-    """What is known of the sensor."""
+    """The sensor's noise and range."""
 
 
 @dataclass(frozen=True)
 class _Tail:
-    """What stands after them."""
+    """The fields after them."""
 
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     """Which frames become keyframes."""
 
     poses: PoseConfig = field(default_factory=PoseConfig)
-    """Whether depth may move keyframes whose poses are slightly wrong."""
+    """Refinement of recorded poses."""
 
     volume: VolumeConfig = field(default_factory=VolumeConfig)
-    """Where the map may be."""
+    """The space and memory of the map."""
 
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     """How a finished map is checked."""
 
     runtime: RuntimeConfig = field(default_factory=RuntimeConfig)
-    """Where the kernels run."""
+    """The device that runs the kernels."""
 
 
 if TYPE_CHECKING:

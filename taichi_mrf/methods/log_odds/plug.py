@@ -13,29 +13,29 @@ class LogOddsConfig:
     """Occupancy mapping by independent log-odds, as OctoMap does it (Hornung et al. 2013)."""
 
     hit: float = 0.7
-    """Probability of occupied that a ray's end gives a voxel."""
+    """Probability of occupied for a voxel in which a ray ends."""
 
     miss: float = 0.4
-    """Probability of occupied that a ray gives a voxel by passing through it."""
+    """Probability of occupied for a voxel that a ray passes through."""
 
     lowest: float = 0.1192
-    """A voxel's probability never falls below this, so that it can change again."""
+    """Lower bound on a voxel's probability, so that it can still change."""
 
     highest: float = 0.971
-    """A voxel's probability never rises above this."""
+    """Upper bound on a voxel's probability."""
 
     update: Literal["scan", "ray"] = "scan"
-    """One update for each voxel and scan, in which a hit wins over misses (OctoMap), or one for each ray."""
+    """Update a voxel once per scan, with a hit overriding misses (OctoMap), or once per ray."""
 
     max_range: float = 0.0
-    """A ray is cut off at this range (metres) and then hits nothing: the voxel in which it ends is not
-    updated. 0 means no limit."""
+    """Cut rays off at this range (metres). A cut ray hits nothing: the voxel in which it ends is not updated.
+    0 means no limit."""
 
     discretise: bool = False
-    """Cast one ray to the centre of each voxel that holds a measurement, instead of one for each pixel."""
+    """Cast one ray to the centre of each voxel that contains a measurement instead of one per pixel."""
 
     correct_bias: bool = False
-    """Take the sensor's known bias out of the measurements first."""
+    """Subtract the sensor's bias from the measurements first."""
 
     def __post_init__(self) -> None:
         check_field(0.5 < self.hit < 1, "log_odds.hit", "must lie between 0.5 and 1")

@@ -18,28 +18,28 @@ class VisibilityConfig:
     """P(H | V, O): probability of a hit for a visible voxel that is occupied."""
 
     hit_if_hidden: float = 0.05
-    """P(H | not V): probability of a hit for a voxel that cannot be seen."""
+    """P(H | not V): probability of a hit for a voxel that is not visible."""
 
     visible_if_occluded: float = 0.2
     """P(V_i | C_i, V_i-1): probability that a locally occluded voxel behind a visible one is visible."""
 
     visible_if_clear: float = 1.0
-    """P(V_i | not C_i, V_i-1): the same for one that is not locally occluded."""
+    """P(V_i | not C_i, V_i-1): the same for a voxel that is not locally occluded."""
 
     q_min: float = 0.1
-    """A ray ends where the probability of being visible falls below this."""
+    """A ray ends where the probability of visibility falls below this."""
 
     q_max: float = 0.7
-    """A probability of being visible from here on counts as 1."""
+    """A probability of visibility of at least this counts as 1."""
 
     lowest: float = 0.1192
-    """A voxel's probability never falls below this (OctoMap's default)."""
+    """Lower bound on a voxel's probability (OctoMap's default)."""
 
     highest: float = 0.971
-    """A voxel's probability never rises above this (OctoMap's default)."""
+    """Upper bound on a voxel's probability (OctoMap's default)."""
 
     max_range: float = 0.0
-    """A ray is cut off at this range (metres) and its end then counts as free; 0 means no limit."""
+    """Cut rays off at this range (metres). The end of a cut ray counts as free. 0 means no limit."""
 
     def __post_init__(self) -> None:
         for name in ("hit_if_free", "hit_if_occupied", "hit_if_hidden"):
