@@ -1,7 +1,8 @@
-"""What the documentation site is made of beside docs/: the README files, the changelog, all parameters.
+"""Adds to the documentation site what is not written in docs/.
 
-MkDocs calls these hooks (mkdocs.yml). Nothing is written twice: the page of parameters is made from the
-dataclasses, the front page from README.md.
+MkDocs calls these hooks (mkdocs.yml). Nothing is written twice: the front page is README.md, the page of
+parameters is made from the dataclasses, the API page from docstrings (api_page.py), and the plan of the
+packages from floors.yaml (floor_plan.py).
 """
 
 import dataclasses
@@ -9,6 +10,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+from api_page import api_page
+from floor_plan import floor_plan
 from mkdocs.structure.files import File, Files
 
 from taichi_mrf.config.schema import Config
@@ -17,8 +20,16 @@ from taichi_mrf.factor_graph.config import LaserConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 
-BROUGHT_IN = {"index.md": "README.md", "data.md": "data/README.md", "changelog.md": "CHANGELOG.md"}
+BROUGHT_IN = {
+    "index.md": "README.md",
+    "data.md": "data/README.md",
+    "contributing.md": "CONTRIBUTING.md",
+    "changelog.md": "CHANGELOG.md",
+}
 """Page -> the file that it is made from."""
+
+FLOORS = "<!-- floors -->"
+"""The line that the plan of the packages replaces."""
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -27,28 +38,38 @@ def on_files(files: Files, config: Any) -> Files:
         text = (ROOT / source).read_text(encoding="utf-8")
         files.append(File.generated(config, page, content=text))
     files.append(File.generated(config, "parameters.md", content=parameters_page()))
+    files.append(File.generated(config, "api.md", content=api_page()))
     return files
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Links among the repository's files become links among pages; other files are named, not linked."""
+    """Put the plan of the packages in; links among the repository's files become links among pages, and links
+    to files that are no pages become their names.
+    """
+    if FLOORS in markdown:
+        markdown = markdown.replace(FLOORS, floor_plan())
     for page, source in BROUGHT_IN.items():
         markdown = re.sub(rf"\]\((?:\.\./)?{re.escape(source)}(#[^)]*)?\)", rf"]({page}\1)", markdown)
     markdown = re.sub(r"\]\((?:\.\./)?docs/\)", "](architecture.md)", markdown)
     markdown = re.sub(r"\]\((?:\.\./)?docs/([^)]+)\)", r"](\1)", markdown)
-    elsewhere = r"(?:LICENSE|(?:examples|configs|taichi_mrf)/)[^)]*"
+    elsewhere = r"(?:LICENSE|(?:examples|configs|taichi_mrf|tests|Makefile)/?)[^)]*"
     return re.sub(rf"\[([^\]]+)\]\((?:\.\./)?{elsewhere}\)", r"\1", markdown)
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Docstrings name code as reStructuredText does, ``:meth:`infer```; on the page only the code stays."""
+    return re.sub(r":(?:attr|class|func|meth|mod):(?=<code>)", "", html)
 
 
 def parameters_page() -> str:
     """Every parameter with its default and its help, from the dataclasses."""
     sections = [
         "# Parameters\n",
-        "One YAML file holds any of these; `taichi-mrf map --help` lists them as flags, and a file needs to "
-        "hold only what it changes.\n",
-        *_section(Config(), "", "Maps"),
-        "`taichi-mrf laser` has parameters of its own:\n",
-        *_section(LaserConfig(), "", "Laser scans"),
+        "A YAML file sets any of these, and needs to hold only what it changes (`--config FILE`). Each is a "
+        "flag as well: `taichi-mrf map --help-all` lists them.\n",
+        *_section(Config(), "", "Maps from depth images"),
+        "`taichi-mrf laser` has its own parameters:\n",
+        *_section(LaserConfig(), "", "Maps from laser scans"),
     ]
     return "\n".join(sections)
 

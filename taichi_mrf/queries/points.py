@@ -12,8 +12,14 @@ from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology
 
-UNKNOWN, FREE, OCCUPIED = 0, 1, 2
-"""What a place can be. Free is seen to be empty; unknown was never seen or nothing was learnt of it."""
+UNKNOWN = 0
+"""The state of a place that no ray has crossed, or that has too little evidence either way."""
+
+FREE = 1
+"""The state of a place that was seen to be empty."""
+
+OCCUPIED = 2
+"""The state of a place that is more likely occupied than not."""
 
 
 def point_log_odds(

@@ -1,4 +1,5 @@
-"""The documentation site is built without a warning, names every parameter, and its pictures have makers."""
+"""The documentation site: it is built without a warning, its generated pages are complete, and every picture
+comes from a script or a command."""
 
 import dataclasses
 import re
@@ -8,8 +9,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pytest
+import yaml
+
+import taichi_mrf
+import taichi_mrf.errors
 from taichi_mrf.config.schema import Config
 from taichi_mrf.factor_graph.config import LaserConfig
+
+REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 def names(section: Any, prefix: str = "") -> Iterator[str]:
@@ -21,24 +29,79 @@ def names(section: Any, prefix: str = "") -> Iterator[str]:
             yield prefix + field.name
 
 
-def test_the_site_is_built_without_a_warning(repository: Path, tmp_path: Path) -> None:
-    built = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)],
-        cwd=repository, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the built site. A warning ends the build."""
+    folder = tmp_path_factory.mktemp("site")
+    built = build(REPOSITORY / "mkdocs.yml", folder)
     assert built.returncode == 0, built.stderr
-    page = (tmp_path / "parameters" / "index.html").read_text(encoding="utf-8")
-    for name in [*names(Config()), *names(LaserConfig())]:
-        assert f"<code>{name}</code>" in page
-    front = (tmp_path / "index.html").read_text(encoding="utf-8")
+    return folder
+
+
+def build(configuration: Path, folder: Path) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--config-file", str(configuration)]
+    return subprocess.run(
+        [*command, "--site-dir", str(folder)], cwd=REPOSITORY, capture_output=True, text=True, check=False
+    )
+
+
+def html(site: Path, page: str) -> str:
+    return (site / page / "index.html").read_text(encoding="utf-8")
+
+
+def test_the_site_is_built_without_a_warning(site: Path) -> None:
+    front = html(site, ".")
     assert "taichi-mrf live" in front
     assert 'href="live/"' in front
+
+
+def test_every_parameter_is_on_its_page(site: Path) -> None:
+    page = html(site, "parameters")
+    missing = [
+        name for name in (*names(Config()), *names(LaserConfig())) if f"<code>{name}</code>" not in page
+    ]
+    assert not missing
+
+
+def test_every_public_name_and_every_exception_is_on_the_api_page(site: Path) -> None:
+    page = html(site, "api")
+    exceptions = [
+        name
+        for name, each in vars(taichi_mrf.errors).items()
+        if isinstance(each, type) and issubclass(each, taichi_mrf.TaichiMRFError)
+    ]
+    anchors = set(re.findall(r'id="taichi_mrf\.[\w.]*?(\w+)"', page)) | {"__version__"}
+    assert not {*taichi_mrf.__all__, *exceptions} - anchors
+    assert "add_keyframe" in anchors  # verbs that the maps inherit
+    assert ":meth:" not in page
+
+
+def test_the_plan_of_the_packages_is_made_from_the_table(site: Path) -> None:
+    page = html(site, "architecture")
+    packages = [path.parent.name for path in (REPOSITORY / "taichi_mrf").glob("*/__init__.py")]
+    assert packages
+    assert not [
+        name for name in packages if f"<code>{name}/</code>" not in page or f">{name}</text>" not in page
+    ]
+
+
+@pytest.mark.parametrize("link", ["absent.md", "#absent", "/absent", "other.md#absent"])
+def test_a_broken_link_ends_the_build(link: str, tmp_path: Path) -> None:
+    ours = yaml.safe_load((REPOSITORY / "mkdocs.yml").read_text(encoding="utf-8"))
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "index.md").write_text(f"# Start\n\n[a link]({link}) [another](other.md)\n")
+    (tmp_path / "docs" / "other.md").write_text("# Other\n")
+    configuration = tmp_path / "mkdocs.yml"
+    configuration.write_text(yaml.safe_dump({"site_name": "x", "validation": ours["validation"]}))
+    built = build(configuration, tmp_path / "site")
+    assert built.returncode != 0
+    assert "absent" in built.stderr
 
 
 PICTURE = re.compile(r"!\[[^\]]*\]\(([^)]+)\)")
 
 
-def test_pictures_are_there_are_shown_and_come_from_a_script_or_a_command(repository: Path) -> None:
+def test_every_picture_is_shown_and_comes_from_a_script_or_a_command(repository: Path) -> None:
     pages = [repository / "README.md", *sorted((repository / "docs").glob("*.md"))]
     shown = {
         (page.parent / link).resolve() for page in pages for link in PICTURE.findall(page.read_text("utf-8"))

@@ -1,0 +1,74 @@
+"""The page of the Python API: every public name of taichi_mrf, in groups, from its docstring.
+
+site.py adds the page; the plugin mkdocstrings replaces each ``:::`` block by the name's documentation.
+"""
+
+import importlib
+
+import taichi_mrf
+
+GROUPS: dict[str, tuple[str, ...]] = {
+    "Starting": ("init",),
+    "Maps": ("MRFMap", "LogOddsMap", "VisibilityMap"),
+    "Sensors": ("PinholeCamera", "PolynomialNoise", "PatchNoise", "Frame"),
+    "Queries": (
+        "UNKNOWN",
+        "FREE",
+        "OCCUPIED",
+        "read_box",
+        "slice_map",
+        "cast_rays",
+        "distance_field",
+        "find_frontiers",
+        "view_gain",
+        "compare_maps",
+    ),
+    "Files": ("open_dataset", "load_map", "ChunkedMap", "take_part", "export_map", "ExportOptions"),
+    "Evaluation": ("accuracy",),
+    "Configuration": ("Config",),
+    "Errors": ("TaichiMRFError",),
+}
+"""A new public name needs a place here, or the site is not built."""
+
+INTRODUCTION = f"""# Python API
+
+Everything on this page is imported from `taichi_mrf`; the examples write `import taichi_mrf as tm`.
+`tm.__version__` is the version, {taichi_mrf.__version__} here. [Queries](queries.md) has an example
+of each query, and [Parameters](parameters.md) lists every field of the configuration.
+"""
+
+OTHER_ERRORS = """
+The other exceptions are in `taichi_mrf.errors`. All of them derive from `TaichiMRFError`.
+"""
+
+
+def api_page() -> str:
+    """The page as Markdown. Raises ValueError if GROUPS and the public names differ."""
+    grouped = {name for names in GROUPS.values() for name in names}
+    public = set(taichi_mrf.__all__) - {"__version__"}
+    if grouped != public:
+        raise ValueError(
+            f"docs/api_page.py: GROUPS and taichi_mrf.__all__ differ: {sorted(grouped ^ public)}"
+        )
+    parts = [INTRODUCTION]
+    for title, names in GROUPS.items():
+        parts.append(f"## {title}\n")
+        parts += [f"::: {_home(name)}.{name}\n" for name in names]
+    parts.append(OTHER_ERRORS)
+    parts += [f"::: taichi_mrf.errors.{name}\n" for name in _other_errors()]
+    return "\n".join(parts)
+
+
+def _home(name: str) -> str:
+    """The module that defines a public name; constants do not tell, so theirs is the one they come from."""
+    home = getattr(getattr(taichi_mrf, name), "__module__", "")
+    return home if home.startswith("taichi_mrf") else taichi_mrf._PUBLIC[name]
+
+
+def _other_errors() -> list[str]:
+    base = taichi_mrf.TaichiMRFError
+    return [
+        name
+        for name, each in vars(importlib.import_module("taichi_mrf.errors")).items()
+        if isinstance(each, type) and issubclass(each, base) and each is not base
+    ]
