@@ -71,6 +71,10 @@ class Dataset(ABC):
         cannot be read again, and an error other than FrameError is the end."""
         return False
 
+    def check_scale(self, poses_are_used: bool) -> list[str]:
+        """Check the unit of depth, once the camera is final; returns notes. Most sources know their unit."""
+        return []
+
     @property
     @abstractmethod
     def frame_names(self) -> Sequence[str]:

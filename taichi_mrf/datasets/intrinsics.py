@@ -1,5 +1,6 @@
-"""Finding a recording's camera: the caller's word, else a file in the folder, else the format's default."""
+"""Finding a recording's camera: the caller's, else a file's in the folder, else the format's default."""
 
+import re
 from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
@@ -15,6 +16,8 @@ from taichi_mrf.errors import ConfigError, DatasetError, said
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import read_text
 
+_NAMED = re.compile(r"\b(fx|fy|cx|cy|width|height|skew|s)\b\s*[:=]\s*([-+.\w]+)", re.IGNORECASE)
+
 PRIMESENSE = PinholeCamera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
 """What drivers of PrimeSense cameras (Kinect 1, Xtion) assume, and ROS with them."""
 
@@ -22,11 +25,19 @@ CAMERA_FILES = (
     "camera.txt",
     "camera.yaml",
     "camera-intrinsics.txt",
+    "camera_intrinsics.txt",
     "intrinsics.txt",
+    "intrinsic.txt",
+    "K.txt",
+    "cam_K.txt",
     "camera_intrinsic.json",
+    "intrinsics.json",
 )
-"""camera.txt: width height fx fy cx cy; camera.yaml: the same by name; camera_intrinsic.json: Open3D's; the
-others: the 3 x 3 or 4 x 4 matrix."""
+"""camera.yaml: width, height, fx, fy, cx, cy by name; .json: Open3D's; the others: any layout of
+:func:`read_camera`."""
+
+SCENE_FILE = "camera-intrinsics.txt"
+"""3DMatch keeps this one in the folder above the sequences."""
 
 
 def find_camera(
@@ -45,41 +56,85 @@ def find_camera(
         return options.camera, []
     if options.intrinsics is not None:
         return PinholeCamera(*_image_size(default, depth_files), *options.intrinsics), []
-    for name in CAMERA_FILES:
-        path = folder / name
+    for path in (*(folder / name for name in CAMERA_FILES), folder.parent / SCENE_FILE):
         if path.is_file():
             return read_camera(path, default, depth_files), []
     k = default
+    size = _image_size(default, depth_files)
+    if size != (k.width, k.height):
+        raise DatasetError(
+            f"{folder}: the images have {size[0]} x {size[1]} pixels, the camera of {default_name} has "
+            f"{k.width} x {k.height}, and there is no camera file: pass --camera fx,fy,cx,cy, or put K.txt "
+            "(the 3 x 3 matrix) or camera.txt (width height fx fy cx cy) into the folder"
+        )
     note = (
-        f"no {' or '.join(CAMERA_FILES)} in {folder}: assumed the camera of {default_name}, "
-        f"{k.width} x {k.height}, fx {k.fx:g}, fy {k.fy:g}, cx {k.cx:g}, cy {k.cy:g}"
+        f"no camera file such as K.txt in {folder}: assumed the camera of {default_name}, "
+        f"{k.width} x {k.height}, fx {k.fx:g}, fy {k.fy:g}, cx {k.cx:g}, cy {k.cy:g}; --camera fx,fy,cx,cy "
+        "sets another"
     )
     return default, [note]
 
 
 def read_camera(path: Path, default: PinholeCamera, depth_files: Iterable[Path]) -> PinholeCamera:
-    """The camera in a file of one of the layouts above; ``default`` gives the image size where neither the
-    file nor ``depth_files`` do. Raises DatasetError, whose text names the file."""
+    """The camera in a file: ``width height fx fy cx cy``, ``fx fy cx cy``, a 3 x 3, 3 x 4 or 4 x 4 matrix,
+    lines of ``fx: 525.0``, or YAML or JSON by the file's suffix.
+
+    ``default`` gives the image size where neither the file nor ``depth_files`` do. Raises DatasetError, whose
+    text names the file."""
     if path.suffix == ".json":
         return read_intrinsics(path)
     try:
         text = read_text(path, DatasetError)
         if path.suffix == ".yaml":
             return _camera_from_yaml(text, path)
-        numbers = [float(word) for line in text.splitlines() for word in line.split("#")[0].split()]
+        named = _NAMED.findall(text)
+        if named:
+            return _camera_from_names(
+                {name.lower(): float(value) for name, value in named}, default, depth_files
+            )
+        numbers = [float(word) for line in text.splitlines() for word in _words(line)]
         if len(numbers) == 6:
             return _camera_from_numbers(numbers)
-        if len(numbers) in (9, 16):
-            side = 3 if len(numbers) == 9 else 4
-            K = np.reshape(numbers, (side, side))[:3, :3]
-            return _camera_from_matrix(K, default, depth_files)
+        if len(numbers) == 4:
+            return PinholeCamera(*_image_size(default, depth_files), *numbers)
+        if len(numbers) in (9, 12, 16):
+            K = np.reshape(numbers, (3 if len(numbers) < 16 else 4, -1))[:3, :3]
+            try:
+                return PinholeCamera.from_matrix(*_image_size(default, depth_files), K)
+            except ConfigError as error:
+                raise ConfigError(f"line {_line_of_numbers(text)}: {error}") from error
     except ConfigError as error:
         raise DatasetError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
     except ValueError as error:
         raise DatasetError(f"{path}: holds something that is not a number: {said(error)}") from error
     raise DatasetError(
-        f"{path}: holds {len(numbers)} numbers; expected width height fx fy cx cy, or a 3 x 3 or 4 x 4 matrix"
+        f"{path}: holds {len(numbers)} numbers; expected width height fx fy cx cy, fx fy cx cy, or a 3 x 3 "
+        "or 4 x 4 matrix"
     )
+
+
+def _words(line: str) -> list[str]:
+    """The numbers of a line as text, without comment, brackets and separators."""
+    return re.sub(r"[\[\],;]", " ", line.split("#")[0]).split()
+
+
+def _line_of_numbers(text: str) -> int:
+    """The number, from 1, of the first line with numbers."""
+    return next(number for number, line in enumerate(text.splitlines(), start=1) if _words(line))
+
+
+def _camera_from_names(
+    values: dict[str, float], default: PinholeCamera, depth_files: Iterable[Path]
+) -> PinholeCamera:
+    missing = [name for name in ("fx", "fy", "cx", "cy") if name not in values]
+    if missing:
+        raise ConfigError(f"{', '.join(missing)} missing")
+    if values.get("skew", values.get("s", 0.0)) != 0.0:
+        raise ConfigError("the camera has skew; only cameras without skew can be used")
+    intrinsics = (values["fx"], values["fy"], values["cx"], values["cy"])
+    if "width" in values and "height" in values:
+        return _camera_from_numbers([values["width"], values["height"], *intrinsics])
+    return PinholeCamera(*_image_size(default, depth_files), *intrinsics)
 
 
 def _camera_from_numbers(numbers: list[float]) -> PinholeCamera:
@@ -100,15 +155,6 @@ def _camera_from_yaml(text: str, path: Path) -> PinholeCamera:
             if name not in values:
                 raise DatasetError(f"{path}: {name} is missing")
     return from_dict(PinholeCamera, values, str(path))
-
-
-def _camera_from_matrix(K: np.ndarray, default: PinholeCamera, depth_files: Iterable[Path]) -> PinholeCamera:
-    if K[0, 1] or K[1, 0] or tuple(K[2]) != (0.0, 0.0, 1.0):
-        raise ConfigError("not the matrix of a pinhole camera without skew: fx 0 cx / 0 fy cy / 0 0 1")
-    width, height = _image_size(default, depth_files)
-    return PinholeCamera(
-        width, height, fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2])
-    )
 
 
 def _image_size(default: PinholeCamera, depth_files: Iterable[Path]) -> tuple[int, int]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.depth_scale import PLAUSIBLE_MEDIAN_M, USUAL, Evidence, gather
 from taichi_mrf.datasets.images import read_color, read_depth
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
 from taichi_mrf.geometry.poses import Pose
@@ -34,12 +35,15 @@ class RecordedFrame:
 class Recording(Dataset):
     """Frames in files, read when asked for.
 
-    ``steps_per_metre`` is the scale of the depth images, ``sentinel`` a value of theirs that means no
-    measurement (beside 0).
+    ``steps_per_metre`` is the scale of the depth images and ``scale_source`` where it comes from; if it is
+    ``scale_assumed``, no file says so and :meth:`check_scale` may find another. ``sentinel`` is a value of
+    the images that means no measurement (beside 0).
     """
 
     frames: Sequence[RecordedFrame] = ()
     steps_per_metre: float = 1000.0
+    scale_source: str = "the format's"
+    scale_assumed: bool = False
     sentinel: int | None = None
     color: bool = True
     _names: list[str] = field(init=False, repr=False)
@@ -76,3 +80,57 @@ class Recording(Dataset):
         except DatasetError as error:
             raise FrameError(f"frame {recorded.name}: {error}") from error
         return Frame(depth_m, T_world_camera, self.camera, recorded.stamp, recorded.name, color)
+
+    def check_scale(self, poses_are_used: bool) -> list[str]:
+        """Compare neighbouring frames at the recorded poses, and note which scale is used and why.
+
+        An assumed scale is replaced by a usual one with which neighbouring frames agree clearly better; one
+        that a file or the caller gives is kept, and a note says that another would agree better.
+        """
+        own = self.steps_per_metre
+        found = gather(
+            len(self.frames) if poses_are_used else min(1, len(self.frames)),
+            lambda index: self.frames[index].read_pose(),
+            lambda index: read_depth(self.frames[index].depth_file, 1.0, self.sentinel, self.camera),
+            self.camera,
+            tuple(dict.fromkeys((own, *USUAL))),
+        )
+        notes = []
+        better = found.better_than(own)
+        if better is not None and self.scale_assumed:
+            self.steps_per_metre = better
+            notes.append(
+                f"depth: {better:g} steps per metre, found by comparing neighbouring frames at the recorded "
+                f"poses: their depths differ by {found.disagreement[better]:.1%}, by "
+                f"{found.disagreement[own]:.1%} at {own:g} ({self.scale_source}); --depth-scale sets another"
+            )
+        elif better is not None:
+            notes.append(
+                f"depth: {own:g} steps per metre ({self.scale_source}) do not fit the recorded poses: "
+                f"neighbouring frames differ by {found.disagreement[own]:.1%}, at {better:g} by "
+                f"{found.disagreement[better]:.1%}; check --depth-scale"
+            )
+        elif self.scale_assumed:
+            notes.append(
+                f"depth: {own:g} steps per metre ({self.scale_source}){_evidence(found, own)}; "
+                "--depth-scale sets another"
+            )
+        median_m = None if found.median is None else found.median / self.steps_per_metre
+        if median_m is not None and not PLAUSIBLE_MEDIAN_M[0] <= median_m <= PLAUSIBLE_MEDIAN_M[1]:
+            notes.append(
+                f"depth: {self.steps_per_metre:g} steps per metre make a median depth of {median_m:.3g} m, "
+                "which is not plausible; check --depth-scale"
+            )
+        return notes
+
+
+def _evidence(found: Evidence, steps_per_metre: float) -> str:
+    """What supports a scale, in words."""
+    words = []
+    if found.median is not None:
+        words.append(f"the median depth is {found.median / steps_per_metre:.2f} m")
+    if steps_per_metre in found.disagreement:
+        words.append(
+            f"neighbouring frames differ by {found.disagreement[steps_per_metre]:.1%} at the recorded poses"
+        )
+    return f": {', '.join(words)}" if words else ""

@@ -107,6 +107,7 @@ def _as_asked(dataset: Dataset, options: ReadOptions) -> Dataset:
     """Apply the options that all formats share: the caller's intrinsics, undistortion, every n-th pixel."""
     if options.intrinsics is not None:
         dataset.camera = PinholeCamera(dataset.camera.width, dataset.camera.height, *options.intrinsics)
+    dataset.notes += dataset.check_scale(not (dataset.tracked or options.track))
     distortion = dataset.distortion if options.undistort is None else options.undistort
     picked = resampled(dataset, distortion, options.stride)
     picked.tracked = dataset.tracked or options.track

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 from taichi_mrf.config.arguments import instance, real, whole
 from taichi_mrf.errors import ConfigError
 
+_NO_SKEW = 1e-6
+"""Entries of a camera matrix below this share of fx come from rounding."""
+
 
 @dataclass(frozen=True)
 class PinholeCamera:
@@ -35,6 +38,17 @@ class PinholeCamera:
                 raise ConfigError(f"camera {name} is not finite")
         if self.fx <= 0 or self.fy <= 0:
             raise ConfigError(f"camera focal lengths {self.fx}, {self.fy}: both must be positive")
+
+    @classmethod
+    def from_matrix(cls, width: int, height: int, K: NDArray[np.floating]) -> "PinholeCamera":
+        """The camera of a matrix (3, 3), fx 0 cx / 0 fy cy / 0 0 1. Raises ConfigError for one with skew or
+        of another form."""
+        fx = float(K[0, 0])
+        if abs(K[0, 1]) > _NO_SKEW * abs(fx):
+            raise ConfigError(f"the matrix has skew {K[0, 1]:g}; only cameras without skew can be used")
+        if abs(K[1, 0]) > _NO_SKEW * abs(fx) or np.abs(K[2] - (0.0, 0.0, 1.0)).max() > _NO_SKEW:
+            raise ConfigError("not the matrix of a pinhole camera: fx 0 cx / 0 fy cy / 0 0 1")
+        return cls(width, height, fx, float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
 
     @property
     def shape(self) -> tuple[int, int]:

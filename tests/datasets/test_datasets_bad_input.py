@@ -111,7 +111,10 @@ def test_a_time_gap_that_is_none(folder: Path) -> None:
         ("camera.yaml", "{width: wide, height: 12, fx: 1, fy: 1, cx: 1, cy: 1}", "width must be of type int"),
         ("camera.yaml", "[1, 2", "not valid YAML"),
         ("camera.yaml", "17", "expected a mapping"),
-        ("intrinsics.txt", "14 0.3 7.5\n0 15 5.5\n0 0 1", "without skew"),
+        ("camera-intrinsics.txt", "fx: 14\nfy: 15\ncx: 7.5\ncy: 5.5\nskew: 0.3", "skew"),
+        ("camera-intrinsics.txt", "fx: 14\nfy: 15\ncx: 7.5", "cy missing"),
+        ("K.txt", "14 0 7.5\n0 15 5.5\n0 0 2", "not the matrix of a pinhole camera"),
+        ("intrinsics.txt", "# K\n14 0.3 7.5\n0 15 5.5\n0 0 1", "line 2: the matrix has skew 0.3"),
     ],
 )
 def test_a_camera_file_that_makes_no_sense(folder: Path, file: str, text: str, problem: str) -> None:

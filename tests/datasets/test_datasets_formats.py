@@ -17,6 +17,7 @@ from datasets_recordings import (
 )
 
 from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -109,11 +110,21 @@ def test_the_callers_word_wins(tmp_path: Path, name: str) -> None:
     ],
 )
 def test_an_assumed_camera_is_noted(tmp_path: Path, name: str, folder: str, expected: PinholeCamera) -> None:
-    path = FORMATS[name][0](tmp_path / folder, Content(2))
+    path = FORMATS[name][0](tmp_path / folder, Content(2, (480, 640)))
     (path / "camera.txt").unlink()
     dataset = open_dataset(path)
     assert dataset.camera == expected
     assert any("assumed" in note and f"fx {expected.fx:g}" in note for note in dataset.notes)
+
+
+def test_images_of_another_size_than_the_assumed_camera(tmp_path: Path) -> None:
+    folder = write_house(tmp_path / "recording", Content(2))
+    (folder / "camera.txt").unlink()
+    with pytest.raises(
+        DatasetError, match=r"16 x 12 pixels, .* Redwood has 640 x 480, .*--camera fx,fy,cx,cy"
+    ):
+        open_dataset(folder)
+    assert open_dataset(folder, intrinsics=(14, 15, 7.5, 5.5)).camera == CAMERA
 
 
 @pytest.mark.parametrize(
@@ -123,6 +134,11 @@ def test_an_assumed_camera_is_noted(tmp_path: Path, name: str, folder: str, expe
         ("camera.yaml", "{width: 16, height: 12, fx: 14, fy: 15.0, cx: 7.5, cy: 5.5}", CAMERA),
         ("camera-intrinsics.txt", "14 0 7.5\n0 15 5.5\n0 0 1", CAMERA),
         ("intrinsics.txt", "1.4e1 0 7.5\n0 15 5.5\n0 0 1", CAMERA),
+        ("K.txt", "[14, 0, 7.5]\n[0, 15, 5.5]\n[0, 0, 1]", CAMERA),
+        ("cam_K.txt", "14 0 7.5 0\n0 15 5.5 0\n0 0 1 0", CAMERA),
+        ("intrinsic.txt", "14 15 7.5 5.5", CAMERA),
+        ("camera_intrinsics.txt", "fx: 14\nfy: 15\ncx = 7.5\ncy = 5.5", CAMERA),
+        ("../camera-intrinsics.txt", "14 0 7.5\n0 15 5.5\n0 0 1", CAMERA),
     ],
 )
 def test_camera_files(tmp_path: Path, file: str, text: str, expected: PinholeCamera) -> None:
@@ -131,7 +147,7 @@ def test_camera_files(tmp_path: Path, file: str, text: str, expected: PinholeCam
     (folder / file).write_text(text)
     dataset = open_dataset(folder)
     assert dataset.camera == expected
-    assert not any("assumed" in note for note in dataset.notes)
+    assert not any("assumed the camera" in note for note in dataset.notes)
     assert dataset.read(1).depth_m.shape == (12, 16)
 
 

@@ -73,8 +73,8 @@ def test_scannet_leaves_out_what_was_not_tracked(tmp_path: Path, content: Conten
     assert "lost in all 5 images" in refused(folder)
 
 
-def test_scannets_own_camera_is_assumed_without_a_file(tmp_path: Path, content: Content) -> None:
-    folder = write_scannet(tmp_path, content)
+def test_scannets_own_camera_is_assumed_without_a_file(tmp_path: Path) -> None:
+    folder = write_scannet(tmp_path, Content(2, (480, 640)))
     (folder / "intrinsic/intrinsic_depth.txt").unlink()
     dataset = open_dataset(folder)
     assert dataset.camera.fx == pytest.approx(577.87, abs=0.01)
@@ -90,7 +90,8 @@ def test_replica(tmp_path: Path, content: Content, place: str) -> None:
     assert dataset.notes == []
 
 
-def test_replica_that_is_not_whole(tmp_path: Path, content: Content) -> None:
+def test_replica_that_is_not_whole(tmp_path: Path) -> None:
+    content = Content(2, (680, 1200))
     folder = write_replica(tmp_path, content, tmp_path / "cam_params.json")
     (folder / "cam_params.json").write_text('{"camera": {"w": 16}}')
     assert "cam_params.json: camera needs the numbers w, h" in refused(folder)
@@ -124,7 +125,8 @@ def test_open3d_with_a_json(tmp_path: Path, content: Content, kind: str) -> None
     (folder / "trajectory.json").write_text(json.dumps({"class_name": kind, **values}))
     dataset = open_dataset(folder)
     assert_same(dataset, content, 1000.0, colored=True)
-    assert dataset.notes == []
+    (note,) = dataset.notes
+    assert note.startswith("depth: 1000 steps per metre (assumed as Redwood has it)")
 
 
 @pytest.mark.parametrize(
@@ -186,7 +188,7 @@ def test_a_folder_of_npz_is_one_sequence(tmp_path: Path, content: Content) -> No
     dataset = open_dataset(tmp_path)
     assert list(dataset.frame_names) == ["a-000000", "a-000001", "b2", "b3", "b4"]
     assert_same(dataset, content, 1000.0, colored=True)
-    write_npz(tmp_path / "c.npz", {**both, "K": 2 * K})
+    write_npz(tmp_path / "c.npz", {**both, "K": np.diag([2, 2, 1]) @ K})
     assert "c.npz: has another camera than a.npz" in refused(tmp_path)
 
 
@@ -204,7 +206,9 @@ def test_missing_depth_is_zero(tmp_path: Path, content: Content) -> None:
         ({"T_world_camera": None}, "T_world_camera is missing"),
         ({"K": None}, "needs K (3, 3), or fx, fy, cx, cy; fx, fy, cx, cy missing"),
         ({"K": np.eye(4)}, "K is (4, 4)"),
-        ({"K": np.zeros((3, 3))}, "both must be positive"),
+        ({"K": np.zeros((3, 3))}, "K: not the matrix of a pinhole camera"),
+        ({"K": K + 0.5 * np.eye(3, k=1) * (np.arange(3) == 1)}, "K: the matrix has skew 0.5"),
+        ({"stamp": np.array([0.0, 0.1, np.nan, 0.3, 0.4])}, "stamp of frame 2 is nan"),
         ({"T_world_camera": np.zeros((4, 4, 4))}, "T_world_camera is (4, 4, 4); expected (5, 4, 4)"),
         ({"T_world_camera": np.zeros(3)}, "T_world_camera is (3,)"),
         ({"depth_m": np.zeros((5, 12))}, None),

@@ -182,7 +182,7 @@ def refused(source: str, **options: float) -> str:
         ("?poses={poses}&seed", "name=value"),
         ("?poses={poses}&=3", "name=value"),
         ("?poses={poses}&seed=[", "name=value"),
-        ("?poses={poses}.gone", "poses.txt.gone: cannot be read"),
+        ("?poses={poses}.gone", "poses.txt.gone: there is no such file"),
     ],
 )
 def test_wrong_options(files: tuple[Path, Path], query: str, problem: str) -> None:

@@ -22,14 +22,15 @@ class Content:
     """What the frames of a recording hold: raw 16-bit depth, colour, and poses."""
 
     count: int = 5
+    size: tuple[int, int] = SIZE
     depth: list[NDArray[np.uint16]] = field(init=False)
     color: list[NDArray[np.uint8]] = field(init=False)
     poses: list[Pose] = field(init=False)
 
     def __post_init__(self) -> None:
         random = np.random.default_rng(self.count)
-        self.depth = [random.integers(400, 9000, SIZE).astype(np.uint16) for _ in range(self.count)]
-        self.color = [random.integers(0, 256, (*SIZE, 3)).astype(np.uint8) for _ in range(self.count)]
+        self.depth = [random.integers(400, 9000, self.size).astype(np.uint16) for _ in range(self.count)]
+        self.color = [random.integers(0, 256, (*self.size, 3)).astype(np.uint8) for _ in range(self.count)]
         self.poses = [look_at(random.normal(size=3), random.normal(size=3)) for _ in range(self.count)]
         for image in self.depth:
             image[0, 0] = 0

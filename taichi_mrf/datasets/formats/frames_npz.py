@@ -141,6 +141,11 @@ def _read_part(path: Path, options: ReadOptions) -> Part:
         )
         if stamps.shape != (count,):
             raise DatasetError(f"{path}: {STAMP} is {stamps.shape}; expected ({count},)")
+        if not np.isfinite(stamps).all():
+            first = int(np.flatnonzero(~np.isfinite(stamps))[0])
+            raise DatasetError(
+                f"{path}: {STAMP} of frame {first} is {stamps[first]:g}; stamps must be finite"
+            )
         if COLOR in file:
             found, kind = file.header(COLOR)
             if found != (*shape, 3) or kind != np.uint8:
@@ -164,7 +169,10 @@ def _camera(path: Path, file: NpzFile, width: int, height: int, options: ReadOpt
         K = _numbers(file, path, MATRIX)
         if K.shape != (3, 3):
             raise DatasetError(f"{path}: {MATRIX} is {K.shape}; expected (3, 3)")
-        intrinsics = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+        try:
+            return PinholeCamera.from_matrix(width, height, K)
+        except ConfigError as error:
+            raise DatasetError(f"{path}: {MATRIX}: {error}") from error
     else:
         missing = [name for name in names if name not in file]
         if missing:

@@ -74,6 +74,8 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         dropped=len(images) - len(frames),
         frames=frames,
         steps_per_metre=options.depth_scale or (1000.0 if trajectory.layout == "log" else 5000.0),
+        scale_source="--depth-scale" if options.depth_scale else f"assumed as {name} has it",
+        scale_assumed=options.depth_scale is None,
         color=options.color,
     )
 

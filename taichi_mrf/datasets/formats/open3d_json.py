@@ -66,8 +66,8 @@ def _pose(path: Path, index: int, entry: Any) -> RecordedPose:
 def _camera(path: Path, values: Any) -> PinholeCamera:
     try:
         width, height = int(values["width"]), int(values["height"])
-        fx, _, _, _, fy, _, cx, cy, _ = map(float, values["intrinsic_matrix"])
-        return PinholeCamera(width, height, fx, fy, cx, cy)
+        columns = np.array([float(value) for value in values["intrinsic_matrix"]]).reshape(3, 3)
+        return PinholeCamera.from_matrix(width, height, columns.T)
     except ConfigError as error:
         raise DatasetError(f"{path}: {error}") from error
     except (KeyError, TypeError, ValueError, OverflowError):

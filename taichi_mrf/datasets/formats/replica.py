@@ -56,6 +56,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         notes=notes,
         frames=[_frame(path, pose) for path, pose in zip(images, trajectory.poses, strict=True)],
         steps_per_metre=options.depth_scale or steps,
+        scale_source="--depth-scale" if options.depth_scale else str(parameters or NAME),
         color=options.color,
     )
 

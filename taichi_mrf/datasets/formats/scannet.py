@@ -45,9 +45,11 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     tracked = [path for path in images if not _lost(folder / "pose" / f"{path.stem}.txt")]
     if not tracked:
         raise DatasetError(f"{folder / 'pose'}: tracking was lost in all {len(images)} images")
-    camera, notes = find_camera(folder, options, CAMERA, NAME, iter(tracked))
     if options.camera is None and options.intrinsics is None and (folder / INTRINSICS).is_file():
-        camera, notes = read_camera(folder / INTRINSICS, CAMERA, iter(tracked)), []
+        camera = read_camera(folder / INTRINSICS, CAMERA, iter(tracked))
+        notes: list[str] = []
+    else:
+        camera, notes = find_camera(folder, options, CAMERA, NAME, iter(tracked))
     dropped = len(images) - len(tracked)
     if dropped:
         notes.append(f"{dropped} of {len(images)} images dropped: tracking was lost")
@@ -58,6 +60,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         dropped=dropped,
         frames=[_frame(folder, path) for path in tracked],
         steps_per_metre=options.depth_scale or STEPS_PER_METRE,
+        scale_source="--depth-scale" if options.depth_scale else NAME,
         color=False,
     )
 

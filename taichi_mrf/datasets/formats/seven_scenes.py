@@ -46,6 +46,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         notes=notes,
         frames=frames,
         steps_per_metre=options.depth_scale or STEPS_PER_METRE,
+        scale_source="--depth-scale" if options.depth_scale else NAME,
         sentinel=NO_DEPTH,
         color=options.color,
     )

@@ -79,6 +79,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         dropped=dropped,
         frames=frames,
         steps_per_metre=options.depth_scale or STEPS_PER_METRE,
+        scale_source="--depth-scale" if options.depth_scale else NAME,
         color=options.color,
     )
 

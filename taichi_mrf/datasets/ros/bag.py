@@ -162,7 +162,7 @@ def _camera(
     if options.intrinsics is not None:
         return PinholeCamera(*_size(reader, depth), *options.intrinsics), ()
     if not (wanted or depth.info):
-        raise DatasetError(f"{reader.path}: holds no CameraInfo: --camera fx,fy,cx,cy says what it would")
+        raise DatasetError(f"{reader.path}: contains no CameraInfo; pass --camera fx,fy,cx,cy")
     name = choose(reader, "info", wanted, depth.info, f"topics of the CameraInfo of {depth.name}")
     message = reader.first(name)
     if message is None or reader.topics[name].type != messages.CAMERA_INFO:

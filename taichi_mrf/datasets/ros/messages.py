@@ -109,11 +109,9 @@ def camera_of(info: Any, rectified: bool) -> tuple[PinholeCamera, tuple[float, .
     K, D, P = (_field(info, name) for name in "kdp")
     matrix = P.reshape(3, 4)[:, :3] if rectified and P.any() else K.reshape(3, 3)
     if matrix[0, 0] == 0:
-        raise DatasetError("is not calibrated (K is zero): --camera fx,fy,cx,cy says what it would")
+        raise DatasetError("is not calibrated (K is zero); pass --camera fx,fy,cx,cy")
     try:
-        camera = PinholeCamera(
-            int(info.width), int(info.height), *(float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        )
+        camera = PinholeCamera.from_matrix(int(info.width), int(info.height), matrix)
     except ConfigError as error:
         raise DatasetError(str(error)) from error
     if rectified or not D.any():

@@ -146,6 +146,8 @@ def _stamps(folder: Path, described: RigFile, left: Sequence[Path]) -> list[floa
         values = [float(image.stem) for image in left]
     except ValueError:
         return None
+    if not np.isfinite(values).all():  # a file called nan.png
+        return None
     whole = all(image.stem.isdecimal() for image in left)
     if whole:
         return [v / 1e9 for v in values] if len(left[0].stem) >= _NANOSECOND_DIGITS else None

@@ -1,0 +1,125 @@
+"""Whether the steps per metre of a recording's depth images agree with its poses.
+
+A 16-bit image does not say its unit. Between two poses some centimetres apart a surface moves in the image
+by focal length * baseline / depth: only with the right scale do the depths of neighbouring frames agree.
+Where a scale is assumed and not recorded, this decides between the usual ones; otherwise it only warns.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.errors import DatasetError, KeyframeError
+from taichi_mrf.geometry.poses import Pose, inverse
+from taichi_mrf.sensor.camera import PinholeCamera
+
+USUAL = (1000.0, 5000.0)
+"""Steps per metre of millimetres (Kinect, RealSense, Redwood) and of TUM RGB-D and ICL-NUIM."""
+
+PLAUSIBLE_MEDIAN_M = (0.1, 100.0)
+"""A median depth outside of this is doubted."""
+
+_PLACES = 4
+_LEAST_BASELINE_M, _LARGEST_TURN = 0.1, 0.5
+_FARTHEST_NEIGHBOUR = 60
+_SAMPLES = 4000
+_LEAST_SAMPLES = 200
+_AGREES, _TIMES_BETTER = 0.03, 2.0
+
+Image = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """``median`` is the median raw value of the images that were looked at, None if all are empty.
+    ``disagreement`` is, by steps per metre, the median relative difference of the depths of neighbouring
+    frames; it is empty where no two frames tell."""
+
+    median: float | None
+    disagreement: dict[float, float]
+
+    def better_than(self, steps_per_metre: float) -> float | None:
+        """A scale with which neighbouring frames agree clearly better than with this one, or None."""
+        if steps_per_metre not in self.disagreement:
+            return None
+        best = min(self.disagreement, key=self.disagreement.__getitem__)
+        found, given = self.disagreement[best], self.disagreement[steps_per_metre]
+        return best if found <= _AGREES and given >= _TIMES_BETTER * found and given > _AGREES / 3 else None
+
+
+def gather(
+    frames: int,
+    read_pose: Callable[[int], Pose],
+    read_steps: Callable[[int], Image],
+    camera: PinholeCamera,
+    candidates: Sequence[float],
+) -> Evidence:
+    """Compare neighbouring frames at a few places of a recording.
+
+    ``read_steps`` gives the raw depth image (H, W) of a frame, 0 where there is no measurement. Frames that
+    cannot be read (DatasetError, KeyframeError) are passed over.
+    """
+    medians, differences = [], []
+    for first in np.unique(np.linspace(0, frames - 1, _PLACES + 1).astype(int)[:-1] if frames else []):
+        try:
+            T_first, steps = read_pose(int(first)), read_steps(int(first))
+        except (DatasetError, KeyframeError):
+            continue
+        if steps.shape != camera.shape or not (steps > 0).any():
+            continue
+        medians.append(float(np.median(steps[steps > 0])))
+        neighbour = _neighbour(int(first), frames, T_first, read_pose)
+        if neighbour is None:
+            continue
+        second, T_second_first = neighbour
+        try:
+            other = read_steps(second)
+        except DatasetError:
+            continue
+        if other.shape == camera.shape:
+            found = [_difference(steps, other, T_second_first, camera, scale) for scale in candidates]
+            if not any(np.isnan(found)):
+                differences.append(found)
+    median = float(np.median(medians)) if medians else None
+    if not differences:
+        return Evidence(median, {})
+    return Evidence(median, dict(zip(candidates, np.median(differences, axis=0).tolist(), strict=True)))
+
+
+def _neighbour(
+    first: int, frames: int, T_world_first: Pose, read_pose: Callable[[int], Pose]
+) -> tuple[int, Pose] | None:
+    """The next frame that was taken far enough away to tell, and not turned too far; T_second_first."""
+    for second in range(first + 1, min(frames, first + _FARTHEST_NEIGHBOUR)):
+        try:
+            T = inverse(read_pose(second)) @ T_world_first
+        except (DatasetError, KeyframeError):
+            continue
+        if np.linalg.norm(T[:3, 3]) >= _LEAST_BASELINE_M:
+            turn = np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1))
+            return (second, T) if turn <= _LARGEST_TURN else None
+    return None
+
+
+def _difference(
+    first: Image, second: Image, T_second_first: Pose, camera: PinholeCamera, scale: float
+) -> float:
+    """The median of |expected - measured| / measured over the pixels of the first image that the second one
+    sees too; NaN if they are few."""
+    v, u = np.nonzero(first > 0)
+    some = slice(None, None, max(1, len(v) // _SAMPLES))
+    v, u = v[some], u[some]
+    points = camera.rays()[v, u] * (first[v, u] / scale)[:, None]
+    x, y, z = (points @ T_second_first[:3, :3].T + T_second_first[:3, 3]).T
+    ahead = z > 1e-3
+    x, y, z = x[ahead], y[ahead], z[ahead]
+    column = np.rint(camera.fx * x / z + camera.cx)
+    row = np.rint(camera.fy * y / z + camera.cy)
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    seen = second[row[inside].astype(int), column[inside].astype(int)] / scale
+    both = seen > 0
+    if both.sum() < min(_LEAST_SAMPLES, len(v) // 4):
+        return float("nan")
+    return float(np.median(np.abs(z[inside][both] - seen[both]) / seen[both]))
