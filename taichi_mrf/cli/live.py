@@ -35,10 +35,10 @@ def run_live(options: Live) -> int:
         page = _Page(options, say, bar, stack)
         let_the_page_go_first()
         # Imported late: the page starts meanwhile, in a process of its own.
-        from taichi_mrf.live.files import write_all
-        from taichi_mrf.live.open_source import open_source
         from taichi_mrf.live.run import Policy
         from taichi_mrf.live.session import Session
+        from taichi_mrf.live.source import open_source
+        from taichi_mrf.runs.folder import write_run
 
         source, notes = open_source(
             options.source,
@@ -57,10 +57,16 @@ def run_live(options: Live) -> int:
         with bar:
             problem = _run(session.run, session.reconnect, page, request)
         if options.out is not None:
-            track = session.state.track if source.tracked else None
-            if track is not None:
-                say(f"tracking: {len(track.frames)} frames found, {track.lost} lost")
-            for path in write_all(session.state.mapper.map, source.config, options.out, track):
+            state = session.state
+            result = state.result()
+            if result.track is not None:
+                say(f"tracking: {len(result.track.frames)} frames found, {result.track.lost} lost")
+            # A user who stops the run does not wait for the check and the pictures.
+            whole = request.signal is None and not result.interrupted
+            _, written = write_run(
+                options.out, result, state.facts, check=whole, pictures=whole, haste=request
+            )
+            for path in written:
                 say(f"wrote {path}")
     if problem is not None:
         raise TaichiMRFError(problem)

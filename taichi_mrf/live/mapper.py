@@ -10,19 +10,18 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
-from taichi_mrf.inference.schedule import InferProgress
+from taichi_mrf.inference.schedule import InferProgress, InferReport, Progress
 from taichi_mrf.live.live_keyframes import Entry, LiveKeyframes
 from taichi_mrf.live.pictures import thumbnail
 from taichi_mrf.live.publish import Publisher
 from taichi_mrf.live.ray_answers import PosedDepthImage
 from taichi_mrf.mapping.freezing import surplus
-from taichi_mrf.mapping.refinement import refiner_of
+from taichi_mrf.mapping.intake import Added
+from taichi_mrf.mapping.refinement import PoseRefiner
 from taichi_mrf.methods.capabilities import can_freeze, has_messages
 from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap
-from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.viewer import messages
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 
@@ -43,11 +42,11 @@ class Mapper:
     before its inference was complete.
     """
 
-    def __init__(self, m: OccupancyMap, first_id: int = 0, poses: PoseConfig | None = None) -> None:
-        """A map that may have keyframes already; the viewer's numbers begin at ``first_id``. Raises
-        ConfigError if ``poses`` asks for what the map cannot do."""
-        self.map = m
-        self.refiner = refiner_of(m, poses or PoseConfig())
+    def __init__(self, m: OccupancyMap, first_id: int = 0, refiner: PoseRefiner | None = None) -> None:
+        """A map that may have keyframes already; the viewer's numbers begin at ``first_id``. ``refiner``
+        refines the map's poses, None if they stay."""
+        self.map, self.refiner = m, refiner
+        self.inferred: InferReport | None = None
         self.roster = LiveKeyframes(next_id=first_id)
         for id, keyframe in m.keyframes.items():
             self.roster.add(keyframe, keyframe.rays, thumbnail(keyframe.depth_m), id)
@@ -71,17 +70,24 @@ class Mapper:
         """Whether the map shows nothing of the last edits until it is settled."""
         return self.map.stale
 
-    def take_in(self, frame: Frame) -> Entry:
-        """Add a frame as a keyframe, align it if poses are refined, and sweep it once. Raises what the map
-        raises, and is then unchanged."""
-        refiner = self.refiner
-        place = self._sweep_id if refiner is None else refiner.place
-        map_id = self._add(frame.depth_m, frame.T_world_camera, frame, place)
+    def enter(self, added: Added) -> Entry:
+        """Enter a keyframe that the intake has added to the map."""
         self.unsettled = self.unanswered = True
-        self.unaligned = refiner is not None
-        entry = self.roster.add(frame, self.map.keyframes[map_id].rays, thumbnail(frame.depth_m), map_id)
-        entry.T_world_camera = entry.T_home = self.map.keyframes[map_id].T_world_camera
+        self.unaligned = self.refiner is not None
+        frame = added.frame
+        entry = self.roster.add(frame, added.rays, thumbnail(frame.depth_m), added.keyframe)
+        entry.T_world_camera = entry.T_home = self.map.keyframes[added.keyframe].T_world_camera
         return entry
+
+    def sweep(self, map_id: int) -> None:
+        """Sweep a keyframe once, by its number in the map, unless the map has to be made anew anyway."""
+        if not self.stale:
+            self.map.infer(sweeps=1, keyframes=[map_id])
+
+    def sweep_all(self, progress: Progress) -> None:
+        """Sweep all keyframes that are on once, the oldest first."""
+        ids = [self._map_id(entry) for entry in self.roster.with_state("on")]
+        self.map.infer(sweeps=1, keyframes=ids, progress=progress)
 
     def switch(self, id: int, on: bool) -> Entry:
         """Take a keyframe out of the map, keeping its image, or bring it back. Raises KeyframeError."""
@@ -89,8 +95,7 @@ class Mapper:
         if on == (entry.state == "on"):
             return entry
         if on:
-            assert entry.depth_m is not None
-            entry.map_id = self._add(entry.depth_m, entry.T_world_camera, entry, self._sweep_id)
+            entry.map_id = self._add(entry)
             if self.refiner is not None:
                 self.refiner.know(entry.map_id, entry.T_recorded)
             entry.depth_m, entry.state = None, "on"
@@ -106,7 +111,7 @@ class Mapper:
         entry, T = self._changeable(id), as_pose(T_world_camera)
         if entry.state == "on":
             self.map.move_keyframe(self._map_id(entry), T)
-            self._sweep(entry)
+            self.sweep(self._map_id(entry))
             self.unsettled = self.edited = self.unanswered = True
         entry.T_world_camera, entry.moved_by_hand = T, True
         return entry
@@ -116,7 +121,7 @@ class Mapper:
         if np.array_equal(entry.T_world_camera, T_world_camera):
             return False
         self.map.move_keyframe(self._map_id(entry), T_world_camera)
-        self._sweep(entry)
+        self.sweep(self._map_id(entry))
         self.unsettled = True
         entry.T_world_camera = entry.T_home = T_world_camera
         return True
@@ -165,7 +170,8 @@ class Mapper:
 
         complete = False
         try:
-            complete = m.infer(progress=progress).complete
+            self.inferred = m.infer(progress=progress)
+            complete = self.inferred.complete
         except Exception:
             self.unsettled = self.lacks_messages = False  # or it would be tried again without end
             raise
@@ -205,33 +211,21 @@ class Mapper:
         entries.sort(key=lambda entry: float(np.linalg.norm(entry.T_world_camera[:3, 3] - point)))
         return map(self.seer, entries)
 
-    def _add(
-        self,
-        depth_m: NDArray[np.float32],
-        T_world_camera: Pose,
-        of: Frame | Entry,
-        place: Callable[[int], None],
-    ) -> int:
-        """Add a keyframe and ``place`` it, or leave nothing of it."""
-        map_id = self.map.add_keyframe(depth_m, T_world_camera, of.camera, of.name)
+    def _add(self, entry: Entry) -> int:
+        """Add a keyframe that was off, and sweep it once; leaves nothing of it if that fails."""
+        assert entry.depth_m is not None
+        map_id = self.map.add_keyframe(entry.depth_m, entry.T_world_camera, entry.camera, entry.name)
         try:
-            place(map_id)
+            self.sweep(map_id)
         except BaseException:
             self.map.remove_keyframe(map_id)
             raise
         return map_id
 
-    def _sweep(self, entry: Entry) -> None:
-        self._sweep_id(self._map_id(entry))
-
-    def _sweep_id(self, map_id: int) -> None:
-        if not self.stale:
-            self.map.infer(sweeps=1, keyframes=[map_id])
-
     def _changeable(self, id: int) -> Entry:
         entry = self.roster.find(id)
         if entry.state == "frozen":
-            raise KeyframeError(f"keyframe {id} ({entry.name}) is frozen")
+            raise KeyframeError(f"keyframe {id} ({entry.name}) is frozen: it stays in the map as it is")
         return entry
 
     def _map_id(self, entry: Entry) -> int:

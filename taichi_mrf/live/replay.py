@@ -1,26 +1,18 @@
 """When the next frame of a source is due: at the recording's own pace, faster, slower, or at once.
 
-A frame's stamp is known only once it has been read, so at a given pace the next frame is read ahead. Broken
-frames are handed out as what they are, and the one after them comes next.
+A frame's stamp is known only once it has been read, so at a given pace the next frame is read ahead. Instead
+of a frame that cannot be read an UnreadableFrame is handed out.
 """
 
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
+from taichi_mrf.mapping.intake import UnreadableFrame
 from taichi_mrf.mapping.selection import is_held_out
 from taichi_mrf.sensor.frame import Frame
-
-
-@dataclass(frozen=True)
-class BrokenFrame:
-    """A frame that cannot be read; with ``last`` none after it can be either, as with a lost camera."""
-
-    problem: str
-    last: bool = False
 
 
 class Replay:
@@ -43,13 +35,16 @@ class Replay:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """``speed`` is the multiple of the recording's own pace, 0 as fast as possible. One frame in
-        ``hold_out`` is left out, the same as in pipeline.map_sequence. ``clock`` tells the time in seconds.
+        ``hold_out`` is passed unread, the same as in pipeline.map_sequence. ``clock`` tells the time in
+        seconds.
         """
         self._dataset, self._clock = dataset, clock
         self._every, self._limit, self._loop, self._hold_out = every, limit, loop, hold_out
         self.number, self.paused, self.finished, self.problem = 0, False, False, ""
         self._next, self._readable = 1, False
-        self._ahead: Frame | BrokenFrame | None = None
+        self._ahead: Frame | UnreadableFrame | None = None
+        self.held_out: dict[int, None] = {}
+        """Dataset indices of the frames that were passed unread, to check the map against."""
         self._begin: tuple[float, float] | None = None
         """A moment, and the stamp that was due then."""
         self.set_speed(speed)
@@ -71,6 +66,11 @@ class Replay:
     def next_number(self) -> int:
         """The number of the frame that will be taken next."""
         return self._next
+
+    @property
+    def index(self) -> int:
+        """The dataset index of the frame taken last."""
+        return self._index(self.number)
 
     @property
     def speed(self) -> float:
@@ -99,14 +99,14 @@ class Replay:
             return 0.0
         if self._ahead is None:
             self._ahead = self._read()
-        if isinstance(self._ahead, BrokenFrame) or not math.isfinite(self._ahead.stamp):
+        if isinstance(self._ahead, UnreadableFrame) or not math.isfinite(self._ahead.stamp):
             return 0.0
         now, stamp = self._clock(), self._ahead.stamp
         if self._begin is None:
             self._begin = (now, stamp)
         return max(0.0, self._begin[0] + (stamp - self._begin[1]) / self._speed - now)
 
-    def take(self) -> Frame | BrokenFrame | None:
+    def take(self) -> Frame | UnreadableFrame | None:
         """The next frame, due or not; None after the last."""
         if self.finished:
             return None
@@ -115,20 +115,27 @@ class Replay:
         self._readable = self._readable or isinstance(frame, Frame)
         self.number, self._next = self._next, self._next + 1
         self._find_next()
-        if isinstance(frame, BrokenFrame) and frame.last:
+        if isinstance(frame, UnreadableFrame) and frame.last:
             self.finished, self.problem = True, frame.problem
         return frame
 
-    def _read(self) -> Frame | BrokenFrame:
-        index = (self._next - 1) * self._every
+    def _read(self) -> Frame | UnreadableFrame:
+        index = self._index(self._next)
         try:
             return self._dataset.read(index)
         except FrameError as error:
-            return BrokenFrame(str(error))
+            return UnreadableFrame(self._name(index), str(error))
         except DatasetError as error:
-            return BrokenFrame(str(error), last=True)
+            return UnreadableFrame(self._name(index), str(error), last=True)
         except Exception as error:  # a reader's own mistake must not end mapping
-            return BrokenFrame(f"{self._dataset.frame_names[index]}: cannot be read: {error}")
+            return UnreadableFrame(self._name(index), f"{self._name(index)}: cannot be read: {error}")
+
+    def _index(self, number: int) -> int:
+        return (number - 1) * self._every
+
+    def _name(self, index: int) -> str:
+        names = self._dataset.frame_names
+        return names[index] if index < len(names) else f"frame {index}"
 
     def _find_next(self) -> None:
         """Step over frames that are kept out, and into the next round if need be."""
@@ -141,4 +148,5 @@ class Replay:
                 self._next, self._readable, self._begin = 1, False, None
             if not is_held_out(self._next, self._hold_out):
                 return
+            self.held_out[self._index(self._next)] = None
             self._next += 1

@@ -1,16 +1,18 @@
 """What each request of the viewer does. Whatever goes wrong with one becomes a notice for the user."""
 
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from taichi_mrf.live.extras import Extras
-from taichi_mrf.live.files import file_content
 from taichi_mrf.live.live_keyframes import Entry
 from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.live.ray_answers import pixel_answer, point_answer
 from taichi_mrf.live.run import Run
+from taichi_mrf.runs.folder import MAP_FILE, VOXEL_FILE, write_report, write_voxel_file
 from taichi_mrf.viewer.messages import (
     File,
     Freeze,
@@ -29,9 +31,6 @@ from taichi_mrf.viewer.messages import (
     Switch,
     Watch,
 )
-
-EDITS = (Switch, Freeze, Move, Reset)
-"""Requests that change the map, and so cannot be carried out while it is being inferred."""
 
 
 def goes_on(request: Request) -> bool:
@@ -121,8 +120,17 @@ class Requests:
         self._run.send(pixel_answer(mapper.map, seer, request.u, request.v))
 
     def _save(self, request: Save) -> None:
-        run = self._run
-        name, content = file_content(request.kind, run.mapper.map, run.policy.out)
-        run.send(File(name, content, request.client))
-        if run.policy.out is not None:
-            run.send(Notice(f"{name} is in {run.policy.out}"))
+        """Send a file to the browser that asked for it; with --out it is also left in the run's folder, with
+        the report and the parameters."""
+        run, m, out = self._run, self._run.mapper.map, self._run.policy.out
+        with tempfile.TemporaryDirectory() as temporary:
+            path = (out or Path(temporary)) / (MAP_FILE if request.kind == "map" else VOXEL_FILE)
+            if request.kind == "map":
+                m.save(path)
+            else:
+                write_voxel_file(path, m)
+            if out is not None:
+                write_report(out, run.result(), run.facts)
+            run.send(File(path.name, path.read_bytes(), request.client))
+        if out is not None:
+            run.send(Notice(f"{path.name} is in {out}"))

@@ -1,44 +1,22 @@
 """The state of a live run: what is mapped, what has come of it, and who watches."""
 
-from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from taichi_mrf.config.schema import Config, to_yaml
-from taichi_mrf.errors import CapacityError, LostFrameError
+from taichi_mrf.config.schema import to_yaml
+from taichi_mrf.errors import CapacityError
 from taichi_mrf.live.link import Link
-from taichi_mrf.live.live_keyframes import Entry
 from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.live.progress import Progress
 from taichi_mrf.live.replay import Replay
-from taichi_mrf.mapping.tracking import Track, tracker_of
-from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.live.session_core import SessionCore
+from taichi_mrf.live.source import Source, saved_unsettled
+from taichi_mrf.mapping.intake import Intake
+from taichi_mrf.mapping.result import MappingResult
+from taichi_mrf.runs.folder import RunFacts
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system import runtime
-from taichi_mrf.viewer.messages import CurrentCamera, Hello, KeyframeInfo, Notice, Request, Update
-
-WAY_BACK = "bring the camera back to where it was then, or to where it started"
-
-
-def saved_unsettled(name: str) -> str:
-    """What a user is told of a saved map whose inference was interrupted."""
-    return (
-        f"{name} was saved before its inference was complete. It is shown as it was saved; "
-        "inference over all keyframes now completes it."
-    )
-
-
-@dataclass(frozen=True)
-class Source:
-    """What is mapped: how to make its map (an empty one, or one from a file), and how to replay its frames,
-    which a saved map has not. ``tracked`` says that their poses are to be found."""
-
-    name: str
-    config: Config
-    new_map: Callable[[], OccupancyMap]
-    new_replay: Callable[[], Replay] | None = None
-    tracked: bool = False
+from taichi_mrf.viewer.messages import CurrentCamera, Hello, KeyframeInfo, Notice
 
 
 @dataclass(frozen=True)
@@ -52,21 +30,20 @@ class Policy:
     leave_when_done: bool = False
 
 
-class Run:
-    """One live run. ``mapper`` holds the map; ``replay`` the frames, None if there are none to come.
+class Run(SessionCore):
+    """One live run. ``mapper`` holds the map, ``intake`` takes frames into it; ``replay`` has the frames,
+    None if there are none to come.
 
-    ``stepping`` says that one more keyframe is to be taken whatever the pace, ``ended`` that the run is over,
-    ``current`` is the frame that was read last. ``waiting`` are the requests that have not been carried out.
-    ``tracker`` finds the poses of a tracked source, and ``track`` remembers them for ``policy.out``.
-    ``version`` changes with the map that is shown and with the current camera. ``full`` says why the last
-    frame found no room in the map, None if it did.
+    ``stepping`` says that one more keyframe is to be taken whatever the pace, ``current`` is the frame that
+    was read last. ``version`` changes with the map that is shown and with the current camera. ``full`` says
+    why the last frame found no room in the map, None if it did.
     """
 
     def __init__(self, source: Source, link: Link, policy: Policy) -> None:
         """Makes the map. Raises TaichiMRFError."""
-        self.source, self.link, self.policy = source, link, policy
-        self.waiting: deque[Request] = deque()
-        self.ended, self.version = False, 0
+        super().__init__(link)
+        self.source, self.policy = source, policy
+        self.version = 0
         self.full: str | None = None
         self.replay: Replay | None = None
         self.begin(first_id=0)
@@ -75,21 +52,28 @@ class Run:
         """Forget the map, if there is one, and start the source from its beginning, at the speed in
         force. The viewer's numbers of keyframes begin at ``first_id``. What is raised leaves the old map in
         place."""
-        poses = self.source.config.poses
-        self.mapper = Mapper(self.source.new_map(), first_id, poses)
-        self.tracker = tracker_of(self.mapper.map, poses) if self.source.tracked else None
-        self.track = Track()
-        replay = self.source.new_replay() if self.source.new_replay else None
+        source = self.source
+        intake = Intake(
+            source.new_map(),
+            source.config,
+            tracked=source.tracked,
+            hold_out=source.hold_out,
+            sweep=lambda id: self.mapper.sweep(id),
+            remember_frames=self.policy.out is not None,
+            before_adding=self._show_adding,
+        )
+        replay = source.new_replay() if source.new_replay else None
         if replay is not None and self.replay is not None:
             replay.set_speed(self.replay.speed)
-        self.replay = replay
+        self.intake, self.replay = intake, replay
+        self.mapper = Mapper(intake.map, first_id, intake.refiner)
         self.progress = Progress()
         self.current: Frame | None = None
         self.stepping, self.full = False, None
         self.greet()
 
     def greet(self) -> None:
-        """Tell a viewer that knows nothing yet all that there is."""
+        """Send a viewer that has just started the whole state."""
         m, backend = self.mapper.map, runtime.choice()
         self.send(
             Hello(
@@ -126,61 +110,41 @@ class Run:
         self.version += 1
         self.send(CurrentCamera(frame.name, frame.T_world_camera, frame.camera))
 
-    def located(self, frame: Frame) -> Frame | None:
-        """The frame where it was taken; None if that cannot be found out, of which the viewer is told when it
-        begins and when it is over."""
-        if self.tracker is None:
-            return frame
-        lost = self.tracker.lost
-        try:
-            found, tracked = self.tracker.follow(frame)
-        except LostFrameError as error:
-            self.track.lost += 1
-            if not lost:
-                self.send(Notice(f"{error}; {WAY_BACK}", "warning"))
-            return None
-        if lost:
-            self.send(Notice(f"{frame.name}: tracking goes on after {lost} lost frames"))
-        if self.policy.out is not None:
-            self.track.frames[len(self.track.frames)] = tracked
-        return found
-
-    def tracked_keyframe(self, entry: Entry) -> None:
-        """The frame that was located last has become a keyframe."""
-        if self.tracker is not None and entry.map_id is not None:
-            tracked = self.tracker.took(entry.map_id)
-            if self.track.frames:
-                self.track.frames[len(self.track.frames) - 1] = tracked
-
     def describe(self, id: int) -> KeyframeInfo:
         """What the viewer must know of a keyframe."""
         return self.mapper.describe(self.mapper.roster.find(id))
 
-    def send(self, update: Update) -> None:
-        """Pass an update to the viewer."""
-        self.link.send(update)
-
-    def tell(self, activity: str, share: float, edits_wait: bool = False) -> None:
+    def tell(self, activity: str, share: float) -> None:
         """Tell the viewer what is being done, and how much of that is."""
-        self.send(self.progress.status(activity, share, self.replay, self.mapper, edits_wait))
+        waiting = self.inbox.has_edits()
+        self.send(self.progress.status(activity, share, self.replay, self.mapper, waiting))
 
     def notice_error(self, error: Exception) -> None:
-        """Tell the viewer that something went wrong; a map that is full also pauses the replay."""
-        self.send(Notice(" ".join(str(error).split()) or type(error).__name__, "error"))
+        """Tell the viewer what went wrong; a map that is full also pauses the replay."""
+        super().notice_error(error)
         if isinstance(error, CapacityError) and self.replay is not None:
             self.full = str(error)
             self.replay.pause()
             self.stepping = False
 
-    def guarded(self, work: Callable[[], None]) -> bool:
-        """Do some work; what goes wrong with one frame or one request must not end mapping, and becomes a
-        notice. Returns whether it went well."""
-        try:
-            work()
-        except Exception as error:
-            self.notice_error(error)
-            return False
-        return True
+    def result(self) -> MappingResult:
+        """What the run has made so far, as a batch run reports it."""
+        result, replay, inferred = self.intake.result, self.replay, self.mapper.inferred
+        result.interrupted, result.full = not self.is_done, self.full
+        if replay is not None:
+            result.frames = replay.frames if replay.finished and replay.frames else replay.number
+            if not self.source.tracked:
+                result.held_out = list(replay.held_out)
+        if inferred is not None:
+            result.sweeps, result.residual = inferred.sweeps, inferred.residual
+        if self.mapper.refiner is not None:
+            result.poses = self.mapper.refiner.changes()
+        return result
+
+    @property
+    def facts(self) -> RunFacts:
+        """What else the run's report says."""
+        return RunFacts(self.source.name, self.source.config, self.source.dataset, self.source.choice)
 
     @property
     def has_frames_left(self) -> bool:
@@ -209,3 +173,7 @@ class Run:
         if self.replay.finished:
             return self.replay.problem or "done: the map is up to date"
         return "waiting: paused" if self.replay.paused else "waiting for the next frame"
+
+    def _show_adding(self, frame: Frame) -> None:
+        self.show_camera(frame)
+        self.tell(f"adding {frame.name}", self.replay.share if self.replay else 0.0)

@@ -13,26 +13,34 @@ One thread does all of it, one piece after the other, because Taichi has one own
     else wait
 """
 
-from collections import deque
+import time
 from collections.abc import Callable
 
 from taichi_mrf.errors import CapacityError
-from taichi_mrf.inference.schedule import InferProgress
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.inference.schedule import InferProgress, Progress
 from taichi_mrf.live.extras import Extras
 from taichi_mrf.live.link import Link
-from taichi_mrf.live.live_keyframes import Entry
 from taichi_mrf.live.progress import sweeping
-from taichi_mrf.live.replay import BrokenFrame, Replay
-from taichi_mrf.live.requests import EDITS, Requests, goes_on
-from taichi_mrf.live.rounds import Rounds
-from taichi_mrf.live.run import Policy, Run, Source
-from taichi_mrf.mapping.selection import KeyframeSelector
-from taichi_mrf.mapping.tracking import keyframe_steps
+from taichi_mrf.live.replay import Replay
+from taichi_mrf.live.requests import Requests, goes_on
+from taichi_mrf.live.run import Policy, Run
+from taichi_mrf.live.session_core import EDITS, WAIT_SECONDS
+from taichi_mrf.live.source import Source
+from taichi_mrf.mapping.intake import Added, Full, Lost, Skipped, UnreadableFrame
+from taichi_mrf.mapping.refinement import PoseRefiner
+from taichi_mrf.mapping.rounds import AlignmentRounds, RoundStep
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.viewer.messages import Listening, Notice, Request
 
-WAIT_SECONDS = 0.25
-"""So long at most it takes until a signal is noticed while there is nothing to do."""
+REQUEST_SECONDS = 0.25
+"""While frames come, requests are carried out for so long at most before the next frame is taken: many
+clients cannot stop mapping."""
+
+ASK_SECONDS = 0.05
+"""Between two pairs of keyframes that are aligned, requests are looked at so often, at most."""
+
+WAY_BACK = "bring the camera back to where it was then, or to where it started"
 
 
 class Session:
@@ -50,28 +58,27 @@ class Session:
         self.state = Run(source, link, policy)
         self._extras = Extras(self.state)
         self._requests = Requests(self.state, self._extras, listening, self._begin_anew)
-        self._selector = self._new_selector()
-        self._should_stop: Callable[[], bool] = lambda: False
+        self._asked = float("-inf")
 
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Work until told to stop: by ``should_stop``, by the viewer's Quit, or because the link is lost.
 
         Can be called again, after :meth:`reconnect` for instance.
         """
-        self._should_stop, state = should_stop, self.state
-        while not self._is_over():
-            self._hear()
-            while state.waiting and not state.ended and self._may_carry_out(state.waiting[0]):
-                self._requests.carry_out(state.waiting.popleft())
-            if not self._is_over() and not self._work():
+        state = self.state
+        state.should_stop = should_stop
+        while not state.is_over:
+            state.hear()
+            self._carry_out_waiting()
+            if not state.is_over and not self._work():
                 if state.policy.leave_when_done and state.is_done:
                     return
-                self._tell(state.idle_activity, 1.0)
+                state.tell(state.idle_activity, 1.0)
                 due = state.replay.due_in() if state.replay else None
                 state.link.wait(WAIT_SECONDS if due is None else min(due, WAIT_SECONDS))
 
     def reconnect(self, link: Link) -> None:
-        """Go on with another viewer, which is told all that there is."""
+        """Go on with another viewer, which is sent the whole state."""
         self.state.link = link
         self._extras.nothing_wanted()
         self.state.greet()
@@ -79,22 +86,14 @@ class Session:
     def _begin_anew(self) -> None:
         self.state.begin(self.state.mapper.roster.next_id)
         self._extras.start_over()
-        self._selector = self._new_selector()
 
-    def _new_selector(self) -> KeyframeSelector:
-        source = self.state.source
-        config = source.config.keyframes
-        return KeyframeSelector(keyframe_steps(config) if source.tracked else config)
-
-    def _is_over(self) -> bool:
-        return self._should_stop() or self.state.ended or self.state.link.lost is not None
-
-    def _hear(self) -> None:
-        self.state.waiting.extend(self.state.link.requests())
-
-    def _tell(self, activity: str, share: float) -> None:
-        edits_wait = any(isinstance(request, EDITS) for request in self.state.waiting)
-        self.state.tell(activity, share, edits_wait)
+    def _carry_out_waiting(self) -> None:
+        """Carry out what has been asked for; signals are looked at between any two requests."""
+        state, begin = self.state, time.monotonic()
+        while len(state.inbox) and not state.is_over and self._may_carry_out(state.inbox.next):
+            self._requests.carry_out(state.inbox.take())
+            if state.is_replaying and time.monotonic() - begin > REQUEST_SECONDS:
+                return
 
     def _work(self) -> bool:
         """Do the next piece of work; returns whether there was any."""
@@ -106,12 +105,12 @@ class Session:
             self._extras.work(self._go_on)
             return True
         if mapper.unanswered and state.is_replaying:
-            self._tell("sweeping keyframes whose evidence has changed", 0.0)
+            state.tell("sweeping keyframes whose evidence has changed", 0.0)
             state.guarded(mapper.renew)
             state.publish()
             return True
-        if mapper.unaligned and not state.has_frames_left:
-            return self._align()
+        if mapper.unaligned and mapper.refiner is not None and not state.has_frames_left:
+            return self._align(mapper.refiner)
         if mapper.unsettled and not state.is_replaying:
             return self._settle()
         return self._extras.work(self._go_on)
@@ -120,30 +119,41 @@ class Session:
         return self.state.stepping or replay.due_in() == 0
 
     def _take_frame(self, replay: Replay) -> None:
-        """Read the next frame and, if it is to be a keyframe, put it into the map."""
-        of = f" of {replay.frames}" if replay.frames else ""
-        self._tell(f"reading frame {replay.next_number}{of}", replay.share)
-        frame = replay.take()
-        if isinstance(frame, BrokenFrame):
-            text = f"{frame.problem}; what is mapped stays" if frame.last else frame.problem
-            self.state.send(Notice(text, "error"))
-        elif frame is not None and (frame := self.state.located(frame)) is not None:
-            self.state.show_camera(frame)
-            if self._selector.wants(frame.T_world_camera) and (frame.depth_m > 0).any():
-                self._tell(f"adding {frame.name}", replay.share)
-                self.state.guarded(lambda: self._take_in(frame))
-        if replay.finished:
-            self.state.stepping = False
-
-    def _take_in(self, frame: Frame) -> None:
+        """Read the next frame, and offer it to the map."""
         state = self.state
-        try:
-            entry = state.mapper.take_in(frame)
-        except CapacityError as error:
-            raise CapacityError(f"frame {frame.name} does not fit: {error}") from error
+        of = f" of {replay.frames}" if replay.frames else ""
+        state.tell(f"reading frame {replay.next_number}{of}", replay.share)
+        with state.intake.result.timed("reading"):
+            frame = replay.take()
+        if frame is not None:
+            state.guarded(lambda: self._offer(frame, replay))
+        if replay.finished:
+            state.stepping = False
+
+    def _offer(self, frame: Frame | UnreadableFrame, replay: Replay) -> None:
+        state, tracker = self.state, self.state.intake.tracker
+        lost_before = 0 if tracker is None else tracker.lost
+        answer = state.intake.offer(frame, replay.number, replay.index)
+        if lost_before and not isinstance(answer, Lost | Skipped):
+            state.send(Notice(f"{frame.name}: tracking goes on after {lost_before} lost frames"))
+        if isinstance(answer, Skipped):
+            ends = isinstance(frame, UnreadableFrame) and frame.last
+            text = f"{answer.problem}; what is mapped stays" if ends else answer.problem
+            state.send(Notice(text, "error"))
+        elif isinstance(answer, Lost):
+            if answer.in_a_row == 1:
+                state.send(Notice(f"{answer.problem}; {WAY_BACK}", "warning"))
+        elif isinstance(answer, Full):
+            raise CapacityError(answer.problem) from answer.error
+        elif isinstance(answer, Added):
+            self._show_added(answer)
+        elif answer.frame is not None:
+            state.show_camera(answer.frame)
+
+    def _show_added(self, added: Added) -> None:
+        state = self.state
+        entry = state.mapper.enter(added)
         state.full = None
-        state.tracked_keyframe(entry)
-        self._selector.accept(frame.T_world_camera)
         state.progress.keyframe_taken()
         state.send(state.mapper.describe(entry))
         state.mapper.renew()
@@ -157,52 +167,60 @@ class Session:
 
     def _settle(self) -> bool:
         def settle() -> None:
-            if self.state.mapper.settle(self._go_on_sweeping):
+            with self.state.intake.result.timed("inferring"):
+                settled = self.state.mapper.settle(self._go_on_sweeping)
+            if settled:
                 self.state.publish()
 
         self.state.guarded(settle)
         return True
 
-    def _align(self) -> bool:
+    def _align(self, refiner: PoseRefiner) -> bool:
+        """Rounds of alignment. Each keyframe that moves is swept and shown at once, so that the map is whole
+        between any two of them; what is asked for meanwhile is answered, or ends the rounds if it is an
+        edit."""
         state, mapper = self.state, self.state.mapper
-        assert mapper.refiner is not None
-
-        def show(entry: Entry) -> None:
-            state.send(mapper.describe(entry))
-            state.publish()
 
         def align() -> None:
-            assert mapper.refiner is not None
             mapper.unaligned = False  # or what goes wrong would be tried again without end
-            mapper.unaligned = not Rounds(mapper, mapper.refiner, self._go_on_aligning, show).run()
+            mover = _ShowingMover(state)
+            with state.intake.result.timed("refining"):
+                complete = AlignmentRounds(refiner, mover, self._go_on_aligning).run(mover.placed_by_hand())
+            mapper.unaligned = not complete
             state.publish()
 
         state.guarded(align)
         return True
 
-    def _go_on_aligning(self, activity: str, share: float) -> bool:
-        self._tell(activity, share)
+    def _go_on_aligning(self, step: RoundStep) -> bool:
+        now = time.monotonic()
+        if not step.judging and now - self._asked < ASK_SECONDS:
+            return True
+        self._asked = now
+        doing = f"aligning all keyframes: round {step.round} of {step.rounds}"
+        doing = "sweeping aligned keyframes" if step.judging else doing
+        self.state.tell(doing, max(step.round - 1, 0) / step.rounds)
         return self._go_on()
 
     def _go_on_sweeping(self, step: InferProgress) -> bool:
-        self._tell(*sweeping(step))
+        self.state.tell(*sweeping(step))
         return self._go_on(step)
 
     def _go_on(self, step: InferProgress | None = None) -> bool:
         """Between two steps of a long piece of work: answer what can be, and say whether to go on."""
         state = self.state
-        self._hear()
-        kept: deque[Request] = deque()
-        go_on = not self._is_over()
-        while state.waiting and go_on:
-            request = state.waiting.popleft()
+        state.hear()
+        kept: list[Request] = []
+        go_on = not state.is_over
+        while len(state.inbox) and go_on:
+            request = state.inbox.take()
             if isinstance(request, EDITS) or (goes_on(request) and state.has_frames_left):
                 kept.append(request)
                 go_on = not self._may_carry_out(request)
             else:
                 self._requests.carry_out(request)
-                go_on = not self._is_over()
-        state.waiting.extendleft(reversed(kept))
+                go_on = not state.is_over
+        state.inbox.put_back(kept)
         if go_on:
             self._extras.answer()
         return go_on
@@ -210,3 +228,25 @@ class Session:
     def _may_carry_out(self, request: Request) -> bool:
         """Edits of a map from a file wait for its messages, which only full inference brings."""
         return not (self.state.mapper.lacks_messages and isinstance(request, EDITS))
+
+
+class _ShowingMover:
+    """Moves keyframes as a user would: each is swept at its new pose and shown."""
+
+    def __init__(self, state: Run) -> None:
+        self._state = state
+        entries = state.mapper.roster.with_state("on")
+        self._entries = {entry.map_id: entry for entry in entries if entry.map_id is not None}
+
+    def placed_by_hand(self) -> list[int]:
+        """The keyframes, by their numbers in the map, that a user has moved: they stay."""
+        return [id for id, entry in self._entries.items() if entry.moved_by_hand]
+
+    def move(self, id: int, T_world_camera: Pose) -> None:
+        entry, mapper = self._entries[id], self._state.mapper
+        if mapper.align(entry, T_world_camera):
+            self._state.send(mapper.describe(entry))
+            self._state.publish()
+
+    def sweep(self, progress: Progress) -> None:
+        self._state.mapper.sweep_all(progress)

@@ -31,7 +31,7 @@ class UnreadableFrame:
 @dataclass(frozen=True)
 class Added:
     """The frame, at the pose that was found for it, is keyframe ``keyframe`` of the map, with ``rays``
-    measured pixels. Its marginals are not inferred yet, unless the intake sweeps on arrival."""
+    measured pixels. Its marginals are not inferred yet, unless the intake sweeps or aligns it."""
 
     frame: Frame
     keyframe: int
@@ -85,15 +85,15 @@ class Intake:
         *,
         tracked: bool = False,
         hold_out: int = 0,
-        sweep_on_arrival: bool = False,
+        sweep: Callable[[int], None] | None = None,
         remember_frames: bool = True,
         before_adding: Callable[[Frame], None] = lambda frame: None,
     ) -> None:
         """``tracked``: the poses of frames are found by tracking. ``hold_out``: one frame in so many is held
-        out. ``sweep_on_arrival``: each keyframe is swept once as it comes, so that the map can be looked at;
-        with ``config.poses.refine`` that is always done. ``remember_frames``: the result lists skipped frames
-        and tracked poses, which grow with the run. ``before_adding`` is called with each frame that is about
-        to be added. Raises ConfigError if poses are to be refined or tracked in a map whose method cannot."""
+        out. ``sweep`` is called with each new keyframe that is not aligned, which is swept anyway, so that
+        the map can be looked at. ``remember_frames``: the result lists skipped frames and tracked poses,
+        which grow with the run. ``before_adding`` is called with each frame that is about to be added.
+        Raises ConfigError if poses are to be refined or tracked in a map whose method cannot."""
         self.map = m
         self.result = MappingResult(m)
         self.refiner = refiner_of(m, config.poses)
@@ -101,7 +101,7 @@ class Intake:
         if self.tracker is not None:
             self.result.track = Track()
         self._selector = KeyframeSelector(keyframe_steps(config.keyframes) if tracked else config.keyframes)
-        self._hold_out, self._sweeps = hold_out, sweep_on_arrival
+        self._hold_out, self._sweep = hold_out, sweep
         self._remembers, self._before_adding = remember_frames, before_adding
 
     def passes_unread(self, number: int, index: int) -> bool:
@@ -179,9 +179,9 @@ class Intake:
             if self.refiner is not None:
                 with self.result.timed("refining"):
                     self.refiner.place(keyframe)
-            elif self._sweeps:
+            elif self._sweep is not None:
                 with self.result.timed("inferring"):
-                    self.map.infer(sweeps=1, keyframes=[keyframe])
+                    self._sweep(keyframe)
         except BaseException:
             if self.refiner is not None:
                 self.refiner.forget(keyframe)

@@ -112,6 +112,12 @@ def write_run(
     return report, [*written, folder / REPORT_FILE]
 
 
+def write_report(folder: Path, result: MappingResult, facts: RunFacts) -> None:
+    """Write only the report, without a check, and the parameters. Raises MapFileError."""
+    write_text(folder / CONFIG_FILE, commented_yaml(facts.config))
+    write_text(folder / REPORT_FILE, report_json(facts.report(result, None)))
+
+
 def write_voxel_file(path: Path, m: OccupancyMap) -> None:
     """Write the voxels that are more likely occupied than free. Raises MapFileError."""
     centres, probability = m.voxels(min_probability=0.5)

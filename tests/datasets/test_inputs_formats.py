@@ -24,7 +24,7 @@ from datasets_recordings import (
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import inverse
-from taichi_mrf.live.open_source import open_source
+from taichi_mrf.live.source import open_source
 
 
 @pytest.fixture

@@ -46,10 +46,14 @@ def test_a_ray_through_a_point_is_that_of_a_keyframe_that_sees_it() -> None:
     depth = float(frame.depth_m[v, u])
     point = (frame.T_world_camera @ np.append(frame.camera.rays()[v, u] * depth, 1.0))[:3]
     eye = (0.0, 0.0, 1.0)
-    link.ask(RayThrough(tuple(point), eye, 2), RayThrough(tuple(point), eye, None))
     behind = tuple((frame.T_world_camera @ [0.0, 0.0, -50.0, 1.0])[:3])
-    link.ask(RayThrough(behind, eye, 2))
-    finished(session)
+    for click in (
+        RayThrough(tuple(point), eye, 2),
+        RayThrough(tuple(point), eye, None),
+        RayThrough(behind, eye, 2),
+    ):
+        link.ask(click)
+        finished(session)
     wanted, nearest, from_eye = link.of_type(RayAnswer)
     assert wanted.title == f"{frame.name}, pixel ({u}, {v})"
     assert wanted.measured_m == pytest.approx(np.linalg.norm(point - frame.T_world_camera[:3, 3]), rel=1e-5)

@@ -1,5 +1,6 @@
 """``taichi-mrf live`` as a person runs it: two processes, their page, their files, and how they end."""
 
+import json
 import os
 import re
 import signal
@@ -11,6 +12,7 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 import trimesh
@@ -18,7 +20,8 @@ from live_program import DEADLINE_S
 
 ROOM = "synthetic:room?frames=6&width=80&height=60"
 FLAGS = ("--voxel-size", "0.1", "--runtime.arch", "cpu", "--port", "0")
-FILES = {"map.npz", "voxels.ply", "config.yaml"}
+FILES = {"map.npz", "voxels.ply", "config.yaml", "report.json"}
+PICTURES = {"top_view.png", "perspective.png", "depth.png"}
 
 linux_only = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs the list in /proc")
 
@@ -115,13 +118,24 @@ def voxels(folder: Path) -> dict[tuple[float, ...], float]:
     return {tuple(c.tolist()): float(p) for c, p in zip(cloud.vertices, occupancy, strict=True)}
 
 
+def read_report(folder: Path) -> dict[str, Any]:
+    report = json.loads((folder / "report.json").read_text())
+    assert isinstance(report, dict)
+    return report
+
+
 def test_a_run_that_ends_by_itself_leaves_the_map_that_map_makes(tmp_path: Path) -> None:
     done = live(ROOM, "--exit-when-done", "--out", tmp_path / "live", *FLAGS)
     assert (done.returncode, done.stderr) == (0, "")
     assert re.search(r"The map is at http://127\.0\.0\.1:\d+ ", done.stdout)
-    assert {path.name for path in (tmp_path / "live").iterdir()} == FILES
-    batch = command("map", ROOM, "--out", tmp_path / "batch", "--no-pictures", *FLAGS[:-2])
+    assert {path.name for path in (tmp_path / "live").iterdir()} == FILES | PICTURES
+    batch = command("map", ROOM, "--out", tmp_path / "batch", *FLAGS[:-2])
     subprocess.run(batch, check=True, capture_output=True)
+    assert {path.name for path in (tmp_path / "batch").iterdir()} == FILES | PICTURES
+    live_report, batch_report = (read_report(tmp_path / name) for name in ("live", "batch"))
+    assert live_report.keys() == batch_report.keys()
+    different = {key for key in live_report if live_report[key] != batch_report[key]}
+    assert different <= {"seconds", "peak_memory_mb", "map_memory_mb"}
     assert voxels(tmp_path / "live") == voxels(tmp_path / "batch")
 
 

@@ -30,11 +30,11 @@ from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.timed_poses import read_timed_poses
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose, tangent_norms
-from taichi_mrf.live.files import TRAJECTORY_FILE, write_all
 from taichi_mrf.live.run import Policy
 from taichi_mrf.live.session import Session
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.runs.folder import TRAJECTORY_FILE, write_run
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.viewer.messages import (
     CurrentCamera,
@@ -232,7 +232,7 @@ def test_a_tracked_camera_gives_the_map_of_its_batch_run(tmp_path: Path) -> None
     assert link.errors() == []
     batch = map_sequence(walk(range(12)), tracked_room.CONFIG)
     assert marginals(session.state.mapper.map) == marginals(batch.map)
-    write_all(session.state.mapper.map, tracked_room.CONFIG, tmp_path, session.state.track)
+    write_run(tmp_path, session.state.result(), session.state.facts, pictures=False)
     found = read_timed_poses(tmp_path / TRAJECTORY_FILE)
     assert len(found) == 12
     assert errors(dict(enumerate(found.poses)))[:, 1].max() < 0.05

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
-from taichi_mrf.live.replay import BrokenFrame, Replay
+from taichi_mrf.live.replay import Replay
+from taichi_mrf.mapping.intake import UnreadableFrame
 from taichi_mrf.mapping.selection import is_held_out
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
@@ -112,7 +113,7 @@ def test_twice_the_speed_is_half_the_wait(speed: float) -> None:
 def test_as_fast_as_possible_reads_nothing_ahead() -> None:
     replay = Replay(recording(0.0, 1e9, broken=[0]))
     assert replay.due_in() == 0.0
-    assert replay.take() == BrokenFrame("0: broken")
+    assert replay.take() == UnreadableFrame("0", "0: broken")
     assert replay.due_in() == 0.0
 
 
@@ -173,8 +174,8 @@ def test_broken_frames_come_in_their_place_and_at_once() -> None:
     replay.due_in()
     assert isinstance(replay.take(), Frame)
     assert replay.due_in() == 0.0
-    assert replay.take() == BrokenFrame("1: broken")
-    assert replay.take() == BrokenFrame("2: cannot be read: a defect")
+    assert replay.take() == UnreadableFrame("1", "1: broken")
+    assert replay.take() == UnreadableFrame("2", "2: cannot be read: a defect")
     assert isinstance(replay.take(), Frame)
     assert replay.finished
 
@@ -214,7 +215,7 @@ def test_a_loop_over_nothing_ends() -> None:
 def test_a_source_that_breaks_off_ends_and_says_why(loop: bool) -> None:
     replay = Replay(recording(0.0, 1.0, 2.0, lost=1), loop=loop)
     assert isinstance(replay.take(), Frame)
-    assert replay.take() == BrokenFrame("the camera is gone", last=True)
+    assert replay.take() == UnreadableFrame("1", "the camera is gone", last=True)
     assert replay.finished
     assert replay.problem == "the camera is gone"
     assert replay.take() is None
@@ -228,7 +229,7 @@ def test_a_camera_sets_its_own_pace_and_has_no_number_of_frames() -> None:
         assert replay.due_in() == 0.0
         assert isinstance(replay.take(), Frame)
         assert not replay.finished
-    assert replay.take() == BrokenFrame("the camera is gone", last=True)
+    assert replay.take() == UnreadableFrame("frame 3", "the camera is gone", last=True)
     assert replay.finished
 
 

@@ -1,6 +1,7 @@
 """A live session against a viewer that is only a list: what is published, and what becomes of requests."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 import live_scene
@@ -27,9 +28,9 @@ from live_scene import (
 from taichi_mrf.config.schema import Config, VolumeConfig
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.live.mapper import Mapper
-from taichi_mrf.live.open_source import open_source
-from taichi_mrf.live.run import Policy, Source
+from taichi_mrf.live.run import Policy
 from taichi_mrf.live.session import Session
+from taichi_mrf.live.source import Source, open_source
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.registry import create_map, load_map
 from taichi_mrf.viewer.messages import (
@@ -274,7 +275,7 @@ def test_many_resets_do_not_run_out_of_maps() -> None:
     session = session_of(link, room(1))
     for _ in range(70):
         link.ask(Reset())
-        session.run(lambda: not session.state.waiting and session.state.is_done)
+        session.run(lambda: not len(session.state.inbox) and session.state.is_done)
     assert link.errors() == []
 
 
@@ -363,3 +364,42 @@ def test_what_is_sent_for_a_keyframe_is_what_changed() -> None:
                 assert old is None or (old[0] != log_odds).any() or (old[1] != seen).any()
         view.hear(update)
     assert any(isinstance(update, Notice) for update in link.sent) is False
+
+
+def test_a_signal_is_noticed_between_any_two_requests() -> None:
+    link = FakeLink()
+    session = session_of(link, room(3))
+    finished(session)
+    link.ask(*(Save("map", client) for client in range(50)))
+    session.run(lambda: len(link.of_type(File)) >= 2)
+    assert len(link.of_type(File)) == 2
+
+
+def test_clients_that_never_stop_moving_a_keyframe_do_not_stop_mapping(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("taichi_mrf.live.session.REQUEST_SECONDS", 0.0)
+    T = small_room.frames()[0].T_world_camera
+    link = FakeLink()
+    session = session_of(link, room(4))
+
+    def over() -> bool:
+        mapper = session.state.mapper
+        link.ask(*(Move(id, T) for id in mapper.roster.entries for _ in range(10)))
+        return len(mapper.roster.entries) == 4 and len(session.state.inbox) > 0
+
+    session.run(over)
+    assert len(session.state.mapper.map.keyframes) == 4
+    assert link.errors() == []
+
+
+def test_150_presses_of_save_are_one(tmp_path: Path) -> None:
+    link = FakeLink()
+    session = Session(source(room(3)), link, Policy(out=tmp_path, leave_when_done=True))
+    finished(session)
+    link.ask(*[Save("map", 7)] * 150)
+    finished(session)
+    assert len(link.of_type(File)) == 1
+    assert {path.name for path in tmp_path.iterdir()} == {"map.npz", "config.yaml", "report.json"}
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (report["keyframes"], report["frames"], report["interrupted"]) == (3, 3, False)

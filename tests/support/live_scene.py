@@ -10,8 +10,9 @@ from taichi_mrf.config.schema import Config, EvaluationConfig
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import FrameError
 from taichi_mrf.live.replay import Replay
-from taichi_mrf.live.run import Policy, Source
+from taichi_mrf.live.run import Policy
 from taichi_mrf.live.session import Session
+from taichi_mrf.live.source import Source
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map

@@ -1,0 +1,88 @@
+"""What a live run maps: a recording or a camera with a new map, or a saved map."""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from taichi_mrf.config.schema import Config
+from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets.formats import frames_npz
+from taichi_mrf.datasets.source_flags import SourceFlags
+from taichi_mrf.live.replay import Replay
+from taichi_mrf.mapping.intake import hold_out_of
+from taichi_mrf.methods.map_file import open_map_file, read_header
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.methods.registry import create_map, load_map
+from taichi_mrf.system import runtime
+from taichi_mrf.system.files import is_file
+
+
+def saved_unsettled(name: str) -> str:
+    """The note on a saved map whose inference was interrupted."""
+    return (
+        f"{name} was saved before its inference was complete. It is shown as it was saved; "
+        "inference over all keyframes now completes it."
+    )
+
+
+@dataclass(frozen=True)
+class Source:
+    """How to make the map (an empty one, or one from a file), and how to replay the frames, which a saved map
+    does not have. ``tracked``: the poses of the frames are found by tracking. ``dataset`` is the recording,
+    to check the map against its held-out frames; ``choice`` are the flags that chose its frames."""
+
+    name: str
+    config: Config
+    new_map: Callable[[], OccupancyMap]
+    new_replay: Callable[[], Replay] | None = None
+    tracked: bool = False
+    dataset: Dataset | None = None
+    choice: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def hold_out(self) -> int:
+        """One frame in so many is held out."""
+        if self.dataset is None:
+            return self.config.evaluation.hold_out
+        return hold_out_of(self.dataset, self.config)
+
+
+def open_source(
+    name: str,
+    config: Config,
+    *,
+    every: int,
+    limit: int | None,
+    speed: float,
+    loop: bool,
+    reading: SourceFlags | None = None,
+    track: bool = False,
+) -> tuple[Source, list[str]]:
+    """Start Taichi and open a source, read as ``reading`` says; returns it with notes for the user. With
+    ``track`` the poses of its frames are found by tracking.
+
+    Raises TaichiMRFError: DatasetError, MapFileError, BackendError, ConfigError.
+    """
+    runtime.init(config.runtime.arch, config.runtime.threads, config.runtime.debug)
+    path = Path(name)
+    if path.suffix == ".npz" and is_file(path) and not frames_npz.FORMAT.recognises(path):
+        with open_map_file(path) as file:
+            header = read_header(path, file)
+        parameters = dataclasses.replace(header.config, runtime=config.runtime)
+        notes = [f"{path.name} is a saved map: its own parameters are in force."]
+        if not header.settled:
+            notes.append(saved_unsettled(path.name))
+        return Source(path.name, parameters, lambda: load_map(path)), notes
+    dataset = open_dataset(name, color=False, track=track, **(reading or SourceFlags()).keywords())
+    # Held-out frames of a tracked source are read, so that their poses are known when the map is checked.
+    unread = 0 if dataset.tracked else hold_out_of(dataset, config)
+
+    def new_replay() -> Replay:
+        return Replay(dataset, every=every, limit=limit, loop=loop, hold_out=unread, speed=speed)
+
+    new_map = partial(create_map, config, dataset.camera)
+    choice = {"every": every, "limit": limit, "track_poses": track}
+    return Source(name, config, new_map, new_replay, dataset.tracked, dataset, choice), dataset.notes
