@@ -6,13 +6,14 @@ are ConfigErrors.
 
 import numbers
 from collections.abc import Iterable
-from typing import Any, TypeVar
-
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from taichi_mrf.config.values import shown
 from taichi_mrf.errors import ArgumentError, ArgumentTypeError
+
+if TYPE_CHECKING:  # a --help loads this file, and NumPy takes longer to load than all else that it needs
+    import numpy as np
+    from numpy.typing import ArrayLike, NDArray
 
 T = TypeVar("T")
 
@@ -45,8 +46,10 @@ def instance(value: T, kind: Any, name: str, what: str) -> T:
     return value
 
 
-def array(value: ArrayLike, name: str) -> NDArray[np.float64]:
+def array(value: "ArrayLike", name: str) -> "NDArray[np.float64]":
     """An array of numbers, of any shape."""
+    import numpy as np
+
     try:
         return np.asarray(value, np.float64)
     except (TypeError, ValueError) as error:

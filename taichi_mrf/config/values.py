@@ -6,13 +6,12 @@ does not fit is a ConfigError that says where it stands and, for a name, which o
 
 import dataclasses
 import difflib
+import numbers
 import reprlib
 import types
 import typing
 from collections.abc import Sequence
 from typing import Any, Literal, TypeVar
-
-import numpy as np
 
 from taichi_mrf.errors import ArgumentTypeError, ConfigError
 
@@ -112,8 +111,8 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
             value = float(value)
         except ValueError:
             raise ConfigError(f"{where} must be a number, not {shown(value)}") from None
-    if isinstance(value, np.generic):
-        value = value.item()
+    if hint in (int, float) and isinstance(value, numbers.Real) and not isinstance(value, bool):
+        value = int(value) if isinstance(value, numbers.Integral) else float(value)  # from NumPy's types
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) > _LARGEST_INTEGER:
         raise ConfigError(f"{where} must be a number of a sensible size, not {shown(value)}")
     accepted = (int, float) if hint is float else hint

@@ -82,7 +82,7 @@ def test_the_short_help_of_map_fits_a_screen_and_the_long_one_shows_every_parame
     for flag in ("--out DIR", "--config", "--every", "--limit", "--resume", "--voxel-size", "--help-all"):
         assert flag in short.stdout
     assert "--inference.sweeps" in long.stdout
-    assert "Gauss-Seidel sweeps over all keyframes." in long.stdout
+    assert "Number of sweeps over all keyframes." in long.stdout
 
 
 @pytest.mark.parametrize("name", COMMANDS)
