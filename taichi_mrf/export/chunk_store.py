@@ -11,64 +11,45 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-import taichi_mrf
-from taichi_mrf.config.schema import Config, to_yaml
 from taichi_mrf.errors import MapFileError, said
+from taichi_mrf.export.store_header import (
+    CHUNKS,
+    FORMAT,
+    FORMAT_KEY,
+    LOG_ODDS,
+    StoreHeader,
+    StoreLayout,
+    check_packed,
+    read_layout,
+)
 from taichi_mrf.system.atomic import temporary_name
-from taichi_mrf.system.files import exists, is_file, is_folder
+from taichi_mrf.system.files import exists, is_file, is_folder, read_text
 from taichi_mrf.system.libraries import library
+from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
-FORMAT = 1
 SUFFIX = ".zarr"
 CHUNK_BYTES = 4 * CHUNK_VOXELS**3
-LOG_ODDS, CHUNKS = "log_odds", "chunks"
+_LISTED_BYTES = 12
 
 Chunk = tuple[int, int, int]
-
-
-@dataclass(frozen=True)
-class StoreHeader:
-    """What holds for all voxels: ``voxel_size`` in metres, the log-odds of the prior and of space that was
-    seen to be free without a surface near, the evidence from which a voxel counts as known, the configuration
-    as YAML and the version of the package that made the map."""
-
-    voxel_size: float
-    prior_log_odds: float
-    seen_free_log_odds: float
-    min_evidence: float
-    config: str
-    version: str
-
-    @staticmethod
-    def of(config: Config, prior_log_odds: float, min_evidence: float) -> "StoreHeader":
-        """The header of a map that this version has made with a configuration."""
-        return StoreHeader(
-            voxel_size=config.voxel_size,
-            prior_log_odds=prior_log_odds,
-            seen_free_log_odds=prior_log_odds - config.inference.message_clamp,
-            min_evidence=min_evidence,
-            config=to_yaml(config),
-            version=taichi_mrf.__version__,
-        )
 
 
 class ChunkStore:
     """The chunks of a map on disk. Each is read and written by itself; different chunks may be written by
     different processes at the same time."""
 
-    def __init__(self, path: Path, group: Any, header: StoreHeader) -> None:
+    def __init__(self, path: Path, group: Any, layout: StoreLayout) -> None:
         """As :meth:`create` and :meth:`open` make it."""
-        self.path, self.header, self._group = path, header, group
+        self.path, self.header, self._layout, self._group = path, layout.header, layout, group
         self._array = group[LOG_ODDS]
-        self._lowest = np.array(group.attrs["lowest_chunk"], np.int64)
 
     @classmethod
     def create(cls, path: str | Path, header: StoreHeader, chunks: NDArray[np.int32]) -> "ChunkStore":
@@ -86,7 +67,7 @@ class ChunkStore:
         place = {"lowest_chunk": lowest.astype(int).tolist(), "origin_m": origin_m.tolist()}
         try:
             group = zarr.create_group(
-                store=str(path), attributes={"taichi_mrf_map": FORMAT, **asdict(header), **place}
+                store=str(path), attributes={FORMAT_KEY: FORMAT, **asdict(header), **place}
             )
             group.create_array(
                 LOG_ODDS, shape=tuple(shape.tolist()), chunks=(CHUNK_VOXELS,) * 3, dtype="float32",
@@ -95,38 +76,43 @@ class ChunkStore:
             group.create_array(CHUNKS, data=np.ascontiguousarray(chunks, np.int32).reshape(-1, 3))
         except OSError as error:
             raise MapFileError(f"{path}: cannot be written: {error.strerror or error}") from error
-        return cls(path, group, header)
+        return cls(path, group, read_layout(path))
 
     @classmethod
     def open(cls, path: str | Path) -> "ChunkStore":
-        """A store that there is. Raises MapFileError, naming what is wrong, TaichiMRFError without zarr."""
+        """A store that exists. Raises MapFileError, naming what is wrong, TaichiMRFError without zarr."""
         zarr = library("zarr", "maps in chunks need", "store")
         path = Path(path)
         if not is_folder(path):
             raise MapFileError(f"{path}: there is no such folder")
+        layout = read_layout(path)
         try:
-            group = zarr.open_group(store=str(path), mode="r+")
-            found = group.attrs.get("taichi_mrf_map")
-            if found is None:
-                raise MapFileError(f"{path}: not a map of taichi_mrf in chunks")
-            if found != FORMAT:
-                raise MapFileError(f"{path}: written in format {found}; this version reads format {FORMAT}")
-            header = StoreHeader(**{field.name: group.attrs[field.name] for field in fields(StoreHeader)})
-            return cls(path, group, header)
-        except KeyError as error:
-            raise MapFileError(f"{path}: damaged: it lacks {error}") from error
-        except (OSError, ValueError, TypeError) as error:
-            raise MapFileError(f"{path}: not a readable map in chunks: {error}") from error
+            group = zarr.open_group(store=str(path), mode="r+", zarr_format=3, use_consolidated=False)
+            return cls(path, group, layout)
+        except Exception as error:  # zarr raises whatever its parsing stumbles over
+            raise MapFileError(f"{path}: not a readable map in chunks: {said(error)}") from error
 
     @property
     def chunks(self) -> NDArray[np.int32]:
         """The chunks (n, 3) in which something is known. Raises MapFileError."""
+        layout = self._layout
+        check_memory(_LISTED_BYTES * layout.listed, f"{self.path}: its list of chunks")
+        for file in (self.path / CHUNKS).glob("c/*/0"):
+            check_packed(file, _LISTED_BYTES * layout.listed_together)
         try:
-            return np.asarray(self._group[CHUNKS][:], np.int32).reshape(-1, 3)
-        except (KeyError, OSError, ValueError, TypeError, IndexError, RuntimeError) as error:
+            found = np.asarray(self._group[CHUNKS][:], np.int32).reshape(-1, 3)
+        except Exception as error:  # as above
             raise MapFileError(
                 f"{self.path}: damaged: its list of chunks cannot be read: {said(error)}"
             ) from error
+        place = found - np.array(layout.lowest_chunk, np.int64)
+        if ((place < 0) | (place >= layout.chunks_across)).any() or len(np.unique(found, axis=0)) < len(
+            found
+        ):
+            raise MapFileError(
+                f"{self.path}: damaged: its list names a chunk twice, or one outside of the array"
+            )
+        return found
 
     def write(self, chunk: Sequence[int], log_odds: NDArray[np.float32]) -> None:
         """Write one chunk, (64, 64, 64) log-odds, NaN for unknown. Raises MapFileError."""
@@ -137,13 +123,18 @@ class ChunkStore:
 
     def read(self, chunk: Sequence[int]) -> NDArray[np.float32]:
         """One of :attr:`chunks`, (64, 64, 64). Raises MapFileError."""
+        place = self._place(chunk)
+        check_packed(self.path.joinpath(LOG_ODDS, "c", *map(str, place)), CHUNK_BYTES)
         try:
-            return np.asarray(self._array.blocks[self._place(chunk)], np.float32)
-        except (OSError, ValueError, RuntimeError, IndexError) as error:
+            found = np.asarray(self._array.blocks[place], np.float32)
+        except Exception as error:  # as above
             raise MapFileError(f"{self.path}: chunk {tuple(chunk)} cannot be read: {said(error)}") from error
+        if found.shape != (CHUNK_VOXELS,) * 3 or np.isinf(found).any():
+            raise MapFileError(f"{self.path}: damaged: chunk {tuple(chunk)} holds a value that is not finite")
+        return found
 
     def _place(self, chunk: Sequence[int]) -> Chunk:
-        x, y, z = (np.array(chunk, np.int64) - self._lowest).tolist()
+        x, y, z = (np.array(chunk, np.int64) - self._layout.lowest_chunk).tolist()
         return x, y, z
 
 
@@ -179,4 +170,4 @@ def new_store(path: str | Path) -> Iterator[Path]:
 
 def _is_store(path: Path) -> bool:
     header = path / "zarr.json"
-    return is_file(header) and "taichi_mrf_map" in header.read_text("utf-8", "replace")
+    return is_file(header) and FORMAT_KEY in read_text(header, MapFileError)

@@ -23,11 +23,19 @@ _BYTES_PER_VOXEL = 9
 
 def _config_of(store: ChunkStore) -> Config:
     try:
-        return from_dict(Config, parse_yaml(store.header.config), str(store.path))
+        config = from_dict(Config, parse_yaml(store.header.config), str(store.path))
     except ValueError as error:
         raise MapFileError(
             f"{store.path}: damaged: its configuration cannot be read: {said(error)}"
         ) from error
+    except ConfigError as error:
+        raise MapFileError(str(error)) from error
+    if config.voxel_size != store.header.voxel_size:
+        raise MapFileError(
+            f"{store.path}: damaged: voxel_size is {store.header.voxel_size:g}, "
+            f"in its configuration {config.voxel_size:g}"
+        )
+    return config
 
 
 class ChunkedMap:

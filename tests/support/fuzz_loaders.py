@@ -10,6 +10,7 @@ import pickle
 from collections.abc import Callable
 from dataclasses import astuple, dataclass
 from functools import cache, partial
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -44,8 +45,10 @@ from taichi_mrf.datasets.laser.plan_image import read_floor_plan
 from taichi_mrf.datasets.laser.readers import open_scans
 from taichi_mrf.datasets.synthetic.mesh_scene import load_mesh
 from taichi_mrf.errors import FrameError, TaichiMRFError
+from taichi_mrf.export.formats import export_map
 from taichi_mrf.export.octomap import write_bt, write_ot
 from taichi_mrf.export.octomap_reader import read_octomap
+from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
@@ -149,6 +152,14 @@ def _map(path: Path) -> bytes:
     if content != path.read_bytes():
         _answers(m)
     return content
+
+
+def _chunks(path: Path) -> bytes:
+    m = ChunkedMap.open(path)
+    centres, p = m.voxels(min_probability=0.0)
+    assert np.isfinite(centres).all()
+    assert ((p >= 0) & (p <= 1)).all()
+    return _arrays_of(m.header, m.chunks, centres, p)
 
 
 def _arrays_of(*values: object) -> bytes:
@@ -324,6 +335,11 @@ def _saved_map(method: str, folder: Path) -> Path:
     return folder / "map.npz"
 
 
+def _store(folder: Path) -> Path:
+    export_map(_small_map("mrf"), folder / "map.zarr")
+    return folder / "map.zarr"
+
+
 def _octree(suffix: str, folder: Path) -> Path:
     path = folder / f"map{suffix}"
     (write_ot if suffix == ".ot" else write_bt)(path, _small_map("log_odds"))
@@ -404,6 +420,7 @@ LOADERS = [
     Loader("floor plan", _plan_png, _plan),
     Loader("map, MRFMap", partial(_saved_map, "mrf"), _map, sealed=True),
     Loader("map, LogOddsMap", partial(_saved_map, "log_odds"), _map, sealed=True),
+    *([Loader("map in chunks", _store, _chunks)] if find_spec("zarr") else []),
     Loader("OctoMap .ot", partial(_octree, ".ot"), _octomap),
     Loader("OctoMap .bt", partial(_octree, ".bt"), _octomap),
     Loader("configuration YAML", _yaml, _config),
