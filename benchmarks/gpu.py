@@ -35,7 +35,7 @@ TESTS = (
     "pool",
     "footprint",
     "ray_list",
-    "affected",
+    "incremental",
     "forward",
     "queries",
 )
@@ -116,7 +116,7 @@ def _run_part(options: Options, name: str, seconds: int) -> dict[str, Any]:
 def tests(options: Options) -> dict[str, Any]:
     """The tests of kernels and maps that use a backend, on this one."""
     names = ("vectors",) if options.quick else TESTS
-    files = [f"tests/test_{name}.py" for name in names]
+    files = [str(next((ROOT / "tests").rglob(f"test_{name}.py"))) for name in names]
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--arch", options.arch, *files]
     done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
     found = {"summary": done.stdout.strip().splitlines()[-1], "files": files}
@@ -129,9 +129,9 @@ def tests(options: Options) -> dict[str, Any]:
 
 def kernels(options: Options) -> dict[str, Any]:
     """Kernel times of a keyframe at each voxel size, by Taichi's profiler."""
+    from taichi_mrf.benchmark.bandwidth import copy_bandwidth
+    from taichi_mrf.benchmark.profile import profile_mapping
     from taichi_mrf.config.schema import Config
-    from taichi_mrf.experiments.speed.bandwidth import copy_bandwidth
-    from taichi_mrf.experiments.speed.profile import profile_mapping
 
     device = _start(options, profile=options.arch != "vulkan")
     bandwidth = copy_bandwidth(1 << 24 if options.quick else 0)
@@ -153,9 +153,9 @@ def kernels(options: Options) -> dict[str, Any]:
 
 def wall(options: Options) -> dict[str, Any]:
     """Wall time of a keyframe with three sweeps, and of full inference at the finest voxel size."""
+    from taichi_mrf.benchmark.keyframe_cost import Seconds, live_stages, timed, warm_up
+    from taichi_mrf.benchmark.launches import count_launches
     from taichi_mrf.config.schema import Config
-    from taichi_mrf.experiments.speed.keyframe_cost import Seconds, live_stages, timed, warm_up
-    from taichi_mrf.experiments.speed.launches import count_launches
     from taichi_mrf.methods.mrf.map import MRFMap
 
     device = _start(options)
@@ -194,7 +194,7 @@ def _sweep_again(m: Any, keyframe: Any) -> None:
 
 def _ways_back(m: Any) -> dict[str, float]:
     """Seconds of one sweep over all keyframes, by how rays find their way back (sum_product.py)."""
-    from taichi_mrf.experiments.speed.keyframe_cost import timed
+    from taichi_mrf.benchmark.keyframe_cost import timed
 
     seconds = {}
     for name, retrace in (("replayed", False), ("followed twice", True)):
@@ -207,8 +207,8 @@ def _ways_back(m: Any) -> dict[str, float]:
 
 def octomap(options: Options) -> dict[str, Any]:
     """OctoMap on one CPU core, a ray for each pixel, at the finest voxel size."""
-    from taichi_mrf.experiments.speed.bench import octomap_available, octomap_inserter
-    from taichi_mrf.experiments.speed.keyframe_cost import Seconds
+    from taichi_mrf.benchmark.bench import octomap_available, octomap_inserter
+    from taichi_mrf.benchmark.keyframe_cost import Seconds
 
     if not octomap_available():
         return {"missing": "pip install 'taichi-mrf[bench]' brings OctoMap"}

@@ -5,9 +5,38 @@ command line can print its help without starting Taichi.
 """
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from taichi_mrf.system import taichi_environment
+
+if TYPE_CHECKING:
+    from taichi_mrf.config.schema import Config as Config
+    from taichi_mrf.datasets.registry import open_dataset as open_dataset
+    from taichi_mrf.errors import TaichiMRFError as TaichiMRFError
+    from taichi_mrf.evaluation.accuracy import accuracy as accuracy
+    from taichi_mrf.export.formats import export_map as export_map
+    from taichi_mrf.export.options import ExportOptions as ExportOptions
+    from taichi_mrf.methods.chunked import ChunkedMap as ChunkedMap
+    from taichi_mrf.methods.chunked_part import take_part as take_part
+    from taichi_mrf.methods.log_odds.map import LogOddsMap as LogOddsMap
+    from taichi_mrf.methods.mrf.map import MRFMap as MRFMap
+    from taichi_mrf.methods.registry import load_map as load_map
+    from taichi_mrf.methods.visibility.map import VisibilityMap as VisibilityMap
+    from taichi_mrf.queries.box import read_box as read_box
+    from taichi_mrf.queries.cast import cast_rays as cast_rays
+    from taichi_mrf.queries.change import compare_maps as compare_maps
+    from taichi_mrf.queries.distance import distance_field as distance_field
+    from taichi_mrf.queries.frontiers import find_frontiers as find_frontiers
+    from taichi_mrf.queries.gain import view_gain as view_gain
+    from taichi_mrf.queries.points import FREE as FREE
+    from taichi_mrf.queries.points import OCCUPIED as OCCUPIED
+    from taichi_mrf.queries.points import UNKNOWN as UNKNOWN
+    from taichi_mrf.queries.slices import slice_map as slice_map
+    from taichi_mrf.sensor.camera import PinholeCamera as PinholeCamera
+    from taichi_mrf.sensor.frame import Frame as Frame
+    from taichi_mrf.sensor.noise import PatchNoise as PatchNoise
+    from taichi_mrf.sensor.noise import PolynomialNoise as PolynomialNoise
+    from taichi_mrf.system.runtime import init as init
 
 __version__ = "0.1.0"
 

@@ -28,7 +28,9 @@ def modules() -> dict[str, Path]:
 @cache
 def imports() -> dict[str, set[str]]:
     """The modules that each module imports, wherever in the file it does so."""
-    return {name: _imported(path) & set(modules()) for name, path in modules().items()}
+    graph = {name: _imported(path) & set(modules()) for name, path in modules().items()}
+    graph[""] = set()  # the public names, which are loaded when they are asked for
+    return graph
 
 
 def _imported(path: Path) -> set[str]:

@@ -5,15 +5,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from taichi_mrf import LogOddsMap, MRFMap, VisibilityMap
 from taichi_mrf.config.schema import to_yaml
 from taichi_mrf.experiments.scenes import Scene
-from taichi_mrf.methods.log_odds.map import LogOddsMap
-from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.protocol import OccupancyMap
-from taichi_mrf.methods.visibility.map import VisibilityMap
-from taichi_mrf.voxels.traversal import FAR
 
-BOTH: dict[str, dict[str, float]] = {"all leaves": {"empty_below": -FAR}, "occupied leaves": {}}
+BOTH: dict[str, dict[str, float]] = {"all leaves": {"empty_below": -1e30}, "occupied leaves": {}}
 """Readings of a recursive map: as the metric has it, every known voxel dims a ray; and as such maps are used,
 those that are more likely free than occupied let it through."""
 

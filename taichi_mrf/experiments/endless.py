@@ -13,16 +13,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from taichi_mrf.datasets.registry import open_dataset
+from taichi_mrf import MRFMap, open_dataset
 from taichi_mrf.evaluation.accuracy import Tolerance, judge_view
 from taichi_mrf.evaluation.pictures.figures import new_figure
+from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.exact import room_scene
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene
-from taichi_mrf.experiments.tables import Entry, Table, write_table
 from taichi_mrf.mapping.freezing import surplus
-from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.system.atomic import atomic_path
 
 if TYPE_CHECKING:

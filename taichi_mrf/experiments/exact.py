@@ -14,19 +14,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf import MRFMap, PolynomialNoise, open_dataset
 from taichi_mrf.config.schema import VolumeConfig
-from taichi_mrf.datasets.registry import open_dataset
 from taichi_mrf.datasets.synthetic.room import SyntheticRoom
 from taichi_mrf.evaluation.accuracy import judge_view
+from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.folds import Experiment, require_views
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene, SceneView, kitchen_scene
-from taichi_mrf.experiments.tables import Entry, Table, write_table
 from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.graph import FactorGraph
 from taichi_mrf.factor_graph.solve import Solution, energy, solve
-from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.sensor.noise import PolynomialNoise
 from taichi_mrf.sensor.simulate import KINECT_1
 
 VIEWS = 32

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING
 
 import taichi as ti
 
+from taichi_mrf import Frame
+from taichi_mrf.benchmark.bench import octomap_available, octomap_inserter
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.pictures.figures import new_figure
+from taichi_mrf.evaluation.tables import Table, write_table
 from taichi_mrf.experiments.contenders import mrf
 from taichi_mrf.experiments.folds import Experiment, fold_key
 from taichi_mrf.experiments.scenes import Scene, house_scene
-from taichi_mrf.experiments.speed.bench import octomap_available, octomap_inserter
-from taichi_mrf.experiments.tables import Table, write_table
 from taichi_mrf.methods.protocol import OccupancyMap
-from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.atomic import atomic_path
 
 if TYPE_CHECKING:

@@ -1,5 +1,6 @@
 """MRFMap's Fig. 7: where each map is right, and what one ray meets in it."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,14 +11,13 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.accuracy import NO_ANSWER, NOT_JUDGED, RIGHT, WRONG, JudgedView, judge_view
 from taichi_mrf.evaluation.pictures.figures import new_figure
+from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.contenders import Contender, log_odds, mrf
 from taichi_mrf.experiments.folds import Experiment, require_views
 from taichi_mrf.experiments.judging import build
 from taichi_mrf.experiments.scenes import Scene, SceneView, coffin_scene
-from taichi_mrf.experiments.tables import Entry, Table, write_table
 from taichi_mrf.queries.profile import RayProfile
 from taichi_mrf.system.atomic import atomic_path
-from taichi_mrf.voxels.traversal import FAR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -151,7 +151,7 @@ def _draw_profile(
         likeliest = float(profile.distance[profile.omega.argmax()])
         axes.axvline(likeliest, color="tab:blue", label="argmax omega")
     depths = [true, measured] if measured > 0 else [true]
-    near = min(*depths, *(begins[profile.omega > 0.02 * peak].tolist() or [FAR])) - 0.3
+    near = min(*depths, *(begins[profile.omega > 0.02 * peak].tolist() or [math.inf])) - 0.3
     axes.set(xlim=(near, max(depths) + 0.4), ylim=(-0.02, 1.05), xlabel="range (m)")
     axes.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False)
     axes.grid(alpha=0.3)

@@ -13,21 +13,19 @@ from pathlib import Path
 
 import numpy as np
 
+from taichi_mrf import MRFMap, PinholeCamera, PolynomialNoise
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.config.schema import PoseConfig, VolumeConfig
 from taichi_mrf.datasets.synthetic.room import RoomOptions, SyntheticRoom
+from taichi_mrf.evaluation.tables import Entry, Spread, Table, write_table
 from taichi_mrf.experiments.contenders import mrf
 from taichi_mrf.experiments.folds import Experiment, fold_key, require_views
 from taichi_mrf.experiments.judging import judge_all
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene, SceneView, house_scene, kitchen_scene
-from taichi_mrf.experiments.tables import Entry, Spread, Table, write_table
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.mapping.refinement import PoseRefiner
 from taichi_mrf.mapping.rounds import AlignmentRounds, PlainMover
-from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.sensor.noise import PolynomialNoise
 from taichi_mrf.sensor.simulate import KINECT_1
 
 DISTURBED_M, DISTURBED_RAD = 0.02, np.radians(1.0)

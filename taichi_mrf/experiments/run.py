@@ -13,10 +13,11 @@ from typing import Any
 import yaml
 
 import taichi_mrf
-from taichi_mrf.config.schema import Config, to_yaml
+from taichi_mrf import Config
+from taichi_mrf.config.schema import to_yaml
+from taichi_mrf.evaluation.tables import Table
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Ledger
-from taichi_mrf.experiments.tables import Table
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import write_text
 

@@ -12,13 +12,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf import PatchNoise, PinholeCamera, PolynomialNoise, TaichiMRFError, open_dataset
 from taichi_mrf.config.schema import KeyframeConfig, VolumeConfig
-from taichi_mrf.datasets import open_dataset
-from taichi_mrf.errors import DatasetError, TaichiMRFError
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.mapping.selection import KeyframeSelector
-from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
+from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.simulate import KINECT_1_LATERAL, simulate, simulate_model
 
 COFFIN_VOLUME = ((-2.0, -2.0, 0.0), (2.0, 2.0, 3.0))

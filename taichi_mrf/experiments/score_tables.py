@@ -2,8 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 
+from taichi_mrf.evaluation.tables import Entry, Spread, Table
 from taichi_mrf.experiments.folds import Scored
-from taichi_mrf.experiments.tables import Entry, Spread, Table
 
 COLUMNS: dict[str, str] = {
     "voxel": "voxel",

@@ -12,13 +12,13 @@ from taichi_mrf.datasets.synthetic.mesh_scene import load_mesh
 from taichi_mrf.evaluation.occupancy_scores import OccupancyScores, score_occupancy
 from taichi_mrf.evaluation.occupancy_truth import OccupancyTruth, occupancy_truth
 from taichi_mrf.evaluation.pictures.reliability import reliability_figure, roc_figure
+from taichi_mrf.evaluation.tables import Entry, Spread, Table, write_table
 from taichi_mrf.experiments.contenders import Contender, standard_contenders
 from taichi_mrf.experiments.folds import Experiment, Scored, flatten, fold_key, require_views
 from taichi_mrf.experiments.judging import build, judge_all
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene, house_scene, keyframes_of
 from taichi_mrf.experiments.score_tables import score_table
-from taichi_mrf.experiments.tables import Entry, Spread, Table, write_table
 from taichi_mrf.experiments.tuning import tuned_contender
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.system.atomic import atomic_path

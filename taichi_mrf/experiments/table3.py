@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
+from taichi_mrf.evaluation.tables import Spread, Table, write_table
 from taichi_mrf.experiments.contenders import standard_contenders
 from taichi_mrf.experiments.folds import Experiment, Scored, flatten, fold_key, require_views
 from taichi_mrf.experiments.judging import build_and_judge
 from taichi_mrf.experiments.scenes import Scene, kitchen_scene
 from taichi_mrf.experiments.score_tables import score_table
-from taichi_mrf.experiments.tables import Spread, Table, write_table
 from taichi_mrf.experiments.tuning import tuned_contender
 
 PAPER = {

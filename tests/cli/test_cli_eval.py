@@ -15,8 +15,8 @@ import yaml
 from console import FAST, ROOM, assert_refused, mapped, report_of, taichi_mrf
 from small_scenes import make_data
 
+from taichi_mrf.evaluation.tables import entry_text
 from taichi_mrf.experiments.table3 import PAPER
-from taichi_mrf.experiments.tables import entry_text
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.system import runtime
 

@@ -13,7 +13,7 @@ import small_room
 
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
-from taichi_mrf.experiments.tables import Table, write_table
+from taichi_mrf.evaluation.tables import Table, write_table
 from taichi_mrf.export.formats import export_map, extensions
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.methods.mrf.map import MRFMap

@@ -10,15 +10,15 @@ import pytest
 import small_room
 from console import taichi_mrf
 
+from taichi_mrf.benchmark.bandwidth import copy_bandwidth
+from taichi_mrf.benchmark.bench import TARGETS, bench_mapping, octomap_available
+from taichi_mrf.benchmark.growth import elsewhere, fit_line, measure_growth
+from taichi_mrf.benchmark.kernel_floors import COPIES, FLOORS, Work
+from taichi_mrf.benchmark.keyframe_cost import Seconds, add_timed, live_stages
+from taichi_mrf.benchmark.profile import host_seconds
 from taichi_mrf.cli.options.bench import Bench
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.experiments.speed.bandwidth import copy_bandwidth
-from taichi_mrf.experiments.speed.bench import TARGETS, bench_mapping, octomap_available
-from taichi_mrf.experiments.speed.growth import elsewhere, fit_line, measure_growth
-from taichi_mrf.experiments.speed.kernel_floors import COPIES, FLOORS, Work
-from taichi_mrf.experiments.speed.keyframe_cost import Seconds, add_timed, live_stages
-from taichi_mrf.experiments.speed.profile import host_seconds
 from taichi_mrf.methods.mrf.map import MRFMap
 
 COARSE = Config(voxel_size=small_room.VOXEL_SIZE)

@@ -6,10 +6,10 @@ import pytest
 from small_scenes import experiment, make_data
 
 from taichi_mrf.evaluation.accuracy import judge_view
+from taichi_mrf.evaluation.tables import Table
 from taichi_mrf.experiments.exact import MAPS, PER_RAY, room_scene, run_exact
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.scenes import Scene, kitchen_scene
-from taichi_mrf.experiments.tables import Table
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.system import runtime
 

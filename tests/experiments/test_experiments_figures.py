@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from small_scenes import COFFIN_VIEWS, HOUSE_VIEWS, experiment, make_data
 
+from taichi_mrf.benchmark.bench import octomap_available
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.accuracy import NO_ANSWER, NOT_JUDGED, RIGHT, WRONG, judge_view
 from taichi_mrf.experiments.fig7 import COLORS, NAMES, beside_an_edge, run_fig7
 from taichi_mrf.experiments.fig10 import FULL_AT, run_fig10
 from taichi_mrf.experiments.scenes import SceneView, coffin_scene
-from taichi_mrf.experiments.speed.bench import octomap_available
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
 

@@ -1,5 +1,6 @@
 """The stereo experiment: its measure against brute force, its curves by hand, all of it on a made street."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,13 +14,13 @@ from stereo_scene import Layer, render
 
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.evaluation.artefacts import LEAST_RAYS, SIGMAS, Sightings, sightings
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Ledger
 from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.experiments.stereo import maps as stereo
 from taichi_mrf.experiments.stereo.artefact_curve import artefacts_at, curve, threshold_for
 from taichi_mrf.experiments.stereo.artefact_tables import ratio
-from taichi_mrf.experiments.stereo.artefacts import LEAST_RAYS, SIGMAS, Sightings, sightings
 from taichi_mrf.experiments.stereo.growth import corridor_scene, grow, updates_to
 from taichi_mrf.experiments.stereo.street import (
     RECORDING,
@@ -32,6 +33,7 @@ from taichi_mrf.experiments.stereo.street import (
     visibility_at_once,
 )
 from taichi_mrf.geometry.poses import Pose, look_at
+from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
 
@@ -52,6 +54,11 @@ class FixedMap:
     def voxels(self, min_probability: float) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         keep = self.probability >= min_probability
         return self.centres[keep], self.probability[keep]
+
+
+def seen_by(m: OccupancyMap, scene: Scene, views: Sequence[SceneView], least_probability: float) -> Sightings:
+    """What some views of a scene see of a map."""
+    return sightings(m, views, scene.camera, scene.noise, scene.max_depth, least_probability)
 
 
 def view_of(depth_m: NDArray[np.float32], T_world_camera: Pose) -> SceneView:
@@ -83,7 +90,7 @@ def test_what_rays_say_of_voxels_is_what_brute_force_says(seed: int, voxels: int
         depth = random.uniform(0.5, 9, CAMERA.shape).astype(np.float32)
         depth[random.random(CAMERA.shape) < 0.2] = 0
         views.append(view_of(depth, look_at(random.uniform(-1, 1, 3), random.uniform(2, 4, 3))))
-    found = sightings(m, scene_of(views), views, 0.4)
+    found = seen_by(m, scene_of(views), views, 0.4)
 
     kept = m.probability >= 0.4
     np.testing.assert_array_equal(found.centres, m.centres[kept])
@@ -167,7 +174,7 @@ def test_a_lie_is_an_artefact_and_the_wall_is_none() -> None:
     scene = scene_of(views, camera)
     m = Row(octomap_style()).build(scene, SIZE)
     assert len(m.keyframes) == 4
-    seen = sightings(m, scene, views[1::2], 0.0)
+    seen = seen_by(m, scene, views[1::2], 0.0)
     depth = seen.centres[:, 2]
     floating = np.abs(depth - 3.25) < 0.1
     wall = np.abs(depth - 5.25) < 0.1
@@ -287,7 +294,7 @@ def test_on_the_real_street_mrf_leaves_the_fewest_artefacts(street: Scene) -> No
     at = {}
     for row in (Row(octomap_style()), Row(visibility_at_once()), Row(mrf_of_street(), 1, 0.03)):
         m = row.build(street, 0.4)
-        swept = curve(sightings(m, street, street.views[1::2], row.least_probability), row.least_probability)
+        swept = curve(seen_by(m, street, street.views[1::2], row.least_probability), row.least_probability)
         assert swept["coverage"][0] > 0.8
         at[row.name] = artefacts_at(swept, 0.8)
     assert at["MRFMap"] < 0.7 * at["OctoMap-style, Table I"]

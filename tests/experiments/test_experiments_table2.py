@@ -17,6 +17,7 @@ from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.evaluation.accuracy import judge_view
 from taichi_mrf.evaluation.occupancy_scores import score_occupancy
 from taichi_mrf.evaluation.occupancy_truth import occupancy_truth
+from taichi_mrf.evaluation.tables import Spread, Table
 from taichi_mrf.experiments import table2
 from taichi_mrf.experiments.contenders import standard_contenders
 from taichi_mrf.experiments.folds import Experiment
@@ -25,7 +26,6 @@ from taichi_mrf.experiments.score_tables import COLUMNS
 from taichi_mrf.experiments.table2 import run_table2
 from taichi_mrf.experiments.table3 import PAPER as PAPER3
 from taichi_mrf.experiments.table3 import run_table3
-from taichi_mrf.experiments.tables import Spread, Table
 from taichi_mrf.experiments.tuning import GRID
 from taichi_mrf.experiments.tuning import NAME as TUNED
 from taichi_mrf.methods.mrf.map import MRFMap

@@ -13,9 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from taichi_mrf.errors import MapFileError
-from taichi_mrf.experiments.folds import Scored
-from taichi_mrf.experiments.score_tables import COLUMNS, score_table
-from taichi_mrf.experiments.tables import (
+from taichi_mrf.evaluation.tables import (
     Entry,
     Spread,
     Table,
@@ -25,6 +23,8 @@ from taichi_mrf.experiments.tables import (
     entry_text,
     write_table,
 )
+from taichi_mrf.experiments.folds import Scored
+from taichi_mrf.experiments.score_tables import COLUMNS, score_table
 
 TABLE = Table(
     "some_table",

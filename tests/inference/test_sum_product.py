@@ -11,8 +11,8 @@ from one_pixel import EXACT, ONE_PIXEL, VOXEL, allocated, image, look_along, mar
 from oracles import inference as reference
 from oracles.forward import Noise
 
+from taichi_mrf.benchmark.launches import count_launches
 from taichi_mrf.config.inference import InferenceConfig
-from taichi_mrf.experiments.speed.launches import count_launches
 from taichi_mrf.inference.prior import prior_probability
 from taichi_mrf.inference.schedule import content_key
 from taichi_mrf.methods.mrf.map import MRFMap

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
+from taichi_mrf.benchmark.bandwidth import copy_bandwidth
+from taichi_mrf.benchmark.bench import STEADY_FRAMES, BenchRow, bench_mapping, octomap_available
+from taichi_mrf.benchmark.bench_pictures import draw_growth, draw_profiles, draw_stages, write_figure
+from taichi_mrf.benchmark.growth import Growth, measure_growth
+from taichi_mrf.benchmark.profile import Profile, profile_mapping
 from taichi_mrf.cli.bench.tables import bench_table, growth_table, profile_tables, viewer_table
 from taichi_mrf.cli.options.bench import Bench
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.experiments.speed.bandwidth import copy_bandwidth
-from taichi_mrf.experiments.speed.bench import STEADY_FRAMES, BenchRow, bench_mapping, octomap_available
-from taichi_mrf.experiments.speed.bench_pictures import draw_growth, draw_profiles, draw_stages, write_figure
-from taichi_mrf.experiments.speed.growth import Growth, measure_growth
-from taichi_mrf.experiments.speed.profile import Profile, profile_mapping
 from taichi_mrf.live.bench import bench_viewer
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system import runtime

@@ -5,11 +5,11 @@ from collections.abc import Callable, Sequence
 
 from rich.table import Table
 
-from taichi_mrf.experiments.speed.bandwidth import Bandwidth
-from taichi_mrf.experiments.speed.bench import BenchRow
-from taichi_mrf.experiments.speed.growth import Growth, Lap, Line
-from taichi_mrf.experiments.speed.keyframe_cost import Seconds
-from taichi_mrf.experiments.speed.profile import KernelCost, Profile
+from taichi_mrf.benchmark.bandwidth import Bandwidth
+from taichi_mrf.benchmark.bench import BenchRow
+from taichi_mrf.benchmark.growth import Growth, Lap, Line
+from taichi_mrf.benchmark.keyframe_cost import Seconds
+from taichi_mrf.benchmark.profile import KernelCost, Profile
 from taichi_mrf.live.bench import ViewerRow
 
 HOST_ROWS = 12

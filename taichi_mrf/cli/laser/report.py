@@ -9,7 +9,7 @@ from taichi_mrf.cli.laser.files import Outcome
 from taichi_mrf.datasets.laser.scans import LaserScans
 from taichi_mrf.evaluation.laser.floor_plan_frame import Registration
 from taichi_mrf.evaluation.laser.floor_plan_scores import CellScores
-from taichi_mrf.experiments.tables import Entry, Table
+from taichi_mrf.evaluation.tables import Entry, Table
 from taichi_mrf.factor_graph.graph import FactorGraph
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import peak_memory_mb

@@ -23,7 +23,7 @@ from taichi_mrf.errors import DatasetError
 from taichi_mrf.evaluation.laser.floor_plan_frame import Registration, register
 from taichi_mrf.evaluation.laser.floor_plan_scores import floor_plan_scores, true_cells
 from taichi_mrf.evaluation.laser.laser_map import LaserMap
-from taichi_mrf.experiments.tables import write_table
+from taichi_mrf.evaluation.tables import write_table
 from taichi_mrf.factor_graph.beams import Grid
 from taichi_mrf.factor_graph.graph import FactorGraph, build_graph
 from taichi_mrf.factor_graph.solve import Solution, Step, solve

@@ -10,7 +10,7 @@ from typing import Any
 from taichi_mrf.cli.map.process import Outcome
 from taichi_mrf.cli.shared.print_table import print_table
 from taichi_mrf.cli.shared.terminal import Terminal
-from taichi_mrf.experiments.tables import Table
+from taichi_mrf.evaluation.tables import Table
 
 
 @dataclass(frozen=True)

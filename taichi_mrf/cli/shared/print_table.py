@@ -4,7 +4,7 @@ from rich.measure import Measurement
 from rich.table import Table as RichTable
 
 from taichi_mrf.cli.shared.terminal import Terminal
-from taichi_mrf.experiments.tables import Table, entry_text
+from taichi_mrf.evaluation.tables import Table, entry_text
 
 _WIDEST = 1000
 """Columns of text that no table needs."""

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from taichi_mrf.evaluation.artefacts import MAJORITY, Sightings
 from taichi_mrf.evaluation.pictures.figures import new_figure
 from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.stereo.artefacts import MAJORITY, Sightings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 
+from taichi_mrf.evaluation.artefacts import LEAST_RAYS, MAJORITY, SIGMAS
+from taichi_mrf.evaluation.tables import Entry, Table
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene
 from taichi_mrf.experiments.stereo.artefact_curve import MAJORITIES, artefacts_at
-from taichi_mrf.experiments.stereo.artefacts import LEAST_RAYS, MAJORITY, SIGMAS
 from taichi_mrf.experiments.stereo.street import PASSES
-from taichi_mrf.experiments.tables import Entry, Table
 
 COVERAGES = (0.9, 0.8, 0.7, 0.6)
 """Coverages at which maps are compared."""

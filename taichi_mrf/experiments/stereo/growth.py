@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf import PinholeCamera
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.evaluation.pictures.figures import new_figure
 from taichi_mrf.experiments.contenders import Contender
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.geometry.poses import look_at
-from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel
 
 if TYPE_CHECKING:

@@ -5,13 +5,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from taichi_mrf.benchmark.bench import octomap_available
+from taichi_mrf.evaluation.artefacts import sightings
+from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene
-from taichi_mrf.experiments.speed.bench import octomap_available
 from taichi_mrf.experiments.stereo.artefact_curve import curve, curve_figure, threshold_for
 from taichi_mrf.experiments.stereo.artefact_tables import COVERAGES, artefact_table, majority_table
-from taichi_mrf.experiments.stereo.artefacts import sightings
 from taichi_mrf.experiments.stereo.growth import corridor_scene, grow, growth_figure, growth_rows
 from taichi_mrf.experiments.stereo.scaling import (
     OCTOMAP,
@@ -32,7 +33,6 @@ from taichi_mrf.experiments.stereo.street import (
     visibility_at_once,
 )
 from taichi_mrf.experiments.stereo.street_plan import plan, plan_figure
-from taichi_mrf.experiments.tables import Entry, Table, write_table
 from taichi_mrf.system.atomic import atomic_path
 
 if TYPE_CHECKING:
@@ -107,7 +107,8 @@ def _map_and_judge(row: Row, scene: Scene, voxel_size: float) -> Result:
     start = time.perf_counter()
     m = row.build(scene, voxel_size)
     seconds = time.perf_counter() - start
-    seen = sightings(m, scene, scene.views[1::2], row.least_probability)
+    measured = (scene.views[1::2], scene.camera, scene.noise, scene.max_depth)
+    seen = sightings(m, *measured, row.least_probability)
     swept = curve(seen, row.least_probability)
     threshold = swept["threshold"][threshold_for(swept, PICTURE_COVERAGE)]
     return {

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import taichi as ti
 
+from taichi_mrf.benchmark.bench import octomap_available
 from taichi_mrf.evaluation.pictures.figures import new_figure
 from taichi_mrf.experiments.contenders import Contender
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene, SceneView
-from taichi_mrf.experiments.speed.bench import octomap_available
 from taichi_mrf.experiments.stereo.street import TABLE_I, thinned
 
 if TYPE_CHECKING:

@@ -12,16 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from taichi_mrf import PinholeCamera, PolynomialNoise, VisibilityMap, open_dataset
 from taichi_mrf.config.schema import VolumeConfig
-from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.stereo.pairs import StereoPairs
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.experiments.contenders import Contender, log_odds, mrf
 from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.methods.protocol import OccupancyMap
-from taichi_mrf.methods.visibility.map import VisibilityMap
-from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.sensor.noise import PolynomialNoise
 
 RECORDING = Path("stereo_kitti/KITTI_sequence_1")
 MAX_DEPTH_M = 40.0

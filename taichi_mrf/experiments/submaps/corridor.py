@@ -6,19 +6,18 @@ import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
+from taichi_mrf import ChunkedMap, Config, MRFMap
 from taichi_mrf.cluster.local import LocalProcesses
-from taichi_mrf.config.schema import Config, EvaluationConfig
+from taichi_mrf.config.schema import EvaluationConfig
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.synthetic.corridor import NAME
 from taichi_mrf.datasets.synthetic.corridor_plan import floor_area_m2
+from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.submaps.costs import MeasuredCost, costs_table
 from taichi_mrf.experiments.submaps.equality import KilledOnce, compare, infer_or_be_killed
-from taichi_mrf.experiments.tables import Entry, Table, write_table
 from taichi_mrf.mapping.pipeline import map_sequence
-from taichi_mrf.methods.chunked import ChunkedMap
-from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.submaps.job import Job, Sequence
 from taichi_mrf.submaps.plan import Plan, Submap
 from taichi_mrf.submaps.rounds import SETTLED, SubmapsResult, map_in_submaps

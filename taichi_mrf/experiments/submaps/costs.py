@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from taichi_mrf.experiments.tables import Entry, Table
+from taichi_mrf.evaluation.tables import Entry, Table
 
 SECONDS_A_DAY = 86400.0
 

@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf import UNKNOWN, ChunkedMap, MRFMap
 from taichi_mrf.inference.schedule import InferProgress
-from taichi_mrf.methods.chunked import ChunkedMap
-from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.queries.known_bricks import BrickReader, known_bricks
-from taichi_mrf.queries.points import UNKNOWN, probability
+from taichi_mrf.queries.points import probability
 from taichi_mrf.submaps.round_files import SubmapReport
 from taichi_mrf.submaps.task import SubmapTask, infer_submap
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS

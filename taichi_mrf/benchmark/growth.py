@@ -11,10 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from taichi_mrf.config.schema import Config
-from taichi_mrf.experiments.speed.keyframe_cost import Seconds, add_timed, warm_up
-from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.sensor.frame import Frame
+from taichi_mrf import Config, Frame, MRFMap
+from taichi_mrf.benchmark.keyframe_cost import Seconds, add_timed, warm_up
 
 LAPS = 8
 

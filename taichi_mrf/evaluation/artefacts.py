@@ -11,17 +11,21 @@ A map could avoid all artefacts by being empty, hence its **coverage**: the shar
 measurements that have an occupied voxel on their ray within 3 sigma and one voxel size. Both depend on the
 probability from which a voxel counts as occupied, and maps are compared at equal coverage.
 """
+# ruff: noqa: ANN202 - Taichi does not allow `-> None` on a kernel or a func.
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf.experiments.scenes import Scene, SceneView
+from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Mat3, Struct, Template, Vec3, Vec4
 from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.rays import pixel_direction
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK, VOXELS
@@ -67,12 +71,27 @@ class Sightings:
         return float(np.mean(self.met >= occupied_from)) if len(self.met) else float("nan")
 
 
+class MeasuredView(Protocol):
+    """A depth image that the map has not seen: (H, W) axial depth in metres, 0 for no measurement, and its
+    pose."""
+
+    @property
+    def measured_m(self) -> NDArray[np.float32]: ...
+    @property
+    def T_world_camera(self) -> Pose: ...
+
+
 def sightings(
-    m: OccupancyMap, scene: Scene, views: Sequence[SceneView], least_probability: float
+    m: OccupancyMap,
+    views: Iterable[MeasuredView],
+    camera: PinholeCamera,
+    noise: NoiseModel,
+    max_depth: float,
+    least_probability: float,
 ) -> Sightings:
     """Follow all rays of ``views`` through the voxels of a map of at least this probability.
 
-    Measurements beyond the scene's ``max_depth`` pass voxels like all others, but need no cover.
+    Measurements beyond ``max_depth`` metres pass voxels like all others, but need no cover.
     """
     centres, probability = m.voxels(least_probability)
     voxels = np.floor(centres / m.voxel_size).astype(np.int32)
@@ -94,7 +113,7 @@ def sightings(
     )
     index = WindowIndex()
     index.fill(window, window.cells_of(bricks), np.arange(len(bricks), dtype=np.int32))
-    table, camera = scene.noise.table(scene.camera), scene.camera
+    table = noise.table(camera)
     intrinsics = ti.Vector([camera.fx, camera.fy, camera.cx, camera.cy], ti.f32)
     met = []
     for view in views:
@@ -106,7 +125,7 @@ def sightings(
             *window.rays_of(view.T_world_camera), window.shape_vector, *window.clip_box(None, None),
             index.chunks, index.bricks, probabilities, passed, confirmed, best,
         )  # fmt: skip
-        met.append(best[(depth > 0).reshape(-1) & (depth <= scene.max_depth).reshape(-1)])
+        met.append(best[(depth > 0).reshape(-1) & (depth <= max_depth).reshape(-1)])
     near = np.concatenate(met) if met else np.zeros(0, np.float32)
     found = Sightings(centres, probability, passed.to_numpy()[place], confirmed.to_numpy()[place], near)
     runtime.settle()  # before the arrays are dropped

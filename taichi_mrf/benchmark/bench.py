@@ -11,10 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from taichi_mrf.config.schema import Config
-from taichi_mrf.experiments.speed.keyframe_cost import KeyframeCost, Seconds, add_timed, timed, warm_up
-from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.sensor.frame import Frame
+from taichi_mrf import Config, Frame, MRFMap
+from taichi_mrf.benchmark.keyframe_cost import KeyframeCost, Seconds, add_timed, timed, warm_up
 from taichi_mrf.system.memory import peak_memory_mb, reset_peak_memory
 from taichi_mrf.voxels.layout import VOXELS
 

@@ -18,12 +18,10 @@ import numpy as np
 import taichi as ti
 
 import taichi_mrf
-from taichi_mrf.config.schema import Config
-from taichi_mrf.experiments.speed.kernel_floors import FLOORS, Work
-from taichi_mrf.experiments.speed.keyframe_cost import live_stages, timed, warm_up
-from taichi_mrf.experiments.speed.launches import count_launches
-from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.sensor.frame import Frame
+from taichi_mrf import Config, Frame, MRFMap
+from taichi_mrf.benchmark.kernel_floors import FLOORS, Work
+from taichi_mrf.benchmark.keyframe_cost import live_stages, timed, warm_up
+from taichi_mrf.benchmark.launches import count_launches
 from taichi_mrf.system import runtime
 
 PACKAGE = str(Path(taichi_mrf.__file__).parent)

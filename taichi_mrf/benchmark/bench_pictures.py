@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from taichi_mrf.benchmark.bench import BenchRow
+from taichi_mrf.benchmark.growth import Growth, Lap
+from taichi_mrf.benchmark.profile import Profile
 from taichi_mrf.evaluation.pictures.figures import new_figure
-from taichi_mrf.experiments.speed.bench import BenchRow
-from taichi_mrf.experiments.speed.growth import Growth, Lap
-from taichi_mrf.experiments.speed.profile import Profile
 from taichi_mrf.system.atomic import atomic_path
 
 if TYPE_CHECKING:

@@ -12,8 +12,7 @@ from typing import Any
 
 import taichi as ti
 
-from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.sensor.frame import Frame
+from taichi_mrf import Frame, MRFMap
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,0 @@
-"""Measurements of speed: the benchmark, the profiler, floors given by memory bandwidth."""
