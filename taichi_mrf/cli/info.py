@@ -20,6 +20,9 @@ from taichi_mrf.datasets.summary import summarise
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.system import runtime
 
+CANNOT_BE_MAPPED = 2
+"""Exit status for a recording that ``map`` refuses."""
+
 
 def run_info(options: Info) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
@@ -27,10 +30,11 @@ def run_info(options: Info) -> int:
     if options.json:
         facts = _backend_facts(options.arch) if options.source is None else _source_facts(options)
         print(json.dumps(facts, indent=2))
+        return 0 if facts.get("usable", True) else CANNOT_BE_MAPPED
     elif options.source is None:
         _print_backends(console, options.arch)
-    else:
-        _print_source(console, options.source, options.arch, options.reading)
+    elif not _print_source(console, options.source, options.arch, options.reading):
+        return CANNOT_BE_MAPPED
     return 0
 
 
@@ -81,7 +85,8 @@ def _print_backends(console: Terminal, arch: Arch) -> None:
         console.say(f"{name} {version}")
 
 
-def _print_source(console: Terminal, source: str, arch: Arch, reading: SourceFlags) -> None:
+def _print_source(console: Terminal, source: str, arch: Arch, reading: SourceFlags) -> bool:
+    """Print what is in a source; returns whether it can be mapped."""
     path = bag_path(source)
     if path is not None:
         bag = summarise_bag(path)
@@ -93,13 +98,14 @@ def _print_source(console: Terminal, source: str, arch: Arch, reading: SourceFla
     except DatasetError as error:
         if path is None:
             raise
-        console.say(f"To be mapped it needs more: {error}")
+        console.say(f"It cannot be mapped like this: {error}")
         for name in bag.sources:
             console.say(f"taichi-mrf map {shlex.quote(name)}{bag.flags} --out DIR")
-    else:
-        _print_frames(console, format_name(source), dataset)
-        if path is not None:
-            console.say(f"taichi-mrf map {shlex.quote(source)} --out DIR")
+        return False
+    usable = _print_frames(console, format_name(source), dataset)
+    if path is not None and usable:
+        console.say(f"taichi-mrf map {shlex.quote(source)} --out DIR")
+    return usable
 
 
 def _print_topics(console: Terminal, bag: BagSummary) -> None:
@@ -115,8 +121,7 @@ def _print_topics(console: Terminal, bag: BagSummary) -> None:
         console.say(f"tf {transform}")
 
 
-def _print_frames(console: Terminal, format_name: str, dataset: Dataset) -> None:
-
+def _print_frames(console: Terminal, format_name: str, dataset: Dataset) -> bool:
     found, camera = summarise(dataset), dataset.camera
     table = Table(show_header=False, title=dataset.name, title_justify="left")
     table.add_column(style="bold")
@@ -138,3 +143,4 @@ def _print_frames(console: Terminal, format_name: str, dataset: Dataset) -> None
     console.print(table)
     for note in [*dataset.notes, *([found.problem] if found.problem else [])]:
         console.say(f"Note: {note}")
+    return found.usable

@@ -71,6 +71,12 @@ class Dataset(ABC):
         cannot be read again, and an error other than FrameError is the end."""
         return False
 
+    @property
+    def recorded_sigma(self) -> tuple[float, ...] | None:
+        """Standard deviation of depth that the recording itself gives, as coefficients in ascending powers of
+        depth in metres; None if it gives none."""
+        return None
+
     def check_scale(self, poses_are_used: bool) -> list[str]:
         """Check the unit of depth, once the camera is final; returns notes. Most sources know their unit."""
         return []

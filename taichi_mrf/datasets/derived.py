@@ -22,6 +22,11 @@ class Derived(Dataset):
         return self.source.endless
 
     @property
+    def recorded_sigma(self) -> tuple[float, ...] | None:
+        """The source's."""
+        return self.source.recorded_sigma
+
+    @property
     def frame_names(self) -> Sequence[str]:
         """The source's."""
         return self.source.frame_names

@@ -1,4 +1,4 @@
-"""What a sequence of frames is like: its length, camera, way and depth range, from a few of its frames."""
+"""A sequence of frames in figures: its length, camera, path and depth range, from a few of its frames."""
 
 from dataclasses import dataclass
 
@@ -27,6 +27,8 @@ class Summary:
     measured: float | None
     centre_range: tuple[tuple[float, ...], tuple[float, ...]] | None
     problem: str | None
+    usable: bool
+    """Whether one of the frames that were looked at can be read: otherwise there is nothing to map."""
 
 
 def summarise(dataset: Dataset) -> Summary:
@@ -60,6 +62,7 @@ def summarise(dataset: Dataset) -> Summary:
         measured=measured / pixels if pixels else None,
         centre_range=_range(np.array(centres)) if centres else None,
         problem=problem,
+        usable=bool(centres),
     )
 
 

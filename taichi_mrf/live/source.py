@@ -10,6 +10,7 @@ from typing import Any
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.formats import frames_npz
+from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.live.replay import Replay
 from taichi_mrf.mapping.intake import hold_out_of
@@ -77,6 +78,7 @@ def open_source(
             notes.append(saved_unsettled(path.name))
         return Source(path.name, parameters, lambda: load_map(path)), notes
     dataset = open_dataset(name, color=False, track=track, **(reading or SourceFlags()).keywords())
+    config = with_recorded_noise(config, dataset)
     # Held-out frames of a tracked source are read, so that their poses are known when the map is checked.
     unread = 0 if dataset.tracked else hold_out_of(dataset, config)
 

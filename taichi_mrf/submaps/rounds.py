@@ -11,6 +11,7 @@ from taichi_mrf.cluster.runner import TaskRunner
 from taichi_mrf.config.registry import METHODS, methods_with
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.values import from_dict
+from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.submaps.job import PLAN_FILE, Job, Sequence
 from taichi_mrf.submaps.merge import merge_submaps
@@ -117,6 +118,7 @@ def _job(
     progress: Progress,
 ) -> Job:
     """The job of the run to go on with, or a new one."""
+    config = with_recorded_noise(config, sequence.open())
     if resume and (folder / PLAN_FILE).exists():
         job = Job.read(folder)
         changed = job.differences(sequence, config, submap_size)

@@ -70,8 +70,8 @@ def test_info_of_a_bag_that_leaves_a_choice_suggests_all_of_them(tmp_path: Path)
     with writing(tmp_path / "walk", "mcap") as bag:
         fill(bag, ("/vio/pose", "/slam/pose"))
     status, out, errors = said("info", tmp_path / "walk")
-    assert (status, errors) == (0, "")
-    assert "To be mapped it needs more" in out
+    assert (status, errors) == (2, "")  # map refuses it too
+    assert "It cannot be mapped like this" in out
     commands = [shlex.split(line) for line in out.splitlines() if line.startswith("taichi-mrf map")]
     sources = [command[2] for command in commands]
     assert sources == [f"{tmp_path / 'walk'}?pose={name}" for name in ("/slam/pose", "/vio/pose", "tf")]
@@ -90,6 +90,16 @@ def test_info_of_bags_that_need_more(tmp_path: Path) -> None:
     assert (
         f"taichi-mrf map 'realsense:{tmp_path}/own.bag?poses=FILE'" in said("info", tmp_path / "own.bag")[1]
     )
+
+
+@pytest.mark.parametrize("flags", [(), ("--json",)])
+def test_info_of_a_recording_without_a_frame_that_can_be_read(tmp_path: Path, flags: tuple[str, ...]) -> None:
+    folder = write_seven_scenes(tmp_path / "office", Content())
+    for image in folder.glob("*.depth.png"):
+        image.write_bytes(image.read_bytes()[:60])
+    status, out, _ = said("info", folder, *flags)
+    assert status == 2
+    assert "cut short" in out
 
 
 def test_info_of_a_folder(tmp_path: Path) -> None:

@@ -1,14 +1,17 @@
 """Stereo recordings in KITTI's layout: written here, read back as depth frames, and broken in every way."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from datasets_recordings import row_of, write_image, write_rows
+from datasets_recordings import Content, row_of, write_image, write_rows, write_seven_scenes
 from kitti_street import BASELINE, CAMERA, COUNT, P0, P1, pairs, poses, write_kitti
 from numpy.typing import NDArray
 
+from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX, StereoMatching, stereo_depth
 from taichi_mrf.datasets.stereo.pairs import StereoPairs
 from taichi_mrf.errors import DatasetError, FrameError
@@ -49,6 +52,25 @@ def test_the_notes_say_that_depth_is_stereo_and_how_good(folder: Path) -> None:
     assert f"sigma_d = {SIGMA_D_PX}" in stereo
     assert f"{SIGMA_D_PX / (BASELINE * 100):.3e}" in stereo
     assert "times.txt" in stamps
+
+
+def test_the_noise_of_the_rig_takes_the_place_of_the_default(folder: Path) -> None:
+    dataset = open_dataset(folder, image_scale=0.5)
+    own = (0.0, 0.0, SIGMA_D_PX / (BASELINE * 100))
+    applied = with_recorded_noise(Config(), dataset)
+    assert applied.sensor.sigma == pytest.approx(own)
+    assert applied == replace(Config(), sensor=replace(SensorConfig(), sigma=applied.sensor.sigma))
+    assert dataset.notes[-1].startswith("sensor.sigma is [0, 0, ")
+    assert with_recorded_noise(applied, dataset) is applied
+    chosen = replace(Config(), sensor=SensorConfig(sigma=(0.05,)))
+    assert with_recorded_noise(chosen, dataset) is chosen
+    assert "is not used" in dataset.notes[-1]
+
+
+def test_a_recording_without_noise_of_its_own_keeps_the_default(tmp_path: Path) -> None:
+    dataset = open_dataset(write_seven_scenes(tmp_path / "office", Content(1)))
+    assert with_recorded_noise(Config(), dataset) == Config()
+    assert dataset.notes == []
 
 
 def test_kittis_own_names_labels_and_times(tmp_path: Path) -> None:

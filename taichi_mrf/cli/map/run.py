@@ -17,6 +17,7 @@ from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.terminal import Terminal, tell_problem
 from taichi_mrf.config.schema import Config, with_absolute_tables
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.pipeline import (
@@ -124,6 +125,7 @@ def map_to_folder(
         previous = resumed_map(task.out, settings) if task.resume else None
         skipped = skipped_before(task.out) if task.resume else {}
         dataset = open_dataset(task.source, color=False, track=task.track_poses, **task.reading.keywords())
+        settings = with_recorded_noise(settings, dataset)
         opening = time.perf_counter() - start
 
         with _collected_warnings() as warned:

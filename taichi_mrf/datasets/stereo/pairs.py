@@ -47,6 +47,11 @@ class StereoPairs(Dataset):
         return [pair.left_file.stem for pair in self.pairs]
 
     @property
+    def recorded_sigma(self) -> tuple[float, ...] | None:
+        """lambda z^2, from the baseline and the focal length."""
+        return self.rig.sigma()
+
+    @property
     def rig(self) -> StereoRig:
         """The left camera and the baseline."""
         return StereoRig(self.camera, self.baseline_m)
@@ -74,12 +79,12 @@ class StereoPairs(Dataset):
 
 
 def noise_note(rig: StereoRig, left: str, right: str) -> str:
-    """What a report should say of depth that is matched in the images ``left`` and ``right``."""
+    """What a report says of depth that is matched in the images ``left`` and ``right``."""
     lambda_ = rig.sigma()[2]
     return (
         f"depth comes from stereo: {left} and {right} by semi-global matching, "
         f"baseline {rig.baseline_m:.4f} m, fx {rig.camera.fx:.1f} px; with sigma_d = {SIGMA_D_PX:g} px "
-        f"its sigma is lambda z^2, lambda = {lambda_:.3e} per metre (sensor.sigma: [0, 0, {lambda_:.3e}])"
+        f"its sigma is lambda z^2, lambda = {lambda_:.3e} per metre"
     )
 
 
