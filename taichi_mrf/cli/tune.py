@@ -60,6 +60,7 @@ def run_tune(options: Tune) -> int:
             search=search,
             listening=lambda where: tell_address(where, "The page", options.port, options.open, say),
             tried=lambda attempt: _tell_try(attempt, session.search, told, say),
+            judged=lambda verdict: _tell_verdict(session, say),
         )
         for note in dataset.notes:
             say(note)
@@ -86,13 +87,9 @@ def _page(options: Tune, say: Say, stack: ExitStack) -> ViewerLink:
 
 
 def _finish(session: "TuneSession", options: Tune, say: Say) -> None:
-    """Print what the search was worth, and leave the files."""
-    from taichi_mrf.tune.files import BEST_FILE, TABLE_FILE
-    from taichi_mrf.tune.verdict import verdict_lines
+    """Write the table of all tries, and the parameters that the search has found."""
+    from taichi_mrf.tune.history import BEST_FILE, TABLE_FILE
 
-    verdict = verdict_lines(session.verdict, len(session.frames.unseen)) if session.verdict else []
-    for line in verdict:
-        say(line)
     if options.out is None or not session.history.attempts:
         return
     write_text(options.out / TABLE_FILE, session.history.to_csv())
@@ -100,8 +97,21 @@ def _finish(session: "TuneSession", options: Tune, say: Say) -> None:
     best = session.search.best if session.search is not None else None
     attempt = next((each for each in session.history.attempts if each.config == best), None)
     if attempt is not None:
-        write_text(options.out / BEST_FILE, session.history.to_yaml(attempt.number, tuple(verdict)))
+        write_text(options.out / BEST_FILE, session.history.to_yaml(attempt.number, tuple(_verdict(session))))
         say(f"wrote {options.out / BEST_FILE}")
+
+
+def _verdict(session: "TuneSession") -> list[str]:
+    """What the search was worth on views that it has not seen, line by line; none before it has ended."""
+    from taichi_mrf.tune.verdict import verdict_lines
+
+    return verdict_lines(session.verdict, len(session.frames.unseen)) if session.verdict else []
+
+
+def _tell_verdict(session: "TuneSession", say: Say) -> None:
+    """Print the verdict as soon as the search has ended; the page stays up."""
+    for line in _verdict(session):
+        say(line)
 
 
 def _tell_try(attempt: "Attempt", search: "Search | None", told: set[int], say: Say) -> None:

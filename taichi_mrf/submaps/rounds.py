@@ -1,11 +1,14 @@
 """A long sequence in, one map in chunks out: survey, plan, rounds of inference and exchange, merge."""
 
 import json
+import math
 import shutil
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+
+import numpy as np
 
 from taichi_mrf.cluster.runner import TaskRunner
 from taichi_mrf.config.registry import METHODS, methods_with
@@ -13,13 +16,16 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.errors import ConfigError, MapFileError
+from taichi_mrf.export.chunk_blocks import by_chunk, chunk_block
+from taichi_mrf.export.chunk_store import ChunkStore, StoreHeader, new_store
+from taichi_mrf.inference.prior import prior_probability
 from taichi_mrf.submaps.job import PLAN_FILE, Job, Sequence
-from taichi_mrf.submaps.merge import merge_submaps
 from taichi_mrf.submaps.plan import plan_submaps
-from taichi_mrf.submaps.round_files import SubmapReport
+from taichi_mrf.submaps.round_files import SubmapReport, read_core, read_places, round_path
 from taichi_mrf.submaps.survey import find_keyframes
 from taichi_mrf.submaps.task import SubmapTask, infer_submap, is_idle
 from taichi_mrf.system.atomic import write_text
+from taichi_mrf.voxels.layout import CHUNK, VOXELS
 
 SETTLED = 0.001
 """No further round is made when no larger share of all voxels has moved in the last."""
@@ -93,7 +99,7 @@ def map_in_submaps(
     result.seconds["inferring"] = sum(each.seconds for each in result.rounds)
     begin = time.perf_counter()
     progress("Merging", 0, 1)
-    merge_submaps(folder, result.job, last, map_path)
+    _merge(folder, result.job, last, map_path)
     result.seconds["merging"] = time.perf_counter() - begin
     return result
 
@@ -210,3 +216,21 @@ def _mean(reports: list[SubmapReport], name: str) -> float | None:
     values = [(getattr(report, name), report.core_bricks) for report in reports]
     known = [(value, weight) for value, weight in values if value is not None]
     return sum(v * w for v, w in known) / max(1, sum(w for _, w in known)) if known else None
+
+
+def _merge(folder: Path, job: Job, round: int, path: Path) -> None:
+    """Write the cores of all submaps after a round as one map in chunks. A chunk belongs to one submap
+    alone, so each is written once, and only one submap's core is in memory at a time. Raises MapFileError."""
+    files = [round_path(folder, round, number) for number in range(len(job.plan.submaps))]
+    prior = prior_probability(job.config.inference, job.config.voxel_size)
+    header = StoreHeader.of(job.config, math.log(prior / (1 - prior)), job.config.volume.min_evidence)
+    chunks = [np.unique(np.concatenate(read_places(file)) // CHUNK, axis=0) for file in files]
+    with new_store(path) as place:
+        store = ChunkStore.create(place, header, np.unique(np.concatenate(chunks), axis=0))
+        for file in files:
+            bricks, belief, free = read_core(file)
+            empty = np.full((len(free), VOXELS), header.seen_free_log_odds, np.float32)
+            bricks, belief = np.concatenate([bricks, free]), np.concatenate([belief, empty])
+            for chunk, rows in by_chunk(bricks):
+                block = chunk_block(chunk, bricks[rows], belief[rows], header.prior_log_odds)
+                store.write(chunk, block)

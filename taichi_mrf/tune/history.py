@@ -4,7 +4,7 @@ import csv
 import dataclasses
 import io
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import commented_yaml, differences
@@ -12,10 +12,13 @@ from taichi_mrf.errors import ConfigError
 from taichi_mrf.viewer.tune.messages import By, Tried
 from taichi_mrf.viewer.tune.scores import Scores, figures, scores_in_words
 
+TABLE_FILE = "tries.csv"
+BEST_FILE = "best.yaml"
+
 
 @dataclass
 class Attempt:
-    """One line of the table."""
+    """One try: its parameters, its scores, and whether a person or the search asked for it."""
 
     number: int
     config: Config
@@ -23,7 +26,7 @@ class Attempt:
     by: By
 
     def message(self) -> Tried:
-        """As the page is told of it."""
+        """The message that tells the page of it."""
         return Tried(self.number, self.config, self.scores, self.by)
 
 
@@ -39,8 +42,8 @@ class History:
         self.pinned = 0
 
     def note(self, config: Config, scores: Scores, by: By) -> Attempt:
-        """Enter a try. The same parameters again are the same try, whose scores become those of more pixels
-        if they are."""
+        """Add a try. Parameters that were tried before update that try, unless the new scores use fewer
+        pixels."""
         known = next((each for each in self.attempts if each.config == config), None)
         if known is None:
             known = Attempt(len(self.attempts), config, scores, by)
@@ -58,6 +61,13 @@ class History:
     def pin(self, number: int) -> None:
         """Make a try the reference. Raises ConfigError if there is none of that number."""
         self.pinned = self.find(number).number
+
+    def file(self, kind: Literal["yaml", "csv"], number: int) -> tuple[str, str]:
+        """Name and text of a file: the parameters of a try, or the table of all. Raises ConfigError if there
+        is no try of that number."""
+        if kind == "csv":
+            return TABLE_FILE, self.to_csv()
+        return f"try-{number}.yaml", self.to_yaml(number)
 
     def parameters(self) -> list[str]:
         """Names of all parameters in which some try differs from the first one."""

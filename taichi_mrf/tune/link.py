@@ -1,11 +1,35 @@
-"""The line to the tuning page's process."""
+"""The line to the tuning page's process, and which of the updates that wait for it replace each other."""
 
 import signal
+from collections.abc import Callable, Hashable
 from multiprocessing.connection import Connection
 
 from taichi_mrf.live.link import ViewerLink
-from taichi_mrf.tune.outbox import TuneOutbox
-from taichi_mrf.viewer.messages import Request, Update
+from taichi_mrf.live.outbox import Outbox, Waiting, WaitingBricks
+from taichi_mrf.viewer.messages import Hello, KeyframeInfo, Request, Update
+from taichi_mrf.viewer.tune.messages import Activity, Chosen, HeldOutView, Pinned, Residuals, Tried, Tuning
+
+LATEST_ONLY = (Tuning, Activity, Pinned, Chosen, Residuals, HeldOutView)
+
+
+class TuneOutbox(Outbox):
+    """An outbox for tries: a new map replaces the one before, but the tries stay."""
+
+    def key(self, update: Update) -> Hashable | None:
+        """Every try waits in a place of its own."""
+        if isinstance(update, LATEST_ONLY):
+            return type(update).__name__
+        if isinstance(update, Tried):
+            return "try", update.number
+        return super().key(update)
+
+    def still_wanted(self, update: Update) -> Callable[[Waiting], bool] | None:
+        """Other frames make tries pointless, another map what is of the map."""
+        if isinstance(update, Tuning):
+            return lambda waiting: not isinstance(waiting, (*LATEST_ONLY, Tried))
+        if isinstance(update, Hello):
+            return lambda waiting: not isinstance(waiting, KeyframeInfo | Hello | WaitingBricks)
+        return None
 
 
 def start_page(host: str, port: int) -> ViewerLink:
@@ -14,19 +38,19 @@ def start_page(host: str, port: int) -> ViewerLink:
 
 
 class NoPage:
-    """A line with nobody at its other end, for runs without a page."""
+    """The line of a run without a page: sends nothing, and nothing is asked for."""
 
     lost: str | None = None
 
     def send(self, update: Update) -> None:
-        """Nobody hears it."""
+        """Does nothing."""
 
     def requests(self) -> list[Request]:
-        """Nobody asks for anything."""
+        """No requests."""
         return []
 
     def wait(self, timeout: float) -> None:
-        """There is nothing to wait for."""
+        """Returns at once."""
 
 
 def _serve_page(connection: Connection, host: str, port: int) -> None:

@@ -7,6 +7,7 @@ being tried end the try at once, so what is worked on is never older than the la
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,9 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import ConfigError, TaichiMRFError
 from taichi_mrf.live.link import Link
+from taichi_mrf.live.session_core import WAIT_SECONDS, SessionCore
 from taichi_mrf.system import runtime
-from taichi_mrf.tune.files import csv_file, yaml_file
+from taichi_mrf.system.atomic import write_text
 from taichi_mrf.tune.held_out_pictures import HeldOutPictures
 from taichi_mrf.tune.history import Attempt, History
 from taichi_mrf.tune.map_publisher import MapPublisher
@@ -24,7 +26,7 @@ from taichi_mrf.tune.search import Search
 from taichi_mrf.tune.trial import Trial, run_trial
 from taichi_mrf.tune.verdict import Judged, contenders, judge_unseen
 from taichi_mrf.tune.working_set import WorkingSet, coarse_stride, read_working_set
-from taichi_mrf.viewer.messages import File, Listening, Notice, Quit, Request
+from taichi_mrf.viewer.messages import File, Listening, Notice, Quit
 from taichi_mrf.viewer.tune.messages import (
     Activity,
     By,
@@ -40,9 +42,6 @@ from taichi_mrf.viewer.tune.messages import (
     Tuning,
 )
 
-WAIT_SECONDS = 0.25
-"""So long at most it takes until a signal is noticed while there is nothing to do."""
-
 
 @dataclass(frozen=True)
 class Policy:
@@ -55,8 +54,10 @@ class Policy:
     leave_when_done: bool = False
 
 
-class TuneSession:
+class TuneSession(SessionCore):
     """Works on one sequence. ``history`` holds all tries; ``frames`` is the working set."""
+
+    EXPECTED = TaichiMRFError
 
     def __init__(
         self,
@@ -69,15 +70,16 @@ class TuneSession:
         search: Search | None = None,
         listening: Callable[[Listening], None] = lambda where: None,
         tried: Callable[[Attempt], None] = lambda attempt: None,
+        judged: Callable[[list[Judged]], None] = lambda verdict: None,
     ) -> None:
         """Reads the working set and tells the page of it. ``search`` is carried out at first. ``listening``
-        is called when the viewer says where its page is, ``tried`` after each try.
-        Raises TaichiMRFError."""
-        self._dataset, self._config, self._link, self._policy = dataset, config, link, policy
-        self.search, self._tried = search, tried
+        is called when the viewer says where its page is, ``tried`` after each try, ``judged`` with the
+        scores on unseen views once the search has ended. Raises TaichiMRFError."""
+        super().__init__(link)
+        self._dataset, self._config, self._policy = dataset, config, policy
+        self.search, self._tried, self._judged = search, tried, judged
         self.verdict: list[Judged] = []
-        self._ended, self._view = False, 0
-        self._should_stop: Callable[[], bool] = lambda: False
+        self._view = 0
         self._ways: dict[type, Callable[[Any], None]] = {
             Listening: listening,
             Try: self._want,
@@ -92,36 +94,36 @@ class TuneSession:
 
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Work until told to stop: by ``should_stop``, by the viewer, or because the link is lost."""
-        self._should_stop = should_stop
-        while not self._is_over():
+        self.should_stop = should_stop
+        while not self.is_over:
             self._hear()
-            if self._is_over():
+            if self.is_over:
                 return
             if self._wanted is not None:
-                self._guarded(self._try_wanted)
+                self.guarded(self._try_wanted)
             elif self.search is not None and not self.search.done:
-                self._guarded(self._search_once)
+                self.guarded(self._search_once)
             elif self.search is not None and self.search.best is not None and not self._is_judged:
-                self._guarded(self._judge_found)
+                self.guarded(self._judge_found)
             elif self._policy.leave_when_done:
                 return
             else:
-                self._link.send(Activity("waiting: all scores are up to date", 1.0, busy=False))
-                self._link.wait(WAIT_SECONDS)
+                self.send(Activity("waiting: all scores are up to date", 1.0, busy=False))
+                self.link.wait(WAIT_SECONDS)
 
     def _begin(self, choice: FrameChoice) -> None:
         """Start on a working set, with an empty table; what is raised leaves the old one in place."""
         self.frames: WorkingSet = read_working_set(self._dataset, choice, keep_unseen=self.search is not None)
         self.history = History(self.frames.source)
         self._pictures = HeldOutPictures(self.frames.held_out)
-        self._publisher = MapPublisher(self.frames.source, self._link)
+        self._publisher = MapPublisher(self.frames.source, self.link)
         self._current: int | None = None
         self._coarse = coarse_stride(self.frames.camera)
         self._is_judged = self.search is None
         self._newer = 0
         self._wanted: tuple[Config, By] | None = (self._config, "start")
         backend = runtime.choice()
-        self._link.send(
+        self.send(
             Tuning(
                 source=self.frames.source,
                 backend=backend.name if backend else "",
@@ -135,24 +137,14 @@ class TuneSession:
             )
         )
         for problem in (*self._dataset.notes, *self.frames.skipped):
-            self._link.send(Notice(problem, "warning"))
-
-    def _is_over(self) -> bool:
-        return self._should_stop() or self._ended or self._link.lost is not None
+            self.send(Notice(problem, "warning"))
 
     def _hear(self) -> None:
-        for request in self._link.requests():
-            self._carry_out(request)
-
-    def _carry_out(self, request: Request) -> None:
-        self._guarded(lambda: self._ways[type(request)](request))
-
-    def _guarded(self, work: Callable[[], None]) -> None:
-        """Do some work; what goes wrong with one try or one request becomes a notice."""
-        try:
-            work()
-        except TaichiMRFError as error:
-            self._link.send(Notice(" ".join(str(error).split()), "error"))
+        """Carry out what the page has asked for; signals are looked at between any two requests."""
+        self.hear()
+        while len(self.inbox) and not self.is_over:
+            request = self.inbox.take()
+            self.guarded(partial(self._ways[type(request)], request))
 
     def _want(self, request: Try) -> None:
         self._wanted = request.config, "hand"
@@ -164,9 +156,9 @@ class TuneSession:
 
         def go_on(activity: str, share: float) -> bool:
             prefix = "" if self.search is None or self.search.done else f"{self._search_text()}: "
-            self._link.send(Activity(prefix + activity, share, busy=True))
+            self.send(Activity(prefix + activity, share, busy=True))
             self._hear()
-            return self._newer == began_with and not self._is_over()
+            return self._newer == began_with and not self.is_over
 
         return go_on
 
@@ -222,9 +214,10 @@ class TuneSession:
         if judged is None:
             return
         self._is_judged, self.verdict = True, judged
+        self._judged(judged)
         gain = judged[-1].scores.log_likelihood - judged[0].scores.log_likelihood
         right = judged[-1].scores.accuracy_sigma - judged[0].scores.accuracy_sigma
-        self._link.send(
+        self.send(
             Notice(
                 f"The search has ended. On {len(self.frames.unseen)} views that were never looked at before, "
                 f"what it found changes the log-likelihood by {gain:+.3f} and the share of right pixels "
@@ -240,32 +233,32 @@ class TuneSession:
         """Enter a try into the table, and tell of it."""
         attempt = self.history.note(trial.config, trial.scores, by)
         self._pictures.keep(attempt.number, trial.views, trial.scores.pixel_stride, self.history.pinned)
-        self._link.send(attempt.message())
+        self.send(attempt.message())
         if attempt.number == self.history.pinned:
-            self._link.send(Pinned(self.history.pinned))
+            self.send(Pinned(self.history.pinned))
         if by != "search" and trial.scores.pixel_stride == self._coarse:  # once is enough
             for text in trial.warnings:
-                self._link.send(Notice(text, "warning"))
+                self.send(Notice(text, "warning"))
         self._tried(attempt)
         return attempt
 
     def _show(self, trial: Trial, attempt: Attempt) -> None:
         """Let map, plot and pictures be those of a try."""
         self._current = attempt.number
-        self._link.send(Chosen(attempt.number, attempt.config))
+        self.send(Chosen(attempt.number, attempt.config))
         self._publisher.show(trial)
-        self._link.send(residuals_of(attempt.number, trial.views))
+        self.send(residuals_of(attempt.number, trial.views))
         self._send_pictures()
 
     def _send_pictures(self) -> None:
         if self._current is not None:
             shown = self._pictures.show(self._view, self._current, self.history)
             if shown is not None:
-                self._link.send(shown)
+                self.send(shown)
 
     def _pin(self, request: Pin) -> None:
         self.history.pin(request.number)
-        self._link.send(Pinned(self.history.pinned))
+        self.send(Pinned(self.history.pinned))
         self._send_pictures()
 
     def _look_at(self, request: LookAt) -> None:
@@ -280,11 +273,13 @@ class TuneSession:
         self._begin(request.choice)
 
     def _save(self, request: SaveTries) -> None:
-        make = yaml_file if request.kind == "yaml" else csv_file
-        name, text = make(self.history, request.number, self._policy.out)
-        self._link.send(File(name, text.encode(), request.client))
+        """Send a file to the browser that asked for it; with --out it is also left there."""
+        name, text = self.history.file(request.kind, request.number)
         if self._policy.out is not None:
-            self._link.send(Notice(f"{name} is in {self._policy.out}"))
+            write_text(self._policy.out / name, text)
+        self.send(File(name, text.encode(), request.client))
+        if self._policy.out is not None:
+            self.send(Notice(f"{name} is in {self._policy.out}"))
 
     def _quit(self) -> None:
-        self._ended = True
+        self.ended = True

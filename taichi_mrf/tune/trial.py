@@ -1,5 +1,6 @@
 """One try: parameters in, a fresh map of the training frames out, and its scores on the held-out ones."""
 
+import dataclasses
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -8,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config.schema import Config
+from taichi_mrf.config.schema import Config, PoseConfig
 from taichi_mrf.evaluation.accuracy import JudgedView, judge_view
 from taichi_mrf.evaluation.depth_error import pooled_depth_error
-from taichi_mrf.mapping.selection import KeyframeSelector
+from taichi_mrf.mapping.intake import Full, Intake
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.sensor.frame import Frame
@@ -84,15 +85,16 @@ def judge(m: OccupancyMap, frame: Frame, pixel_stride: int = 1) -> JudgedView:
 
 
 def _build(config: Config, frames: WorkingSet, pixel_stride: int, go_on: GoOn) -> OccupancyMap | None:
+    """The map of the training frames, None if it was abandoned. Poses stay as they were recorded, so that the
+    scores of two tries compare their parameters only."""
     m = create_map(config, frames.camera)
-    selector = KeyframeSelector(config.keyframes)
+    intake = Intake(m, dataclasses.replace(config, poses=PoseConfig()))
     for number, frame in enumerate(frames.training):
         if not go_on(f"adding {frame.name}", number / len(frames.training)):
             return None
-        if selector.wants(frame.T_world_camera):
-            selector.accept(frame.T_world_camera)
-            image = thinned(frame, pixel_stride)
-            m.add_keyframe(image.depth_m, frame.T_world_camera, frame.camera, frame.name)
+        answer = intake.offer(thinned(frame, pixel_stride))
+        if isinstance(answer, Full):
+            raise answer.error
     report = m.infer(
         progress=lambda step: go_on(
             f"sweep {step.sweep} of {step.sweeps}",

@@ -10,7 +10,6 @@ import pytest
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig, load
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.tune.files import csv_file, yaml_file
 from taichi_mrf.tune.history import History
 from taichi_mrf.viewer.tune.messages import Tried
 from taichi_mrf.viewer.tune.score_board import score_board_html, sparkline_svg
@@ -51,9 +50,9 @@ def test_only_a_try_that_there_is_can_be_pinned() -> None:
 
 
 def test_the_yaml_reads_back_as_the_very_parameters(tmp_path: Path) -> None:
-    name, text = yaml_file(history(), 1, tmp_path)
+    name, text = history().file("yaml", 1)
+    (tmp_path / name).write_text(text)
     assert load(tmp_path / name) == OTHER
-    assert (tmp_path / name).read_text() == text
     head = text[: text.index("\n\n")]
     assert all(line.startswith("#") for line in head.splitlines())
     for said in ("try 1 of a kitchen", "inference.sweeps: 5 (was 3)", "log-likelihood: +1.500", "80.0 %"):
@@ -63,14 +62,15 @@ def test_the_yaml_reads_back_as_the_very_parameters(tmp_path: Path) -> None:
 def test_the_source_cannot_break_out_of_the_comment(tmp_path: Path) -> None:
     made = History("a\nvoxel_size: 7")
     made.note(FIRST, SCORES, "start")
-    name, _ = yaml_file(made, 0, tmp_path)
+    name, text = made.file("yaml", 0)
+    (tmp_path / name).write_text(text)
     assert load(tmp_path / name) == FIRST
 
 
 def test_the_csv_has_a_line_for_each_try_with_what_differs() -> None:
     made = history()
     made.pin(1)
-    name, text = csv_file(made, 0, None)
+    name, text = made.file("csv", 0)
     assert name == "tries.csv"
     rows = list(csv.DictReader(io.StringIO(text)))
     assert [row["inference.sweeps"] for row in rows] == ["3", "5"]

@@ -10,7 +10,7 @@ from tune_scene import CHOICE, CONFIG, room, working_set
 
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig, load
-from taichi_mrf.tune.outbox import TuneOutbox
+from taichi_mrf.tune.link import TuneOutbox
 from taichi_mrf.tune.search import Search
 from taichi_mrf.tune.session import Policy, TuneSession
 from taichi_mrf.tune.trial import run_trial
@@ -187,6 +187,24 @@ def test_a_search_is_made_and_judged_on_views_that_it_has_not_seen() -> None:
     assert link.of_type(Chosen)[-1].config == search.best
     assert [line.name for line in session.verdict] == ["shipped defaults", "found"]
     assert any("that were never looked at before" in notice.text for notice in link.of_type(Notice))
+
+
+def test_the_verdict_is_told_when_the_search_ends_and_not_when_the_session_does() -> None:
+    pytest.importorskip("optuna", reason="the search needs Optuna (extra: auto)")
+    search = Search(CONFIG, ("inference.surface_density",), 2, seed=0)
+    link, told = FakeLink(), list[list[str]]()
+    session = TuneSession(
+        room(),
+        CONFIG,
+        CHOICE,
+        link,
+        Policy(),
+        search=search,
+        judged=lambda verdict: told.append([line.name for line in verdict]),
+    )
+    session.run(lambda: link.waits > 0)
+    assert told == [["shipped defaults", "found"]]
+    assert not session.ended
 
 
 def test_a_person_comes_before_the_search_and_can_end_it() -> None:
