@@ -13,6 +13,7 @@ from taichi_mrf.live.session_core import SessionCore
 from taichi_mrf.live.source import Source, saved_unsettled
 from taichi_mrf.mapping.intake import Intake
 from taichi_mrf.mapping.result import MappingResult
+from taichi_mrf.methods.capabilities import can_freeze
 from taichi_mrf.runs.folder import RunFacts
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system import runtime
@@ -85,6 +86,7 @@ class Run(SessionCore):
                 prior_log_odds=m.view.pool.prior_log_odds,
                 min_evidence=self.mapper.min_evidence,
                 parameters=to_yaml(self.source.config),
+                can_freeze=can_freeze(m),
             )
         )
         if self.mapper.saved_unsettled and self.mapper.unsettled:

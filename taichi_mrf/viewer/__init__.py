@@ -1,4 +1,6 @@
-"""The page in the browser, a process of its own that knows no map.
+"""The pages in the browser, in a process of their own that knows no map.
 
-`transport` is the guarded web server, `scene` what is drawn in 3D, `live` and `tune` the two pages.
+`messages` is what the mapping process and a page send each other. `transport` is the guarded web server,
+`scene` is what both pages share, `live` and `tune` are the pages. docs/floors.yaml has their order: the pages
+know the scene, the scene knows the transport, and not the other way round.
 """

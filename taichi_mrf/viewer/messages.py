@@ -51,6 +51,8 @@ class Hello(Update):
     min_evidence: float
     parameters: str
     """The effective configuration as YAML."""
+    can_freeze: bool = True
+    """Whether the map's method can freeze keyframes."""
 
 
 @dataclass(frozen=True)

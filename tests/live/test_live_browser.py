@@ -119,6 +119,22 @@ def test_the_threshold_moves_the_count(page: LivePage, saved: MRFMap) -> None:
     page.until(lambda seen: seen.agrees and seen.voxels == voxels_of(saved, 0.5), "the first count")
 
 
+def test_a_typed_threshold_takes_no_detour(page: LivePage) -> None:
+    """The 0 of 0.8 is outside the slider's range; clamped, it would show almost every voxel."""
+    before, counts = page.look(), set()
+    box = page.input("Threshold").locator("xpath=..").get_by_role("textbox")
+    box.press("Control+A")
+    for key in "0.8":
+        box.press(key)
+        page.pause(0.3)
+        counts.add(page.look().voxels)
+    seen = page.until(lambda seen: seen.agrees and seen.voxels < before.voxels, "fewer voxels")
+    assert box.input_value() == "0.8"
+    assert max(counts | {seen.voxels}) == before.voxels
+    page.slide("Threshold", 0.5)
+    page.until(lambda seen: seen.agrees and seen.voxels == before.voxels, "the first count")
+
+
 def test_the_colour_menu_changes_the_colours(page: LivePage) -> None:
     first = page.look()
     known = {first.colors}
@@ -305,5 +321,8 @@ def test_the_view_follows_the_camera(page: LivePage) -> None:
     page.until(followed, "an eye that moves with the camera")
     page.select("Speed", "2x")
     page.screenshot("followed")
-    page.tick("Follow", on=False)
     page.until_settled()
+    behind = page.position()
+    page.page.reload()
+    page.until(lambda seen: seen.settled and np.allclose(page.position(), behind, atol=0.01), "the same view")
+    page.tick("Follow", on=False)

@@ -109,6 +109,12 @@ def test_a_frozen_keyframe_cannot_be_changed(handled: HandledPage) -> None:
     assert handled.asked == [m.Switch(0, on=False)]
 
 
+def test_a_method_that_cannot_freeze_has_no_button_for_it(handled: HandledPage) -> None:
+    assert "Freeze" in handled.page.panel._edits.options
+    handled.take(replace(HELLO, can_freeze=False))
+    assert list(handled.page.panel._edits.options) == ["On/off", "Move", "Put back"]
+
+
 def test_reset_asks_before_it_deletes_a_map(handled: HandledPage, browser: RawClient) -> None:
     client = handled.client_id()
     handled.act(Action.RESET, client)

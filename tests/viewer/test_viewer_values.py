@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from raw_viewer_client import RawClient, wait_for, widget_message
 
+from taichi_mrf.viewer.transport import connection
 from taichi_mrf.viewer.transport.widget_values import LARGEST_NUMBER, LONGEST_TEXT, is_same, value_to_set
 
 if TYPE_CHECKING:
@@ -65,8 +66,14 @@ def test_what_the_stock_client_sends_is_taken(
     ],
 )
 def test_a_value_out_of_range_is_clamped_and_sent_back(
-    guarded: GuardedPage, stranger: RawClient, name: str, sent: Any, in_force: Any
+    guarded: GuardedPage,
+    stranger: RawClient,
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    sent: Any,
+    in_force: Any,
 ) -> None:
+    monkeypatch.setattr(connection, "TYPING_REST_S", 0.05)
     stranger.say(widget_message(guarded.uuid(name), sent))
     told = stranger.hear_type("GuiUpdateMessage", uuid=guarded.uuid(name))["updates"]["value"]
     assert told == (list(in_force) if isinstance(in_force, tuple) else in_force)

@@ -91,6 +91,9 @@ class Panel(BasePanel):
             '<div style="margin:0.5em 0.75em;font-size:0.85em">Parameters'
             f'<pre style="overflow:auto;margin:0.3em 0">{in_html(hello.parameters)}</pre></div>'
         )
+        self._edits.options = tuple(
+            label for label, action in EDIT_BUTTONS.items() if hello.can_freeze or action is not Action.FREEZE
+        )
         self.clear_notices()
 
     def show_status(self, status: Status) -> None:

@@ -9,6 +9,8 @@ from taichi_mrf.viewer.messages import KeyframeInfo
 
 MOST_FROZEN = 50
 MOST_WAYPOINTS = 2000
+LEAST_TO_MERGE = 4096
+"""Bricks that forgotten keyframes crossed are merged from this number on."""
 
 
 class ShownKeyframes:
@@ -19,7 +21,8 @@ class ShownKeyframes:
         self.recorded: dict[int, Pose] = {}
         """The pose of each keyframe that *Put back* restores."""
         self._old_way: list[NDArray[np.float64]] = []
-        self._old_crossed = np.zeros((0, 3), np.int32)
+        self._old_crossed: list[NDArray[np.int32]] = []
+        self._merged = 0
         self._every, self._forgotten = 1, 0
 
     def put(self, keyframe: KeyframeInfo) -> list[int]:
@@ -45,13 +48,16 @@ class ShownKeyframes:
     def crossed(self) -> list[NDArray[np.int32]]:
         """Bricks (n, 3) that rays of keyframes cross; keyframes that are off are left out."""
         seen = [keyframe.crossed for keyframe in self.keyframes.values() if keyframe.state != "off"]
-        return [self._old_crossed, *seen]
+        return [*self._old_crossed, *seen]
 
     def _forget(self, id: int) -> None:
         keyframe = self.keyframes.pop(id)
         del self.recorded[id]
-        together = np.concatenate([self._old_crossed, keyframe.crossed])
-        self._old_crossed = np.unique(together, axis=0).astype(np.int32)
+        self._old_crossed.append(keyframe.crossed)
+        # Merged only when they have doubled, so that each brick is sorted a few times at most.
+        if sum(map(len, self._old_crossed)) > max(2 * self._merged, LEAST_TO_MERGE):
+            self._old_crossed = [np.unique(np.concatenate(self._old_crossed), axis=0).astype(np.int32)]
+            self._merged = len(self._old_crossed[0])
         if self._forgotten % self._every == 0:
             self._old_way.append(keyframe.T_world_camera[:3, 3])
         self._forgotten += 1
