@@ -124,41 +124,52 @@ def time_taichi(problem: Path, threads: int) -> None:
     import taichi as ti
 
     from taichi_mrf.inference import sum_product
+    from taichi_mrf.inference.keyframe import RayList
     from taichi_mrf.inference.ray_list import BITS
-    from taichi_mrf.inference.sweep import workers_for
+    from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
+    from taichi_mrf.inference.sweep import TRACE_BYTES
+    from taichi_mrf.inference.workers import workers_for
     from taichi_mrf.kernels.vectors import vec4_array
+    from taichi_mrf.sensor.camera import PinholeCamera
     from taichi_mrf.sensor.forward import CENTRE
+    from taichi_mrf.sensor.model import Sensor
+    from taichi_mrf.sensor.noise import PolynomialNoise
     from taichi_mrf.system import runtime
+    from taichi_mrf.voxels.traversal import Space, Viewpoint
 
     runtime.init("cpu", threads)
     data = np.load(problem.with_suffix(".npz"))
     side = round(len(data["log_free"]) ** (1 / 3))
     bricks, count, longest = side // 8, len(data["pixels"]), 4 * side
-    workers = workers_for("cpu", False, longest)
+    workers = workers_for("cpu", False, longest, TRACE_BYTES)
     begins = ti.ndarray(ti.f32, count)
     log_free, sums = ti.ndarray(ti.f32, side**3), ti.ndarray(ti.i64, side**3)
     log_free.from_numpy(data["log_free"])
-    noise = np.zeros((1, 2, 5), np.float32)
-    noise[0, 0, 0] = SIGMA_M
+    camera = PinholeCamera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+    sensor = Sensor(camera.in_kernels(), PolynomialNoise((SIGMA_M,)).table(camera).in_kernels())
+    view = Viewpoint(
+        ti.Vector(data["origin"].tolist(), ti.f32), ti.Matrix((np.eye(3) / VOXEL_SIZE).tolist(), ti.f32)
+    )
+    space = Space(
+        ti.Vector([bricks] * 3, ti.i32), ti.Vector([0.0] * 3, ti.f32), ti.Vector([float(side)] * 3, ti.f32),
+        np.ones((bricks // 8) ** 3, np.int32), np.arange(bricks**3, dtype=np.int32),
+    )  # fmt: skip
+    model = RayModel(
+        voxel_size=VOXEL_SIZE, max_depth=1e3, end_sigmas=SIGMAS, floor=FLOOR, clamp=CLAMP,
+        likelihood=CENTRE, segment_lengths=True, log_average=True, maximise=False,
+    )  # fmt: skip
     steps = np.zeros(workers.number, np.int32)
-    trace_voxel, trace = ti.ndarray(ti.i32, workers.number * longest), vec4_array(workers.number * longest)
+    rays = RayList(data["pixels"] << BITS, data["depth"], count, 1)
+    swept = SweptVoxels(log_free, sums, float(data["scale"]))
+    trace = Trace(
+        ti.ndarray(ti.i32, workers.number * longest), vec4_array(workers.number * longest), longest, steps
+    )
     best = math.inf
     for attempt in range(RUNS + 1):  # the first is compiled
         sums.fill(0)
         begins.fill(0.0)
         begin = time.perf_counter()
-        sum_product.send_messages(
-            data["pixels"] << BITS, data["depth"], count, begins, 0,
-            WIDTH, ti.Vector([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2], ti.f32),
-            ti.Vector(data["origin"].tolist(), ti.f32), ti.Matrix((np.eye(3) / VOXEL_SIZE).tolist(), ti.f32),
-            noise, 1 << 20, 1, VOXEL_SIZE, 1e3, SIGMAS, FLOOR,
-            ti.Vector([bricks] * 3, ti.i32),
-            ti.Vector([0.0] * 3, ti.f32), ti.Vector([float(side)] * 3, ti.f32),
-            np.ones((bricks // 8) ** 3, np.int32), np.arange(bricks**3, dtype=np.int32),
-            log_free, sums, float(data["scale"]), CLAMP,
-            trace_voxel, trace, longest, steps, workers.number, workers.run, workers.spread,
-            CENTRE, True, True, False, False, 0,
-        )  # fmt: skip
+        sum_product.send_messages(rays, begins, 0, sensor, view, space, model, swept, trace, workers, False)
         ti.sync()
         if attempt > 0:
             best = min(best, time.perf_counter() - begin)

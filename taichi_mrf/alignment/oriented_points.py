@@ -7,9 +7,9 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.inference.keyframe import DepthImage
-from taichi_mrf.kernels.types import I32, F32Array, F32Array2, F32Array3, Vec3, Vec4
-from taichi_mrf.sensor.forward import depth_of_deviation, pixel_noise, sigma_at
-from taichi_mrf.sensor.rays import pixel_direction
+from taichi_mrf.kernels.bundles import kernel
+from taichi_mrf.kernels.types import I32, F32Array, F32Array2
+from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.system import runtime
 
 STRIDE = 2
@@ -59,34 +59,36 @@ def oriented_points(image: DepthImage, max_depth: float) -> OrientedPoints:
     """The points of a depth image, up to ``max_depth`` metres, around which the surface is smooth."""
     camera = image.camera
     columns, rows = -(-camera.width // STRIDE), -(-camera.height // STRIDE)
-    half = max(LEAST_WINDOW, round(WINDOW * min(camera.fx, camera.fy)))
+    half = max(LEAST_WINDOW, round(WINDOW * camera.pixels_per_radian))
     step = -(-half // MOST_STEPS)
     depth, sigmas = np.zeros((2, columns * rows), np.float32)
     normals = np.zeros((columns * rows, 3), np.float32)
-    fit_planes(
-        image.depth, camera.width, image.intrinsics, image.noise, image.noise_table.patch,
-        image.noise_table.columns, step, half // step, columns, depth, normals, sigmas,
-    )  # fmt: skip
+    fit_planes(image.depth, image.sensor, step, half // step, columns, depth, normals, sigmas)
     runtime.settle()
     found = np.flatnonzero((depth > 0) & (depth <= max_depth))
     places = np.stack([found % columns, found // columns], axis=1).astype(np.int32)
-    u, v = places[:, 0] * STRIDE, places[:, 1] * STRIDE
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(found))], axis=1)
+    rays = camera.directions(places[:, 0] * STRIDE, places[:, 1] * STRIDE)
     points = (rays * depth[found, None]).astype(np.float32)
     return OrientedPoints(points, normals[found], sigmas[found], places)
 
 
-@ti.kernel
+@kernel
 def fit_planes(
-    measured: F32Array, width: I32, intrinsics: Vec4, noise: F32Array3, patch: I32, noise_columns: I32,
-    step: I32, steps: I32, columns: I32, depth: F32Array, normals: F32Array2, sigmas: F32Array,
-):  # fmt: skip
-    """A plane for every STRIDE-th pixel; ``depth`` is 0 where there is none.
+    measured: F32Array, sensor: Sensor, step: I32, steps: I32, columns: I32,
+    depth: F32Array, normals: F32Array2, sigmas: F32Array,
+) -> None:  # fmt: skip
+    """A plane for every STRIDE-th pixel, from the pixels up to ``steps`` steps of ``step`` pixels away.
 
-    The inverse depth of a plane is linear in the pixel's place: 1 / z = a du + b dv + c, whose coefficients
-    are the plane's normal but for its length. The least squares are those of the pixels around.
+    ``measured`` is (H * W) metres, 0 without a measurement. The results are those of a grid with ``columns``:
+    ``depth`` (N) metres without bias, 0 where there is no plane, ``normals`` (N, 3) unit vectors of the
+    camera frame, ``sigmas`` (N) metres along the normal.
+
+    The inverse depth of a plane is nearly linear in the pixel's place, for a pinhole exactly:
+    1 / z = a du + b dv + c. The sensor makes the plane of these coefficients, which are those of the least
+    squares over the pixels around.
     """
     for point in range(depth.shape[0]):
+        width = sensor.camera.width
         u, v = point % columns * STRIDE, point // columns * STRIDE
         height = measured.shape[0] // width
         here = measured[v * width + u]
@@ -122,13 +124,11 @@ def fit_planes(
             determinant = uu * vv - uv * uv
             a, b = (uq * vv - vq * uv) / determinant, (vq * uu - uq * uv) / determinant
             c = (q - a * du - b * dv) / n + 1.0 / here
-            slope = Vec3(a * intrinsics[0], b * intrinsics[1], 0.0)
-            ray = pixel_direction(u, v, intrinsics)
-            slope[2] = c - slope[0] * ray[0] - slope[1] * ray[1]
-            normal = -slope.normalized()
+            ray = sensor.direction(u, v)
+            normal = -sensor.camera.plane(u, v, a, b, c).normalized()
             if -normal.dot(ray) > STEEPEST * ray.norm():
-                own = pixel_noise(noise, patch, noise_columns, u, v)
-                depth[point] = depth_of_deviation(here, 0.0, own)
-                sigmas[point] = -normal.dot(ray) * sigma_at(own, depth[point])
+                noise = sensor.noise_at(u, v)
+                depth[point] = sensor.surface_depth(here, noise)
+                sigmas[point] = -normal.dot(ray) * noise.sigma(depth[point])
                 for axis in ti.static(range(3)):
                     normals[point, axis] = normal[axis]

@@ -88,10 +88,10 @@ class PointToPlane:
         """Residuals and their derivatives at a pose."""
         sums = np.zeros((self._strips, _TERMS), np.float32)
         if self.total and self.grid.count:
-            centre, to_cells = self.grid.window.rays_of(T_world_camera)
+            view = self.grid.window.viewpoint(T_world_camera)
             rotation = ti.Matrix(T_world_camera[:3, :3].tolist(), ti.f32)
             accumulate(
-                self._points, self._normals, self._sigmas, self.total, centre, to_cells, rotation,
+                self._points, self._normals, self._sigmas, self.total, view.centre, view.to_voxels, rotation,
                 self.grid.cell_size, self.grid.window.shape_vector, self.grid.index.bricks,
                 self.grid.places, self.grid.planes, self._strips, self._spread, sums,
             )  # fmt: skip

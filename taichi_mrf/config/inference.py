@@ -78,11 +78,16 @@ class InferenceConfig:
     """Lower bound on a voxel's cavity probability, as a share of its prior: a voxel that other keyframes see
     as free may still stop a ray. 0 leaves only ``cavity_clamp``."""
 
+    return_pass: Literal["replay", "retrace"] = "replay"
+    """How a ray's messages are found on the way back to the camera: from a trace of its way out (replay), or
+    by following it a second time (retrace), which takes less memory and is slower on a CPU. max-product
+    always replays."""
+
     message_precision: Literal["float16", "float32"] = "float16"
     """Storage of messages. float16 halves their memory and changes beliefs by at most 0.006."""
 
     def __post_init__(self) -> None:
-        for name in ("method", "likelihood", "ray_choice", "average", "message_precision"):
+        for name in ("method", "likelihood", "ray_choice", "average", "return_pass", "message_precision"):
             choices = get_args(get_type_hints(type(self))[name])
             check_field(
                 getattr(self, name) in choices, f"inference.{name}", f"must be one of {', '.join(choices)}"

@@ -22,14 +22,15 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Mat3, Struct, Template, Vec3, Vec4
+from taichi_mrf.kernels.bundles import Bundle, kernel
+from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel
-from taichi_mrf.sensor.rays import pixel_direction
+from taichi_mrf.sensor.rays import CameraRays
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK, VOXELS
-from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
+from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, walk_voxels
 from taichi_mrf.voxels.window import Window, WindowIndex
 
 SIGMAS = 3.0
@@ -113,23 +114,35 @@ def sightings(
     )
     index = WindowIndex()
     index.fill(window, window.cells_of(bricks), np.arange(len(bricks), dtype=np.int32))
-    table = noise.table(camera)
-    intrinsics = ti.Vector([camera.fx, camera.fy, camera.cx, camera.cy], ti.f32)
+    table, seen = noise.table(camera), _Seen(probabilities, passed, confirmed)
     met = []
     for view in views:
         depth = np.ascontiguousarray(view.measured_m, np.float32)
         reach = (SIGMAS * table.at_pixels(depth)[0]).astype(np.float32)
         best = np.full(depth.size, -1.0, np.float32)
         _look(
-            depth.reshape(-1), reach.reshape(-1), camera.width, intrinsics,
-            *window.rays_of(view.T_world_camera), window.shape_vector, *window.clip_box(None, None),
-            index.chunks, index.bricks, probabilities, passed, confirmed, best,
+            depth.reshape(-1), reach.reshape(-1), camera.in_kernels(), window.viewpoint(view.T_world_camera),
+            index.space(window), seen, best,
         )  # fmt: skip
         met.append(best[(depth > 0).reshape(-1) & (depth <= max_depth).reshape(-1)])
     near = np.concatenate(met) if met else np.zeros(0, np.float32)
     found = Sightings(centres, probability, passed.to_numpy()[place], confirmed.to_numpy()[place], near)
     runtime.settle()  # before the arrays are dropped
     return found
+
+
+@dataclass(frozen=True)
+class _Seen(Bundle):
+    """The occupied voxels. Arrays (bricks * 512)."""
+
+    probability: F32Array
+    """-1 for a voxel that is not occupied."""
+
+    passed: I32Array
+    """Rays that have passed the voxel."""
+
+    confirmed: I32Array
+    """Rays that confirm it."""
 
 
 @ti.dataclass
@@ -141,35 +154,34 @@ class _Sight(Struct):
 
 
 @ti.func
-def _see(sight: Template, context: Template, voxel: I32, t: F32, t_leave: F32):
-    probability = context[0][voxel]
+def _see(sight: Template, seen: Template, voxel: I32, t: F32, t_leave: F32):
+    probability = seen.probability[voxel]
     if probability >= 0.0:
         if t_leave < sight.near:
-            ti.atomic_add(context[1][voxel], 1)
+            ti.atomic_add(seen.passed[voxel], 1)
         elif t < sight.far:
-            ti.atomic_add(context[2][voxel], 1)
+            ti.atomic_add(seen.confirmed[voxel], 1)
         if t_leave >= sight.covers:
             sight.best = ti.max(sight.best, probability)
     return 1
 
 
-@ti.kernel
+@kernel
 def _look(
-    depth: F32Array, reach: F32Array, width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
-    shape: IVec3, lower: Vec3, upper: Vec3, chunks: I32Array, bricks: I32Array,
-    probabilities: F32Array, passed: I32Array, confirmed: I32Array, best: F32Array,
-):  # fmt: skip
+    depth: F32Array, reach: F32Array, camera: CameraRays, view: Viewpoint, space: Space, seen: _Seen,
+    best: F32Array,
+) -> None:  # fmt: skip
+    """Follow the ray of each pixel. ``depth`` and ``reach`` are (H * W) metres, 0 without a measurement;
+    ``best`` (H * W) receives the highest probability of a voxel near the measurement, -1 without one."""
     for pixel in range(depth.shape[0]):
         measured = depth[pixel]
         sight = _Sight(measured - reach[pixel], measured + reach[pixel], 0.0, -1.0)
         if measured > 0.0:
-            direction = to_voxels @ pixel_direction(pixel % width, pixel // width, intrinsics)
-            one_voxel = 1.0 / direction.norm()
+            u, v = camera.pixel(pixel)
+            ray = pixel_ray(camera, view, u, v)
+            one_voxel = 1.0 / ray.direction.norm()
             sight.covers = sight.near - one_voxel
-            ray = make_ray(centre, direction)
             begin, end = 0.0, sight.far + one_voxel
-            clip(ray, begin, end, lower, upper)
-            walk_voxels(
-                ray, begin, end, shape, chunks, bricks, _see, sight, (probabilities, passed, confirmed)
-            )
+            clip(ray, begin, end, space.lower, space.upper)
+            walk_voxels(ray, begin, end, space, _see, sight, seen)
         best[pixel] = sight.best  # always: on Vulkan what a kernel does not write comes back undefined

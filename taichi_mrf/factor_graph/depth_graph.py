@@ -14,6 +14,7 @@ are not weighed by length: with lengths there is no joint distribution that the 
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
@@ -28,107 +29,120 @@ from taichi_mrf.factor_graph.kernels import count_degrees
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.sum_product import TINY
 from taichi_mrf.inference.sweep import LIKELIHOODS
+from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import softplus
-from taichi_mrf.kernels.types import (
-    F32,
-    I32,
-    AnyArray,
-    F32Array,
-    F32Array2,
-    F32Array3,
-    I32Array,
-    IVec3,
-    Mat3,
-    Struct,
-    Template,
-    Vec3,
-    Vec4,
-)
-from taichi_mrf.sensor.forward import (
-    SUPPORT,
-    PixelNoise,
-    beyond_likelihood,
-    depth_of_deviation,
-    pixel_noise,
-    surface_likelihood,
-)
-from taichi_mrf.sensor.rays import pixel_direction
+from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, F32Array2, I32Array, Struct, Template
+from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.voxels.pool import BrickPool
-from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
+from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, walk_voxels
 from taichi_mrf.voxels.window import WindowIndex
+
+
+@dataclass(frozen=True)
+class _RayFactors(Bundle):
+    """What the factors of all rays have in common (InferenceConfig)."""
+
+    voxel_size: F32
+    """Metres."""
+
+    max_depth: F32
+    """Metres of depth that no ray goes beyond."""
+
+    end_sigmas: F32
+    """A ray ends this many sigmas behind its measurement."""
+
+    floor: F32
+    """Density, per metre, of a measurement that no surface explains."""
+
+    likelihood: Template
+    """AUTO, SEGMENT or CENTRE of sensor/forward.py."""
 
 
 @ti.dataclass
 class _Way(Struct):
-    """A ray on its way: what it measured, and where its next cell is written."""
+    """A ray on its way."""
 
+    steps: I32  # voxels crossed so far
+
+
+@dataclass(frozen=True)
+class _Factor(Bundle):
+    """One ray, and where its cells and energies are written."""
+
+    sensor: Sensor
     measured: F32
-    noise: PixelNoise
-    support: F32
-    steps: I32
+    noise: Template  # of its pixel
+    support: F32  # depth before which no surface can have made the measurement
+    model: _RayFactors
     edge: I32
     entry: I32
+    cells: I32Array
+    table: F32Array2
 
 
 @ti.func
-def _count_voxel(way: Template, context: Template, voxel: I32, near: F32, far: F32):
+def _count_voxel(way: Template, nothing: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of a ray whose voxels are counted."""
     way.steps += 1
     return 1
 
 
 @ti.func
-def _write_voxel(way: Template, context: Template, voxel: I32, near: F32, far: F32):
+def _write_voxel(way: Template, factor: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of a ray: a cell of its factor, and the energy of the first surface lying there."""
     density = 0.0
-    if far > way.support:
-        density = surface_likelihood(way.measured, near, far, way.noise, context[2], context[3])
-    context[0][way.edge + way.steps] = voxel
-    context[1][way.entry + way.steps, 0] = -ti.log(density + context[4])
+    if far > factor.support:
+        density = factor.sensor.likelihood(
+            factor.measured, near, far, factor.noise, factor.model.voxel_size, factor.model.likelihood
+        )
+    factor.cells[factor.edge + way.steps] = voxel
+    factor.table[factor.entry + way.steps, 0] = -ti.log(density + factor.model.floor)
     way.steps += 1
     return 1
 
 
-@ti.kernel
+@kernel
 def _follow(
-    pixels: I32Array, depth: F32Array, width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
-    noise: F32Array3, patch: I32, columns: I32, voxel_size: F32, max_depth: F32, end_sigmas: F32, floor: F32,
-    shape: IVec3, box_lower: Vec3, box_upper: Vec3, chunks: I32Array, bricks: I32Array,
-    beam: I32, begins: AnyArray, cells: I32Array, table: F32Array2,
-    likelihood: Template, write: Template,
-):  # fmt: skip
-    """Follow the rays of some pixels, which are factors ``beam`` and onwards.
+    pixels: I32Array, depth: F32Array, sensor: Sensor, view: Viewpoint, space: Space, model: _RayFactors,
+    beam: I32, begins: AnyArray, cells: I32Array, table: F32Array2, write: Template,
+) -> None:  # fmt: skip
+    """Follow the rays of some ``pixels`` (n), which are factors ``beam`` and onwards.
 
-    Counts the voxels on each ray's way into ``begins[beam + i + 1]``, or, with ``write``, writes them, and
-    the energies, where ``begins`` says.
+    ``depth`` is (H * W) metres. Counts the voxels on each ray's way into ``begins[beam + i + 1]`` (beams +
+    1), or, with ``write``, writes them to ``cells`` (edges), and the energies to ``table`` (edges + beams,
+    1), where ``begins`` says.
     """
     for i in range(pixels.shape[0]):
-        u, v = pixels[i] % width, pixels[i] // width
+        u, v = sensor.pixel(pixels[i])
         measured = depth[pixels[i]]
-        ray = make_ray(centre, to_voxels @ pixel_direction(u, v, intrinsics))
-        here = pixel_noise(noise, patch, columns, u, v)
-        last = depth_of_deviation(measured, -end_sigmas, here)
-        begin, end = 0.0, ti.min(last, max_depth)
-        clip(ray, begin, end, box_lower, box_upper)
-        way = _Way(measured, here, depth_of_deviation(measured, SUPPORT, here), 0, 0, 0)
+        ray = pixel_ray(sensor, view, u, v)
+        noise = sensor.noise_at(u, v)
+        last = sensor.farthest_depth(measured, noise, model.end_sigmas)
+        begin, end = 0.0, ti.min(last, model.max_depth)
+        clip(ray, begin, end, space.lower, space.upper)
+        way = _Way(0)
         if ti.static(write):
             f = beam + i
-            way.edge = begins[f]
-            way.entry = begins[f] + f
-            walk_voxels(
-                ray, begin, end, shape, chunks, bricks, _write_voxel, way,
-                (cells, table, voxel_size, likelihood, floor),
-            )  # fmt: skip
+            edge, entry = begins[f], begins[f] + f
+            support = sensor.support(measured, noise)
+            factor = _Factor(sensor, measured, noise, support, model, edge, entry, cells, table)
+            walk_voxels(ray, begin, end, space, _write_voxel, way, factor)
             beyond = 0.0
             if end < last:
-                beyond = beyond_likelihood(measured, end, here)
-            table[way.entry + way.steps, 0] = -ti.log(beyond + floor)
+                beyond = sensor.likelihood_beyond(measured, end, noise)
+            table[entry + way.steps, 0] = -ti.log(beyond + model.floor)
         else:
-            walk_voxels(ray, begin, end, shape, chunks, bricks, _count_voxel, way, voxel_size)
+            walk_voxels(ray, begin, end, space, _count_voxel, way, 0)
             begins[beam + i + 1] = way.steps
 
 
 @ti.kernel
 def _write_priors(log_odds: F32Array, beam: I32, edge: I32, cells: I32Array, table: F32Array2):
-    """A factor for each cell: occupied costs -log p, and free -log (1 - p)."""
+    """A factor for each cell: occupied costs -log p, and free -log (1 - p).
+
+    ``log_odds`` is (cells); the factors are ``beam`` and onwards, their edges ``edge`` and onwards in
+    ``cells`` (edges), their energies in ``table`` (edges + beams, 1).
+    """
     for cell in range(log_odds.shape[0]):
         cells[edge + cell] = cell
         entry = edge + cell + beam + cell
@@ -225,19 +239,19 @@ class _RaysOf:
         """Count the voxels on every ray's way into ``begins``, or write cells and table (``into``)."""
         cells, table = into or (ti.ndarray(ti.i32, 1), ti.ndarray(ti.f32, (1, 1)))
         config, beam = self.inference, 0
+        model = _RayFactors(
+            self.voxel_size, self.sensor.max_depth, config.end_sigmas, config.outlier_floor + TINY,
+            LIKELIHOODS[config.likelihood],
+        )  # fmt: skip
         for keyframe, pixels in zip(keyframes, chosen, strict=True):
             image, visible, window = keyframe.image, keyframe.visible, keyframe.footprint.window
             if len(pixels) == 0:
                 continue
-            centre, to_voxels = window.rays_of(keyframe.T_world_camera)
-            box_lower, box_upper = window.clip_box(self.volume.lower, self.volume.upper)
             self.index.fill(window, visible.cells, self.rank[visible.slots])
             _follow(
-                pixels, image.depth, image.camera.width, image.intrinsics, centre, to_voxels,
-                image.noise, image.noise_table.patch, image.noise_table.columns, self.voxel_size,
-                self.sensor.max_depth, config.end_sigmas, config.outlier_floor + TINY,
-                window.shape_vector, box_lower, box_upper, self.index.chunks, self.index.bricks,
-                beam, begins, cells, table, LIKELIHOODS[config.likelihood], into is not None,
+                pixels, image.depth, image.sensor, window.viewpoint(keyframe.T_world_camera),
+                self.index.space(window, self.volume.lower, self.volume.upper), model,
+                beam, begins, cells, table, into is not None,
             )  # fmt: skip
             self.index.clear(window, visible.cells)
             beam += len(pixels)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.types import F32, I32, Template
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.window import Window
 
@@ -52,7 +52,7 @@ def mean_message(packed: ti.i64) -> F32:
 
 
 def finest_scale(
-    camera: PinholeCamera,
+    camera: Camera,
     rays: int,
     T_world_camera: Pose,
     window: Window,
@@ -61,8 +61,8 @@ def finest_scale(
 ) -> float:
     """The largest power of two by which lengths can be scaled before a sum could overflow 31 bits.
 
-    A voxel at a distance of D voxels lies in the cone of the sphere around it, which no more pixels
-    can meet than fit in the cone's solid angle at the image's corner, where pixels are densest.
+    A voxel at a distance of D voxels lies in the cone of the sphere around it, and the camera bounds the
+    pixels in a cone.
     ``bricks`` (n, 3) are those that the rays may meet; ``rays`` are counted as the pixels that they stand
     for, squares of ``widest`` pixels a side at most.
     """
@@ -72,11 +72,6 @@ def finest_scale(
     nearest = float(np.sqrt((beside**2).sum(axis=1)).min()) if len(bricks) else 0.0
     most = float(rays)
     if nearest > 2.0:
-        distance = nearest + HALF_VOXEL  # of the voxel's centre
-        slant = camera.largest_slant()
-        density = camera.fx * camera.fy * slant**3  # pixels for each unit of solid angle
-        radius = math.asin(HALF_VOXEL / distance)
-        solid_angle = 2 * math.pi * (1 - math.cos(radius))
-        rim = 2 * math.pi * radius * slant**2 * max(camera.fx, camera.fy)  # pixels along the cone's edge
-        most = min(most, density * solid_angle + rim * widest + 4 * widest**2)
+        radius = math.asin(HALF_VOXEL / (nearest + HALF_VOXEL))  # the distance is that of the voxel's centre
+        most = min(most, camera.most_pixels_in_cone(radius, widest))
     return 2.0 ** math.floor(math.log2(2**31 / (LONGEST * max(most, 1.0) + 1)))

@@ -8,15 +8,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.kernels.bundles import Bundle
 from taichi_mrf.kernels.resident import Resident, on_host, resident
-from taichi_mrf.sensor.camera import PinholeCamera, check_camera
+from taichi_mrf.kernels.types import I32, F32Array, I32Array
+from taichi_mrf.sensor.camera import Camera, check_camera
+from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import NoiseModel, NoiseTable
 from taichi_mrf.voxels.window import Window
 
 Cells = NDArray[np.int32]
 
 
-def checked_depth(depth_m: ArrayLike, camera: PinholeCamera, min_depth: float) -> NDArray[np.float32]:
+def checked_depth(depth_m: ArrayLike, camera: Camera, min_depth: float) -> NDArray[np.float32]:
     """A copy of (H, W) axial depth in metres, in which what is no measurement is 0: NaN, infinite, not
     positive, or nearer than ``min_depth``.
 
@@ -47,36 +50,30 @@ those of a tile cross the same bricks. A tile is also the largest block of pixel
 class DepthImage:
     """A depth image where kernels can reach it, with its camera and the camera's noise.
 
-    ``depth`` is (H * W) float32 axial depth in metres, 0 where there is no measurement; ``farthest`` the
-    largest in each tile (rows, columns).
+    ``depth`` is (H * W) float32 in metres along each pixel's ray (axial depth for a pinhole), 0 where there
+    is no measurement; ``farthest`` the largest in each tile (rows, columns). ``sensor`` is camera and noise
+    as kernels take them, ``rays`` the number of measurements.
     """
 
     depth: Resident
-    camera: PinholeCamera
-    noise: Resident
+    camera: Camera
+    sensor: Sensor
     noise_table: NoiseTable
     rays: int
     farthest: NDArray[np.float32]
 
     @staticmethod
-    def upload(depth_m: NDArray[np.float32], camera: PinholeCamera, noise: NoiseModel) -> "DepthImage":
+    def upload(depth_m: NDArray[np.float32], camera: Camera, noise: NoiseModel) -> "DepthImage":
         """Put :func:`checked_depth` (H, W), which nobody may change from now on, where kernels can reach it.
         Raises ConfigError if the noise model does not fit the camera."""
         table = noise.table(camera)
-        depth, coefficients = resident(depth_m.reshape(-1)), resident(table.coefficients)
-        return DepthImage(
-            depth, camera, coefficients, table, int(np.count_nonzero(depth_m)), _farthest(depth_m)
-        )
+        sensor = Sensor(camera.in_kernels(), table.in_kernels())
+        depth = resident(depth_m.reshape(-1))
+        return DepthImage(depth, camera, sensor, table, int(np.count_nonzero(depth_m)), _farthest(depth_m))
 
     def to_numpy(self) -> NDArray[np.float32]:
         """(H, W) axial depth in metres, 0 where there is no measurement."""
         return np.array(on_host(self.depth)).reshape(self.camera.shape)
-
-    @property
-    def intrinsics(self) -> ti.Vector:
-        """(fx, fy, cx, cy) as a kernel argument."""
-        c = self.camera
-        return ti.Vector([c.fx, c.fy, c.cx, c.cy], ti.f32)
 
 
 def _farthest(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -92,18 +89,20 @@ def _farthest(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 @dataclass(frozen=True)
-class RayList:
-    """The rays of a depth image, tile after tile.
+class RayList(Bundle):
+    """The rays of a depth image, tile after tile. Kernels take it as it is."""
 
-    ``blocks`` (n) int32 says which pixels a ray stands for (ray_list.py), ``depth`` (n) float32 is its
-    measurement, axial depth in metres. There is at least one entry; ``number`` of them are rays. ``widest``
-    is the largest number of pixels along a block's side.
-    """
+    blocks: I32Array
+    """(n): which block of pixels each ray stands for (ray_list.block_of); n is at least 1."""
 
-    blocks: ti.Ndarray
-    depth: ti.Ndarray
-    number: int
-    widest: int
+    depth: F32Array
+    """(n): each ray's measurement, the mean of its pixels, in metres."""
+
+    number: I32
+    """How many entries are rays."""
+
+    widest: I32
+    """Largest number of pixels along a block's side."""
 
     @property
     def nbytes(self) -> int:
@@ -185,7 +184,8 @@ class Keyframe:
     pending_visible: VisibleBricks | None = None
 
     @property
-    def camera(self) -> PinholeCamera:
+    def camera(self) -> Camera:
+        """The camera that took its image."""
         return self.image.camera
 
     @property

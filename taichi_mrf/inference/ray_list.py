@@ -7,15 +7,18 @@ counts as many as they are. What does not agree, such as the rim of a surface, s
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
 
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.inference.keyframe import TILE, DepthImage, RayList
-from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array3, I32Array, Struct, Template
-from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.sensor.forward import pixel_noise, sigma_at
+from taichi_mrf.kernels.bundles import Bundle, kernel
+from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Template
+from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.voxels.traversal import pixel_ray
 
 LEVELS = 10
 """A block of level n has 2^n pixels: the odd levels put two blocks side by side, the even ones two above each
@@ -39,13 +42,22 @@ def block_of(ray: I32, width: I32):
     return pixel % width, pixel // width, 1 << (level + 1) // 2, 1 << level // 2
 
 
-def stride_metres(camera: PinholeCamera, voxel_size: float, ray_density: float) -> float:
+@ti.func
+def listed_ray(rays: Template, i: I32, sensor: Template, view: Template):
+    """Ray i of a list (keyframe.RayList): the ray through the middle of its block, the noise there, and how
+    many pixels the block has."""
+    u, v, wide, high = block_of(rays.blocks[i], sensor.camera.width)
+    ray = pixel_ray(sensor, view, u + 0.5 * (wide - 1), v + 0.5 * (high - 1))
+    return ray, sensor.noise_at(u + wide // 2, v + high // 2), wide * high
+
+
+def stride_metres(camera: Camera, voxel_size: float, ray_density: float) -> float:
     """Distance between rays, in pixels, times the depth in metres: a voxel at depth z covers
-    voxel_size * f / z pixels along each side. 0 casts every pixel."""
+    voxel_size * pixels_per_radian / z pixels along each side. 0 casts every pixel."""
     if ray_density == 0:
         return 0.0
     rays_per_voxel = max(1.0, ray_density * 100.0 * voxel_size)
-    return voxel_size * min(camera.fx, camera.fy) / math.sqrt(rays_per_voxel)
+    return voxel_size * camera.pixels_per_radian / math.sqrt(rays_per_voxel)
 
 
 class RayBundler:
@@ -65,12 +77,10 @@ class RayBundler:
         tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
         stride = stride_metres(camera, self.voxel_size, self.inference.ray_density)
         counts, widest = np.zeros(tiles, np.int32), np.ones(tiles, np.int32)
-        _choose(
-            image.depth, camera.width, image.noise, image.noise_table.patch, image.noise_table.columns,
-            stride, AGREE_VOXELS * self.voxel_size, AGREE_SIGMAS,
-            self._nearest, self._farthest, self._mean, self._level, counts,
-            self.inference.ray_choice == "thin",
-        )  # fmt: skip
+        rule = _MergeRule(stride, AGREE_VOXELS * self.voxel_size, AGREE_SIGMAS)
+        blocks_of_pixels = _PixelBlocks(self._nearest, self._farthest, self._mean, self._level)
+        thin = self.inference.ray_choice == "thin"
+        _choose(image.depth, image.sensor, rule, blocks_of_pixels, counts, thin)
         number = int(counts.sum())
         blocks, depth = ti.ndarray(ti.i32, max(1, number)), ti.ndarray(ti.f32, max(1, number))
         first = np.cumsum(counts, dtype=np.int32) - counts
@@ -83,14 +93,35 @@ class RayBundler:
             self._level = ti.ndarray(ti.i32, pixels)
 
 
-@ti.dataclass
-class _Blocks(Struct):
+@dataclass(frozen=True)
+class _MergeRule(Bundle):
     """What is asked of a block of pixels before it becomes one ray."""
 
-    width: I32
     stride_metres: F32
+    """See :func:`stride_metres`."""
+
     agree_m: F32
+    """Measurements in metres agree if they differ by no more than this,"""
+
     agree_sigmas: F32
+    """or by no more than this many sigma."""
+
+
+@dataclass(frozen=True)
+class _PixelBlocks(Bundle):
+    """The blocks that begin at each pixel, row by row. All arrays (H * W)."""
+
+    nearest: F32Array
+    """The smallest measurement in the block, metres."""
+
+    farthest: F32Array
+    """The largest one."""
+
+    mean: F32Array
+    """Their mean."""
+
+    level: I32Array
+    """The block's level, -1 where none begins."""
 
 
 @ti.func
@@ -101,35 +132,36 @@ def _is_thinned_out(u: I32, v: I32, measured: F32, stride_metres: F32) -> I32:
 
 
 @ti.func
-def _merge(asked: Template, u: I32, v: I32, n: I32, noise: Template, patch: I32, columns: I32,
-           nearest: Template, farthest: Template, mean: Template, level: Template):  # fmt: skip
+def _merge(rule: Template, blocks: Template, sensor: Template, u: I32, v: I32, n: I32):
     """Make one block of level ``n`` at pixel (u, v) of the two below it, if they are there and agree."""
     wide, high = 1 << (n + 1) // 2, 1 << n // 2
-    a = v * asked.width + u
-    b = a + (wide // 2 if n % 2 == 1 else high // 2 * asked.width)
-    if level[a] == n - 1 and level[b] == n - 1:
-        near, far = ti.min(nearest[a], nearest[b]), ti.max(farthest[a], farthest[b])
-        if wide * high * near * near <= asked.stride_metres * asked.stride_metres:
-            agree = far - near <= asked.agree_m
+    a = v * sensor.camera.width + u
+    b = a + (wide // 2 if n % 2 == 1 else high // 2 * sensor.camera.width)
+    if blocks.level[a] == n - 1 and blocks.level[b] == n - 1:
+        near = ti.min(blocks.nearest[a], blocks.nearest[b])
+        far = ti.max(blocks.farthest[a], blocks.farthest[b])
+        if wide * high * near * near <= rule.stride_metres * rule.stride_metres:
+            agree = far - near <= rule.agree_m
             if not agree:  # the noise need not be looked up for most
-                sigma = sigma_at(pixel_noise(noise, patch, columns, u + wide // 2, v + high // 2), near)
-                agree = far - near <= asked.agree_sigmas * sigma
+                sigma = sensor.noise_at(u + wide // 2, v + high // 2).sigma(near)
+                agree = far - near <= rule.agree_sigmas * sigma
             if agree:
-                nearest[a] = near
-                farthest[a] = far
-                mean[a] = 0.5 * (mean[a] + mean[b])
-                level[a] = n
-                level[b] = -1
+                blocks.nearest[a] = near
+                blocks.farthest[a] = far
+                blocks.mean[a] = 0.5 * (blocks.mean[a] + blocks.mean[b])
+                blocks.level[a] = n
+                blocks.level[b] = -1
 
 
-@ti.kernel
+@kernel
 def _choose(
-    depth: F32Array, width: I32, noise: F32Array3, patch: I32, columns: I32,
-    stride_metres: F32, agree_m: F32, agree_sigmas: F32,
-    nearest: F32Array, farthest: F32Array, mean: F32Array, level: I32Array, counts: I32Array, thin: Template,
-):  # fmt: skip
-    """Give each pixel the level of the block that begins there, or -1 if none does; count them by tile."""
-    asked = _Blocks(width, stride_metres, agree_m, agree_sigmas)
+    depth: F32Array, sensor: Sensor, rule: _MergeRule, blocks: _PixelBlocks, counts: I32Array, thin: Template
+) -> None:
+    """Give each pixel the level of the block that begins there, or -1 if none does; count them by tile.
+
+    ``depth`` is (H * W) metres, 0 without a measurement; ``counts`` (tiles) receives the number of rays.
+    """
+    width = sensor.camera.width
     height = depth.shape[0] // width
     across = (width + TILE - 1) // TILE
     for iteration in range(counts.shape[0] * SPREAD):
@@ -141,13 +173,13 @@ def _choose(
                 for u in range(left, right):
                     i = v * width + u
                     measured = depth[i]
-                    nearest[i] = measured
-                    farthest[i] = measured
-                    mean[i] = measured
-                    level[i] = 0 if measured > 0.0 else -1
+                    blocks.nearest[i] = measured
+                    blocks.farthest[i] = measured
+                    blocks.mean[i] = measured
+                    blocks.level[i] = 0 if measured > 0.0 else -1
                     if ti.static(thin):  # noqa: SIM102 (a static condition stands alone)
-                        if measured > 0.0 and _is_thinned_out(u, v, measured, stride_metres):
-                            level[i] = -1
+                        if measured > 0.0 and _is_thinned_out(u, v, measured, rule.stride_metres):
+                            blocks.level[i] = -1
             if ti.static(not thin):
                 for n in range(1, LEVELS + 1):
                     wide, high = 1 << (n + 1) // 2, 1 << n // 2
@@ -155,11 +187,11 @@ def _choose(
                         u = left + block % (TILE // wide) * wide
                         v = top + block // (TILE // wide) * high
                         if u + wide <= right and v + high <= bottom:
-                            _merge(asked, u, v, n, noise, patch, columns, nearest, farthest, mean, level)
+                            _merge(rule, blocks, sensor, u, v, n)
             rays = 0
             for v in range(top, bottom):
                 for u in range(left, right):
-                    rays += ti.cast(level[v * width + u] >= 0, ti.i32)
+                    rays += ti.cast(blocks.level[v * width + u] >= 0, ti.i32)
             counts[tile] = rays
 
 
@@ -168,7 +200,11 @@ def _write_down(
     width: I32, height: I32, mean: F32Array, level: I32Array, first: I32Array,
     blocks: I32Array, depth: F32Array, widest: I32Array,
 ):  # fmt: skip
-    """List the blocks that begin in each tile, from its first place in the list on."""
+    """List the blocks that begin in each tile, from its place ``first`` (tiles) in the list on.
+
+    ``mean`` (H * W) metres and ``level`` (H * W) are those of _PixelBlocks, ``blocks`` and ``depth`` (rays)
+    those of the list. ``widest`` (tiles) receives the largest side of a block in pixels.
+    """
     across = (width + TILE - 1) // TILE
     for iteration in range(first.shape[0] * SPREAD):
         if iteration % SPREAD == 0:

@@ -10,51 +10,53 @@ the supplement's are marked S.
 All rays of a keyframe send a voxel the same, average message (section IV-A), so a keyframe keeps one
 message for each voxel that it sees, and a sweep over it is four steps:
 
-    cavity     what all others believe of each voxel                    belief - own message      (6)
+    cavity     belief of each voxel without the keyframe's own message                          (6)
     forward    follow each ray: which voxel may have made the measurement?                  (4), (11)
-    backward   tell each voxel what that implies for it                                    (13), (14)
+    backward   the message of the ray to each voxel                                        (13), (14)
     finish     average over rays, renew the keyframe's message, update the beliefs          (7), (8)
 
-With ``maximise`` the middle two are those of max_product.py. Messages and beliefs are log-odds. A voxel
-counts by the length l (in voxel sizes) that a ray spends in it: it lets the ray pass with probability
-(1 - m)^l where m is its probability of being occupied.
+Messages and beliefs are log-odds. A voxel counts by the length l (in voxel sizes) that a ray spends in it: it
+lets the ray pass with probability (1 - m)^l where m is its probability of being occupied. In the symbols of
+section III, for the voxels 1 .. N of one ray, ordered from the camera:
+
+    m_i         cavity probability of occupied              exp(log_free) = 1 - m_i
+    nu_i        likelihood of the measurement if voxel i is the first surface                   (4)
+    vis_i       prod_{k<i} (1 - m_k)^l_k                                        ForwardPass.visibility
+    before_i    sum_{j<i} nu_j m_j vis_j                                         ForwardPass.explained
+    behind_i    sum_{j>i} nu_j m_j vis_j, and what lies beyond the map
+
+With ``maximise`` sums over explanations become maxima: max_product.py.
 """
+
+from dataclasses import dataclass
 
 import taichi as ti
 
 from taichi_mrf.inference.accumulators import add_message, length_sum, mean_message
 from taichi_mrf.inference.first_occupied import NEVER
+from taichi_mrf.inference.keyframe import RayList
 from taichi_mrf.inference.max_product import best_message, cost, see_best
-from taichi_mrf.inference.ray_list import block_of
+from taichi_mrf.inference.ray_list import listed_ray
+from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
+from taichi_mrf.inference.workers import Workers
+from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import clamped_log_odds, exp_of_negative, logistic, softplus
 from taichi_mrf.kernels.types import (
     F32,
     I32,
     AnyArray,
     F32Array,
-    F32Array3,
     I32Array,
     I64Array,
-    IVec3,
-    Mat3,
     Struct,
     Template,
     Vec3,
     Vec4,
-    Vec4Array,
 )
-from taichi_mrf.sensor.forward import (
-    SUPPORT,
-    PixelNoise,
-    beyond_likelihood,
-    depth_of_deviation,
-    pixel_noise,
-    surface_likelihood,
-)
-from taichi_mrf.sensor.rays import deals, dealt_ray, pixel_direction
+from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.strips import strip_begin
-from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
+from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_voxels
 
 TINY = 1e-30
 """Keeps a ray that explains nothing, without an outlier floor, from dividing zero by zero."""
@@ -65,28 +67,40 @@ MOVED = 0.01
 
 @ti.dataclass
 class ForwardPass(Struct):
-    """What is known of a ray on its way from the camera."""
+    """A ray on its way from the camera, in front of voxel i."""
 
-    measured: F32  # axial depth, metres
-    noise: PixelNoise
-    support: F32  # depth before which no surface can have made the measurement
-    voxels_per_depth: F32  # length of the ray, in voxels, for one metre of axial depth
-    visibility: F32  # prod_{k < i} (1 - m_k)^{l_k}
-    explained: F32  # sum_{j < i} of eq. 11; for max-product the least cost of such an explanation
+    visibility: F32  # vis_i
+    explained: F32  # before_i; for max-product the least cost of such an explanation
     first: F32  # depth at which the ray enters its first voxel
-    voxels: I32
-    trace: I32  # where this ray's steps are written down
+    voxels: I32  # i
 
 
-@ti.kernel
+@dataclass(frozen=True)
+class _Cast(Bundle):
+    """One ray, and all that a step along it needs."""
+
+    model: RayModel
+    swept: SweptVoxels
+    sensor: Sensor
+    measured: F32  # its measurement, metres
+    noise: Template  # of its pixel
+    support: F32  # depth before which no surface can have made the measurement
+    voxels_per_depth: F32  # length of the ray, in voxels, for one metre of depth
+    pixels: F32  # for how many pixels it stands
+
+
+@kernel
 def cavity(
     slots: I32Array, belief: F32Array, messages: AnyArray, lowest: F32, highest: F32,
     log_free: F32Array, sums: I64Array, strip: Template,
-):  # fmt: skip
-    """Eq. 6: what a voxel tells this keyframe's rays is all that it knows but from them.
+) -> None:  # fmt: skip
+    """Eq. 6: the belief of each voxel without this keyframe's own message.
 
-    Writes log(1 - m) for each voxel, its log-odds bounded by ``lowest`` and ``highest``, and empties the
-    sums. ``strip``: voxels an iteration (voxels/strips.py), here and below.
+    ``slots`` (n) are the visible bricks' places in the pool, ``belief`` (pool * 512) log-odds and
+    ``messages`` (n * 512) log-odds, float16 or float32. Writes log(1 - m) to ``log_free`` (n * 512), with
+    log-odds bounded by ``lowest`` and ``highest``, and sets the ``sums`` (n * 512) to zero. ``strip`` is the
+    number of voxels
+    for an iteration (voxels/strips.py), here and below.
     """
     for part in range(slots.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, slots, strip)
@@ -96,177 +110,179 @@ def cavity(
             sums[i + k] = 0
 
 
-@ti.kernel
+@kernel
 def send_messages(
-    blocks: I32Array, depth: F32Array, rays: I32, entry_depths: F32Array, entry_depths_known: I32,
-    width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
-    noise: F32Array3, patch: I32, columns: I32,
-    voxel_size: F32, max_depth: F32, end_sigmas: F32, floor: F32,
-    shape: IVec3, box_lower: Vec3, box_upper: Vec3, chunks: I32Array, bricks: I32Array,
-    log_free: F32Array, sums: I64Array, scale: F32, clamp: F32,
-    trace_voxel: I32Array, trace: Vec4Array, longest: I32, steps: I32Array,
-    workers: I32, run: I32, spread: I32,
-    likelihood: Template, segment_lengths: Template, log_average: Template, maximise: Template,
-    retrace: Template, block_dim: Template,
-):  # fmt: skip
-    """Follow the rays of a keyframe there and back, and sum up what they tell each voxel.
+    rays: RayList, entry_depths: F32Array, entry_depths_known: I32,
+    sensor: Sensor, view: Viewpoint, space: Space,
+    model: RayModel, swept: SweptVoxels, trace: Trace, workers: Workers, retrace: Template,
+) -> None:  # fmt: skip
+    """Follow the rays of a keyframe out and back, and sum up their messages to each voxel.
 
-    A worker follows one ray after the other and writes each ray's steps into its own part of the trace,
-    so that the way back need not be walked again. ``longest`` is never less than a ray has voxels.
-    With ``retrace``, which cannot ``maximise``, each ray is followed a second time and leaves no trace.
-    ``steps`` receives each worker's number of voxels crossed.
-    ``entry_depths`` holds the depth at which each ray meets its first brick: found by the first sweep, and
-    where later sweeps start. Rays are dealt out in runs of ``run`` neighbours; one that
-    stands for a block of pixels counts as many as they are.
+    A worker follows one ray after the other. It writes each ray's steps into its own part of the trace and
+    reads them on the way back; with ``retrace``, which cannot maximise, it walks along the ray a second time
+    instead. ``entry_depths`` (rays) holds the depth at which each ray meets its first brick: the first sweep
+    finds it, and later sweeps start there.
     """
-    if ti.static(block_dim > 0):
-        ti.loop_config(block_dim=block_dim)
-    for iteration in range(workers * spread):
-        worker = iteration // spread
-        largest = ti.exp(clamp)
+    if ti.static(workers.block > 0):
+        ti.loop_config(block_dim=workers.block)
+    for iteration in range(workers.number * workers.spread):
+        worker = iteration // workers.spread
+        largest = ti.exp(model.clamp)
         turns = 0
-        if iteration % spread == 0:
-            turns = deals(workers, run, rays)
-            steps[worker] = 0
+        if iteration % workers.spread == 0:
+            turns = workers.turns(rays.number)
+            trace.steps[worker] = 0
         for turn in range(turns):
-            i = dealt_ray(worker, turn, workers, run)
-            if i < rays:
-                measured = depth[i]
-                u, v, wide, high = block_of(blocks[i], width)
-                middle = pixel_direction(u + 0.5 * (wide - 1), v + 0.5 * (high - 1), intrinsics)
-                direction = to_voxels @ middle
-                ray = make_ray(centre, direction)
-                here = pixel_noise(noise, patch, columns, u + wide // 2, v + high // 2)
+            i = workers.ray(worker, turn)
+            if i < rays.number:
+                measured = rays.depth[i]
+                ray, noise, pixels = listed_ray(rays, i, sensor, view)
+                cast = _Cast(
+                    model, swept, sensor, measured, noise, sensor.support(measured, noise),
+                    ray.direction.norm(), ti.cast(pixels, ti.f32),
+                )  # fmt: skip
 
                 # The ray ends where its measurement has nothing more to say, or where the map does.
-                last = depth_of_deviation(measured, -end_sigmas, here)
-                begin, end = 0.0, ti.min(last, max_depth)
+                last = sensor.farthest_depth(measured, noise, model.end_sigmas)
+                begin, end = 0.0, ti.min(last, model.max_depth)
                 if entry_depths_known == 1:
                     begin = entry_depths[i]
-                clip(ray, begin, end, box_lower, box_upper)
+                clip(ray, begin, end, space.lower, space.upper)
 
-                # Forward: eq. 11 for each voxel, from the camera outwards.
-                ahead = ForwardPass(
-                    measured, here, depth_of_deviation(measured, SUPPORT, here), direction.norm(),
-                    1.0, NEVER if ti.static(maximise) else 0.0, end, 0, worker * longest,
-                )  # fmt: skip
-                walk_voxels(
-                    ray, begin, end, shape, chunks, bricks, _see_voxel, ahead,
-                    (log_free, voxel_size, likelihood, segment_lengths,
-                     trace_voxel, trace, maximise, retrace, floor),
-                )  # fmt: skip
-
+                # Forward: eqs. 4 and 11 for each voxel, from the camera outwards.
+                ahead = ForwardPass(1.0, NEVER if ti.static(model.maximise) else 0.0, end, 0)
+                first_step = worker * trace.longest
+                if ti.static(retrace):
+                    walk_voxels(ray, begin, end, space, _see_voxel, ahead, cast)
+                else:
+                    walk_voxels(ray, begin, end, space, _trace_voxel, ahead, _Traced(cast, trace, first_step))
                 if entry_depths_known == 0:
                     entry_depths[i] = ahead.first
-                steps[worker] += ahead.voxels
+                trace.steps[worker] += ahead.voxels
 
                 # What gets through to where the map ends may have met its surface there.
-                behind = 0.0
+                beyond = 0.0
                 if end < last:
-                    behind = beyond_likelihood(measured, end, here)
-                behind = cost(behind, floor + TINY) if ti.static(maximise) else ahead.visibility * behind
+                    beyond = sensor.likelihood_beyond(measured, end, noise)
 
                 # Backward: eqs. 13 and 14 for each voxel, from the far end.
-                pixels = ti.cast(wide * high, ti.f32)
-                if ti.static(retrace):
-                    # From the near end again: what lies behind a voxel is what neither it nor those before
-                    # it explain.
-                    total = ahead.explained + behind
-                    again = ForwardPass(
-                        measured, here, ahead.support, ahead.voxels_per_depth, 1.0, 0.0, end, 0, 0
-                    )  # fmt: skip
+                if ti.static(model.maximise):
+                    behind = cost(beyond, model.floor + TINY)
+                    for step in range(ahead.voxels):
+                        j = first_step + ahead.voxels - 1 - step
+                        message = best_message(trace.step[j], behind, model.clamp, model.log_average)
+                        _add(cast, trace.voxel[j], trace.step[j][0], message)
+                elif ti.static(retrace):
+                    # From the near end again: behind a voxel is what neither it nor those before it explain.
+                    total = ahead.explained + ahead.visibility * beyond
+                    again = ForwardPass(1.0, 0.0, end, 0)
                     if ahead.voxels > 0:
                         walk_voxels(
-                            ray, ahead.first, end, shape, chunks, bricks, _tell_voxel, again,
-                            (log_free, voxel_size, likelihood, segment_lengths,
-                             sums, total, pixels, scale, floor, clamp, largest, log_average),
-                        )  # fmt: skip
+                            ray, ahead.first, end, space, _tell_voxel, again, _Retraced(cast, total, largest)
+                        )
                 else:
+                    behind = ahead.visibility * beyond
                     for step in range(ahead.voxels):
-                        j = ahead.trace + ahead.voxels - 1 - step
-                        message = 0.0
-                        if ti.static(maximise):
-                            message = best_message(trace[j], behind, clamp, log_average)
-                        else:
-                            free, density, before = trace[j][1], trace[j][2], trace[j][3]
-                            message = _message(
-                                before, density, behind, free, floor, clamp, largest, log_average
-                            )
-                            behind += (1.0 - free) * density
-                        weight = pixels
-                        if ti.static(segment_lengths):
-                            weight *= trace[j][0]
-                        add_message(sums, trace_voxel[j], weight, message, scale)
+                        j = first_step + ahead.voxels - 1 - step
+                        free, density, before = trace.step[j][1], trace.step[j][2], trace.step[j][3]
+                        message = _message(model, before, density, behind, free, largest)
+                        behind += (1.0 - free) * density
+                        _add(cast, trace.voxel[j], trace.step[j][0], message)
+
+
+@dataclass(frozen=True)
+class _Traced(Bundle):
+    """A ray that writes down its steps, from ``first_step`` of the trace on."""
+
+    cast: _Cast
+    trace: Trace
+    first_step: I32
+
+
+@dataclass(frozen=True)
+class _Retraced(Bundle):
+    """A ray that is followed a second time, with all that its voxels explain together."""
+
+    cast: _Cast
+    total: F32
+    largest: F32
 
 
 @ti.func
-def _crossing(way: Template, context: Template, voxel: I32, near: F32, far: F32) -> Vec3:
-    """How long a ray is in a voxel, the log-chance that the voxel lets it pass, and the density of its
-    measurement if not; ``near`` and ``far`` bound the ray's segment in it, in axial depth."""
-    length = (far - near) * way.voxels_per_depth
-    log_free = context[0][voxel]
-    if ti.static(context[3]):
+def _crossing(cast: Template, voxel: I32, near: F32, far: F32) -> Vec3:
+    """l_i, log(1 - m_i)^l_i and nu_i of a voxel, in which the ray is from depth ``near`` to ``far``."""
+    length = (far - near) * cast.voxels_per_depth
+    log_free = cast.swept.log_free[voxel]
+    if ti.static(cast.model.segment_lengths):
         log_free *= length
     density = 0.0
-    if far > way.support:
-        density = surface_likelihood(way.measured, near, far, way.noise, context[1], context[2])
+    if far > cast.support:
+        density = cast.sensor.likelihood(
+            cast.measured, near, far, cast.noise, cast.model.voxel_size, cast.model.likelihood
+        )
     return Vec3(length, log_free, density)
 
 
 @ti.func
-def _see_voxel(ahead: Template, context: Template, voxel: I32, near: F32, far: F32):
-    """One voxel of the forward pass."""
-    met = _crossing(ahead, context, voxel, near, far)
+def _explain(ahead: Template, met: Vec3) -> Vec4:
+    """Eqs. 4 and 11 for one voxel: it is visible, it is occupied, and it explains the measurement.
+
+    Renews ``ahead``; returns the step that the way back reads: length, (1 - m)^l, nu * vis, before.
+    """
+    free = exp_of_negative(met[1])
+    density = met[2] * ahead.visibility
+    before = ahead.explained
+    ahead.explained += (1.0 - free) * density
+    ahead.visibility *= free
+    return Vec4(met[0], free, density, before)
+
+
+@ti.func
+def _see_voxel(ahead: Template, cast: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of the forward pass, of which nothing is written down."""
     if ahead.voxels == 0:
         ahead.first = near
-    j = ahead.trace + ahead.voxels
-    if ti.static(not context[7]):
-        context[4][j] = voxel
-    if ti.static(context[6]):
-        context[5][j] = see_best(ahead.explained, met[0], met[1], met[2], context[8] + TINY)
-    else:
-        # Eq. 4, and eq. 11: the voxel is seen, it is occupied, and it explains the measurement.
-        free = exp_of_negative(met[1])
-        density = met[2] * ahead.visibility
-        if ti.static(not context[7]):
-            context[5][j] = Vec4(met[0], free, density, ahead.explained)
-        ahead.explained += (1.0 - free) * density
-        ahead.visibility *= free
+    _explain(ahead, _crossing(cast, voxel, near, far))
     ahead.voxels += 1
     return 1
 
 
 @ti.func
-def _tell_voxel(again: Template, context: Template, voxel: I32, near: F32, far: F32):
-    """One voxel of the second way along a ray (``retrace``)."""
-    met = _crossing(again, context, voxel, near, far)
-    free = exp_of_negative(met[1])
-    density = met[2] * again.visibility
-    before = again.explained
-    again.explained += (1.0 - free) * density
-    again.visibility *= free
-    behind = ti.max(0.0, context[5] - again.explained)
-    weight = context[6]
-    if ti.static(context[3]):
-        weight *= met[0]
-    message = _message(
-        before, density, behind, free, context[8], context[9], context[10], context[11]
-    )  # fmt: skip
-    add_message(context[4], voxel, weight, message, context[7])
+def _trace_voxel(ahead: Template, traced: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of the forward pass, written down in the trace."""
+    met = _crossing(traced.cast, voxel, near, far)
+    if ahead.voxels == 0:
+        ahead.first = near
+    j = traced.first_step + ahead.voxels
+    traced.trace.voxel[j] = voxel
+    if ti.static(traced.cast.model.maximise):
+        floor = traced.cast.model.floor + TINY
+        traced.trace.step[j] = see_best(ahead.explained, met[0], met[1], met[2], floor)
+    else:
+        traced.trace.step[j] = _explain(ahead, met)
+    ahead.voxels += 1
     return 1
 
 
 @ti.func
-def _message(
-    before: F32, here: F32, behind: F32, free: F32, floor: F32, clamp: F32, largest: F32,
-    log_average: Template,
-) -> F32:  # fmt: skip
-    """What a ray tells a voxel, in [0, 1] for the accumulators."""
-    occupied = occupied_message(before, here, floor)
-    empty = empty_message(before, behind, free, floor)
+def _tell_voxel(again: Template, retraced: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of the second way along a ray."""
+    cast = retraced.cast
+    step = _explain(again, _crossing(cast, voxel, near, far))
+    behind = ti.max(0.0, retraced.total - again.explained)
+    message = _message(cast.model, step[3], step[2], behind, step[1], retraced.largest)
+    _add(cast, voxel, step[0], message)
+    return 1
+
+
+@ti.func
+def _message(model: Template, before: F32, here: F32, behind: F32, free: F32, largest: F32) -> F32:
+    """Eqs. 13 and 14 as one number in [0, 1] for the accumulators. ``largest`` is e^clamp."""
+    occupied = occupied_message(before, here, model.floor)
+    empty = empty_message(before, behind, free, model.floor)
     message = occupied / (occupied + empty)
-    if ti.static(log_average):
-        message = clamped_log_odds(occupied, empty, clamp, largest)
+    if ti.static(model.log_average):
+        message = clamped_log_odds(occupied, empty, model.clamp, largest)
     return message
 
 
@@ -285,14 +301,27 @@ def empty_message(before: F32, behind: F32, free: F32, floor: F32) -> F32:
     return before + behind / ti.max(free, TINY) + (floor + TINY)
 
 
-@ti.kernel
+@ti.func
+def _add(cast: Template, voxel: I32, length: F32, message: F32):
+    """Section IV-A: a ray's message counts by its length in the voxel, and by the pixels it stands for."""
+    weight = cast.pixels
+    if ti.static(cast.model.segment_lengths):
+        weight *= length
+    add_message(cast.swept.sums, voxel, weight, message, cast.swept.scale)
+
+
+@kernel
 def finish(
     slots: I32Array, belief: F32Array, messages: AnyArray, sums: I64Array, scale: F32,
     clamp: F32, damping: F32, min_length: F32, moved: I32Array, log_average: Template, strip: Template,
-):  # fmt: skip
+) -> None:  # fmt: skip
     """Renew a keyframe's messages with the rays' averages (eq. 7), and the beliefs with them (eq. 8).
 
-    ``moved`` counts, for each brick, the voxels whose marginal changed by more than MOVED.
+    ``slots`` (n) are the visible bricks' places in the pool, ``belief`` (pool * 512) and ``messages`` (n *
+    512) log-odds, ``sums`` (n * 512) those of the rays. A voxel that rays crossed for ``min_length`` voxel
+    sizes or less keeps its message. ``damping`` is the share of the old message that stays. ``moved`` (n)
+    counts,
+    for each brick, the voxels whose marginal changed by more than MOVED.
     """
     for part in range(slots.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, slots, strip)
@@ -324,9 +353,9 @@ def _moves(log_odds: F32, change: F32) -> I32:
     return moves
 
 
-@ti.kernel
-def withdraw(slots: I32Array, belief: F32Array, messages: AnyArray, moved: I32Array, strip: Template):
-    """Take a keyframe's messages out of the beliefs; ``moved`` counts as in :func:`finish`."""
+@kernel
+def withdraw(slots: I32Array, belief: F32Array, messages: AnyArray, moved: I32Array, strip: Template) -> None:
+    """Take a keyframe's messages out of the beliefs; arrays as in :func:`finish`."""
     for part in range(slots.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, slots, strip)
         count = 0
@@ -338,9 +367,10 @@ def withdraw(slots: I32Array, belief: F32Array, messages: AnyArray, moved: I32Ar
             moved[i // VOXELS] += count
 
 
-@ti.kernel
-def fold(slots: I32Array, evidence: F32Array, messages: AnyArray, strip: Template):
-    """Add a keyframe's messages to what inference starts from (freezing)."""
+@kernel
+def fold(slots: I32Array, evidence: F32Array, messages: AnyArray, strip: Template) -> None:
+    """Add a keyframe's messages (n * 512) to the ``evidence`` (pool * 512) that inference starts from
+    (freezing)."""
     for part in range(slots.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, slots, strip)
         for k in range(strip):

@@ -1,7 +1,6 @@
 """One sweep over one keyframe: the host's side of sum_product.py, with the scratch that it needs."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
@@ -12,6 +11,8 @@ from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.accumulators import finest_scale
 from taichi_mrf.inference.keyframe import Keyframe, RayList
+from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
+from taichi_mrf.inference.workers import workers_for
 from taichi_mrf.kernels.resident import on_host
 from taichi_mrf.kernels.vectors import vec4_array
 from taichi_mrf.sensor.forward import AUTO, CENTRE, SEGMENT
@@ -25,35 +26,7 @@ from taichi_mrf.voxels.window import WindowIndex
 LIKELIHOODS = {"auto": AUTO, "segment": SEGMENT, "centre": CENTRE}
 
 TRACE_BYTES = 20
-"""What one step of a ray leaves in the trace."""
-
-
-RETRACE = False
-"""Whether rays are followed a second time on their way back, or their trace is replayed. Max-product always
-replays. docs/performance.md has what was measured."""
-
-
-@dataclass(frozen=True)
-class Workers:
-    """How rays are dealt out: to how many workers, in runs of how many neighbours, how many loop iterations
-    a worker stands for, and the block size on a GPU."""
-
-    number: int
-    run: int
-    spread: int
-    block: int
-
-
-def workers_for(arch: str, software: bool, longest: int) -> Workers:
-    """On a CPU a worker takes runs of rays, and its trace stays in the cache; on a GPU it is a thread,
-    neighbours take neighbouring rays, and the trace is bounded to half a GB."""
-    if arch == "cpu":
-        # Taichi gives a CPU thread no fewer than 512 iterations of a loop at a time.
-        return Workers(64, 256, 512, 0)
-    if software:
-        return Workers(1024, 1, 1, runtime.SOFTWARE_BLOCK)
-    most = (512 << 20) // (TRACE_BYTES * longest)
-    return Workers(max(256, min(65536, most)), 1, 1, 128)
+"""Bytes of one step of a ray in the trace."""
 
 
 def least_log_odds(inference: InferenceConfig, prior_log_odds: float) -> float:
@@ -87,7 +60,6 @@ class Sweeper:
         self.trace = vec4_array(1)
         self.steps = ti.ndarray(ti.i32, 1)
         self._workers = 0  # of the last sweep
-        self.retrace = RETRACE
 
     @property
     def nbytes(self) -> int:
@@ -116,34 +88,30 @@ class Sweeper:
         if n == 0:
             return False
         messages = keyframe.messages
-        workers = workers_for(runtime.active() or "cpu", runtime.is_software(), footprint.longest)
+        workers = workers_for(
+            runtime.active() or "cpu", runtime.is_software(), footprint.longest, TRACE_BYTES
+        )
         self._reserve(n, workers.number * footprint.longest, workers.number)
-        window = footprint.window
-        centre, to_voxels = window.rays_of(keyframe.T_world_camera)
-        box_lower, box_upper = window.clip_box(self.volume.lower, self.volume.upper)
-        bricks, scale, strip = visible.on_device(), self._scale(keyframe), strip_length()
-        log_average = config.average == "log_odds"
+        window, bricks, strip = footprint.window, visible.on_device(), strip_length()
+        model = self._model()
+        retrace = config.return_pass == "retrace" and not model.maximise
+        swept = SweptVoxels(self.log_free, self.sums, self._scale(keyframe))
 
-        # Eq. 6: what all others believe of each voxel.
+        # Eq. 6: the belief of each voxel without this keyframe's message.
         sum_product.cavity(
             bricks.slots, pool.belief, messages,
             least_log_odds(config, pool.prior_log_odds), config.cavity_clamp,
-            self.log_free, self.sums, strip,
+            swept.log_free, swept.sums, strip,
         )  # fmt: skip
 
-        # Eqs. 4, 11, 13 and 14: what the rays make of that and of their measurements.
+        # Eqs. 4, 11, 13 and 14: the rays' messages.
         self.index.fill(window, bricks.cells, self.order)
         sum_product.send_messages(
-            rays.blocks, rays.depth, rays.number, keyframe.entry_depths, int(keyframe.entry_depths_known),
-            image.camera.width, image.intrinsics, centre, to_voxels,
-            image.noise, image.noise_table.patch, image.noise_table.columns,
-            self.voxel_size, self.sensor.max_depth, config.end_sigmas, config.outlier_floor,
-            window.shape_vector, box_lower, box_upper, self.index.chunks, self.index.bricks,
-            self.log_free, self.sums, scale, config.message_clamp,
-            self.trace_voxel, self.trace, footprint.longest, self.steps,
-            workers.number, workers.run, workers.spread,
-            LIKELIHOODS[config.likelihood], config.segment_lengths, log_average,
-            config.method == "max-product", self.retrace and config.method != "max-product", workers.block,
+            rays, keyframe.entry_depths, int(keyframe.entry_depths_known),
+            image.sensor, window.viewpoint(keyframe.T_world_camera),
+            self.index.space(window, self.volume.lower, self.volume.upper),
+            model, swept, Trace(self.trace_voxel, self.trace, footprint.longest, self.steps),
+            workers, retrace,
         )  # fmt: skip
         keyframe.entry_depths_known = True
         self.index.clear(window, bricks.cells)
@@ -151,12 +119,26 @@ class Sweeper:
         # Eqs. 7 and 8: the average over rays is the keyframe's new message, and changes the beliefs.
         bricks.moved.fill(0)  # a NumPy array's method or a Taichi array's
         sum_product.finish(
-            bricks.slots, pool.belief, messages, self.sums, scale,
-            config.message_clamp, config.damping, config.min_length, bricks.moved, log_average, strip,
+            bricks.slots, pool.belief, messages, swept.sums, swept.scale, config.message_clamp,
+            config.damping, config.min_length, bricks.moved, model.log_average, strip,
         )  # fmt: skip
         pool.revision += 1
         keyframe.revision = pool.revision
         return True
+
+    def _model(self) -> RayModel:
+        config = self.inference
+        return RayModel(
+            voxel_size=self.voxel_size,
+            max_depth=self.sensor.max_depth,
+            end_sigmas=config.end_sigmas,
+            floor=config.outlier_floor,
+            clamp=config.message_clamp,
+            likelihood=LIKELIHOODS[config.likelihood],
+            segment_lengths=config.segment_lengths,
+            log_average=config.average == "log_odds",
+            maximise=config.method == "max-product",
+        )
 
     def take_moved(self, keyframe: Keyframe, pool: BrickPool) -> NDArray[np.int32]:
         """How many voxels of each visible brick moved in the keyframe's last sweep, (n,). The pool adds

@@ -1,22 +1,27 @@
 """Argument types of Taichi kernels, spelt once.
 
-Taichi reads them at run time and they are values, not types; a type checker is shown classes that
-allow everything.
+Taichi reads them at run time, where they are values and not types; a type checker sees types that allow
+everything.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import taichi as ti
 
 if TYPE_CHECKING:
-
-    class Template(Any): ...
+    Template: TypeAlias = Any
+    F32: TypeAlias = Any
+    I32: TypeAlias = Any
+    Mat3: TypeAlias = Any
+    AnyArray: TypeAlias = Any
+    I32Array: TypeAlias = Any
+    I64Array: TypeAlias = Any
+    F32Array: TypeAlias = Any
+    F32Array2: TypeAlias = Any
+    F32Array3: TypeAlias = Any
+    Vec4Array: TypeAlias = Any
 
     class Struct(Any): ...
-
-    class F32(Any): ...
-
-    class I32(Any): ...
 
     class Vec3(Any): ...
 
@@ -27,22 +32,6 @@ if TYPE_CHECKING:
     class IVec3(Any): ...
 
     class IVec4(Any): ...
-
-    class Mat3(Any): ...
-
-    class AnyArray(Any): ...
-
-    class I32Array(Any): ...
-
-    class I64Array(Any): ...
-
-    class F32Array(Any): ...
-
-    class F32Array2(Any): ...
-
-    class F32Array3(Any): ...
-
-    class Vec4Array(Any): ...
 
 else:
     Template = ti.template()

@@ -44,7 +44,11 @@ class LiveKeyframes:
     next_id: int = 0
 
     def add(self, frame: PosedDepth, rays: int, picture: NDArray[np.uint8], map_id: int) -> Entry:
-        """Enter a keyframe that the map has just taken in."""
+        """Enter a keyframe that the map has just taken in. Raises KeyframeError for one without a pinhole
+        camera."""
+        if not isinstance(frame.camera, PinholeCamera):
+            kind = type(frame.camera).__name__
+            raise KeyframeError(f"{frame.name}: the live page cannot show a camera of type {kind}")
         entry = Entry(self.next_id, frame.name, frame.T_world_camera, frame.camera, rays, picture, map_id)
         self.entries[entry.id] = entry
         self.next_id += 1

@@ -24,7 +24,7 @@ from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.queries.points import classify, point_log_odds, probability
 from taichi_mrf.queries.profile import RayProfile
 from taichi_mrf.queries.view import View
-from taichi_mrf.sensor.camera import PinholeCamera, check_camera
+from taichi_mrf.sensor.camera import Camera, PinholeCamera, check_camera
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config
 from taichi_mrf.system import runtime
 from taichi_mrf.system.owner import Owned, owned_attribute
@@ -131,7 +131,7 @@ class BrickMap(Owned):
         """All allocated voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
         return extract_voxels(self._pool, self.voxel_size, real(min_probability, "min_probability"))
 
-    def render_depth(self, camera: PinholeCamera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
+    def render_depth(self, camera: Camera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
         """Axial depth of the likeliest surface seen by each pixel, (H, W) float32, NaN where none is."""
         check_camera(camera)
         return self.view.render_depth(camera, as_pose(T_world_camera), self.sensor.max_depth)

@@ -20,7 +20,7 @@ from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import CapacityError, MapFileError, TaichiMRFError, said
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.methods.sensor_section import describing
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
 from taichi_mrf.system.npz_file import NpzFile, open_npz
 from taichi_mrf.voxels.layout import VOXELS
@@ -42,7 +42,7 @@ class StoredKeyframe:
     name: str
     depth_m: NDArray[np.float32]
     T_world_camera: Pose
-    camera: PinholeCamera
+    camera: Camera
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,10 @@ def _config(path: Path, file: NpzFile) -> Config:
         raise MapFileError(f"{path}: damaged: config cannot be read: {said(error)}") from error
 
 
-def _camera_row(camera: PinholeCamera) -> list[float]:
+def _camera_row(camera: Camera) -> list[float]:
+    """What a file keeps of a camera. Raises MapFileError for one that is no pinhole."""
+    if not isinstance(camera, PinholeCamera):
+        raise MapFileError(f"a keyframe's camera of type {type(camera).__name__} cannot be saved")
     return [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
 
 

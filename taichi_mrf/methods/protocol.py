@@ -14,7 +14,7 @@ from taichi_mrf.inference.schedule import InferReport, Progress
 from taichi_mrf.methods.statistics import MapStatistics
 from taichi_mrf.queries.profile import RayProfile
 from taichi_mrf.queries.view import View
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel
 
 
@@ -27,7 +27,7 @@ class PosedDepth(Protocol):
     @property
     def T_world_camera(self) -> Pose: ...
     @property
-    def camera(self) -> PinholeCamera: ...
+    def camera(self) -> Camera: ...
     @property
     def depth_m(self) -> NDArray[np.float32]: ...
 
@@ -75,7 +75,7 @@ class OccupancyMap(Protocol):
         ...
 
     def add_keyframe(
-        self, depth_m: ArrayLike, T_world_camera: ArrayLike, camera: PinholeCamera, name: str = ""
+        self, depth_m: ArrayLike, T_world_camera: ArrayLike, camera: Camera, name: str = ""
     ) -> int:
         """Add a depth image, (H, W) axial depth in metres, taken at a pose (4, 4); returns its id."""
         ...
@@ -110,7 +110,7 @@ class OccupancyMap(Protocol):
         """Voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
         ...
 
-    def render_depth(self, camera: PinholeCamera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
+    def render_depth(self, camera: Camera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
         """Axial depth of the likeliest surface seen by each pixel, (H, W) float32, NaN where none is."""
         ...
 

@@ -5,9 +5,10 @@ import taichi as ti
 
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import DepthImage
-from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, F32Array3, Mat3, Template, Vec3, Vec4
-from taichi_mrf.sensor.forward import depth_of_deviation, pixel_noise
-from taichi_mrf.sensor.rays import pixel_direction
+from taichi_mrf.kernels.bundles import kernel
+from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, Template, Vec3, Vec4
+from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.voxels.traversal import Viewpoint
 from taichi_mrf.voxels.window import Window
 
 NO_RAY, FREE_END, HIT = -1.0, 0.0, 1.0
@@ -32,17 +33,13 @@ def ray_ends(
     holds an end (OctoMap's computeDiscreteUpdate), else there is one for each pixel. What then is longer
     than the Euclidean ``max_range`` is cut off there (0: nothing is).
     """
-    table = image.noise_table
-    centre, to_voxels = window.rays_of(T_world_camera)
+    view = window.viewpoint(T_world_camera)
     ends = ti.ndarray(ti.f32, (image.camera.width * image.camera.height, 4))
-    _find_ends(
-        image.depth, image.camera.width, image.intrinsics, centre, to_voxels,
-        image.noise, table.patch, table.columns, max_depth, ends, correct_bias,
-    )  # fmt: skip
+    _find_ends(image.depth, image.sensor, view, max_depth, ends, correct_bias)
     if discretise:
         ends = _once_a_voxel(ends)
     if max_range > 0:
-        _cut_off(ends, centre, max_range / window.voxel_size)
+        _cut_off(ends, view.centre, max_range / window.voxel_size)
     return ends
 
 
@@ -77,25 +74,31 @@ def put_end(ends: Template, ray: I32, place: Vec3, kind: F32):
     ends[ray, 3] = kind
 
 
-@ti.kernel
+@kernel
 def _find_ends(
-    depth: F32Array, width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
-    noise: F32Array3, patch: I32, columns: I32, max_depth: F32, ends: F32Array2, correct_bias: Template,
-):  # fmt: skip
+    depth: F32Array, sensor: Sensor, view: Viewpoint, max_depth: F32, ends: F32Array2, correct_bias: Template
+) -> None:
+    """The end of each pixel's ray.
+
+    ``depth`` is (H * W) metres, 0 without a measurement. ``ends`` (H * W, 4) receives voxels from the
+    window's corner, and the kind of end.
+    """
     for pixel in range(depth.shape[0]):
-        u, v = pixel % width, pixel // width
+        u, v = sensor.pixel(pixel)
         surface = depth[pixel]
         kind = NO_RAY
         if surface > 0.0:
             if ti.static(correct_bias):
-                surface = depth_of_deviation(surface, 0.0, pixel_noise(noise, patch, columns, u, v))
+                surface = sensor.surface_depth(surface, sensor.noise_at(u, v))
             kind = HIT if surface <= max_depth else FREE_END
-        end = centre + to_voxels @ pixel_direction(u, v, intrinsics) * ti.min(surface, max_depth)
+        end = view.centre + view.to_voxels @ sensor.direction(u, v) * ti.min(surface, max_depth)
         put_end(ends, pixel, end, kind)
 
 
 @ti.kernel
 def _cut_off(ends: F32Array2, centre: Vec3, longest: F32):
+    """Cut off rays that are longer than ``longest`` voxels. ``ends`` (n, 4) as in :func:`_find_ends`;
+    ``centre`` is the camera's, in voxels."""
     for i in range(ends.shape[0]):
         end = end_of(ends, i)
         way = Vec3(end[0], end[1], end[2]) - centre

@@ -30,7 +30,7 @@ from taichi_mrf.methods.recursive_storage import RecursiveContents, read_recursi
 from taichi_mrf.methods.recursive_update import LEAST_LOG_ODDS, UNKNOWN_LOG_ODDS
 from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.occlusion import Occlusion
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import VOXELS
@@ -51,7 +51,7 @@ class ScanRecord:
     name: str
     depth_m: NDArray[np.float32]
     T_world_camera: Pose
-    camera: PinholeCamera
+    camera: Camera
 
     @property
     def rays(self) -> int:
@@ -144,7 +144,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         return np.zeros((0, 3), np.int32)
 
     def add_keyframe(
-        self, depth_m: ArrayLike, T_world_camera: ArrayLike, camera: PinholeCamera, name: str = ""
+        self, depth_m: ArrayLike, T_world_camera: ArrayLike, camera: Camera, name: str = ""
     ) -> int:
         """Add a depth image and integrate it at once (in a stale map with the next :meth:`infer`).
 

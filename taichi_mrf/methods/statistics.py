@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.layout import CHUNK, VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 
 
@@ -37,7 +37,7 @@ def measure(
         rays=rays,
         bricks=len(in_use),
         voxels=voxels,
-        chunks=len(np.unique(pool.bricks[in_use] // BRICK, axis=0)),
+        chunks=len(np.unique(pool.bricks[in_use] // CHUNK, axis=0)),
         memory_mb=(of_voxels + other_bytes) / 1e6,
         bytes_per_voxel=of_voxels / max(voxels, 1),
     )

@@ -8,12 +8,13 @@ import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, IVec3, Struct, Template, Vec3
+from taichi_mrf.kernels.bundles import kernel
+from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, Struct, Template, Vec3
 from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.queries.ray_space import RaySpace
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK
-from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
+from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_voxels
 from taichi_mrf.voxels.window import Window
 
 Unknown = Literal["free", "stop", "hit"]
@@ -140,13 +141,11 @@ def _launch(
     end_m: NDArray[np.float32],
     outcome: NDArray[np.int32],
 ) -> None:
-    lower, upper = window.clip_box(None, None)
     view = m.view
     _cast(
         window.to_voxels(start).astype(np.float32), (along / m.voxel_size).astype(np.float32),
         float(end_m[0]), view.pool.prior_log_odds, view.volume.min_evidence, unknown_from, stop_in_unknown,
-        window.shape_vector, lower, upper, view.index.chunks, view.index.bricks, view.pool.belief,
-        end_m, outcome,
+        view.index.space(window), view.pool.belief, end_m, outcome,
     )  # fmt: skip
 
 
@@ -163,10 +162,11 @@ class _Search(Struct):
 
 
 @ti.func
-def _look(search: Template, context: Template, voxel: I32, near: F32, far: F32):
+def _look(search: Template, belief: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of a ray."""
     log_odds = search.prior
     if voxel < search.unknown_from:
-        log_odds = context[0][voxel]
+        log_odds = belief[voxel]
     found = _PASSED
     # The states of queries/points.py.
     if log_odds > 0.0 and ti.abs(log_odds - search.prior) > search.min_evidence:
@@ -179,12 +179,18 @@ def _look(search: Template, context: Template, voxel: I32, near: F32, far: F32):
     return ti.cast(found == _PASSED, ti.i32)
 
 
-@ti.kernel
+@kernel
 def _cast(
     origins: F32Array2, directions: F32Array2, max_range: F32, prior: F32, min_evidence: F32,
-    unknown_from: I32, stop_in_unknown: I32, shape: IVec3, lower: Vec3, upper: Vec3,
-    chunks: I32Array, bricks: I32Array, belief: F32Array, end_m: F32Array, outcome: I32Array,
-):  # fmt: skip
+    unknown_from: I32, stop_in_unknown: I32, space: Space, belief: F32Array, end_m: F32Array, outcome:
+    I32Array,
+) -> None:  # fmt: skip
+    """Follow each ray until something ends it.
+
+    ``origins`` (N, 3) are in voxels from the window's corner, ``directions`` (N, 3) the way in voxels for one
+    metre; ``belief`` (pool * 512) holds log-odds. ``end_m`` (N) receives the range in metres, ``outcome`` (N)
+    what ended the ray.
+    """
     for i in range(outcome.shape[0]):
         ray = make_ray(
             Vec3(origins[i, 0], origins[i, 1], origins[i, 2]),
@@ -192,7 +198,7 @@ def _cast(
         )
         search = _Search(prior, min_evidence, unknown_from, stop_in_unknown, max_range, _PASSED)
         begin, end = 0.0, max_range
-        clip(ray, begin, end, lower, upper)
-        walk_voxels(ray, begin, end, shape, chunks, bricks, _look, search, (belief,))
+        clip(ray, begin, end, space.lower, space.upper)
+        walk_voxels(ray, begin, end, space, _look, search, belief)
         end_m[i] = search.end_m
         outcome[i] = search.outcome

@@ -18,23 +18,24 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose, as_pose
+from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.log_odds import exp_of_negative, logistic
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Mat3, Struct, Template, Vec3, Vec4
+from taichi_mrf.kernels.types import F32, I32, F32Array, Struct, Template
 from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.queries.occlusion import occlusion, stopped_share
 from taichi_mrf.queries.ray_space import RaySpace
 from taichi_mrf.queries.survey import OPAQUE
-from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.sensor.rays import pixel_direction
+from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.rays import CameraRays
 from taichi_mrf.system import runtime
-from taichi_mrf.voxels.traversal import FAR, clip, make_ray, walk_voxels
+from taichi_mrf.voxels.traversal import FAR, Space, Viewpoint, clip, pixel_ray, walk_voxels
 
 _THINNEST = 1e-6
 """Below this thickness a voxel dims nothing, and the integral of the visibility is the length."""
 
 
 def view_gain(
-    m: QueriedMap, camera: PinholeCamera, T_world_camera: ArrayLike, max_depth: float
+    m: QueriedMap, camera: Camera, T_world_camera: ArrayLike, max_depth: float
 ) -> NDArray[np.float64]:
     """What views would tell, in bits: poses (N, 4, 4) -> (N,), or (4, 4) -> a number of shape ().
 
@@ -51,7 +52,7 @@ def view_gain(
 
 
 def pixel_gain(
-    m: QueriedMap, camera: PinholeCamera, T_world_camera: ArrayLike, max_depth: float
+    m: QueriedMap, camera: Camera, T_world_camera: ArrayLike, max_depth: float
 ) -> NDArray[np.float32]:
     """What the ray of each pixel would tell up to an axial depth in metres, (H, W) float32 in bits.
 
@@ -61,9 +62,7 @@ def pixel_gain(
     return _gain(RaySpace(m), camera, as_pose(T_world_camera), max_depth)
 
 
-def _gain(
-    space: RaySpace, camera: PinholeCamera, T_world_camera: Pose, max_depth: float
-) -> NDArray[np.float32]:
+def _gain(space: RaySpace, camera: Camera, T_world_camera: Pose, max_depth: float) -> NDArray[np.float32]:
     if not (np.isfinite(max_depth) and max_depth > 0):
         raise ConfigError(f"max_depth must be a positive number, not {max_depth}")
     m = space.map
@@ -72,13 +71,10 @@ def _gain(
     ends = camera.rays()[:: camera.height - 1 or 1, :: camera.width - 1 or 1].reshape(-1, 3) * max_depth
     points = np.concatenate([ends @ T_world_camera[:3, :3].T + centre_m, centre_m[None]])
     with space.indexed(points.min(axis=0), points.max(axis=0)) as window:
-        centre, to_voxels = window.rays_of(T_world_camera)
-        lower, upper = window.clip_box(None, None)
         view = m.view
         _gain_rays(
-            camera.width, ti.Vector([camera.fx, camera.fy, camera.cx, camera.cy], ti.f32), centre, to_voxels,
-            max_depth, view.pool.prior_log_odds, view.occlusion.empty_below, space.unknown_from,
-            window.shape_vector, lower, upper, view.index.chunks, view.index.bricks, view.pool.belief, gain,
+            camera.in_kernels(), window.viewpoint(T_world_camera), view.index.space(window), view.pool.belief,
+            max_depth, view.pool.prior_log_odds, view.occlusion.empty_below, space.unknown_from, gain,
         )  # fmt: skip
         runtime.settle()
     return gain.reshape(camera.shape)
@@ -88,12 +84,12 @@ def _gain(
 class _Look(Struct):
     """A ray that looks for what is not certain."""
 
-    voxels_per_depth: F32
+    voxels_per_depth: F32  # length of the ray, in voxels, for one metre of depth
     prior: F32
     empty_below: F32
     unknown_from: I32
-    visibility: F32
-    bits: F32
+    visibility: F32  # what is left of the ray
+    bits: F32  # gained so far
 
 
 @ti.func
@@ -107,10 +103,11 @@ def _entropy(log_odds: F32):
 
 
 @ti.func
-def _learn(look: Template, context: Template, voxel: I32, near: F32, far: F32):
+def _learn(look: Template, belief: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of a ray."""
     log_odds = look.prior
     if voxel < look.unknown_from:
-        log_odds = context[0][voxel]
+        log_odds = belief[voxel]
     length = (far - near) * look.voxels_per_depth
     # Unknown voxels dim here, in every kind of map: what lies behind them is less likely to be seen.
     alpha = occlusion(log_odds, FAR, look.empty_below)
@@ -123,18 +120,20 @@ def _learn(look: Template, context: Template, voxel: I32, near: F32, far: F32):
     return ti.cast(look.visibility > OPAQUE, ti.i32)
 
 
-@ti.kernel
+@kernel
 def _gain_rays(
-    width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3, max_depth: F32,
-    prior: F32, empty_below: F32, unknown_from: I32,
-    shape: IVec3, lower: Vec3, upper: Vec3, chunks: I32Array, bricks: I32Array, belief: F32Array,
-    gain: F32Array,
-):  # fmt: skip
+    camera: CameraRays, view: Viewpoint, space: Space, belief: F32Array, max_depth: F32, prior: F32,
+    empty_below: F32, unknown_from: I32, gain: F32Array,
+) -> None:  # fmt: skip
+    """The gain in bits of each pixel's ray into ``gain`` (H * W), up to ``max_depth`` metres.
+
+    ``belief`` (pool * 512) holds log-odds; voxels from ``unknown_from`` on have none, but the ``prior``.
+    """
     for pixel in range(gain.shape[0]):
-        direction = to_voxels @ pixel_direction(pixel % width, pixel // width, intrinsics)
-        look = _Look(direction.norm(), prior, empty_below, unknown_from, 1.0, 0.0)
-        path = make_ray(centre, direction)
+        u, v = camera.pixel(pixel)
+        path = pixel_ray(camera, view, u, v)
+        look = _Look(path.direction.norm(), prior, empty_below, unknown_from, 1.0, 0.0)
         begin, end = 0.0, max_depth
-        clip(path, begin, end, lower, upper)
-        walk_voxels(path, begin, end, shape, chunks, bricks, _learn, look, (belief,))
+        clip(path, begin, end, space.lower, space.upper)
+        walk_voxels(path, begin, end, space, _learn, look, belief)
         gain[pixel] = look.bits

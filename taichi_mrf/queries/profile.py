@@ -6,10 +6,11 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import logistic
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Struct, Template, Vec3
+from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template, Vec3
 from taichi_mrf.queries.occlusion import occlusion
-from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
+from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_voxels
 
 
 @dataclass(frozen=True)
@@ -28,44 +29,65 @@ class RayProfile:
     omega: NDArray[np.float32]
 
 
+@dataclass(frozen=True)
+class ProfileArrays(Bundle):
+    """Where a ray's profile is written, one entry for each voxel: arrays (N,) as in RayProfile."""
+
+    distance: F32Array
+    length: F32Array
+    occupancy: F32Array
+    visibility: F32Array
+    omega: F32Array
+
+
 @ti.dataclass
 class _Meet(Struct):
-    voxel_size: F32
+    """The ray on its way."""
+
+    voxel_size: F32  # metres
     unknown: F32
     empty_below: F32
-    visibility: F32
-    count: I32
+    visibility: F32  # what is left of it
+    count: I32  # voxels met
+
+
+@dataclass(frozen=True)
+class _Profiled(Bundle):
+    belief: F32Array
+    out: ProfileArrays
 
 
 @ti.func
-def _meet(meet: Template, context: Template, voxel: I32, near: F32, far: F32):
-    alpha = occlusion(context[0][voxel], meet.unknown, meet.empty_below) / meet.voxel_size
+def _meet(meet: Template, profiled: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of the ray."""
+    log_odds = profiled.belief[voxel]
+    alpha = occlusion(log_odds, meet.unknown, meet.empty_below) / meet.voxel_size
     i = meet.count
-    context[1][i] = 0.5 * (near + far)
-    context[2][i] = far - near
-    context[3][i] = logistic(context[0][voxel])
-    context[4][i] = meet.visibility
-    context[5][i] = alpha * meet.visibility
+    profiled.out.distance[i] = 0.5 * (near + far)
+    profiled.out.length[i] = far - near
+    profiled.out.occupancy[i] = logistic(log_odds)
+    profiled.out.visibility[i] = meet.visibility
+    profiled.out.omega[i] = alpha * meet.visibility
     meet.visibility *= ti.exp(-alpha * (far - near))
     meet.count += 1
     return 1
 
 
-@ti.kernel
+@kernel
 def profile_ray(
     origin: Vec3, direction: Vec3, voxel_size: F32, max_range: F32, unknown: F32, empty_below: F32,
-    shape: IVec3, lower: Vec3, upper: Vec3,
-    chunks: I32Array, bricks: I32Array, belief: F32Array,
-    distance: F32Array, length: F32Array, occupancy: F32Array, visibility: F32Array, omega: F32Array,
-    count: I32Array,
-):  # fmt: skip
+    space: Space, belief: F32Array, out: ProfileArrays, count: I32Array,
+) -> None:  # fmt: skip
+    """Follow one ray up to ``max_range`` metres.
+
+    ``origin`` is in voxels from the window's corner, ``direction`` the way in voxels for one metre.
+    ``belief`` (pool * 512) holds log-odds; ``count`` (1) receives the number of voxels met. The others:
+    Occlusion.
+    """
     for _ in range(1):
         ray = make_ray(origin, direction)
         begin, end = 0.0, max_range
-        clip(ray, begin, end, lower, upper)
+        clip(ray, begin, end, space.lower, space.upper)
         meet = _Meet(voxel_size, unknown, empty_below, 1.0, 0)
-        walk_voxels(
-            ray, begin, end, shape, chunks, bricks, _meet, meet,
-            (belief, distance, length, occupancy, visibility, omega),
-        )  # fmt: skip
+        walk_voxels(ray, begin, end, space, _meet, meet, _Profiled(belief, out))
         count[0] = meet.count

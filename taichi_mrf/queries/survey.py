@@ -11,25 +11,13 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import exp_of_negative
-from taichi_mrf.kernels.types import (
-    F32,
-    I32,
-    F32Array,
-    F32Array3,
-    I32Array,
-    IVec3,
-    Mat3,
-    Struct,
-    Template,
-    Vec3,
-    Vec4,
-    Vec5,
-)
+from taichi_mrf.kernels.types import F32, I32, F32Array, Struct, Template
 from taichi_mrf.queries.occlusion import occlusion, stopped_share
-from taichi_mrf.sensor.forward import SEGMENT, PixelNoise, pixel_noise, surface_likelihood
-from taichi_mrf.sensor.rays import pixel_direction
-from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
+from taichi_mrf.sensor.forward import SEGMENT
+from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, walk_voxels
 
 OPAQUE = 1e-3
 """A ray that has lost this much of its visibility meets nothing more."""
@@ -57,17 +45,43 @@ class SurfaceSurvey:
         return np.float32(0.5) * (self.near + self.far)
 
 
+@dataclass(frozen=True)
+class Medium(Bundle):
+    """How a survey reads the map (View)."""
+
+    voxel_size: F32
+    """Metres."""
+
+    max_depth: F32
+    """Metres of depth at which rays end."""
+
+    learnt: F32
+    """Log-odds above which a voxel can be the surface."""
+
+    unknown: F32
+    """Log-odds of voxels that let every ray through (Occlusion.unknown)."""
+
+    empty_below: F32
+    """Voxels with less log-odds let every ray through (Occlusion.empty_below)."""
+
+
+@dataclass(frozen=True)
+class Answers(Bundle):
+    """Where a survey is written: arrays (H * W), as in SurfaceSurvey."""
+
+    near: F32Array
+    far: F32Array
+    visibility: F32Array
+    expected: F32Array
+    likelihood: F32Array
+
+
 @ti.dataclass
 class RaySurvey(Struct):
-    """What is known of a ray on its way from the camera."""
+    """A ray on its way from the camera."""
 
-    voxels_per_depth: F32  # length of the ray, in voxels, for one metre of axial depth
-    voxel_size: F32
-    learnt: F32  # log-odds above which a voxel can be the surface
-    unknown: F32
-    empty_below: F32
+    voxels_per_depth: F32  # length of the ray, in voxels, for one metre of depth
     measured: F32
-    noise: PixelNoise
     visibility: F32
     omega: F32  # the largest so far
     near: F32
@@ -77,14 +91,25 @@ class RaySurvey(Struct):
     likelihood: F32
 
 
+@dataclass(frozen=True)
+class _Surveyed(Bundle):
+    """What a step of the survey reads."""
+
+    belief: F32Array
+    medium: Medium
+    sensor: Sensor
+    noise: Template  # of the ray's pixel
+    judged: Template
+
+
 @ti.func
-def survey_voxel(ray: Template, context: Template, voxel: I32, near: F32, far: F32):
-    """One voxel of a ray, whose segment in it reaches from axial depth ``near`` to ``far``."""
-    log_odds = context[0][voxel]
-    alpha = occlusion(log_odds, ray.unknown, ray.empty_below)
+def survey_voxel(ray: Template, surveyed: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of a ray, whose segment in it reaches from depth ``near`` to ``far``."""
+    log_odds = surveyed.belief[voxel]
+    alpha = occlusion(log_odds, surveyed.medium.unknown, surveyed.medium.empty_below)
     # Eq. 18. A voxel that may not be the surface still dims the ray as eq. 15 has it.
     omega = alpha * ray.visibility
-    if omega > ray.omega and log_odds > ray.learnt:
+    if omega > ray.omega and log_odds > surveyed.medium.learnt:
         ray.omega = omega
         ray.near = near
         ray.far = far
@@ -94,44 +119,41 @@ def survey_voxel(ray: Template, context: Template, voxel: I32, near: F32, far: F
     ray.visibility *= exp_of_negative(-thickness)
     ray.stopped += here
     ray.moment += here * 0.5 * (near + far)
-    if ti.static(context[1]):
-        ray.likelihood += here * surface_likelihood(
-            ray.measured, near, far, ray.noise, ray.voxel_size, SEGMENT
+    if ti.static(surveyed.judged):
+        ray.likelihood += here * surveyed.sensor.likelihood(
+            ray.measured, near, far, surveyed.noise, surveyed.medium.voxel_size, SEGMENT
         )
     return ti.cast(ray.visibility > OPAQUE, ti.i32)
 
 
-@ti.kernel
+@kernel
 def survey_rays(
-    width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3, voxel_size: F32,
-    max_depth: F32, learnt: F32, unknown: F32, empty_below: F32,
-    measured: F32Array, noise: F32Array3, patch: I32, columns: I32,
-    shape: IVec3, lower: Vec3, upper: Vec3, chunks: I32Array, bricks: I32Array, belief: F32Array,
-    near: F32Array, far: F32Array, visibility: F32Array, expected: F32Array, likelihood: F32Array,
-    judged: Template,
-):  # fmt: skip
-    """Follow the ray of each pixel; with ``judged`` only where ``measured`` is not 0. A negative value stands
-    for a ray that is to be followed and has no measurement."""
-    for pixel in range(near.shape[0]):
-        u, v = pixel % width, pixel // width
-        ray = RaySurvey(
-            0.0, voxel_size, learnt, unknown, empty_below, 0.0, PixelNoise(Vec5(0.0), Vec5(0.0)),
-            1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
-        )  # fmt: skip
+    sensor: Sensor, view: Viewpoint, space: Space, belief: F32Array, medium: Medium,
+    measured: F32Array, answers: Answers, judged: Template,
+) -> None:  # fmt: skip
+    """Follow the ray of each pixel; with ``judged`` only where ``measured`` (H * W, metres) is not 0.
+
+    A negative value stands for a ray that is to be followed and has no measurement. ``belief`` (pool * 512)
+    holds log-odds.
+    """
+    for pixel in range(answers.near.shape[0]):
+        u, v = sensor.pixel(pixel)
+        ray = RaySurvey(0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        noise = sensor.noise_at(u, v)
         wanted = 1
         if ti.static(judged):
             ray.measured = measured[pixel]
-            ray.noise = pixel_noise(noise, patch, columns, u, v)
             wanted = ti.cast(ray.measured != 0.0, ti.i32)
         if wanted == 1:
-            direction = to_voxels @ pixel_direction(u, v, intrinsics)
-            ray.voxels_per_depth = direction.norm()
-            path = make_ray(centre, direction)
-            begin, end = 0.0, max_depth
-            clip(path, begin, end, lower, upper)
-            walk_voxels(path, begin, end, shape, chunks, bricks, survey_voxel, ray, (belief, judged))
-        near[pixel] = ray.near
-        far[pixel] = ray.far
-        visibility[pixel] = ray.visibility
-        expected[pixel] = ray.moment / ray.stopped if ray.stopped > 0.0 else 0.0
-        likelihood[pixel] = ray.likelihood
+            path = pixel_ray(sensor, view, u, v)
+            ray.voxels_per_depth = path.direction.norm()
+            begin, end = 0.0, medium.max_depth
+            clip(path, begin, end, space.lower, space.upper)
+            walk_voxels(
+                path, begin, end, space, survey_voxel, ray, _Surveyed(belief, medium, sensor, noise, judged)
+            )
+        answers.near[pixel] = ray.near
+        answers.far[pixel] = ray.far
+        answers.visibility[pixel] = ray.visibility
+        answers.expected[pixel] = ray.moment / ray.stopped if ray.stopped > 0.0 else 0.0
+        answers.likelihood[pixel] = ray.likelihood

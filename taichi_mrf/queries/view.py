@@ -11,9 +11,10 @@ from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.queries.occlusion import Occlusion
-from taichi_mrf.queries.profile import RayProfile, profile_ray
-from taichi_mrf.queries.survey import SurfaceSurvey, survey_rays
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.queries.profile import ProfileArrays, RayProfile, profile_ray
+from taichi_mrf.queries.survey import Answers, Medium, SurfaceSurvey, survey_rays
+from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import NoiseTable
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK
@@ -22,7 +23,7 @@ from taichi_mrf.voxels.traversal import FAR
 from taichi_mrf.voxels.window import Window, WindowIndex
 
 _ALL_DIM = Occlusion()
-_NO_NOISE = NoiseTable(np.zeros((1, 2, 5), np.float32), 1, 1)
+_NO_NOISE = NoiseTable(np.zeros((1, 2, 5), np.float32), 1 << 30, 1)
 
 
 class View:
@@ -38,9 +39,7 @@ class View:
         """Another view of the same map, in which other voxels let rays through (fields of Occlusion)."""
         return View(self.pool, self.voxel_size, self.volume, dataclasses.replace(self.occlusion, **changes))
 
-    def render_depth(
-        self, camera: PinholeCamera, T_world_camera: Pose, max_depth: float
-    ) -> NDArray[np.float32]:
+    def render_depth(self, camera: Camera, T_world_camera: Pose, max_depth: float) -> NDArray[np.float32]:
         """(H, W) axial depth in metres, NaN where the ray is more likely to pass than to be stopped.
 
         What was never seen dims a ray, but is no surface.
@@ -52,7 +51,7 @@ class View:
 
     def survey(
         self,
-        camera: PinholeCamera,
+        camera: Camera,
         T_world_camera: Pose,
         max_depth: float,
         measured_m: NDArray[np.float32],
@@ -67,7 +66,7 @@ class View:
 
     def _survey(
         self,
-        camera: PinholeCamera,
+        camera: Camera,
         T_world_camera: Pose,
         max_depth: float,
         learnt: float,
@@ -77,27 +76,22 @@ class View:
         near, far, visibility, expected, likelihood = np.zeros((5, *camera.shape), np.float32)
         visibility[:] = 1.0
         survey = SurfaceSurvey(near, far, visibility, expected, likelihood)
-        u = np.array([-0.5, camera.width - 0.5])
-        v = np.array([-0.5, camera.height - 0.5])
-        x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
-        corners = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) * max_depth
+        corners = camera.tile_hulls(max(camera.shape)).reshape(-1, 3) * max_depth
         points = (
             np.concatenate([corners @ T_world_camera[:3, :3].T, np.zeros((1, 3))]) + T_world_camera[:3, 3]
         )
         window = self.fill(points)
         if window is None:
             return survey
-        centre, to_voxels = window[0].rays_of(T_world_camera)
-        lower, upper = window[0].clip_box(self.volume.lower, self.volume.upper)
         judged = measured_m is not None
         measured = np.zeros(1, np.float32) if measured_m is None else measured_m.reshape(-1)
         survey_rays(
-            camera.width, ti.Vector([camera.fx, camera.fy, camera.cx, camera.cy], ti.f32), centre, to_voxels,
-            self.voxel_size, max_depth, learnt, self.occlusion.unknown, self.occlusion.empty_below,
-            np.ascontiguousarray(measured, np.float32), noise.coefficients, noise.patch, noise.columns,
-            window[0].shape_vector, lower, upper, self.index.chunks, self.index.bricks, self.pool.belief,
-            near.reshape(-1), far.reshape(-1), visibility.reshape(-1), expected.reshape(-1),
-            likelihood.reshape(-1), judged,
+            Sensor(camera.in_kernels(), noise.in_kernels()), window[0].viewpoint(T_world_camera),
+            self.index.space(window[0], self.volume.lower, self.volume.upper), self.pool.belief,
+            Medium(self.voxel_size, max_depth, learnt, self.occlusion.unknown, self.occlusion.empty_below),
+            np.ascontiguousarray(measured, np.float32),
+            Answers(*(answer.reshape(-1) for answer in (near, far, visibility, expected, likelihood))),
+            judged,
         )  # fmt: skip
         self.index.clear(*window)
         runtime.settle()
@@ -121,13 +115,12 @@ class View:
         steps = 4 * sum(window[0].shape) * BRICK
         out = [np.zeros(steps, np.float32) for _ in range(5)]
         count = np.zeros(1, np.int32)
-        lower, upper = window[0].clip_box(self.volume.lower, self.volume.upper)
         profile_ray(
             ti.Vector(window[0].to_voxels(start).tolist(), ti.f32),
             ti.Vector((along / self.voxel_size).tolist(), ti.f32), self.voxel_size,
             max_range, self.occlusion.unknown, self.occlusion.empty_below,
-            window[0].shape_vector, lower, upper,
-            self.index.chunks, self.index.bricks, self.pool.belief, *out, count,
+            self.index.space(window[0], self.volume.lower, self.volume.upper), self.pool.belief,
+            ProfileArrays(*out), count,
         )  # fmt: skip
         self.index.clear(*window)
         runtime.settle()

@@ -1,16 +1,68 @@
-"""The pinhole camera: how pixels become rays."""
+"""Cameras: how pixels become rays. The pinhole, and what any other kind has to answer.
+
+Kernels get their part of a camera from ``in_kernels``; importing this file does not load Taichi.
+"""
 
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import instance, real, whole
 from taichi_mrf.errors import ConfigError
 
+if TYPE_CHECKING:
+    from taichi_mrf.sensor.rays import CameraRays
+
+
 _NO_SKEW = 1e-6
 """Entries of a camera matrix below this share of fx come from rounding."""
+
+
+@runtime_checkable
+class Camera(Protocol):
+    """What mapping asks of a camera.
+
+    A camera is immutable, equal to another that maps pixels to the same rays, and its ``repr`` says all of
+    it. Depth is the parameter of a ray along its direction: axial depth if directions have z = 1, range if
+    they have the length 1.
+    """
+
+    @property
+    def width(self) -> int:
+        """Columns of its images."""
+
+    @property
+    def height(self) -> int:
+        """Rows of its images."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width)."""
+
+    @property
+    def pixels_per_radian(self) -> float:
+        """Pixels along one radian, where there are fewest."""
+
+    def directions(self, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
+        """Rays through columns and rows that broadcast with each other, (..., 3) in the camera frame for one
+        metre of depth. Whole numbers are pixels' centres."""
+
+    def rays(self) -> NDArray[np.float64]:
+        """:meth:`directions` of all pixels, (H, W, 3)."""
+
+    def tile_hulls(self, tile: int) -> NDArray[np.float64]:
+        """For each square of ``tile`` pixels, (rows, columns, k, 3): directions for one metre of depth whose
+        convex hull, with the camera's centre, holds all points of its rays up to that depth."""
+
+    def most_pixels_in_cone(self, half_angle: float, block: int) -> float:
+        """A bound on the pixels in a cone of ``half_angle`` radians, wherever it points, and in the square
+        blocks of ``block`` pixels a side whose middle lies in it."""
+
+    def in_kernels(self) -> "CameraRays":
+        """The camera as kernels take it."""
 
 
 @dataclass(frozen=True)
@@ -69,13 +121,52 @@ class PinholeCamera:
             cy=(self.cy + 0.5) * sy - 0.5,
         )
 
-    def rays(self) -> NDArray[np.float64]:
-        """Directions of all pixels in the camera frame, (H, W, 3), with z = 1.
+    @property
+    def pixels_per_radian(self) -> float:
+        """The smaller focal length: pixels along one radian at the image's centre."""
+        return min(self.fx, self.fy)
+
+    def directions(self, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
+        """Rays through columns and rows that broadcast with each other, (..., 3) in the camera frame, z = 1.
 
         A ray's parameter along these is axial depth; times ``range_per_depth`` it is Euclidean range.
         """
+        x, y = np.broadcast_arrays((np.asarray(u) - self.cx) / self.fx, (np.asarray(v) - self.cy) / self.fy)
+        return np.stack([x, y, np.ones(x.shape)], axis=-1)
+
+    def rays(self) -> NDArray[np.float64]:
+        """Directions of all pixels in the camera frame, (H, W, 3), with z = 1."""
         u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
-        return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(self.shape)], axis=-1)
+        return self.directions(u, v)
+
+    def tile_hulls(self, tile: int) -> NDArray[np.float64]:
+        """The outer corners of each square of ``tile`` pixels as directions, (rows, columns, 4, 3), z = 1."""
+        u = np.minimum(np.arange(-(-self.width // tile) + 1) * tile, self.width) - 0.5
+        v = np.minimum(np.arange(-(-self.height // tile) + 1) * tile, self.height) - 0.5
+        corners = self.directions(u[None, :], v[:, None])
+        sides = slice(None, -1), slice(1, None)
+        return np.stack([corners[row, column] for column in sides for row in sides], axis=2)
+
+    def most_pixels_in_cone(self, half_angle: float, block: int) -> float:
+        """A bound on the pixels in a cone of ``half_angle`` radians, wherever it points, and in the square
+        blocks of ``block`` pixels a side whose middle lies in it.
+
+        It is the cone's solid angle at the image's corner, where pixels are densest, and the blocks along its
+        rim.
+        """
+        slant = self.largest_slant()
+        density = self.fx * self.fy * slant**3  # pixels for each unit of solid angle
+        solid_angle = 2 * math.pi * (1 - math.cos(half_angle))
+        rim = 2 * math.pi * half_angle * slant**2 * max(self.fx, self.fy)  # pixels along the cone's edge
+        return density * solid_angle + rim * block + 4 * block**2
+
+    def in_kernels(self) -> "CameraRays":
+        """The camera as kernels take it: a rays.PinholeRays."""
+        import taichi as ti
+
+        from taichi_mrf.sensor.rays import PinholeRays
+
+        return PinholeRays(self.width, ti.Vector([self.fx, self.fy, self.cx, self.cy], ti.f32))
 
     def range_per_depth(self) -> NDArray[np.float64]:
         """Euclidean range of each pixel's ray for one metre of axial depth, (H, W), at least 1."""
@@ -90,4 +181,4 @@ class PinholeCamera:
 
 def check_camera(camera: object) -> None:
     """Raise ArgumentTypeError for an argument ``camera`` that is none."""
-    instance(camera, PinholeCamera, "camera", "a PinholeCamera")
+    instance(camera, Camera, "camera", "a PinholeCamera")

@@ -1,13 +1,14 @@
 """The forward sensor model: how likely is a measurement, given where the ray meets the first surface?
 
-Everything is in axial depth (metres along the optical axis), because that is what depth images hold and
-what noise is learnt in. Functions for Taichi kernels; each is tested against a NumPy oracle.
+Measurements are normally distributed around the depth of the surface plus a bias. ``noise`` is that of one
+pixel, with the methods of polynomials.PixelNoise. All depths are in metres along the ray's direction (axial
+depth for a pinhole), because that is what depth images hold and what noise is learnt in. Functions for Taichi
+kernels, which reach them through model.Sensor; each is tested against a NumPy oracle.
 """
 
 import taichi as ti
 
-from taichi_mrf.kernels.types import F32, I32, Struct, Template, Vec5
-from taichi_mrf.sensor.noise import LEAST_SIGMA_M, TERMS
+from taichi_mrf.kernels.types import F32, Template
 
 AUTO, SEGMENT, CENTRE = 0, 1, 2
 """How a segment of the ray stands for its surface: see InferenceConfig.likelihood."""
@@ -18,67 +19,24 @@ SUPPORT = 6.5
 NORMALISER = 0.3989422804014327  # 1 / sqrt(2 pi)
 
 
-@ti.dataclass
-class PixelNoise(Struct):
-    """The polynomials of one pixel."""
-
-    sigma: Vec5
-    bias: Vec5
-
-
 @ti.func
-def pixel_noise(coefficients: Template, patch: I32, columns: I32, u: I32, v: I32):
-    """Look up the noise of pixel (u, v)."""
-    row = (v // patch) * columns + u // patch
-    noise = PixelNoise(Vec5(0.0), Vec5(0.0))
-    for term in ti.static(range(TERMS)):
-        noise.sigma[term] = coefficients[row, 0, term]
-        noise.bias[term] = coefficients[row, 1, term]
-    return noise
-
-
-@ti.func
-def polynomial(coefficients: Vec5, depth: F32) -> F32:
-    """Horner's rule, ascending powers."""
-    value = coefficients[TERMS - 1]
-    for term in ti.static(range(TERMS - 2, -1, -1)):
-        value = value * depth + coefficients[term]
-    return value
-
-
-@ti.func
-def slope(coefficients: Vec5, depth: F32) -> F32:
-    """Derivative of a polynomial."""
-    value = (TERMS - 1) * coefficients[TERMS - 1]
-    for term in ti.static(range(TERMS - 2, 0, -1)):
-        value = value * depth + term * coefficients[term]
-    return value
-
-
-@ti.func
-def sigma_at(noise: PixelNoise, depth: F32) -> F32:
-    """Standard deviation of the measurement of a surface at ``depth``, at least LEAST_SIGMA_M."""
-    return ti.max(polynomial(noise.sigma, depth), LEAST_SIGMA_M)
-
-
-@ti.func
-def deviation(measured: F32, depth: F32, noise: PixelNoise) -> F32:
+def deviation(measured: F32, depth: F32, noise: Template) -> F32:
     """How many sigma the measurement lies beyond what a surface at ``depth`` would give on average."""
-    return (measured - depth - polynomial(noise.bias, depth)) / sigma_at(noise, depth)
+    return (measured - depth - noise.bias(depth)) / noise.sigma(depth)
 
 
 @ti.func
-def depth_of_deviation(measured: F32, sigmas: F32, noise: PixelNoise) -> F32:
+def depth_of_deviation(measured: F32, sigmas: F32, noise: Template) -> F32:
     """The surface depth whose measurement would deviate by ``sigmas``: the inverse of deviation().
 
     Newton's method from the measurement. A table may hold polynomials that have no such depth, or one
     that runs away, so each step and the whole way are bounded.
     """
-    reach = 3.0 * (ti.abs(sigmas) * sigma_at(noise, measured) + ti.abs(polynomial(noise.bias, measured)))
+    reach = 3.0 * (ti.abs(sigmas) * noise.sigma(measured) + ti.abs(noise.bias(measured)))
     depth = measured
     for _ in ti.static(range(3)):
-        excess = measured - depth - polynomial(noise.bias, depth) - sigmas * sigma_at(noise, depth)
-        gradient = 1.0 + slope(noise.bias, depth) + sigmas * slope(noise.sigma, depth)
+        excess = measured - depth - noise.bias(depth) - sigmas * noise.sigma(depth)
+        gradient = 1.0 + noise.bias_slope(depth) + sigmas * noise.sigma_slope(depth)
         depth += excess / ti.max(gradient, 0.3)
         depth = ti.max(measured - reach, ti.min(measured + reach, depth))
     return ti.max(depth, 0.0)
@@ -117,21 +75,21 @@ def normal_between(low: F32, high: F32) -> F32:
 
 @ti.func
 def surface_likelihood(
-    measured: F32, near: F32, far: F32, noise: PixelNoise, voxel_size: F32, mode: Template
+    measured: F32, near: F32, far: F32, noise: Template, voxel_size: F32, mode: Template
 ) -> F32:
     """nu of eq. 4: density of the measurement if the first surface lies between depths near and far.
 
     Averaged over the segment, or taken at its centre. sigma is that of the centre.
     """
     centre = 0.5 * (near + far)
-    sigma = sigma_at(noise, centre)
+    sigma = noise.sigma(centre)
     average = ti.cast(mode == SEGMENT, ti.i32)
     if ti.static(mode == AUTO):
         average = ti.cast(sigma < voxel_size, ti.i32)
     density = 0.0
     if average == 1:
-        high = (measured - near - polynomial(noise.bias, near)) / sigma
-        low = (measured - far - polynomial(noise.bias, far)) / sigma
+        high = (measured - near - noise.bias(near)) / sigma
+        low = (measured - far - noise.bias(far)) / sigma
         # On a segment of next to no length the two probabilities would cancel; there the centre is exact.
         if high - low > 1e-2:
             if low < SUPPORT and high > -SUPPORT:
@@ -139,16 +97,16 @@ def surface_likelihood(
         else:
             density = normal_density(0.5 * (low + high)) / sigma
     else:
-        density = normal_density((measured - centre - polynomial(noise.bias, centre)) / sigma) / sigma
+        density = normal_density((measured - centre - noise.bias(centre)) / sigma) / sigma
     return density
 
 
 @ti.func
-def beyond_likelihood(measured: F32, depth: F32, noise: PixelNoise) -> F32:
+def beyond_likelihood(measured: F32, depth: F32, noise: Template) -> F32:
     """Density of the measurement if the first surface lies somewhere beyond ``depth``.
 
     For rays that leave the map: as likely as the likeliest surface out there, which is the one that the
     measurement would show if that lies beyond, else one at ``depth``.
     """
     surface = ti.max(depth, depth_of_deviation(measured, 0.0, noise))
-    return normal_density(deviation(measured, surface, noise)) / sigma_at(noise, surface)
+    return normal_density(deviation(measured, surface, noise)) / noise.sigma(surface)

@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,14 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.config.arguments import array
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.errors import ConfigError, said
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera, PinholeCamera
+from taichi_mrf.sensor.limits import LEAST_SIGMA_M, TERMS
 from taichi_mrf.system.npz_file import open_npz, read_npy
 
-TERMS = 5
-"""Coefficients of a polynomial in the kernels: up to degree 4, padded with zeros."""
-
-LEAST_SIGMA_M = 1e-3
-"""Fitted polynomials can fall to zero or below; no depth camera is more precise than this."""
+if TYPE_CHECKING:
+    from taichi_mrf.sensor.polynomials import SensorNoise
 
 
 @dataclass(frozen=True)
@@ -46,13 +44,28 @@ class NoiseTable:
         sigma, bias = (evaluate(self.coefficients[row, which], depth_m) for which in (0, 1))
         return np.maximum(sigma, LEAST_SIGMA_M), bias
 
+    def largest(self, depth_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The largest sigma and the largest absolute bias that any pixel has at each of some depths, (N,)."""
+        values = np.abs(evaluate(self.coefficients[:, :, None], depth_m.reshape(1, 1, -1)))
+        return np.maximum(values[:, 0], LEAST_SIGMA_M).max(axis=0), values[:, 1].max(axis=0)
+
+    def in_kernels(self) -> "SensorNoise":
+        """The table as kernels take it: a polynomials.PolynomialTable."""
+        from taichi_mrf.kernels.resident import resident
+        from taichi_mrf.sensor.polynomials import PolynomialTable
+
+        return PolynomialTable(resident(self.coefficients), self.patch, self.columns)
+
 
 @runtime_checkable
 class NoiseModel(Protocol):
-    """What MRFMap asks of a noise model."""
+    """What MRFMap asks of a noise model.
 
-    def table(self, camera: PinholeCamera) -> NoiseTable:
-        """The noise for one camera. Raises ConfigError if the model does not fit the camera."""
+    Its ``table`` may be of any class with the methods of NoiseTable, and need not hold polynomials.
+    """
+
+    def table(self, camera: Camera) -> NoiseTable:
+        """The noise of one camera's pixels. Raises ConfigError if the model does not fit the camera."""
 
 
 class PolynomialNoise:
@@ -63,7 +76,7 @@ class PolynomialNoise:
         self.sigma = _padded(np.atleast_2d(array(sigma, "sigma")), "sigma")
         self.bias = _padded(np.atleast_2d(array(bias, "bias")), "bias")
 
-    def table(self, camera: PinholeCamera) -> NoiseTable:
+    def table(self, camera: Camera) -> NoiseTable:
         """One patch that covers the image, whatever the camera."""
         return _table(self.sigma, self.bias, max(camera.width, camera.height), 1)
 
@@ -112,7 +125,7 @@ class PatchNoise:
         camera = np.array([k.width, k.height, k.fx, k.fy, k.cx, k.cy], np.float64)
         return {"sigma": self.sigma, "bias": self.bias, "patch": np.array(self.patch), "camera": camera}
 
-    def table(self, camera: PinholeCamera) -> NoiseTable:
+    def table(self, camera: Camera) -> NoiseTable:
         if camera.shape != self.camera.shape:
             raise ConfigError(
                 f"the noise table was learnt at {self.camera.width} x {self.camera.height} pixels, "

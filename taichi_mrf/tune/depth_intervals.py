@@ -10,6 +10,7 @@ in a share q of all pixels, so the probabilities of "no more than what was measu
 # ruff: noqa: ANN202 - Taichi does not allow `-> None` on a kernel or a func.
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
@@ -17,39 +18,19 @@ from numpy.typing import NDArray
 
 from taichi_mrf.evaluation.accuracy import OUTLIERS
 from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import exp_of_negative
-from taichi_mrf.kernels.types import (
-    F32,
-    I32,
-    F32Array,
-    F32Array3,
-    I32Array,
-    IVec3,
-    Mat3,
-    Struct,
-    Template,
-    Vec3,
-    Vec4,
-    Vec5,
-)
+from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template
 from taichi_mrf.queries.occlusion import occlusion, stopped_share
 from taichi_mrf.queries.survey import OPAQUE
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.sensor.forward import (
-    SUPPORT,
-    PixelNoise,
-    normal_density,
-    normal_tail,
-    pixel_noise,
-    polynomial,
-    sigma_at,
-)
+from taichi_mrf.sensor.forward import SUPPORT, normal_density, normal_tail
+from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import NoiseTable
-from taichi_mrf.sensor.rays import pixel_direction
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK
-from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
+from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, walk_voxels
 from taichi_mrf.voxels.window import Window
 
 LEVELS = np.linspace(0.05, 0.95, 19)
@@ -64,7 +45,6 @@ class Prediction(Struct):
     unknown: F32
     empty_below: F32
     measured: F32
-    noise: PixelNoise
     visibility: F32
     below: F32  # probability of a surface so far whose measurement is no more than that
 
@@ -88,14 +68,11 @@ def probability_below(
         window = Window.covering(middles_m.min(axis=0), middles_m.max(axis=0), view.voxel_size)
         cells = window.cells_of(bricks)
         view.index.fill(window, cells, slots)
-        centre, to_voxels = window.rays_of(T_world_camera)
-        lower, upper = window.clip_box(view.volume.lower, view.volume.upper)
         _follow(
-            chosen, np.ascontiguousarray(measured_m.reshape(-1)[chosen], np.float32), camera.width,
-            ti.Vector([camera.fx, camera.fy, camera.cx, camera.cy], ti.f32), centre, to_voxels, max_depth,
-            view.occlusion.unknown, view.occlusion.empty_below, noise.coefficients, noise.patch,
-            noise.columns, window.shape_vector, lower, upper, view.index.chunks, view.index.bricks,
-            view.pool.belief, below,
+            chosen, np.ascontiguousarray(measured_m.reshape(-1)[chosen], np.float32),
+            Sensor(camera.in_kernels(), noise.in_kernels()), window.viewpoint(T_world_camera),
+            view.index.space(window, view.volume.lower, view.volume.upper), view.pool.belief,
+            max_depth, view.occlusion.unknown, view.occlusion.empty_below, below,
         )  # fmt: skip
         view.index.clear(window, cells)
         runtime.settle()
@@ -141,37 +118,43 @@ def _mean_below(low: F32, high: F32) -> F32:
     return mean
 
 
+@dataclass(frozen=True)
+class _Predicted(Bundle):
+    """What a step along a ray reads: log-odds (pool * 512), and the noise of the ray's pixel."""
+
+    belief: F32Array
+    noise: Template
+
+
 @ti.func
-def _predict_voxel(ray: Template, context: Template, voxel: I32, near: F32, far: F32):
+def _predict_voxel(ray: Template, predicted: Template, voxel: I32, near: F32, far: F32):
     """One voxel of a ray, whose segment in it reaches from axial depth ``near`` to ``far``."""
-    alpha = occlusion(context[0][voxel], ray.unknown, ray.empty_below)
+    alpha = occlusion(predicted.belief[voxel], ray.unknown, ray.empty_below)
     thickness = alpha * (far - near) * ray.voxels_per_depth
     here = ray.visibility * stopped_share(thickness)
     ray.visibility *= exp_of_negative(-thickness)
-    sigma = sigma_at(ray.noise, 0.5 * (near + far))
-    high = (ray.measured - near - polynomial(ray.noise.bias, near)) / sigma
-    low = (ray.measured - far - polynomial(ray.noise.bias, far)) / sigma
+    sigma = predicted.noise.sigma(0.5 * (near + far))
+    high = (ray.measured - near - predicted.noise.bias(near)) / sigma
+    low = (ray.measured - far - predicted.noise.bias(far)) / sigma
     ray.below += here * _mean_below(ti.min(low, high), high)
     return ti.cast(ray.visibility > OPAQUE, ti.i32)
 
 
-@ti.kernel
+@kernel
 def _follow(
-    chosen: I32Array, measured: F32Array, width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
-    max_depth: F32, unknown: F32, empty_below: F32, noise: F32Array3, patch: I32, columns: I32,
-    shape: IVec3, lower: Vec3, upper: Vec3, chunks: I32Array, bricks: I32Array, belief: F32Array,
-    below: F32Array,
-):  # fmt: skip
+    chosen: I32Array, measured: F32Array, sensor: Sensor, view: Viewpoint, space: Space, belief: F32Array,
+    max_depth: F32, unknown: F32, empty_below: F32, below: F32Array,
+) -> None:  # fmt: skip
+    """Follow the rays of the ``chosen`` pixels (n) up to ``max_depth`` metres.
+
+    ``measured`` (n) are their measurements in metres; ``belief`` (pool * 512) holds log-odds; ``below`` (n)
+    receives the probability of measuring no more.
+    """
     for i in range(chosen.shape[0]):
-        u, v = chosen[i] % width, chosen[i] // width
-        ray = Prediction(
-            0.0, unknown, empty_below, measured[i], PixelNoise(Vec5(0.0), Vec5(0.0)), 1.0, 0.0
-        )  # fmt: skip
-        ray.noise = pixel_noise(noise, patch, columns, u, v)
-        direction = to_voxels @ pixel_direction(u, v, intrinsics)
-        ray.voxels_per_depth = direction.norm()
-        path = make_ray(centre, direction)
+        u, v = sensor.pixel(chosen[i])
+        path = pixel_ray(sensor, view, u, v)
+        ray = Prediction(path.direction.norm(), unknown, empty_below, measured[i], 1.0, 0.0)
         begin, end = 0.0, max_depth
-        clip(path, begin, end, lower, upper)
-        walk_voxels(path, begin, end, shape, chunks, bricks, _predict_voxel, ray, (belief, 0))
+        clip(path, begin, end, space.lower, space.upper)
+        walk_voxels(path, begin, end, space, _predict_voxel, ray, _Predicted(belief, sensor.noise_at(u, v)))
         below[i] = ray.below + ray.visibility * ti.min(1.0, ray.measured / max_depth)

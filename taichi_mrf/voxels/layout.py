@@ -17,6 +17,9 @@ CHUNK = 8
 CHUNK_VOXELS = BRICK * CHUNK
 """Voxels along each side of a chunk."""
 
+CHUNK_BRICKS = CHUNK**3
+"""Bricks in a chunk."""
+
 VOXELS = BRICK**3
 """Voxels in a brick."""
 

@@ -6,17 +6,51 @@ brick that exists through voxels, so that empty space costs one step for each ch
 
 Coordinates are voxels from the corner of a window (window.py), so they stay small and float32 stays
 exact to about 1e-4 of a voxel however far from the world's origin the map has grown. A ray is
-origin + t * direction; what t means (axial depth or range) is up to whoever made the direction.
+origin + t * direction; t is axial depth or range, as the direction has it.
 """
+
+from dataclasses import dataclass
 
 import taichi as ti
 
-from taichi_mrf.kernels.types import F32, I32, IVec3, Struct, Template, Vec3
+from taichi_mrf.kernels.bundles import Bundle
+from taichi_mrf.kernels.types import F32, I32, I32Array, IVec3, Mat3, Struct, Template, Vec3
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS
 from taichi_mrf.voxels.numbering import flat, voxel_number
 
 FAR = 1e30
 """Stands for 1 / 0 and 'never': finite, because Taichi's fast maths may not keep infinities apart."""
+
+
+@dataclass(frozen=True)
+class Space(Bundle):
+    """The bricks of a window that rays meet (WindowIndex.space)."""
+
+    shape: IVec3
+    """Size of the window in bricks, a multiple of CHUNK along each axis."""
+
+    lower: Vec3
+    """Corner of the mapped part of the window, in voxels from the window's corner."""
+
+    upper: Vec3
+    """The opposite corner."""
+
+    chunks: I32Array
+    """(chunks of the window): 0 for a chunk without bricks, which a ray passes in one step."""
+
+    bricks: I32Array
+    """(bricks of the window): the slot of each brick, -1 where there is none. May be longer."""
+
+
+@dataclass(frozen=True)
+class Viewpoint(Bundle):
+    """Where a camera stands in a window (Window.viewpoint)."""
+
+    centre: Vec3
+    """The camera's centre, in voxels from the window's corner."""
+
+    to_voxels: Mat3
+    """Turns a direction of the camera frame, in metres, into one of the window, in voxels."""
 
 
 @ti.dataclass
@@ -48,6 +82,12 @@ def make_ray(origin: Vec3, direction: Vec3) -> Ray:
             if direction[axis] < 0.0:
                 step[axis] = -1
     return Ray(origin, direction, inverse, step)
+
+
+@ti.func
+def pixel_ray(sensor: Template, view: Template, u: F32, v: F32) -> Ray:
+    """The ray of pixel (u, v) of a sensor (sensor/model.py) in a window; t is depth in metres."""
+    return make_ray(view.centre, view.to_voxels @ sensor.direction(u, v))
 
 
 @ti.func
@@ -95,7 +135,7 @@ def within(cell: IVec3, count: IVec3) -> I32:
 
 @ti.func
 def inside_eight(cell: IVec3) -> I32:
-    """Whether a cell lies among the 8^3 of its parent."""
+    """Whether a cell lies among the 8^3 of its parent: a voxel in a brick, a brick in a chunk."""
     return ((cell[0] | cell[1] | cell[2]) & -8) == 0
 
 
@@ -151,33 +191,36 @@ def walk_bricks(
         advance(ray, chunk, next_chunk, CHUNK_VOXELS)
 
 
+@dataclass(frozen=True)
+class _InBricks(Bundle):
+    """What :func:`walk_voxels` takes along through the bricks."""
+
+    space: Space
+    visit: Template
+    context: Template
+
+
 @ti.func
 def walk_voxels(
-    ray: Ray,
-    t_begin: F32,
-    t_end: F32,
-    shape: IVec3,
-    chunks: Template,
-    bricks: Template,
-    visit: Template,
-    state: Template,
-    context: Template,
+    ray: Ray, t_begin: F32, t_end: F32, space: Template, visit: Template, state: Template, context: Template
 ):
-    """Call ``visit(state, context, index, t, t_leave)`` for each voxel of the window along the ray.
+    """Call ``visit(state, context, index, t, t_leave)`` for each voxel of the space along the ray.
 
-    Only voxels of bricks that exist: ``bricks`` holds the slot of each brick of the window, -1 for none.
-    ``index`` is slot * 512 + the voxel's number in its brick. The segments [t, t_leave) follow each
-    other without overlap. The walk ends where ``visit`` returns 0.
+    Only voxels of bricks that exist. ``index`` is slot * 512 + the voxel's number in its brick. The segments
+    [t, t_leave) follow each other without overlap. The interval must lie inside the window (:func:`clip`).
+    The walk ends where ``visit`` returns 0.
     """
     walk_bricks(
-        ray, t_begin, t_end, shape, chunks, True, _cross_brick, state, (shape, bricks, visit, context)
-    )
+        ray, t_begin, t_end, space.shape, space.chunks, True, _cross_brick, state,
+        _InBricks(space, visit, context),
+    )  # fmt: skip
 
 
 @ti.func
-def _cross_brick(state: Template, context: Template, ray: Ray, brick: IVec3, t_enter: F32, t_leave: F32):
+def _cross_brick(state: Template, inside: Template, ray: Ray, brick: IVec3, t_enter: F32, t_leave: F32):
+    """Visit the voxels of one brick."""
     go = 1
-    slot = context[1][flat(brick, context[0])]
+    slot = inside.space.bricks[flat(brick, inside.space.shape)]
     if slot >= 0:
         t = t_enter
         voxel = enter(ray, t, 1, brick * BRICK, IVec3(BRICK))
@@ -186,7 +229,7 @@ def _cross_brick(state: Template, context: Template, ray: Ray, brick: IVec3, t_e
             t_voxel = ti.min(next_voxel, t_leave)
             if t_voxel > t:
                 index = slot * VOXELS + voxel_number(voxel.cell)
-                go = context[2](state, context[3], index, t, t_voxel)
+                go = inside.visit(state, inside.context, index, t, t_voxel)
                 t = t_voxel
             advance(ray, voxel, next_voxel, 1)
     return go

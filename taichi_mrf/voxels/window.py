@@ -18,8 +18,9 @@ from taichi_mrf.kernels.resident import Resident
 from taichi_mrf.kernels.types import I32, I32Array, IVec3
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import check_memory
-from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS
+from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_BRICKS
 from taichi_mrf.voxels.numbering import flat
+from taichi_mrf.voxels.traversal import Space, Viewpoint
 
 LARGEST_CHUNK = 2**31 // CHUNK
 """Bricks further out than this, in chunks, have no int32 coordinates."""
@@ -78,10 +79,9 @@ class Window:
         """World points in metres -> voxels from the window's corner."""
         return np.asarray(points_m, np.float64) / self.voxel_size - np.asarray(self.lowest) * BRICK
 
-    def rays_of(self, T_world_camera: Pose) -> tuple[ti.Vector, ti.Matrix]:
-        """The camera in the window: its centre, and the matrix that turns a camera-frame direction of
-        one metre into voxels."""
-        return (
+    def viewpoint(self, T_world_camera: Pose) -> Viewpoint:
+        """The camera in the window, as kernels take it."""
+        return Viewpoint(
             ti.Vector(self.to_voxels(T_world_camera[:3, 3]).tolist(), ti.f32),
             ti.Matrix((T_world_camera[:3, :3] / self.voxel_size).tolist(), ti.f32),
         )
@@ -112,7 +112,7 @@ class WindowIndex:
         runtime.settle()
         self.bricks = ti.ndarray(ti.i32, cells)
         self.bricks.fill(-1)
-        self.chunks = ti.ndarray(ti.i32, max(1, cells // VOXELS))
+        self.chunks = ti.ndarray(ti.i32, max(1, cells // CHUNK_BRICKS))
         self.chunks.fill(0)
 
     def fill(self, window: Window, cells: Resident, slots: Resident) -> None:
@@ -126,9 +126,18 @@ class WindowIndex:
         """Take the same bricks out again, which costs less than filling the whole index."""
         _take_out(window.shape_vector, cells, self.bricks, self.chunks)
 
+    def space(
+        self, window: Window, lower_m: ArrayLike | None = None, upper_m: ArrayLike | None = None
+    ) -> Space:
+        """The bricks that are filled in, as rays meet them. Two corners in metres bound the mapped volume."""
+        lower, upper = window.clip_box(lower_m, upper_m)
+        return Space(window.shape_vector, lower, upper, self.chunks, self.bricks)
+
 
 @ti.kernel
 def _enter(shape: IVec3, cells: I32Array, slots: I32Array, bricks: I32Array, chunks: I32Array):
+    """Write slot ``slots[i]`` at cell ``cells[i]``; there may be more slots than cells. ``bricks`` and
+    ``chunks`` are those of traversal.Space, ``shape`` is the window's in bricks."""
     for i in range(cells.shape[0]):
         bricks[cells[i]] = slots[i]
         chunks[_chunk_of(cells[i], shape)] = 1
@@ -136,6 +145,7 @@ def _enter(shape: IVec3, cells: I32Array, slots: I32Array, bricks: I32Array, chu
 
 @ti.kernel
 def _take_out(shape: IVec3, cells: I32Array, bricks: I32Array, chunks: I32Array):
+    """Undo :func:`_enter` for the same cells."""
     for i in range(cells.shape[0]):
         bricks[cells[i]] = -1
         chunks[_chunk_of(cells[i], shape)] = 0

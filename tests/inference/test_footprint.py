@@ -23,12 +23,13 @@ from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.inference.footprint import find_footprint, visible_box
 from taichi_mrf.inference.keyframe import DepthImage, Footprint, RayList
 from taichi_mrf.inference.ray_list import RayBundler
-from taichi_mrf.kernels.types import F32, I32, AnyArray, I32Array, IVec3, Struct, Template, Vec3
+from taichi_mrf.kernels.bundles import kernel
+from taichi_mrf.kernels.types import F32, I32, AnyArray, I32Array, Struct, Template, Vec3
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
 from taichi_mrf.system import runtime
-from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS
-from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
+from taichi_mrf.voxels.layout import BRICK, CHUNK
+from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_voxels
 from taichi_mrf.voxels.window import Window
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -254,19 +255,18 @@ def _count_voxel(count: Template, context: Template, index: I32, near: F32, far:
     return 1
 
 
-@ti.kernel
+@kernel
 def _count_voxels(
-    rays: AnyArray, centre: Vec3, shape: IVec3, lower: Vec3, upper: Vec3, chunks: I32Array, bricks: I32Array,
-    out: I32Array, block: Template,
-):  # fmt: skip
+    rays: AnyArray, centre: Vec3, space: Space, out: I32Array, block: Template,
+) -> None:  # fmt: skip
     if ti.static(block > 0):
         ti.loop_config(block_dim=block)
     for i in range(out.shape[0]):
         ray = make_ray(centre, Vec3(rays[i, 0], rays[i, 1], rays[i, 2]))
         begin, end = 0.0, rays[i, 3]
-        clip(ray, begin, end, lower, upper)
+        clip(ray, begin, end, space.lower, space.upper)
         count = _Count(0)
-        walk_voxels(ray, begin, end, shape, chunks, bricks, _count_voxel, count, ())
+        walk_voxels(ray, begin, end, space, _count_voxel, count, 0)
         out[i] = count.voxels
 
 
@@ -289,12 +289,12 @@ def test_longest_bounds_the_voxels_on_every_ray(pose: str, bounded: bool) -> Non
             rays.centre, direction, 0.0, end - 0.001, box_lower.to_numpy(), box_upper.to_numpy()
         )
         expected = max(expected, len(segments(rays.centre, direction, *interval)[1]))
-    all_bricks = np.zeros(window.cells, np.int32)
+    chunks, all_bricks = np.ones(window.cells // CHUNK**3, np.int32), np.zeros(window.cells, np.int32)
     counts = np.zeros(len(rays.end), np.int32)
     _count_voxels(
         np.column_stack([rays.directions, rays.end]).astype(np.float32), ti.Vector(rays.centre, ti.f32),
-        window.shape_vector, box_lower, box_upper, np.ones(window.cells // VOXELS, np.int32), all_bricks,
-        counts, 8 if runtime.is_software() else 0,
+        Space(window.shape_vector, box_lower, box_upper, chunks, all_bricks), counts,
+        8 if runtime.is_software() else 0,
     )  # fmt: skip
     assert counts.max() > 2 * CHUNK
     assert footprint.longest >= max(expected, counts.max())

@@ -31,9 +31,14 @@ priors = st.floats(0.02, 0.6)
 
 @settings(max_examples=60)
 @given(
-    seed=seeds, depth=shallow, sigma=wide, prior=priors, bias=st.floats(-0.05, 0.05),
-    method=st.sampled_from(["sum-product", "max-product"]), retrace=st.booleans(),
-)  # fmt: skip
+    seed=seeds,
+    depth=shallow,
+    sigma=wide,
+    prior=priors,
+    bias=st.floats(-0.05, 0.05),
+    method=st.sampled_from(["sum-product", "max-product"]),
+    return_pass=st.sampled_from(["replay", "retrace"]),
+)
 def test_one_ray_equals_enumeration(
     seed: int,
     depth: float,
@@ -41,15 +46,14 @@ def test_one_ray_equals_enumeration(
     prior: float,
     bias: float,
     method: Literal["sum-product", "max-product"],
-    retrace: bool,
+    return_pass: Literal["replay", "retrace"],
 ) -> None:
     rng = np.random.default_rng(seed)
     T = random_pose(rng)
-    sensor, config = Noise((sigma,), (bias,)), InferenceConfig(prior=prior, **EXACT)
+    sensor, config = Noise((sigma,), (bias,)), InferenceConfig(prior=prior, return_pass=return_pass, **EXACT)
     rays = reference.cast(image(depth), T, ONE_PIXEL, VOXEL, sensor, config, max_depth=0.75)
     assume(well_cut(rays, 12))
     m = MRFMap(VOXEL, PolynomialNoise((sigma,), (bias,)), inference=config, max_depth=0.75)
-    m._sweeper.retrace = retrace
     m.add_keyframe(image(depth), T, ONE_PIXEL)
     m.infer(sweeps=2, method=method)
     exact = reference.enumerate_marginals(rays, prior, config.outlier_floor, method == "max-product")
@@ -203,9 +207,8 @@ def test_float16_messages_move_beliefs_a_little() -> None:
 @pytest.mark.parametrize("average", ["log_odds", "probability"])
 def test_rays_followed_twice_say_what_their_trace_says(average: Literal["log_odds", "probability"]) -> None:
     marginals = []
-    for retrace in (False, True):
-        m = MRFMap(small_room.VOXEL_SIZE, inference=InferenceConfig(average=average))
-        m._sweeper.retrace = retrace
+    for return_pass in ("replay", "retrace"):
+        m = MRFMap(small_room.VOXEL_SIZE, average=average, return_pass=return_pass)
         for frame in small_room.frames()[:4]:
             small_room.add(m, frame)
         m.infer()

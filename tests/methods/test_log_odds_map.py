@@ -129,8 +129,8 @@ def counted(
     window, cells = footprint.window, footprint.crossed
     integrator.index.fill(window, cells, np.arange(len(cells), dtype=np.int32))
     count_rays(
-        footprint.ends, window.rays_of(T)[0], window.shape_vector, *window.clip_box(None, None),
-        integrator.index.chunks, integrator.index.bricks, integrator.tally, every_ray,
+        footprint.ends, window.viewpoint(T).centre, integrator.index.space(window), integrator.tally,
+        every_ray,
     )  # fmt: skip
     tally = integrator.tally.to_numpy()
     assert (tally[len(cells) * VOXELS :] == 0).all()

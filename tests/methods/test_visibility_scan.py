@@ -14,7 +14,11 @@ from oracles import visibility as reference
 from taichi_mrf.kernels.types import F32, AnyArray, F32Array, I32Array, Vec4
 from taichi_mrf.methods.visibility import scan
 from taichi_mrf.methods.visibility.plug import VisibilityConfig
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.sensor.noise import PolynomialNoise
 from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.traversal import Space
 from taichi_mrf.voxels.window import Window, WindowIndex
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -197,11 +201,10 @@ def test_local_occlusion_is_the_papers_across_bricks(
     belief = on_device(log_odds, ti.f32)
     occluded, visible, inside = scratch(len(bricks))
     centre = np.asarray(sensor, np.float32)
-    scan.hide(
-        cells, ti.Vector(centre.tolist(), ti.f32), window.shape_vector,
-        ti.Vector([float(x) for x in low], ti.f32), ti.Vector([float(x) for x in high], ti.f32),
-        index.bricks, belief, occluded, visible, inside,
-    )  # fmt: skip
+    lower, upper = (ti.Vector([float(x) for x in corner], ti.f32) for corner in (low, high))
+    space = Space(window.shape_vector, lower, upper, index.chunks, index.bricks)
+    seen = scan.SeenVoxels(occluded, visible, inside)
+    scan.hide(cells, ti.Vector(centre.tolist(), ti.f32), space, belief, seen)
 
     offsets = np.stack(np.unravel_index(np.arange(VOXELS), (BRICK,) * 3), axis=1)
     known = {}
@@ -265,14 +268,12 @@ def follow_row(
     T = np.eye(4)
     T[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]  # the camera looks along x
     T[:3, 3] = [1e-3, 0.5 * VOXEL, 0.5 * VOXEL]
-    centre, to_voxels = window.rays_of(T)
-    lower, upper = window.clip_box(None, None)
-    noise = np.zeros((1, 2, 5), np.float32)
-    noise[0, 0, 0], noise[0, 1, 0] = sigma, bias
+    camera = PinholeCamera(1, 1, 1.0, 1.0, 0.0, 0.0)
+    noise = PolynomialNoise((sigma,), (bias,)).table(camera)
     scan.follow(
-        np.array([measured], np.float32), 1, ti.Vector([1.0, 1.0, 0.0, 0.0], ti.f32), centre, to_voxels,
-        noise, 1, 1, VOXEL, max_depth, max_range, *RULES,
-        window.shape_vector, lower, upper, index.chunks, index.bricks, hidden, visible, inside,
+        np.array([measured], np.float32), Sensor(camera.in_kernels(), noise.in_kernels()),
+        window.viewpoint(T), index.space(window), scan.RayLimits(VOXEL, max_depth, max_range, *RULES),
+        scan.SeenVoxels(hidden, visible, inside),
     )  # fmt: skip
     out = np.zeros(length * VOXELS, np.float32), np.zeros(length * VOXELS, np.float32)
     _floats(visible, out[0])

@@ -18,19 +18,16 @@ from taichi_mrf.sensor.forward import (
     CENTRE,
     SEGMENT,
     SUPPORT,
-    PixelNoise,
     beyond_likelihood,
     depth_of_deviation,
     deviation,
     normal_between,
     normal_density,
     normal_tail,
-    polynomial,
-    sigma_at,
-    slope,
     surface_likelihood,
 )
 from taichi_mrf.sensor.noise import LEAST_SIGMA_M, TERMS
+from taichi_mrf.sensor.polynomials import PixelNoise
 
 pytestmark = pytest.mark.usefixtures("backend")
 
@@ -52,8 +49,8 @@ ROUNDING = 2.0**-23
 def _noise(coefficients: Template):
     noise = PixelNoise(Vec5(0.0), Vec5(0.0))
     for term in ti.static(range(TERMS)):
-        noise.sigma[term] = coefficients[0, term]
-        noise.bias[term] = coefficients[1, term]
+        noise.sigma_terms[term] = coefficients[0, term]
+        noise.bias_terms[term] = coefficients[1, term]
     return noise
 
 
@@ -69,9 +66,9 @@ def _normal(low: F32Array, high: F32Array, between: F32Array, tail: F32Array, de
 def _curves(coefficients: AnyArray, depth: F32Array, value: F32Array, rise: F32Array, sigma: F32Array):
     for i in range(depth.shape[0]):
         noise = _noise(coefficients)
-        value[i] = polynomial(noise.bias, depth[i])
-        rise[i] = slope(noise.bias, depth[i])
-        sigma[i] = sigma_at(noise, depth[i])
+        value[i] = noise.bias(depth[i])
+        rise[i] = noise.bias_slope(depth[i])
+        sigma[i] = noise.sigma(depth[i])
 
 
 @ti.kernel

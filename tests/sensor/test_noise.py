@@ -1,7 +1,5 @@
 """Noise models: polynomials, patches of pixels, tables from files, and what is said of bad ones."""
 
-# ruff: noqa: ANN202 - Taichi does not allow `-> None` on a kernel or a func.
-
 import dataclasses
 import warnings
 from collections.abc import Callable
@@ -18,9 +16,9 @@ from numpy.typing import NDArray
 
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.kernels.types import I32, AnyArray, F32Array3
+from taichi_mrf.kernels.bundles import kernel
+from taichi_mrf.kernels.types import I32, AnyArray
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.sensor.forward import pixel_noise
 from taichi_mrf.sensor.noise import (
     LEAST_SIGMA_M,
     TERMS,
@@ -31,6 +29,7 @@ from taichi_mrf.sensor.noise import (
     noise_from_config,
     warn_of_bad_sigma,
 )
+from taichi_mrf.sensor.polynomials import SensorNoise
 
 CAMERA = PinholeCamera(width=50, height=37, fx=40, fy=40, cx=24.5, cy=18)
 """With patches of 16 pixels it has 4 columns and 3 rows, the last ones cut off by the image's edge."""
@@ -41,19 +40,19 @@ REALSENSE = PinholeCamera(width=640, height=480, fx=615, fy=615, cx=319.5, cy=23
 coefficient = st.floats(-10, 10)
 
 
-@ti.kernel
-def _look_up(coefficients: F32Array3, patch: I32, columns: I32, width: I32, height: I32, out: AnyArray):
+@kernel
+def _look_up(noise: SensorNoise, width: I32, height: I32, out: AnyArray) -> None:
     for u, v in ti.ndrange(width, height):
-        noise = pixel_noise(coefficients, patch, columns, u, v)
+        here = noise.at_pixel(u, v)
         for term in range(TERMS):
-            out[v, u, 0, term] = noise.sigma[term]
-            out[v, u, 1, term] = noise.bias[term]
+            out[v, u, 0, term] = here.sigma_terms[term]
+            out[v, u, 1, term] = here.bias_terms[term]
 
 
 def per_pixel(table: NoiseTable, camera: PinholeCamera) -> NDArray[np.float32]:
     """What kernels read for each pixel, (H, W, 2, TERMS): sigma, bias."""
     out = np.full((*camera.shape, 2, TERMS), np.nan, np.float32)
-    _look_up(table.coefficients, table.patch, table.columns, camera.width, camera.height, out)
+    _look_up(table.in_kernels(), camera.width, camera.height, out)
     return out
 
 

@@ -12,10 +12,11 @@ import taichi as ti
 from numpy.typing import NDArray
 from oracles.traversal import clip_to_box, segments
 
+from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, offsets_in_brick
-from taichi_mrf.voxels.traversal import clip, make_ray, walk_bricks, walk_voxels
+from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_bricks, walk_voxels
 
 pytestmark = pytest.mark.usefixtures("backend")
 
@@ -32,42 +33,47 @@ class _Record(Struct):
     most: I32
 
 
+@dataclass(frozen=True)
+class _Kept(Bundle):
+    index: I32Array
+    near: F32Array
+    far: F32Array
+    shape: IVec3
+
+
 @ti.func
-def _keep_voxel(record: Template, context: Template, index: I32, near: F32, far: F32):
+def _keep_voxel(record: Template, kept: Template, index: I32, near: F32, far: F32):
     i = record.begin + record.count
-    context[0][i] = index
-    context[1][i] = near
-    context[2][i] = far
+    kept.index[i] = index
+    kept.near[i] = near
+    kept.far[i] = far
     record.count += 1
     return ti.cast(record.count < record.most, ti.i32)
 
 
 @ti.func
-def _keep_brick(record: Template, context: Template, ray: Template, brick: IVec3, near: F32, far: F32):
+def _keep_brick(record: Template, kept: Template, ray: Template, brick: IVec3, near: F32, far: F32):
     return _keep_voxel(
-        record, context, (brick[0] * context[3][1] + brick[1]) * context[3][2] + brick[2], near, far
+        record, kept, (brick[0] * kept.shape[1] + brick[1]) * kept.shape[2] + brick[2], near, far
     )
 
 
-@ti.kernel
+@kernel
 def _walk(
-    rays: AnyArray, shape: IVec3, chunks: I32Array, bricks: I32Array, most: I32, room: I32,
-    index: I32Array, near: F32Array, far: F32Array, counts: I32Array,
+    rays: AnyArray, space: Space, most: I32, room: I32, kept: _Kept, counts: I32Array,
     voxels: Template, skip_empty: Template, block: Template,
-):  # fmt: skip
+) -> None:  # fmt: skip
     if ti.static(block > 0):
         ti.loop_config(block_dim=block)
     for r in range(counts.shape[0]):
         ray = make_ray(Vec3(rays[r, 0], rays[r, 1], rays[r, 2]), Vec3(rays[r, 3], rays[r, 4], rays[r, 5]))
         begin, end = rays[r, 6], rays[r, 7]
-        clip(ray, begin, end, Vec3(0.0), ti.cast(shape * BRICK, ti.f32))
+        clip(ray, begin, end, space.lower, space.upper)
         record = _Record(r * room, 0, most)
         if ti.static(voxels):
-            walk_voxels(ray, begin, end, shape, chunks, bricks, _keep_voxel, record, (index, near, far))
+            walk_voxels(ray, begin, end, space, _keep_voxel, record, kept)
         else:
-            walk_bricks(
-                ray, begin, end, shape, chunks, skip_empty, _keep_brick, record, (index, near, far, shape)
-            )
+            walk_bricks(ray, begin, end, space.shape, space.chunks, skip_empty, _keep_brick, record, kept)
         counts[r] = record.count
 
 
@@ -134,10 +140,11 @@ def walk(
     index = np.full(len(rays) * room, -1, np.int32)
     near, far = np.zeros(len(index), np.float32), np.zeros(len(index), np.float32)
     counts = np.zeros(len(rays), np.int32)
-    _walk(
-        rays, ti.Vector(grid.shape, ti.i32), grid.chunks, grid.slots, most, room,
-        index, near, far, counts, voxels, skip, 8 if runtime.is_software() else 0,
-    )  # fmt: skip
+    shape = ti.Vector(grid.shape, ti.i32)
+    upper = ti.Vector([float(n * BRICK) for n in grid.shape], ti.f32)
+    space = Space(shape, ti.Vector([0.0] * 3, ti.f32), upper, grid.chunks, grid.slots)
+    block = 8 if runtime.is_software() else 0
+    _walk(rays, space, most, room, _Kept(index, near, far, shape), counts, voxels, skip, block)
     assert counts.max(initial=0) <= room
     written = (np.arange(room) < counts[:, None]).reshape(-1)
     return Walked(

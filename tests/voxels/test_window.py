@@ -85,10 +85,10 @@ def test_camera_rays_in_the_window_are_those_of_the_world(
 ) -> None:
     T = look_at(eye, eye + np.array([1, 2, -0.5]))
     window = Window.covering(eye - 10 * voxel_size, eye + 10 * voxel_size, voxel_size)
-    centre, to_voxels = window.rays_of(T)
-    np.testing.assert_allclose(centre.to_numpy(), window.to_voxels(eye), rtol=1e-6)
+    view = window.viewpoint(T)
+    np.testing.assert_allclose(view.centre.to_numpy(), window.to_voxels(eye), rtol=1e-6)
     world = T[:3, :3] @ direction
-    in_voxels = to_voxels.to_numpy().astype(np.float64) @ direction * voxel_size
+    in_voxels = view.to_voxels.to_numpy().astype(np.float64) @ direction * voxel_size
     np.testing.assert_allclose(in_voxels, world, atol=1e-6 * (1 + np.abs(direction).sum()))
 
 

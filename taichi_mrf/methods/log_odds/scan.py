@@ -18,6 +18,7 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.accumulators import low_half
 from taichi_mrf.inference.footprint import visible_box, window_around
 from taichi_mrf.inference.keyframe import DepthImage, Footprint
+from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import (
     F32,
     I32,
@@ -39,7 +40,7 @@ from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat, voxel_number
 from taichi_mrf.voxels.pool import BrickPool
-from taichi_mrf.voxels.traversal import clip, make_ray, walk_bricks, walk_voxels
+from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_bricks, walk_voxels
 from taichi_mrf.voxels.window import Window, WindowIndex
 
 
@@ -85,7 +86,7 @@ class ScanIntegrator:
         )  # fmt: skip
         marks = np.zeros(window.cells, np.int32)
         box = window.clip_box(self.volume.lower, self.volume.upper)
-        _mark(ends, window.rays_of(T_world_camera)[0], window.shape_vector, *box, marks)
+        _mark(ends, window.viewpoint(T_world_camera).centre, window.shape_vector, *box, marks)
         crossed = np.flatnonzero(marks).astype(np.int32)
         self._reserve(len(crossed))
         return RayFootprint(window, crossed, crossed, 1, ends)
@@ -95,12 +96,11 @@ class ScanIntegrator:
     ) -> None:
         """Change the log-odds of what a scan's rays pass and hit; ``slots`` (n,) are the bricks crossed."""
         config, window, n = self.config, footprint.window, len(slots)
-        box = window.clip_box(self.volume.lower, self.volume.upper)
         every_ray = config.update == "ray"
         self.index.fill(window, footprint.crossed, np.arange(n, dtype=np.int32))
         count_rays(
-            footprint.ends, window.rays_of(T_world_camera)[0], window.shape_vector, *box,
-            self.index.chunks, self.index.bricks, self.tally, every_ray,
+            footprint.ends, window.viewpoint(T_world_camera).centre,
+            self.index.space(window, self.volume.lower, self.volume.upper), self.tally, every_ray,
         )  # fmt: skip
         self.index.clear(window, footprint.crossed)
         weigh(
@@ -133,16 +133,30 @@ def _in_box(voxel: IVec3, lower: Vec3, upper: Vec3) -> I32:
     return (centre - lower).min() > 0.0 and (upper - centre).min() > 0.0
 
 
+@dataclass(frozen=True)
+class _Marks(Bundle):
+    """The bricks of a window that rays cross."""
+
+    shape: IVec3
+    marks: I32Array
+
+
 @ti.func
-def _mark_brick(state: Template, context: Template, ray: Template, brick: IVec3, t: F32, t_leave: F32):
-    cell = flat(brick, context[0])
-    if context[1][cell] == 0:  # most bricks are marked already, and reading is cheaper
-        context[1][cell] = 1
+def _mark_brick(state: Template, marked: Template, ray: Template, brick: IVec3, t: F32, t_leave: F32):
+    """One brick of a ray."""
+    cell = flat(brick, marked.shape)
+    if marked.marks[cell] == 0:  # most bricks are marked already, and reading is cheaper
+        marked.marks[cell] = 1
     return 1
 
 
 @ti.kernel
 def _mark(ends: F32Array2, centre: Vec3, shape: IVec3, lower: Vec3, upper: Vec3, marks: I32Array):
+    """Mark the bricks that rays cross, from the camera's ``centre`` to their ``ends`` (n, 4) (ray_ends.py).
+
+    ``shape`` is the window's size in bricks; ``lower`` and ``upper`` bound the mapped volume in voxels.
+    ``marks`` (bricks of the window) is 1 for a brick that is crossed.
+    """
     for i in range(ends.shape[0]):
         end = end_of(ends, i)
         if end[3] >= 0.0:
@@ -150,21 +164,32 @@ def _mark(ends: F32Array2, centre: Vec3, shape: IVec3, lower: Vec3, upper: Vec3,
             t_begin, t_end = 0.0, 1.0
             clip(ray, t_begin, t_end, lower, upper)
             nothing = 0
-            walk_bricks(ray, t_begin, t_end, shape, marks, False, _mark_brick, nothing, (shape, marks))
+            walk_bricks(ray, t_begin, t_end, shape, marks, False, _mark_brick, nothing, _Marks(shape, marks))
             if _in_box(_end_voxel(end), lower, upper):
                 marks[flat(_end_voxel(end) // BRICK, shape)] = 1
 
 
 @ti.dataclass
 class _Pass(Struct):
+    """A ray on its way."""
+
     last: I32  # the voxel that the ray ends in, -1 outside the volume
 
 
+@dataclass(frozen=True)
+class _Tally(Bundle):
+    """Where rays are counted, and whether each one is."""
+
+    tally: I64Array
+    every_ray: Template
+
+
 @ti.func
-def _pass_voxel(state: Template, context: Template, voxel: I32, near: F32, far: F32):
+def _pass_voxel(state: Template, counted: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of a ray."""
     go = ti.cast(voxel != state.last, ti.i32)
     if go == 1:
-        _count(context[0], voxel, ti.cast(1, ti.i64), context[1])
+        _count(counted.tally, voxel, ti.cast(1, ti.i64), counted.every_ray)
     return go
 
 
@@ -177,28 +202,28 @@ def _count(tally: Template, voxel: I32, one: ti.i64, every_ray: Template):
         ti.atomic_or(tally[voxel], one)
 
 
-@ti.kernel
-def count_rays(
-    ends: F32Array2, centre: Vec3, shape: IVec3, lower: Vec3, upper: Vec3,
-    chunks: I32Array, bricks: I32Array, tally: I64Array, every_ray: Template,
-):  # fmt: skip
-    """Count hits (upper half of the tally) and misses (lower half) of each voxel, or with ``every_ray``
+@kernel
+def count_rays(ends: F32Array2, centre: Vec3, space: Space, tally: I64Array, every_ray: Template) -> None:
+    """Count hits (upper half of the ``tally``) and misses (lower half) of each voxel, or with ``every_ray``
     off only whether there were any.
 
-    A ray goes from ``centre`` to its end, both in voxels.
+    A ray goes from the camera's ``centre`` to its end in ``ends`` (n, 4), both in voxels (ray_ends.py).
+    ``tally`` is (crossed bricks * 512).
     """
     for i in range(ends.shape[0]):
         end = end_of(ends, i)
         if end[3] >= 0.0:
             ray = make_ray(centre, Vec3(end[0], end[1], end[2]) - centre)
             t_begin, t_end = 0.0, 1.0
-            clip(ray, t_begin, t_end, lower, upper)
+            clip(ray, t_begin, t_end, space.lower, space.upper)
             voxel = _end_voxel(end)
             state = _Pass(-1)
-            if _in_box(voxel, lower, upper):
+            if _in_box(voxel, space.lower, space.upper):
                 brick = voxel // BRICK
-                state.last = bricks[flat(brick, shape)] * VOXELS + voxel_number(voxel - brick * BRICK)
-            walk_voxels(ray, t_begin, t_end, shape, chunks, bricks, _pass_voxel, state, (tally, every_ray))
+                state.last = space.bricks[flat(brick, space.shape)] * VOXELS + voxel_number(
+                    voxel - brick * BRICK
+                )
+            walk_voxels(ray, t_begin, t_end, space, _pass_voxel, state, _Tally(tally, every_ray))
             if state.last >= 0 and end[3] == HIT:
                 _count(tally, state.last, ti.cast(1, ti.i64) << 32, every_ray)
 
@@ -208,9 +233,11 @@ def weigh(
     slots: I32Array, belief: F32Array, tally: I64Array,
     hit: F32, miss: F32, lowest: F32, highest: F32, every_ray: Template,
 ):  # fmt: skip
-    """Change each voxel's log-odds by what was counted, and empty the tally.
+    """Change each voxel's log-odds by what was counted, and set the tally to zero.
 
-    One update for each voxel, in which a hit wins, or with ``every_ray`` the sum over all rays.
+    One update for each voxel, in which a hit wins, or with ``every_ray`` the sum over all rays. ``slots`` (n)
+    are the bricks' places in the pool, ``belief`` (pool * 512) log-odds, ``tally`` (n * 512) the counts;
+    ``hit`` and ``miss`` are log-odds of one ray, ``lowest`` and ``highest`` bound the result.
     """
     for i in range(slots.shape[0] * VOXELS):
         counted = tally[i]

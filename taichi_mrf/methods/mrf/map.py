@@ -42,7 +42,7 @@ from taichi_mrf.methods.mrf.plug import METHOD
 from taichi_mrf.methods.mrf.storage import contents_of, read_contents, write_contents
 from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.occlusion import Occlusion
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
 from taichi_mrf.voxels.layout import VOXELS
 
@@ -123,7 +123,7 @@ class MRFMap(BrickMap):
         return MappingProxyType(self._frozen)
 
     def add_keyframe(
-        self, depth_m: ArrayLike, T_world_camera: ArrayLike, camera: PinholeCamera, name: str = ""
+        self, depth_m: ArrayLike, T_world_camera: ArrayLike, camera: Camera, name: str = ""
     ) -> int:
         """Add a depth image; it takes part from the next :meth:`infer` on.
 
@@ -355,7 +355,7 @@ class MRFMap(BrickMap):
             raise KeyframeError(f"there is no keyframe {id}")
         return self._keyframes[id]
 
-    def _upload(self, depth_m: ArrayLike, camera: PinholeCamera) -> DepthImage:
+    def _upload(self, depth_m: ArrayLike, camera: Camera) -> DepthImage:
         image = DepthImage.upload(checked_depth(depth_m, camera, self.sensor.min_depth), camera, self.noise)
         if not self._keyframes:
             warn_of_bad_sigma(image.noise_table, self.sensor.min_depth, self.sensor.max_depth)

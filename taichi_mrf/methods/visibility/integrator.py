@@ -36,6 +36,10 @@ class VisibilityIntegrator:
         self.max_range = visibility.max_range or FAR
         # A depth is never more than its range, so what lies deeper need not be looked at.
         self.sensor = dataclasses.replace(sensor, max_depth=min(sensor.max_depth, self.max_range))
+        self.limits = visibility_scan.RayLimits(
+            voxel_size, self.sensor.max_depth, self.max_range,
+            visibility.visible_if_occluded, visibility.visible_if_clear, visibility.q_min, visibility.q_max,
+        )  # fmt: skip
         self.index = WindowIndex()
         self.bundler = RayBundler(voxel_size, InferenceConfig(ray_density=0.0))  # every pixel
         self.occluded = ti.ndarray(ti.f32, VOXELS)
@@ -77,31 +81,23 @@ class VisibilityIntegrator:
         """Change the log-odds of the voxels that the scan sees. All bricks of the footprint must exist:
         ``slots`` are their places in the pool."""
         config, window, cells = self.visibility, footprint.window, footprint.crossed
-        centre, to_voxels = window.rays_of(T_world_camera)
-        box_lower, box_upper = window.clip_box(self.volume.lower, self.volume.upper)
+        view = window.viewpoint(T_world_camera)
         self._reserve(len(slots) * VOXELS)
+        seen = visibility_scan.SeenVoxels(self.occluded, self.visible, self.inside)
 
         # Eq. 1, in the map as it is now; a neighbour may lie in a brick that this scan does not cross.
         in_use = pool.in_use
         all_cells = window.cells_of(pool.bricks[in_use])
         there = all_cells >= 0
         self.index.fill(window, all_cells[there], in_use[there])
-        visibility_scan.hide(
-            cells, centre, window.shape_vector, box_lower, box_upper,
-            self.index.bricks, pool.belief, self.occluded, self.visible, self.inside,
-        )  # fmt: skip
+        space = self.index.space(window, self.volume.lower, self.volume.upper)
+        visibility_scan.hide(cells, view.centre, space, pool.belief, seen)
         self.index.clear(window, all_cells[there])
 
         # Eqs. 2, 3 and 7: how far each ray sees, and where it is inside what it has measured.
         self.index.fill(window, cells, np.arange(len(cells), dtype=np.int32))
-        visibility_scan.follow(
-            image.depth, image.camera.width, image.intrinsics, centre, to_voxels,
-            image.noise, image.noise_table.patch, image.noise_table.columns,
-            self.voxel_size, self.sensor.max_depth, self.max_range,
-            config.visible_if_occluded, config.visible_if_clear, config.q_min, config.q_max,
-            window.shape_vector, box_lower, box_upper, self.index.chunks, self.index.bricks,
-            self.occluded, self.visible, self.inside,
-        )  # fmt: skip
+        space = self.index.space(window, self.volume.lower, self.volume.upper)
+        visibility_scan.follow(image.depth, image.sensor, view, space, self.limits, seen)
         self.index.clear(window, cells)
 
         # Eqs. 4 to 6 and 8: what that says of each voxel.

@@ -14,30 +14,20 @@ P(I_v) between 0 and 1, the largest wins. A voxel is hidden only if it is so for
 P(V_v) wins too.
 """
 
+from dataclasses import dataclass
 from statistics import NormalDist
 
 import taichi as ti
 
+from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import logistic
-from taichi_mrf.kernels.types import (
-    F32,
-    I32,
-    F32Array,
-    F32Array3,
-    I32Array,
-    IVec3,
-    Mat3,
-    Struct,
-    Template,
-    Vec3,
-    Vec4,
-)
+from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.methods.recursive_update import updated
-from taichi_mrf.sensor.forward import SUPPORT, depth_of_deviation, normal_tail, pixel_noise, sigma_at
-from taichi_mrf.sensor.rays import pixel_direction
+from taichi_mrf.sensor.forward import SUPPORT, normal_tail
+from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat
-from taichi_mrf.voxels.traversal import clip, make_ray, walk_voxels
+from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, walk_voxels
 
 UNKNOWN = 0.5
 """P(O_v) of a voxel that has no brick; one that has starts there (recursive_update)."""
@@ -69,30 +59,74 @@ class Beam(Struct):
     sure: I32  # whether that voxel was inside the obstacle for sure
 
 
-@ti.kernel
-def hide(
-    cells: I32Array, centre: Vec3, shape: IVec3, box_lower: Vec3, box_upper: Vec3,
-    bricks: I32Array, belief: F32Array, occluded: F32Array, visible: I32Array, inside: I32Array,
-):  # fmt: skip
-    """P(C_v) of each voxel of the bricks at a window's ``cells``, and nothing seen of it by any ray yet.
+@dataclass(frozen=True)
+class SeenVoxels(Bundle):
+    """What a scan sees of each voxel that its rays cross. Arrays (crossed bricks * 512)."""
 
-    ``bricks`` holds the pool's slots of all bricks of the window, those that this scan does not see too.
+    occluded: F32Array
+    """P(C_v)."""
+
+    visible: I32Array
+    """The largest P(V_v) of any ray, as the bits of a float: those of positive floats are ordered as
+    integers, which have an atomic maximum everywhere."""
+
+    inside: I32Array
+    """The largest P(I_v) of any ray, likewise."""
+
+
+@dataclass(frozen=True)
+class RayLimits(Bundle):
+    """How far rays see (VisibilityConfig)."""
+
+    voxel_size: F32
+    """Metres."""
+
+    max_depth: F32
+    """Metres of depth that no ray goes beyond."""
+
+    max_range: F32
+    """Metres of range that no ray goes beyond."""
+
+    if_occluded: F32
+    """P(V) of a voxel that is occluded by its neighbours, if the one before it on the ray is visible."""
+
+    if_clear: F32
+    """The same of a voxel that is not."""
+
+    q_min: F32
+    """P(V) below which a ray ends."""
+
+    q_max: F32
+    """P(V) from which a voxel counts as visible for sure."""
+
+
+@dataclass(frozen=True)
+class _Followed(Bundle):
+    """What a step along a ray reads and writes."""
+
+    seen: SeenVoxels
+    limits: RayLimits
+
+
+@kernel
+def hide(cells: I32Array, centre: Vec3, space: Space, belief: F32Array, seen: SeenVoxels) -> None:
+    """P(C_v) of each voxel of the bricks at a window's ``cells`` (n), and nothing seen of it by any ray yet.
+
+    ``space`` holds the pool's slots of all bricks of the window, those that this scan does not see too;
+    ``belief`` (pool * 512) log-odds; ``centre`` is the camera's, in voxels.
     """
     sensor = ti.floor(centre, ti.i32)
     for i in range(cells.shape[0] * VOXELS):
-        cell, number = cells[i // VOXELS], i % VOXELS
+        cell, number, shape = cells[i // VOXELS], i % VOXELS, space.shape
         brick = IVec3(cell // (shape[1] * shape[2]), cell // shape[2] % shape[1], cell % shape[2])
         voxel = brick * BRICK + IVec3(number // BRICK**2, number // BRICK % BRICK, number % BRICK)
-        occluded[i] = local_occlusion(voxel, sensor, shape, box_lower, box_upper, bricks, belief)
-        visible[i] = 0
-        inside[i] = 0
+        seen.occluded[i] = local_occlusion(voxel, sensor, space, belief)
+        seen.visible[i] = 0
+        seen.inside[i] = 0
 
 
 @ti.func
-def local_occlusion(
-    voxel: IVec3, sensor: IVec3, shape: IVec3, box_lower: Vec3, box_upper: Vec3,
-    bricks: Template, belief: Template,
-) -> F32:  # fmt: skip
+def local_occlusion(voxel: IVec3, sensor: IVec3, space: Template, belief: Template) -> F32:
     """Eq. 1: the least P(O) of the voxels at those faces of v that the sensor sees, usually three.
 
     In the slab of voxels that holds the sensor, neither of an axis' faces can be seen, and a voxel that
@@ -104,25 +138,23 @@ def local_occlusion(
         neighbour = voxel
         if sensor[axis] != voxel[axis]:
             neighbour[axis] += 1 if sensor[axis] > voxel[axis] else -1
-            least = ti.min(least, occupancy(neighbour, shape, box_lower, box_upper, bricks, belief))
+            least = ti.min(least, occupancy(neighbour, space, belief))
             seen = 1
     return least * seen
 
 
 @ti.func
-def occupancy(
-    voxel: IVec3, shape: IVec3, box_lower: Vec3, box_upper: Vec3, bricks: Template, belief: Template
-) -> F32:
+def occupancy(voxel: IVec3, space: Template, belief: Template) -> F32:
     """P(O) of any voxel, in whatever brick it lies: UNKNOWN where there is none.
 
-    Beyond the box that is mapped, nothing is ever known, and nothing may be in the way for ever: 0.
+    Voxels outside the mapped box count as free, so they never occlude.
     """
     probability = UNKNOWN
     middle = ti.cast(voxel, ti.f32) + 0.5
-    if (middle - box_lower).min() < 0.0 or (box_upper - middle).min() < 0.0:
+    if (middle - space.lower).min() < 0.0 or (space.upper - middle).min() < 0.0:
         probability = 0.0
     else:
-        slot = bricks[flat(voxel // BRICK, shape)]
+        slot = space.bricks[flat(voxel // BRICK, space.shape)]
         if slot >= 0:
             local = voxel % BRICK
             number = (local[0] * BRICK + local[1]) * BRICK + local[2]
@@ -130,50 +162,44 @@ def occupancy(
     return probability
 
 
-@ti.kernel
+@kernel
 def follow(
-    depth: F32Array, width: I32, intrinsics: Vec4, centre: Vec3, to_voxels: Mat3,
-    noise: F32Array3, patch: I32, columns: I32,
-    voxel_size: F32, max_depth: F32, max_range: F32,
-    if_occluded: F32, if_clear: F32, q_min: F32, q_max: F32,
-    shape: IVec3, box_lower: Vec3, box_upper: Vec3, chunks: I32Array, bricks: I32Array,
-    occluded: F32Array, visible: I32Array, inside: I32Array,
-):  # fmt: skip
+    depth: F32Array, sensor: Sensor, view: Viewpoint, space: Space, limits: RayLimits, seen: SeenVoxels
+) -> None:
     """Follow each ray until it is no longer visible, or sure to be inside what it has measured.
 
-    ``visible`` and ``inside`` take the largest P(V) and P(I) that any ray has for a voxel, as the bits of
-    a float: those of positive floats are ordered as integers, which have an atomic maximum everywhere.
+    ``depth`` is (H * W) metres, 0 without a measurement.
     """
     for pixel in range(depth.shape[0]):
         if depth[pixel] > 0.0:
-            u, v = pixel % width, pixel // width
-            direction = to_voxels @ pixel_direction(u, v, intrinsics)
-            ray = make_ray(centre, direction)
-            here = pixel_noise(noise, patch, columns, u, v)
+            u, v = sensor.pixel(pixel)
+            ray = pixel_ray(sensor, view, u, v)
+            noise = sensor.noise_at(u, v)
+            voxels_per_depth = ray.direction.norm()
 
             # Eq. 7, with any noise model: the sigma of the depth that the measurement stands for.
-            measured = depth_of_deviation(depth[pixel], 0.0, here)
-            sigma = sigma_at(here, measured)
+            measured = sensor.surface_depth(depth[pixel], noise)
+            sigma = noise.sigma(measured)
 
-            range_per_depth = direction.norm() * voxel_size
-            end = measured + SURE_SIGMAS * sigma + BEYOND_VOXELS * voxel_size
-            begin, end = 0.0, ti.min(end, max_depth, max_range / range_per_depth)
-            clip(ray, begin, end, box_lower, box_upper)
+            range_per_depth = voxels_per_depth * limits.voxel_size
+            end = measured + SURE_SIGMAS * sigma + BEYOND_VOXELS * limits.voxel_size
+            begin, end = 0.0, ti.min(end, limits.max_depth, limits.max_range / range_per_depth)
+            clip(ray, begin, end, space.lower, space.upper)
 
-            beam = Beam(measured, sigma, GRAZED / direction.norm(), 1.0, 0)
-            walk_voxels(
-                ray, begin, end, shape, chunks, bricks, _come_through, beam,
-                (occluded, visible, inside, if_occluded, if_clear, q_min, q_max),
-            )  # fmt: skip
+            beam = Beam(measured, sigma, GRAZED / voxels_per_depth, 1.0, 0)
+            walk_voxels(ray, begin, end, space, _come_through, beam, _Followed(seen, limits))
 
 
 @ti.func
-def _come_through(beam: Template, context: Template, voxel: I32, near: F32, far: F32):
-    """One voxel of a ray; ``near`` and ``far`` bound the ray's segment in it, in axial depth."""
+def _come_through(beam: Template, followed: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of a ray; ``near`` and ``far`` bound the ray's segment in it, in depth."""
+    seen, limits = followed.seen, followed.limits
     go = 1
     if far - near > beam.grazed:
-        beam.visible = visibility(beam.visible, context[0][voxel], context[3], context[4], context[6])
-        if beam.visible < context[5]:  # q_min
+        beam.visible = visibility(
+            beam.visible, seen.occluded[voxel], limits.if_occluded, limits.if_clear, limits.q_max
+        )
+        if beam.visible < limits.q_min:
             go = 0
         else:
             # The voxel is reduced to a point on the ray: the centre of the ray's segment in it.
@@ -184,8 +210,8 @@ def _come_through(beam: Template, context: Template, voxel: I32, near: F32, far:
                 go = 0  # this was the further voxel
             if probability >= SURE:
                 beam.sure = 1
-            _raise(context[1], voxel, beam.visible)
-            _raise(context[2], voxel, probability)
+            _raise(seen.visible, voxel, beam.visible)
+            _raise(seen.inside, voxel, probability)
     return go
 
 
@@ -213,6 +239,7 @@ def inside_obstacle(depth: F32, measured: F32, sigma: F32) -> F32:
 
 @ti.func
 def _raise(largest: Template, voxel: I32, value: F32):
+    """Keep the larger of a voxel's value, as the bits of a float, and this one."""
     bits = ti.bit_cast(value, ti.i32)
     if largest[voxel] < bits:  # most rays come late, and reading is cheaper
         ti.atomic_max(largest[voxel], bits)
@@ -223,7 +250,11 @@ def update(
     slots: I32Array, belief: F32Array, visible: I32Array, inside: I32Array,
     hit_if_occupied: F32, hit_if_free: F32, hit_if_hidden: F32, lowest: F32, highest: F32,
 ):  # fmt: skip
-    """Let each voxel that some ray has seen know, once; its log-odds stay within [lowest, highest]."""
+    """Update each voxel that some ray has seen once; its log-odds stay within [lowest, highest].
+
+    ``slots`` (n) are the crossed bricks' places in the pool, ``belief`` (pool * 512) log-odds; ``visible``
+    and ``inside`` (n * 512) those of SeenVoxels.
+    """
     for i in range(slots.shape[0] * VOXELS):
         seen = ti.bit_cast(visible[i], ti.f32)
         if seen > 0.0:

@@ -1,0 +1,52 @@
+"""How a keyframe's rays are dealt out to workers: runs of neighbouring rays, which cross the same bricks."""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from taichi_mrf.kernels.bundles import Bundle
+from taichi_mrf.kernels.types import I32, Template
+from taichi_mrf.system import runtime
+
+
+@dataclass(frozen=True)
+class Workers(Bundle):
+    """How many workers there are, and which rays each takes."""
+
+    number: I32
+    """Workers; each has its own part of the trace."""
+
+    run: I32
+    """Neighbouring rays that a worker takes at a time."""
+
+    spread: I32
+    """Iterations of the parallel loop that a worker stands for."""
+
+    block: Template
+    """Threads in a block on a GPU; 0 leaves it to Taichi."""
+
+    @ti.func
+    def turns(self, rays: I32):
+        """How many rays each worker is dealt, those beyond the last included."""
+        runs = (rays + self.run - 1) // self.run
+        return (runs + self.number - 1) // self.number * self.run
+
+    @ti.func
+    def ray(self, worker: I32, turn: I32):
+        """The ray of a worker's turn. It may lie beyond the last."""
+        return (turn // self.run * self.number + worker) * self.run + turn % self.run
+
+
+def workers_for(arch: str, software: bool, longest: int, trace_bytes: int) -> Workers:
+    """Workers for a backend, whose traces hold ``longest`` voxels of ``trace_bytes`` each.
+
+    On a CPU a worker takes runs of rays, and its trace stays in the cache; on a GPU it is a thread,
+    neighbours take neighbouring rays, and the trace is bounded to half a GB.
+    """
+    if arch == "cpu":
+        # Taichi gives a CPU thread no fewer than 512 iterations of a loop at a time.
+        return Workers(64, 256, 512, 0)
+    if software:
+        return Workers(1024, 1, 1, runtime.SOFTWARE_BLOCK)
+    most = (512 << 20) // (trace_bytes * longest)
+    return Workers(max(256, min(65536, most)), 1, 1, 128)

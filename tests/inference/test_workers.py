@@ -1,0 +1,31 @@
+"""Every ray is dealt to one worker, once."""
+
+import numpy as np
+import pytest
+import taichi as ti
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from taichi_mrf.inference.workers import Workers
+from taichi_mrf.kernels.bundles import kernel
+from taichi_mrf.kernels.types import I32, I32Array
+
+pytestmark = pytest.mark.usefixtures("backend")
+
+
+@kernel
+def _deal(workers: Workers, rays: I32, times: I32Array) -> None:
+    for worker in range(workers.number):
+        for turn in range(workers.turns(rays)):
+            ray = workers.ray(worker, turn)
+            if ray < rays:
+                ti.atomic_add(times[ray], 1)
+
+
+@settings(max_examples=50)
+@given(rays=st.integers(1, 5000), workers=st.integers(1, 40), run=st.integers(1, 300))
+def test_every_ray_is_dealt_once(rays: int, workers: int, run: int) -> None:
+    times = ti.ndarray(ti.i32, rays)
+    times.fill(0)
+    _deal(Workers(workers, run, 1, 0), rays, times)
+    np.testing.assert_array_equal(times.to_numpy(), 1)
