@@ -1,21 +1,29 @@
 """Sources that are no regular files, whose names are too long, or that claim far more than they hold."""
 
+import bz2
 import os
 import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import lz4.frame
 import numpy as np
 import pytest
 from datasets_recordings import Content, write_image, write_seven_scenes
-from inputs_bags import plain, writing
+from inputs_bags import Bag, plain, writing
+from rosbags.rosbag1 import reader as rosbag1
+from rosbags.rosbag2 import StoragePlugin, storage_mcap
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 
 from taichi_mrf.calibration.depth_files import DepthFiles
 from taichi_mrf.config.schema import load
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.images import read_color, read_depth, read_grey
 from taichi_mrf.datasets.laser.readers import open_scans
+from taichi_mrf.datasets.ros.unpacking import bound_chunks
 from taichi_mrf.datasets.trajectories import read_trajectory
 from taichi_mrf.errors import DatasetError, FrameError, TaichiMRFError
 from taichi_mrf.export.octomap_reader import read_octomap
@@ -138,3 +146,48 @@ def test_an_image_that_claims_too_many_pixels_is_refused_by_its_header(
 def test_a_jpeg_of_the_cameras_size_is_read(tmp_path: Path) -> None:
     path = write_image(tmp_path / "a.jpg", np.full((12, 16, 3), 99, np.uint8))
     assert read_color(path).shape == (12, 16, 3)
+
+
+def packed_zeros(codec: str, size: int) -> bytes:
+    pack: dict[str, Callable[[bytes], bytes]] = {
+        "bz2": bz2.compress,
+        "lz4": lz4.frame.compress,
+        "zstd": storage_mcap.zstd.compress,
+    }
+    return pack[codec](bytes(size))
+
+
+def test_a_chunk_of_an_mcap_that_unpacks_to_more_than_it_says_is_refused(tmp_path: Path) -> None:
+    bomb = packed_zeros("zstd", 300_000_000)
+    assert len(bomb) < 10_000
+    writer: Any = Writer2(tmp_path / "walk", version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with writer:
+        plain(Bag("mcap", writer))
+        writer.storage.compressor = lambda data: bomb
+    with pytest.raises(DatasetError, match=r"walk.*claims to unpack to more than it may"):
+        open_dataset(tmp_path / "walk").read(0)
+
+
+@pytest.mark.parametrize("codec", ["bz2", "lz4", "zstd"])
+def test_unpackers_are_bounded_and_give_what_is_packed(codec: str) -> None:
+    bound_chunks()
+    with_size = (1_000_000,)
+    calls = [(storage_mcap.DECOMPRESSORS, with_size), (rosbag1.decompressors, ())]
+    found = [(table[codec], size) for table, size in calls if codec in table]
+    assert found
+    for unpack, size in found:
+        packed = packed_zeros(codec, 1_000_000)
+        assert unpack(packed, *size) == bytes(1_000_000)
+        with pytest.raises((ValueError, EOFError), match=r"cut short"):
+            unpack(packed[:-5], *size)
+
+
+@pytest.mark.parametrize(
+    ("codec", "claimed"), [("bz2", ()), ("zstd", (1000,)), ("zstd", (300_000_000,)), ("lz4", (1000,))]
+)
+def test_nothing_is_unpacked_beyond_what_is_claimed_or_likely(codec: str, claimed: tuple[int, ...]) -> None:
+    bound_chunks()
+    table = storage_mcap.DECOMPRESSORS if claimed else rosbag1.decompressors
+    with pytest.raises(ValueError, match="unpack to more than it may"):
+        table[codec](packed_zeros(codec, 300_000_000), *claimed)
