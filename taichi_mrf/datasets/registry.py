@@ -6,12 +6,11 @@ first entry that recognises a folder or a file opens it.
 
 import difflib
 import re
-import shlex
 from pathlib import Path
 
 from taichi_mrf.datasets.base import BuiltIn, Dataset, Format
 from taichi_mrf.datasets.formats import frames_npz, numbered_depth, replica, scannet, seven_scenes, tum_rgbd
-from taichi_mrf.datasets.laser.readers import holds_scans
+from taichi_mrf.datasets.hints import hint_for
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.realsense import device
 from taichi_mrf.datasets.resampled import resampled
@@ -140,23 +139,22 @@ def _open_path(source: str, options: ReadOptions) -> Dataset:
 
 def _not_recognised(path: Path) -> str:
     """Why a path cannot be opened, and what to do."""
-    if holds_scans(path):
-        return (
-            f"{path}: contains scans of a 2D laser scanner, not depth images; "
-            f"map them with: taichi-mrf laser {shlex.quote(str(path))} --out DIR"
-        )
+    if is_folder(path):
+        children = sorted(path.iterdir())
+        inside = [child.name for child in children if bag.FORMAT.recognises(child) or _is_recording(child)]
+        if inside:
+            return f"{path}: contains several recordings; pass one of: {', '.join(inside[:8])}"
+    hint = hint_for(path)
+    if hint is not None:
+        return f"{path}: {hint}"
     looked_for = "; ".join(f"{each.name}: {each.looks_for}" for each in FORMATS)
     if is_file(path):
         return (
             f"{path}: unsupported file type; for a recording of many files pass its folder. "
             f"Looked for {looked_for}"
         )
-    children = sorted(path.iterdir())
     if not children:
         return f"{path}: the folder is empty; looked for {looked_for}"
-    inside = [child.name for child in children if bag.FORMAT.recognises(child) or _is_recording(child)]
-    if inside:
-        return f"{path}: contains several recordings; pass one of: {', '.join(inside[:8])}"
     return f"{path}: no recording found; looked for {looked_for}"
 
 

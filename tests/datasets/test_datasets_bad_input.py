@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from datasets_recordings import (
     Content,
+    row_of,
     stamped_line,
+    text_of,
     write_image,
     write_log,
     write_numbered,
@@ -76,6 +78,49 @@ def test_laser_scans_name_the_command_that_maps_them(tmp_path: Path, name: str) 
     else:
         path.write_bytes(gzip.compress(line) if name.endswith("gz") else line)
     assert f"taichi-mrf laser {path} --out DIR" in refused(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("scan.pcd", "contains lidar point clouds (.pcd), which are not supported"),
+        ("walk.osf", "lidar point clouds (.osf)"),
+        ("house.ply", "?poses=FILE' renders depth images of a mesh"),
+        ("office.bt", "taichi-mrf import reads it"),
+        ("scene.sens", "extract it"),
+    ],
+)
+def test_other_data_names_what_reads_it(tmp_path: Path, name: str, words: str) -> None:
+    (tmp_path / name).write_bytes(b"something")
+    assert words in refused(tmp_path / name)
+    assert words in refused(tmp_path)
+
+
+@pytest.mark.parametrize("layout", ["NNNN.cam.info.txt", "pose/NNNN.txt"])
+def test_poses_in_a_file_for_each_image_name_the_flags(tmp_path: Path, layout: str) -> None:
+    content = Content()
+    for number, image in enumerate(content.depth):
+        write_image(tmp_path / f"{number:04d}.png", image)
+        write_frame_text(tmp_path / layout.replace("NNNN", f"{number:04d}"))
+    text = refused(tmp_path)
+    assert "--camera 14.5,15,7.5,5.5 and --depth-scale" in text
+    assert "poses.txt" in text
+    (tmp_path / "poses.txt").write_text("\n".join(row_of(np.eye(4)[:3]) for _ in content.depth))
+    flags = {"intrinsics": (14.5, 15, 7.5, 5.5), "depth_scale": 1000.0}
+    assert len(open_dataset(tmp_path, **flags)) == content.count  # type: ignore[arg-type]
+
+
+def test_frames_with_a_text_file_each_name_the_pose_file(tmp_path: Path) -> None:
+    for number, image in enumerate(Content().depth):
+        write_image(tmp_path / f"frame-{number:06d}.depth.png", image)
+        write_frame_text(tmp_path / f"frame-{number:06d}.cam.info.txt")
+    assert "into frame-NNNNNN.pose.txt, and pass --camera 14.5,15,7.5,5.5" in refused(tmp_path)
+
+
+def write_frame_text(path: Path) -> None:
+    """K and a pose, as cam.info.txt has them."""
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(f"K\n14.5 0 7.5\n0 15 5.5\n0 0 1\nT_world_camera\n{text_of(np.eye(4))}\n")
 
 
 def test_a_folder_of_recordings_names_them(folder: Path) -> None:
@@ -168,7 +213,7 @@ def test_numbered_images_without_a_trajectory_or_with_two(tmp_path: Path) -> Non
     assert "without a trajectory" in refused(tmp_path)
     write_rows(tmp_path / "a.txt", content.poses)
     write_log(tmp_path / "b.log", content.poses)
-    assert "a.txt, b.log: keep one" in refused(tmp_path)
+    assert "a.txt, b.log; keep one" in refused(tmp_path)
 
 
 def test_numbered_images_that_no_stamp_names(tmp_path: Path) -> None:

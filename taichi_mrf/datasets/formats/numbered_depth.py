@@ -15,6 +15,7 @@ A camera file in the folder or the caller's word wins over all of these; what wa
 """
 
 import re
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +23,8 @@ import numpy as np
 
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.formats.open3d_json import is_trajectory_json, read_trajectory_json
-from taichi_mrf.datasets.intrinsics import PRIMESENSE, find_camera
+from taichi_mrf.datasets.hints import pose_files_hint
+from taichi_mrf.datasets.intrinsics import CAMERA_FILES, PRIMESENSE, find_camera
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.recording import RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory, is_trajectory, read_trajectory
@@ -48,7 +50,7 @@ def recognises(folder: Path) -> bool:
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     """List the images in the order of their numbers, each with its pose of the trajectory."""
     images = _numbered_images(folder)
-    trajectory, recorded = _find_trajectory(folder)
+    trajectory, recorded = _find_trajectory(folder, list(images.values()))
     poses, notes = _poses_by_number(list(images), trajectory)
     left_handed = trajectory.path.suffix == ".freiburg"
     if left_handed:
@@ -90,20 +92,24 @@ def _numbered_images(folder: Path) -> dict[int, Path]:
     return {}
 
 
-def _find_trajectory(folder: Path) -> tuple[Trajectory, PinholeCamera | None]:
+def _find_trajectory(folder: Path, images: Sequence[Path]) -> tuple[Trajectory, PinholeCamera | None]:
     """The only trajectory of a recording, and the camera that it holds, if it does."""
     suffixes = (".txt", ".log", ".freiburg")
     candidates = [
         path
         for path in sorted(folder.iterdir())
-        if (path.suffix in suffixes and is_trajectory(path))
+        if (path.suffix in suffixes and path.name not in CAMERA_FILES and is_trajectory(path))
         or (path.suffix == ".json" and is_trajectory_json(path))
     ]
+    if len(candidates) != 1 and (hint := pose_files_hint(folder, images)):
+        raise DatasetError(f"{folder}: {hint}")
     if not candidates:
         raise DatasetError(f"{folder}: numbered images without a trajectory; looked for {LOOKS_FOR}")
     if len(candidates) > 1:
         names = ", ".join(path.name for path in candidates)
-        raise DatasetError(f"{folder}: holds several trajectories, {names}: keep one")
+        raise DatasetError(
+            f"{folder}: contains several trajectories, {names}; keep one of them in the folder"
+        )
     if candidates[0].suffix == ".json":
         return read_trajectory_json(candidates[0])
     return read_trajectory(candidates[0]), None

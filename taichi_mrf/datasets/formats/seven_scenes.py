@@ -10,10 +10,12 @@ from functools import partial
 from pathlib import Path
 
 from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.hints import pose_files_hint
 from taichi_mrf.datasets.intrinsics import find_camera
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.recording import RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import read_matrix_file
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 
 NAME = "7-Scenes"
@@ -38,6 +40,11 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         match = _FILE.fullmatch(path.name)
         if match:
             numbers[match[1]] = int(match[2])
+    if not any((folder / f"{name}.pose.txt").is_file() for name in numbers):
+        remedy = "write each T_world_camera, a 4 x 4 matrix, into frame-NNNNNN.pose.txt"
+        hint = pose_files_hint(folder, [folder / f"{name}.depth.png" for name in numbers], remedy)
+        if hint is not None:
+            raise DatasetError(f"{folder}: {hint}")
     frames = [_frame(folder, name, numbers[name]) for name in sorted(numbers, key=lambda n: (numbers[n], n))]
     camera, notes = find_camera(folder, options, CAMERA, NAME, (frame.depth_file for frame in frames))
     return Recording(
