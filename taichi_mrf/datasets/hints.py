@@ -16,8 +16,8 @@ _MESHES = (".ply", ".obj", ".stl", ".glb", ".off")
 _OCTOMAPS = (".bt", ".ot")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 ONE_FILE = (
-    "write them into poses.txt in this folder, for each image a line of the 12 numbers of the first three rows "
-    "of T_world_camera"
+    "write them into poses.txt in this folder, for each image a line of the 12 numbers of the first three "
+    "rows of T_world_camera"
 )
 _POSE_TEXTS = (".txt", ".pose", ".cam", ".info")
 
@@ -44,7 +44,7 @@ def hint_for(path: Path) -> str | None:
 def _kind(path: Path) -> str | None:
     suffix = path.suffix.lower()
     if suffix in _LIDAR:
-        return f"contains lidar point clouds ({suffix}), which are not supported; depth images are"
+        return "contains lidar point clouds, which are not supported; depth images are"
     if suffix in _MESHES:
         return (
             f"contains a mesh or points ({path.name}), not depth images; "

@@ -83,8 +83,8 @@ def test_laser_scans_name_the_command_that_maps_them(tmp_path: Path, name: str) 
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("scan.pcd", "contains lidar point clouds (.pcd), which are not supported"),
-        ("walk.osf", "lidar point clouds (.osf)"),
+        ("scan.pcd", "contains lidar point clouds, which are not supported"),
+        ("walk.osf", "lidar point clouds"),
         ("house.ply", "?poses=FILE' renders depth images of a mesh"),
         ("office.bt", "taichi-mrf import reads it"),
         ("scene.sens", "extract it"),
