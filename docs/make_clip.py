@@ -58,6 +58,7 @@ def keyframes_arriving(page: LivePage) -> list[Image.Image]:
     """One picture for each keyframe, from the first one on."""
     close_warning(page)
     page.press("Reset")
+    page.press("Delete the map and start again")
     page.until(lambda seen: len(seen.keyframes) < 2, "a new beginning")
     shots: list[Image.Image] = []
     counts = [0]
@@ -104,7 +105,7 @@ def still(page: LivePage) -> Image.Image:
     page.select("Keyframe", re.compile("room-0009"))
     page.tab("Ray")
     page.fill("Pixel (u, v)", 160, 130)
-    page.press("Ray of pixel")
+    page.press("Show the ray")
     page.until(lambda seen: "/ray" in seen.nodes, "the ray")
     page.pause(1.0)
     return shot(page)

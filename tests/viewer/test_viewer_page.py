@@ -1,5 +1,6 @@
 """The live page without a mapping process and without a browser: what updates and users' actions do."""
 
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
@@ -245,3 +246,25 @@ def test_so_many_pictures_are_awaited_and_no_more(
     handled.act(Action.SAVE_PICTURE, 1234)
     notices = [item for item in drained(handled) if isinstance(item, m.Notice)]
     assert ["try again" in notice.text for notice in notices] == [True]
+
+
+def test_a_page_is_made_once_however_often_it_is_asked_for(
+    handled: HandledPage, browser: RawClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client, held, made = handled.client_id(), threading.Event(), []
+
+    class Scene:
+        def as_html(self, dark: bool) -> str:
+            made.append(dark)
+            held.wait()
+            return "a page"
+
+    monkeypatch.setattr(handled.server, "get_scene_serializer", Scene)
+    for _ in range(20):
+        handled.act(Action.SAVE_PAGE, client)
+    held.set()
+    assert browser.hear_type("FileTransferStartDownload")["filename"] == "map.html"
+    wait_for(lambda: not handled.page.downloads._begun, "the end of the work")
+    assert len(made) == 1
+    handled.act(Action.SAVE_PAGE, client)
+    browser.hear_type("FileTransferStartDownload")

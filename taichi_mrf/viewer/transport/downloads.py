@@ -29,8 +29,8 @@ class Downloads:
         self._server, self._problem = server, problem
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="downloads")
         self._lock = threading.Lock()
-        self._awaited: set[int] = set()
-        """Clients that were asked for a picture and have not sent it."""
+        self._begun: set[tuple[int, str]] = set()
+        """Clients and the kinds of files that are being made for them: one of each kind at a time."""
         self._recording: Any = None
         self._recorded_to = 0.0
 
@@ -48,26 +48,18 @@ class Downloads:
     def picture(self, client: int) -> None:
         """Give a browser what it shows, as PNG. A browser that does not answer keeps nobody else waiting."""
         with self._lock:
-            if client in self._awaited:
-                return
-            if len(self._awaited) >= PICTURES_AT_ONCE:
-                self._problem(f"{PICTURES_AT_ONCE} pictures are being made; try again in a moment")
-                return
-            self._awaited.add(client)
-
-        def picture() -> None:
-            try:
-                self._guarded("picture", lambda: self._picture(client))
-            finally:
-                with self._lock:
-                    self._awaited.discard(client)
-
-        threading.Thread(target=picture, name=f"picture of client {client}", daemon=True).start()
+            is_full = sum(kind == "picture" for _, kind in self._begun) >= PICTURES_AT_ONCE
+        if is_full and (client, "picture") not in self._begun:
+            self._problem(f"{PICTURES_AT_ONCE} pictures are being made; try again in a moment")
+        elif self._begin(client, "picture"):
+            work = (client, "picture", lambda: self._picture(client))
+            threading.Thread(target=self._finish, args=work, name="picture", daemon=True).start()
 
     def page(self, client: int, dark: bool) -> None:
         """Give a browser the scene as one HTML file."""
-        scene = self._server.get_scene_serializer()
-        self._later("page", lambda: self.send(client, "map.html", scene.as_html(dark).encode()))
+        if self._begin(client, "page"):
+            scene = self._server.get_scene_serializer()
+            self._later(client, "page", lambda: self.send(client, "map.html", scene.as_html(dark).encode()))
 
     def toggle_recording(self, client: int) -> None:
         """Start to record, or stop and give the browser the file."""
@@ -76,7 +68,8 @@ class Downloads:
             return
         self.tick()
         recording, self._recording = self._recording, None
-        self._later("recording", lambda: self.send(client, "map.viser", recording.serialize()))
+        self._begin(client, "recording")
+        self._later(client, "recording", lambda: self.send(client, "map.viser", recording.serialize()))
 
     def tick(self) -> None:
         """Tell the recording how much time has passed; call it before each change of the scene."""
@@ -100,11 +93,21 @@ class Downloads:
         bgra = rendered[..., [2, 1, 0, 3]] if rendered.shape[2] == 4 else rendered[..., ::-1]
         self.send(client, "view.png", cv2.imencode(".png", np.ascontiguousarray(bgra))[1].tobytes())
 
-    def _later(self, what: str, work: Callable[[], None]) -> None:
-        self._pool.submit(self._guarded, what, work)
+    def _begin(self, client: int, kind: str) -> bool:
+        """Whether no file of this kind is being made for this client yet; from now on one is."""
+        with self._lock:
+            is_new = (client, kind) not in self._begun
+            self._begun.add((client, kind))
+        return is_new
 
-    def _guarded(self, what: str, work: Callable[[], None]) -> None:
+    def _later(self, client: int, kind: str, work: Callable[[], None]) -> None:
+        self._pool.submit(self._finish, client, kind, work)
+
+    def _finish(self, client: int, kind: str, work: Callable[[], None]) -> None:
         try:
             work()
         except Exception as error:  # a browser that leaves or hangs must not end the page
-            self._problem(f"The {what} could not be made: {error or type(error).__name__}")
+            self._problem(f"The {kind} could not be made: {error or type(error).__name__}")
+        finally:
+            with self._lock:
+                self._begun.discard((client, kind))
