@@ -81,7 +81,7 @@ def view_images(
         pass
     else:
         verdict = judged.image
-        score = f"right {judged.score:.0%} within 1.5 sigma, no answer {judged.unanswered:.0%}"
+        score = f"right {judged.score:.0%} within 1.5 sigma, no surface {judged.unanswered:.0%}"
     return Images(
         name,
         depth_colors(measured, bounds),

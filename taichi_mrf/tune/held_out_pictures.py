@@ -76,7 +76,7 @@ def _verdict(packed: bytes) -> NDArray[np.uint8]:
 
 
 def _title(number: int, shown: tuple[bytes, float, float]) -> str:
-    return f"try {number}: right {shown[1]:.1%} within 1.5 sigma, no answer {shown[2]:.1%}"
+    return f"try {number}: right {shown[1]:.1%} within 1.5 sigma, no surface {shown[2]:.1%}"
 
 
 def _step(depth_m: NDArray[np.float32]) -> int:

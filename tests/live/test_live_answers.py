@@ -73,7 +73,7 @@ def test_images_of_a_view_are_small_and_scored() -> None:
         assert image.shape == (120, 160, 3)
         assert image.dtype == np.uint8
     assert images[0].score.startswith("right ")
-    assert "no answer" in images[0].score
+    assert "no surface" in images[0].score
 
 
 def test_octomaps_way_follows_the_keyframes_and_goes_away_again() -> None:

@@ -227,5 +227,5 @@ class Panel(BasePanel):
         black = np.zeros((2, 2, 3), np.uint8)
         self._measured = gui.add_image(black, label="measured depth", visible=False)
         self._rendered = gui.add_image(black, label="depth rendered from the map", visible=False)
-        label = "accuracy: right (blue), wrong (orange), no answer (light), not judged (dark)"
+        label = "accuracy: right (blue), wrong (orange), no surface (light), not judged (dark)"
         self._accuracy = gui.add_image(black, label=label, visible=False)

@@ -150,7 +150,7 @@ def _reach_mm(residuals: Residuals, curves: NoiseCurves) -> float:
 def sentence(residuals: Residuals, curves: NoiseCurves) -> str:
     """The text below the plot, markdown."""
     if not len(residuals.bin_m):
-        return "The map has no answer in the held-out views."
+        return "The map has no surface in the held-out views."
     points = "Grey: measured minus expected depth in held-out views, mm. Blue: its median and spread. "
     ratio = float(np.median(residuals.spread_m / curves.at(residuals.bin_m)[1]))
     if not np.isfinite(ratio):

@@ -181,7 +181,7 @@ class TunePanel(BasePanel):
             "Held-out view", [NONE_YET], hint="A frame that is not in the map and scores it."
         )
         self.watch(self.view, Action.CHOOSE_VIEW)
-        gui.add_markdown("Right (blue), wrong (orange), no answer (light), not judged (dark).")
+        gui.add_markdown("Right (blue), wrong (orange), no surface (light), not judged (dark).")
         black = np.zeros((2, 2, 3), np.uint8)
         self._reference_text = gui.add_markdown("")
         self._reference = gui.add_image(black, visible=False)

@@ -16,7 +16,7 @@ class Scores:
     """
 
     accuracy_voxel: float
-    """Share of pixels whose depth lies in the voxel of the likeliest surface; no answer counts as wrong."""
+    """Share of pixels whose depth lies in the voxel of the likeliest surface; no surface counts as wrong."""
 
     accuracy_sigma: float
     """The same for depths within 1.5 sigma of that voxel's middle, sigma being the voxel size."""
@@ -25,7 +25,7 @@ class Scores:
     """The same for depths within 5 cm of it."""
 
     unanswered: float
-    """Share of pixels without an answer: the ray meets no surface."""
+    """Share of pixels whose ray meets no surface."""
 
     median_abs_m: float
     """Median absolute difference of expected and measured depth, in metres."""
@@ -86,7 +86,7 @@ KINDS = (
     ScoreKind("accuracy_voxel", "right, in the voxel", "higher", 100, ".1f", "%"),
     ScoreKind("accuracy_sigma", "right, 1.5 sigma", "higher", 100, ".1f", "%"),
     ScoreKind("accuracy_5cm", "right, 5 cm", "higher", 100, ".1f", "%"),
-    ScoreKind("unanswered", "no answer", "lower", 100, ".1f", "%"),
+    ScoreKind("unanswered", "no surface", "lower", 100, ".1f", "%"),
     ScoreKind("median_abs_m", "median depth error", "lower", 1000, ".1f", "mm"),
     ScoreKind("rms_m", "RMS depth error", "lower", 1000, ".0f", "mm"),
     ScoreKind("log_likelihood", "log-likelihood", "higher", 1, "+.3f"),
