@@ -26,6 +26,10 @@ MANIFEST = "manifest"
 DEFLATE_RATIO = 1032
 """Deflate packs no tighter than this (zlib's technical details), so that no member is larger."""
 
+_LEAST_BOUND, _LARGEST_RATIO = 1 << 28, 100
+"""What is read of a file may be this large, or this many times what it takes in the file. Measurements pack
+three to ten times; only arrays of a single value pack a thousandfold."""
+
 _CHUNK = 1 << 20
 _MOST_DIMENSIONS = 8
 
@@ -40,6 +44,7 @@ class NpzFile:
         self._path, self._archive, self._error = path, archive, error
         members = {info.filename: info for info in archive.infolist()}
         self._members = {name.removesuffix(".npy"): info for name, info in members.items()}
+        self._packed_bytes = self._unpacked_bytes = 0
 
     @property
     def names(self) -> list[str]:
@@ -64,6 +69,7 @@ class NpzFile:
                 )
             if info.file_size > DEFLATE_RATIO * (info.compress_size + 1):
                 raise self._problem(name, f"claims {info.file_size / 1e9:.3g} GB that the file cannot hold")
+            self._count_bytes(name, info)
             check_memory(size, f"{self._path}: {name}")
             values, place = np.empty(size, np.uint8), 0
             while chunk := stream.read(_CHUNK):
@@ -117,6 +123,15 @@ class NpzFile:
             raise
         except Exception as error:  # zipfile, zlib and NumPy raise whatever their parsing stumbles over
             raise self._problem(name, f"cannot be read: {said(error)}") from error
+
+    def _count_bytes(self, name: str, info: zipfile.ZipInfo) -> None:
+        self._packed_bytes += info.compress_size
+        self._unpacked_bytes += info.file_size
+        most = max(_LEAST_BOUND, _LARGEST_RATIO * self._packed_bytes)
+        if self._unpacked_bytes > most:
+            raise self._problem(
+                name, f"unpacks to {info.file_size / 1e9:.3g} GB, from {info.compress_size / 1e6:.3g} MB"
+            )
 
     def _problem(self, name: str, problem: str) -> TaichiMRFError:
         return self._error(f"{self._path}: {name} {problem}")

@@ -33,3 +33,19 @@ def test_text_with_a_character_that_there_is_not_is_refused(tmp_path: Path, orde
         pytest.raises(MapFileError, match=r"names\.npz: names holds a character that there is not"),
     ):
         file.array("names", "U", (None,))
+
+
+def test_arrays_that_unpack_to_far_more_than_the_file_holds_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("taichi_mrf.system.npz_file._LEAST_BOUND", 3_000_000)
+    path = tmp_path / "zeros.npz"
+    noise = np.random.default_rng(0).integers(0, 256, 5_000_000, dtype=np.uint8)
+    np.savez_compressed(path, a=np.zeros(2_000_000, np.uint8), b=np.zeros(2_000_000, np.uint8), noise=noise)
+    with open_npz(path, MapFileError, "a map") as file:
+        assert len(file["a"]) == 2_000_000
+        with pytest.raises(MapFileError, match=r"zeros\.npz: b unpacks to 0\.002 GB, from 0\.0\d+ MB"):
+            file["b"]
+    with open_npz(path, MapFileError, "a map") as file:
+        assert len(file["noise"]) == 5_000_000
+        assert len(file["a"]) == len(file["b"]) == 2_000_000

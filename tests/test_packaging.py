@@ -1,0 +1,82 @@
+"""The wheel holds what the program needs, and runs where nothing of the source tree can be found."""
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import taichi_mrf
+
+SOURCES = ("taichi_mrf", "configs", "pyproject.toml", "setup.py", "MANIFEST.in", "README.md", "LICENSE")
+
+
+@pytest.fixture(scope="module")
+def wheel(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built from a copy, so that nothing is left in the source tree."""
+    pytest.importorskip("setuptools", minversion="77")
+    folder = tmp_path_factory.mktemp("wheel")
+    for name in SOURCES:
+        source, copy = repository / name, folder / "source" / name
+        copy.parent.mkdir(exist_ok=True)
+        shutil.copytree(source, copy) if source.is_dir() else shutil.copy(source, copy)
+    command = ["pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", str(folder)]
+    subprocess.run([sys.executable, "-m", *command, str(folder / "source")], check=True)
+    return next(folder.glob("*.whl"))
+
+
+@pytest.fixture(scope="module")
+def clean_python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An interpreter with the wheel and the packages that it depends on, and without the source tree."""
+    folder = tmp_path_factory.mktemp("clean") / "venv"
+    venv.create(folder, with_pip=False)
+    python = folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+    command = ["pip", "--python", str(python), "install", "--quiet", "--no-deps", "--no-index", str(wheel)]
+    subprocess.run([sys.executable, "-m", *command], check=True)
+    packages = next(folder.rglob("site-packages"))
+    # Of this interpreter the dependencies alone: its .pth files, which lead to the source tree, do not count.
+    (packages / "dependencies.pth").write_text(sysconfig.get_paths()["purelib"])
+    return python
+
+
+def test_the_wheel_holds_all_that_the_program_needs_and_no_more(wheel: Path, repository: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        found = {name for name in archive.namelist() if ".dist-info/" not in name}
+        info = {
+            name.partition(".dist-info/")[2]: name for name in archive.namelist() if ".dist-info/" in name
+        }
+        metadata = archive.read(info["METADATA"]).decode()
+    package = (path for path in (repository / "taichi_mrf").rglob("*") if path.is_file())
+    expected = {path.relative_to(repository).as_posix() for path in package if path.suffix != ".pyc"}
+    expected |= {f"taichi_mrf/configs/{path.name}" for path in (repository / "configs").glob("*.yaml")}
+    assert found == expected
+    assert "taichi_mrf/py.typed" in found
+    assert "licenses/LICENSE" in info
+    assert "License-Expression: MIT" in metadata
+    assert f"Version: {taichi_mrf.__version__}" in metadata
+
+
+def test_an_installed_wheel_maps_with_a_shipped_configuration(clean_python: Path, tmp_path: Path) -> None:
+    def run(*arguments: str) -> str:
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        program = clean_python.parent / arguments[0]
+        done = subprocess.run(
+            [str(program), *arguments[1:]],
+            capture_output=True, text=True, check=False, cwd=tmp_path, env=environment,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    where = run(clean_python.name, "-c", "import taichi_mrf; print(taichi_mrf.__file__)")
+    assert Path(where.strip()).is_relative_to(clean_python.parent.parent)
+    names = f"import taichi_mrf\nfor name in {taichi_mrf.__all__}: getattr(taichi_mrf, name)"
+    run(clean_python.name, "-W", "error", "-c", names)
+    assert run("taichi-mrf", "--version") == f"taichi-mrf {taichi_mrf.__version__}\n"
+    arguments = ("--config", "kinect1", "--voxel-size", "0.2", "--out", "run")
+    run("taichi-mrf", "map", "synthetic:room?frames=2", *arguments)
+    assert (tmp_path / "run" / "report.json").is_file()
