@@ -26,7 +26,7 @@ TARGETS = {0.05: (0.15, 0.5), 0.02: (0.1, 0.3), 0.01: (0.05, 0.1)}
 size in metres; on two CPU cores, with 30 keyframes in the map."""
 
 Advance = Callable[[int], object]
-"""Told the number of frames done."""
+"""Called with the number of frames done."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,8 @@ def bench_mapping(
     m.infer(sweeps=1)
     sweeps, steps = [], []
     last = [m.keyframes[id] for id in sorted(m.keyframes)[-steady:]]
-    m.infer(sweeps=1, keyframes=[min(m.keyframes)])  # whoever was swept last has nothing to send
+    # the keyframe that was swept last has nothing new to send
+    m.infer(sweeps=1, keyframes=[min(m.keyframes)])
     for keyframe in last:
         sweeps.append(timed(lambda: m.infer(sweeps=1, keyframes=[keyframe.id])))  # noqa: B023
         steps.append(m.last_voxel_steps)

@@ -35,7 +35,7 @@ _DPI = 120
 
 
 def write_figure(figure: "Figure", path: Path) -> None:
-    """Write a picture in the format that the file's name says. Raises MapFileError."""
+    """Write a picture in the format of the file's suffix. Raises MapFileError."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=_DPI)
 

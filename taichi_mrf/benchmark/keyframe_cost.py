@@ -1,7 +1,7 @@
 """What a new keyframe costs a live map, stage by stage, in seconds of the clock and of the processors.
 
-On a machine that does other things as well, the clock says little; the processors' time, all threads of the
-process together, still does.
+On a machine that runs other programs too, wall-clock time is of little use; the processors' time, all threads
+of the process together, still does.
 """
 
 import statistics

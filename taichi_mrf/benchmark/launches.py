@@ -1,7 +1,7 @@
 """Kernel launches, watched from outside: how often the host waits for the device, and how long each takes.
 
 On a device with a memory of its own, the launch of a kernel that is handed a NumPy array waits until that has
-been copied there and back; reading an array back is such a launch too. On a CPU nobody waits for a copy.
+been copied there and back; reading an array back is such a launch too. On a CPU no copy is needed.
 """
 
 import time

@@ -2,7 +2,7 @@
 
 Taichi has to be started with ``runtime.init(profile=True)``. On Vulkan, where its profiler does not work with
 so many kernels, launches are timed instead (launches.py), which has a launch's own cost in it. Profiling
-slows the host down: what a keyframe costs is for bench.py to say, this says what of it is due to what.
+slows the host down. bench.py measures what a keyframe costs; this divides that cost among kernels and host.
 """
 
 import cProfile

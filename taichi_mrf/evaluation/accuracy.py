@@ -54,8 +54,8 @@ class JudgedMap(Protocol):
 
 @dataclass(frozen=True)
 class Accuracy:
-    """``score`` and ``unanswered`` are shares of the judged pixels, ``image`` (H, W) int8 says of each pixel
-    whether it is NOT_JUDGED, NO_ANSWER, WRONG or RIGHT."""
+    """``score`` and ``unanswered`` are shares of the judged pixels, ``image`` (H, W) int8 gives for each
+    pixel whether it is NOT_JUDGED, NO_ANSWER, WRONG or RIGHT."""
 
     score: float
     unanswered: float
@@ -166,9 +166,9 @@ def judge_view(
 
     ``depth_m`` is (H, W) axial depth in metres, 0 or NaN where there is none. Where it is the truth,
     ``measured_m`` (H, W) is what the sensor made of it; else it was measured itself. ``noise`` is that of the
-    sensor, a constant sigma of one voxel if not given; ``mask`` (H, W) says which pixels count, all with
-    a depth if not given. ``view`` takes the place of ``m.view``.
-    Raises FrameError if shapes do not fit or no pixel is left to judge.
+    sensor, a constant sigma of one voxel if not given; ``mask`` (H, W) selects the pixels that count, all
+    with a depth if not given. ``view`` takes the place of ``m.view``. Raises FrameError if shapes do not fit
+    or no pixel is left to judge.
     """
     depth = np.asarray(depth_m, np.float32)
     check_camera(camera)

@@ -1,11 +1,11 @@
 """Artefacts: occupied voxels that views which the map has not seen look through.
 
-Each ray of a held-out depth image that meets an occupied voxel says one of two things of it. If the voxel
-lies wholly more than 3 sigma in front of what was measured, the ray has **passed** it; if the measurement
-lies within 3 sigma of the ray's way through it, the ray **confirms** it. What lies behind the measurement
-is not judged. A voxel of which at least LEAST_RAYS rays say something is judged, and it is an artefact if
-a clear majority of them has passed it. Held-out stereo errs too, and a voxel may hold a surface in one
-corner only, so no single ray decides.
+Each ray of a held-out depth image that meets an occupied voxel counts for or against it. If the voxel lies
+wholly more than 3 sigma in front of what was measured, the ray has **passed** it; if the measurement lies
+within 3 sigma of the ray's way through it, the ray **confirms** it. What lies behind the measurement is not
+judged. A voxel that at least LEAST_RAYS rays have passed or confirmed is judged, and it is an artefact if a
+clear majority of them has passed it. Held-out stereo errs too, and a voxel may hold a surface in one corner
+only, so no single ray decides.
 
 A map could avoid all artefacts by being empty, hence its **coverage**: the share of the held-out
 measurements that have an occupied voxel on their ray within 3 sigma and one voxel size. Both depend on the
@@ -37,7 +37,7 @@ SIGMAS = 3.0
 """How far from a measurement, in its sigma, its surface may be."""
 
 LEAST_RAYS = 10
-"""Rays that must say something of a voxel before it is judged."""
+"""Rays that must pass or confirm a voxel before it is judged."""
 
 MAJORITY = 0.75
 """Share of these rays from which on they are a clear majority."""
@@ -45,7 +45,7 @@ MAJORITY = 0.75
 
 @dataclass(frozen=True)
 class Sightings:
-    """What held-out rays say of a map's voxels.
+    """How many held-out rays pass and confirm each of a map's voxels.
 
     ``centres`` (N, 3) metres, ``probability`` (N,), and how many rays ``passed`` and ``confirmed`` each,
     (N,) int32. ``met`` (M,) is for each held-out measurement the highest probability of the voxels near
@@ -60,7 +60,7 @@ class Sightings:
 
     @property
     def judged(self) -> NDArray[np.bool_]:
-        """Voxels of which enough rays say something, (N,)."""
+        """Voxels that enough rays have passed or confirmed, (N,)."""
         return self.passed + self.confirmed >= LEAST_RAYS
 
     def artefacts(self, majority: float = MAJORITY) -> NDArray[np.bool_]:

@@ -14,7 +14,8 @@ from taichi_mrf.methods.protocol import OccupancyMap
 
 @dataclass(frozen=True)
 class HeldOutCheck:
-    """The error over ``frames`` held-out frames together; ``skipped`` says which were broken, and how."""
+    """The error over ``frames`` held-out frames together; ``skipped`` names the unreadable ones, each with
+    its problem."""
 
     error: DepthError
     frames: int

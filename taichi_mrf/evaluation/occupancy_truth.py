@@ -1,8 +1,8 @@
 """True occupancy of voxels, to judge a map's probabilities by: which have a surface, which are free.
 
 A voxel is *occupied* if a surface passes through it and a clean ray ends there. It is *free* if a clean ray
-crosses it and no surface so much as touches it. What is left is not judged: no view could tell what is in
-solids or hidden, and rounding alone tells the two voxels beside a surface in the plane between them apart.
+crosses it and no surface touches it. All other voxels are not judged: no view shows what lies inside solids
+or is hidden, and for a surface in the plane between two voxels rounding alone decides which of them holds it.
 Voxels are those of the map's grid: voxel i covers [i, i + 1) times the voxel size along each axis.
 """
 

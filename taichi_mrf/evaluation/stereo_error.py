@@ -1,7 +1,7 @@
 """How far measured disparities lie from true ones: where the sigma_d of a stereo matcher comes from.
 
 Gross mismatches are no part of the noise that a map's sensor model describes, so the spread is taken over
-the inliers alone and the share of the others is told beside it.
+the inliers alone and the share of the others is reported beside it.
 """
 
 from collections.abc import Iterable

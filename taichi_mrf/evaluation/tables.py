@@ -45,7 +45,7 @@ _LATEX = str.maketrans(
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under named columns; a row's first entry is its name. ``notes`` say how to read it."""
+    """Rows under named columns; a row's first entry is its name. ``notes`` explain how to read it."""
 
     name: str
     title: str

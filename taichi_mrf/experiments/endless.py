@@ -2,7 +2,7 @@
 
 The built-in room is walked around again and again, each time with other noise. One map keeps every keyframe
 and is inferred in full at the end; others keep a few, and freeze those that have left the view. All are
-judged from places where nobody has stood.
+judged from viewpoints that are in no keyframe.
 """
 
 import time

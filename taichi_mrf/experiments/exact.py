@@ -2,7 +2,7 @@
 
 MRFMap sends a voxel one average message for each keyframe. Here the same rays of the same keyframes become
 factors of their own (factor_graph/depth_graph.py), and each map is compared with the marginals that
-sum-product then gives, by the energy of its labelling in that graph, and by views that nobody has mapped.
+sum-product then gives, by the energy of its labelling in that graph, and by held-out views.
 """
 
 import time

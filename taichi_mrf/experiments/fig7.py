@@ -33,7 +33,7 @@ NAMES = {NOT_JUDGED: "not judged", NO_ANSWER: "no answer", WRONG: "wrong", RIGHT
 
 
 def run_fig7(experiment: Experiment) -> tuple[list[Table], list[Path]]:
-    """One picture for each voxel size, and what it says in numbers."""
+    """One picture for each voxel size, with its figures."""
     scene = coffin_scene(experiment.data, experiment.seeds[0])
     require_views(scene, 3)
     held_out = min(VIEW, len(scene.views) - 1)

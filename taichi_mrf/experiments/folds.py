@@ -12,7 +12,7 @@ from taichi_mrf.experiments.ledger import Ledger
 from taichi_mrf.experiments.scenes import Scene
 
 Report = Callable[[str, int, int], None]
-"""Told what is being worked on, how much of it is done, and out of how much."""
+"""Called with what is being worked on, how much of it is done, and out of how much."""
 
 
 @dataclass(frozen=True)

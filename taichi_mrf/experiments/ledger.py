@@ -1,7 +1,7 @@
 """Results that are kept as soon as they are found, so that an interrupted experiment goes on where it was.
 
-One line of JSON for each result. The first line says which program and parameters they were made with;
-results of others are not mixed in.
+One line of JSON for each result. The first line names the program and the parameters that they were made
+with; results of others are not mixed in.
 """
 
 import json

@@ -1,7 +1,7 @@
 """What a keyframe loses when not each of its pixels has a ray of its own, and what it gains in time.
 
 On every scene the same views are mapped with every pixel, with bundles and with thinned pixels
-(inference/ray_list.py), and judged by the same views that nobody has mapped.
+(inference/ray_list.py), and judged by the same held-out views.
 """
 
 from collections.abc import Callable, Sequence

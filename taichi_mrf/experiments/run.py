@@ -75,7 +75,7 @@ def run_experiment(
     module, _, function = entry.function.partition(":")
     run = getattr(importlib.import_module(f"{_HERE}.{module}"), function)
     with warnings.catch_warnings():
-        # Learnt tables have patches whose sigma falls below zero far away; the tables' notes say so.
+        # Learnt tables have patches whose sigma falls below zero far away; the tables' notes mention it.
         warnings.filterwarnings("ignore", message="sigma of patch")
         tables, paths = run(experiment)
     return tables, [*paths, configuration]

@@ -1,7 +1,7 @@
 """The scenes that maps are judged on: what a sensor measured, and what is known of the truth.
 
 Where depth is clean it is what a perfect sensor would measure, and the noise is simulated here, so that
-the truth stays known. Folders are laid out as data/README.md says.
+the truth stays known. data/README.md describes the layout of the folders.
 """
 
 import zipfile

@@ -29,7 +29,7 @@ uses 1.0 in a larger room and 0.5 in a small one; this camera turns round in a c
 would leave 5 keyframes that do not see all of the room."""
 
 MORE_LIKELY_THAN_NOT = float(np.nextafter(np.float32(0.5), np.float32(1)))
-"""Just above 0.5, which is what recursive maps say of voxels that they know nothing of."""
+"""Just above 0.5, the probability of unknown voxels in recursive maps."""
 
 PAPER = {
     ("MRFMap", 0.01): Spread(0.945, 0.097),

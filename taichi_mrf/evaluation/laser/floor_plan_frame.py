@@ -10,7 +10,7 @@ from taichi_mrf.datasets.laser.plan_image import FloorPlan
 from taichi_mrf.datasets.laser.scans import LaserScans
 
 _SHORT_M = 2.0
-"""Simulators make noise in proportion to the range, so only beams shorter than this tell where walls are."""
+"""Simulators make noise in proportion to the range, so only beams shorter than this locate walls."""
 
 _EDGE_SHARE = 0.01
 """If a larger share of the beams end outside the image, its edge is a wall (with noise, half of the beams

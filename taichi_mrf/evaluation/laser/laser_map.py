@@ -1,4 +1,5 @@
-"""A finished 2D map as pictures, files and scores want it: arrays whose rows go from the lowest y up."""
+"""A finished 2D map as arrays whose rows go from the lowest y up: the form that pictures, files and scores
+use."""
 
 from dataclasses import dataclass
 
@@ -33,7 +34,7 @@ class LaserMap:
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Lowest and highest x, lowest and highest y in metres, as matplotlib's imshow wants it."""
+        """Lowest and highest x, lowest and highest y in metres, the order of matplotlib's imshow."""
         rows, columns = self.occupied.shape
         x, y = self.lower_x_y
         return x, x + columns * self.cell_size, y, y + rows * self.cell_size

@@ -34,7 +34,7 @@ class Tile:
 
 
 def write_contact_sheet(path: Path, tiles: Sequence[Tile]) -> None:
-    """Write the first MOST_TILES tiles as a PNG, row by row, and say how many are left out. Raises
+    """Write the first MOST_TILES tiles as a PNG, row by row, and note how many are left out. Raises
     MapFileError."""
     shown = tiles[:MOST_TILES]
     columns = max(1, min(_COLUMNS, math.ceil(math.sqrt(len(shown)))))

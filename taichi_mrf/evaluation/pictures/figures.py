@@ -27,7 +27,7 @@ def new_figure(width_in: float, height_in: float) -> "Figure":
 
 
 def notice(text: str) -> "Figure":
-    """A figure that says why there is nothing to see."""
+    """A figure without data, with the reason as text."""
     figure = new_figure(8.0, 3.0)
     figure.text(0.5, 0.5, text, ha="center", va="center")
     return figure

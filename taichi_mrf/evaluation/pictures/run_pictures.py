@@ -30,7 +30,7 @@ def write_pictures(out_dir: Path, m: OccupancyMap, held_out: Sequence[Frame]) ->
     """Write ``top_view.png``, ``depth.png`` and ``perspective.png`` to a folder that exists.
 
     ``held_out`` are frames that the map has not seen, to compare rendered with measured depth; without
-    any a keyframe serves, and the picture says so. Returns the paths. Raises MapFileError.
+    any a keyframe serves, and its title says so. Returns the paths. Raises MapFileError.
     """
     figures = {"depth.png": depth_comparison(m, held_out), **_room_figures(m)}
     for name, figure in figures.items():

@@ -1,7 +1,7 @@
 """Which way the map's surfaces face, and which way is up: what a picture needs beyond the voxels.
 
-A map knows neither gravity nor the inside of a room. Both follow from what the keyframes see: a surface
-faces the camera that saw it, and most of a room is level or upright.
+A map holds neither the direction of gravity nor the inside of a room. Both follow from what the keyframes
+see: a surface faces the camera that saw it, and most of a room is level or upright.
 """
 
 from collections.abc import Iterable
@@ -43,7 +43,7 @@ class Surfaces:
 
     normals: NDArray[np.float32]
     """Mean of the unit normals in each cell, (C, 3), towards where the surface was seen from. Its length
-    tells how well they agree: 1 in a plane, 0.7 at a square edge."""
+    is how well they agree: 1 in a plane, 0.7 at a square edge."""
 
     def normals_at(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
         """The normals of points (N, 3); 0 where nothing was seen."""

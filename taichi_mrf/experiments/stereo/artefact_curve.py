@@ -45,7 +45,7 @@ def artefacts_at(result: Result, coverage: float, majority: float = MAJORITY) ->
     if len(covered) == 0 or not covered[-1] <= coverage <= covered[0]:
         return None
     artefacts = np.asarray(result["artefacts"][f"{majority:g}"], float)[: len(covered)]
-    # Coverage falls with the threshold; np.interp wants it to rise.
+    # Coverage falls with the threshold; np.interp needs it to rise.
     return float(np.interp(coverage, covered[::-1], artefacts[::-1]))
 
 

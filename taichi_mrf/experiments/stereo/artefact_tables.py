@@ -1,4 +1,4 @@
-"""What is said of maps' artefacts: beside each other at equal coverage, and under other definitions."""
+"""Tables of maps' artefacts: beside each other at equal coverage, and under other definitions."""
 
 from collections.abc import Mapping
 
@@ -34,7 +34,7 @@ def artefact_table(name: str, results: Mapping[str, Result], scene: Scene, voxel
         f"{scene.max_depth:g} m, {len(scene.views[1::2])} held out.",
         "The first three figures are at P(O) >= 0.5, the others at equal coverage, with the ratio to the "
         "first row; a dash: no threshold gives that.",
-        f"Artefact: of at least {LEAST_RAYS} held-out rays that say something of an occupied voxel, at least "
+        f"Artefact: of at least {LEAST_RAYS} held-out rays that pass or confirm an occupied voxel, at least "
         f"{MAJORITY:.0%} measure a surface more than {SIGMAS:g} sigma behind it.",
         f"Coverage: held-out measurements with an occupied voxel on their ray within {SIGMAS:g} sigma and a "
         "voxel size.",

@@ -35,7 +35,7 @@ BYTES_PER_VOXEL = 8.0
 
 NOTES = (
     "within 0.02: share of the voxels whose probability differs by no more than that, of all voxels near "
-    "surfaces and of those of which the single map knows something; same state: also of seen-free space",
+    "surfaces and of those that are known in the single map; same state: also of seen-free space",
     "round 0 is before any exchange; both maps make the same number of sweeps, the submaps in each round; in "
     "round 1 a worker is killed in the middle of a task",
     "no overlap: each keyframe only in the submap where its camera was, to show what the comparison can see",

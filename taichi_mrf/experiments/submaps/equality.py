@@ -25,7 +25,7 @@ NEAR = 0.02
 @dataclass(frozen=True)
 class Equality:
     """Shares of voxels: ``within`` NEAR, of all that have a brick in either map; ``known_within``, of those
-    of which the single map knows something; ``same_state``, of all voxels of all chunks that either map has.
+    that are known in the single map; ``same_state``, of all voxels of all chunks that either map has.
     ``largest`` is the largest difference, ``voxels`` how many have a brick, ``known`` how many are known."""
 
     voxels: int
@@ -64,7 +64,7 @@ def compare(single: MRFMap, merged: ChunkedMap) -> Equality:
 
 
 def _bricks_of(single: MRFMap, merged: ChunkedMap) -> Iterator[tuple[NDArray[np.int32], NDArray[np.float32]]]:
-    """All bricks that either map knows of, a chunk at a time, with the merged map's log-odds, (n, 512)."""
+    """All bricks of either map, a chunk at a time, with the merged map's log-odds, (n, 512)."""
     chunks = np.unique(np.concatenate([known_bricks(single) // CHUNK, merged.chunks]), axis=0)
     for chunk in chunks:
         side = BRICK * CHUNK * single.voxel_size
