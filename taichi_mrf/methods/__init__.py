@@ -1,4 +1,6 @@
-"""Mapping methods: MRFMap and its baselines, what they have in common, and the registry that lists them.
+"""Mapping methods: MRFMap and its baselines, what they share, and how a map is created or loaded by method.
+
+Each method has a folder with its entry (`plug.py`), which `config/plugs.py` names.
 
 Uses `inference`, `alignment`, `queries`, `export` and the packages below them.
 """

@@ -17,7 +17,7 @@ from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
 from taichi_mrf.config.values import overridden
 from taichi_mrf.geometry.poses import as_pose
-from taichi_mrf.methods.mrf.brick_registry import BrickRegistry
+from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.sensor_section import describing
 from taichi_mrf.queries.extract import extract_voxels
 from taichi_mrf.queries.occlusion import Occlusion

@@ -18,7 +18,7 @@ from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
 _BYTES_PER_VOXEL = 9
-"""Log-odds, states, and what is made of them."""
+"""Log-odds, states, and temporary arrays."""
 
 
 def _config_of(store: ChunkStore) -> Config:
@@ -39,11 +39,11 @@ def _config_of(store: ChunkStore) -> Config:
 
 
 class ChunkedMap:
-    """Answers queries from a store of :class:`ChunkStore`. The chunks used last are kept, up to ``cache_mb``
-    MB (10^6 bytes); memory beside that grows with the answers alone."""
+    """Answers queries from a :class:`ChunkStore` on disk. It caches the chunks used last, up to ``cache_mb``
+    MB (10^6 bytes); beyond that, memory grows only with the answers."""
 
     def __init__(self, store: ChunkStore, cache_mb: float = 256.0) -> None:
-        """Raises ConfigError for a cache that holds no chunk."""
+        """Raises ConfigError for a cache smaller than one chunk."""
         if not cache_mb * 1e6 >= CHUNK_BYTES:
             raise ConfigError(f"cache_mb must be at least {CHUNK_BYTES / 1e6:.3g}, not {cache_mb}")
         self.store, self.header = store, store.header
@@ -64,12 +64,12 @@ class ChunkedMap:
     def extent(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Two corners, (3,) in metres, of the box around all chunks. Raises ConfigError for an empty map."""
         if not len(self.chunks):
-            raise ConfigError("the map is empty: nothing was ever seen")
+            raise ConfigError("the map is empty: no voxel was observed")
         side = CHUNK_VOXELS * self.voxel_size
         return self.chunks.min(axis=0) * side, (self.chunks.max(axis=0) + 1) * side
 
     def log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Log-odds of occupied at (N, 3) points in metres, (N,); the prior where nobody has looked.
+        """Log-odds of occupied at (N, 3) points in metres, (N,); the prior where nothing was observed.
 
         Raises ConfigError for points of another shape or that are not finite.
         """
@@ -84,8 +84,8 @@ class ChunkedMap:
         return out
 
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Probability of occupied at (N, 3) points in metres, (N,) float32; the prior where nobody has
-        looked."""
+        """Probability of occupied at (N, 3) points in metres, (N,) float32; the prior where nothing was
+        observed."""
         return probability(self.log_odds(points))
 
     def state(self, points: ArrayLike) -> NDArray[np.int8]:
@@ -93,9 +93,9 @@ class ChunkedMap:
         return self._state(self.log_odds(points))
 
     def box(self, lower: ArrayLike, upper: ArrayLike) -> BoxOfVoxels:
-        """The voxels that a box reaches into, from corner to corner, (3,) in metres each, as dense arrays.
+        """The voxels that overlap a box, given by two corners, (3,) in metres each, as dense arrays.
 
-        Raises ConfigError for corners that make no box, CapacityError if it holds more than fits memory.
+        Raises ConfigError for corners that make no box, CapacityError if there is not enough memory.
         """
         first, after = voxels_of_box(lower, upper, self.voxel_size)
         shape = after - first
@@ -114,8 +114,8 @@ class ChunkedMap:
         upper: ArrayLike | None = None,
         min_probability: float = 0.5,
     ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """Voxels that something is known of, of at least this probability, in a box or in all of the map:
-        centres (N, 3) in metres, and (N,).
+        """Observed voxels of at least this probability in a box (default: the whole map): centres (N, 3) in
+        metres, and probabilities (N,).
 
         Raises ConfigError for a probability outside [0, 1] and for corners that make no box.
         """
@@ -130,14 +130,14 @@ class ChunkedMap:
             )
             for begin, block in self._cut(first, after):
                 occupancy = probability(block)
-                # A comparison with NaN, which is what is unknown, is false.
+                # Unknown voxels are NaN, for which the comparison is false.
                 place = np.argwhere(occupancy >= min_probability)
                 centres.append((place + begin + 0.5).astype(np.float64) * self.voxel_size)
                 found.append(occupancy[tuple(place.T)])
         return np.concatenate(centres), np.concatenate(found)
 
     def blocks(self, lower: ArrayLike, upper: ArrayLike) -> Iterator[tuple[Chunk, NDArray[np.float32]]]:
-        """The chunks that reach into a box in metres, each with (64, 64, 64) log-odds, NaN for unknown."""
+        """The chunks that overlap a box in metres, each with (64, 64, 64) log-odds, NaN for unknown."""
         first, after = voxels_of_box(lower, upper, self.voxel_size)
         for chunk in self._chunks_between(first, after):
             yield chunk, self._block(chunk)
@@ -152,7 +152,7 @@ class ChunkedMap:
     def _cut(
         self, first: NDArray[np.int64], after: NDArray[np.int64]
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32]]]:
-        """The parts of chunks that lie in a box of voxels, each with its lowest voxel."""
+        """The parts of chunks inside a box of voxels, each with its lowest voxel."""
         for chunk in self._chunks_between(first, after):
             corner = np.array(chunk, np.int64) * CHUNK_VOXELS
             begin, end = np.maximum(first, corner), np.minimum(after, corner + CHUNK_VOXELS)

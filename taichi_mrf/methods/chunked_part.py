@@ -1,4 +1,4 @@
-"""A box of a map in chunks, taken into memory, where all queries and exports can work on it."""
+"""A box of a chunked map, loaded into memory for all queries and exports."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -21,8 +21,8 @@ from taichi_mrf.voxels.pool import BrickPool
 
 @dataclass
 class MapPart:
-    """What a map in chunks says of the bricks from ``lowest`` up to, but without, ``after``, (3,) each;
-    outside of them nothing is known. It has the queries of a map, but neither keyframes nor inference."""
+    """The bricks of a chunked map from ``lowest`` up to, but without, ``after``, (3,) each; everything
+    outside is unknown. It has the queries of a map, but no keyframes and no inference."""
 
     source: ChunkedMap
     lowest: NDArray[np.int64]
@@ -52,8 +52,7 @@ class MapPart:
         return np.where(self._inside(points_m), self.source.state(points_m), np.int8(0))
 
     def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """All voxels that something is known of, of at least this probability: centres (N, 3) in metres, and
-        (N,)."""
+        """All observed voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
         brick_m = BRICK * self.voxel_size
         return self.source.voxels(self.lowest * brick_m, self.after * brick_m, min_probability)
 
@@ -63,9 +62,9 @@ class MapPart:
 
 
 def take_part(m: ChunkedMap, lower: ArrayLike | None = None, upper: ArrayLike | None = None) -> MapPart:
-    """The bricks that a box reaches into, from corner to corner, (3,) in metres each, in memory; None means
-    up to the map's end. Raises ConfigError for corners that make no box or for an empty map, CapacityError if
-    memory would not do."""
+    """Load the bricks that overlap a box, given by two corners, (3,) in metres each; None means the map's own
+    corner. Raises ConfigError for corners that make no box or for an empty map, CapacityError if there is not
+    enough memory."""
     runtime.init()
     low, high = m.extent
     low, high = low if lower is None else np.asarray(lower), high if upper is None else np.asarray(upper)
@@ -76,7 +75,7 @@ def take_part(m: ChunkedMap, lower: ArrayLike | None = None, upper: ArrayLike | 
         values = block.reshape((CHUNK, BRICK) * 3).transpose(0, 2, 4, 1, 3, 5).reshape(-1, VOXELS)
         bricks = np.indices((CHUNK,) * 3).reshape(3, -1).T + np.array(chunk) * CHUNK
         inside = ((bricks >= lowest) & (bricks < after)).all(axis=1)
-        # Free and unknown space without a surface near needs no voxels: occupancy() and state() know it.
+        # Free and unknown space away from surfaces needs no voxels: occupancy() and state() read the chunks.
         known = ~np.isnan(values)
         near = (known & (values != np.float32(m.header.seen_free_log_odds))).any(axis=1)
         taken = np.flatnonzero(inside & near)

@@ -1,8 +1,8 @@
-"""What maps on disk have in common, whatever the mapping method: one .npz file that NumPy alone can read.
+"""The part of a map file that all mapping methods share. A map file is one .npz that NumPy alone can read.
 
-Its header says which format and which method it is of, with which parameters and which noise, and holds
-the keyframes' images and poses. The bricks and what they hold are each method's own matter. Its manifest
-names all members with their checksums, so that nothing of it can change, or be lost, unnoticed.
+The header holds the format, the method, the whole configuration, the noise model, and the keyframes' images
+and poses. Each method stores its bricks itself. The manifest lists all members with their checksums, so that
+a damaged or incomplete file is detected.
 """
 
 from collections.abc import Iterator
@@ -26,17 +26,17 @@ from taichi_mrf.system.npz_file import NpzFile, open_npz
 from taichi_mrf.voxels.layout import VOXELS
 
 FORMAT = 2
-"""What is written: since format 2 with a manifest."""
+"""The format that is written. Format 2 added the manifest."""
 
 READABLE = (1, 2)
-"""What is read."""
+"""The formats that can be read."""
 
 _CAMERA_VALUES = 6
 
 
 @dataclass(frozen=True)
 class StoredKeyframe:
-    """A keyframe's number, name, (H, W) axial depth in metres, pose and camera."""
+    """A keyframe's id, name, depth image ((H, W) axial depth in metres), pose and camera."""
 
     id: int
     name: str
@@ -57,7 +57,7 @@ class MapHeader:
     settled: bool = True
 
     def limited_to(self, memory_limit_gb: float | None) -> Config:
-        """The parameters, with another limit of memory unless it is None."""
+        """The configuration, with another memory limit unless it is None."""
         if memory_limit_gb is None:
             return self.config
         volume = replace(self.config.volume, memory_limit_gb=memory_limit_gb)
@@ -85,11 +85,8 @@ class MapHeader:
 
 @contextmanager
 def open_map_file(path: Path, method: str | None = None) -> Iterator[NpzFile]:
-    """The arrays of a map's file, by name.
-
-    Raises MapFileError naming the file and what is wrong with it, also for what goes wrong inside the
-    ``with`` block, and if the map is of another ``method`` (None takes all).
-    """
+    """The arrays of a map file, by name. Raises MapFileError, which names the file, for a damaged file, for a
+    map of another ``method`` (None accepts all), and for errors of this package inside the ``with`` block."""
     with naming(path), open_npz(path, MapFileError, "a readable map") as file:
         if "format" not in file:
             raise MapFileError(f"{path}: not a map of taichi_mrf")
@@ -114,8 +111,8 @@ def open_map_file(path: Path, method: str | None = None) -> Iterator[NpzFile]:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """What goes wrong in the block, with what a file holds, is raised as an error that names the file:
-    CapacityError as such, all else of this package as MapFileError."""
+    """Errors of this package in the block are raised again with the file's name: CapacityError as
+    CapacityError, all others as MapFileError."""
     try:
         yield
     except TaichiMRFError as error:
@@ -124,7 +121,7 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def method_of(file: NpzFile) -> str:
-    """The mapping method of a map's file; the first maps did not say it, because there was only one."""
+    """The name of the mapping method of a map file. The first maps have no such entry; they are all mrf."""
     return file.scalar("method", "U") if "method" in file else "mrf"
 
 
@@ -142,7 +139,7 @@ def read_header(path: Path, file: NpzFile) -> MapHeader:
         keyframes.append(StoredKeyframe(id, names[i], depth_m, as_pose(poses[i]), camera))
     next_id = file.scalar("next_id", "i")
     if len(set(ids.tolist())) < n or not all(0 <= id < next_id for id in ids.tolist()):
-        raise MapFileError(f"{path}: damaged: the numbers of its keyframes are not those of a map")
+        raise MapFileError(f"{path}: damaged: the ids of its keyframes are not valid")
     config, noise = _config(path, file), _noise(file)
     # Maps of earlier versions saved the default sensor, whatever their noise.
     config = replace(config, sensor=describing(noise, config.sensor))
@@ -151,10 +148,10 @@ def read_header(path: Path, file: NpzFile) -> MapHeader:
 
 
 def read_bricks(path: Path, file: NpzFile) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Which bricks a map has, (n, 3), and their beliefs, (n, 512)."""
+    """The coordinates of a map's bricks, (n, 3), and their beliefs, log-odds (n, 512)."""
     bricks = file.array("bricks", "i", (None, 3))
     if len(np.unique(bricks, axis=0)) < len(bricks):
-        raise MapFileError(f"{path}: damaged: it has a brick twice")
+        raise MapFileError(f"{path}: damaged: a brick appears twice")
     return bricks.astype(np.int32), file.array("belief", "f", (len(bricks), VOXELS)).astype(np.float32)
 
 

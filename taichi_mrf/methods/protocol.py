@@ -1,4 +1,4 @@
-"""What every map can do, whatever the method that makes it: the verbs that the rest of the program uses."""
+"""The interface of all maps: what the rest of the program uses, whatever the method."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -19,7 +19,7 @@ from taichi_mrf.sensor.noise import NoiseModel
 
 
 class PosedDepth(Protocol):
-    """A depth image with its place: a keyframe of a map, or a frame. Depth is (H, W) axial depth in metres, 0
+    """A depth image with its pose: a keyframe of a map, or a frame. Depth is (H, W) axial depth in metres, 0
     for no measurement."""
 
     @property
@@ -33,7 +33,7 @@ class PosedDepth(Protocol):
 
 
 class MappedKeyframe(PosedDepth, Protocol):
-    """What a map remembers of a keyframe."""
+    """A keyframe as a map stores it."""
 
     @property
     def rays(self) -> int:
@@ -44,7 +44,7 @@ class MappedKeyframe(PosedDepth, Protocol):
 class OccupancyMap(Protocol):
     """A probabilistic occupancy map of depth keyframes, whatever its method.
 
-    Between changes and :meth:`infer`, queries answer with what is known.
+    Until :meth:`infer`, queries after a change return what was computed before.
     """
 
     METHOD: ClassVar[Method]
@@ -62,16 +62,17 @@ class OccupancyMap(Protocol):
 
     @property
     def stale(self) -> bool:
-        """Whether queries miss the last removals and moves until :meth:`infer`."""
+        """Whether the last removals and moves show only after :meth:`infer`."""
         ...
 
     @property
     def settled(self) -> bool:
-        """Whether the map is the one that its keyframes give, which a full :meth:`infer` would not change."""
+        """Whether a full :meth:`infer` would leave the map as it is."""
         ...
 
     def crossed_bricks(self, id: int) -> NDArray[np.int32]:
-        """The bricks that a keyframe's rays cross, (n, 3), if some of them may not exist; else none."""
+        """The bricks that a keyframe's rays cross, (n, 3). Empty if the method allocates all crossed
+        bricks."""
         ...
 
     def add_keyframe(
@@ -81,11 +82,11 @@ class OccupancyMap(Protocol):
         ...
 
     def remove_keyframe(self, id: int) -> None:
-        """Take a keyframe out."""
+        """Remove a keyframe. Raises KeyframeError if there is none of this id."""
         ...
 
     def move_keyframe(self, id: int, T_world_camera: ArrayLike) -> None:
-        """Give a keyframe another pose."""
+        """Move a keyframe to another pose, (4, 4). Raises KeyframeError."""
         ...
 
     def infer(
@@ -95,7 +96,7 @@ class OccupancyMap(Protocol):
         keyframes: Iterable[int] | None = None,
         progress: Progress | None = None,
     ) -> InferReport:
-        """Make the map the one that its keyframes give."""
+        """Compute the map of all keyframes. ``progress`` is called after each; returning False stops."""
         ...
 
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
@@ -121,12 +122,12 @@ class OccupancyMap(Protocol):
         ...
 
     def statistics(self) -> MapStatistics:
-        """How large the map is."""
+        """The size of the map."""
         ...
 
     def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """How many keyframes see each voxel of some bricks of ``view.pool``, (n,) -> (n, 512), 0 where the
-        map does not remember it."""
+        """How many keyframes observe each voxel of some bricks of ``view.pool``, (n,) slots -> (n, 512).
+        Zeros if the method does not store it."""
         ...
 
     def save(self, path: str | Path) -> None:

@@ -1,4 +1,4 @@
-"""Where the rays of a scan end: at the measured points, at the end of the sensor's range, or once a voxel."""
+"""The ends of a scan's rays: at the measured points, at the end of the range, or once per voxel."""
 
 import numpy as np
 import taichi as ti
@@ -12,8 +12,8 @@ from taichi_mrf.voxels.traversal import Viewpoint
 from taichi_mrf.voxels.window import Window
 
 NO_RAY, FREE_END, HIT = -1.0, 0.0, 1.0
-"""Fourth component of a ray's end: there is no measurement; the ray was cut off and says only what is
-free; a surface was measured here."""
+"""Fourth component of a ray's end: no measurement; the ray was cut off and only marks free space; a surface
+was measured here."""
 
 
 def ray_ends(
@@ -26,12 +26,13 @@ def ray_ends(
     discretise: bool = False,
     correct_bias: bool = False,
 ) -> "ti.Ndarray":
-    """The ends of an image's rays as (n, 4): voxels from the window's corner, and what kind of end.
+    """The ends of an image's rays, (n, 4) float32: the place in voxels from the window's corner, and the kind
+    of end.
 
-    ``correct_bias`` puts an end where a surface gives the measurement on average. Measurements beyond the
-    axial ``max_depth`` are cut off there. ``discretise`` leaves one ray to the centre of each voxel that
-    holds an end (OctoMap's computeDiscreteUpdate), else there is one for each pixel. What then is longer
-    than the Euclidean ``max_range`` is cut off there (0: nothing is).
+    ``correct_bias`` subtracts the sensor's bias. Measurements beyond the axial ``max_depth`` (metres) are cut
+    off there. ``discretise`` keeps one ray to the centre of each voxel that contains an end (OctoMap's
+    computeDiscreteUpdate); otherwise there is one ray per pixel. Rays longer than the Euclidean ``max_range``
+    (metres, 0 for no limit) are then cut off there.
     """
     view = window.viewpoint(T_world_camera)
     ends = ti.ndarray(ti.f32, (image.camera.width * image.camera.height, 4))
@@ -44,7 +45,7 @@ def ray_ends(
 
 
 def _once_a_voxel(ends: "ti.Ndarray") -> "ti.Ndarray":
-    """The centres of the voxels that hold ends, each once for hits and once for rays that were cut off."""
+    """The centres of the voxels that contain ends, (n, 4): each once for hits and once for cut-off rays."""
     every = ends.to_numpy()
     every = every[every[:, 3] >= 0]
     once = np.array([[0.0, 0.0, 0.0, NO_RAY]], np.float32)
@@ -62,13 +63,13 @@ def _once_a_voxel(ends: "ti.Ndarray") -> "ti.Ndarray":
 
 @ti.func
 def end_of(ends: Template, ray: I32) -> Vec4:
-    """Where a ray ends, and how."""
+    """The place and kind of a ray's end."""
     return Vec4(ends[ray, 0], ends[ray, 1], ends[ray, 2], ends[ray, 3])
 
 
 @ti.func
 def put_end(ends: Template, ray: I32, place: Vec3, kind: F32):
-    """Write down where a ray ends, and how."""
+    """Store the place and kind of a ray's end."""
     for axis in ti.static(range(3)):
         ends[ray, axis] = place[axis]
     ends[ray, 3] = kind

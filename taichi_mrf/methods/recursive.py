@@ -1,9 +1,8 @@
-"""Maps that integrate each scan when it is added: what the methods other than MRFMap have in common.
+"""Recursive maps: maps that integrate each scan when it is added.
 
-A voxel of such a map holds one number, its log-odds, which every scan changes once. Scans cannot be told
-apart in it any more, so none can be taken back: after a removal or a move the map is made anew from the
-scans that are left. A method says which bricks a scan reaches and how the scan changes their voxels;
-the books are kept here.
+A voxel holds one number, its log-odds, and every scan changes it once. The contributions of single scans
+cannot be separated afterwards, so after a removal or a move the map is rebuilt from the remaining scans. A
+method defines which bricks a scan reaches and how it changes their voxels; this module does the rest.
 """
 
 import dataclasses
@@ -42,7 +41,7 @@ MapT = TypeVar("MapT", bound="RecursiveMap[Any]")
 
 @dataclass(frozen=True)
 class ScanRecord:
-    """A scan as the map keeps it, in the host's memory: what is needed to integrate it once more.
+    """A scan in host memory: what is needed to integrate it again.
 
     ``depth_m`` is (H, W) float32 axial depth in metres, 0 where there is no measurement.
     """
@@ -66,7 +65,7 @@ class ScanRecord:
 
 @dataclass(frozen=True)
 class Scan(Generic[FootprintT]):
-    """A scan that is about to be integrated, where kernels reach it.
+    """A scan on the device, ready to be integrated.
 
     ``cells`` are the bricks of its window that its rays cross, ascending; all of them exist, and
     ``slots`` are their places in the pool.
@@ -79,31 +78,31 @@ class Scan(Generic[FootprintT]):
 
     @property
     def window(self) -> Window:
-        """The box of bricks that the scan looks at."""
+        """The box of bricks that contains the scan's rays."""
         return self.footprint.window
 
     @property
     def cells(self) -> NDArray[np.int32]:
-        """The bricks that exist and are crossed, as cells of the window."""
+        """The bricks that the rays cross, as cells of the window; all are allocated."""
         return self.footprint.crossed
 
 
 class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
     """A probabilistic occupancy map that integrates one depth image after the other.
 
-    A voxel is unknown until the first scan says something of it, and free or occupied from then on, by
-    the sign of its log-odds. Removing or moving a keyframe leaves the map stale: queries still answer
-    with what is known, and the next :meth:`infer` integrates all scans that are left anew.
+    A voxel is unknown until the first scan observes it, and from then on free or occupied by the sign of its
+    log-odds. Removing or moving a keyframe makes the map stale: queries still return the old values, and the
+    next :meth:`infer` integrates all remaining scans again.
 
-    ``view`` follows rays through the map. They pass voxels that are unknown or more likely free than
-    occupied as if these were empty: such a map says of free space "0.12 at the least", which read as a
-    medium (eq. 15 of MRFMap) would stop every ray within a metre or two.
+    ``view`` follows rays through the map and treats voxels that are unknown or more likely free than occupied
+    as empty. The lowest probability of such a map, 0.12, read as an occlusion density (eq. 15 of MRFMap),
+    would stop every ray within a metre or two.
     """
 
     def _set_up(self, config: Config, noise: NoiseModel | None) -> None:
         any_evidence_counts = dataclasses.replace(config.volume, min_evidence=0.0)
         occlusion = Occlusion(unknown=UNKNOWN_LOG_ODDS, empty_below=0.0)
-        # Every brick that was seen exists, so no place is seen and has none.
+        # Every brick that a ray crosses is allocated, so no observed place is without one.
         self._make_bricks(config, noise, UNKNOWN_LOG_ODDS, UNKNOWN_LOG_ODDS, any_evidence_counts, occlusion)
         self._keyframes: dict[int, ScanRecord] = {}
         self._next_id = 0
@@ -111,17 +110,17 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
 
     @abstractmethod
     def _reach(self, image: DepthImage, T_world_camera: Pose) -> FootprintT:
-        """The bricks that a scan's rays cross: ``surface`` the same as ``crossed``, because all of them
-        are to exist. Raises CapacityError if there are too many."""
+        """The bricks that a scan's rays cross; ``surface`` equals ``crossed``, so that all are allocated.
+        Raises CapacityError if there is not enough memory."""
 
     @abstractmethod
     def _integrate(self, scan: Scan[FootprintT]) -> None:
-        """Change the log-odds of the voxels that a scan says something of (recursive_update.updated)."""
+        """Update the log-odds of the voxels that a scan observes (recursive_update.updated)."""
 
     @property
     @abstractmethod
     def _scratch_bytes(self) -> int:
-        """Bytes that integration holds beside the voxels."""
+        """Bytes of the memory that integration needs besides the voxels."""
 
     @property
     def keyframes(self) -> Mapping[int, ScanRecord]:
@@ -130,7 +129,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
 
     @property
     def stale(self) -> bool:
-        """Whether keyframes were removed or moved since the voxels were last worked out."""
+        """Whether keyframes were removed or moved since the voxels were last computed."""
         return self._stale
 
     @property
@@ -139,14 +138,14 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         return not self._stale
 
     def crossed_bricks(self, id: int) -> NDArray[np.int32]:
-        """No brick, (0, 3): all that a scan's rays cross exist."""
+        """No bricks, (0, 3): all that a scan's rays cross are allocated."""
         self._find(id)
         return np.zeros((0, 3), np.int32)
 
     def add_keyframe(
         self, depth_m: ArrayLike, T_world_camera: ArrayLike, camera: Camera, name: str = ""
     ) -> int:
-        """Add a depth image and integrate it at once (in a stale map with the next :meth:`infer`).
+        """Add a depth image and integrate it at once; in a stale map the next :meth:`infer` does.
 
         ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
         ``T_world_camera`` is (4, 4). Returns the keyframe's id.
@@ -164,13 +163,13 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         return record.id
 
     def remove_keyframe(self, id: int) -> None:
-        """Take a keyframe out. What it has said stays in the map until the next :meth:`infer`."""
+        """Remove a keyframe. Its contribution stays in the map until the next :meth:`infer`."""
         self._find(id)
         del self._keyframes[id]
         self._stale = True
 
     def move_keyframe(self, id: int, T_world_camera: ArrayLike) -> None:
-        """Give a keyframe another pose, which the map follows with the next :meth:`infer`."""
+        """Move a keyframe to another pose, (4, 4). The map changes with the next :meth:`infer`."""
         self._keyframes[id] = dataclasses.replace(self._find(id), T_world_camera=as_pose(T_world_camera))
         self._stale = True
 
@@ -181,13 +180,12 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         keyframes: Iterable[int] | None = None,
         progress: Progress | None = None,
     ) -> InferReport:
-        """Bring the map up to date: nothing to do, unless keyframes were removed or moved.
+        """Rebuild the map if keyframes were removed or moved; otherwise do nothing.
 
-        Then all scans are integrated anew, in the order in which they were added, and the map is the one
-        that these scans alone give. ``sweeps``, ``tolerance`` and ``keyframes`` are those of
-        MRFMap.infer and change nothing here. ``progress`` is called after each scan; returning False
-        stops, and leaves a map of the scans up to there that is still stale.
-        Raises CapacityError if the map would not fit.
+        All scans are integrated again in the order in which they were added. The result is the map of these
+        scans alone. ``sweeps``, ``tolerance`` and ``keyframes`` are arguments of MRFMap.infer; here they are
+        checked and ignored. ``progress`` is called after each scan; if it returns False, the map holds the
+        scans up to there and stays stale. Raises CapacityError if there is not enough memory.
         """
         for id in check_inference(sweeps, tolerance, keyframes) or ():
             self._find(id)
@@ -208,14 +206,14 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
     def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """All known voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
         if min_probability == 0.5:
-            # Leaves the unknown out before they are collected: there are far more of them than others.
+            # Excludes unknown voxels before they are collected: there are far more of them than of others.
             min_probability += 0.2 * LEAST_LOG_ODDS
         centres, p = super().voxels(min_probability)
-        known = p != 0.5  # LEAST_LOG_ODDS sees to that
+        known = p != 0.5  # see LEAST_LOG_ODDS
         return centres[known], p[known]
 
     def statistics(self) -> MapStatistics:
-        """How large the map is; no keyframe is ever frozen."""
+        """The size of the map; ``frozen`` is 0."""
         keyframes = self._keyframes.values()
         return measure(
             self._pool,
@@ -227,12 +225,11 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         )
 
     def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """How many keyframes see each voxel of some bricks of the pool, (n,) -> (n, 512): such a map does not
-        remember it, and says 0."""
+        """Zeros, (n,) -> (n, 512): a recursive map does not store how many keyframes observe a voxel."""
         return np.zeros((len(slots), VOXELS), np.uint8)
 
     def save(self, path: str | Path) -> None:
-        """Write the map to one .npz file, beside it first and then into place. Raises MapFileError."""
+        """Write the map to one .npz file, under a temporary name first. Raises MapFileError."""
         slots = self._pool.in_order
         keyframes = [
             StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera)
@@ -244,8 +241,9 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
 
     @classmethod
     def load(cls: type[MapT], path: str | Path, memory_limit_gb: float | None = None) -> MapT:
-        """Read a map that can be queried at once and extended; ``memory_limit_gb`` takes the place of its
-        own. Raises MapFileError, also for a map of another method, or CapacityError if there is no room."""
+        """Read a saved map, which can be queried at once and extended. ``memory_limit_gb`` overrides the
+        saved limit. Raises MapFileError, also for a map of another method, or CapacityError if there is not
+        enough memory."""
         contents = read_recursive(Path(path), cls.METHOD.name)
         header, bricks = contents.header, contents.bricks
         with naming(Path(path)):
@@ -263,7 +261,8 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         return self._keyframes[id]
 
     def _add(self, record: ScanRecord) -> None:
-        """Allocate what a scan's rays cross and integrate it; what is raised leaves the map as it was."""
+        """Allocate the bricks that a scan's rays cross and integrate it. An error leaves the map
+        unchanged."""
         image = DepthImage.upload(record.depth_m, record.camera, self.noise)
         footprint = self._reach(image, record.T_world_camera)
         self._registry.anchor_at(record.T_world_camera[:3, 3])
@@ -276,7 +275,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         runtime.settle()  # before the image's arrays are dropped
 
     def _forget_voxels(self) -> None:
-        """Give all bricks back."""
+        """Release all bricks."""
         self._pool.release(self._pool.in_use)
         self._pool.revision += 1
         self._registry.topology.clear()

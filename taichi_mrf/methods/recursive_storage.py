@@ -1,8 +1,5 @@
-"""A map that integrates its scans one by one as one .npz file.
-
-Beside the scans, the voxels are stored: a loaded map answers queries at once, and goes on from there
-without integrating anything anew.
-"""
+"""The file of a recursive map. It holds the scans and the voxels, so that a loaded map answers queries at
+once and continues without integrating its scans again."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +13,8 @@ from taichi_mrf.system.atomic import write_npz
 
 @dataclass(frozen=True)
 class RecursiveContents:
-    """All that makes such a map. ``belief`` (n, 512) are the log-odds of the ``bricks`` (n, 3); ``stale``
-    says that they are no longer those of the keyframes."""
+    """The contents of such a file. ``belief`` (n, 512) are the log-odds of the ``bricks`` (n, 3); ``stale``
+    says that keyframes were removed or moved since they were computed."""
 
     header: MapHeader
     bricks: NDArray[np.int32]
@@ -26,7 +23,7 @@ class RecursiveContents:
 
 
 def write_recursive(path: Path, contents: RecursiveContents) -> None:
-    """Write a map beside its place first, then into it. Raises MapFileError."""
+    """Write the file under a temporary name and rename it into place. Raises MapFileError."""
     arrays = {
         **contents.header.arrays(),
         "bricks": contents.bricks,
@@ -37,7 +34,7 @@ def write_recursive(path: Path, contents: RecursiveContents) -> None:
 
 
 def read_recursive(path: Path, method: str) -> RecursiveContents:
-    """Read a map of a method back. Raises MapFileError naming the file and what is wrong with it."""
+    """Read a map of a method back. Raises MapFileError, which names the file and what is wrong."""
     with open_map_file(path, method) as file:
         return RecursiveContents(
             read_header(path, file), *read_bricks(path, file), stale=file.scalar("stale", "b")

@@ -1,9 +1,9 @@
-"""What maps that integrate scans one by one share: the log-odds of a voxel, and how they change.
+"""The update of a voxel's log-odds in recursive maps.
 
-Such a map needs no prior: a voxel starts at log-odds of 0 and stays there until the first scan says
-something of it. That very number therefore marks the unknown, and no update may end there. A sum can,
-where a hit and a miss weigh the same; it is then moved aside by next to nothing, and up rather than
-down, because a voxel whose log-odds reach the threshold counts as occupied (OctoMap).
+A voxel starts at log-odds 0 and keeps them until the first scan observes it, so the value 0 marks unknown
+voxels and no update may end there. A sum of updates can be exactly 0 where a hit and a miss weigh the same.
+It is then moved to LEAST_LOG_ODDS, up rather than down, because a voxel whose log-odds reach the threshold
+counts as occupied (OctoMap).
 """
 
 import taichi as ti
@@ -11,11 +11,11 @@ import taichi as ti
 from taichi_mrf.kernels.types import F32
 
 UNKNOWN_LOG_ODDS = 0.0
-"""What a voxel holds of which no scan has said anything."""
+"""The log-odds of a voxel that no scan has observed."""
 
 LEAST_LOG_ODDS = 1e-6
-"""The log-odds nearest to unknown that a known voxel can have. Small beside any update, and large enough
-for the probability, a float32 near 0.5, to differ from 0.5."""
+"""The smallest magnitude of a known voxel's log-odds: small compared to any update, and large enough for the
+probability, a float32 near 0.5, to differ from 0.5."""
 
 
 @ti.func

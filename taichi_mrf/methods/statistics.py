@@ -1,4 +1,4 @@
-"""How large a map is, in numbers that compare from one mapping method to another."""
+"""The size of a map in numbers that can be compared between mapping methods."""
 
 from dataclasses import dataclass
 
@@ -10,8 +10,8 @@ from taichi_mrf.voxels.pool import BrickPool
 
 @dataclass(frozen=True)
 class MapStatistics:
-    """How large a map is. ``memory_mb`` counts its voxels, messages, images and scratch;
-    ``bytes_per_voxel`` what grows with the voxels: their channels, and all keyframes' messages."""
+    """The size of a map. ``memory_mb`` counts voxels, messages, images and scratch memory;
+    ``bytes_per_voxel`` what grows with the voxels: their channels and all keyframes' messages."""
 
     keyframes: int
     frozen: int
@@ -26,8 +26,8 @@ class MapStatistics:
 def measure(
     pool: BrickPool, *, keyframes: int, frozen: int, rays: int, message_bytes: int, other_bytes: int
 ) -> MapStatistics:
-    """Take a map's measure: ``message_bytes`` is what keyframes hold for each voxel, ``other_bytes`` what
-    does not grow with the voxels."""
+    """The statistics of a map; ``message_bytes`` is the memory of all messages, ``other_bytes`` what does not
+    grow with the voxels."""
     in_use = pool.in_use
     voxels = len(in_use) * VOXELS
     of_voxels = pool.capacity * VOXELS * pool.bytes_per_voxel + message_bytes

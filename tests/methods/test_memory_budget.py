@@ -16,7 +16,7 @@ def assert_counts_all(m: MRFMap, bricks: dict[int, int]) -> None:
     budget, keyframes = m._allocator.budget, m.keyframes.values()
     assert budget._messages == sum(2 * VOXELS * bricks[k.id] for k in keyframes)
     assert budget._images == sum(k.image_bytes for k in keyframes)
-    assert budget._to_come == sum(2 * VOXELS * bricks[k.id] for k in keyframes if k.messages is None)
+    assert budget._reserved == sum(2 * VOXELS * bricks[k.id] for k in keyframes if k.messages is None)
 
 
 def test_the_sums_are_those_of_the_keyframes_whatever_has_happened() -> None:
@@ -53,17 +53,17 @@ def test_a_keyframe_that_does_not_fit_is_not_counted() -> None:
     assert len(m.keyframes) == len(m._allocator.budget._shares) == 1
 
 
-def test_a_full_inference_that_is_given_up_makes_keyframes_silent_again() -> None:
+def test_a_full_inference_that_is_given_up_reserves_memory_for_the_messages_again() -> None:
     m = MRFMap(small_room.VOXEL_SIZE)
     for i in range(3):
         small_room.add(m, small_room.frames()[i])
     bricks = {id: len(k.visible.slots) for id, k in m.keyframes.items()}
     checkpoint = m.checkpoint()
     m.infer(progress=lambda step: False)
-    assert m._allocator.budget._to_come == 0
+    assert m._allocator.budget._reserved == 0
     m.restore(checkpoint)
     assert_counts_all(m, bricks)
-    assert m._allocator.budget._to_come > 0
+    assert m._allocator.budget._reserved > 0
 
 
 def test_a_keyframe_that_cannot_be_moved_stays_although_the_map_is_over_its_limit() -> None:

@@ -1,7 +1,7 @@
-"""Occupancy mapping with independent log-odds: the baseline that everybody knows, OctoMap's method.
+"""Occupancy mapping with independent log-odds: OctoMap's method, the usual baseline.
 
-Every voxel is updated on its own, as if a ray's miss told nothing of the voxels around it. In OctoMap's
-octree equal voxels share a node; here they are kept one by one, which changes no voxel's value.
+Every voxel is updated independently of its neighbours. OctoMap's octree merges equal voxels into one node;
+here each voxel is stored by itself, which changes no value.
 """
 
 from typing import Any, ClassVar

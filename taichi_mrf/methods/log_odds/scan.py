@@ -1,9 +1,9 @@
 """One scan integrated into independent log-odds, as OctoMap does it (Hornung et al. 2013, section 3.2).
 
-A ray says "free" of every voxel from the camera's own up to, but not including, the one that it ends in,
-and "occupied" of that one if it ends at a measured surface. For each voxel the scan's rays are counted
-first, hits and misses in the halves of one integer, and then weighed into one change of its log-odds:
-what comes out does not depend on the order of the rays.
+A ray is a miss for every voxel from the camera's up to, but not including, the one in which it ends, and a
+hit for that one if it ends at a measured surface. First the scan's hits and misses are counted for each
+voxel, in the halves of one integer; then they are turned into one change of its log-odds. The result does not
+depend on the order of the rays.
 """
 
 import math
@@ -52,7 +52,7 @@ class RayFootprint(Footprint):
 
 
 class ScanIntegrator:
-    """Counts and weighs; owns the scratch that all scans share, which grows to the largest of them."""
+    """Integrates scans. They share one scratch memory, which grows to the largest of them."""
 
     def __init__(
         self, voxel_size: float, max_depth: float, config: LogOddsConfig, volume: VolumeConfig
@@ -68,13 +68,13 @@ class ScanIntegrator:
         return self.tally.shape[0] * 8 + self.index.bricks.shape[0] * 4
 
     def reach(self, image: DepthImage, T_world_camera: Pose) -> RayFootprint:
-        """The bricks that a scan's rays cross. Raises CapacityError if there are too many of them."""
+        """The bricks that a scan's rays cross. Raises CapacityError if there is not enough memory."""
         config, centre_m = self.config, T_world_camera[:3, 3]
         lower_m, upper_m = visible_box(image, T_world_camera, self.max_depth, end_sigmas=0.0)
         if config.max_range > 0:
             lower_m = np.maximum(lower_m, centre_m - config.max_range)
             upper_m = np.minimum(upper_m, centre_m + config.max_range)
-        # A voxel to spare: the centre of a voxel may lie further out than what was measured in it.
+        # One voxel more: the centre of a voxel may lie further out than the measurement in it.
         lower_m, upper_m = lower_m - self.voxel_size, upper_m + self.voxel_size
         window = window_around(lower_m, upper_m, self.voxel_size, self.volume)
         if window is None or image.rays == 0:
@@ -94,7 +94,8 @@ class ScanIntegrator:
     def integrate(
         self, footprint: RayFootprint, T_world_camera: Pose, slots: NDArray[np.int32], pool: BrickPool
     ) -> None:
-        """Change the log-odds of what a scan's rays pass and hit; ``slots`` (n,) are the bricks crossed."""
+        """Update the log-odds of the voxels that a scan's rays cross; ``slots`` (n,) are the crossed
+        bricks."""
         config, window, n = self.config, footprint.window, len(slots)
         every_ray = config.update == "ray"
         self.index.fill(window, footprint.crossed, np.arange(n, dtype=np.int32))
@@ -195,7 +196,7 @@ def _pass_voxel(state: Template, counted: Template, voxel: I32, near: F32, far: 
 
 @ti.func
 def _count(tally: Template, voxel: I32, one: ti.i64, every_ray: Template):
-    """Count a ray, or only that there is one: near the camera hundreds of rays pass each voxel."""
+    """Count a ray, or only that there is one, because near the camera hundreds of rays cross each voxel."""
     if ti.static(every_ray):
         ti.atomic_add(tally[voxel], one)
     elif (tally[voxel] & one) == 0:

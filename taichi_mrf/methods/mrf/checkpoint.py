@@ -1,8 +1,8 @@
-"""What an MRFMap goes back to when a full inference is given up before its end.
+"""The state that an MRFMap returns to when a full inference is stopped before its end.
 
-Full inference forgets all messages first. Whoever may want to break it off, because an edit has come, keeps
-a checkpoint: the beliefs as they were (which queries can go on reading, see BrickPool.showing) and the
-messages behind them. Between the two no keyframe may come, go or move.
+Full inference starts by dropping all messages. A caller that may have to stop it, to carry out an edit for
+instance, takes a checkpoint first: the beliefs, which queries can keep reading (BrickPool.showing), and the
+messages behind them. Between checkpoint and restore no keyframe may be added, removed or moved.
 """
 
 from collections.abc import Iterable
@@ -18,8 +18,8 @@ from taichi_mrf.voxels.pool import BrickPool, PoolSnapshot
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A map's beliefs, and each keyframe's messages with the list of bricks that they are for, and what
-    it had heard."""
+    """A map's beliefs, and for each keyframe its visible bricks, its messages for them, and the bricks'
+    change counts at its last sweep."""
 
     pool: PoolSnapshot
     messages: dict[int, "tuple[VisibleBricks, ti.Ndarray | None, NDArray[np.int64] | None]"]
@@ -30,7 +30,7 @@ class Checkpoint:
 def take_checkpoint(
     pool: BrickPool, keyframes: Iterable[Keyframe], messages_lost: bool, settled: bool
 ) -> Checkpoint:
-    """Copy the beliefs. The messages need no copy: full inference begins with new arrays."""
+    """Copy the beliefs. The messages need no copy because full inference starts with new arrays."""
     return Checkpoint(
         pool.snapshot(),
         {k.id: (k.visible, k.messages, k.change_count_at_last_sweep) for k in keyframes},
@@ -40,7 +40,7 @@ def take_checkpoint(
 
 
 def go_back(checkpoint: Checkpoint, pool: BrickPool, keyframes: Iterable[Keyframe]) -> None:
-    """Undo all sweeps since the checkpoint."""
+    """Restore beliefs and messages as of the checkpoint."""
     pool.restore(checkpoint.pool)
     for keyframe in keyframes:
         keyframe.visible, keyframe.messages, keyframe.change_count_at_last_sweep = checkpoint.messages[

@@ -1,4 +1,4 @@
-"""Keyframes in and out of a map: which bricks they need and see, and their messages in step with that."""
+"""Adding keyframes to a map and removing them: their bricks, their visible bricks and their messages."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -16,18 +16,18 @@ from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
 from taichi_mrf.inference.messages import carry_over, new_messages, withdraw_messages
 from taichi_mrf.inference.ray_list import RayBundler
 from taichi_mrf.inference.sweep import unknown_entry_depths
-from taichi_mrf.methods.mrf.brick_registry import BrickRegistry
+from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.mrf.memory_budget import MemoryBudget
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.strips import strip_length
 
 SCOUTS = 4
-"""Of so many neighbouring rays one is followed through free space to find the bricks that they cross."""
+"""One of this many neighbouring rays is followed through free space to find the crossed bricks."""
 
 
 @dataclass(frozen=True)
 class KeyframeAllocator:
-    """What it takes to place keyframes in a map, and to take them out again."""
+    """Allocates and releases what the keyframes of one map need."""
 
     registry: BrickRegistry
     bundler: RayBundler
@@ -38,8 +38,8 @@ class KeyframeAllocator:
     budget: MemoryBudget
 
     def place(self, id: int, name: str, image: DepthImage, T_world_camera: Pose) -> Keyframe:
-        """Find out which bricks a keyframe needs and sees, and claim them. Raises CapacityError if there is
-        no budget for them."""
+        """Find the bricks that a keyframe's rays cross and claim those near its surfaces. Raises
+        CapacityError if there is not enough memory."""
         rays, voxel_size = self.bundler.rays_of(image), self.registry.voxel_size
         parts = (voxel_size, self.sensor, self.inference, self.volume)
         footprint = find_footprint(image, rays, T_world_camera, *parts, scouts=SCOUTS)
@@ -48,15 +48,15 @@ class KeyframeAllocator:
         return self._claimed(id, name, image, rays, T_world_camera, footprint)
 
     def put_back(self, keyframe: Keyframe) -> Keyframe:
-        """Place a keyframe again, without messages, where it has just been taken out: what it needs is free,
-        and nobody is asked for budget."""
+        """Place a keyframe again, without messages, right after :meth:`take_out`. The memory that it needs
+        was just released, so the budget is not checked."""
         parts = (keyframe.image, keyframe.ray_list, keyframe.T_world_camera, keyframe.footprint)
         return self._claimed(keyframe.id, keyframe.name, *parts)
 
     def _claimed(
         self, id: int, name: str, image: DepthImage, rays: RayList, T_world_camera: Pose, footprint: Footprint
     ) -> Keyframe:
-        """A keyframe whose bricks have been claimed, and that is counted."""
+        """Claim the bricks and return the keyframe, counted in the budget."""
         self.registry.claim(footprint)
         self.bounds.put(id, footprint.window)
         visible, entry_depths = self.registry.visible(footprint), unknown_entry_depths(rays)
@@ -65,7 +65,7 @@ class KeyframeAllocator:
         return keyframe
 
     def take_out(self, keyframe: Keyframe) -> None:
-        """Undo :meth:`place`, and withdraw the keyframe's messages."""
+        """Undo :meth:`place` and subtract the keyframe's messages from the beliefs."""
         pool = self.registry.pool
         if keyframe.messages is not None:
             messages, slots = self.refresh(keyframe), keyframe.visible.slots
@@ -79,7 +79,8 @@ class KeyframeAllocator:
         runtime.settle()  # before its arrays are dropped
 
     def freeze(self, keyframe: Keyframe) -> None:
-        """Add a keyframe's messages to what inference starts from, and keep its bricks for good."""
+        """Add a keyframe's messages to the evidence that inference starts from, and keep its bricks for
+        good."""
         pool, messages = self.registry.pool, self.refresh(keyframe)
         if len(keyframe.visible.slots):
             sum_product.fold(keyframe.visible.slots, pool.keep_evidence(), messages, strip_length())
@@ -90,19 +91,20 @@ class KeyframeAllocator:
         runtime.settle()  # before its arrays are dropped
 
     def mark_without_messages(self, keyframes: Iterable[Keyframe]) -> None:
-        """Note which of them have lost their messages, for which there must be memory again."""
+        """Reserve memory for the messages of those keyframes that have none."""
         for keyframe in keyframes:
             if keyframe.messages is None:
                 self.budget.mark_unallocated(keyframe.id)
 
     def look_again(self, keyframe: Keyframe) -> None:
-        """Find out what a keyframe sees now, and leave its messages as they are."""
+        """Update a keyframe's list of visible bricks and leave its messages as they are."""
         seen = keyframe.visible if keyframe.pending_visible is None else keyframe.pending_visible
         visible = self.registry.visible_again(keyframe.footprint, seen)
         keyframe.pending_visible = None if visible is keyframe.visible else visible
 
     def refresh(self, keyframe: Keyframe) -> "ti.Ndarray":
-        """Bring a keyframe's bricks and messages up to date; bricks new to it get no message yet."""
+        """Bring a keyframe's visible bricks and messages up to date. Newly visible bricks start without a
+        message (log-odds 0)."""
         old, old_messages = keyframe.visible, keyframe.messages
         self.look_again(keyframe)
         if keyframe.pending_visible is not None:
@@ -112,7 +114,7 @@ class KeyframeAllocator:
             keyframe.entry_depths_known = False
         if old_messages is None or keyframe.visible is not old:
             keyframe.messages = new_messages(keyframe.visible, self.inference.message_precision)
-            self.budget.has_spoken(keyframe.id)
+            self.budget.mark_allocated(keyframe.id)
             keyframe.revision = -1
             if old_messages is not None:
                 carry_over(old, old_messages, keyframe.visible, keyframe.messages)

@@ -1,7 +1,6 @@
-"""The map: keyframes go in, marginal probabilities of occupancy come out.
+"""MRFMap (Shankar & Michael, RSS 2020): keyframes in, marginal probabilities of occupancy out.
 
-MRFMap (Shankar & Michael, RSS 2020) as an object. It keeps the books: which bricks exist and who owns
-them, which keyframes see them. The computation itself is inference/sum_product.py.
+The class manages keyframes, bricks and messages. The computation itself is inference/sum_product.py.
 """
 
 import math
@@ -50,8 +49,8 @@ from taichi_mrf.voxels.layout import VOXELS
 class MRFMap(BrickMap):
     """A probabilistic occupancy map of any set of depth keyframes.
 
-    Keyframes can be added, removed, moved and frozen in any order; after :meth:`infer` the map is the
-    one that the final set gives. Between changes and :meth:`infer`, queries answer with what is known.
+    Keyframes can be added, removed, moved and frozen in any order; after :meth:`infer` the map depends only
+    on the final set. Until then, queries return what was computed before.
     """
 
     METHOD: ClassVar[Method] = METHOD
@@ -103,17 +102,17 @@ class MRFMap(BrickMap):
 
     @property
     def stale(self) -> bool:
-        """Never: a change shows at once."""
+        """Always False: changes show at once."""
         return False
 
     @property
     def settled(self) -> bool:
-        """Whether the marginals are those that a full :meth:`infer` gives: none of the keyframes has changed
-        since, and it was not stopped."""
+        """Whether the marginals are those of a full :meth:`infer` with the configured sweeps: it was not
+        stopped, and no keyframe changed since."""
         return self._settled
 
     def crossed_bricks(self, id: int) -> NDArray[np.int32]:
-        """The bricks that a keyframe's rays cross, (n, 3), whether they exist or not."""
+        """The bricks that a keyframe's rays cross, (n, 3), whether they are allocated or not."""
         footprint = self._find(id).footprint
         return footprint.window.bricks_of(footprint.crossed)
 
@@ -125,7 +124,7 @@ class MRFMap(BrickMap):
     def add_keyframe(
         self, depth_m: ArrayLike, T_world_camera: ArrayLike, camera: Camera, name: str = ""
     ) -> int:
-        """Add a depth image; it takes part from the next :meth:`infer` on.
+        """Add a depth image. It takes part in the next :meth:`infer`.
 
         ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
         ``T_world_camera`` is (4, 4). Returns the keyframe's id.
@@ -140,7 +139,8 @@ class MRFMap(BrickMap):
         return keyframe.id
 
     def remove_keyframe(self, id: int) -> None:
-        """Take a keyframe out, with all that it has said, and the bricks that only it wanted."""
+        """Remove a keyframe, its messages, and every brick that no other keyframe owns. Raises
+        KeyframeError."""
         keyframe = self._find(id)
         self._restore_messages()
         self._allocator.take_out(keyframe)
@@ -148,7 +148,8 @@ class MRFMap(BrickMap):
         self._settled = False
 
     def move_keyframe(self, id: int, T_world_camera: ArrayLike) -> None:
-        """Give a keyframe another pose, as a SLAM back-end does; its messages begin anew."""
+        """Move a keyframe to another pose, (4, 4), as a SLAM back-end does. Its messages are dropped. Raises
+        KeyframeError, or CapacityError if there is not enough memory; the map is then unchanged."""
         keyframe = self._find(id)
         T = as_pose(T_world_camera)
         self._restore_messages()
@@ -176,10 +177,10 @@ class MRFMap(BrickMap):
         return refined
 
     def freeze_keyframe(self, id: int) -> None:
-        """Fold a keyframe's messages into what inference starts from, and forget its image.
+        """Add a keyframe's messages to the evidence that inference starts from, and drop its image.
 
-        It can be neither moved nor removed any more, and costs neither time nor memory. What it saw of
-        bricks that do not exist yet is lost, but for their being free.
+        A frozen keyframe can be neither moved nor removed, and costs neither time nor memory. Of bricks that
+        are not allocated yet, only that it saw them to be free is kept.
         """
         keyframe = self._find(id)
         self._restore_messages()
@@ -203,11 +204,11 @@ class MRFMap(BrickMap):
     ) -> InferReport:
         """Compute the marginals by loopy belief propagation.
 
-        Without ``keyframes`` all of them are swept, from no messages and in an order that depends on
-        what they hold: the map is a function of the set of keyframes. With ``keyframes`` (ids) only
-        those are renewed, starting from what is known, which costs no more than they do.
-        ``progress`` is called after each keyframe and stops inference by returning False. ``method`` takes
-        the place of the configuration's, from now on. Raises ConfigError for one that there is not.
+        Without ``keyframes`` it starts without messages and sweeps all keyframes in an order that follows
+        from their content, so the map is a function of the set of keyframes. With ``keyframes`` (ids) it
+        starts from the present messages and sweeps only those. ``sweeps`` and ``tolerance`` override the
+        configuration for this call, ``method`` from now on. ``progress`` is called after each keyframe;
+        returning False stops. Raises ConfigError for an impossible argument, KeyframeError for an unknown id.
         """
         chosen_ids = check_inference(sweeps, tolerance, keyframes)
         if method is not None and method != self.config.inference.method:
@@ -219,7 +220,7 @@ class MRFMap(BrickMap):
             chosen = sorted(self._keyframes.values(), key=content_key)
             self._pool.restart()
             for keyframe in chosen:
-                # A ray that starts further out rounds otherwise, so what earlier sweeps learnt must not show.
+                # Entry depths of earlier sweeps would change the rounding of rays, so they start over too.
                 keyframe.entry_depths = unknown_entry_depths(keyframe.ray_list)
                 keyframe.entry_depths_known = False
                 keyframe.messages = None
@@ -266,9 +267,9 @@ class MRFMap(BrickMap):
         return self._incremental.run(self._keyframes, first, tolerance, seconds, progress)
 
     def factor_graph(self, every: int = 1, memory_limit_gb: float = 0.0) -> FactorGraph:
-        """The factor graph without average messages, for factor_graph.solve: a factor for each ray of every
-        ``every``-th pixel, both ways, and one for each voxel's prior; its cells are the pool's voxels.
-        Raises CapacityError, which names its size, if it does not fit."""
+        """The factor graph without average messages, for factor_graph.solve: a factor for the ray of every
+        ``every``-th pixel in both directions, and one for each voxel's prior; its cells are the pool's
+        voxels. Raises CapacityError, which names its size, if there is not enough memory."""
         keyframes = sorted(self._keyframes.values(), key=content_key)
         for keyframe in keyframes:
             self._allocator.refresh(keyframe)
@@ -276,7 +277,7 @@ class MRFMap(BrickMap):
         return depth_graph(keyframes, self._pool, self.voxel_size, *parts, every, memory_limit_gb)
 
     def adopt(self, log_odds: NDArray[np.float32]) -> None:
-        """Believe these log-odds of the cells of :meth:`factor_graph`, (cells,), until the next infer."""
+        """Use these log-odds, (cells,) of :meth:`factor_graph`, as beliefs until the next infer."""
         self._pool.restart()
         for keyframe in self._keyframes.values():
             keyframe.messages = None
@@ -290,24 +291,24 @@ class MRFMap(BrickMap):
         return take_checkpoint(self._pool, self._keyframes.values(), self._messages_lost, self._settled)
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go back to a checkpoint, since which only :meth:`infer` was called."""
+        """Go back to a checkpoint. Since then only :meth:`infer` may have been called."""
         go_back(checkpoint, self._pool, self._keyframes.values())
         self._messages_lost, self._settled = checkpoint.messages_lost, checkpoint.settled
         self._allocator.mark_without_messages(self._keyframes.values())
 
     def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """How many keyframes say something of each voxel of some bricks of the pool, (n,) -> (n, 512); all
-        that are frozen count as one, and 255 means so many or more."""
-        spoken = [(k.visible, k.messages) for k in self._keyframes.values() if k.messages is not None]
-        return count_observations(slots, spoken, self._pool)
+        """How many keyframes observe each voxel of some bricks of the pool, (n,) slots -> (n, 512). All
+        frozen ones count as one; 255 means 255 or more."""
+        sent = [(k.visible, k.messages) for k in self._keyframes.values() if k.messages is not None]
+        return count_observations(slots, sent, self._pool)
 
     @property
     def last_voxel_steps(self) -> int:
-        """Voxels that the rays of the last keyframe swept have crossed, each ray's counted."""
+        """Voxels that the rays of the last swept keyframe crossed, summed over its rays."""
         return self._sweeper.voxel_steps
 
     def statistics(self) -> MapStatistics:
-        """How large the map is."""
+        """The size of the map."""
         keyframes = self._keyframes.values()
         return measure(
             self._pool,
@@ -319,7 +320,7 @@ class MRFMap(BrickMap):
         )
 
     def save(self, path: str | Path) -> None:
-        """Write the map to one .npz file, beside it first and then into place. Raises MapFileError."""
+        """Write the map to one .npz file, under a temporary name first. Raises MapFileError."""
         keyframes = list(self._keyframes.values())
         stored = [StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera) for k in keyframes]
         header = MapHeader(self.config, self.noise, stored, self._next_id, self._settled)
@@ -327,8 +328,8 @@ class MRFMap(BrickMap):
 
     @classmethod
     def load(cls, path: str | Path, memory_limit_gb: float | None = None) -> "MRFMap":
-        """Read a map that can be queried at once and extended; ``memory_limit_gb`` takes the place of its
-        own. Raises MapFileError, or CapacityError if there is no budget for it."""
+        """Read a saved map, which can be queried at once and extended. ``memory_limit_gb`` overrides the
+        saved limit. Raises MapFileError, or CapacityError if there is not enough memory."""
         contents = read_contents(Path(path))
         header, bricks = contents.header, contents.bricks
         with naming(Path(path)):
@@ -362,7 +363,7 @@ class MRFMap(BrickMap):
         return image
 
     def _use(self, method: str) -> None:
-        """Infer by this method from now on: no keyframe has sent its messages by it yet."""
+        """Switch the inference method. All messages so far are of the other method, so all are outdated."""
         inference = overridden(self.config.inference, {"method": method}, "MRFMap.infer")
         self.config = replace(self.config, **{self.METHOD.section: inference})
         self._sweeper.inference = inference
@@ -370,6 +371,6 @@ class MRFMap(BrickMap):
             keyframe.revision = -1
 
     def _restore_messages(self) -> None:
-        """A loaded map has no messages, because they are large and follow from the images."""
+        """Compute the messages of a loaded map: its file holds none, because they follow from the images."""
         if self._messages_lost:
             self.infer()

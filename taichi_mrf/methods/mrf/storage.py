@@ -1,8 +1,8 @@
 """An MRFMap as one .npz file.
 
-What is stored is what a map is made of: its parameters, its bricks with their beliefs, and its
-keyframes' images and poses. Messages are not: they are the largest part of a map in memory and follow
-from the rest. Beliefs are, so that a loaded map answers queries at once.
+The file holds the parameters, the bricks with their beliefs, and the keyframes' images and poses. It does not
+hold the messages: they are the largest part of a map in memory and can be computed from the rest. It holds
+the beliefs so that a loaded map answers queries at once.
 """
 
 from collections.abc import Iterable
@@ -14,16 +14,17 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.map_file import MapHeader, open_map_file, read_bricks, read_header
-from taichi_mrf.methods.mrf.brick_registry import BrickRegistry
 from taichi_mrf.system.atomic import write_npz
 from taichi_mrf.voxels.layout import VOXELS
 
 
 @dataclass(frozen=True)
 class MapContents:
-    """All that makes an MRFMap. ``belief`` and ``evidence`` are (n, 512) log-odds of the ``bricks``
-    (n, 3); ``frozen_owners`` (n,) counts the frozen keyframes that want each brick."""
+    """The contents of an MRFMap's file. ``belief`` and ``evidence`` are (n, 512) log-odds of the ``bricks``
+    (n, 3); ``frozen_owners`` (n,) counts the frozen keyframes that own each brick, ``frozen_crossed`` (m, 3)
+    are the bricks that they crossed, and ``frozen`` their names by id."""
 
     header: MapHeader
     bricks: NDArray[np.int32]
@@ -37,7 +38,7 @@ class MapContents:
 def contents_of(
     header: MapHeader, registry: BrickRegistry, keyframes: Iterable[Keyframe], frozen: dict[int, str]
 ) -> MapContents:
-    """What is to be stored of a map; ``keyframes`` are those that can still be moved."""
+    """The contents to store; ``keyframes`` are those that are not frozen."""
     pool = registry.pool
     slots = pool.in_order
     live = np.zeros(pool.capacity, np.int32)
@@ -55,7 +56,7 @@ def contents_of(
 
 
 def write_contents(path: Path, contents: MapContents) -> None:
-    """Write a map beside its place first, then into it. Raises MapFileError."""
+    """Write the file under a temporary name and rename it into place. Raises MapFileError."""
     arrays = {
         **contents.header.arrays(),
         "bricks": contents.bricks,
@@ -71,7 +72,7 @@ def write_contents(path: Path, contents: MapContents) -> None:
 
 
 def read_contents(path: Path) -> MapContents:
-    """Read a map back. Raises MapFileError naming the file and what is wrong with it."""
+    """Read a file back. Raises MapFileError, which names the file and what is wrong."""
     with open_map_file(path, "mrf") as file:
         header = read_header(path, file)
         bricks, belief = read_bricks(path, file)

@@ -1,4 +1,4 @@
-"""One scan into a visibility map: the host's side of visibility_scan.py, with the scratch that it needs."""
+"""Integration of one scan into a visibility map: host code and scratch memory for the kernels of scan.py."""
 
 import dataclasses
 import math
@@ -23,18 +23,18 @@ from taichi_mrf.voxels.traversal import FAR
 from taichi_mrf.voxels.window import WindowIndex
 
 SCRATCH_BYTES = 12
-"""What a scan needs for each voxel of the bricks that its rays cross: P(C), P(V) and P(I)."""
+"""Scratch for each voxel of the bricks that a scan's rays cross: P(C), P(V) and P(I)."""
 
 
 class VisibilityIntegrator:
-    """Integrates scans; owns the scratch that they share, which grows to the largest of them."""
+    """Integrates scans. They share one scratch memory, which grows to the largest of them."""
 
     def __init__(
         self, voxel_size: float, sensor: SensorConfig, visibility: VisibilityConfig, volume: VolumeConfig
     ) -> None:
         self.voxel_size, self.visibility, self.volume = voxel_size, visibility, volume
         self.max_range = visibility.max_range or FAR
-        # A depth is never more than its range, so what lies deeper need not be looked at.
+        # A depth is never more than its range, so deeper bricks cannot be reached.
         self.sensor = dataclasses.replace(sensor, max_depth=min(sensor.max_depth, self.max_range))
         self.limits = visibility_scan.RayLimits(
             voxel_size, self.sensor.max_depth, self.max_range,
@@ -52,10 +52,8 @@ class VisibilityIntegrator:
         return self.occluded.shape[0] * SCRATCH_BYTES + self.index.bricks.shape[0] * 4
 
     def reach(self, image: DepthImage, T_world_camera: Pose) -> Footprint:
-        """The bricks that a scan's rays cross if they are visible all the way to their ends.
-
-        All of them are wanted, which ``surface`` says. Raises CapacityError if there are too many.
-        """
+        """The bricks that a scan's rays cross if everything up to their ends is visible. ``surface`` equals
+        ``crossed``, so that all are allocated. Raises CapacityError if there is not enough memory."""
         to_its_end = InferenceConfig(end_sigmas=visibility_scan.SURE_SIGMAS)
         beyond_m = visibility_scan.BEYOND_VOXELS * self.voxel_size
         footprint = find_footprint(
@@ -78,14 +76,14 @@ class VisibilityIntegrator:
         slots: NDArray[np.int32],
         pool: BrickPool,
     ) -> None:
-        """Change the log-odds of the voxels that the scan sees. All bricks of the footprint must exist:
-        ``slots`` are their places in the pool."""
+        """Update the log-odds of the voxels that the scan observes. All bricks of the footprint must be
+        allocated; ``slots`` (n,) are their places in the pool."""
         config, window, cells = self.visibility, footprint.window, footprint.crossed
         view = window.viewpoint(T_world_camera)
         self._reserve(len(slots) * VOXELS)
         seen = visibility_scan.SeenVoxels(self.occluded, self.visible, self.inside)
 
-        # Eq. 1, in the map as it is now; a neighbour may lie in a brick that this scan does not cross.
+        # Eq. 1, in the map before the scan. A neighbour may lie in a brick that this scan does not cross.
         in_use = pool.in_use
         all_cells = window.cells_of(pool.bricks[in_use])
         there = all_cells >= 0
@@ -94,13 +92,13 @@ class VisibilityIntegrator:
         visibility_scan.hide(cells, view.centre, space, pool.belief, seen)
         self.index.clear(window, all_cells[there])
 
-        # Eqs. 2, 3 and 7: how far each ray sees, and where it is inside what it has measured.
+        # Eqs. 2, 3 and 7: each ray's visibility, and its probability of being inside the measured obstacle.
         self.index.fill(window, cells, np.arange(len(cells), dtype=np.int32))
         space = self.index.space(window, self.volume.lower, self.volume.upper)
         visibility_scan.follow(image.depth, image.sensor, view, space, self.limits, seen)
         self.index.clear(window, cells)
 
-        # Eqs. 4 to 6 and 8: what that says of each voxel.
+        # Eqs. 4 to 6 and 8: the update of each voxel.
         visibility_scan.update(
             slots, pool.belief, self.visible, self.inside,
             config.hit_if_occupied, config.hit_if_free, config.hit_if_hidden,

@@ -1,8 +1,8 @@
-"""Occupancy mapping that asks first what the sensor could see: the baseline for stereo cameras.
+"""Visibility-aware occupancy mapping: the baseline for stereo cameras.
 
-A measurement of a voxel that cannot be seen must be an error, and is not believed: a voxel is updated
-only as far as the map so far lets the sensor see it. Where nothing is known yet, a beam gets a few
-voxels far, and the mapped space grows scan by scan.
+A measurement behind an occluding voxel is likely to be an error, so a voxel is updated only as far as it is
+visible in the map so far. In unknown space visibility ends after a few voxels, so the mapped space grows scan
+by scan.
 """
 
 from typing import Any, ClassVar
@@ -21,7 +21,7 @@ from taichi_mrf.sensor.noise import NoiseModel
 class VisibilityMap(RecursiveMap[Footprint]):
     """A map that integrates scans as Schauwecker & Zell do (IROS 2014), with their Table I as defaults.
 
-    What a scan adds depends on what the map knew before it, so the order of the keyframes matters.
+    The effect of a scan depends on the map before it, so the order of the keyframes matters.
     """
 
     METHOD: ClassVar[Method] = METHOD
@@ -40,8 +40,8 @@ class VisibilityMap(RecursiveMap[Footprint]):
         """``parameters`` are fields of VisibilityConfig, such as ``q_max=0.7`` or ``max_range=10.0``.
 
         ``noise`` (a Kinect 1 by default) gives the sigma of eq. 7: a stereo camera of baseline b, focal
-        length f and disparity error sigma_d has PolynomialNoise((0, 0, sigma_d / (b * f))). A bias, which
-        the paper's sensor has not, is taken out of the measurements first.
+        length f and disparity error sigma_d has PolynomialNoise((0, 0, sigma_d / (b * f))). A bias is
+        subtracted from the measurements first; the paper's sensor has none.
         Raises ConfigError for an unknown or impossible parameter.
         """
         section = own_section(visibility, VisibilityConfig, parameters, "visibility", "VisibilityMap")

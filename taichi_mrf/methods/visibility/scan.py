@@ -1,17 +1,16 @@
-"""One scan into an occupancy map that asks first what the sensor could see: the method itself.
+"""The kernels of visibility-aware occupancy mapping: one scan into the map.
 
-Schauwecker & Zell, "Robust and Efficient Volumetric Occupancy Mapping with an Application to Stereo
-Vision" (IROS 2014); equation numbers are theirs. A voxel v is occupied (O_v), visible (V_v), locally
-occluded (C_v), or inside the obstacle that a ray has measured (I_v). A scan goes in by three steps:
+Schauwecker & Zell, "Robust and Efficient Volumetric Occupancy Mapping with an Application to Stereo Vision"
+(IROS 2014); equation numbers are theirs. A voxel v is occupied (O_v), visible (V_v), locally occluded (C_v),
+or inside the obstacle that a ray measured (I_v). A scan is integrated in three steps:
 
     hide     is a voxel occluded by its neighbours towards the sensor?                              (1)
     follow   each ray: is the voxel visible from here, and inside the obstacle?           (2), (3), (7)
     update   each voxel once, with the scan's largest P(V_v) and largest P(I_v)          (4) to (6), (8)
 
-All visibility comes from the map as it was before the scan, so the order of the rays does not matter.
-The paper keeps one update for each voxel and scan and lets hits win over misses as OctoMap does: with
-P(I_v) between 0 and 1, the largest wins. A voxel is hidden only if it is so for all rays: the largest
-P(V_v) wins too.
+Visibility is computed in the map before the scan, so the order of the rays does not matter. The paper updates
+each voxel once per scan and lets hits override misses, as OctoMap does; with P(I_v) between 0 and 1, the
+largest is used. A voxel is hidden only if it is hidden from all rays, so the largest P(V_v) is used too.
 """
 
 from dataclasses import dataclass
@@ -30,48 +29,48 @@ from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, walk_voxels
 
 UNKNOWN = 0.5
-"""P(O_v) of a voxel that has no brick; one that has starts there (recursive_update)."""
+"""P(O_v) of a voxel without a brick; a new brick starts with it too (recursive_update)."""
 
 SURE = 0.95
-"""P(I_v) that is "close to 1" (section III-C): the ray takes one further voxel, a full hit, and ends. The
-less is left of it behind the measurement, the thinner are the walls."""
+"""P(I_v) that is "close to 1" (section III-C): the ray crosses one more voxel, a full hit, and ends. A
+smaller value makes walls thinner."""
 
 SURE_SIGMAS = NormalDist().inv_cdf(SURE)
 """Sigmas behind the measurement at which P(I_v) is SURE."""
 
 BEYOND_VOXELS = 4.5
-"""Voxel sizes behind that depth in which every ray has ended: the voxel that holds this depth, one whose
-segment's centre lies behind it, and the further one, each up to sqrt(3) long."""
+"""Voxel sizes behind that depth by which every ray has ended: the voxel at this depth, one whose segment's
+centre lies behind it, and one more, each up to sqrt(3) long."""
 
 GRAZED = 1e-4
-"""Voxel sizes of a ray's way below which it only touches a voxel: no more than float32 can tell
-(voxels/traversal.py), as at the face of the mapped box, whose other side must stay unknown."""
+"""A ray's segment in a voxel that is shorter than this, in voxel sizes, is skipped: it is below the precision
+of float32 (voxels/traversal.py). At the face of the mapped box it keeps the other side unknown."""
 
 
 @ti.dataclass
 class Beam(Struct):
-    """What is known of a ray on its way from the sensor."""
+    """The state of a ray on its way from the sensor."""
 
-    measured: F32  # axial depth, metres, the sensor's bias taken out
+    measured: F32  # axial depth in metres, without the sensor's bias
     sigma: F32  # of that measurement
     grazed: F32  # the least axial depth to spend in a voxel, metres
-    visible: F32  # P(V) of the voxel that it has come through last
-    sure: I32  # whether that voxel was inside the obstacle for sure
+    visible: F32  # P(V) of the last voxel
+    sure: I32  # whether P(I) of that voxel reached SURE
 
 
 @dataclass(frozen=True)
 class SeenVoxels(Bundle):
-    """What a scan sees of each voxel that its rays cross. Arrays (crossed bricks * 512)."""
+    """The visibility of each voxel that a scan's rays cross. Arrays (crossed bricks * 512)."""
 
     occluded: F32Array
     """P(C_v)."""
 
     visible: I32Array
-    """The largest P(V_v) of any ray, as the bits of a float: those of positive floats are ordered as
-    integers, which have an atomic maximum everywhere."""
+    """The largest P(V_v) of any ray, as the bits of a float. Positive floats are ordered like their bits,
+    and integers have an atomic maximum on every backend."""
 
     inside: I32Array
-    """The largest P(I_v) of any ray, likewise."""
+    """The largest P(I_v) of any ray, in the same form."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +96,7 @@ class RayLimits(Bundle):
     """P(V) below which a ray ends."""
 
     q_max: F32
-    """P(V) from which a voxel counts as visible for sure."""
+    """P(V) of at least this counts as 1."""
 
 
 @dataclass(frozen=True)
@@ -110,9 +109,9 @@ class _Followed(Bundle):
 
 @kernel
 def hide(cells: I32Array, centre: Vec3, space: Space, belief: F32Array, seen: SeenVoxels) -> None:
-    """P(C_v) of each voxel of the bricks at a window's ``cells`` (n), and nothing seen of it by any ray yet.
+    """P(C_v) of each voxel of the bricks at a window's ``cells`` (n); P(V_v) and P(I_v) are reset to 0.
 
-    ``space`` holds the pool's slots of all bricks of the window, those that this scan does not see too;
+    ``space`` holds the pool's slots of all bricks of the window, crossed by this scan or not;
     ``belief`` (pool * 512) log-odds; ``centre`` is the camera's, in voxels.
     """
     sensor = ti.floor(centre, ti.i32)
@@ -166,7 +165,7 @@ def occupancy(voxel: IVec3, space: Template, belief: Template) -> F32:
 def follow(
     depth: F32Array, sensor: Sensor, view: Viewpoint, space: Space, limits: RayLimits, seen: SeenVoxels
 ) -> None:
-    """Follow each ray until it is no longer visible, or sure to be inside what it has measured.
+    """Follow each ray until it is no longer visible, or surely inside the measured obstacle.
 
     ``depth`` is (H * W) metres, 0 without a measurement.
     """
@@ -207,7 +206,7 @@ def _come_through(beam: Template, followed: Template, voxel: I32, near: F32, far
             if beam.sure == 0:
                 probability = inside_obstacle(0.5 * (near + far), beam.measured, beam.sigma)
             else:
-                go = 0  # this was the further voxel
+                go = 0  # this was the one more voxel
             if probability >= SURE:
                 beam.sure = 1
             _raise(seen.visible, voxel, beam.visible)
@@ -219,7 +218,7 @@ def _come_through(beam: Template, followed: Template, voxel: I32, near: F32, far
 def visibility(before: F32, occluded: F32, if_occluded: F32, if_clear: F32, q_max: F32) -> F32:
     """Eqs. 2 and 3: P(V) of a voxel, from that of the one before it and its own P(C); 1 from q_max on.
 
-    A voxel behind one that is not visible is not visible either, so two of eq. 2's terms are none.
+    A voxel behind one that is not visible is not visible either, so two of eq. 2's terms are 0.
     """
     visible = before * (if_occluded * occluded + if_clear * (1.0 - occluded))
     return visible if visible < q_max else 1.0

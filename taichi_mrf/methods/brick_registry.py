@@ -1,7 +1,8 @@
-"""Which bricks a map has, who wants them, and who looks through them.
+"""Brick allocation and its two reference counts: owners and ray crossings.
 
-A brick exists as long as some keyframe has measured a surface in it, and is given back with the last
-of them. Keyframes' footprints go in and out; nothing here knows what inference does with the voxels.
+A brick exists as long as at least one keyframe owns it, that is, has measured a surface in it or near it. How
+many keyframes' rays cross a place is counted for all bricks, allocated or not: crossed but not allocated
+means seen to be free. This module does not depend on what inference stores in the voxels.
 """
 
 from collections import deque
@@ -17,11 +18,11 @@ from taichi_mrf.voxels.topology import Topology
 Bricks = NDArray[np.int32]
 
 REMEMBERED = 64
-"""Changes of the set of bricks that are kept, so that few lists must be made anew."""
+"""Changes of the set of bricks that are remembered. Lists of visible bricks older than that are rebuilt."""
 
 
 class BrickRegistry:
-    """Keeps topology and pool in step. ``version`` changes whenever a brick comes or goes."""
+    """Keeps topology and pool consistent. ``version`` changes whenever bricks are allocated or released."""
 
     def __init__(self, topology: Topology, pool: BrickPool, voxel_size: float) -> None:
         self.topology, self.pool, self.voxel_size = topology, pool, voxel_size
@@ -31,9 +32,9 @@ class BrickRegistry:
         self._frozen_keys = np.zeros(0, np.int64)
 
     def claim(self, footprint: Footprint) -> None:
-        """Allocate the bricks that a keyframe needs, and count it as an owner and as a looker.
+        """Allocate a keyframe's surface bricks and count its ownership and its crossings.
 
-        Raises CapacityError, before anything has changed, if there is no budget for them.
+        Raises CapacityError if there is not enough memory; nothing has changed then.
         """
         crossed = footprint.window.bricks_of(footprint.crossed)
         self.topology.check(crossed, self.voxel_size)
@@ -46,15 +47,13 @@ class BrickRegistry:
         self.topology.add_crossings(crossed, 1)
 
     def anchor_at(self, position_m: NDArray[np.float64]) -> None:
-        """Let the map lie around a position (3,) in the world, unless it already lies somewhere."""
+        """Centre the volume on a position (3,) in the world, if its place is not fixed yet."""
         brick = np.floor(position_m / (self.voxel_size * BRICK))
         self.topology.anchor(np.clip(brick, -(2**30), 2**30).astype(np.int32))
 
     def restore(self, bricks: Bricks, owners: NDArray[np.int32] | int) -> NDArray[np.int32]:
-        """The bricks of a saved map (n, 3), at least one, with so many owners each; returns their slots.
-
-        Raises CapacityError if there is no budget for them.
-        """
+        """Allocate the bricks of a saved map, (n, 3) with n > 0, with their numbers of owners; returns their
+        slots (n,). Raises CapacityError if there is not enough memory."""
         self.topology.anchor(bricks[len(bricks) // 2])
         self.topology.check(bricks, self.voxel_size)
         slots = self.create(bricks)
@@ -62,14 +61,14 @@ class BrickRegistry:
         return slots
 
     def create(self, bricks: Bricks) -> NDArray[np.int32]:
-        """New bricks (n, 3) at the prior, owned by nobody yet; returns their slots."""
+        """Allocate bricks (n, 3) at the prior, without owners; returns their slots (n,)."""
         slots = self.pool.allocate(bricks)
         self.topology.insert(bricks, slots)
         self._note_change(bricks)
         return slots
 
     def disclaim(self, footprint: Footprint) -> None:
-        """Undo :meth:`claim`; bricks that nobody owns any more are given back."""
+        """Undo :meth:`claim` and release the bricks that are left without an owner."""
         self.topology.add_crossings(footprint.window.bricks_of(footprint.crossed), -1)
         surface = footprint.window.bricks_of(footprint.surface)
         slots = self.topology.slots(surface)
@@ -81,20 +80,20 @@ class BrickRegistry:
             self._note_change(surface[orphans])
 
     def freeze(self, footprint: Footprint) -> None:
-        """Keep a footprint for good: its bricks stay, and what it crossed stays seen.
+        """Keep a footprint for good: its bricks stay allocated, and what it crossed stays crossed.
 
-        All frozen keyframes count as one looker, so that their memory is bounded by the space they saw.
+        All frozen keyframes share one crossing count, which bounds their memory by the space that they saw.
         """
         crossed = footprint.window.bricks_of(footprint.crossed)
         self.topology.add_crossings(crossed, -1)
         self.see_for_good(crossed)
 
     def see_for_good(self, bricks: Bricks) -> None:
-        """Count bricks (n, 3), each given once, as crossed by what is frozen."""
+        """Count bricks (n, 3), without repetitions, as crossed by frozen keyframes."""
         keys = grid_keys(bricks)
         order = np.argsort(keys)
         keys, bricks = keys[order], bricks[order]
-        # Kept in order, so that a keyframe that is frozen costs what it sees and not what all before it saw.
+        # Sorted, so that freezing a keyframe costs as much as it sees and not as much as all frozen ones saw.
         place = np.searchsorted(self._frozen_keys, keys)
         known = np.zeros(len(keys), bool)
         inside = place < len(self._frozen_keys)
@@ -105,13 +104,13 @@ class BrickRegistry:
         self.topology.add_crossings(np.ascontiguousarray(bricks, np.int32), 1)
 
     def start_over(self) -> None:
-        """Note that all bricks may have come or gone."""
+        """Mark all lists of visible bricks as outdated."""
         self.version += 1
         self._changes.clear()
 
     def visible_again(self, footprint: Footprint, old: VisibleBricks) -> VisibleBricks:
-        """What a keyframe sees now that once saw ``old``: the same list, if none of the bricks that its rays
-        cross has come or gone since, which costs no more than to look at those that have."""
+        """The keyframe's visible bricks now: ``old`` itself if none of the bricks that its rays cross was
+        allocated or released since. Only the changes since then are looked at."""
         steps = self.version - old.version
         if steps > len(self._changes):
             return self.visible(footprint)
@@ -128,7 +127,7 @@ class BrickRegistry:
         self._changes.append(bricks)
 
     def visible(self, footprint: Footprint) -> VisibleBricks:
-        """The bricks that exist among those that a keyframe's rays cross."""
+        """The allocated bricks among those that a keyframe's rays cross."""
         slots = self.topology.slots(footprint.window.bricks_of(footprint.crossed))
         exist = slots >= 0
         slots = slots[exist]
