@@ -1,0 +1,94 @@
+"""The tuning page without a tuning process and without a browser: what updates and users' actions do."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from taichi_mrf.config.schema import Config
+from taichi_mrf.viewer import messages as m
+from taichi_mrf.viewer.transport.inbox import Used
+from taichi_mrf.viewer.transport.server import start_server
+from taichi_mrf.viewer.tune import messages as t
+from taichi_mrf.viewer.tune.actions import Action, KnobMoved
+from taichi_mrf.viewer.tune.page import TunePage
+from taichi_mrf.viewer.tune.scores import Scores
+
+FIRST = Config(voxel_size=0.1)
+OTHER = replace(FIRST, voxel_size=0.15)
+SCORES = Scores(0.5, 0.5, 0.5, 0.1, 0.1, 0.1, 1.0, 0.1, float("nan"), 1.0, 10, 2)
+TUNING = t.Tuning("a recording", "cpu", "", FIRST, t.FrameChoice(), 9, ("a", "b"), ("c", "d"), ())
+
+
+class HandledTunePage:
+    """A page whose items are handled here; ``asked`` is what it asked of the tuning process."""
+
+    def __init__(self) -> None:
+        self.server = start_server("127.0.0.1", 0, "Handled")
+        self.asked: list[m.Request] = []
+        self.page = TunePage(self.server, self.asked.append)
+        self.take(TUNING, t.Tried(0, FIRST, SCORES, "start"))
+
+    def take(self, *items: Any) -> None:
+        """Handle items that came together."""
+        for item in items:
+            self.page.handlers[type(item)](item)
+        self.page.batch_done()
+
+    def slider(self, name: str) -> Any:
+        return next(each for each in self.page.panel._knobs if name in each)._handles[name]
+
+    def move(self, name: str, value: float) -> KnobMoved:
+        self.slider(name).value = value
+        return KnobMoved(name)
+
+
+@pytest.fixture
+def handled() -> Iterator[HandledTunePage]:
+    running = HandledTunePage()
+    yield running
+    running.server.stop()
+
+
+def test_sliders_that_moved_together_make_one_try(handled: HandledTunePage) -> None:
+    moves = [handled.move("voxel_size", 0.15), handled.move("inference.surface_density", 5.0)]
+    handled.take(*moves, moves[0])
+    wanted = replace(OTHER, inference=replace(FIRST.inference, surface_density=5.0))
+    assert handled.asked == [t.Try(wanted)]
+    handled.take(moves[0])
+    assert handled.asked == [t.Try(wanted)]
+
+
+def test_the_sliders_follow_the_shown_try_unless_another_is_coming(handled: HandledTunePage) -> None:
+    handled.take(t.Chosen(1, OTHER))
+    assert handled.slider("voxel_size").value == 0.15
+    handled.take(handled.move("voxel_size", 0.05))
+    handled.take(t.Chosen(2, replace(FIRST, voxel_size=0.2)))
+    assert handled.slider("voxel_size").value == 0.05
+    handled.take(t.Activity("waiting", 1.0, busy=False), t.Chosen(3, OTHER))
+    assert handled.slider("voxel_size").value == 0.15
+
+
+def test_buttons_act_on_the_selected_try(handled: HandledTunePage) -> None:
+    handled.take(t.Tried(1, OTHER, SCORES, "hand"))
+    assert handled.page.panel.chosen_try() == 1
+    actions = (Action.PIN, Action.SAVE_YAML, Action.SAVE_CSV, Action.RESTORE)
+    handled.take(*[Used(action, 7) for action in actions])
+    saves = [t.SaveTries("yaml", 1, 7), t.SaveTries("csv", 1, 7)]
+    assert handled.asked == [t.Pin(1), *saves, t.Try(OTHER)]
+    assert handled.slider("voxel_size").value == 0.15
+
+
+def test_without_a_try_there_is_a_notice(handled: HandledTunePage) -> None:
+    handled.take(TUNING)  # another working set
+    handled.take(Used(Action.RESTORE, 0))
+    assert handled.asked == []
+    assert [notice.text for notice in handled.page.panel._notices] == ["There is no try yet."]
+
+
+def test_held_out_views_and_frames_are_asked_for(handled: HandledTunePage) -> None:
+    handled.page.panel.view.value = "d"
+    handled.page.panel._frames.handles["count"].value = 20
+    handled.take(Used(Action.CHOOSE_VIEW, 0), Used(Action.USE_FRAMES, 0), Used(Action.STOP_SEARCH, 0))
+    assert handled.asked == [t.LookAt(1), t.ChooseFrames(t.FrameChoice(count=20)), t.StopSearch()]
