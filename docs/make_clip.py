@@ -1,9 +1,9 @@
-"""Makes docs/images/live.gif and live.png: the built-in room in the live viewer, as a browser shows it.
+"""Makes docs/images/live.gif and live.png: the built-in room on the live page, in a browser.
 
     python docs/make_clip.py
 
 Needs what the browser tests need: playwright (extra: dev) and Debian's chromium. The browser draws by
-software, so the pictures are taken one by one, and the clip plays them at a pace of its own.
+software and is slow, so the pictures are taken one by one and played at a fixed rate.
 """
 
 import io
@@ -22,13 +22,13 @@ from live_program import LiveProgram  # noqa: E402
 
 IMAGES = REPOSITORY / "docs" / "images"
 ROOM = ("synthetic:room", "--voxel-size", "0.05", "--speed", "0.2")
-"""At this pace a frame comes in a second, in which the browser can draw and be photographed."""
+"""At this speed a frame arrives each second, which is enough for the browser to draw it."""
 
 WIDTH, HEIGHT = 1240, 700
 CLIP_WIDTH = 640
 COLORS = 80
 CAMERA_COLOR = (230, 0, 126)
-"""Of the camera and its way: too few pixels to get a place among the colours of the clip by themselves."""
+"""The colour of the camera and its path, which have too few pixels to enter the palette by themselves."""
 
 FRAME_MS, LAST_MS = 150, 1500
 
@@ -49,13 +49,13 @@ def main() -> None:
 
 
 def shot(page: LivePage) -> Image.Image:
-    """What the page looks like, once it has drawn what it knows."""
+    """A screenshot after the page has drawn everything."""
     page.pause(0.4)
     return Image.open(io.BytesIO(page.page.screenshot())).convert("RGB")
 
 
 def keyframes_arriving(page: LivePage) -> list[Image.Image]:
-    """One picture for each keyframe, from the first one on."""
+    """One picture for each keyframe, from the first one."""
     close_warning(page)
     page.press("Reset")
     page.press("Delete the map and start again")
@@ -71,7 +71,7 @@ def keyframes_arriving(page: LivePage) -> list[Image.Image]:
 
 
 def orbit(page: LivePage) -> list[Image.Image]:
-    """A turn around the map, by dragging beside it."""
+    """A turn around the map, by dragging the mouse beside it."""
     shots, mouse, (x, y) = [], page.page.mouse, (0.3 * WIDTH, 0.9 * HEIGHT)
     mouse.move(x, y)
     mouse.down()
@@ -83,7 +83,7 @@ def orbit(page: LivePage) -> list[Image.Image]:
 
 
 def cut_moving_through(page: LivePage) -> list[Image.Image]:
-    """A level cut that sinks into the room, so that free space is seen."""
+    """A level cut that moves down through the room and shows free space."""
     shots = []
     page.slide("Cut at", CUT_FROM)
     page.select("Cut axis", "z")
@@ -98,7 +98,7 @@ def cut_moving_through(page: LivePage) -> list[Image.Image]:
 
 
 def still(page: LivePage) -> Image.Image:
-    """The whole map, with the ray of a pixel of one keyframe."""
+    """The whole map, with the ray of one pixel of a keyframe."""
     page.until_settled()
     close_warning(page)
     page.tab("Keyframes")
@@ -112,23 +112,23 @@ def still(page: LivePage) -> Image.Image:
 
 
 def close_warning(page: LivePage) -> None:
-    """Send away what the page says of browsers that draw by software."""
+    """Close the notice about browsers that draw by software."""
     page.page.locator(".mantine-Notification-closeButton").first.click()
     page.pause(0.5)
 
 
 def small_colors(picture: Image.Image, count: int) -> Image.Image:
-    """The same in few colours, which makes files small."""
+    """The picture in few colours, for a small file."""
     return picture.quantize(count, dither=Image.Dither.NONE)
 
 
 def side_by_side(pictures: list[Image.Image]) -> Image.Image:
-    """Pictures of one size as one."""
+    """Pictures of the same size in a row, as one picture."""
     return Image.fromarray(np.concatenate([np.asarray(each) for each in pictures], axis=1))
 
 
 def write_clip(shots: list[Image.Image], path: Path) -> None:
-    """A GIF of all pictures in the same few colours."""
+    """Write a GIF of all pictures with one palette."""
     size = CLIP_WIDTH, round(CLIP_WIDTH * HEIGHT / WIDTH)
     small = [each.resize(size, Image.Resampling.LANCZOS) for each in shots]
     rare = Image.new("RGB", (size[0] // 4, size[1]), CAMERA_COLOR)

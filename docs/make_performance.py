@@ -1,9 +1,9 @@
-"""Makes the pictures of docs/performance.md, which are measurements: run it on an idle machine.
+"""Makes the pictures of docs/performance.md. They are measurements: run it on an idle machine.
 
     python docs/make_performance.py ../shared/data                          # all, half an hour
     python docs/make_performance.py ../shared/data performance_stages.png   # these
 
-The figures of each go into runs/performance, from where the tables of the page are taken.
+The figures go into runs/performance. The tables of the page are copied from there.
 """
 
 import shutil
@@ -21,13 +21,13 @@ BENCHES: dict[str, list[str]] = {
     "performance_kernels.png": ["bench", KITCHEN, "--profile"],
     "performance_growth.png": ["bench", LAPS, "--frames", "480", "--voxel-sizes", "0.05", "--growth"],
 }
-"""What ``taichi-mrf bench --plot`` draws, and its arguments."""
+"""The pictures of ``taichi-mrf bench --plot``, each with its arguments."""
 
 EVALUATIONS: dict[str, tuple[list[str], str]] = {
     "performance_rays.png": (["rays"], "rays_curve.png"),
     "performance_endless.png": (["endless", "--voxel-sizes", "0.1"], "endless_100mm.png"),
 }
-"""What ``taichi-mrf eval`` draws: its arguments, and its name for the picture."""
+"""The pictures of ``taichi-mrf eval``: arguments, and the name that the command gives the picture."""
 
 
 def main() -> None:
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def program(*arguments: str) -> None:
-    """Run taichi-mrf; what it prints is for the user."""
+    """Run taichi-mrf with its output in this terminal."""
     subprocess.run([sys.executable, "-m", "taichi_mrf", *arguments], check=True)
 
 

@@ -1,11 +1,11 @@
-"""Makes the pictures of the documentation: docs/images/*.jpg, all or those that are named.
+"""Makes the pictures of the documentation, docs/images/*.jpg: all of them, or the named ones.
 
     python docs/make_pictures.py                       # all
     python docs/make_pictures.py mesh.jpg cuts.jpg     # these
 
-The built-in room is mapped, watched and tuned as a person would, by the command line and in a browser. Needs
-what the browser tests need (playwright, extra dev; Debian's chromium) and the extra ``mesh``. The clip of the
-front page has a script of its own, make_clip.py.
+The built-in room is mapped on the command line, and shown and tuned in a browser. Needs the same as the
+browser tests (playwright, extra dev; Debian's chromium) and the extra ``mesh``. make_clip.py makes the clip
+of the front page.
 """
 
 import io
@@ -34,7 +34,7 @@ ROOM = "synthetic:room"
 WIDTH = 1280
 MOST_BYTES = 140_000
 QUALITIES = range(80, 40, -4)
-"""Of JPEG, the best that is small enough wins."""
+"""Qualities of JPEG, from which the best with a small enough file is chosen."""
 
 Draw = Callable[[Any], Image.Image]
 
@@ -44,7 +44,7 @@ OF_A_MAP: dict[str, Draw] = {
     "cuts.jpg": map_pictures.cuts,
     "mesh.jpg": map_pictures.mesh,
 }
-"""Drawn from the folder that ``taichi-mrf map`` leaves, which is what ``make run`` does."""
+"""Drawn from the folder of a ``taichi-mrf map`` run, the same as that of ``make run``."""
 
 OF_THE_LIVE_PAGE: dict[str, Draw] = {
     "live_cut.jpg": page_pictures.live_cut,
@@ -56,7 +56,7 @@ OF_THE_TUNING_PAGE: dict[str, Draw] = {
     "tune.jpg": page_pictures.tune_noise,
     "tune_panels.jpg": page_pictures.tune_panels,
 }
-"""Both want the tries that the first one makes."""
+"""Both show the tries of page_pictures.make_tries."""
 
 
 def main() -> None:
@@ -81,7 +81,7 @@ def main() -> None:
 
 @contextmanager
 def a_map() -> Iterator[Path]:
-    """The folder that a run leaves."""
+    """Map the room; yields the folder of the run."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "taichi_mrf", "map", ROOM, "--out", folder]
         subprocess.run(command, cwd=REPOSITORY, check=True, stdout=subprocess.DEVNULL)
@@ -115,7 +115,7 @@ def the_tuning_page() -> Iterator[LivePage]:
 
 
 def write(picture: Image.Image, path: Path) -> None:
-    """A JPEG of at most MOST_BYTES."""
+    """Write a JPEG of at most MOST_BYTES, or of the lowest quality."""
     for quality in QUALITIES:
         buffer = io.BytesIO()
         picture.save(buffer, "JPEG", quality=quality, optimize=True, progressive=True)

@@ -1,7 +1,7 @@
-"""What make_pictures.py draws of a saved map: its overview, a 2D map, cuts with queries in them, a mesh.
+"""The pictures of a saved map for make_pictures.py: overview, 2D map, cuts with queries, mesh.
 
-Each function takes the folder that ``taichi-mrf map`` left, and returns the picture. A mesh is drawn from the
-file that the export wrote, and the 2D map too, so that the pictures show what other programs get.
+Each function takes the folder of a ``taichi-mrf map`` run and returns the picture. The mesh and the 2D map
+are drawn from exported files, so the pictures show what other programs read.
 """
 
 import io
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BAND_M = (-0.9, 0.3)
-"""Heights of the 2D map, as in docs/queries.md: from above the floor to a head's height."""
+"""Heights of the 2D map, as in docs/queries.md: from above the floor to the height of a head."""
 
 CUT_AT_M = -0.4
 CLEARANCE_M = 1.0
@@ -46,7 +46,7 @@ def overview(run: Path) -> Image.Image:
 
 
 def level_map(run: Path) -> Image.Image:
-    """The .pgm of the map in the places that its .yaml says, with the way of the camera."""
+    """The exported .pgm at the position in its .yaml file, with the path of the camera."""
     m = taichi_mrf.load_map(run / "map.npz")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "floor.pgm"
@@ -98,7 +98,7 @@ def cuts(run: Path) -> Image.Image:
 
 
 def mesh(run: Path) -> Image.Image:
-    """The mesh of ``--mesh`` from where the overview is drawn, without what would hide the inside."""
+    """The mesh of ``--mesh`` from the viewpoint of the overview, without triangles that hide the inside."""
     import trimesh
     from matplotlib.colors import ListedColormap
 
@@ -134,7 +134,7 @@ def mesh(run: Path) -> Image.Image:
 
 
 def _way(m: taichi_mrf.MRFMap) -> np.ndarray:
-    """Where the keyframes were taken, (K, 3)."""
+    """The positions of the keyframes' cameras, (K, 3) metres."""
     return np.array([each.T_world_camera[:3, 3] for each in m.keyframes.values()])
 
 

@@ -1,7 +1,7 @@
-"""What make_pictures.py does on the live page and on the tuning page before it photographs them.
+"""Operates the live page and the tuning page for the pictures of make_pictures.py.
 
-Each function brings the page into the state that it names, returns the picture, and leaves the page fit for
-the next one, whatever that is.
+Each function brings the page into the state of its name, takes a screenshot, and resets what it has changed,
+so that any picture can follow.
 """
 
 import io
@@ -16,26 +16,26 @@ TRIES = (
     ("Parameters", "Voxel size (m)", 0.04),
     ("Noise", "Sigma · 1 (m)", 0.004),
 )
-"""What is tried before the pictures of the tuning page are taken: tab, slider, value."""
+"""The changes before the pictures of the tuning page are taken: tab, slider, value."""
 
 HIGH = 1440
-"""Pixels: a window in which the whole panel has room, with three images."""
+"""Height in pixels of a window that fits the whole panel, with three images."""
 
 STEADY_S = 10.0
-"""A map that has not changed for so long is complete."""
+"""Seconds without a change after which a map counts as complete."""
 
 
 def shot(page: LivePage) -> Image.Image:
-    """What the page looks like, once it has drawn what it knows and nothing pops up over it."""
+    """A screenshot after the page has drawn everything and without notices."""
     for button in page.page.locator(".mantine-Notification-closeButton").all():
         button.click()
-    page.page.mouse.move(5, 5)  # off the widgets, whose hints would pop up
+    page.page.mouse.move(5, 5)  # away from the widgets, whose hints would show
     page.pause(1.5)
     return Image.open(io.BytesIO(page.page.screenshot())).convert("RGB")
 
 
 def live_cut(page: LivePage) -> Image.Image:
-    """The map opened by a level cut at the height of the furniture."""
+    """The map with a level cut at the height of the furniture."""
     page.tab("Map")
     page.select("Cut axis", "z")
     page.slide("Cut at", 0.3)
@@ -47,7 +47,7 @@ def live_cut(page: LivePage) -> Image.Image:
 
 
 def live_keyframes(page: LivePage) -> Image.Image:
-    """A keyframe with the gizmo that moves it, the map coloured by how many keyframes' rays went through."""
+    """A keyframe with the gizmo that moves it, the map coloured by the number of keyframes."""
     page.tab("Map")
     page.select("Color by", "keyframes")
     page.tab("Keyframes")
@@ -77,7 +77,7 @@ def live_images(page: LivePage) -> Image.Image:
 
 
 def live_beside(page: LivePage) -> Image.Image:
-    """The map that OctoMap's way makes of the same keyframes, next to this one."""
+    """The map of OctoMap's update from the same keyframes, next to this one."""
     page.tab("Map")
     page.select("Cut axis", "z")
     page.slide("Cut at", 0.6)
@@ -95,7 +95,7 @@ def live_beside(page: LivePage) -> Image.Image:
 
 
 def make_tries(page: LivePage) -> None:
-    """Some tries, one of them the reference: all pictures of the tuning page begin with them."""
+    """Make the tries of TRIES, with the first as the reference, for all pictures of the tuning page."""
     for number, (tab, label, value) in enumerate(TRIES, start=1):
         page.tab(tab)
         page.slide(label, value)
@@ -114,7 +114,7 @@ def tune_noise(page: LivePage) -> Image.Image:
 
 
 def tune_panels(page: LivePage) -> Image.Image:
-    """The table of tries beside a held-out view as the reference and the try that is shown have it."""
+    """The table of tries beside a held-out view of the reference and of the current try."""
     page.tab("Tries")
     tries = panel(page)
     page.tab("Views")
@@ -123,7 +123,7 @@ def tune_panels(page: LivePage) -> Image.Image:
 
 
 def panel(page: LivePage) -> Image.Image:
-    """The tab that is in front, whole, and nothing else of the page."""
+    """A screenshot of the whole open tab, without the rest of the page."""
     size = page.page.viewport_size
     assert size is not None
     page.page.set_viewport_size({"width": size["width"], "height": HIGH})
@@ -139,7 +139,7 @@ def panel(page: LivePage) -> Image.Image:
 
 
 def side_by_side(*pictures: Image.Image) -> Image.Image:
-    """Pictures in a row on white, their upper ends level."""
+    """Pictures in a row on white, aligned at the top."""
     size = sum(each.width for each in pictures), max(each.height for each in pictures)
     row = Image.new("RGB", size, "white")
     left = 0

@@ -1,9 +1,9 @@
-"""Map depth images of your own camera: its four intrinsics, its poses, and nothing else.
+"""Map depth images of your own camera from its four intrinsics and its poses.
 
     python examples/01_own_camera.py
 
-Replace the loop's three lines by your own depth images (metres along the optical axis, 0 or NaN where
-there is none) and poses (4 x 4, from the camera frame, x right, y down, z forward, to the world).
+Replace the lines of the loop by your own depth images (metres along the optical axis, 0 or NaN for no
+measurement) and poses (4 x 4, from the camera frame, x right, y down, z forward, to the world frame).
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ def main() -> None:
     camera = tm.PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
     m = tm.MRFMap(voxel_size=0.05)
 
-    # A camera that walks 60 cm towards a wall at z = 3 m with a box in front of it.
+    # The camera moves 60 cm towards a wall at z = 3 m with a box in front of it.
     for step in range(4):
         T_world_camera = np.eye(4)
         T_world_camera[2, 3] = 0.2 * step

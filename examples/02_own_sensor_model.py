@@ -1,10 +1,10 @@
-"""Give a sensor's own noise and bias to the map, and see what that is worth.
+"""Describe your sensor's noise and bias to the map, and compare the result with the defaults.
 
     python examples/02_own_sensor_model.py
 
-The sensor here measures 3 cm too far at 2 m (its bias grows with depth) and with a sigma of 1.5 cm. A map
-that knows this puts the wall where it is; one that believes the measurements does not. `taichi-mrf calibrate`
-learns such polynomials, also for each patch of pixels, from your own recordings (docs/calibration.md).
+The sensor here measures 3 cm too far at 2 m (its bias grows with depth), with a sigma of 1.5 cm. The wall is
+at its true place only in the map whose noise model includes the bias. `taichi-mrf calibrate` learns such
+polynomials, also for each patch of pixels, from your own recordings (docs/calibration.md).
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ import taichi_mrf as tm
 WALL_M = 2.02
 SIGMA = (0.015,)
 BIAS = (0.0, 0.015)
-"""Coefficients in ascending powers of depth, metres: here 0.015 times the depth."""
+"""Coefficients in ascending powers of depth, in metres: here 0.015 times the depth."""
 
 
 def main() -> None:

@@ -1,10 +1,10 @@
-"""Move keyframes after the fact, as a SLAM back-end does when it closes a loop.
+"""Move keyframes afterwards, as a SLAM back-end does when it closes a loop.
 
     python examples/04_loop_closure.py
 
-Odometry drifts: the poses of the second half of a walk around the built-in room are off by up to 30 cm. When
-the loop is closed, the poses are corrected. The map of the moved keyframes is the one that the right poses
-would have given from the start, voxel by voxel.
+Odometry drifts: in the second half of a walk around the built-in room, poses are wrong by up to 30 cm. When
+the loop is closed, the poses are corrected. The map of the moved keyframes is equal, voxel by voxel, to the
+map of keyframes that had the right poses from the start.
 """
 
 import numpy as np
@@ -33,7 +33,7 @@ def main() -> None:
 
 
 def compare(m: tm.MRFMap, other: tm.MRFMap) -> str:
-    """How many occupied voxels two maps share, and by how much their probabilities differ."""
+    """The share of occupied voxels that maps have in common, and the largest difference of probability."""
     centres, probability = other.voxels(min_probability=0.5)
     found = m.occupancy(centres)
     shared, largest = (found > 0.5).mean(), np.abs(found - probability).max()

@@ -1,10 +1,10 @@
-"""Explore: always look next from where a view would tell the most.
+"""Exploration: take the view with the largest information gain next.
 
     python examples/05_next_best_view.py
 
-The gain of a view is the entropy that its rays would see, in bits: uncertain voxels count as far as they are
-visible. Out of 24 views of the built-in room the best is taken each time; the share of the surface that
-the map has found grows faster than with views taken in their order.
+The gain of a view is the entropy of the voxels that its rays cross, in bits, weighted by their visibility.
+The best of 24 views of the built-in room is taken each time. The share of the surface that the map contains
+grows faster than with the views in their recorded order.
 """
 
 import numpy as np
@@ -30,7 +30,7 @@ def main() -> None:
 
 
 def explore(frames: list[Frame], surface: np.ndarray, choose: bool) -> float:
-    """Map VIEWS frames, each chosen by its gain or the next in order; the share of the surface found."""
+    """Map VIEWS frames, each chosen by gain or in order, and return the share of the surface found."""
     m = tm.MRFMap(voxel_size=0.1)
     left = list(range(len(frames)))
     small = tm.PinholeCamera(width=20, height=15, fx=17.5, fy=17.5, cx=9.5, cy=7.0)

@@ -1,8 +1,8 @@
-"""Three mapping methods on the same keyframes, judged on views that none of them has seen.
+"""Three mapping methods on the same keyframes, evaluated on held-out views.
 
     python examples/06_comparing_methods.py
 
-All have the same verbs, so they can be exchanged for each other in any program.
+All maps have the same methods, so any of them can replace another in a program.
 """
 
 import numpy as np

@@ -119,3 +119,24 @@ def test_pictures_are_small(repository: Path) -> None:
     assert sizes
     assert max(sizes.values()) < 200_000
     assert sum(sizes.values()) < 1_000_000
+
+
+FILE = re.compile(r"`((?:[\w.-]+/)*[\w-]+\.(?:py|cpp|toml))`")
+PAGES = [
+    *sorted((REPOSITORY / "docs").glob("*.md")),
+    *REPOSITORY.glob("*.md"),
+    REPOSITORY / "data" / "README.md",
+]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_the_files_that_a_page_names_exist(page: Path) -> None:
+    """Names with a folder are relative to the repository or to the package."""
+    named = set(FILE.findall(page.read_text(encoding="utf-8")))
+    bare = {path.name for path in (REPOSITORY / "taichi_mrf").rglob("*.py")}
+    missing = [
+        name
+        for name in named
+        if not ((REPOSITORY / name).exists() or (REPOSITORY / "taichi_mrf" / name).exists() or name in bare)
+    ]
+    assert not missing

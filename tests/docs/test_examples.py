@@ -46,8 +46,8 @@ def test_own_sensor_model(tmp_path: Path) -> None:
 
 def test_planner_query(tmp_path: Path) -> None:
     out = printed(EXAMPLES[2], tmp_path)
-    assert "the straight way of 2.34 m is clear" in out
-    assert 0.3 < float(re.findall(r"has ([0-9.]+) m to spare", out)[0]) < 1.0
+    assert "the straight path of 2.34 m is clear" in out
+    assert 0.3 < float(re.findall(r"clearance is ([0-9.]+) m", out)[0]) < 1.0
     met, unknown = map(int, re.findall(r"([0-9]+) of 360 rays meet a surface, ([0-9]+) end", out)[0])
     assert met > 180
     assert met + unknown == 360
