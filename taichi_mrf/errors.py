@@ -2,7 +2,7 @@
 
 
 class TaichiMRFError(Exception):
-    """Base of everything that this package raises on purpose; its text is one clear line for a person."""
+    """Base of all exceptions of this package. The text is one line that a user can read."""
 
 
 class ConfigError(TaichiMRFError):
@@ -18,11 +18,12 @@ class ArgumentTypeError(ConfigError, TypeError):
 
 
 class BackendError(TaichiMRFError):
-    """The wanted Taichi backend is not to be had, or Taichi already runs on another one."""
+    """The requested Taichi backend is not available, or Taichi already runs on another one or in another
+    thread."""
 
 
 class CapacityError(TaichiMRFError):
-    """The map would need more memory or more space than there is; the text says how much."""
+    """Not enough memory, or a map beyond its spatial limit; the text says how much is needed."""
 
 
 class DatasetError(TaichiMRFError):
@@ -32,16 +33,16 @@ class DatasetError(TaichiMRFError):
 class FrameError(DatasetError):
     """One frame of a recording is broken; the text names the frame and the file.
 
-    With ``--skip-bad-frames`` these are counted in the report instead of ending the run.
+    With ``--skip-bad-frames`` such frames are counted in the report and do not end the run.
     """
 
 
 class LostFrameError(FrameError):
-    """Where a frame was taken could not be found out; the text names the frame and says why."""
+    """Tracking found no pose for a frame; the text names the frame and the reason."""
 
 
 class KeyframeError(TaichiMRFError):
-    """A keyframe does not exist, is frozen, or was given data of the wrong shape."""
+    """A keyframe does not exist or is frozen, or its depth image or pose is not valid."""
 
 
 class MapFileError(TaichiMRFError):
@@ -49,13 +50,13 @@ class MapFileError(TaichiMRFError):
 
 
 class ViewerError(TaichiMRFError):
-    """The page cannot be served, or viser is not the version that it is guarded against."""
+    """The page cannot be served, or the installed viser is not the version that the guard supports."""
 
 
 class ClusterError(TaichiMRFError):
-    """The scheduler does not answer, or tasks were lost because every process that took them died.
+    """The scheduler does not answer, or tasks were lost because every process that ran them died.
 
-    ``lost`` says, by the task's index, what became of each such task; the others are done.
+    ``lost`` says for each lost task, by its index, what happened to it; the others are done.
     """
 
     def __init__(self, text: str, lost: dict[int, str] | None = None) -> None:
@@ -64,7 +65,7 @@ class ClusterError(TaichiMRFError):
 
 
 def said(error: BaseException) -> str:
-    """What an exception of another package says, in one line that is not too long to be read."""
+    """The text of an exception of another package, on one line and not too long."""
     return " ".join(str(error).split())[:_LONGEST] or type(error).__name__
 
 

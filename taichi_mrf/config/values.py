@@ -1,7 +1,7 @@
-"""Plain values, as YAML or a caller gives them, made into typed dataclasses.
+"""Typed dataclasses from plain values, which come from YAML or from a caller.
 
-A dataclass is the only definition of its parameters: what they are called, what type they have. Whatever
-does not fit is a ConfigError that says where it stands and, for a name, which one is nearest.
+A dataclass is the only definition of its parameters' names and types. A value that does not fit raises a
+ConfigError, which names the place and, for an unknown name, the nearest known one.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ def unknown_key(key: object, known: typing.Iterable[str], where: str) -> ConfigE
 
 
 def nearest(name: str, known: Sequence[str]) -> str:
-    """A hint for an unknown name: the known one that it is most like, or all of them."""
+    """A hint for an unknown name: the most similar known one, or all of them."""
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     return f"did you mean '{near[0]}'?" if near else f"known are: {', '.join(known)}"
 
@@ -49,8 +49,7 @@ def overridden(config: T, overrides: dict[str, Any], where: str) -> T:
 
 
 def shown(value: Any) -> str:
-    """A value as an error shows it, which is not all of it if it is large: YAML writes in a line what would
-    fill a book."""
+    """A value as an error shows it: shortened if it is long."""
     return _SHORT.repr(value)
 
 
@@ -88,7 +87,8 @@ def from_dict(cls: type[T], values: Any, where: str) -> T:
 
 
 def _convert(value: Any, hint: Any, where: str) -> Any:
-    """Check one YAML value against a field's type; whole numbers are accepted where numbers are."""
+    """Convert one value to a field's type. Whole numbers are accepted for float, numbers of NumPy for
+    both."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if dataclasses.is_dataclass(hint):
         return from_dict(typing.cast(type, hint), value, where)
@@ -114,7 +114,7 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
     if hint in (int, float) and isinstance(value, numbers.Real) and not isinstance(value, bool):
         value = int(value) if isinstance(value, numbers.Integral) else float(value)  # from NumPy's types
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) > _LARGEST_INTEGER:
-        raise ConfigError(f"{where} must be a number of a sensible size, not {shown(value)}")
+        raise ConfigError(f"{where} is too large a number: {shown(value)}")
     accepted = (int, float) if hint is float else hint
     if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
         raise ConfigError(f"{where} must be of type {hint.__name__}, not {shown(value)}")
@@ -122,6 +122,6 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
 
 
 def check_field(ok: bool, name: str, problem: str) -> None:
-    """Raise ConfigError, which names the field, unless its value is possible."""
+    """Raise ConfigError, which names the field, unless ``ok``."""
     if not ok:
         raise ConfigError(f"{name} {problem}")
