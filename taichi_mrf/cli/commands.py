@@ -60,7 +60,7 @@ class Command:
 
 
 _COMMON = ("out", "voxel-size", "method", "config", "every", "limit")
-_MAP_FLAGS = (*_COMMON, "resume", "jobs", "pictures", "track-poses")
+_MAP_FLAGS = (*_COMMON, "resume", "overwrite", "jobs", "track-poses")
 _LIVE_FLAGS = (*_COMMON, "speed", "track-poses", "port", "open")
 _TUNE_FLAGS = ("out", "voxel-size", "config", "frames", "first", "stride", "auto", "search", "port", "open")
 _BENCH_FLAGS = (

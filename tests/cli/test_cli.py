@@ -1,6 +1,7 @@
 """The console program as a person runs it: a process, its exit status, its files and its words."""
 
 import importlib
+import json
 import os
 import pty
 import re
@@ -176,11 +177,31 @@ def test_flags_come_before_the_file_and_the_file_before_the_defaults(tmp_path: P
     assert config.inference.message_clamp == 6.9
 
 
-def test_a_second_run_takes_the_place_of_the_first(tmp_path: Path) -> None:
-    for limit in ("2", "3"):
-        mapped(ROOM, "--out", tmp_path, "--limit", limit, *FAST)
-        assert report_of(tmp_path)["keyframes"] == int(limit)
+def test_a_run_of_other_parameters_is_replaced_only_if_asked(tmp_path: Path) -> None:
+    mapped(ROOM, "--out", tmp_path, "--limit", "2", *FAST)
+    before = (tmp_path / "report.json").read_bytes()
+    other = ("map", ROOM, "--out", tmp_path, "--limit", "3", *FAST, "--voxel-size", "0.2")
+    assert_refused(taichi_mrf(*other), "another limit, voxel_size", "--overwrite")
+    batch = taichi_mrf("map", "synthetic:room?frames=3", *other[1:])
+    assert_refused(batch, "config.yaml: made with another voxel_size", "--overwrite")
+    assert (tmp_path / "report.json").read_bytes() == before
+    assert f"{tmp_path} holds this run already" in mapped(ROOM, "--out", tmp_path, "--limit", "2", *FAST)
+    assert (tmp_path / "report.json").read_bytes() == before
+    mapped(*other[1:], "--overwrite")
+    assert report_of(tmp_path)["keyframes"] == 3
     assert {path.name for path in tmp_path.iterdir()} == FILES
+
+
+def test_an_unfinished_run_is_resumed_or_replaced(tmp_path: Path) -> None:
+    mapped(ROOM, "--out", tmp_path, "--limit", "2", *FAST)
+    report = report_of(tmp_path) | {"interrupted": True}
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    again = ("map", ROOM, "--out", tmp_path, "--limit", "2", *FAST)
+    assert_refused(taichi_mrf(*again), "unfinished run", "--resume continues it", "--overwrite starts anew")
+    (tmp_path / "report.json").unlink()
+    assert_refused(taichi_mrf(*again), "holds files of another run", "--overwrite")
+    mapped(*again[1:], "--overwrite")
+    assert report_of(tmp_path)["interrupted"] is False
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,8 @@ def refuse_changes(path: Path, names: list[str]) -> None:
     changed = [name for name in names if not name.startswith(MAY_CHANGE)]
     if changed:
         raise ConfigError(
-            f"{path}: made with another {', '.join(changed)}; --resume goes on with the same parameters"
+            f"{path}: made with another {', '.join(changed)}; --resume needs the same parameters, and "
+            "--overwrite replaces the run"
         )
 
 

@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import taichi_mrf
+from taichi_mrf.cli.map.earlier import refuse_other_run
 from taichi_mrf.cli.map.keep import refuse_changes
 from taichi_mrf.cli.map.process import Outcome, finished_before, map_in_process
-from taichi_mrf.cli.map.run import MapTask, exit_status, map_task, print_run
+from taichi_mrf.cli.map.run import exit_status, print_run
 from taichi_mrf.cli.map.source_names import folder_names
 from taichi_mrf.cli.map.summary import (
     Row,
@@ -19,6 +20,7 @@ from taichi_mrf.cli.map.summary import (
     summary_line,
     summary_row,
 )
+from taichi_mrf.cli.map.task import MapTask, map_task
 from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.shared.interrupt import StopRequest, interrupt_on_signals
 from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
@@ -66,7 +68,7 @@ def run_many(options: Map) -> int:
     tasks = [map_task(options, *each) for each in zip(options.sources, folders, strict=True)]
     batch = _Batch(options, names, tasks)
     with (
-        output_folder(options.out),
+        output_folder(options.out, locked=not single),  # the one task locks it itself
         interrupt_on_signals(lambda text: console.say(text, "yellow")) as request,
     ):
         _map_all(batch, console, request)
@@ -121,17 +123,18 @@ def _map_all(batch: _Batch, console: Terminal, request: StopRequest) -> None:
 
 
 def _waiting(batch: _Batch, done: Callable[[int, Outcome], None]) -> list[int]:
-    """Who has to be mapped: all, or on resume those that are not finished. Whoever does not resume wants new
-    results, and an old report must not pass for a finished run."""
+    """The tasks that are not finished: with --overwrite all, for which an old report must not pass for a
+    finished run. Raises ConfigError for folders that hold other runs."""
     if len(batch.tasks) > 1:
         path, settings = batch.options.out / CONFIG_FILE, batch.tasks[0].settings
-        if batch.options.resume and path.is_file():
+        if path.is_file() and not batch.options.overwrite:
             refuse_changes(path, differences(load(path), settings))
         write_text(path, commented_yaml(settings))
     waiting = []
     for number, task in enumerate(batch.tasks):
-        if not batch.options.resume:
+        if batch.options.overwrite:
             (task.out / REPORT_FILE).unlink(missing_ok=True)
+        refuse_other_run(task)
         outcome = finished_before(task)
         if outcome is None:
             waiting.append(number)

@@ -4,21 +4,20 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from taichi_mrf.cli.map.earlier import refuse_other_run
 from taichi_mrf.cli.map.keep import Keeper, resumed_map, skipped_before
 from taichi_mrf.cli.map.report import print_report
+from taichi_mrf.cli.map.task import MapTask, map_task
 from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.terminal import Terminal, tell_problem
-from taichi_mrf.config.schema import Config, with_absolute_tables
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
-from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.pipeline import (
     Event,
@@ -37,59 +36,18 @@ OPEN_VOXELS = "voxels.ply in MeshLab, CloudCompare or Blender."
 LIVE_VIEW = "shows the map in the browser."
 
 
-@dataclass(frozen=True)
-class MapTask:
-    """One sequence to map into a folder; all that decides what the files will hold.
-
-    Paths are relative to ``start``, the working directory of the command; those in ``settings`` are
-    absolute.
-    """
-
-    source: str
-    out: Path
-    start: Path
-    settings: Config
-    reading: SourceFlags
-    every: int = 1
-    limit: int | None = None
-    skip_bad_frames: bool = False
-    resume: bool = False
-    pictures: bool = True
-    track_poses: bool = False
-    keep_every: float = Map.keep_every
-
-    def __str__(self) -> str:
-        return self.source
-
-    def choice(self) -> dict[str, Any]:
-        """What was asked for besides the parameters; the report says it too."""
-        return {"every": self.every, "limit": self.limit, "track_poses": self.track_poses}
-
-
-def map_task(options: Map, source: str, out: Path) -> MapTask:
-    """The part of a command that concerns one of its sources."""
-    start = Path.cwd()
-    return MapTask(
-        source,
-        out,
-        start,
-        with_absolute_tables(options.poses.parameters(options.settings), start),
-        options.reading,
-        options.every,
-        options.limit,
-        options.skip_bad_frames,
-        options.resume,
-        options.pictures,
-        options.poses.track_poses,
-        options.keep_every,
-    )
-
-
 def run_map(options: Map) -> int:
     """Carry out the command for one source; returns the exit status. Raises TaichiMRFError."""
     console = open_terminal(options.printing, stderr=options.json)
     task = map_task(options, options.sources[0], options.out)
-    with stop_on_signals(lambda text: console.say(text, "yellow")) as request:
+    with (
+        output_folder(task.out),
+        stop_on_signals(lambda text: console.say(text, "yellow")) as request,
+    ):
+        finished = refuse_other_run(task)
+        if finished is not None:
+            _tell_finished(console, options, finished)
+            return 0
         with ProgressBar(console, options.printing) as progress:
             report, written = map_to_folder(task, progress, request)
         print_run(console, options, report, written)
@@ -97,6 +55,12 @@ def run_map(options: Map) -> int:
         kept = f"the map of {report['keyframes']} keyframes is kept; --resume with more memory goes on"
         tell_problem(f"{report['did_not_fit']}; {kept}")
     return exit_status(request, report["did_not_fit"])
+
+
+def _tell_finished(console: Terminal, options: Map, report: dict[str, Any]) -> None:
+    if options.json:
+        print(report_json(report), end="")
+    console.say(f"{options.out} holds this run already, finished; --overwrite maps it again.")
 
 
 def print_run(console: Terminal, options: Map, report: dict[str, Any], written: list[Path]) -> None:
@@ -113,39 +77,38 @@ def print_run(console: Terminal, options: Map, report: dict[str, Any], written: 
 def map_to_folder(
     task: MapTask, progress: ProgressBar, request: StopRequest
 ) -> tuple[dict[str, Any], list[Path]]:
-    """Map one sequence and write its files, the report last; returns the report and the files.
+    """Map one sequence and write its files into its folder, which exists; returns the report and the files.
 
     A run that the ``request`` stopped says so in its report; one that has to end within seconds is neither
     checked nor drawn. Raises TaichiMRFError.
     """
-    with output_folder(task.out):
-        start = time.perf_counter()
-        settings = task.settings
-        runtime.init(settings.runtime.arch, settings.runtime.threads, settings.runtime.debug)
-        previous = resumed_map(task.out, settings) if task.resume else None
-        skipped = skipped_before(task.out) if task.resume else {}
-        dataset = open_dataset(task.source, color=False, track=task.track_poses, **task.reading.keywords())
-        settings = with_recorded_noise(settings, dataset)
-        opening = time.perf_counter() - start
+    start = time.perf_counter()
+    settings = task.settings
+    runtime.init(settings.runtime.arch, settings.runtime.threads, settings.runtime.debug)
+    previous = resumed_map(task.out, settings) if task.resume else None
+    skipped = skipped_before(task.out) if task.resume else {}
+    dataset = open_dataset(task.source, color=False, track=task.track_poses, **task.reading.keywords())
+    settings = with_recorded_noise(settings, dataset)
+    opening = time.perf_counter() - start
 
-        with _collected_warnings() as warned:
-            facts = RunFacts(task.source, settings, dataset, task.choice(), skipped, warned)
-            result = map_sequence(
-                dataset,
-                settings,
-                listener_of(progress),
-                every=task.every,
-                limit=task.limit,
-                skip_bad_frames=task.skip_bad_frames,
-                should_stop=request,
-                out_of_time=request.out_of_time,
-                resume_from=previous,
-                keep=Keeper(task.out, settings, task.keep_every, facts.unfinished),
-            )
-            result.seconds = {"opening": opening, **result.seconds}
-            return write_run(
-                task.out, result, facts, pictures=task.pictures, haste=request, advance=progress.advance
-            )
+    with _collected_warnings() as warned:
+        facts = RunFacts(task.source, settings, dataset, task.choice(), skipped, warned)
+        result = map_sequence(
+            dataset,
+            settings,
+            listener_of(progress),
+            every=task.every,
+            limit=task.limit,
+            skip_bad_frames=task.skip_bad_frames,
+            should_stop=request,
+            out_of_time=request.out_of_time,
+            resume_from=previous,
+            keep=Keeper(task.out, settings, task.keep_every, facts.unfinished),
+        )
+        result.seconds = {"opening": opening, **result.seconds}
+        return write_run(
+            task.out, result, facts, pictures=task.pictures, haste=request, advance=progress.advance
+        )
 
 
 def listener_of(progress: ProgressBar) -> Listener:

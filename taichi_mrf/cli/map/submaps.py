@@ -46,6 +46,7 @@ def run_submaps(options: Map, submap_size: float) -> int:
         interrupt_on_signals(lambda text: console.say(text, "yellow")) as request,
     ):
         if not options.resume:  # which takes its parameters from here
+            _refuse_to_replace(options)
             (options.out / REPORT_FILE).unlink(missing_ok=True)
             write_text(options.out / CONFIG_FILE, commented_yaml(settings))
         try:
@@ -72,6 +73,15 @@ def run_submaps(options: Map, submap_size: float) -> int:
             return exit_status(request)
         _tell(console, options, result, _write(options, result))
     return exit_status(request)
+
+
+def _refuse_to_replace(options: Map) -> None:
+    """Raise ConfigError if the folder holds a run, and nobody has said that it may be replaced."""
+    held = [name for name in (CONFIG_FILE, REPORT_FILE, MAP_FOLDER) if (options.out / name).exists()]
+    if held and not options.overwrite:
+        raise ConfigError(
+            f"{options.out}: holds an earlier run ({held[0]}): --resume continues it, --overwrite replaces it"
+        )
 
 
 def _write(options: Map, result: SubmapsResult) -> list[Path]:

@@ -48,6 +48,9 @@ class Map:
     """Go on with the map in DIR, with its parameters, after the last frame that is in it. Of several
     sources, those that are finished are left alone."""
 
+    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Replace the run that DIR holds. Without it, a run of other parameters is refused."""
+
     keep_every: Annotated[float, tyro.conf.arg(metavar="SECONDS")] = 30.0
     """Save the keyframes so far at most so often, for --resume to go on with after a crash; at least so
     seldom that it takes no more than a twentieth of the time."""
@@ -93,5 +96,7 @@ class Map:
                 raise ConfigError(f"--{name} must be at least 1, not {value}")
         if self.sources is not tyro.MISSING and not self.sources:
             raise ConfigError("map needs a SOURCE")
+        if self.resume and self.overwrite:
+            raise ConfigError("--resume and --overwrite do not go together")
         if not self.keep_every >= 0:
             raise ConfigError(f"--keep-every must be a number of seconds, not {self.keep_every}")

@@ -1,8 +1,17 @@
-"""The folder that a run writes to: writable before the work starts, gone again if it stays empty."""
+"""The folder that a run writes to: writable before the work starts, used by one run at a time, removed if it
+stays empty."""
 
+import os
+import socket
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.system.atomic import atomic_path, remove_leftovers
@@ -11,13 +20,18 @@ from taichi_mrf.system.files import exists, is_folder
 DID_NOT_FIT = 3
 """Exit status of a run for which memory was not enough: what did fit is mapped and kept."""
 
+LOCK_FILE = ".lock"
+
+_RETRY_S = 0.2
+
 
 @contextmanager
-def output_folder(folder: Path) -> Iterator[None]:
-    """Make a folder and try to write to it, remove what a killed run has left half written; on leaving,
-    remove what was made here if it is still empty.
+def output_folder(folder: Path, locked: bool = True, patience_s: float = 0.0) -> Iterator[None]:
+    """Make a folder and try to write to it, lock it against other runs, remove what a killed run has left
+    half written; on leaving, remove what was made here if it is still empty.
 
-    Raises MapFileError, which names the folder, if it cannot be made or written to.
+    Waits ``patience_s`` for another run that holds it. Raises MapFileError, which names the folder, if it
+    cannot be made or written to, and the other process if one uses it.
     """
     made = _missing_folders(folder)
     try:
@@ -26,12 +40,53 @@ def output_folder(folder: Path) -> Iterator[None]:
         except OSError as error:
             raise MapFileError(f"{folder}: cannot be made: {error.strerror or error}") from error
         _try_writing(folder)
-        remove_leftovers(folder)
-        yield
+        with _lock(folder, patience_s if locked else None):
+            remove_leftovers(folder)
+            yield
     finally:
         for each in made:
             if is_folder(each) and not any(each.iterdir()):
                 each.rmdir()
+
+
+@contextmanager
+def _lock(folder: Path, patience_s: float | None) -> Iterator[None]:
+    """Hold the folder's lock file while the block runs; with a patience of None, or on Windows, nothing.
+
+    The system gives the lock up with the process, however that ends: a lock file that is left is no lock.
+    """
+    if patience_s is None or fcntl is None:
+        yield
+        return
+    path = folder / LOCK_FILE
+    until = time.monotonic() + patience_s
+    descriptor = _locked(path)
+    while descriptor is None:
+        if time.monotonic() >= until:
+            holder = path.read_text(encoding="utf-8", errors="replace").strip() if path.exists() else ""
+            raise MapFileError(f"{folder}: another run uses this folder ({holder or 'unknown process'})")
+        time.sleep(_RETRY_S)
+        descriptor = _locked(path)
+    try:
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}\n".encode(), 0)
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        os.close(descriptor)
+
+
+def _locked(path: Path) -> int | None:
+    """The descriptor of the lock file if nobody else holds its lock."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if path.exists() and os.path.samestat(os.fstat(descriptor), path.stat()):
+            return descriptor
+    except OSError:
+        pass
+    os.close(descriptor)
+    return None
 
 
 def _missing_folders(folder: Path) -> list[Path]:

@@ -1,0 +1,75 @@
+"""The run that a folder holds already: whether it is the same, finished, and may be replaced."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from taichi_mrf.cli.map.task import MapTask
+from taichi_mrf.config.schema import load
+from taichi_mrf.config.text import differences
+from taichi_mrf.errors import ConfigError, MapFileError
+from taichi_mrf.runs.folder import CONFIG_FILE, MAP_FILE, REPORT_FILE, VOXEL_FILE
+
+_FILES = (MAP_FILE, VOXEL_FILE, CONFIG_FILE)
+
+
+def refuse_other_run(task: MapTask) -> dict[str, Any] | None:
+    """What stands in the way of a task in its folder, unless it is to resume or overwrite that.
+
+    Returns the report if the folder holds the finished run of this very task, None if it holds no run. Raises
+    ConfigError, which says what to do, for any other run.
+    """
+    if (
+        task.resume
+        or task.overwrite
+        or not any((task.out / name).exists() for name in (*_FILES, REPORT_FILE))
+    ):
+        return None
+    report = report_in(task.out)
+    if report is None or not (task.out / CONFIG_FILE).is_file():
+        raise ConfigError(f"{task.out}: holds files of another run: choose another --out, or add --overwrite")
+    changed = [name for name in _changes(task, report) if not name.startswith("runtime.")]
+    if changed:
+        raise ConfigError(
+            f"{task.out}: holds a run with another {', '.join(changed)}: choose another --out, or add "
+            "--overwrite to replace it"
+        )
+    finished = finished_report(task)
+    if finished is None:
+        raise ConfigError(
+            f"{task.out}: holds an unfinished run of the same parameters: --resume continues it, --overwrite "
+            "starts anew"
+        )
+    return finished
+
+
+def _changes(task: MapTask, report: dict[str, Any]) -> list[str]:
+    """The names of what differs between the task and the run in its folder."""
+    asked = {"source": task.source, **task.choice()}
+    changed = [name for name, value in asked.items() if report.get(name) != value]
+    return changed + differences(load(task.out / CONFIG_FILE), task.settings)
+
+
+def finished_report(task: MapTask) -> dict[str, Any] | None:
+    """The report in the task's folder, if its run was complete and the same."""
+    report = report_in(task.out)
+    if report is None or not all((task.out / name).is_file() for name in _FILES):
+        return None
+    if report.get("source") != task.source:
+        raise MapFileError(f"{task.out}: holds the map of {report.get('source')}")
+    changed = differences(load(task.out / CONFIG_FILE), task.settings)
+    same = task.choice().items() <= report.items() and all(name.startswith("runtime.") for name in changed)
+    return report if same and not report.get("interrupted") else None
+
+
+def report_in(folder: Path) -> dict[str, Any] | None:
+    path = folder / REPORT_FILE
+    try:
+        report = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise MapFileError(f"{path}: cannot be read: {error}") from error
+    if not isinstance(report, dict):
+        raise MapFileError(f"{path}: holds no report")
+    return report

@@ -1,0 +1,59 @@
+"""One sequence to map into one folder: what `taichi-mrf map` does once or for several sources."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from taichi_mrf.cli.options.map import Map
+from taichi_mrf.config.schema import Config, with_absolute_tables
+from taichi_mrf.datasets.source_flags import SourceFlags
+
+
+@dataclass(frozen=True)
+class MapTask:
+    """One sequence to map into a folder; all that decides what the files will hold.
+
+    Paths are relative to ``start``, the working directory of the command; those in ``settings`` are
+    absolute.
+    """
+
+    source: str
+    out: Path
+    start: Path
+    settings: Config
+    reading: SourceFlags
+    every: int = 1
+    limit: int | None = None
+    skip_bad_frames: bool = False
+    resume: bool = False
+    pictures: bool = True
+    track_poses: bool = False
+    keep_every: float = Map.keep_every
+    overwrite: bool = False
+
+    def __str__(self) -> str:
+        return self.source
+
+    def choice(self) -> dict[str, Any]:
+        """What was asked for besides the parameters; the report says it too."""
+        return {"every": self.every, "limit": self.limit, "track_poses": self.track_poses}
+
+
+def map_task(options: Map, source: str, out: Path) -> MapTask:
+    """The part of a command that concerns one of its sources."""
+    start = Path.cwd()
+    return MapTask(
+        source,
+        out,
+        start,
+        with_absolute_tables(options.poses.parameters(options.settings), start),
+        options.reading,
+        options.every,
+        options.limit,
+        options.skip_bad_frames,
+        options.resume,
+        options.pictures,
+        options.poses.track_poses,
+        options.keep_every,
+        options.overwrite,
+    )
