@@ -8,6 +8,7 @@ from typing import Any
 
 from rich.table import Table
 
+from taichi_mrf.cli.info_map import is_map, map_facts, print_map
 from taichi_mrf.cli.options.info import Info
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.config.schema import Arch
@@ -27,7 +28,13 @@ CANNOT_BE_MAPPED = 2
 def run_info(options: Info) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
     console = Terminal()
-    if options.json:
+    if options.source is not None and is_map(options.source):
+        facts = map_facts(options.source)
+        if options.json:
+            print(json.dumps(facts, indent=2))
+        else:
+            print_map(console, facts)
+    elif options.json:
         facts = _backend_facts(options.arch) if options.source is None else _source_facts(options)
         print(json.dumps(facts, indent=2))
         return 0 if facts.get("usable", True) else CANNOT_BE_MAPPED

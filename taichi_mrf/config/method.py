@@ -52,6 +52,9 @@ class Method:
     prior_is_unknown: bool = False
     """A voxel is unknown exactly if it still holds the prior. Otherwise ``volume.min_evidence`` decides."""
 
+    if_empty: str = ""
+    """What to try when a map of this method has no occupied voxel, as the end of a sentence."""
+
     @property
     def class_name(self) -> str:
         """The name of the map's class, without its module."""

@@ -10,6 +10,9 @@ from taichi_mrf.config.schema import to_yaml
 from taichi_mrf.experiments.scenes import Scene
 from taichi_mrf.methods.protocol import OccupancyMap
 
+VISIBILITY_TABLE_I: dict[str, float] = {"visible_if_occluded": 0.2}
+"""Where Table I of Schauwecker & Zell differs from the defaults of VisibilityMap."""
+
 BOTH: dict[str, dict[str, float]] = {"all leaves": {"empty_below": -1e30}, "occupied leaves": {}}
 """Readings of a recursive map: as the metric has it, every known voxel dims a ray; and as such maps are used,
 those that are more likely free than occupied let it through."""
@@ -60,7 +63,9 @@ def visibility(name: str = "visibility map") -> Contender:
     """Schauwecker & Zell with their Table I and the scene's own sigma in place of lambda z^2."""
 
     def make(scene: Scene, voxel_size: float) -> OccupancyMap:
-        return VisibilityMap(voxel_size, scene.noise, volume=scene.volume, max_depth=scene.max_depth)
+        return VisibilityMap(
+            voxel_size, scene.noise, volume=scene.volume, max_depth=scene.max_depth, **VISIBILITY_TABLE_I
+        )
 
     return Contender(name, make, BOTH)
 

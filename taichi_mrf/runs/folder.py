@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets import Dataset
@@ -98,13 +99,15 @@ def write_run(
 
     Returns the report and the paths. Raises MapFileError.
     """
-    written = _write_map(folder, result, facts.config, advance)
+    written, occupied = _write_map(folder, result, facts.config, advance)
     posed = facts.dataset
     if posed is not None and result.track is not None:
         posed = reposed(posed, result.track.poses(result.map))
     found = _check(result, posed, haste, advance) if check and posed is not None else None
     # Computed before the pictures, which may be left half-way through the launch of a kernel.
     report = facts.report(result, found)
+    if not occupied:
+        report["notes"].append(_nothing_occupied(facts.config))
     if pictures:
         written += _write_pictures(folder, result, posed, haste, advance)
     report |= {"seconds": rounded(result.seconds), "peak_memory_mb": peak_memory_mb()}
@@ -118,25 +121,34 @@ def write_report(folder: Path, result: MappingResult, facts: RunFacts) -> None:
     write_text(folder / REPORT_FILE, report_json(facts.report(result, None)))
 
 
-def write_voxel_file(path: Path, m: OccupancyMap) -> None:
-    """Write the voxels that are more likely occupied than free. Raises MapFileError."""
+def write_voxel_file(path: Path, m: OccupancyMap) -> int:
+    """Write the voxels that are more likely occupied than free; returns their number. Raises MapFileError."""
     centres, probability = m.voxels(min_probability=0.5)
     write_voxels(path, centres, probability, m.voxel_size)
+    return len(centres)
 
 
-def _write_map(folder: Path, result: MappingResult, config: Config, advance: Advance) -> list[Path]:
+def _nothing_occupied(config: Config) -> str:
+    advice = METHODS[config.method].if_empty or "check the depth scale, the voxel size and the sensor's range"
+    return f"The map is empty: no voxel has a probability of 0.5 or more; {advice}."
+
+
+def _write_map(
+    folder: Path, result: MappingResult, config: Config, advance: Advance
+) -> tuple[list[Path], int]:
+    """Returns the paths and the number of occupied voxels."""
     advance("Writing", 0, 2)
     with result.timed("writing"):
         result.map.save(folder / MAP_FILE)
         write_text(folder / CONFIG_FILE, commented_yaml(config))
         advance("Writing", 1, 2)
-        write_voxel_file(folder / VOXEL_FILE, result.map)
+        occupied = write_voxel_file(folder / VOXEL_FILE, result.map)
         advance("Writing", 2, 2)
         written = [folder / MAP_FILE, folder / VOXEL_FILE, folder / CONFIG_FILE]
         if result.track is not None:
             write_trajectory(folder / TRAJECTORY_FILE, result.track.trajectory(result.map))
             written.append(folder / TRAJECTORY_FILE)
-    return written
+    return written, occupied
 
 
 def _check(result: MappingResult, dataset: Dataset, haste: Haste, advance: Advance) -> HeldOutCheck | None:

@@ -9,12 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import small_room
 from console import taichi_mrf
 from datasets_recordings import Content, write_seven_scenes
 from inputs_bags import Bag, writing
 
 from taichi_mrf.cli.main import main
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.export.formats import export_map
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -111,7 +113,33 @@ def test_info_of_a_folder(tmp_path: Path) -> None:
     assert re.search(r"camera +│ +8 x 6, fx 10, fy 10, cx 4, cy 3", out)
     assert "one in 2 rows and columns is read" in out
     (folder / "frame-000000.depth.png").unlink()
-    assert "Note: frame frame-000000:" in said("info", folder)[1]
+    status, out, _ = said("info", folder)
+    assert (status, "Note: frame frame-000000:" in out) == (2, True)
+    assert said("info", folder, "--json")[0] == 2
+
+
+def test_info_of_saved_maps(tmp_path: Path, one_backend: str) -> None:
+    m = small_room.build([0, 1])
+    names = ["map.npz", "map.bt"]
+    m.save(tmp_path / names[0])
+    export_map(m, tmp_path / names[1])
+    for name, words in zip(names, ("MRFMap|mrf", "OctoMap"), strict=True):
+        status, out, errors = said("info", tmp_path / name)
+        assert (status, errors) == (0, "")
+        assert re.search(words, out)
+        assert re.search(rf"voxels +│ +[\d,]+ of {small_room.VOXEL_SIZE:g} m", out)
+        assert re.search(r"extent +│ +x -?\d", out)
+    status, out, _ = said("info", tmp_path / "map.npz", "--json")
+    facts = json.loads(out)
+    assert (status, facts["method"], facts["keyframes"]) == (0, "mrf", 2)
+    assert facts["configuration"]["voxel_size"] == small_room.VOXEL_SIZE
+    centres, _ = m.voxels(min_probability=0.5)
+    lower, upper = np.array(facts["extent"])
+    assert (lower <= centres.min(axis=0)).all()
+    assert (centres.max(axis=0) <= upper).all()
+    (tmp_path / "map.npz").write_bytes((tmp_path / "map.npz").read_bytes()[:-30])
+    status, out, errors = said("info", tmp_path / "map.npz")
+    assert (status, out, errors.count("\n")) == (2, "", 1)
 
 
 def test_info_of_the_room(one_backend: str) -> None:

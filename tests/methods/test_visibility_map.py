@@ -14,7 +14,7 @@ from oracles.forward import Noise
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.errors import CapacityError, ConfigError
 from taichi_mrf.methods.visibility.map import VisibilityMap
-from taichi_mrf.methods.visibility.plug import VisibilityConfig
+from taichi_mrf.methods.visibility.plug import TABLE_I
 from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PatchNoise, PolynomialNoise
@@ -71,7 +71,7 @@ def test_scans_equal_the_oracles(
     """Scans from about the same place, so that later ones see far, and across what earlier ones met."""
     rng = np.random.default_rng(seed)
     camera = PinholeCamera(pixels[0], pixels[1], 6.0, 6.0, (pixels[0] - 1) / 2, (pixels[1] - 1) / 2)
-    config = VisibilityConfig(max_range=max_range)
+    config = dataclasses.replace(TABLE_I, max_range=max_range)
     box = NEAR if volume is None else dataclasses.replace(NEAR, lower=volume[0], upper=volume[1])
     m = VisibilityMap(
         VOXEL, PolynomialNoise(sigma, bias), visibility=config, volume=box, min_depth=0.2, max_depth=3.0
@@ -117,21 +117,23 @@ def repeat(m: VisibilityMap, depth: float, T: np.ndarray, times: int) -> None:
 
 def test_a_voxel_in_full_view_follows_bayes_rule() -> None:
     """The sensor's own voxel is fully visible: five misses are five times Bayes' rule."""
-    m = VisibilityMap(VOXEL, PolynomialNoise((0.01,)), volume=NEAR)
+    m = VisibilityMap(VOXEL, PolynomialNoise((0.01,)), volume=NEAR, visibility=TABLE_I)
     repeat(m, 3.0, along((0, 0, 1), (0.1, 0.1, 0.1)), 5)
     odds = (0.45 / 0.57) ** 5
     assert m.occupancy(np.array([[0.1, 0.1, 0.1]]))[0] == pytest.approx(odds / (1 + odds), abs=1e-6)
 
 
 def test_probabilities_stay_within_their_bounds() -> None:
-    m = VisibilityMap(VOXEL, PolynomialNoise((0.01,)), volume=NEAR, lowest=0.2, highest=0.9)
+    m = VisibilityMap(
+        VOXEL, PolynomialNoise((0.01,)), volume=NEAR, lowest=0.2, highest=0.9, visibility=TABLE_I
+    )
     repeat(m, 1.1, along((0, 0, 1), (0.1, 0.1, 0.1)), 60)
     p = m.occupancy(np.array([[0.1, 0.1, z] for z in (0.1, 0.7, 1.3)]))
     np.testing.assert_allclose(p, [0.2, 0.2, 0.9], atol=1e-6)
 
 
 def test_the_first_scan_reaches_four_unknown_voxels() -> None:
-    m = VisibilityMap(VOXEL, PolynomialNoise((0.01,)), volume=NEAR)
+    m = VisibilityMap(VOXEL, PolynomialNoise((0.01,)), volume=NEAR, visibility=TABLE_I)
     repeat(m, 3.0, along((0, 0, 1), (0.1, 0.1, 0.1)), 1)
     row = np.array([[0.1, 0.1, 0.1 + VOXEL * i] for i in range(16)])
     np.testing.assert_array_equal(m.state(row), [FREE] * 5 + [UNKNOWN] * 11)
@@ -145,7 +147,7 @@ def test_the_first_scan_reaches_four_unknown_voxels() -> None:
 def test_measurements_through_a_known_wall_are_not_believed() -> None:
     """What OctoMap would make an artefact: wrong matches, scan by scan, 2 m behind a wall."""
     noise, T = PolynomialNoise((0.01,)), along((0, 0, 1), (0.1, 0.1, 0.1))
-    m = VisibilityMap(VOXEL, noise, volume=NEAR)
+    m = VisibilityMap(VOXEL, noise, volume=NEAR, visibility=TABLE_I)
     repeat(m, 2.1, T, 60)  # a wall at z = 2.2 m
     wall, behind = np.array([[0.1, 0.1, 2.3]]), np.array([[0.1, 0.1, 2.7 + VOXEL * i] for i in range(10)])
     before = m.occupancy(wall)[0]
@@ -159,7 +161,7 @@ def test_measurements_through_a_known_wall_are_not_believed() -> None:
 
 
 def test_no_measurement_changes_nothing() -> None:
-    m = VisibilityMap(VOXEL)
+    m = VisibilityMap(VOXEL, visibility=TABLE_I)
     m.add_keyframe(np.zeros((4, 4), np.float32), np.eye(4), PinholeCamera(4, 4, 4.0, 4.0, 1.5, 1.5))
     assert len(m.voxels(0.0)[0]) == 0
 
@@ -184,7 +186,7 @@ def belief(m: VisibilityMap) -> dict[tuple[float, ...], float]:
 
 def build(poses: list[np.ndarray]) -> VisibilityMap:
     camera, depth, _ = views()
-    m = VisibilityMap(VOXEL, STEREO, volume=NEAR, max_depth=6.0)
+    m = VisibilityMap(VOXEL, STEREO, volume=NEAR, max_depth=6.0, visibility=TABLE_I)
     for T in poses:
         m.add_keyframe(depth, T, camera)
     return m
@@ -222,8 +224,8 @@ def test_the_order_of_the_rays_does_not_change_a_bit() -> None:
     """A camera turned upside down has the same rays, and the image's last pixel is its first."""
     camera, depth, poses = views()
     upright, turned = (
-        VisibilityMap(VOXEL, STEREO, volume=NEAR, max_depth=6.0),
-        VisibilityMap(VOXEL, STEREO, volume=NEAR, max_depth=6.0),
+        VisibilityMap(VOXEL, STEREO, volume=NEAR, max_depth=6.0, visibility=TABLE_I),
+        VisibilityMap(VOXEL, STEREO, volume=NEAR, max_depth=6.0, visibility=TABLE_I),
     )
     rolled = dataclasses.replace(camera, cx=camera.width - 1 - camera.cx, cy=camera.height - 1 - camera.cy)
     for T in poses * 2:
@@ -236,7 +238,7 @@ def test_a_patch_table_of_one_polynomial_is_that_polynomial() -> None:
     camera, depth, poses = views()
     patches = -(-camera.width // 10) * -(-camera.height // 10)
     table = np.tile([[0.0, 0.0, corridor.STEREO_LAMBDA]], (patches, 1))
-    m = VisibilityMap(VOXEL, PatchNoise(table, 0 * table, 10, camera), max_depth=6.0)
+    m = VisibilityMap(VOXEL, PatchNoise(table, 0 * table, 10, camera), max_depth=6.0, visibility=TABLE_I)
     for T in poses:
         m.add_keyframe(depth, T, camera)
     assert belief(m) == belief(build(poses))
@@ -263,7 +265,7 @@ def test_a_lower_q_max_lets_the_map_grow_faster() -> None:
     camera = corridor.camera(80)
     depth, reached = corridor.depth_image(camera), []
     for q_max in (0.62, 0.7, 0.8):
-        m = VisibilityMap(0.4, STEREO, max_depth=14.0, q_max=q_max)
+        m = VisibilityMap(0.4, STEREO, max_depth=14.0, q_max=q_max, visibility=TABLE_I)
         for _ in range(16):
             m.add_keyframe(depth, corridor.pose(), camera)
         reached.append(corridor.mapped_distance(m))
@@ -282,7 +284,9 @@ def test_impossible_parameters_are_refused_by_name() -> None:
 
 def test_a_scan_that_would_not_fit_is_refused_and_leaves_the_map_as_it_was() -> None:
     camera, depth, poses = views()
-    m = VisibilityMap(0.02, STEREO, max_depth=20.0, volume=VolumeConfig(memory_limit_gb=0.05))
+    m = VisibilityMap(
+        0.02, STEREO, max_depth=20.0, volume=VolumeConfig(memory_limit_gb=0.05), visibility=TABLE_I
+    )
     with pytest.raises(CapacityError, match="choose larger voxels"):
         m.add_keyframe(depth, poses[0], camera)
     assert len(m.voxels(0.0)[0]) == 0

@@ -3,6 +3,7 @@
 hand, and the kernels on rows of voxels that are short enough to write down."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from oracles import visibility as reference
 
 from taichi_mrf.kernels.types import F32, AnyArray, F32Array, I32Array, Vec4
 from taichi_mrf.methods.visibility import scan
-from taichi_mrf.methods.visibility.plug import VisibilityConfig
+from taichi_mrf.methods.visibility.plug import TABLE_I, VisibilityConfig
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import PolynomialNoise
@@ -24,9 +25,8 @@ from taichi_mrf.voxels.window import Window, WindowIndex
 pytestmark = pytest.mark.usefixtures("backend")
 
 VOXEL = 0.2
-TABLE_1 = VisibilityConfig()
-MODEL = (TABLE_1.hit_if_occupied, TABLE_1.hit_if_free, TABLE_1.hit_if_hidden)
-RULES = (TABLE_1.visible_if_occluded, TABLE_1.visible_if_clear, TABLE_1.q_min, TABLE_1.q_max)
+MODEL = (TABLE_I.hit_if_occupied, TABLE_I.hit_if_free, TABLE_I.hit_if_hidden)
+RULES = (TABLE_I.visible_if_occluded, TABLE_I.visible_if_clear, TABLE_I.q_min, TABLE_I.q_max)
 
 probabilities = st.just(0.0) | st.floats(1e-6, 1.0)
 between = st.floats(0.015625, 0.984375, width=32)
@@ -119,11 +119,11 @@ def test_an_interpolated_miss_keeps_the_conditional_of_a_miss(visible: float, in
     """The paper's published code takes P(H | not V) there for P(not H | not V), 0.05 for 0.95, which makes
     a voxel that can hardly be seen almost as free as one in full view. We follow the paper."""
     followed = interpolated(0.5, visible, inside)
-    deviating = reference.interpolated(0.5, visible, inside, TABLE_1, TABLE_1.hit_if_hidden)
+    deviating = reference.interpolated(0.5, visible, inside, TABLE_I, TABLE_I.hit_if_hidden)
     assert followed - deviating > 0.01
     in_view = interpolated(0.5, 1.0, inside)
     assert abs(followed - 0.5) < abs(in_view - 0.5) or followed > 0.5
-    assert reference.interpolated(0.5, 1.0, inside, TABLE_1, TABLE_1.hit_if_hidden) == pytest.approx(in_view)
+    assert reference.interpolated(0.5, 1.0, inside, TABLE_I, TABLE_I.hit_if_hidden) == pytest.approx(in_view)
 
 
 # Equations 2, 3 and 7.
@@ -132,7 +132,7 @@ def test_an_interpolated_miss_keeps_the_conditional_of_a_miss(visible: float, in
 @given(probabilities, probabilities)
 def test_visibility_never_grows_but_for_the_clamp(before: float, occluded: float) -> None:
     after = visibility(before, occluded)
-    assert after <= before + 1e-6 or (after == 1.0 and before >= TABLE_1.q_max)
+    assert after <= before + 1e-6 or (after == 1.0 and before >= TABLE_I.q_max)
 
 
 @given(st.lists(probabilities, max_size=20))
@@ -141,8 +141,8 @@ def test_visibility_along_a_ray_is_the_papers(occluded: list[float]) -> None:
     for c in occluded:
         before = visibility(before, c)
         along.append(before)
-    expected = reference.visibilities(occluded, VisibilityConfig(q_min=0.0))
-    close_call = any(abs(v - TABLE_1.q_max) < 1e-5 for v in raw_visibilities(occluded))
+    expected = reference.visibilities(occluded, replace(TABLE_I, q_min=0.0))
+    close_call = any(abs(v - TABLE_I.q_max) < 1e-5 for v in raw_visibilities(occluded))
     if not close_call:  # float32 and float64 may fall on either side of q_max
         np.testing.assert_allclose(along, expected, atol=1e-5)
 
@@ -152,7 +152,7 @@ def raw_visibilities(occluded: list[float]) -> list[float]:
     out, before = [], 1.0
     for c in occluded:
         out.append(before * (1 - 0.8 * c))
-        before = 1.0 if out[-1] >= TABLE_1.q_max else out[-1]
+        before = 1.0 if out[-1] >= TABLE_I.q_max else out[-1]
     return out
 
 
@@ -349,7 +349,7 @@ def test_voxels_are_updated_within_bounds_and_only_if_seen(
     for array, values in zip(bits, (visible, inside), strict=True):
         array.fill(0)
         _seen(values, array)
-    scan.update(np.array([1], np.int32), belief, *bits, *MODEL, logit(TABLE_1.lowest), logit(TABLE_1.highest))
+    scan.update(np.array([1], np.int32), belief, *bits, *MODEL, logit(TABLE_I.lowest), logit(TABLE_I.highest))
     after = belief.to_numpy()
     np.testing.assert_array_equal(after[:VOXELS], 0.0)
     np.testing.assert_array_equal(after[VOXELS + n :], 0.0)
@@ -358,7 +358,7 @@ def test_voxels_are_updated_within_bounds_and_only_if_seen(
             assert after[VOXELS + i] == before[VOXELS + i]
             continue
         p = reference.interpolated(
-            1 / (1 + math.exp(-log_odds[i])), float(visible[i]), float(inside[i]), TABLE_1
+            1 / (1 + math.exp(-log_odds[i])), float(visible[i]), float(inside[i]), TABLE_I
         )
-        p = min(max(p, TABLE_1.lowest), TABLE_1.highest)
+        p = min(max(p, TABLE_I.lowest), TABLE_I.highest)
         assert after[VOXELS + i] == pytest.approx(logit(p), abs=2e-5)

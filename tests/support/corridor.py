@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.methods.visibility.map import VisibilityMap
+from taichi_mrf.methods.visibility.plug import TABLE_I
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
 
@@ -53,7 +54,7 @@ def mapped_distance(m: VisibilityMap) -> float:
 def grow(voxel_size: float, distance_m: float, camera: PinholeCamera, most: int = 300) -> list[float]:
     """The mapped distance after each update with the same image, until it reaches ``distance_m``."""
     noise, volume = PolynomialNoise((0.0, 0.0, STEREO_LAMBDA)), VolumeConfig(dense_bricks=64)
-    m = VisibilityMap(voxel_size, noise, volume=volume, max_depth=distance_m + 3)
+    m = VisibilityMap(voxel_size, noise, visibility=TABLE_I, volume=volume, max_depth=distance_m + 3)
     depth, curve = depth_image(camera), [0.0]
     while curve[-1] < distance_m and len(curve) <= most:
         m.add_keyframe(depth, pose(), camera)

@@ -15,6 +15,7 @@ from taichi_mrf.datasets import open_dataset
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.visibility.map import VisibilityMap
+from taichi_mrf.methods.visibility.plug import TABLE_I
 from taichi_mrf.queries.extract import extract_voxels
 from taichi_mrf.queries.points import classify, point_log_odds, probability
 from taichi_mrf.queries.view import View
@@ -112,5 +113,5 @@ def room_map(method: str) -> Any:
     """The room by one of the methods; nobody changes it."""
     if method == "visibility":
         # It gets a few voxels further with each scan, and has to come to the walls.
-        return room(VisibilityMap, [*range(len(frames()))] * 20)
+        return room(lambda size: VisibilityMap(size, visibility=TABLE_I), [*range(len(frames()))] * 20)
     return room({"mrf": MRFMap, "log_odds": LogOddsMap}[method])

@@ -12,13 +12,14 @@ from taichi_mrf.datasets.source_flags import SourceFlags
 @dataclass(frozen=True)
 class Info:
     """Show the backend that runs here and why, what each backend can do, and versions; or, with SOURCE, what
-    is in a recording and how to map it.
+    is in a recording and how to map it, or what is in a saved map.
 
-    Example: taichi-mrf info walk.bag
+    The exit status is 0 only if map accepts the recording. Example: taichi-mrf info walk.bag
     """
 
     source: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
-    """A recording, as map takes it. Of a bag, all topics are listed too."""
+    """A recording, as map takes it, or a saved map (map.npz, map.zarr, .bt, .ot). Of a bag, all topics are
+    listed too."""
 
     arch: Arch = "auto"
     """Backend to start."""

@@ -16,7 +16,7 @@ from taichi_mrf import PinholeCamera, PolynomialNoise, VisibilityMap, open_datas
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.datasets.stereo.pairs import StereoPairs
 from taichi_mrf.errors import ConfigError, DatasetError
-from taichi_mrf.experiments.contenders import Contender, log_odds, mrf
+from taichi_mrf.experiments.contenders import VISIBILITY_TABLE_I, Contender, log_odds, mrf
 from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.methods.protocol import OccupancyMap
 
@@ -25,7 +25,7 @@ MAX_DEPTH_M = 40.0
 """With lambda = 7.5e-4 per metre, sigma is 1.2 m there."""
 
 TABLE_I: Mapping[str, float] = {"hit": 0.55, "miss": 0.45}
-"""Schauwecker & Zell's parameters for OctoMap; those for their own method are VisibilityConfig's defaults."""
+"""Schauwecker & Zell's parameters for OctoMap; those for their own method are VISIBILITY_TABLE_I."""
 
 AT_ONCE = 0.4
 """P(V | C, V) with which the visibility map expands at once: a voxel among others of which nothing is known
@@ -73,11 +73,15 @@ def octomap_style() -> Contender:
 
 
 def visibility(name: str = "visibility map, Table I", **parameters: Any) -> Contender:
-    """The paper's method; ``parameters`` are fields of VisibilityConfig."""
+    """The paper's method with its Table I, but for ``parameters``, fields of VisibilityConfig."""
 
     def make(scene: Scene, voxel_size: float) -> OccupancyMap:
         return VisibilityMap(
-            voxel_size, scene.noise, volume=scene.volume, max_depth=scene.max_depth, **parameters
+            voxel_size,
+            scene.noise,
+            volume=scene.volume,
+            max_depth=scene.max_depth,
+            **(VISIBILITY_TABLE_I | parameters),
         )
 
     return Contender(name, make)
