@@ -37,7 +37,7 @@ def run_info(options: Info) -> int:
     elif options.json:
         facts = _backend_facts(options.arch) if options.source is None else _source_facts(options)
         print(json.dumps(facts, indent=2))
-        return 0 if facts.get("usable", True) else CANNOT_BE_MAPPED
+        return 0 if facts.get("problem") is None else CANNOT_BE_MAPPED
     elif options.source is None:
         _print_backends(console, options.arch)
     elif not _print_source(console, options.source, options.arch, options.reading):
@@ -150,4 +150,4 @@ def _print_frames(console: Terminal, format_name: str, dataset: Dataset) -> bool
     console.print(table)
     for note in [*dataset.notes, *([found.problem] if found.problem else [])]:
         console.say(f"Note: {note}")
-    return found.usable
+    return found.usable and found.problem is None  # map stops at the first broken frame

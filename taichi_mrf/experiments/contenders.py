@@ -10,7 +10,7 @@ from taichi_mrf.config.schema import to_yaml
 from taichi_mrf.experiments.scenes import Scene
 from taichi_mrf.methods.protocol import OccupancyMap
 
-VISIBILITY_TABLE_I: dict[str, float] = {"visible_if_occluded": 0.2}
+VISIBILITY_TABLE_I: dict[str, Any] = {"visible_if_occluded": 0.2}
 """Where Table I of Schauwecker & Zell differs from the defaults of VisibilityMap."""
 
 BOTH: dict[str, dict[str, float]] = {"all leaves": {"empty_below": -1e30}, "occupied leaves": {}}
