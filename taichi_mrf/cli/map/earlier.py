@@ -7,6 +7,8 @@ from typing import Any
 from taichi_mrf.cli.map.task import MapTask
 from taichi_mrf.config.schema import load
 from taichi_mrf.config.text import differences
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.runs.folder import CONFIG_FILE, MAP_FILE, REPORT_FILE, VOXEL_FILE
 
@@ -47,7 +49,17 @@ def _changes(task: MapTask, report: dict[str, Any]) -> list[str]:
     """The names of what differs between the task and the run in its folder."""
     asked = {"source": task.source, **task.choice()}
     changed = [name for name, value in asked.items() if report.get(name) != value]
-    return changed + differences(load(task.out / CONFIG_FILE), task.settings)
+    return changed + _changed_parameters(task)
+
+
+def _changed_parameters(task: MapTask) -> list[str]:
+    """The names of the parameters in which the task differs from the run in its folder."""
+    held = load(task.out / CONFIG_FILE)
+    changed = differences(held, task.settings)
+    if "sensor.sigma" in changed:  # the run may have had it from the recording
+        dataset = open_dataset(task.source, color=False, track=task.track_poses, **task.reading.keywords())
+        changed = differences(held, with_recorded_noise(task.settings, dataset))
+    return changed
 
 
 def finished_report(task: MapTask) -> dict[str, Any] | None:
@@ -57,7 +69,7 @@ def finished_report(task: MapTask) -> dict[str, Any] | None:
         return None
     if report.get("source") != task.source:
         raise MapFileError(f"{task.out}: holds the map of {report.get('source')}")
-    changed = differences(load(task.out / CONFIG_FILE), task.settings)
+    changed = _changed_parameters(task)
     same = task.choice().items() <= report.items() and all(name.startswith("runtime.") for name in changed)
     return report if same and not report.get("interrupted") else None
 

@@ -85,10 +85,10 @@ def map_to_folder(
     start = time.perf_counter()
     settings = task.settings
     runtime.init(settings.runtime.arch, settings.runtime.threads, settings.runtime.debug)
-    previous = resumed_map(task.out, settings) if task.resume else None
-    skipped = skipped_before(task.out) if task.resume else {}
     dataset = open_dataset(task.source, color=False, track=task.track_poses, **task.reading.keywords())
     settings = with_recorded_noise(settings, dataset)
+    previous = resumed_map(task.out, settings) if task.resume else None
+    skipped = skipped_before(task.out) if task.resume else {}
     opening = time.perf_counter() - start
 
     with _collected_warnings() as warned:
