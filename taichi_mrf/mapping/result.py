@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from taichi_mrf.mapping.refinement import PoseChange
+from taichi_mrf.mapping.step_check import StepCheck, check_steps
 from taichi_mrf.mapping.tracking import Track
 from taichi_mrf.methods.protocol import OccupancyMap
 
@@ -19,7 +20,8 @@ class MappingResult:
     each stage. ``interrupted``: the run was stopped before its end; the map holds everything up to there.
     ``poses`` are, if they were refined, the recorded and the refined pose of every keyframe; ``track`` has,
     if poses were tracked, the pose of each frame. ``full`` names the frame that did not fit into memory and
-    says why; the map holds those before it.
+    says why; the map holds those before it. ``steps`` says whether depth and recorded poses agree, if that
+    was checked.
     """
 
     map: OccupancyMap
@@ -33,6 +35,7 @@ class MappingResult:
     poses: list[PoseChange] = field(default_factory=list)
     track: Track | None = None
     full: str | None = None
+    steps: StepCheck | None = None
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -42,3 +45,12 @@ class MappingResult:
             yield
         finally:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+    def check_steps(self) -> None:
+        """Compare the recorded steps of the camera with those that depth tells, unless poses were tracked."""
+        if self.track is not None:
+            return
+        keyframes = self.map.keyframes
+        T_recorded = {id: keyframe.T_world_camera for id, keyframe in keyframes.items()}
+        T_recorded |= {change.keyframe: change.T_recorded for change in self.poses}
+        self.steps = check_steps(keyframes, T_recorded, self.map.noise, self.map.sensor.max_depth)

@@ -94,8 +94,8 @@ def write_run(
     advance: Advance = lambda stage, done, total: None,
 ) -> tuple[dict[str, Any], list[Path]]:
     """Write all files of a run to a folder that exists: the map first, because the time went into it, the
-    report last. With ``check`` the held-out frames are compared with the map, with ``pictures`` it is drawn;
-    both are left out in ``haste``.
+    report last. With ``check`` the held-out frames are compared with the map, and the poses with the depth;
+    with ``pictures`` it is drawn; both are left out in ``haste``.
 
     Returns the report and the paths. Raises MapFileError.
     """
@@ -103,7 +103,12 @@ def write_run(
     posed = facts.dataset
     if posed is not None and result.track is not None:
         posed = reposed(posed, result.track.poses(result.map))
-    found = _check(result, posed, haste, advance) if check and posed is not None else None
+    found = None
+    if check and posed is not None:
+        found = _check(result, posed, haste, advance)
+        if not haste.hurried and not result.interrupted:
+            with result.timed("checking"):
+                result.check_steps()
     # Computed before the pictures, which may be left half-way through the launch of a kernel.
     report = facts.report(result, found)
     if not occupied:

@@ -10,6 +10,7 @@ from taichi_mrf.datasets import Dataset
 from taichi_mrf.evaluation.held_out import HeldOutCheck
 from taichi_mrf.mapping.refinement import PoseChange
 from taichi_mrf.mapping.result import MappingResult
+from taichi_mrf.mapping.step_check import StepCheck
 from taichi_mrf.mapping.tracking import Track
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import peak_memory_mb
@@ -47,10 +48,15 @@ def run_report(
         "seconds": rounded(result.seconds),
         "accuracy": None if check is None else {"frames": check.frames, **dataclasses.asdict(check.error)},
         "tracking": None if result.track is None else _tracking(result.track),
+        "steps": None if result.steps is None else _steps_report(result.steps),
         "poses": [_pose_report(change) for change in result.poses],
         "skipped_frames": result.skipped,
         "dropped_frames": 0 if dataset is None else dataset.dropped,
-        "notes": [*([] if dataset is None else dataset.notes), *_pose_notes(result, check is not None)],
+        "notes": [
+            *([] if dataset is None else dataset.notes),
+            *_pose_notes(result, check is not None),
+            *_step_notes(result.steps),
+        ],
     }
 
 
@@ -89,6 +95,25 @@ def _pose_notes(result: MappingResult, checked: bool) -> list[str]:
     if result.track is not None:
         return [_TRACKED_NOTE]
     return [_REFINED_NOTE] if result.poses else []
+
+
+def _steps_report(steps: StepCheck) -> dict[str, Any]:
+    return {
+        "aligned_over_recorded": round(steps.ratio, 4),
+        "deviation": round(steps.deviation, 4),
+        "pairs": steps.pairs,
+        "disagree": steps.disagrees,
+    }
+
+
+def _step_notes(steps: StepCheck | None) -> list[str]:
+    if steps is None or not steps.disagrees:
+        return []
+    return [
+        "Depth and poses disagree, which smears the map: by its depth images the camera moves "
+        f"{steps.ratio:.3f} times as far as by its poses (median of {steps.pairs} pairs of keyframes, "
+        f"+-{steps.deviation:.3f}). Check the depth scale, the stereo baseline and the unit of the poses."
+    ]
 
 
 def report_json(report: dict[str, Any]) -> str:
