@@ -90,7 +90,7 @@ def test_yaml_reads_back_unchanged(
 def test_the_default_file_is_the_defaults_with_every_field_and_its_help(repository: Path) -> None:
     text = (repository / "configs" / "default.yaml").read_text(encoding="utf-8")
     assert load(repository / "configs" / "default.yaml") == Config()
-    assert text.endswith(commented_yaml(Config()))  # if not: paste that text below the heading
+    assert text.endswith(commented_yaml(Config()))  # if not: python docs/make_default_yaml.py
     values = yaml.safe_load(text)
     assert set(values) == {field.name for field in dataclasses.fields(Config)}
     for field in dataclasses.fields(Config):
