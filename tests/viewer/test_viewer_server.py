@@ -1,4 +1,4 @@
-"""The viewer's server: where it listens, whom it lets in, which files it gives, and that it says nothing."""
+"""The viewer's server: where it listens, whom it accepts, what it serves, and that it prints nothing."""
 
 import re
 import socket
@@ -164,7 +164,7 @@ OTHER_FILES = [
 
 
 @pytest.mark.parametrize("target", OTHER_FILES)
-def test_no_other_file_can_be_had(
+def test_no_other_file_is_served(
     server: viser.ViserServer, target: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read: list[Path] = []
@@ -219,7 +219,7 @@ def test_a_busy_port_gives_another_one() -> None:
             running.stop()
 
 
-def test_no_free_port_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_free_port_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(viewer_server, "PORTS_TO_TRY", 1)
     with socket.create_server(("127.0.0.1", 0)) as busy:
         asked = busy.getsockname()[1]
@@ -233,7 +233,7 @@ def test_no_free_port_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     ("host", "port"),
     [("203.0.113.1", 8080), ("no-such-host.invalid", 8080), ("127.0.0.1", -1), ("127.0.0.1", 70000)],
 )
-def test_an_address_that_cannot_be_had_is_said(host: str, port: int) -> None:
+def test_an_unusable_address_is_reported(host: str, port: int) -> None:
     with pytest.raises(TaichiMRFError, match="cannot listen on"):
         start_server(host, port, "Nowhere")
 

@@ -160,7 +160,7 @@ class Panel(BasePanel):
         self._score.content = f"**{in_markdown(images.title)}**\n\n{in_markdown(images.score)}"
 
     def hide_images(self) -> None:
-        """Hide the images: nobody keeps them up to date any more."""
+        """Hide the images, which are not updated any more."""
         for picture in (self._measured, self._rendered, self._accuracy):
             picture.visible = False
         self._score.content = ""

@@ -18,7 +18,7 @@ _BEHIND_M, _ABOVE_M, _AHEAD_M = 1.5, 0.7, 2.0
 
 
 class ViewpointController:
-    """Owns the cameras of the browsers, as far as the page moves them."""
+    """Moves the cameras of the browsers."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
@@ -59,7 +59,7 @@ class ViewpointController:
             self._follow()
 
     def look_at_everything(self) -> None:
-        """Choose the view anew when the map's box is told next; a view that a user has chosen stays."""
+        """Choose the view again at the next :meth:`map_grew`; a view that a user has chosen stays."""
         self._seen_size = 0.0
 
     def map_grew(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:

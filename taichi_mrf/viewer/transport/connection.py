@@ -37,8 +37,8 @@ CAMERA_INTERVAL_S = 0.02
 """Cameras that come faster replace each other."""
 
 TYPING_REST_S = 1.0
-"""A number outside its range is taken, clamped, if nothing else was typed for so long: whoever types 0.8 into
-a range that begins at 0.02 sends 0 first."""
+"""Seconds after which a number outside its range is clamped and taken, if no other number was typed. While
+0.8 is typed into a range that begins at 0.02, the browser sends 0 first."""
 
 CLOSE_TIMEOUT_S = 0.5
 """How long a client may take to answer a close frame."""

@@ -46,7 +46,8 @@ class Downloads:
             handle.send_file_download(name, content, save_immediately=True)
 
     def picture(self, client: int) -> None:
-        """Give a browser what it shows, as PNG. A browser that does not answer keeps nobody else waiting."""
+        """Give a browser what it shows, as PNG. A browser that does not answer delays no other
+        download."""
         with self._lock:
             is_full = sum(kind == "picture" for _, kind in self._begun) >= PICTURES_AT_ONCE
         if is_full and (client, "picture") not in self._begun:

@@ -1,6 +1,6 @@
 """The viewer's process: a page on its main thread, and a thread that reads what the mapping process sends.
 
-The mapping process spawns it. It ends when it is told to or when the mapping process is gone.
+The mapping process starts it. It ends on Quit, and when the mapping process is gone.
 """
 
 import signal

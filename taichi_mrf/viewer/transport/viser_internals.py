@@ -173,7 +173,7 @@ def can_be_used(widget: Widget) -> bool:
 
 
 def scene_of(server: viser.ViserServer, client: int, owner: str) -> viser.SceneApi | None:
-    """Everybody's scene (owner ""), or what only this client sees; nobody else's."""
+    """The shared scene (owner ""), or the client's own; None for the scene of another client."""
     if owner == "":
         return server.scene
     handle = server.get_clients().get(client)

@@ -70,7 +70,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _numbers(sent: WidgetValue, count: int) -> Sequence[float] | None:
-    """``sent`` if it is a list of so many finite numbers."""
+    """``sent`` if it is a list of ``count`` finite numbers."""
     if isinstance(sent, list) and len(sent) == count and all(map(_is_number, sent)):
         return sent
     return None

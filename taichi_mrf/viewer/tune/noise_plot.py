@@ -15,8 +15,8 @@ from taichi_mrf.viewer.scene.safe_text import in_markdown
 from taichi_mrf.viewer.tune.messages import Residuals
 
 SPREADS_SHOWN = 4.0
-"""Half the height of the plot: this many times the median spread, or the median sigma if that is larger. With
-all outliers in the plot the curves could not be told apart."""
+"""Half the height of the plot: this many times the median spread, or the median sigma if that is larger. If
+all outliers fitted into the plot, the curves would lie on each other."""
 
 _SERIES = (
     uplot.Series(label="depth (m)"),
