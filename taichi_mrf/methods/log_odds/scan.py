@@ -33,7 +33,7 @@ from taichi_mrf.kernels.types import (
     Vec4,
 )
 from taichi_mrf.methods.log_odds.plug import LogOddsConfig
-from taichi_mrf.methods.ray_ends import HIT, end_of, ray_ends
+from taichi_mrf.methods.log_odds.ray_ends import HIT, end_of, ray_ends
 from taichi_mrf.methods.recursive_update import updated
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import check_memory
