@@ -199,8 +199,8 @@ def _return_passes(m: Any) -> dict[str, float]:
 
     seconds = {}
     for return_pass in ("replay", "retrace"):
-        inference = dataclasses.replace(m.inference, return_pass=return_pass)
-        other = MRFMap(m.voxel_size, m.noise, inference=inference, volume=m.volume)
+        inference = dataclasses.replace(m.config.inference, return_pass=return_pass)
+        other = MRFMap(m.voxel_size, m.noise, inference=inference, volume=m.config.volume)
         for keyframe in m.keyframes.values():
             other.add_keyframe(keyframe.depth_m, keyframe.T_world_camera, keyframe.camera)
         other.infer(sweeps=1)  # compiled, and the rays' entry depths known

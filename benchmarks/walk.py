@@ -132,7 +132,6 @@ def time_taichi(problem: Path, threads: int) -> None:
     from taichi_mrf.kernels.vectors import vec4_array
     from taichi_mrf.sensor.camera import PinholeCamera
     from taichi_mrf.sensor.forward import CENTRE
-    from taichi_mrf.sensor.model import Sensor
     from taichi_mrf.sensor.noise import PolynomialNoise
     from taichi_mrf.system import runtime
     from taichi_mrf.voxels.traversal import Space, Viewpoint
@@ -146,7 +145,7 @@ def time_taichi(problem: Path, threads: int) -> None:
     log_free, sums = ti.ndarray(ti.f32, side**3), ti.ndarray(ti.i64, side**3)
     log_free.from_numpy(data["log_free"])
     camera = PinholeCamera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
-    sensor = Sensor(camera.in_kernels(), PolynomialNoise((SIGMA_M,)).table(camera).in_kernels())
+    sensor = PolynomialNoise((SIGMA_M,)).table(camera).sensor(camera)
     view = Viewpoint(
         ti.Vector(data["origin"].tolist(), ti.f32), ti.Matrix((np.eye(3) / VOXEL_SIZE).tolist(), ti.f32)
     )

@@ -67,8 +67,7 @@ class DepthImage:
         """Put :func:`checked_depth` (H, W), which nobody may change from now on, where kernels can reach it.
         Raises ConfigError if the noise model does not fit the camera."""
         table = noise.table(camera)
-        sensor = Sensor(camera.in_kernels(), table.in_kernels())
-        depth = resident(depth_m.reshape(-1))
+        depth, sensor = resident(depth_m.reshape(-1)), table.sensor(camera)
         return DepthImage(depth, camera, sensor, table, int(np.count_nonzero(depth_m)), _farthest(depth_m))
 
     def to_numpy(self) -> NDArray[np.float32]:

@@ -68,7 +68,7 @@ def _gain(space: RaySpace, camera: Camera, T_world_camera: Pose, max_depth: floa
     m = space.map
     gain = np.zeros(camera.width * camera.height, np.float32)
     centre_m = T_world_camera[:3, 3]
-    ends = camera.rays()[:: camera.height - 1 or 1, :: camera.width - 1 or 1].reshape(-1, 3) * max_depth
+    ends = camera.rays().reshape(-1, 3) * max_depth
     points = np.concatenate([ends @ T_world_camera[:3, :3].T + centre_m, centre_m[None]])
     with space.indexed(points.min(axis=0), points.max(axis=0)) as window:
         view = m.view

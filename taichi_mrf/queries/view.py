@@ -14,7 +14,6 @@ from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.queries.profile import ProfileArrays, RayProfile, profile_ray
 from taichi_mrf.queries.survey import Answers, Medium, SurfaceSurvey, survey_rays
 from taichi_mrf.sensor.camera import Camera
-from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import NoiseTable
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK
@@ -86,7 +85,7 @@ class View:
         judged = measured_m is not None
         measured = np.zeros(1, np.float32) if measured_m is None else measured_m.reshape(-1)
         survey_rays(
-            Sensor(camera.in_kernels(), noise.in_kernels()), window[0].viewpoint(T_world_camera),
+            noise.sensor(camera), window[0].viewpoint(T_world_camera),
             self.index.space(window[0], self.volume.lower, self.volume.upper), self.pool.belief,
             Medium(self.voxel_size, max_depth, learnt, self.occlusion.unknown, self.occlusion.empty_below),
             np.ascontiguousarray(measured, np.float32),

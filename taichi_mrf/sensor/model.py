@@ -5,9 +5,11 @@ A kernel takes a ``Sensor`` and asks nothing else about cameras or noise. What c
 - a camera: a subclass of ``CameraRays`` with ``direction`` and ``plane`` (rays.py). On the host it is a class
   that serves ``Camera`` (camera.py), whose ``in_kernels`` makes the bundle;
 - noise: a subclass of ``SensorNoise`` with ``at_pixel``, the noise of a pixel (polynomials.py): its ``sigma``
-  and ``bias`` at a depth, and their derivatives. On the host it is a noise model (noise.py), whose table's
-  ``in_kernels`` makes the bundle;
+  and ``bias`` at a depth, and their derivatives;
 - another law of measurements: a subclass of ``Sensor`` with its own ``likelihood`` and ``likelihood_beyond``.
+
+On the host the last two are a noise model (noise.py), whose table's ``sensor`` makes this bundle for a
+camera.
 
 "Depth" is the parameter of a ray along ``direction``: axial depth for a pinhole, range where directions have
 the length 1. It is what depth images hold, and what noise is a function of.

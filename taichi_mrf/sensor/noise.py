@@ -22,6 +22,7 @@ from taichi_mrf.sensor.limits import LEAST_SIGMA_M, TERMS
 from taichi_mrf.system.npz_file import open_npz, read_npy
 
 if TYPE_CHECKING:
+    from taichi_mrf.sensor.model import Sensor
     from taichi_mrf.sensor.polynomials import SensorNoise
 
 
@@ -56,12 +57,19 @@ class NoiseTable:
 
         return PolynomialTable(resident(self.coefficients), self.patch, self.columns)
 
+    def sensor(self, camera: Camera) -> "Sensor":
+        """A camera with this noise as kernels take it."""
+        from taichi_mrf.sensor.model import Sensor
+
+        return Sensor(camera.in_kernels(), self.in_kernels())
+
 
 @runtime_checkable
 class NoiseModel(Protocol):
     """What MRFMap asks of a noise model.
 
-    Its ``table`` may be of any class with the methods of NoiseTable, and need not hold polynomials.
+    What :meth:`table` returns may be of any class with the methods ``at_pixels``, ``largest`` and ``sensor``
+    of NoiseTable, and need not hold polynomials.
     """
 
     def table(self, camera: Camera) -> NoiseTable:
@@ -174,8 +182,11 @@ def evaluate(coefficients: NDArray[np.floating], depth_m: ArrayLike) -> NDArray[
 def warn_of_bad_sigma(table: NoiseTable, min_depth: float, max_depth: float) -> None:
     """Warn, naming the patch, if sigma falls to zero or below somewhere in the working range.
 
-    Kernels clamp it at LEAST_SIGMA_M, so that a badly fitted patch is merely trusted a lot.
+    Kernels clamp it at LEAST_SIGMA_M, so that a badly fitted patch is merely trusted a lot. Noise that is not
+    made of polynomials is left alone.
     """
+    if not isinstance(table, NoiseTable):
+        return
     depths = np.linspace(min_depth, max_depth, 100)
     sigma = evaluate(table.coefficients[:, None, 0, :].astype(np.float64), depths[None, :])
     bad = np.flatnonzero((sigma <= 0).any(axis=1))

@@ -70,7 +70,7 @@ def probability_below(
         view.index.fill(window, cells, slots)
         _follow(
             chosen, np.ascontiguousarray(measured_m.reshape(-1)[chosen], np.float32),
-            Sensor(camera.in_kernels(), noise.in_kernels()), window.viewpoint(T_world_camera),
+            noise.sensor(camera), window.viewpoint(T_world_camera),
             view.index.space(window, view.volume.lower, view.volume.upper), view.pool.belief,
             max_depth, view.occlusion.unknown, view.occlusion.empty_below, below,
         )  # fmt: skip

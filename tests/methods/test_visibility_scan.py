@@ -16,7 +16,6 @@ from taichi_mrf.kernels.types import F32, AnyArray, F32Array, I32Array, Vec4
 from taichi_mrf.methods.visibility import scan
 from taichi_mrf.methods.visibility.plug import TABLE_I, VisibilityConfig
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import PolynomialNoise
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.traversal import Space
@@ -271,7 +270,7 @@ def follow_row(
     camera = PinholeCamera(1, 1, 1.0, 1.0, 0.0, 0.0)
     noise = PolynomialNoise((sigma,), (bias,)).table(camera)
     scan.follow(
-        np.array([measured], np.float32), Sensor(camera.in_kernels(), noise.in_kernels()),
+        np.array([measured], np.float32), noise.sensor(camera),
         window.viewpoint(T), index.space(window), scan.RayLimits(VOXEL, max_depth, max_range, *RULES),
         scan.SeenVoxels(hidden, visible, inside),
     )  # fmt: skip
