@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import small_room
-from taichi_mrf.live.open_source import open_source
 
 from taichi_mrf.cli.main import main
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.config.text import differences
 from taichi_mrf.inference.schedule import InferProgress
+from taichi_mrf.live.source import open_source
 from taichi_mrf.methods.registry import create_map, load_map
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
