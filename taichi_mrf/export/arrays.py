@@ -1,10 +1,9 @@
-"""A map as plain arrays in one .npz file, for whoever has NumPy and nothing else.
+"""A map as plain arrays in one .npz file, which NumPy alone can read.
 
-``voxels`` (n, 3) int32: coordinates of all voxels that something is known of; voxel i covers [i, i + 1)
-times ``voxel_size``, in metres, along each axis. ``probability`` (n,) float32: of being occupied. ``state``
-(n,) int8: 1 free, 2 occupied. ``free_bricks`` (k, 3) int32: cubes of 8 voxels a side that were seen to be
-free and whose voxels are not listed; brick i covers [8 i, 8 i + 8) voxels. ``prior``: the probability where
-nothing is known.
+``voxels`` (n, 3) int32: coordinates of all known voxels; voxel i covers [i, i + 1) times ``voxel_size``, in
+metres, along each axis. ``probability`` (n,) float32: of being occupied. ``state`` (n,) int8: 1 free, 2
+occupied. ``free_bricks`` (k, 3) int32: free cubes of 8 voxels a side, whose voxels are not listed; brick i
+covers [8 i, 8 i + 8) voxels. ``prior``: the probability of unknown voxels.
 """
 
 from pathlib import Path
@@ -23,7 +22,7 @@ _BYTES_PER_VOXEL = 40
 
 
 def write_arrays(path: str | Path, m: QueriedMap) -> None:
-    """Write the arrays that stand at the head of this file. Raises MapFileError, CapacityError."""
+    """Write the arrays described at the top of this file. Raises MapFileError, CapacityError."""
     reader = BrickReader(m)
     count = len(reader.bricks) * VOXELS
     check_memory(_BYTES_PER_VOXEL * count, f"{count / 1e6:.3g} million voxels as arrays")

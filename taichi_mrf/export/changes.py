@@ -1,4 +1,4 @@
-"""Changes between two maps as a PLY of points: where something has appeared, and where it is gone."""
+"""Changes between two maps as a PLY of points: voxels that have appeared or vanished."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from taichi_mrf.queries.change import STATES, MapChange
 from taichi_mrf.queries.points import OCCUPIED
 
 APPEARED, VANISHED = (213, 94, 0), (0, 114, 178)
-"""RGB of voxels that are occupied in b only, and in a only; told apart without telling red from green."""
+"""RGB of voxels that are occupied only in the second map, and only in the first."""
 
 
 def write_changes(path: str | Path, change: MapChange, voxel_size: float) -> int:
@@ -30,7 +30,7 @@ def write_changes(path: str | Path, change: MapChange, voxel_size: float) -> int
     comments = [
         f"voxel_size {voxel_size:.9g} metres",
         f"before and after are states: {states}",
-        f"color is {APPEARED} where something has appeared, {VANISHED} where it is gone",
+        f"color is {APPEARED} where a surface has appeared, {VANISHED} where one has vanished",
     ]
     write_points(path, change.points[shown], colors, extra, comments)
     return int(shown.sum())

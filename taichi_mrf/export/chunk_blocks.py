@@ -1,4 +1,4 @@
-"""Bricks put together to chunks of 64^3 voxels, and a map in memory written to a store that way."""
+"""Assembles bricks to chunks of 64^3 voxels, and writes a map in memory to a store."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,8 +24,8 @@ def by_chunk(bricks: Bricks) -> Iterator[tuple[Chunk, NDArray[np.int64]]]:
 def chunk_block(
     chunk: Chunk, bricks: Bricks, log_odds: NDArray[np.float32], prior_log_odds: float
 ) -> NDArray[np.float32]:
-    """(64, 64, 64) log-odds of a chunk from those of its bricks, (n, 512); NaN elsewhere, and where they are
-    the prior's: nobody has said anything of those voxels."""
+    """(64, 64, 64) log-odds of a chunk from those of its bricks, (n, 512). NaN for unknown voxels: outside
+    the bricks, and where the log-odds equal the prior's."""
     log_odds = np.where(log_odds == np.float32(prior_log_odds), np.float32(np.nan), log_odds)
     block = np.full((CHUNK, BRICK, CHUNK, BRICK, CHUNK, BRICK), np.nan, np.float32)
     x, y, z = (bricks - np.array(chunk) * CHUNK).T

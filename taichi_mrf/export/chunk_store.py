@@ -1,9 +1,9 @@
 """A map as a chunked array on disk, in zarr 3, for maps that are larger than memory.
 
 The folder is a zarr group. Its array ``log_odds`` (x, y, z) float32 has a zarr chunk for each chunk of 64^3
-voxels, NaN where nothing is known, and nothing on disk where a whole chunk is unknown. ``chunks`` (n, 3)
-int32 lists the chunks that there are, in the world's coordinates: chunk c covers the voxels from 64 c up to,
-but without, 64 (c + 1). The attributes say the rest: see :class:`StoreHeader`, and ``origin_m``, the outer
+voxels; unknown voxels are NaN, and chunks without a known voxel are not stored. ``chunks`` (n, 3)
+int32 lists the stored chunks in the world's coordinates: chunk c covers the voxels 64 c to 64 (c + 1) - 1.
+The attributes hold the rest: see :class:`StoreHeader`, and ``origin_m``, the outer
 corner of the array's first voxel.
 """
 
@@ -53,7 +53,7 @@ class ChunkStore:
 
     @classmethod
     def create(cls, path: str | Path, header: StoreHeader, chunks: NDArray[np.int32]) -> "ChunkStore":
-        """An empty store with room for the box around some chunks, (n, 3); they are to be written next.
+        """An empty store for the bounding box of some chunks, (n, 3), which the caller then writes.
 
         Raises MapFileError if it cannot be written, TaichiMRFError without zarr.
         """
@@ -140,19 +140,19 @@ class ChunkStore:
 
 @contextmanager
 def new_store(path: str | Path) -> Iterator[Path]:
-    """A folder beside ``path`` to make a store in, which takes its place when the block ends well.
+    """A temporary folder beside ``path`` to write a store to; it replaces ``path`` if the block succeeds.
 
-    Raises MapFileError if something other than a map in chunks stands there, or if it cannot be written.
+    Raises MapFileError if ``path`` exists and is not a map in chunks, or if it cannot be written.
     """
     path = Path(path)
     if not is_folder(path.parent):  # zarr would make it, as no other format does
         raise MapFileError(f"{path}: cannot be written: No such file or directory")
     if exists(path) and not _is_store(path):
-        raise MapFileError(f"{path}: exists, and is no map in chunks; it is left alone")
+        raise MapFileError(f"{path}: exists and is not a map in chunks: it is not overwritten")
     temporary, old = temporary_name(path), temporary_name(path)
     try:
         yield temporary
-        # A folder cannot take another one's place: for a moment there is none, but never half of one.
+        # A folder cannot replace another in one step: for a moment neither exists, but never half of one.
         if exists(path):
             os.replace(path, old)
         try:

@@ -1,4 +1,4 @@
-"""Which file a map is written to, by the name's extension: the one list of all formats."""
+"""Writes a map in the format of a file's extension: the one list of all formats."""
 
 import difflib
 from collections.abc import Callable, Sequence
@@ -28,7 +28,7 @@ _DEFAULTS = ExportOptions()
 
 
 class ExportedMap(QueriedMap, Protocol):
-    """What exports need of a map; every map of methods/protocol.py has it."""
+    """The parts of a map that exports use; all maps of methods/protocol.py have them."""
 
     @property
     def config(self) -> Config: ...
@@ -41,26 +41,30 @@ Writer = Callable[[ExportedMap, Path, ExportOptions], list[Path]]
 
 
 def export_map(m: ExportedMap, path: str | Path, options: ExportOptions = _DEFAULTS) -> list[Path]:
-    """Write a map in the format that the file's extension stands for; returns what was written, which for a
-    2D map is two files. A file appears whole or not at all.
+    """Write a map to a file, in the format of its extension.
 
-    Raises ConfigError for an extension that no format has and for options that do not fit the map,
-    MapFileError if the file cannot be written, CapacityError if memory would not do, TaichiMRFError if the
-    format needs a library that is not installed.
+    ``m`` is any map, or a part of a chunked map (:func:`take_part`). The formats are ``.ply`` (points, or a
+    mesh), ``.glb``, ``.obj`` and ``.stl`` (meshes), ``.bt`` and ``.ot`` (OctoMap), ``.pgm`` or ``.yaml`` (a
+    2D map for ROS), ``.npz`` (arrays), ``.html`` (a page that shows the map) and ``.zarr`` (chunks, for
+    :class:`ChunkedMap`). ``options`` are the formats' settings. A file is written completely or not at all.
+
+    Returns the paths of the files written; a 2D map has two. Raises ConfigError for an unknown extension and
+    for options that do not fit the map, MapFileError if the file cannot be written, CapacityError if there is
+    not enough memory, and TaichiMRFError if the format needs a library that is not installed.
     """
     return writer_of(path)(m, Path(path), options)
 
 
 def writer_of(path: str | Path) -> Writer:
-    """Who writes a file of this name. Raises ConfigError, which names the nearest extension there is."""
+    """The function that writes a file of this name. Raises ConfigError for an unknown extension."""
     suffix = Path(path).suffix.lower()
     if suffix in _WRITERS:
         return _WRITERS[suffix]
     known = ", ".join(_WRITERS)
     if not suffix:
-        raise ConfigError(f"{path}: the extension says the format, and there is none; known are {known}")
+        raise ConfigError(f"{path}: no file extension: cannot choose an export format; known are {known}")
     near = difflib.get_close_matches(suffix, _WRITERS, 1, cutoff=0.0)[0]
-    raise ConfigError(f"{path}: there is no format {suffix}; did you mean {near}? known are {known}")
+    raise ConfigError(f"{path}: unknown export format {suffix}; did you mean {near}? known are {known}")
 
 
 def extensions() -> Sequence[str]:

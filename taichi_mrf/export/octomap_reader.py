@@ -1,7 +1,7 @@
-"""OctoMap's files read back, into bricks of voxels.
+"""Reads OctoMap's files into bricks of voxels.
 
-A leaf of OctoMap's stands for a cube of any size. Here every voxel of it gets its own log-odds, which takes
-far more memory than the file says: so it is worked out, and checked, before any of it is taken.
+A leaf of OctoMap stands for a cube of any size. Here each voxel of the cube gets its own log-odds, which
+needs far more memory than the file: the size is checked before any memory is allocated.
 """
 
 import re

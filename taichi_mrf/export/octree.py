@@ -1,4 +1,4 @@
-"""A map as the nodes of an octree, the way OctoMap has them, level by level in arrays.
+"""A map as the nodes of an octree like OctoMap's, level by level in arrays.
 
 A leaf is a voxel, or a cube of 8^level voxels that all hold the same. Voxels are numbered along a Z-order
 curve: the bits of x, y and z, counted from the octree's corner, taken in turn. All voxels of a node follow
@@ -27,12 +27,12 @@ BRICK_LEVEL = 3
 """A brick of 8^3 voxels is a node of this level."""
 
 NO_CHILD, FREE_LEAF, OCCUPIED_LEAF, INNER = 0, 1, 2, 3
-"""What a child is, in the two bits that OctoMap's binary format has for it."""
+"""The kinds of a child, in two bits of OctoMap's binary format."""
 
 _CHILDREN = 8
 
 _BYTES_PER_NODE = 60
-"""What putting the nodes in order takes: twice their arrays, and their numbers."""
+"""Peak memory of sorting the nodes: twice their arrays, and their numbers."""
 
 
 @dataclass(frozen=True)
@@ -72,11 +72,11 @@ class Nodes:
 
 
 def octree_of(m: QueriedMap, *, only_state: bool) -> Nodes:
-    """All that a map knows, in pre-order: no node for what is unknown, leaves for what is free, with or
+    """The known space of a map in pre-order: no node for unknown space, leaves for free space, with or
     without voxels in the map, and for what is occupied. Eight equal leaves are one.
 
     With ``only_state`` all free voxels are equal, at -1, and all occupied ones, at +1. Raises CapacityError
-    if the map is larger than an octree of OctoMap's, or memory would not do.
+    if the map is larger than an octree of OctoMap's, or if there is not enough memory.
     """
     reader = BrickReader(m)
     done: list[Nodes] = []

@@ -1,4 +1,4 @@
-"""What can be chosen when a map is written for other programs; the flags of ``taichi-mrf export``."""
+"""The options of exports, which are also the flags of ``taichi-mrf export``."""
 
 import math
 from dataclasses import dataclass
@@ -9,7 +9,10 @@ from taichi_mrf.errors import ConfigError
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Each format reads what concerns it."""
+    """Options of :func:`export_map`; each format uses the fields that name it, and ignores the others.
+
+    Raises ConfigError for values outside their ranges.
+    """
 
     threshold: float = 0.5
     """Voxels of at least this probability are points or cubes; a mesh lies where the probability is this."""

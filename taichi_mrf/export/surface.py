@@ -118,7 +118,7 @@ def _chunks(m: QueriedMap, margin: int, reach_back: bool) -> Iterator[BoxOfVoxel
 
 
 def _seen_probability(m: QueriedMap, found: BoxOfVoxels) -> NDArray[np.float32]:
-    """Marginals, 0 where nothing is known: a map may say one half of the unknown, which is no surface."""
+    """Marginals, 0 for unknown voxels: their prior may be one half, which is no surface."""
     return np.where(found.log_odds == m.view.pool.prior_log_odds, np.float32(0), found.occupancy)
 
 

@@ -152,12 +152,12 @@ def check_capacity(
     what = f"a factor graph of {beams:,} beams, {cells:,} cells and {edges:,} edges"
     if limit is not None and wanted > limit:
         raise CapacityError(
-            f"{what} would take {wanted / 1e9:.3g} GB of memory and {limit / 1e9:.3g} GB are to "
-            f"be had; {advice}"
+            f"{what} would need {wanted / 1e9:.3g} GB of memory, but only {limit / 1e9:.3g} GB are "
+            f"available; {advice}"
         )
     if max(edges + beams, cells) > MOST_EDGES:
         raise CapacityError(
-            f"{what} would take {wanted / 1e9:.3g} GB of memory and has more than 2^31 - 1 of them; {advice}"
+            f"{what} would need {wanted / 1e9:.3g} GB of memory and has more than 2^31 - 1 of them; {advice}"
         )
 
 

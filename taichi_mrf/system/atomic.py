@@ -1,7 +1,7 @@
-"""Files that are either whole or not there: written beside the target, then moved into its place.
+"""Atomic writing: a file is written beside the target, then renamed to it.
 
-A reader, or a run that is resumed after a crash or a full disk, meets the old file or the new one,
-never half of one.
+A reader, or a run that is resumed after a crash or a full disk, finds the old file or the new one, never half
+of one.
 """
 
 import contextlib
@@ -63,7 +63,7 @@ def _target_of(path: str | Path) -> Path:
 
 
 def temporary_name(target: Path) -> Path:
-    """A new name beside ``target`` that says whose it is, for :func:`remove_leftovers`."""
+    """A new name beside ``target`` that holds the process's number, for :func:`remove_leftovers`."""
     # Shortened, so that the name is not too long where the target's is not.
     begin = target.stem.encode()[:_LONGEST_STEM].decode("utf-8", "ignore")
     return target.with_name(f".{begin}.part-{os.getpid()}-{secrets.token_hex(4)}{target.suffix}")
@@ -73,9 +73,9 @@ _LONGEST_STEM = 100
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files and folders that killed processes have left in a folder, if there is one.
+    """Remove the temporary files and folders that killed processes have left in a folder, if it exists.
 
-    Those of a process that lives stay, and those that cannot be removed.
+    Those of running processes stay, and those that cannot be removed.
     """
     for path in folder.iterdir() if folder.is_dir() else ():
         match = _LEFTOVER.search(path.name)
@@ -109,8 +109,8 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def write_npz(path: str | Path, arrays: Mapping[str, NDArray[Any]], manifest: bool = False) -> None:
-    """Write arrays by name to a compressed file that ``numpy.load`` reads, with a ``manifest`` of them
-    (NpzFile.check_manifest) if it is wanted. Raises MapFileError.
+    """Write arrays by name to a compressed file that ``numpy.load`` reads, with a
+    manifest (NpzFile.check_manifest) if ``manifest`` is true. Raises MapFileError.
 
     The same arrays always give the same bytes. Compression level 1 instead of the 6 of
     ``numpy.savez_compressed``: for maps it is several times faster and the file hardly larger.

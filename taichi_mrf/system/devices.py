@@ -1,8 +1,7 @@
-"""What accelerators this machine has, asked of the drivers themselves.
+"""The accelerators of this machine, as the drivers list them.
 
-Taichi tells only whether it can load a driver. Whether a Vulkan device is real hardware or a program
-that imitates one, and why CUDA is missing, only the drivers know; both answer through a C interface
-with no start-up cost, so that nothing here needs Taichi.
+Taichi only tests whether it can load a driver. The drivers also report whether a Vulkan device is hardware or
+software, and why CUDA is not available. Their C interfaces start quickly, and nothing here needs Taichi.
 """
 
 import ctypes
@@ -20,7 +19,7 @@ _PREFERENCE = ("discrete GPU", "integrated GPU", "virtual GPU", "other", "softwa
 
 @dataclass(frozen=True)
 class VulkanDevice:
-    """A Vulkan device; ``index`` is its place in the driver's list, by which Taichi is told to use it."""
+    """A Vulkan device; ``index`` is its place in the driver's list, by which Taichi selects it."""
 
     index: int
     name: str
@@ -91,13 +90,13 @@ def vulkan_devices() -> list[VulkanDevice]:
 
 
 def best_vulkan_device(allow_software: bool) -> VulkanDevice:
-    """The fastest kind of Vulkan device there is. Raises BackendError, saying what there is instead."""
+    """The Vulkan device of the fastest kind. Raises BackendError if there is none that may be used."""
     devices = sorted(vulkan_devices(), key=lambda device: _PREFERENCE.index(device.kind))
     if not devices:
         raise BackendError("the Vulkan driver knows no device")
     if devices[0].software and not allow_software:
         raise BackendError(
-            f"the only Vulkan device is software ({devices[0].name}), which is taken only when asked for"
+            f"the only Vulkan device is software ({devices[0].name}), which is used only on request"
         )
     return devices[0]
 

@@ -1,4 +1,4 @@
-"""Libraries that only some users need: loaded when they are first used, and one helpful line without them."""
+"""Optional libraries: loaded when they are first used; without them, one line says what to install."""
 
 import importlib
 from typing import Any

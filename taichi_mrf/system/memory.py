@@ -1,4 +1,4 @@
-"""How much memory there is, asked before it is taken: a map that does not fit ends in a clear error."""
+"""Checks that memory is available before it is allocated: a map that does not fit is a clear error."""
 
 import contextlib
 import os
@@ -10,8 +10,8 @@ from taichi_mrf.errors import CapacityError
 
 
 def available_bytes() -> int | None:
-    """Memory in bytes that this process can still take, None where it cannot be asked: what the machine has
-    free, or less in a container or under ``ulimit -v``."""
+    """Memory in bytes that this process can still allocate: what the machine has free, or less in a container
+    or under ``ulimit -v``. None where the system does not tell."""
     known = [each for each in (_of_machine(), _of_container(), _of_process()) if each is not None]
     return min(known) if known else None
 
@@ -31,7 +31,7 @@ def _of_machine() -> int | None:
 
 
 def _of_container() -> int | None:
-    """What the control group of this process (cgroup v2) has left."""
+    """Bytes left in the control group of this process (cgroup v2)."""
     try:
         groups = Path("/proc/self/cgroup").read_text(encoding="ascii").splitlines()
     except OSError:
@@ -56,7 +56,7 @@ def left_in_group(folder: Path) -> int | None:
 
 
 def _of_process() -> int | None:
-    """What is left of the address space that a process may have, if that is limited."""
+    """Bytes left of the process's address space, if that is limited."""
     try:
         import resource
 
@@ -70,14 +70,13 @@ def _of_process() -> int | None:
 
 
 def reset_peak_memory() -> None:
-    """Let the system forget the most memory that this process has held, where it can (Linux)."""
+    """Reset the peak that :func:`peak_memory_mb` reads, on Linux; no effect elsewhere."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
 
 def peak_memory_mb() -> float | None:
-    """The most memory that this process has held since the last reset, in MB (10^6 bytes); None where it
-    cannot be asked."""
+    """The process's peak memory since the last reset, in MB (10^6 bytes); None where it is unknown."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
             if line.startswith("VmHWM:"):
@@ -91,9 +90,9 @@ def peak_memory_mb() -> float | None:
 
 
 def check_memory(wanted_bytes: float, what: str, limit_gb: float = 0.0) -> None:
-    """Raise CapacityError if an array of ``wanted_bytes`` is more than the limit, or than there is.
+    """Raise CapacityError if ``wanted_bytes`` exceed the limit. ``what`` begins the error's text.
 
-    ``limit_gb`` of 0 means nine tenths of what the machine has free.
+    ``limit_gb`` of 0 means nine tenths of the available memory.
     """
     if limit_gb <= 0 and _allowance.covers(wanted_bytes):
         return
@@ -101,16 +100,16 @@ def check_memory(wanted_bytes: float, what: str, limit_gb: float = 0.0) -> None:
     limit = limit_gb * 1e9 if limit_gb > 0 else (0.9 * free if free is not None else None)
     if limit is not None and wanted_bytes > limit:
         raise CapacityError(
-            f"{what} would take {wanted_bytes / 1e9:.3g} GB of memory and {limit / 1e9:.3g} GB are to be "
-            "had; choose larger voxels, a smaller volume or a smaller sensor.max_depth"
+            f"{what} would need {wanted_bytes / 1e9:.3g} GB of memory, but only {limit / 1e9:.3g} GB are "
+            "available; choose larger voxels, a smaller volume or a smaller sensor.max_depth"
         )
     if free is not None:
         _allowance.renew(max(0.0, 0.9 * free - wanted_bytes))
 
 
 class _Allowance:
-    """A small part of what was free a moment ago, which may be taken without asking again: a keyframe asks
-    several times, and the system takes longer to answer than most of what is asked for takes to fill."""
+    """A small part of the memory that was free a moment ago, granted without asking the system again: each
+    keyframe makes several checks, and a query takes longer than filling most of the arrays."""
 
     SHARE, SECONDS = 1 / 16, 1.0
 
@@ -118,11 +117,11 @@ class _Allowance:
         self._bytes_left = self._until = 0.0
 
     def renew(self, free: float) -> None:
-        """Begin anew, knowing how many bytes are free now."""
+        """Start a new allowance from the number of free bytes."""
         self._bytes_left, self._until = self.SHARE * free, time.monotonic() + self.SECONDS
 
     def covers(self, wanted_bytes: float) -> bool:
-        """Take so many bytes of it, if there are so many."""
+        """Take ``wanted_bytes`` from the allowance; False if it is too small or too old."""
         if wanted_bytes > self._bytes_left or time.monotonic() > self._until:
             return False
         self._bytes_left -= wanted_bytes

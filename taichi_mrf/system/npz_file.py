@@ -1,8 +1,7 @@
-"""NumPy's npz files, read without trust: a file that is damaged, cut short, or claims more than it holds is
-refused in one line that names it.
+"""NumPy's npz files, read without trust: damaged, truncated and inflated files are refused in one line.
 
-numpy.load notices a wrong checksum only where a member is read to its end, takes the memory that a header
-claims before it looks for the values, and lets through whatever its parsers stumble over.
+numpy.load checks a member's checksum only if the member is read to its end, allocates what a header claims
+before it reads the values, and passes on whatever exception its parsers raise.
 """
 
 import contextlib
@@ -21,10 +20,10 @@ from taichi_mrf.system.files import open_regular
 from taichi_mrf.system.memory import check_memory
 
 MANIFEST = "manifest"
-"""The member that says which others there are, with their checksums: ``name crc32 bytes`` each."""
+"""The member that lists the others with their checksums: ``name crc32 bytes`` each."""
 
 DEFLATE_RATIO = 1032
-"""Deflate packs no tighter than this (zlib's technical details), so that no member is larger."""
+"""The highest compression ratio of deflate (zlib's technical details)."""
 
 _LEAST_BOUND, _LARGEST_RATIO = 1 << 28, 100
 """What is read of a file may be this large, or this many times what it takes in the file. Measurements pack
@@ -38,7 +37,7 @@ ErrorType = Callable[[str], TaichiMRFError]
 
 
 class NpzFile:
-    """An open file; ``file[name]`` reads an array to its end, whose checksum is then known to be right."""
+    """An open file; ``file[name]`` reads an array to its end, and so checks its checksum."""
 
     def __init__(self, path: Path, archive: zipfile.ZipFile, error: ErrorType) -> None:
         self._path, self._archive, self._error = path, archive, error
@@ -48,7 +47,7 @@ class NpzFile:
 
     @property
     def names(self) -> list[str]:
-        """The arrays that there are."""
+        """Names of the arrays."""
         return list(self._members)
 
     def __contains__(self, name: str) -> bool:
@@ -64,11 +63,11 @@ class NpzFile:
             size = _count(shape) * dtype.itemsize
             info = self._members[name]
             if stream.tell() + size != info.file_size:
-                raise self._problem(
-                    name, f"should be {dtype} {shape}, which its {info.file_size} bytes are not"
-                )
+                raise self._problem(name, f"is {dtype} {shape} by its header, but has {info.file_size} bytes")
             if info.file_size > DEFLATE_RATIO * (info.compress_size + 1):
-                raise self._problem(name, f"claims {info.file_size / 1e9:.3g} GB that the file cannot hold")
+                raise self._problem(
+                    name, f"claims {info.file_size / 1e9:.3g} GB, more than the file can hold"
+                )
             self._count_bytes(name, info)
             check_memory(size, f"{self._path}: {name}")
             values, place = np.empty(size, np.uint8), 0
@@ -81,8 +80,10 @@ class NpzFile:
             return array.reshape(shape, order="F" if fortran else "C")
 
     def array(self, name: str, kinds: str, shape: Sequence[int | None]) -> NDArray[Any]:
-        """An array that must be of one of these kinds (NumPy's letters) and of this shape, None being any
-        length; floating-point values must be finite."""
+        """An array of one of these kinds (NumPy's letters) and of this shape, where None is any length.
+
+        Raises the file's error for any other array, and for values that are not finite.
+        """
         found = self[name]
         fits = len(found.shape) == len(shape) and all(
             n is None or n == m for n, m in zip(shape, found.shape, strict=True)
@@ -90,12 +91,12 @@ class NpzFile:
         if found.dtype.kind not in kinds or not fits:
             wanted = ", ".join("N" if n is None else str(n) for n in shape)
             raise self._problem(
-                name, f"is {found.dtype} {found.shape}, where ({wanted}) of another is expected"
+                name, f"is {found.dtype} {found.shape}; expected ({wanted}) of another type or shape"
             )
         if found.dtype.kind == "f" and not np.isfinite(found).all():
             raise self._problem(name, "holds a value that is not finite")
         if found.dtype.kind == "U" and not _is_text(found):
-            raise self._problem(name, "holds a character that there is not")
+            raise self._problem(name, "holds a character outside Unicode")
         return found
 
     def scalar(self, name: str, kinds: str) -> Any:
@@ -103,7 +104,7 @@ class NpzFile:
         return self.array(name, kinds, ()).item()
 
     def check_manifest(self) -> None:
-        """Refuse a file whose members are not those that were written, by its manifest."""
+        """Raise the file's error if its members differ from those in its manifest."""
         wanted = sorted(self.array(MANIFEST, "U", (None,)).tolist())
         found = sorted(manifest_lines(i for name, i in self._members.items() if name != MANIFEST))
         if wanted != found:
@@ -112,7 +113,7 @@ class NpzFile:
 
     @contextmanager
     def _member(self, name: str) -> Iterator[tuple[Any, Shape, bool, np.dtype]]:
-        """A member's stream behind its header, and what that says."""
+        """A member's stream after its header, and the header's values."""
         if name not in self._members:
             raise self._problem(name, "is missing")
         try:
@@ -139,8 +140,9 @@ class NpzFile:
 
 @contextmanager
 def open_npz(path: Path, error: ErrorType, what: str) -> Iterator[NpzFile]:
-    """The arrays of a file, by name. Whatever is wrong with the file is raised as an ``error`` that names it;
-    ``what`` it should be, such as "a readable map". Raises CapacityError if an array does not fit memory."""
+    """The arrays of a file, by name. Raises ``error``, which names the file, for anything wrong with it;
+    ``what`` is the expected content, such as "a readable map". Raises CapacityError if an array does not fit
+    into memory."""
     with contextlib.ExitStack() as opened:
         stream = opened.enter_context(open_regular(path, error))
         try:
@@ -162,7 +164,7 @@ def open_npz(path: Path, error: ErrorType, what: str) -> Iterator[NpzFile]:
 
 
 def _is_text(array: NDArray[np.str_]) -> bool:
-    """Whether every character is one of Unicode's; Python ends in a SystemError over others."""
+    """Whether every character is in Unicode; Python raises SystemError for others."""
     if array.dtype.itemsize == 0:
         return True
     codes = np.ascontiguousarray(array).reshape(-1).view(np.dtype("u4").newbyteorder(array.dtype.byteorder))
@@ -170,14 +172,14 @@ def _is_text(array: NDArray[np.str_]) -> bool:
 
 
 def _compare_names(archive: zipfile.ZipFile) -> None:
-    """Opening a member compares what the directory calls it with what it calls itself, so that no array hides
-    behind a damaged name, where another would be taken for missing."""
+    """Open each member, which compares its name in the directory with the one in its own header. Otherwise an
+    array with a damaged name would count as missing."""
     for info in archive.infolist():
         archive.open(info).close()
 
 
 def manifest_lines(members: Iterator[zipfile.ZipInfo]) -> list[str]:
-    """What the manifest says of these members of an archive."""
+    """The manifest's lines for members of an archive."""
     return [f"{i.filename.removesuffix('.npy')} {i.CRC:08x} {i.file_size}" for i in members]
 
 
@@ -192,7 +194,7 @@ def read_npy(path: Path) -> NDArray[Any]:
         except Exception as error:  # as above
             raise ValueError(said(error)) from error
         if stream.tell() + _count(shape) * dtype.itemsize != size:
-            raise ValueError(f"it should hold {dtype} {shape}, which its {size} bytes are not")
+            raise ValueError(f"it is {dtype} {shape} by its header, but has {size} bytes")
         values = np.frombuffer(stream.read(), dtype) if _count(shape) * dtype.itemsize else np.empty(0, dtype)
     return values.reshape(shape, order="F" if fortran else "C")
 

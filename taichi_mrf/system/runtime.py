@@ -1,4 +1,4 @@
-"""Starting Taichi once, on the best backend that this machine has, and saying why it is that one.
+"""Starts Taichi once, on the best backend of this machine, and records why it was chosen.
 
 A process has one backend. Importing this module neither loads nor starts Taichi.
 """
@@ -28,14 +28,14 @@ ABILITIES = {
     "vulkan": "map within a bounded volume (volume.dense_bricks)",
     "cpu": "sparse map without bounds",
 }
-"""What a map can do on each backend: Vulkan has no sparse fields."""
+"""The kind of map that each backend supports: Vulkan has no sparse fields."""
 SOFTWARE_BLOCK = 8
-"""Mesa's software Vulkan loses iterations of long loops in larger thread blocks."""
+"""Threads in a block of a software device: in larger ones Mesa's Vulkan skips iterations of long loops."""
 
 
 @dataclass(frozen=True)
 class Backend:
-    """The backend that was chosen, and why the ones before it were not."""
+    """The chosen backend, and why those tried before it were rejected."""
 
     name: str
     device: str
@@ -109,8 +109,8 @@ def is_software() -> bool:
 def settle() -> None:
     """Wait for the kernels in flight, on Vulkan.
 
-    Taichi 1.7.4 never frees an array there that is dropped while a kernel may still use it, so whoever
-    drops arrays right after using them calls this first. Elsewhere nothing needs to be waited for.
+    There Taichi 1.7.4 never frees an array that is deleted while a kernel may still use it, so callers that
+    delete arrays right after using them call this first. Other backends need no wait.
     """
     if active() == "vulkan":
         _quiet_taichi().sync()

@@ -80,7 +80,7 @@ class BrickPool:
         """Slots for new bricks, (n, 3) -> (n,), their voxels at the prior and owned by nobody yet.
 
         The lowest free slots go first, so that equal histories give equal pools.
-        Raises CapacityError if the memory would not do.
+        Raises CapacityError if there is not enough memory.
         """
         missing = len(bricks) - len(self._free)
         if missing > 0:

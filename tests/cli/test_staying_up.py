@@ -112,7 +112,7 @@ def test_the_limit_counts_images_and_messages_too() -> None:
         return count
 
     assert 0 < mapped(0.0013) < mapped(0.0021) < 10
-    assert "keyframes with their messages would take" in said[0]
+    assert "keyframes with their messages would need" in said[0]
 
 
 class FartherWall(SlidingCamera):

@@ -185,7 +185,7 @@ def test_a_browser_shows_the_voxels(method: str, tmp_path: Path) -> None:
         ("map.plyy", "no format .plyy; did you mean .ply?"),
         ("map.oct", "no format .oct; did you mean .ot?"),
         ("map.html5", "did you mean .html?"),
-        ("map", "the extension says the format, and there is none"),
+        ("map", "no file extension: cannot choose an export format"),
     ],
 )
 def test_names_that_no_format_has(saved: dict[str, Path], name: str, problem: str, tmp_path: Path) -> None:

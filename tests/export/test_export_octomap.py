@@ -290,7 +290,7 @@ def test_a_leaf_that_stands_for_more_voxels_than_there_is_memory_for(tmp_path: P
     (tmp_path / "vast.bt").write_bytes(BINARY + b"\x01\0")
     leaves = read_octomap(tmp_path / "vast.bt")
     assert leaves.voxels == 32768**3
-    with pytest.raises(CapacityError, match="million voxels, in 1 leaves of OctoMap's, would take"):
+    with pytest.raises(CapacityError, match="million voxels, in 1 leaves of OctoMap's, would need"):
         leaves.bricks()
 
 

@@ -182,7 +182,7 @@ def test_what_a_ray_crosses_is_what_the_oracle_crosses() -> None:
 
 def test_a_graph_that_does_not_fit_is_refused_with_its_size() -> None:
     m = room_map()
-    with pytest.raises(CapacityError, match=r"beams.*edges would take 0\.\d+ GB.*fewer keyframes or pixels"):
+    with pytest.raises(CapacityError, match=r"beams.*edges would need 0\.\d+ GB.*fewer keyframes or pixels"):
         m.factor_graph(memory_limit_gb=0.001)
     with pytest.raises(ConfigError, match="every"):
         m.factor_graph(every=0)

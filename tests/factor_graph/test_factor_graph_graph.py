@@ -73,7 +73,7 @@ def test_cells_are_aligned_to_the_world() -> None:
 
 
 def test_too_much_memory_is_refused_before_it_is_taken() -> None:
-    with pytest.raises(CapacityError, match=r"540 beams.*would take .* GB .*cell size"):
+    with pytest.raises(CapacityError, match=r"540 beams.*would need .* GB .*cell size"):
         build_graph(room_beams(), CELL, memory_limit_gb=1e-5)
     with pytest.raises(CapacityError, match="cells"):
         build_graph(room_beams(), 1e-6)

@@ -22,7 +22,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def test_more_than_nine_tenths_of_what_is_free_is_refused(asked: list[int]) -> None:
     memory.check_memory(1440, "an array")
-    with pytest.raises(CapacityError, match="an array would take"):
+    with pytest.raises(CapacityError, match="an array would need"):
         memory.check_memory(1441, "an array")
 
 

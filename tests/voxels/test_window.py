@@ -101,7 +101,7 @@ def test_the_clip_box_is_the_windows_part_of_the_volume() -> None:
 
 
 def test_a_view_that_cannot_fit_says_how_much_it_would_take() -> None:
-    with pytest.raises(CapacityError, match=r"voxel size of 1e-06 m would take .* GB"):
+    with pytest.raises(CapacityError, match=r"voxel size of 1e-06 m would need .* GB"):
         Window.covering((0, 0, 0), (10, 10, 10), 1e-6)
 
 
