@@ -182,8 +182,8 @@ def test_a_browser_shows_the_voxels(method: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "problem"),
     [
-        ("map.plyy", "no format .plyy; did you mean .ply?"),
-        ("map.oct", "no format .oct; did you mean .ot?"),
+        ("map.plyy", "unknown export format .plyy; did you mean .ply?"),
+        ("map.oct", "unknown export format .oct; did you mean .ot?"),
         ("map.html5", "did you mean .html?"),
         ("map", "no file extension: cannot choose an export format"),
     ],
