@@ -246,5 +246,5 @@ def test_max_product_becomes_the_maps_own_method() -> None:
     np.testing.assert_array_equal(same.voxels(0.5)[0], best)
     m.infer(method="sum-product")
     np.testing.assert_array_equal(m.voxels(0.5)[0], sums)
-    with pytest.raises(ConfigError, match=r"inference\.method"):
+    with pytest.raises(ConfigError, match=r"MRFMap\.infer: method"):
         m.infer(method="best")  # type: ignore[arg-type]
