@@ -1,4 +1,4 @@
-"""OctoMap's way with the same keyframes, shown beside the map on demand."""
+"""The same keyframes mapped by OctoMap's method, shown beside the map on demand."""
 
 import numpy as np
 
@@ -63,13 +63,13 @@ class BaselineOverlay:
         return False
 
     def changes(self) -> Bricks | None:
-        """What the viewer has not been told yet; nothing while the map is being made anew."""
+        """The changes that were not sent yet; None while the map is being rebuilt."""
         return None if self._stale else self._publisher.changes()
 
     def start_over(self) -> None:
-        """A new viewer has been told nothing."""
+        """Send the whole map with the next changes: the viewer is a new one."""
         self._publisher.start_over()
 
     def everything_gone(self) -> Bricks:
-        """What takes this map away from the viewer."""
+        """The update that removes this map from the page."""
         return self._publisher.everything_gone()

@@ -27,13 +27,13 @@ from taichi_mrf.viewer.scene.options import ViewOptions
 from taichi_mrf.viewer.transport.server import start_server
 
 _QUIET_S = 0.3
-"""A client that has got nothing for so long has got everything."""
+"""A client that has received nothing for so long has received everything."""
 
 
 @dataclass(frozen=True)
 class ViewerRow:
     """One keyframe. ``publish`` is what the mapper spends on finding the changes, ``draw`` the page's thread
-    on turning them into what is sent, both in seconds; ``changed`` are the bricks that were told of,
+    on turning them into what is sent, both in seconds; ``changed`` is the number of bricks that were sent,
     ``sent`` the bytes that one browser got, ``shown`` the voxels of the map that the page then shows."""
 
     publish: float

@@ -1,4 +1,5 @@
-"""What is shown beside the map when a user wants it: images of a view, and OctoMap's way with the frames."""
+"""What is shown beside the map on request: images of a view, and the same keyframes mapped by OctoMap's
+method."""
 
 import dataclasses
 import time
@@ -16,7 +17,7 @@ IMAGE_SECONDS = 1.0
 
 
 class Extras:
-    """Keeps the extras up to date, while nothing more important is to be done."""
+    """Keeps the extras up to date while there is no other work."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
@@ -26,20 +27,20 @@ class Extras:
         self._images_made = float("-inf")
 
     def watch(self, wanted: Watch) -> None:
-        """Take over what is wanted; the work is done later."""
+        """Note what is wanted; the work is done later."""
         if wanted != self._watch:
             self._watch, self._shown_version = wanted, -1
 
     def nothing_wanted(self) -> None:
-        """A new viewer has asked for nothing yet."""
+        """Start without extras: the viewer is a new one."""
         self._watch, self._beside = NOTHING, None
 
     def start_over(self) -> None:
-        """The map begins anew; what is wanted stays."""
+        """Start over with a new map; what is wanted stays the same."""
         self._beside, self._shown_version = None, -1
 
     def work(self, progress: Progress) -> bool:
-        """Do one piece of the work that is left, and say whether there was any. ``progress`` can stop it."""
+        """Do one piece of the work that is left; returns whether there was any. ``progress`` can stop it."""
         publisher = self._run.mapper.publisher
         if publisher.counting != self._watch.counts:
             publisher.count(self._watch.counts)
@@ -60,7 +61,7 @@ class Extras:
             return True
 
     def answer(self) -> None:
-        """While the map is being inferred: images of it as it was, where another view is wanted."""
+        """During inference: images of another view that is wanted, from the map before it."""
         self._make_images()
 
     def _catch_up(self, progress: Progress) -> bool:

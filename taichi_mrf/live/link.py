@@ -1,7 +1,7 @@
-"""The line to the viewer, a process of its own that shows the page.
+"""The connection to the viewer, a separate process that shows the page.
 
 The viewer is spawned, never forked: a fork of a process in which Taichi runs hangs. Sending never waits: one
-thread writes to the pipe whatever lies in the outbox. Requests are read by whoever maps, when it has time.
+thread writes to the pipe whatever lies in the outbox. Requests are read between two pieces of mapping.
 """
 
 import multiprocessing
@@ -17,26 +17,26 @@ from taichi_mrf.live.outbox import Outbox
 from taichi_mrf.viewer.messages import Notice, Quit, Request, Update
 
 GOODBYE_SECONDS = 0.5
-"""What the viewer gets to end by itself, before it is ended."""
+"""How long the viewer may take to end by itself, before it is terminated."""
 
 FORCE_SECONDS = 0.1
-"""What it gets after each signal."""
+"""How long it may take after each signal."""
 
 
 Serve = Callable[[Connection, str, int], None]
-"""The main function of a viewer's process: its end of the line, and where to listen."""
+"""The main function of a viewer's process: its end of the connection, host and port."""
 
 
 class Link(Protocol):
-    """What a session asks of the line to its viewer."""
+    """What a session needs of the connection to its viewer."""
 
     @property
     def lost(self) -> str | None:
-        """Why nobody is there any more, None as long as somebody is."""
+        """Reason the viewer disconnected; None while connected."""
         ...
 
     def send(self, update: Update) -> None:
-        """Pass an update on; never waits, and does nothing once the link is lost."""
+        """Send an update; never waits, and does nothing once the viewer has disconnected."""
         ...
 
     def requests(self) -> list[Request]:
@@ -49,13 +49,13 @@ class Link(Protocol):
 
 
 class ViewerLink:
-    """A viewer process and the line to it. Use it as a context, or :meth:`close` it."""
+    """A viewer process and the connection to it. Use it as a context, or :meth:`close` it."""
 
     def __init__(
         self, host: str, port: int, serve: Serve | None = None, outbox: Outbox | None = None
     ) -> None:
-        """Start the viewer; its first request will be Listening. ``serve`` is what the process runs, by
-        default the live page; ``outbox`` knows which updates take each other's place there."""
+        """Start the viewer; its first request will be Listening. ``serve`` is the process's main function,
+        by default the live page's; ``outbox`` decides which updates replace each other."""
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe(duplex=True)
         self._process = context.Process(
@@ -63,7 +63,7 @@ class ViewerLink:
         )
         with _interrupts_ignored():
             self._process.start()
-        theirs.close()  # so that the end of their process is the end of the line
+        theirs.close()  # so that the connection ends with their process
         self._outbox = Outbox() if outbox is None else outbox
         self._lost: str | None = None
         self._heard: list[Request] = []
@@ -72,9 +72,9 @@ class ViewerLink:
 
     @property
     def lost(self) -> str | None:
-        """Why the viewer is gone, None as long as it is there."""
+        """Reason the viewer disconnected; None while connected."""
         if self._lost is None and not self._process.is_alive():
-            self._hear()  # it may have said why
+            self._hear()  # its last message may give the reason
             self._lost = (
                 self._lost or f"the viewer's process has ended (exit status {self._process.exitcode})"
             )
@@ -85,20 +85,20 @@ class ViewerLink:
         self._outbox.put(update)
 
     def requests(self) -> list[Request]:
-        """What the viewer has asked for since the last call."""
+        """The requests that have come since the last call."""
         self._hear()
         heard, self._heard = self._heard, []
         return heard
 
     def wait(self, timeout: float) -> None:
-        """Sleep until the viewer says something or ends, at most ``timeout`` seconds."""
+        """Wait until the viewer sends something or ends, at most ``timeout`` seconds."""
         if self.lost is None:
             wait([self._connection, self._process.sentinel], timeout)
         else:
             time.sleep(timeout)
 
     def close(self) -> None:
-        """End the viewer: by asking, then by force. Nothing is left of it afterwards."""
+        """End the viewer: ask it to, then terminate it, then kill it."""
         self._outbox.close()
         self._process.join(GOODBYE_SECONDS)
         for end in (self._process.terminate, self._process.kill):
@@ -115,8 +115,8 @@ class ViewerLink:
         self.close()
 
     def _hear(self) -> None:
-        """Read what has come from the viewer. That the line has ended is told by the process's end, which
-        follows, or else here."""
+        """Read what has come from the viewer. Where the connection ends, so does the process; if it does
+        not, that is noted here."""
         try:
             while self._connection.poll():
                 request = self._connection.recv()
@@ -140,8 +140,8 @@ class ViewerLink:
 
 @contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    """A process that is started meanwhile ignores Ctrl-C from its first instruction on; whoever started it
-    tells it when to end."""
+    """Processes that are started in this block ignore Ctrl-C from their first instruction on; the session
+    ends them."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,4 +1,4 @@
-"""The keyframes as the viewer knows them: by numbers that stay the same when one is switched off and on."""
+"""The keyframes of a live run, by numbers that stay the same when one is switched off and on again."""
 
 from dataclasses import dataclass, field
 
@@ -13,12 +13,12 @@ from taichi_mrf.viewer.messages import KeyframeState
 
 
 @dataclass
-class Entry:
+class LiveKeyframe:
     """One keyframe. ``map_id`` is its number in the map while it is on; ``depth_m`` (H, W) is its depth image
-    in metres, 0 for no measurement, while it is off. A frozen one has neither any more.
+    in metres, 0 for no measurement, while it is off. A frozen keyframe has neither.
 
-    ``T_recorded`` is where it was recorded and ``T_home`` where alignment has placed it, which is the same if
-    poses are not refined; a user may have put it elsewhere (``moved_by_hand``).
+    ``T_recorded`` is the recorded pose and ``T_home`` the one found by alignment, which is the same if poses
+    are not refined; ``moved_by_hand``: a user has moved it elsewhere.
     """
 
     id: int
@@ -40,30 +40,32 @@ class Entry:
 class LiveKeyframes:
     """All keyframes of a run by number, in the order in which they came. A number is never given twice."""
 
-    entries: dict[int, Entry] = field(default_factory=dict)
+    entries: dict[int, LiveKeyframe] = field(default_factory=dict)
     next_id: int = 0
 
-    def add(self, frame: PosedDepth, rays: int, picture: NDArray[np.uint8], map_id: int) -> Entry:
-        """Enter a keyframe that the map has just taken in. Raises KeyframeError for one without a pinhole
+    def add(self, frame: PosedDepth, rays: int, picture: NDArray[np.uint8], map_id: int) -> LiveKeyframe:
+        """Add a keyframe that has just been added to the map. Raises KeyframeError for one without a pinhole
         camera."""
         if not isinstance(frame.camera, PinholeCamera):
             kind = type(frame.camera).__name__
             raise KeyframeError(f"{frame.name}: the live page cannot show a camera of type {kind}")
-        entry = Entry(self.next_id, frame.name, frame.T_world_camera, frame.camera, rays, picture, map_id)
+        entry = LiveKeyframe(
+            self.next_id, frame.name, frame.T_world_camera, frame.camera, rays, picture, map_id
+        )
         self.entries[entry.id] = entry
         self.next_id += 1
         return entry
 
-    def find(self, id: int) -> Entry:
+    def find(self, id: int) -> LiveKeyframe:
         """A keyframe by the viewer's number. Raises KeyframeError."""
         if id not in self.entries:
             raise KeyframeError(f"there is no keyframe {id}")
         return self.entries[id]
 
-    def with_state(self, state: KeyframeState) -> list[Entry]:
+    def with_state(self, state: KeyframeState) -> list[LiveKeyframe]:
         """Those that are on, off or frozen, the oldest first."""
         return [entry for entry in self.entries.values() if entry.state == state]
 
     def clear(self) -> None:
-        """Forget all of them, but not which numbers were given."""
+        """Remove all keyframes; their numbers are not given again."""
         self.entries.clear()

@@ -1,8 +1,8 @@
-"""The map of a live run with its keyframes: taking them in, editing them, and settling the map.
+"""The map of a live run with its keyframes: adding, editing, and settling the map by full inference.
 
-While frames come, each new keyframe is swept once against what is known, and then those to whom it said
-something new. That is quick, but leaves a map that depends on the order of events. To settle it means full
-inference, after which it is the map that its keyframes give, bit for bit, whatever has happened to them.
+While frames come, each new keyframe is swept once, and then those whose cavity it has changed. That is
+quick, but the map depends on the order of events. Settling runs full inference, after which the map is a
+function of its keyframes, bit for bit, whatever has happened to them.
 """
 
 from collections.abc import Callable, Iterator
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.inference.schedule import InferProgress, InferReport, Progress
-from taichi_mrf.live.live_keyframes import Entry, LiveKeyframes
+from taichi_mrf.live.live_keyframes import LiveKeyframe, LiveKeyframes
 from taichi_mrf.live.pictures import thumbnail
 from taichi_mrf.live.publish import Publisher
 from taichi_mrf.live.ray_answers import PosedDepthImage
@@ -26,20 +26,20 @@ from taichi_mrf.viewer import messages
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 
 RENEW_SECONDS = 0.1
-"""So long at most keyframes are swept again at a time, before a frame or a request may be due."""
+"""Longest time for which keyframes are swept again at a stretch, in seconds, before frames and requests are
+looked at."""
 
 FORGOTTEN = np.full((1, 1, 3), 90, np.uint8)
-"""The picture of a keyframe whose depth image is gone."""
+"""The picture of a keyframe whose depth image is no longer in memory."""
 
 
 class Mapper:
-    """A map, and the roster of its keyframes.
+    """A map and its keyframes as the page shows them.
 
-    ``unsettled`` says that keyframes have come, gone or moved since the last full inference, ``edited`` that
-    some of them by a user's hand, and ``unaligned``, if poses are refined, that keyframes have come since all
-    were aligned with each other. ``unanswered`` says that keyframes may have heard something new
-    that they have not been swept for. ``saved_unsettled`` says that the map comes from a file that was saved
-    before its inference was complete.
+    ``unsettled``: keyframes were added, removed or moved since the last full inference; ``edited``: some of
+    them by a user; ``unaligned``: keyframes were added since all were aligned with each other, if poses are
+    refined; ``unanswered``: the cavity of some keyframes may have changed since their last sweep.
+    ``saved_unsettled``: the map comes from a file that was saved before its inference was complete.
     """
 
     def __init__(self, m: OccupancyMap, first_id: int = 0, refiner: PoseRefiner | None = None) -> None:
@@ -53,7 +53,7 @@ class Mapper:
         self.publisher = Publisher(
             "map", m.view.pool, m.seen_by, prior_is_unknown=m.METHOD.prior_is_unknown, counting=False
         )
-        # A map from a file has beliefs but no messages, and edits would have to infer them first.
+        # A map from a file has beliefs but no messages; an edit would need full inference first.
         self.lacks_messages = bool(m.keyframes) and has_messages(m)
         self.unsettled, self.edited = self.lacks_messages or self.stale, False
         self.saved_unsettled = bool(m.keyframes) and not m.settled
@@ -62,16 +62,16 @@ class Mapper:
 
     @property
     def min_evidence(self) -> float:
-        """Log-odds nearer to the prior than this are unknown, as they are published."""
+        """Voxels whose published log-odds are nearer to the prior than this count as unknown."""
         return LOG_ODDS_STEP if self.map.METHOD.prior_is_unknown else self.map.config.volume.min_evidence
 
     @property
     def stale(self) -> bool:
-        """Whether the map shows nothing of the last edits until it is settled."""
+        """Whether the map does not show the last edits until it is settled."""
         return self.map.stale
 
-    def enter(self, added: Added) -> Entry:
-        """Enter a keyframe that the intake has added to the map."""
+    def enter(self, added: Added) -> LiveKeyframe:
+        """Note a keyframe that the intake has added to the map."""
         self.unsettled = self.unanswered = True
         self.unaligned = self.refiner is not None
         frame = added.frame
@@ -80,7 +80,7 @@ class Mapper:
         return entry
 
     def sweep(self, map_id: int) -> None:
-        """Sweep a keyframe once, by its number in the map, unless the map has to be made anew anyway."""
+        """Sweep a keyframe once, by its number in the map, unless the map is about to be rebuilt."""
         if not self.stale:
             self.map.infer(sweeps=1, keyframes=[map_id])
 
@@ -89,7 +89,7 @@ class Mapper:
         ids = [self._map_id(entry) for entry in self.roster.with_state("on")]
         self.map.infer(sweeps=1, keyframes=ids, progress=progress)
 
-    def switch(self, id: int, on: bool) -> Entry:
+    def switch(self, id: int, on: bool) -> LiveKeyframe:
         """Take a keyframe out of the map, keeping its image, or bring it back. Raises KeyframeError."""
         entry = self._changeable(id)
         if on == (entry.state == "on"):
@@ -106,7 +106,7 @@ class Mapper:
         self.unsettled = self.edited = self.unanswered = True
         return entry
 
-    def move(self, id: int, T_world_camera: Pose) -> Entry:
+    def move(self, id: int, T_world_camera: Pose) -> LiveKeyframe:
         """Give a keyframe another pose. Raises KeyframeError."""
         entry, T = self._changeable(id), as_pose(T_world_camera)
         if entry.state == "on":
@@ -116,8 +116,8 @@ class Mapper:
         entry.T_world_camera, entry.moved_by_hand = T, True
         return entry
 
-    def align(self, entry: Entry, T_world_camera: Pose) -> bool:
-        """Put a keyframe that is on where alignment wants it, and sweep it once; returns whether it moved."""
+    def align(self, entry: LiveKeyframe, T_world_camera: Pose) -> bool:
+        """Move a keyframe that is on to its aligned pose, and sweep it once; returns whether it moved."""
         if np.array_equal(entry.T_world_camera, T_world_camera):
             return False
         self.map.move_keyframe(self._map_id(entry), T_world_camera)
@@ -127,8 +127,8 @@ class Mapper:
         return True
 
     def freeze(self, id: int, by_hand: bool = True) -> messages.KeyframeInfo:
-        """Fold a keyframe into the map for good; returns the last that is to be said of it, because its image
-        is forgotten. Raises KeyframeError."""
+        """Freeze a keyframe: its evidence becomes part of the map for good, its image is dropped. Returns
+        the last message about it. Raises KeyframeError."""
         entry = self._changeable(id)
         if not can_freeze(self.map):
             raise KeyframeError(f"a map of the method {self.map.config.method} cannot freeze keyframes")
@@ -142,14 +142,15 @@ class Mapper:
         return self._message(entry, picture, crossed)
 
     def renew(self) -> None:
-        """Sweep the keyframes that have heard most, for RENEW_SECONDS at most; the rest waits."""
+        """Sweep the keyframes whose cavity has changed most, for RENEW_SECONDS at most; the rest waits."""
         if self.stale or not has_messages(self.map):
             self.unanswered = False
         else:
             self.unanswered = not self.map.renew(seconds=RENEW_SECONDS).complete
 
-    def surplus(self, newest: Entry, keep: int) -> list[Entry]:
-        """Of more than ``keep`` keyframes that are on those to freeze: first what has left the view."""
+    def surplus(self, newest: LiveKeyframe, keep: int) -> list[LiveKeyframe]:
+        """The keyframes to freeze if more than ``keep`` are on: those first that share least with the view
+        of the newest."""
         on = self.roster.with_state("on")
         if not can_freeze(self.map):
             return on[: max(0, len(on) - keep)]
@@ -183,23 +184,24 @@ class Mapper:
             self.unanswered = False
         return complete
 
-    def describe(self, entry: Entry) -> messages.KeyframeInfo:
-        """What the viewer must know of a keyframe."""
+    def describe(self, entry: LiveKeyframe) -> messages.KeyframeInfo:
+        """The message that describes a keyframe to the viewer."""
         return self._message(entry, entry.picture, self.crossed(entry))
 
-    def crossed(self, entry: Entry) -> NDArray[np.int32]:
+    def crossed(self, entry: LiveKeyframe) -> NDArray[np.int32]:
         """The bricks that a keyframe's rays go through, (n, 3); none for one that is not on, and none in a
         map all of whose crossed bricks exist."""
         if entry.state != "on":
             return np.zeros((0, 3), np.int32)
         return self.map.crossed_bricks(self._map_id(entry))
 
-    def depth_of(self, entry: Entry) -> NDArray[np.float32] | None:
+    def depth_of(self, entry: LiveKeyframe) -> NDArray[np.float32] | None:
         """A keyframe's depth image, (H, W) in metres; None once it is frozen."""
         return self._keyframe(entry).depth_m if entry.state == "on" else entry.depth_m
 
-    def seer(self, entry: Entry) -> PosedDepthImage:
-        """A keyframe as what rays can be asked of. Raises KeyframeError for a frozen one."""
+    def seer(self, entry: LiveKeyframe) -> PosedDepthImage:
+        """A keyframe's depth image with its pose, for the rays of its pixels. Raises KeyframeError for a
+        frozen one."""
         depth_m = self.depth_of(entry)
         if depth_m is None:
             raise KeyframeError(f"keyframe {entry.id} ({entry.name}) is frozen: its image is forgotten")
@@ -211,8 +213,8 @@ class Mapper:
         entries.sort(key=lambda entry: float(np.linalg.norm(entry.T_world_camera[:3, 3] - point)))
         return map(self.seer, entries)
 
-    def _add(self, entry: Entry) -> int:
-        """Add a keyframe that was off, and sweep it once; leaves nothing of it if that fails."""
+    def _add(self, entry: LiveKeyframe) -> int:
+        """Add a keyframe that was off, and sweep it once. If that fails, the map is unchanged."""
         assert entry.depth_m is not None
         map_id = self.map.add_keyframe(entry.depth_m, entry.T_world_camera, entry.camera, entry.name)
         try:
@@ -222,21 +224,21 @@ class Mapper:
             raise
         return map_id
 
-    def _changeable(self, id: int) -> Entry:
+    def _changeable(self, id: int) -> LiveKeyframe:
         entry = self.roster.find(id)
         if entry.state == "frozen":
             raise KeyframeError(f"keyframe {id} ({entry.name}) is frozen: it stays in the map as it is")
         return entry
 
-    def _map_id(self, entry: Entry) -> int:
+    def _map_id(self, entry: LiveKeyframe) -> int:
         assert entry.map_id is not None, f"{entry.name} is {entry.state}"
         return entry.map_id
 
-    def _keyframe(self, entry: Entry) -> MappedKeyframe:
+    def _keyframe(self, entry: LiveKeyframe) -> MappedKeyframe:
         return self.map.keyframes[self._map_id(entry)]
 
     def _message(
-        self, entry: Entry, picture: NDArray[np.uint8], crossed: NDArray[np.int32]
+        self, entry: LiveKeyframe, picture: NDArray[np.uint8], crossed: NDArray[np.int32]
     ) -> messages.KeyframeInfo:
         return messages.KeyframeInfo(
             entry.id,

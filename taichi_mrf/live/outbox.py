@@ -1,8 +1,8 @@
-"""Updates that wait for the viewer: what is overtaken before it was sent is never sent.
+"""Updates that wait to be sent to the viewer; an update that a later one replaces is never sent.
 
-A viewer that is slower than mapping, or stopped altogether, must cost mapping neither time nor memory
-without end. So an update takes the place of an older one that it makes pointless, and bricks are merged
-brick by brick: what waits is never more than the map and its keyframes are.
+A viewer that is slower than mapping, or suspended, must not slow mapping down or fill its memory. So an
+update replaces an older one of its kind, and bricks are merged brick by brick: what waits is never larger
+than the map and its keyframes.
 """
 
 import threading
@@ -32,7 +32,7 @@ BRICKS_AT_ONCE = 2048
 """Bricks sent in one piece (3 MB), so that other updates need not wait for a whole map."""
 
 MOST = {Notice: 50, File: 4}
-"""So many of these wait at most; the oldest are dropped first."""
+"""Most updates of these kinds that wait; the oldest are dropped first."""
 
 LATEST_ONLY = (Status, CurrentCamera, Images, RayAnswer)
 
@@ -47,8 +47,8 @@ Waiting = Union[Update, "WaitingBricks", Quit]
 class Outbox:
     """A queue that one thread fills and another empties.
 
-    A page with updates of its own says in a subclass which of them take each other's place (:meth:`key`), and
-    which make pointless what was said before (:meth:`still_wanted`).
+    A page with further kinds of updates defines in a subclass which of them replace each other
+    (:meth:`key`), and which waiting updates a new one makes obsolete (:meth:`still_wanted`).
     """
 
     def __init__(self) -> None:
@@ -74,14 +74,14 @@ class Outbox:
             self._changed.notify()
 
     def close(self) -> None:
-        """Let go of all that waits; the last thing to take is Quit."""
+        """Drop all that waits; the last update to take is Quit."""
         with self._changed:
             self._waiting = {"quit": Quit()}
             self._closed = True
             self._changed.notify()
 
     def take(self) -> Update | Quit:
-        """The next update, once there is one. After Quit nothing comes any more."""
+        """Wait for the next update. Nothing follows after Quit."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting)
             key = next(iter(self._waiting))
@@ -99,8 +99,8 @@ class Outbox:
             return len(self._waiting)
 
     def key(self, update: Update) -> Hashable | None:
-        """Updates with the same key take each other's place; None: it waits beside others of its kind, of
-        which MOST says how many."""
+        """Updates with the same key replace each other; None: the update waits beside others of its kind, up
+        to MOST of them."""
         if isinstance(update, LATEST_ONLY):
             return type(update).__name__
         if isinstance(update, KeyframeInfo):
@@ -110,12 +110,12 @@ class Outbox:
         return None
 
     def still_wanted(self, update: Update) -> Callable[[Waiting], bool] | None:
-        """Which of what waits is still worth sending after this update; None: all. A Hello makes all
-        pointless that was said of the map before."""
+        """Tells which waiting updates are still worth sending after this one; None: all. A Hello makes
+        obsolete all earlier updates of the map."""
         return (lambda waiting: isinstance(waiting, Notice | File)) if isinstance(update, Hello) else None
 
     def _place(self, update: Update) -> Hashable:
-        """Where the update waits; makes room for it if need be."""
+        """The key under which an update waits. Drops older updates of its kind if there are too many."""
         key = self.key(update)
         if key is not None:
             return key
@@ -157,12 +157,12 @@ class WaitingBricks:
 
 
 def merged(parts: list[Bricks]) -> Bricks:
-    """Several updates of one layer as one that says the same as all of them in turn."""
+    """Several updates of one layer as a single one with the same effect."""
     bricks = np.concatenate([part.bricks for part in parts])
     log_odds = np.concatenate([part.log_odds for part in parts])
     seen = np.concatenate([part.seen for part in parts])
     removed = np.concatenate([part.removed for part in parts])
-    # The last word on each brick counts. Within one update nothing is said twice of any.
+    # The last update of each brick counts. No update has a brick twice.
     said = np.concatenate([np.full(len(p.bricks), i) for i, p in enumerate(parts)])
     gone = np.concatenate([np.full(len(p.removed), i) for i, p in enumerate(parts)])
     keys = grid_keys(np.concatenate([bricks, removed]))

@@ -20,7 +20,7 @@ IMAGE_WIDTH = 320
 _NO_DEPTH = np.array([90, 90, 90], np.uint8)
 
 ACCURACY_COLORS = np.zeros((4, 3), np.uint8)
-"""RGB for each value of an accuracy image; told apart without telling red from green."""
+"""RGB for each value of an accuracy image; distinguishable with red-green colour blindness."""
 ACCURACY_COLORS[NOT_JUDGED] = 40, 40, 40
 ACCURACY_COLORS[NO_ANSWER] = 170, 170, 170
 ACCURACY_COLORS[WRONG] = 213, 94, 0
@@ -61,7 +61,8 @@ def view_images(
     T_world_camera: Pose,
     depth_m: NDArray[np.float32] | None,
 ) -> Images:
-    """Measured depth, rendered depth and accuracy of a view; ``depth_m`` is None if its image is forgotten.
+    """Measured depth, rendered depth and accuracy of a view; ``depth_m`` is None if the image is no longer
+    in memory.
 
     A pixel is right if the map's answer lies within 1.5 sigma of the measurement, sigma being one voxel.
     """
@@ -92,7 +93,7 @@ def view_images(
 
 
 def thinned(camera: PinholeCamera, step: int) -> PinholeCamera:
-    """The camera whose pixels are every ``step``-th of a camera's along both sides."""
+    """The camera that has every ``step``-th pixel of a camera along both sides."""
     return PinholeCamera(
         -(-camera.width // step),
         -(-camera.height // step),
@@ -104,5 +105,5 @@ def thinned(camera: PinholeCamera, step: int) -> PinholeCamera:
 
 
 def _step(width: int, most: int) -> int:
-    """Take every so many-th pixel to have at most ``most`` of them."""
+    """The stride with which at most ``most`` of ``width`` pixels are taken."""
     return -(-width // most)

@@ -1,4 +1,4 @@
-"""How the work stands, in words and figures, as the viewer shows it."""
+"""The progress of a live run in words and figures, as the viewer shows it."""
 
 import time
 from collections import deque
@@ -11,7 +11,7 @@ from taichi_mrf.methods.statistics import MapStatistics
 from taichi_mrf.viewer.messages import Status
 
 RATE_SECONDS = 5.0
-"""The keyframe rate is that of the last so many seconds."""
+"""Seconds over which the keyframe rate is averaged."""
 
 
 class Progress:
@@ -28,13 +28,13 @@ class Progress:
         self._taken.append(self._clock())
 
     def measure(self, mapper: Mapper) -> None:
-        """Take the map's measure, which costs too much for each sentence."""
+        """Measure the map's size, which takes too long for every message."""
         self._measured = mapper.map.statistics()
 
     def status(
         self, activity: str, share: float, replay: Replay | None, mapper: Mapper, waiting: bool
     ) -> Status:
-        """``waiting`` says that edits wait for what is being done."""
+        """``waiting``: edits wait until the present work is done."""
         if self._measured is None:
             self.measure(mapper)
         assert self._measured is not None

@@ -1,7 +1,7 @@
-"""Which bricks the viewer must hear of: those that differ from what it was told last.
+"""Which bricks to send to the viewer: those that differ from what was sent last.
 
-The pool notes which bricks may have changed, so looking costs what changed and not what there is; comparing
-with what was sent leaves out the many that inference has touched and hardly moved.
+The pool notes which bricks may have changed, so the cost depends on the changes and not on the size of the
+map; comparing with what was sent leaves out the many bricks that inference has hardly changed.
 """
 
 from collections.abc import Callable
@@ -17,11 +17,11 @@ SeenBy = Callable[[NDArray[np.int32]], NDArray[np.uint8]]
 """Slots (n,) -> how many keyframes see each of their voxels, (n, 512)."""
 
 _AT_ONCE = 4096
-"""Bricks that are read from the pool in one piece."""
+"""Bricks that are read from the pool at once."""
 
 
 class Publisher:
-    """Finds the changes of one map, and remembers what has been told of it."""
+    """Finds the changes of one map since the last call."""
 
     def __init__(
         self,
@@ -33,10 +33,10 @@ class Publisher:
         least_log_odds: float | None = None,
         counting: bool = True,
     ) -> None:
-        """With ``prior_is_unknown`` a voxel that holds exactly the pool's prior is one that nobody has seen,
-        as in maps that integrate scan by scan: it is told as just less likely occupied than not, or all of
-        them would be shown. With ``least_log_odds`` a brick counts only if it has a known voxel above that.
-        ``counting`` asks who sees each voxel, which costs a look at every keyframe's messages.
+        """With ``prior_is_unknown`` a voxel that holds exactly the pool's prior is unobserved, as in maps
+        that integrate scan by scan: it is sent as just less likely occupied than not, or all of them would
+        be shown. With ``least_log_odds`` a brick counts only if it has a known voxel above that.
+        ``counting``: send the number of keyframes that see each voxel, which reads every keyframe's messages.
         """
         self._layer, self._pool, self._seen_by = layer, pool, seen_by
         self._prior_is_unknown, self._least = prior_is_unknown, least_log_odds
@@ -59,7 +59,7 @@ class Publisher:
         return Bricks(self._layer, found[0], found[1], found[2], removed)
 
     def everything_gone(self) -> Bricks:
-        """The update that takes all that was told away again."""
+        """The update that removes everything that was sent."""
         empty = np.zeros((0, VOXELS))
         bricks = self._told.bricks()
         self._told, self._all = _ToldBricks(), True
@@ -68,19 +68,20 @@ class Publisher:
         )
 
     def count(self, on: bool) -> None:
-        """Count who sees the voxels from now on, or no longer; all bricks are told again."""
+        """Start or stop counting the keyframes that see each voxel; all bricks are sent again."""
         if on != self.counting:
             self.counting = on
             self.start_over()
 
     def start_over(self) -> None:
-        """Someone else listens now, who has been told nothing."""
+        """Send the whole map with the next changes: the viewer is a new one."""
         self._told, self._all = _ToldBricks(), True
 
     def _changed(
         self, slots: NDArray[np.int32]
     ) -> tuple[NDArray[np.int32], NDArray[np.int16], NDArray[np.uint8], NDArray[np.int32]]:
-        """Those of some bricks that are news: coordinates, log-odds, seen; and those that count no more."""
+        """Of some bricks those that differ from what was sent: coordinates, log-odds, seen; and the bricks
+        that are hidden now."""
         bricks, belief = self._pool.bricks[slots], self._pool.read("belief", slots)
         log_odds = pack_log_odds(belief)
         seen = self._seen_by(slots) if self.counting else np.zeros(log_odds.shape, np.uint8)
@@ -95,7 +96,7 @@ class Publisher:
         return bricks[news], log_odds[news], seen[news], hidden
 
     def _gone(self) -> NDArray[np.int32]:
-        """Told bricks that do not exist any more."""
+        """Bricks that were sent and do not exist any more."""
         before, self._identity = self._identity, self._pool.identity.copy()
         lived = before >= 0
         if (before[lived] == self._identity[: len(before)][lived]).all():
@@ -106,7 +107,7 @@ class Publisher:
 
 
 class _ToldBricks:
-    """What the viewer knows, by brick: rows of arrays that grow."""
+    """What was sent to the viewer, by brick: rows of arrays that grow."""
 
     def __init__(self) -> None:
         self._rows: dict[int, int] = {}
@@ -122,7 +123,8 @@ class _ToldBricks:
     def tell(
         self, bricks: NDArray[np.int32], log_odds: NDArray[np.int16], seen: NDArray[np.uint8]
     ) -> NDArray[np.bool_]:
-        """Remember what some bricks, each named once, hold; returns which of them are news, (n,)."""
+        """Note the content of some bricks, each at most once; returns which of them differ from before,
+        (n,)."""
         keys = grid_keys(bricks).tolist()
         rows = np.array([self._rows.get(key, -1) for key in keys], np.int64)
         news = rows < 0
@@ -139,7 +141,7 @@ class _ToldBricks:
         return news
 
     def drop(self, bricks: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Forget bricks; returns those of them that were known."""
+        """Drop bricks; returns those of them that had been sent."""
         rows = [self._rows.pop(key, -1) for key in grid_keys(bricks).tolist()]
         self._free += [row for row in rows if row >= 0]
         return bricks[np.array(rows, np.int64) >= 0]

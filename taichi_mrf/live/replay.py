@@ -18,9 +18,9 @@ from taichi_mrf.sensor.frame import Frame
 class Replay:
     """The frames 0, ``every``, 2 ``every``, ... of a source, ``limit`` of them at most, in time.
 
-    ``number`` (from 1) is that of the frame taken last, of ``frames`` (0: without end); ``finished`` says
-    that it was the last, and ``problem`` why, if the source broke off. While ``paused``, frames can still be
-    taken one by one.
+    ``number`` (from 1) is that of the frame taken last, of ``frames`` (0: without end); ``finished``: it was
+    the last one; ``problem``: why, if the source broke off. While ``paused``, frames can still be taken one
+    by one.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class Replay:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """``speed`` is the multiple of the recording's own pace, 0 as fast as possible. One frame in
-        ``hold_out`` is passed unread, the same as in pipeline.map_sequence. ``clock`` tells the time in
+        ``hold_out`` is passed unread, the same as in pipeline.map_sequence. ``clock`` returns the time in
         seconds.
         """
         self._dataset, self._clock = dataset, clock
@@ -78,13 +78,13 @@ class Replay:
         return self._speed
 
     def set_speed(self, factor: float) -> None:
-        """Change the pace from here on. Raises ConfigError for what is no pace."""
+        """Change the speed from here on. Raises ConfigError if it is negative or not finite."""
         if not (math.isfinite(factor) and factor >= 0):
             raise ConfigError(f"a speed must be 0 or a positive number, not {factor}")
         self._speed, self._begin = float(factor), None
 
     def pause(self) -> None:
-        """No frame is due any more."""
+        """Pause: no frame is due."""
         self.paused = True
 
     def resume(self) -> None:

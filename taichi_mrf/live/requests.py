@@ -1,4 +1,4 @@
-"""What each request of the viewer does. Whatever goes wrong with one becomes a notice for the user."""
+"""What each request of the viewer does. An error in one becomes a notice for the user."""
 
 import tempfile
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from taichi_mrf.live.extras import Extras
-from taichi_mrf.live.live_keyframes import Entry
+from taichi_mrf.live.live_keyframes import LiveKeyframe
 from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.live.ray_answers import pixel_answer, point_answer
 from taichi_mrf.live.run import Run
@@ -68,7 +68,7 @@ class Requests:
         }
 
     def carry_out(self, request: Request) -> None:
-        """Do what is asked for, or tell the user why not."""
+        """Carry a request out, or tell the user why not."""
         self._run.guarded(lambda: self._ways[type(request)](request))
 
     def _quit(self, request: Quit) -> None:
@@ -93,12 +93,12 @@ class Requests:
         if self._run.replay is not None:
             self._run.replay.set_speed(request.factor)
 
-    def _edit(self, request: Switch | Move, change: Callable[[Mapper], Entry]) -> None:
+    def _edit(self, request: Switch | Move, change: Callable[[Mapper], LiveKeyframe]) -> None:
         run = self._run
         run.mapper.roster.find(request.keyframe)
         try:
             change(run.mapper)
-        finally:  # whatever has become of it, the viewer shows what is
+        finally:  # even if it fails, the viewer is sent the present state
             run.send(run.describe(request.keyframe))
             run.publish()
 

@@ -1,4 +1,4 @@
-"""The state of a live run: what is mapped, what has come of it, and who watches."""
+"""The state of a live run: its source, its map, and the connection to its page."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,9 +22,9 @@ from taichi_mrf.viewer.messages import CurrentCamera, Hello, KeyframeInfo, Notic
 
 @dataclass(frozen=True)
 class Policy:
-    """What a run does by itself. ``keep_live``: most keyframes that are on before some are frozen, None
-    for no limit. ``out``: folder for the files that a user saves. ``leave_when_done``: end once the source
-    has ended and the map is settled."""
+    """What a run does without being asked. ``keep_live``: most keyframes that are on before some are frozen,
+    None for no limit. ``out``: folder for the files that a user saves. ``leave_when_done``: end once the
+    source has ended and the map is settled."""
 
     keep_live: int | None = None
     out: Path | None = None
@@ -35,9 +35,9 @@ class Run(SessionCore):
     """One live run. ``mapper`` holds the map, ``intake`` takes frames into it; ``replay`` has the frames,
     None if there are none to come.
 
-    ``stepping`` says that one more keyframe is to be taken whatever the pace, ``current`` is the frame that
-    was read last. ``version`` changes with the map that is shown and with the current camera. ``full`` says
-    why the last frame found no room in the map, None if it did.
+    ``stepping``: take frames until one more keyframe is added, whatever the pace. ``current`` is the frame
+    that was read last. ``version`` changes with the map that is shown and with the current camera. ``full``
+    is the reason if the last frame did not fit into memory, else None.
     """
 
     def __init__(self, source: Source, link: Link, policy: Policy) -> None:
@@ -50,9 +50,8 @@ class Run(SessionCore):
         self.begin(first_id=0)
 
     def begin(self, first_id: int) -> None:
-        """Forget the map, if there is one, and start the source from its beginning, at the speed in
-        force. The viewer's numbers of keyframes begin at ``first_id``. What is raised leaves the old map in
-        place."""
+        """Drop the map, if there is one, and start the source from its beginning, at the present speed. The
+        viewer's numbers of keyframes begin at ``first_id``. If it raises, the old map stays."""
         source = self.source
         intake = Intake(
             source.new_map(),
@@ -99,7 +98,7 @@ class Run(SessionCore):
         self.publish()
 
     def publish(self) -> None:
-        """Send what has changed of the map, and take its measure."""
+        """Send the changes of the map, and measure its size."""
         changes = self.mapper.publisher.changes()
         if changes is not None:
             self.send(changes)
@@ -107,17 +106,17 @@ class Run(SessionCore):
         self.progress.measure(self.mapper)
 
     def show_camera(self, frame: Frame) -> None:
-        """Tell the viewer where a frame was taken."""
+        """Show the viewer the pose of a frame."""
         self.current = frame
         self.version += 1
         self.send(CurrentCamera(frame.name, frame.T_world_camera, frame.camera))
 
     def describe(self, id: int) -> KeyframeInfo:
-        """What the viewer must know of a keyframe."""
+        """The message that describes a keyframe to the viewer."""
         return self.mapper.describe(self.mapper.roster.find(id))
 
     def tell(self, activity: str, share: float) -> None:
-        """Tell the viewer what is being done, and how much of that is."""
+        """Tell the viewer the present activity, and the share of it that is done."""
         waiting = self.inbox.has_edits()
         self.send(self.progress.status(activity, share, self.replay, self.mapper, waiting))
 
@@ -145,7 +144,7 @@ class Run(SessionCore):
 
     @property
     def facts(self) -> RunFacts:
-        """What else the run's report says."""
+        """The facts of the run's report besides its result."""
         return RunFacts(self.source.name, self.source.config, self.source.dataset, self.source.choice)
 
     @property
@@ -155,7 +154,7 @@ class Run(SessionCore):
 
     @property
     def is_replaying(self) -> bool:
-        """Whether more frames are to come without anybody's doing, or one is that was asked for."""
+        """Whether frames are being replayed, or a single step was asked for."""
         return (
             self.replay is not None and not self.replay.finished and (self.stepping or not self.replay.paused)
         )
@@ -169,7 +168,7 @@ class Run(SessionCore):
 
     @property
     def idle_activity(self) -> str:
-        """In words, why nothing is being done."""
+        """In words, why there is nothing to do."""
         if self.replay is None:
             return "waiting: the map is up to date"
         if self.replay.finished:

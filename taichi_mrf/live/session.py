@@ -4,9 +4,9 @@ One thread does all of it, one piece after the other, because Taichi has one own
 
     requests that have come
     a frame, if one is due                     find its pose if need be, add it, align it if poses are to be
-                                               refined, sweep it once, and for a while those to whom it said
-                                               something new; publish what has changed
-    else more of those, if any are left
+                                               refined, sweep it once, and for a while those whose cavity has
+                                               changed; publish the changes
+    else sweep more keyframes whose cavity has changed, if any are left
     else rounds of alignment                   once the sequence has ended, if poses are to be refined
     else full inference, if the map needs it   requests are answered from the map as it was before
     else what is shown beside the map
@@ -53,8 +53,8 @@ class Session:
         policy: Policy,
         listening: Callable[[Listening], None] = lambda where: None,
     ) -> None:
-        """Makes the map and tells the viewer of it. ``listening`` is called when the viewer says where its
-        page is. Raises TaichiMRFError."""
+        """Makes the map and sends it to the viewer. ``listening`` is called with the address of the page.
+        Raises TaichiMRFError."""
         self.state = Run(source, link, policy)
         self._extras = Extras(self.state)
         self._requests = Requests(self.state, self._extras, listening, self._begin_anew)
@@ -182,7 +182,7 @@ class Session:
         state, mapper = self.state, self.state.mapper
 
         def align() -> None:
-            mapper.unaligned = False  # or what goes wrong would be tried again without end
+            mapper.unaligned = False  # or a failure would be repeated without end
             mover = _ShowingMover(state)
             with state.intake.result.timed("refining"):
                 complete = AlignmentRounds(refiner, mover, self._go_on_aligning).run(mover.placed_by_hand())
@@ -207,7 +207,7 @@ class Session:
         return self._go_on(step)
 
     def _go_on(self, step: InferProgress | None = None) -> bool:
-        """Between two steps of a long piece of work: answer what can be, and say whether to go on."""
+        """Between two steps of long work: carry out the requests that can be; returns whether to go on."""
         state = self.state
         state.hear()
         kept: list[Request] = []

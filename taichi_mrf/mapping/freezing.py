@@ -1,7 +1,7 @@
-"""Which keyframes to freeze, so that a run without an end stays bounded in time and memory.
+"""Which keyframes to freeze, so that an endless run is bounded in time and memory.
 
-A keyframe whose space the newest one no longer sees will not be asked for its opinion soon: what it has said
-is folded into what inference starts from, and its image and messages are forgotten.
+A keyframe that shares no space with the newest one will not change soon: its messages become part of the
+evidence that inference starts from, and its image and messages are dropped.
 """
 
 import numpy as np

@@ -76,7 +76,7 @@ HELD_OUT = Passed("held out to check the map")
 
 
 class Intake:
-    """Takes frames into one map; :attr:`result` says what has become of them."""
+    """Takes frames into one map; :attr:`result` is the record of the run."""
 
     def __init__(
         self,

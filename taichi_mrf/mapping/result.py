@@ -20,8 +20,8 @@ class MappingResult:
     each stage. ``interrupted``: the run was stopped before its end; the map holds everything up to there.
     ``poses`` are, if they were refined, the recorded and the refined pose of every keyframe; ``track`` has,
     if poses were tracked, the pose of each frame. ``full`` names the frame that did not fit into memory and
-    says why; the map holds those before it. ``steps`` says whether depth and recorded poses agree, if that
-    was checked.
+    says why; the map holds those before it. ``steps``: whether depth and recorded poses agree, if that was
+    checked.
     """
 
     map: OccupancyMap
@@ -47,7 +47,8 @@ class MappingResult:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
     def check_steps(self) -> None:
-        """Compare the recorded steps of the camera with those that depth tells, unless poses were tracked."""
+        """Compare the recorded steps of the camera with those found by aligning depth, unless poses were
+        tracked."""
         if self.track is not None:
             return
         keyframes = self.map.keyframes

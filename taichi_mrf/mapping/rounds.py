@@ -55,7 +55,7 @@ class KeyframeMover(Protocol):
 
 
 class PlainMover:
-    """Moves keyframes of a map that nobody watches."""
+    """Moves keyframes of a map that is not shown."""
 
     def __init__(self, m: AligningMap) -> None:
         self._map = m

@@ -33,7 +33,7 @@ FEWEST_KEYFRAMES = 20
 """Recordings with fewer keyframes are not checked: too few of their pairs would tell their step."""
 
 FEWEST_PAIRS = 5
-"""Fewer pairs that tell their step say nothing about the recording."""
+"""With fewer pairs whose depth determines the step there is no result."""
 
 OBSERVABLE = 0.0005
 """Least share of the largest eigenvalue that a direction needs to be aligned, as in alignment/locate.py."""
@@ -82,9 +82,9 @@ class StepCheck:
 def check_steps(
     keyframes: Mapping[int, PosedDepth], T_recorded: Mapping[int, Pose], noise: NoiseModel, max_depth: float
 ) -> StepCheck | None:
-    """Compare the steps between keyframes at their recorded poses, (4, 4) by id, with what their depth
-    tells. Depth beyond ``max_depth`` metres does not count. None if too few pairs of keyframes tell their
-    step."""
+    """Compare the steps between keyframes at their recorded poses, (4, 4) by id, with those found by
+    aligning their depth. Depth beyond ``max_depth`` metres does not count. None if the depth of too few
+    pairs determines their step."""
     ids = [id for id in T_recorded if id in keyframes]
     if len(ids) < FEWEST_KEYFRAMES:
         return None

@@ -1,11 +1,11 @@
-"""Tracking a camera without poses: where each frame was taken, by the map that the frames before it made.
+"""Tracking a camera without poses: each frame is aligned with the map of the frames before it.
 
 The first frame fixes the map's frame. Each later one is aligned with what the keyframes have measured
-(alignment/locate.py), from two guesses: that the camera stands still, and that it moves on as it did. A frame
-that fits nowhere near is lost, and the next one is looked for around the last that was not, and around where
-the camera started. There is no loop closure: what alignment is wrong by adds up along the way, until the
-camera sees again what it has mapped at the beginning. Poses are kept relative to the keyframe of the moment,
-so that they go along when it is moved.
+(alignment/locate.py), from two guesses: that the camera stands still, and that it moves on as it did. A
+frame that fits neither is lost; the next one is searched around the last pose that was found, and around the
+first. There is no loop closure: errors of alignment add up along the way, until the camera sees again what
+it has mapped at the beginning. Poses are kept relative to the keyframe of the moment, so that they follow
+when it is moved.
 """
 
 import math
@@ -23,15 +23,15 @@ from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.frame import Frame
 
 STEPS = KeyframeConfig(rotation=0.2, translation=0.2)
-"""Which frames become keyframes if the configuration does not say: with each of them, what alignment is wrong
-by would add up with each."""
+"""The steps between keyframes if the configuration sets none: if every frame were a keyframe, errors of
+alignment would add up with every frame."""
 
 REACH_M, REACH_RAD = 0.4, 0.4
 """How far from a guess a frame may be found."""
 
 GUESS_M, GUESS_RAD = 0.03, 0.03
-"""How wrong guesses are, standard deviations along and about each axis. Where depth tells a direction badly,
-the pose is a compromise; with 0.1 the camera's way in the built-in room is wrong by 4.6 cm instead of 2.8."""
+"""Standard deviations of guesses along and about each axis. Where depth determines a direction badly, the
+pose is a compromise; with 0.1 the camera's way in the built-in room is wrong by 4.6 cm instead of 2.8."""
 
 LONGEST_AHEAD = 3.0
 """A motion is continued for this many times as long as it was observed, at most."""
@@ -39,8 +39,8 @@ LONGEST_AHEAD = 3.0
 
 @dataclass(frozen=True)
 class TrackedFrame:
-    """Where a frame was taken: relative to a keyframe, the last one at that time, and in the world as it was
-    then. ``directions`` says how many of the six its points told."""
+    """The pose of a frame: relative to the last keyframe at that time, and in the world as it was then.
+    ``directions``: how many of the six degrees of freedom its points determine."""
 
     name: str
     stamp: float
@@ -50,7 +50,7 @@ class TrackedFrame:
     directions: int
 
     def pose_in(self, m: OccupancyMap) -> Pose:
-        """(4, 4) in the world as it is now; as it was if its keyframe is gone or frozen."""
+        """(4, 4) in the present world frame; the original pose if its keyframe was removed or frozen."""
         if self.keyframe is None or self.keyframe not in m.keyframes:
             return self.T_world_camera
         return m.keyframes[self.keyframe].T_world_camera @ self.T_keyframe_camera
@@ -58,18 +58,18 @@ class TrackedFrame:
 
 @dataclass
 class Track:
-    """What became of a sequence's frames: by dataset index where each was taken, and how many were lost."""
+    """The poses of a sequence's frames by dataset index, and how many frames were lost."""
 
     frames: dict[int, TrackedFrame] = field(default_factory=dict)
     lost: int = 0
 
     @property
     def unsure(self) -> int:
-        """Frames that did not tell all six directions, and took the rest from the guess."""
+        """Frames whose points do not determine all six degrees of freedom; the rest is the guess."""
         return sum(frame.directions < 6 for frame in self.frames.values())
 
     def poses(self, m: OccupancyMap) -> dict[int, Pose]:
-        """Where each frame was taken, (4, 4), in the world as it is now."""
+        """The pose of each frame, (4, 4), in the present world frame."""
         return {index: frame.pose_in(m) for index, frame in self.frames.items()}
 
     def trajectory(self, m: OccupancyMap) -> list[tuple[float, Pose]]:
@@ -78,7 +78,7 @@ class Track:
 
 
 class Tracker:
-    """Follows the camera through one map, to which somebody else adds keyframes."""
+    """Follows the camera through one map. It does not add keyframes itself."""
 
     def __init__(self, m: AligningMap, config: PoseConfig) -> None:
         self._map = m
@@ -102,7 +102,7 @@ class Tracker:
         return self._lost
 
     def follow(self, frame: Frame) -> tuple[Frame, TrackedFrame]:
-        """The frame at the pose that was found for it, its own being of no interest but for the first one.
+        """The frame at the pose that was found for it. Only the first frame's own pose counts.
 
         Raises LostFrameError, which names the frame.
         """
@@ -118,12 +118,12 @@ class Tracker:
             self._lost += 1
             raise LostFrameError(f"{frame.name}: tracking lost: {located.reason}")
         if self._lost:
-            self._last = None  # what lies between is not known, so neither is the motion
+            self._last = None  # the motion since then is unknown
         return self._found(frame, located.T_world_camera, located.directions)
 
     def took(self, keyframe: int) -> TrackedFrame:
-        """The frame that was followed last is this keyframe of the map, and may have been moved a little;
-        returns where it is now said to have been taken."""
+        """Note that the frame that was followed last has become this keyframe of the map, and may have been
+        moved a little; returns its pose."""
         assert self._last is not None
         T_world_camera = self._map.keyframes[keyframe].T_world_camera
         self._keyframe = keyframe
@@ -184,7 +184,7 @@ def tracker_of(m: OccupancyMap, config: PoseConfig) -> Tracker:
 
 
 def keyframe_steps(config: KeyframeConfig) -> KeyframeConfig:
-    """What makes a tracked frame a keyframe: what the configuration says, or STEPS if it says nothing."""
+    """The steps between keyframes of a tracked camera: the configuration's, or STEPS if it sets none."""
     if config.rotation == 0 and config.translation == 0:
         return replace(config, rotation=STEPS.rotation, translation=STEPS.translation)
     return config

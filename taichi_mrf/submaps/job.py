@@ -37,8 +37,8 @@ class Sequence:
 
 @dataclass(frozen=True)
 class Job:
-    """A sequence, how it is mapped, and how it is cut. ``skipped`` tells of each broken frame by name what is
-    wrong with it; ``centres_m`` are the cameras' places of all keyframes, by their index in the dataset."""
+    """A sequence, how it is mapped, and how it is cut. ``skipped`` has the problem of each unreadable frame
+    by name; ``centres_m`` are the camera centres of all keyframes, by their index in the dataset."""
 
     sequence: Sequence
     config: Config
@@ -80,7 +80,7 @@ class Job:
             raise MapFileError(f"{path}: not a readable plan of submaps: {said(error)}") from error
 
     def differences(self, sequence: Sequence, config: Config, submap_size: float) -> list[str]:
-        """Names of what another run would do otherwise, so that its results would be others."""
+        """Names of the settings in which another run differs, as far as they change its result."""
         # As JSON, in which a tuple is a list.
         mine, other = (json.loads(json.dumps(asdict(each))) for each in (self.sequence, sequence))
         found = [name for name in mine if mine[name] != other[name]]

@@ -1,4 +1,4 @@
-"""An MRFMap of some of a sequence's keyframes, which takes what the others say as given."""
+"""An MRFMap of some of a sequence's keyframes, with the evidence of the others as given."""
 
 from collections.abc import Iterable
 
@@ -15,12 +15,11 @@ Bricks = NDArray[np.int32]
 
 
 class PartialMap(MRFMap):
-    """Rounds of exchange need two things more of a map: to be told what absent keyframes say, and to tell
-    what others should hear."""
+    """Adds what rounds of exchange need: evidence of absent keyframes in, beliefs for other submaps out."""
 
     def assume(self, bricks: Bricks, evidence: NDArray[np.float32]) -> None:
-        """Start inference in these bricks from these log-odds, (n, 512): the prior and what keyframes say
-        that are not here. Bricks that only those have measured a surface in come to exist."""
+        """Start inference in these bricks from these log-odds, (n, 512): the prior plus the messages of
+        keyframes that are not in this map. Bricks in which only those have measured a surface are created."""
         topology = self._registry.topology
         topology.check(bricks, self.voxel_size)
         slots = topology.slots(bricks)

@@ -15,14 +15,15 @@ from taichi_mrf.system.atomic import atomic_path
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
 BAND_M = 0.3
-"""The plan shows what stands no further than this below the lowest or above the highest camera."""
+"""The plan shows voxels from this far below the lowest camera to this far above the highest."""
 
 MARGIN_M = 1.0
-"""Around what is known."""
+"""Margin around the known voxels."""
 
 BLUE = "tab:blue"
 MOST_PIXELS = 2000
-"""Along the longer side; of a larger map several voxels share a pixel, which shows the likeliest surface."""
+"""Along the longer side; in a larger map several voxels share a pixel, which shows the one most likely
+occupied."""
 
 
 def write_submap_picture(

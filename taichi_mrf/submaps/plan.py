@@ -1,8 +1,8 @@
 """How a long sequence is cut into submaps: which space each owns, and which keyframes it needs.
 
-The plane is cut into square columns, aligned to chunks of 64^3 voxels and without end in z. A submap owns the
-bricks in its column, its core, and takes every keyframe that has a ray in there, with all of its rays: what
-is said of the core is said by all who have seen it. The rest of those rays lies in the cores of others.
+The plane is cut into square columns, aligned to chunks of 64^3 voxels and without end in z. A submap owns
+the bricks in its column, its core, and has every keyframe with a ray in there, with all of its rays: all
+messages to the core are computed in one place. The rest of those rays lies in the cores of other submaps.
 """
 
 import math
@@ -21,7 +21,7 @@ Cell = tuple[int, int]
 
 @dataclass(frozen=True)
 class SeenKeyframe:
-    """A keyframe as far as the plan cares: its index in the dataset, where the camera was, in metres, and the
+    """What the plan needs of a keyframe: its index in the dataset, where the camera was, in metres, and the
     chunks (n, 3) that its rays cross."""
 
     index: int

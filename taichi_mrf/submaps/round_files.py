@@ -1,4 +1,4 @@
-"""What a submap's task leaves behind in each round: one .npz file, for the next round and the merge."""
+"""The file that a submap's task writes in each round, for the next round and the merge."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -24,9 +24,9 @@ Halo = tuple[Bricks, LogOdds]
 @dataclass(frozen=True)
 class SubmapReport:
     """How a task went. ``core_bricks`` belong to the submap; ``free_bricks`` do too, but have no voxels;
-    ``halo_bricks`` are those of others that it was told about. ``moved`` is the share of the core's voxels
-    whose probability has changed by more than 0.01 since the round before, and ``halo_moved`` the same of
-    what is told to others; None in the first round."""
+    ``halo_bricks`` are those of other submaps whose evidence it was given. ``moved`` is the share of the
+    core's voxels whose probability has changed by more than 0.01 since the round before, and ``halo_moved``
+    the same for the evidence sent to others; None in the first round."""
 
     submap: int
     round: int
@@ -45,8 +45,8 @@ class SubmapReport:
 
 @dataclass(frozen=True)
 class RoundResult:
-    """What a submap has found out: the beliefs in the bricks that it owns, the bricks that it owns and that
-    rays have crossed without a surface near, and what each neighbour is to be told."""
+    """The result of a submap: the beliefs in the bricks that it owns, the bricks that it owns in which rays
+    met no surface, and the evidence for each neighbour."""
 
     bricks: Bricks
     belief: LogOdds
@@ -94,7 +94,7 @@ def _halo(file: NpzFile, bricks: str, log_odds: str) -> Halo:
 
 
 def read_report(path: Path) -> SubmapReport:
-    """Only how the task went."""
+    """Only the report."""
     with _opened(path) as file:
         try:
             return from_dict(SubmapReport, json.loads(file.scalar("report", "U")), str(path))
@@ -103,7 +103,7 @@ def read_report(path: Path) -> SubmapReport:
 
 
 def read_halo(path: Path, listener: int) -> Halo | None:
-    """Only what a neighbour is told; None if that is nothing."""
+    """Only the evidence for one neighbour; None if there is none."""
     with _opened(path) as file:
         if f"halo_{listener}_bricks" not in file:
             return None

@@ -28,10 +28,10 @@ from taichi_mrf.system.atomic import write_text
 from taichi_mrf.voxels.layout import CHUNK, VOXELS
 
 SETTLED = 0.001
-"""No further round is made when no larger share of all voxels has moved in the last."""
+"""The rounds end when at most this share of all voxels has changed in the last one."""
 
 Progress = Callable[[str, int, int], None]
-"""Told what is being done, how much of it is done, and out of how much."""
+"""Called with the present activity, the number of its steps that are done, and how many there are."""
 
 
 @dataclass(frozen=True)
@@ -72,11 +72,11 @@ def map_in_submaps(
 ) -> SubmapsResult:
     """Map a sequence in columns of ``submap_size`` metres, and write the map in chunks to ``map_path``.
 
-    Every submap is inferred by itself, then up to ``rounds`` times again with what its neighbours have found
-    out meanwhile, until no more than ``settled`` of the voxels move. The tasks' files are kept in ``folder``,
-    which all workers must see; with ``resume`` what is there already is not done again. ``infer`` is what the
-    runner is given. Raises ConfigError for parameters that do not fit, or differ from those of the run to
-    resume, and what datasets, maps and the runner raise.
+    Every submap is inferred by itself, then up to ``rounds`` times again with the latest beliefs of its
+    neighbours, until at most the share ``settled`` of the voxels changes. The tasks' files are kept in
+    ``folder``, which all workers must see; with ``resume`` complete tasks are not repeated. ``infer`` is
+    what the runner is given. Raises ConfigError for parameters that do not fit, or differ from those of the
+    run to resume, and what datasets, maps and the runner raise.
     """
     _check(config, rounds)
     begin = time.perf_counter()
@@ -171,7 +171,7 @@ def _round(
     infer: Callable[[SubmapTask], SubmapReport],
     progress: Progress,
 ) -> RoundReport:
-    """Carry out a round, or read what is known of it."""
+    """Carry out a round, or read its report if it is complete."""
     path = folder / f"round-{round:03d}.json"
     if path.exists():
         return _read_round(path)

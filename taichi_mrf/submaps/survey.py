@@ -35,8 +35,8 @@ class SurveyTask:
 
 @dataclass(frozen=True)
 class SurveyedFrame:
-    """A frame's pose, the chunks (n, 3) that its rays cross, and whether it holds any measurement, be it one
-    that no ray is cast for; or the ``problem`` that it is broken."""
+    """A frame's pose, the chunks (n, 3) that its rays cross, and whether it holds any measurement, even one
+    that no ray is cast for; ``problem``: why it could not be read."""
 
     index: int
     name: str
@@ -115,7 +115,7 @@ def _chosen(
             skipped[frame.name] = str(frame.problem)
         elif frame.measured and selector.wants(frame.T_world_camera):
             selector.accept(frame.T_world_camera)
-            if len(frame.chunks):  # else it is a keyframe that says nothing
+            if len(frame.chunks):  # else no ray is cast for it
                 x, y, z = frame.T_world_camera[:3, 3].tolist()
                 keyframes.append(SeenKeyframe(frame.index, (x, y, z), frame.chunks))
     return keyframes, skipped

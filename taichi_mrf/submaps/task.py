@@ -50,9 +50,9 @@ class SubmapTask:
 def infer_submap(
     task: SubmapTask, progress: Callable[[InferProgress], bool] = lambda step: True
 ) -> SubmapReport:
-    """Infer a submap with what its neighbours said in the round before, and write what it has found out.
+    """Infer a submap with the evidence of its neighbours from the round before, and write the result.
 
-    Nothing is done if that is written already. ``progress`` is called after each keyframe's sweep. Raises
+    Does nothing if the result is there already. ``progress`` is called after each keyframe's sweep. Raises
     MapFileError, DatasetError, CapacityError.
     """
     folder = Path(task.folder)
@@ -79,8 +79,8 @@ def infer_submap(
 
 
 def is_idle(task: SubmapTask) -> bool:
-    """Whether there is nothing to do but to repeat what the round before has found: rays only pass through
-    this column, and they are the same in every round."""
+    """Whether the result is that of the round before: rays only pass through this column, and they are the
+    same in every round."""
     before = round_path(Path(task.folder), task.round - 1, task.submap)
     return task.round > 0 and not read_report(before).core_bricks
 
@@ -134,7 +134,7 @@ def _with_keyframes(job: Job, submap: int) -> tuple[PartialMap, dict[int, int]]:
 
 
 def _listen(m: PartialMap, task: SubmapTask, neighbours: Iterable[int]) -> int:
-    """Take in what neighbours said in the round before; returns of how many bricks."""
+    """Take in the evidence of neighbours from the round before; returns its number of bricks."""
     heard = 0
     for other in neighbours if task.round > 0 else ():
         halo = read_halo(round_path(Path(task.folder), task.round - 1, other), task.submap)
@@ -145,8 +145,8 @@ def _listen(m: PartialMap, task: SubmapTask, neighbours: Iterable[int]) -> int:
 
 
 def _spoken(m: PartialMap, job: Job, submap: int, common: dict[int, list[int]]) -> dict[int, Halo]:
-    """What each neighbour is to be told of the core: what is believed there without the messages of the
-    keyframes (ids) that it has too, in the bricks that rays of those cross."""
+    """The evidence of the core for each neighbour: the beliefs without the messages of the keyframes (ids)
+    that both have, in the bricks that rays of those cross."""
     halos = {}
     for other, ids in common.items():
         bricks = _core(job, submap, m.seen_bricks(ids))

@@ -140,7 +140,7 @@ def test_a_run_that_ends_by_itself_leaves_the_map_that_map_makes(tmp_path: Path)
 
 
 @linux_only
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("whole_group", [True, False], ids=["terminal", "process"])
 def test_a_signal_ends_it_with_its_files_and_without_orphans(
     number: signal.Signals, whole_group: bool, tmp_path: Path

@@ -27,8 +27,8 @@ class Live:
     (map.npz)."""
 
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Folder for map.npz, voxels.ply, config.yaml and, where poses are tracked, trajectory.txt; it is made if
-    need be."""
+    """Folder for the files that map writes too: map.npz, voxels.ply, config.yaml, report.json, pictures if
+    the run ends by itself, trajectory.txt if poses are tracked. It is created if it does not exist."""
 
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
     """A YAML file of parameters, such as those in configs/."""
