@@ -4,6 +4,8 @@ site.py adds the page; the plugin mkdocstrings replaces each ``:::`` block by th
 """
 
 import importlib
+import inspect
+import typing
 
 import taichi_mrf
 
@@ -37,6 +39,12 @@ Everything on this page is imported from `taichi_mrf`; the examples write `impor
 of each query, and [Parameters](parameters.md) lists every field of the configuration.
 """
 
+RESULTS = """
+## Results
+
+The types that the functions and methods above return. Programs read them and do not construct them.
+"""
+
 OTHER_ERRORS = """
 The other exceptions are in `taichi_mrf.errors`. All of them derive from `TaichiMRFError`.
 """
@@ -56,6 +64,8 @@ def api_page() -> str:
         parts += [f"::: {_home(name)}.{name}\n" for name in names]
     parts.append(OTHER_ERRORS)
     parts += [f"::: taichi_mrf.errors.{name}\n" for name in _other_errors()]
+    parts.append(RESULTS)
+    parts += [f"::: {module}.{name}\n" for module, name in _result_types()]
     return "\n".join(parts)
 
 
@@ -63,6 +73,18 @@ def _home(name: str) -> str:
     """The module that defines a public name; constants do not tell, so theirs is the one they come from."""
     home = getattr(getattr(taichi_mrf, name), "__module__", "")
     return home if home.startswith("taichi_mrf") else taichi_mrf._PUBLIC[name]
+
+
+def _result_types() -> list[tuple[str, str]]:
+    """Module and name of the package's classes that public functions and methods of MRFMap return."""
+    public = [getattr(taichi_mrf, name) for name in taichi_mrf.__all__]
+    methods = [each for name, each in inspect.getmembers(taichi_mrf.MRFMap) if not name.startswith("_")]
+    returned = {
+        typing.get_type_hints(each).get("return") for each in (*public, *methods) if inspect.isfunction(each)
+    }
+    classes = {each for each in returned if isinstance(each, type)} - set(filter(inspect.isclass, public))
+    homes = {(each.__module__, each.__name__) for each in classes}
+    return sorted(home for home in homes if home[0].startswith("taichi_mrf."))
 
 
 def _other_errors() -> list[str]:
