@@ -1,4 +1,4 @@
-"""Finding the board in a folder of images, and saying of each that was not used why."""
+"""Finding the board in a folder of images, and recording which images were not used and why."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -29,7 +29,7 @@ def image_files(folder: Path) -> dict[str, Path]:
         raise DatasetError(f"{folder}: is not a folder of images")
     files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in FORMATS}
     if not files:
-        raise DatasetError(f"{folder}: holds no images ({', '.join(FORMATS)})")
+        raise DatasetError(f"{folder}: contains no images ({', '.join(FORMATS)})")
     return files
 
 
@@ -40,7 +40,7 @@ def find_boards(
     camera: PinholeCamera,
     progress: Callable[[int], None] = lambda number: None,
 ) -> FoundBoards:
-    """Look for the board in the images called ``names``; ``progress`` is told how many are done.
+    """Look for the board in the images called ``names``; ``progress`` gets the number of images done.
 
     Raises ConfigError if the board is not described, DatasetError, naming the file, if an image has
     another size than the camera, and if the board is in none of them.

@@ -77,7 +77,7 @@ def board_depth(T_camera_board: Pose, board: BoardConfig, camera: PinholeCamera)
 def _dark_first(grey: NDArray[np.uint8], grid: NDArray[np.float32]) -> NDArray[np.float32]:
     """The corners, (rows * columns, 1, 2), from the end at which the first inner square is dark.
 
-    It tells the two ends of a board apart whose numbers of rows and columns are one even, one odd.
+    This distinguishes the two ends of a board if one of rows and columns is even and the other odd.
     """
     centres = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
     shade = cv2.remap(grey, centres, None, cv2.INTER_LINEAR).astype(np.float64)

@@ -1,4 +1,4 @@
-"""Which parts of the view frustum the samples cover, and where they do not, in words."""
+"""Which parts of the view frustum the samples cover, and sentences that name the gaps."""
 
 from dataclasses import dataclass
 
@@ -11,10 +11,10 @@ ENOUGH = 0.5
 """A region counts as covered at some depth if this share of its patches has enough samples there."""
 
 SOMEWHERE = 0.1
-"""A depth counts as covered at all if this share of all patches has enough samples there."""
+"""A depth counts as covered if this share of all patches has enough samples there."""
 
 GAP_BINS = 3
-"""Shorter gaps in one part of the image are not worth a word: the polynomials bridge them."""
+"""Shorter gaps in one part of the image are not reported: the polynomials bridge them."""
 
 _ROWS = ("top", "middle", "bottom")
 _COLUMNS = ("left", "centre", "right")
@@ -42,7 +42,7 @@ class Coverage:
         return float(self.cells.edges[bins[0]]), float(self.cells.edges[bins[-1] + 1])
 
     def in_words(self) -> list[str]:
-        """Sentences that say where data are lacking, or one that says that nowhere."""
+        """Sentences that name where data are missing, or one that all is covered."""
         missing = self._by_region() < ENOUGH
         everywhere = np.asarray(missing.all(axis=0))
         sentences = []
@@ -63,7 +63,7 @@ class Coverage:
         shape = (self.cells.rows, self.cells.columns)
         grid = self.covered.reshape(*shape, -1)
         rows, columns = (np.array_split(np.arange(count), 3) for count in shape)
-        # An image of fewer than three patches along a side has empty ninths, which lack nothing.
+        # An image of fewer than three patches along a side has empty ninths, which count as covered.
         return np.stack(
             [
                 grid[np.ix_(r, c)].mean(axis=(0, 1)) if len(r) and len(c) else np.ones(self.cells.bins)

@@ -14,7 +14,7 @@ _STEPS = 2000
 @dataclass(frozen=True)
 class Curves:
     """Polynomials in ascending powers: ``coefficients`` (patches, terms), ``covariance`` (patches, terms,
-    terms), the first the best estimate and the second how far it may be off."""
+    terms), the best estimate and its uncertainty."""
 
     coefficients: NDArray[np.float64]
     covariance: NDArray[np.float64]
@@ -45,8 +45,8 @@ class Curves:
 
 @dataclass(frozen=True)
 class Prior:
-    """What is believed of each patch's curve before its own samples: mean (patches, terms) and information,
-    the inverse of the covariance, (patches, terms, terms). No information means no belief."""
+    """The belief about each patch's curve before its own samples: mean (patches, terms) and information,
+    the inverse of the covariance, (patches, terms, terms). Zero information is no belief."""
 
     mean: NDArray[np.float64]
     information: NDArray[np.float64]
@@ -59,7 +59,7 @@ class Prior:
 def kept_above(curves: Curves, floor: float, low: float, high: float) -> tuple[Curves, NDArray[np.bool_]]:
     """The curves, and which of them had to be changed to be at least ``floor`` from ``low`` to ``high``.
 
-    A curve is moved as little as its covariance allows for: most where the samples said least. The
+    A curve is moved as little as its covariance allows for: most where the samples determine it least. The
     covariance stays that of the samples.
     """
     depths = np.linspace(low, high, CHECKED_DEPTHS)
@@ -77,7 +77,7 @@ def _lifted(
     """Minimise (b - beta)^T covariance^-1 (b - beta) so that rows b >= floor (Hildreth 1957).
 
     The dual has one multiplier, never negative, for each row; they are improved one at a time, always
-    the one that gains most. What is missing at the end is added to the constant.
+    the one that gains most. A remaining deficit is added to the constant.
     """
     reach = covariance @ rows.T
     gain = np.maximum(np.einsum("ni,in->n", rows, reach), 1e-300)

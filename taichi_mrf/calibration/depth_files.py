@@ -1,4 +1,4 @@
-"""Depth images of a folder or of one file, by name: what is calibrated, and what it is compared with.
+"""Depth images of a folder or of one file, by name: those measured, and their true counterparts.
 
 A folder holds 16-bit PNGs, ``.npy`` images and ``.npz`` stacks; a single ``.npy`` or ``.npz`` is a stack. The
 images of a stack are called by their number, 0000, 0001, ...; those of a stack in a folder get the
@@ -18,7 +18,7 @@ from taichi_mrf.system.npz_file import open_npz, read_npy
 
 FORMATS = (".png", ".npy", ".npz")
 STACK_NAME = "depth_m"
-"""The array of a .npz file that is taken where there are several."""
+"""The array of a .npz file that is used if there are several."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class DepthFiles:
     """The depth images under ``path``, listed at once and read one at a time."""
 
     def __init__(self, path: Path, steps_per_metre: float) -> None:
-        """Raises DatasetError, which names the file, if there is nothing or a stack cannot be read."""
+        """Raises DatasetError, which names the file, if there are no images or a stack cannot be read."""
         if not (np.isfinite(steps_per_metre) and steps_per_metre > 0):
             raise DatasetError(f"the depth scale must be a positive number of steps, not {steps_per_metre}")
         self.path = path
@@ -45,7 +45,7 @@ class DepthFiles:
         else:
             raise DatasetError(f"{path}: is neither a folder nor a .npy or .npz file of depth images")
         if not self._places:
-            raise DatasetError(f"{path}: holds no depth images ({', '.join(FORMATS)})")
+            raise DatasetError(f"{path}: contains no depth images ({', '.join(FORMATS)})")
 
     @property
     def names(self) -> list[str]:
@@ -83,7 +83,7 @@ class DepthFiles:
             return {prefix or path.stem: _Place(path, None)}
         if array.ndim != 3:
             raise DatasetError(
-                f"{path}: holds an array of shape {array.shape}, not a stack (N, H, W) of depth"
+                f"{path}: contains an array of shape {array.shape}, not a stack (N, H, W) of depth"
             )
         start = f"{prefix}-" if prefix else ""
         return {f"{start}{number:04d}": _Place(path, number) for number in range(len(array))}
@@ -111,11 +111,11 @@ def _load(path: Path) -> NDArray:
             name = STACK_NAME if STACK_NAME in names else names[0] if len(names) == 1 else None
             if name is None:
                 raise DatasetError(
-                    f"{path}: holds no array '{STACK_NAME}' but {', '.join(names) or 'nothing'}"
+                    f"{path}: contains no array '{STACK_NAME}' but {', '.join(names) or 'nothing'}"
                 ) from None
             array = file[name]
     if not np.issubdtype(array.dtype, np.integer) and not np.issubdtype(array.dtype, np.floating):
-        raise DatasetError(f"{path}: holds no numbers")
+        raise DatasetError(f"{path}: contains no numbers")
     if array.ndim == 2 or array.ndim == 3:
         return array
-    raise DatasetError(f"{path}: holds an array of shape {array.shape}, not depth images")
+    raise DatasetError(f"{path}: contains an array of shape {array.shape}, not depth images")

@@ -13,7 +13,7 @@ from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.noise import PatchNoise
 
 NEIGHBOURS = 8
-"""Patches that a borrowing one learns from at least: enough to know how much neighbours differ."""
+"""Least number of patches that a borrowing one learns from: enough to estimate how much neighbours differ."""
 
 BEST_COVERED = 0.9
 """Spans are compared with that of the patch at this quantile, which a stray bin far away does not move."""
@@ -159,7 +159,7 @@ def _nearest(own: NDArray[np.bool_], rest: NDArray[np.bool_], columns: int) -> l
 
 def _prior(curves: Curves, groups: list[NDArray[np.int64]]) -> Prior:
     """Mean of each group's curves, and how far one more patch may lie from it: their spread, and their own
-    errors once more, so that neighbours that happen to agree are not taken for certain."""
+    errors once more, so that neighbours that agree by chance do not count as certain."""
     mean = np.stack([curves.coefficients[group].mean(axis=0) for group in groups])
     covariance = np.stack(
         [

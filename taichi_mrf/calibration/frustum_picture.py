@@ -1,6 +1,6 @@
 """The coverage of the view frustum as a picture: over the image, from above, from the side, in slices.
 
-What the paper's Fig. 4 shows while recording: which cells still lack data.
+As the paper's Fig. 4 during a recording: the cells that still lack data.
 """
 
 from typing import TYPE_CHECKING

@@ -34,7 +34,7 @@ def read_stamps(path: Path) -> dict[str, float]:
             ) from None
         stamps[Path(words[1]).stem if Path(words[1]).suffix in SUFFIXES else words[1]] = stamp
     if not stamps:
-        raise DatasetError(f"{path}: holds no stamp")
+        raise DatasetError(f"{path}: contains no stamp")
     return stamps
 
 

@@ -13,7 +13,7 @@ from taichi_mrf.sensor.camera import PinholeCamera
 
 @dataclass(frozen=True)
 class Calibration:
-    """What was learnt, from how many samples and frames, and how many samples were left out as outliers."""
+    """The learnt noise, the numbers of samples and frames, and the number of outliers."""
 
     noise: LearntNoise
     frames: int
@@ -30,7 +30,7 @@ def calibrate(
 ) -> Calibration:
     """Learn bias and sigma for each patch of the camera's image.
 
-    ``progress`` is told how many images have been read, twice the number of pairs at the end. Raises
+    ``progress`` gets the number of images read, twice the number of pairs at the end. Raises
     DatasetError if an image cannot be read or has the wrong size, if no pixel has both depths, or if
     there are too few samples.
     """
@@ -45,7 +45,7 @@ def calibrate(
             empty.append(name)
         progress(number)
     if not measured:
-        raise DatasetError(f"none of the {len(source.names)} depth images holds a single measurement")
+        raise DatasetError(f"none of the {len(source.names)} depth images contains a measurement")
     if histograms.samples == 0:
         raise DatasetError(
             f"in none of {len(source.names)} images a pixel has both measured and true depth from "

@@ -47,7 +47,7 @@ class Sums:
         return Sums(self.powers[patches], self.products[patches], self.squares[patches])
 
     def merged(self) -> "Sums":
-        """All patches taken for one."""
+        """The sums of all patches together."""
         return Sums(*(each.sum(axis=0, keepdims=True) for each in (self.powers, self.products, self.squares)))
 
     def outer(self) -> NDArray[np.float64]:

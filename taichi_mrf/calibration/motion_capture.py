@@ -34,7 +34,7 @@ _LARGEST_RATIO = 0.999
 
 @dataclass(frozen=True)
 class Alignment:
-    """What links motion capture to the images; ``lag`` and ``lag_error`` (one sigma) in seconds, to be
+    """The link from motion capture to the images; ``lag`` and ``lag_error`` (one sigma) in seconds, to be
     added to an image's stamp; ``reprojection`` in pixels, RMS."""
 
     T_camera_body: Pose
@@ -47,7 +47,7 @@ class Alignment:
     def T_camera_board(
         self, stamps: NDArray[np.float64], bodies: BodyPair, largest_gap: float
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """The board's pose at image stamps (N,), (N, 4, 4), and where motion capture knows it."""
+        """The board's pose at image stamps (N,), (N, 4, 4), and where motion capture has it."""
         M, known = bodies.relative(np.asarray(stamps) + self.lag, largest_gap)
         return self.T_camera_body @ M @ self.T_body_board, known
 
@@ -63,7 +63,7 @@ def align(
     """Find the lag and where the markers sit, from views of the board at ascending ``stamps``.
 
     Raises ConfigError for a board that looks the same upside down, DatasetError if the streams do not
-    belong together or the views do not tell enough.
+    belong together or the views are too few or too alike.
     """
     if (board.columns + board.rows) % 2 == 0:
         raise ConfigError(
@@ -100,7 +100,7 @@ def hand_eye(T_camera_board: NDArray[np.float64], M: NDArray[np.float64]) -> tup
     calibration problem using the Kronecker product", 2013). OpenCV 4 had it, OpenCV 5 has not.
 
     ``T_camera_board`` and ``M``, the board's body in the camera's body, are (N, 4, 4). Raises DatasetError
-    if the board was not turned enough to tell.
+    if the board was not turned enough.
     """
     R_A, R_M = T_camera_board[:, :3, :3], M[:, :3, :3]
     # R_A R_X = R_Z R_M; with columns stacked, (R_M kron R_A) vec R_X = vec R_Z for every pose.
@@ -108,7 +108,7 @@ def hand_eye(T_camera_board: NDArray[np.float64], M: NDArray[np.float64]) -> tup
     U, s, Vt = np.linalg.svd(kron)
     if len(M) < 3 or s[1] > _LARGEST_RATIO * s[0]:
         raise DatasetError(
-            "the views of the board do not tell where the markers sit: tilt it about two axes as it moves"
+            "the views of the board do not determine where the markers sit; tilt the board about two axes"
         )
     R_X, R_Z = _rotation(Vt[0]), _rotation(U[:, 0])
     # R_A t_X - t_Z = R_Z t_M - t_A
@@ -133,7 +133,7 @@ _State = tuple[Pose, Pose, float]
 
 @dataclass(frozen=True)
 class _Reprojection:
-    """Where corners (N, corners, 2) were seen at ``stamps`` (N,), and where a state says they are."""
+    """Corners (N, corners, 2) seen at ``stamps`` (N,), and their prediction from a state."""
 
     stamps: NDArray[np.float64]
     corners: NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""What was learnt, as pictures: bias and sigma against depth, and over the image."""
+"""Pictures of the learnt noise: bias and sigma against depth, and over the image."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING

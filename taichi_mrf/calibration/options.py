@@ -1,5 +1,5 @@
 """The parameters of learning a sensor's noise. As in config.py, the string under a field is its help, and
-nothing in this file needs NumPy, so that ``taichi-mrf --help`` answers at once.
+nothing in this file needs NumPy, so that ``taichi-mrf --help`` is fast.
 """
 
 import math
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from taichi_mrf.errors import ConfigError
 
 HIGHEST_DEGREE = 4
-"""What the map's kernels have room for: sensor.noise.TERMS coefficients."""
+"""The map's kernels take sensor.noise.TERMS coefficients."""
 
 LEAST_CORNERS = 3
 """Inner corners along each side of a chessboard that OpenCV can find."""
@@ -16,7 +16,7 @@ LEAST_CORNERS = 3
 
 @dataclass(frozen=True)
 class BoardConfig:
-    """The chessboard that stands in for ground truth. It must be flat."""
+    """The chessboard that gives ground truth. It must be flat."""
 
     columns: int = 0
     """Inner corners along a row of the chessboard: one less than the squares."""
@@ -81,7 +81,7 @@ class CalibrationConfig:
     """Degree of the polynomials in depth."""
 
     min_depth: float = 0.3
-    """Nearest depth that the sensor is used at; nearer samples are not looked at."""
+    """Nearest depth that the sensor is used at; nearer samples are ignored."""
 
     max_depth: float = 5.0
     """Furthest depth that the sensor is used at. From the nearest to the furthest sigma is kept positive."""
@@ -98,11 +98,11 @@ class CalibrationConfig:
 
     outlier_sigmas: float = 5.0
     """Samples further than this many robust standard deviations from the median of their patch and bin are
-    left out; the map's inference.outlier_floor is there for these."""
+    left out; the map's inference.outlier_floor accounts for these."""
 
     least_sigma: float = 1e-4
-    """Sigma is kept at this many metres or more from min_depth to max_depth. The map itself takes nothing
-    below 1 mm for true."""
+    """Sigma is kept at this many metres or more from min_depth to max_depth. The map itself bounds sigma
+    at 1 mm from below."""
 
     board: BoardConfig = field(default_factory=BoardConfig)
     """The chessboard, where one is used."""

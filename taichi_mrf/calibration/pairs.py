@@ -1,4 +1,4 @@
-"""Measured depth beside the true depth of the same pixels: what every kind of ground truth comes down to."""
+"""Measured depth beside the true depth of the same pixels: the common form of every kind of ground truth."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from taichi_mrf.sensor.camera import PinholeCamera
 
 @dataclass(frozen=True)
 class DepthPair:
-    """Axial depths in metres, both (H, W) float32; 0 where nothing was measured or nothing is known."""
+    """Axial depths in metres, both (H, W) float32; 0 where there is no measurement or no truth."""
 
     name: str
     measured_m: NDArray[np.float32]
@@ -29,7 +29,7 @@ class PairSource(Protocol):
 
     @property
     def names(self) -> list[str]:
-        """What reports call the pairs."""
+        """The names of the pairs, for reports."""
 
     def read(self, name: str) -> DepthPair:
         """One pair, of the camera's size. Raises DatasetError naming the file."""

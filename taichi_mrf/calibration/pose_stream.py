@@ -1,4 +1,4 @@
-"""A stream of timed poses: where a body was at any time between two of its poses, and how fast it moved."""
+"""A stream of timed poses: the pose of a body at any time between two recorded ones, and its speed."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,7 @@ class PoseStream:
     def at(
         self, times: NDArray[np.float64], largest_gap: float
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """The poses at ``times`` (M,), (M, 4, 4), and which of them can be had: the stream has a pose
+        """The poses at ``times`` (M,), (M, 4, 4), and which of them are known: the stream has a pose
         before and one after, at most ``largest_gap`` seconds apart. A stream of one pose stands still.
 
         Positions lie on the line between the two, rotations on the shortest way (slerp).

@@ -1,4 +1,4 @@
-"""What a calibration found, as plain values for ``report.json``, and the sentences that go with it."""
+"""The result of a calibration as plain values for ``report.json``, and remarks for the user."""
 
 import dataclasses
 from typing import Any
@@ -40,11 +40,13 @@ def calibration_report(calibration: Calibration, coverage: Coverage) -> dict[str
 
 
 def remarks(calibration: Calibration) -> list[str]:
-    """What a user should know besides the numbers."""
+    """Remarks for the user, besides the numbers."""
     noise, options = calibration.noise, calibration.noise.cells.options
     texts = []
     if calibration.empty_frames:
-        texts.append(f"{len(calibration.empty_frames)} images have no pixel with both depths and say nothing")
+        texts.append(
+            f"{len(calibration.empty_frames)} images have no pixel with both depths and are not used"
+        )
     borrowed = int((~noise.own).sum())
     if borrowed and noise.own.sum() < NEIGHBOURS:
         texts.append(f"{borrowed} patches have too little data and got one curve made from all samples")
@@ -59,8 +61,8 @@ def remarks(calibration: Calibration) -> list[str]:
     if misfit > LARGE_MISFIT:
         texts.append(
             f"bins lie {np.sqrt(misfit):.1f} times as far from the bias polynomials as independent samples "
-            f"would: errors of one image hang together, or degree {options.degree} is too low; standard "
-            "errors are too small by as much"
+            f"would: the errors of one image are correlated, or degree {options.degree} is too low; standard "
+            "errors are too small by this factor"
         )
     return texts
 

@@ -1,6 +1,6 @@
 """Samples of depth error, gathered frame by frame into cells: a patch of pixels and a bin of true depth.
 
-Two passes over the frames keep memory bounded however many there are. The first counts errors in
+Two passes over the frames bound the memory, independent of their number. The first counts errors in
 histograms, from whose quartiles the outliers of each cell are known. The second sums what least
 squares needs of the others: powers of depth, and their products with the error.
 """
@@ -104,7 +104,7 @@ class ErrorHistograms:
         """The least and the largest error of each cell that is no outlier, two of (patches * bins,).
 
         They lie ``outlier_sigmas`` robust standard deviations from the median, and at least as many
-        times LEAST_SIGMA_M, so that depth in whole millimetres loses nothing. A cell with too few
+        times LEAST_SIGMA_M, so that rounding to whole millimetres removes no sample. A cell with too few
         samples gets an empty range.
         """
         low, median, high = (self._quantile(share) for share in (0.25, 0.5, 0.75))

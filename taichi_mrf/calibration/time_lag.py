@@ -17,7 +17,7 @@ LEAST_PAIRS = 10
 """Pairs of successive views of the board without which a lag is not sought."""
 
 _LONGEST_PAUSE = 5.0
-"""Views further apart than this many median intervals do not tell a speed."""
+"""Views further apart than this many median intervals give no speed."""
 
 _STEPS_PER_INTERVAL = 4
 _COARSEST_STEP_S, _FINEST_STEP_S = 0.02, 0.002
@@ -34,7 +34,7 @@ class BodyPair:
         self, times: NDArray[np.float64], largest_gap: float
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """The board's body in the camera's body at ``times`` (M,) of motion capture, (M, 4, 4), and
-        where it can be had."""
+        where it is known."""
         T_world_camera, has_camera = self.camera.at(times, largest_gap)
         T_world_board, has_board = self.board.at(times, largest_gap)
         return inverses(T_world_camera) @ T_world_board, has_camera & has_board
@@ -64,7 +64,7 @@ def estimate_lag(
     pairs = np.flatnonzero((interval > 0) & (interval <= _LONGEST_PAUSE * usual))
     if len(pairs) < LEAST_PAIRS:
         raise DatasetError(
-            f"the time lag needs {LEAST_PAIRS} views of the board in quick succession, there are {len(pairs)}"
+            f"the time lag needs {LEAST_PAIRS} views of the board in quick succession; there are {len(pairs)}"
         )
     in_images = _speeds(T_camera_board[pairs], T_camera_board[pairs + 1], interval[pairs])
     step = float(np.clip(usual / _STEPS_PER_INTERVAL, _FINEST_STEP_S, _COARSEST_STEP_S))

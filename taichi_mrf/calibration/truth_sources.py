@@ -24,7 +24,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """Pairs of measured and true depth, how they came about, and what a user should know besides."""
+    """Pairs of measured and true depth, their origin, and remarks for the user."""
 
     source: PairSource
     facts: dict[str, Any]

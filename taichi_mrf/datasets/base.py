@@ -12,7 +12,7 @@ from taichi_mrf.sensor.frame import Frame
 
 
 def start_pose() -> Pose:
-    """Where a camera stands whose poses are not known: at the origin, level, looking along x."""
+    """The first pose of a camera without recorded poses: at the origin, level, looking along x."""
     return look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
 
 
@@ -50,12 +50,11 @@ class BuiltIn:
 class Dataset(ABC):
     """A sequence of frames that are read one at a time.
 
-    ``notes`` are sentences that a report should show: what was assumed or left out. ``dropped`` counts the
-    depth images that have no pose near enough in time. ``distortion`` are OpenCV's coefficients of the images
-    as they were recorded, where the recording knows them: :func:`open_dataset` undoes them. If it is
-    ``tracked``, the poses of its frames say nothing but where the first was taken: who maps them finds the
-    others (mapping/tracking.py). A frame that cannot be read does not stop the others: :meth:`read` raises
-    FrameError for it and the next one can be read.
+    ``notes`` are sentences for the report: what was assumed or left out. ``dropped`` counts the depth images
+    without a pose near enough in time. ``distortion`` are OpenCV's coefficients of the recorded images, where
+    the recording has them; :func:`open_dataset` undistorts the images. If it is ``tracked``, only the first
+    frame's pose counts, and mapping finds the others (mapping/tracking.py). For a broken frame :meth:`read`
+    raises FrameError; the others can still be read.
     """
 
     name: str
@@ -67,8 +66,8 @@ class Dataset(ABC):
 
     @property
     def endless(self) -> bool:
-        """Whether frames come as long as they are asked for, as from a camera: then len says nothing, frames
-        cannot be read again, and an error other than FrameError is the end."""
+        """Whether the source never ends, as a camera: then len has no meaning, frames cannot be read twice,
+        and an error other than FrameError ends the sequence."""
         return False
 
     @property
@@ -78,13 +77,13 @@ class Dataset(ABC):
         return None
 
     def check_scale(self, poses_are_used: bool) -> list[str]:
-        """Check the unit of depth, once the camera is final; returns notes. Most sources know their unit."""
+        """Check the unit of depth, once the camera is final, and return notes; empty for a known unit."""
         return []
 
     @property
     @abstractmethod
     def frame_names(self) -> Sequence[str]:
-        """What errors and reports call the frames, in their order."""
+        """The names of the frames in order, for errors and reports."""
 
     @abstractmethod
     def read(self, index: int) -> Frame:

@@ -1,8 +1,8 @@
 """Whether the steps per metre of a recording's depth images agree with its poses.
 
-A 16-bit image does not say its unit. Between two poses some centimetres apart a surface moves in the image
-by focal length * baseline / depth: only with the right scale do the depths of neighbouring frames agree.
-Where a scale is assumed and not recorded, this decides between the usual ones; otherwise it only warns.
+A 16-bit image does not contain its unit. Between two poses some centimetres apart a surface moves in the
+image by focal length * baseline / depth: only with the right scale do the depths of neighbouring frames
+agree. Where a scale is assumed and not recorded, this decides between the usual ones; otherwise it warns.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,9 +33,9 @@ Image = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Evidence:
-    """``median`` is the median raw value of the images that were looked at, None if all are empty.
+    """``median`` is the median raw value of the images that were compared, None if all are empty.
     ``disagreement`` is, by steps per metre, the median relative difference of the depths of neighbouring
-    frames; it is empty where no two frames tell."""
+    frames; it is empty if no two frames can be compared."""
 
     median: float | None
     disagreement: dict[float, float]
@@ -91,7 +91,7 @@ def gather(
 def _neighbour(
     first: int, frames: int, T_world_first: Pose, read_pose: Callable[[int], Pose]
 ) -> tuple[int, Pose] | None:
-    """The next frame that was taken far enough away to tell, and not turned too far; T_second_first."""
+    """The next frame with a large enough baseline and a small enough turn, and T_second_first."""
     for second in range(first + 1, min(frames, first + _FARTHEST_NEIGHBOUR)):
         try:
             T = inverse(read_pose(second)) @ T_world_first

@@ -11,8 +11,7 @@ from taichi_mrf.sensor.frame import Frame
 
 @dataclass
 class Derived(Dataset):
-    """As many frames as ``source`` has, by the same names; what a frame is, the class says that derives from
-    this one."""
+    """As many frames as ``source`` has, with the same names; subclasses define how a frame is read."""
 
     source: Dataset = field(kw_only=True)
 
@@ -41,10 +40,10 @@ class Reposed(Derived):
     def read(self, index: int) -> Frame:
         """The source's frame. Raises LostFrameError if it has no pose, and what the source raises."""
         if index not in self.poses:
-            raise LostFrameError(f"{self.frame_names[index]}: where it was taken is not known")
+            raise LostFrameError(f"{self.frame_names[index]}: pose unknown (tracking was lost)")
         return replace(self.source.read(index), T_world_camera=self.poses[index])
 
 
 def reposed(dataset: Dataset, poses: Mapping[int, Pose]) -> Reposed:
-    """A dataset's frames at other poses."""
+    """The frames of a dataset at other poses."""
     return Reposed(dataset.name, dataset.camera, dataset.notes, dataset.dropped, source=dataset, poses=poses)

@@ -107,7 +107,7 @@ def _claimed_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _png_damage(data: bytes) -> str | None:
-    """What is wrong with the chunks of a PNG, if anything.
+    """The damage of a PNG's chunks, or None.
 
     Checked here since libpng writes to stderr past every logger, and since some builds of OpenCV hand
     out the upper part of a cut image with zeros below, which would pass for missing depth. For what is
@@ -133,7 +133,7 @@ def _png_damage(data: bytes) -> str | None:
 
 
 def _png_content_damage(data: bytes, packed: bytes) -> str | None:
-    """What is wrong with the pixels of a PNG whose chunks are whole, if anything."""
+    """The damage of a PNG's pixels when its chunks are whole, or None."""
     width, height, depth, color, method, row_filter, interlaced = struct.unpack_from(">IIBBBBB", data, 16)
     samples = _SAMPLES.get(color)
     if samples is None or depth not in (1, 2, 4, 8, 16) or method or row_filter or not width * height:

@@ -106,10 +106,10 @@ def read_camera(path: Path, default: PinholeCamera, depth_files: Iterable[Path])
     except ConfigError as error:
         raise DatasetError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
     except ValueError as error:
-        raise DatasetError(f"{path}: holds something that is not a number: {said(error)}") from error
+        raise DatasetError(f"{path}: contains something that is not a number: {said(error)}") from error
     raise DatasetError(
-        f"{path}: holds {len(numbers)} numbers; expected width height fx fy cx cy, fx fy cx cy, or a 3 x 3 "
-        "or 4 x 4 matrix"
+        f"{path}: contains {len(numbers)} numbers; expected width height fx fy cx cy, fx fy cx cy, or a "
+        "3 x 3 or 4 x 4 matrix"
     )
 
 

@@ -1,4 +1,4 @@
-"""What can be said of a source beside its name: how it is read, and the options after a question mark."""
+"""How a source is read: the options of ``open_dataset``, and those after a question mark in its name."""
 
 import math
 from dataclasses import dataclass
@@ -20,33 +20,33 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What a caller may say about a recording that its files do not say, or say wrongly."""
+    """How a recording is read. Each option replaces what the recording's files or its format give."""
 
     camera: PinholeCamera | None = None
-    """Takes the place of the recording's or the format's intrinsics."""
+    """Replaces the recording's or the format's intrinsics."""
 
     depth_scale: float | None = None
-    """Steps of the depth images per metre; takes the place of the format's own."""
+    """Steps of the depth images per metre; replaces the format's own."""
 
     color: bool = True
     """Read the colour images too, where there are any."""
 
     max_time_gap: float | None = None
-    """Largest difference in seconds between a depth image and the poses that its own comes from; None leaves
-    it to the format."""
+    """Largest difference in seconds between a depth image and the poses that its own is computed from; None
+    is the format's default."""
 
     intrinsics: tuple[float, float, float, float] | None = None
-    """fx, fy, cx, cy in pixels: as ``camera``, for images of whatever size the recording has."""
+    """fx, fy, cx, cy in pixels: as ``camera``, with the image size of the recording."""
 
     undistort: tuple[float, ...] | None = None
     """OpenCV's coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]] of the recorded images, which are undistorted
-    as they are read. They take the place of the recording's own; zeros leave the images as they are."""
+    as they are read. They replace the recording's own; zeros leave the images as they are."""
 
     image_scale: float = 1.0
     """Reads 1/n of the rows and columns: 1, 1/2, 1/3, ..."""
 
     track: bool = False
-    """The recording's poses, if it has any, are of no interest: who maps it finds them from the images."""
+    """Ignore recorded poses, and find them from the images while mapping."""
 
     def __post_init__(self) -> None:
         scale = self.depth_scale
@@ -56,7 +56,7 @@ class ReadOptions:
         if gap is not None and not (math.isfinite(gap) and gap >= 0):
             raise DatasetError(f"max_time_gap must be a number of seconds, not {gap}")
         if self.camera is not None and self.intrinsics is not None:
-            raise DatasetError("camera and intrinsics say the same thing: give one of them")
+            raise DatasetError("camera and intrinsics both set the intrinsics; pass only one of them")
         if self.intrinsics is not None:
             try:
                 PinholeCamera(1, 1, *self.intrinsics)
@@ -75,16 +75,16 @@ class ReadOptions:
 
     @property
     def stride(self) -> int:
-        """One in so many rows and columns is read."""
+        """Every ``stride``-th row and column is read."""
         return round(1 / self.image_scale)
 
 
 def parse_options(cls: type[T], query: str, source: str) -> T:
-    """What stands after the question mark, as a dataclass whose fields are all options that there are.
+    """Parse ``name=value&name=value`` into a dataclass, whose fields are the options.
 
-    A field of type str takes its text as it stands, such as a path. Raises DatasetError, whose text names
+    A field of type str takes its text unchanged, such as a path. Raises DatasetError, whose text names
     the source, for an option that does not exist (naming the nearest), a value of the wrong type or out of
-    range, and for a text that is not made of name=value.
+    range, and for text that is not of the form name=value.
     """
     texts = {field for field, hint in get_type_hints(cls).items() if hint is str}
     values = {}

@@ -1,6 +1,6 @@
-"""A recording in files: the one reader behind every folder format.
+"""A recording in files: the reader behind every folder format.
 
-A format only lists where each frame's files are; all checks on a frame are made here, when it is read.
+A format only lists the files of each frame; a frame is checked here, when it is read.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,10 +17,10 @@ from taichi_mrf.sensor.frame import Frame
 
 @dataclass(frozen=True)
 class RecordedFrame:
-    """Where one frame's parts are.
+    """The files of one frame.
 
     ``read_pose`` gives T_world_camera. It raises DatasetError, which names the file, or KeyframeError
-    for a pose that is none; ``pose_source`` then says where that stands (a file, or a file and a line).
+    for an invalid pose; ``pose_source`` then names the file, or the file and the line.
     """
 
     name: str
@@ -33,7 +33,7 @@ class RecordedFrame:
 
 @dataclass
 class Recording(Dataset):
-    """Frames in files, read when asked for.
+    """Frames in files, read on request.
 
     ``steps_per_metre`` is the scale of the depth images and ``scale_source`` where it comes from; if it is
     ``scale_assumed``, no file says so and :meth:`check_scale` may find another. ``sentinel`` is a value of
@@ -53,15 +53,15 @@ class Recording(Dataset):
 
     @property
     def frame_names(self) -> Sequence[str]:
-        """What errors and reports call the frames, in their order."""
+        """The names of the frames in order, for errors and reports."""
         return self._names
 
     def read(self, index: int) -> Frame:
         """Read one frame from disk.
 
         Raises FrameError, which names the frame and the file, if the depth or colour image is missing,
-        damaged, of the wrong type or of another size than the camera's, or if there is no pose, one
-        with NaN, or one whose rotation is none. Raises IndexError outside 0 to len - 1.
+        damaged, of the wrong type or of another size than the camera's, or if the pose is missing or
+        invalid. Raises IndexError outside 0 to len - 1.
         """
         if not 0 <= index < len(self.frames):
             raise IndexError(f"{self.name} has {len(self.frames)} frames, there is no frame {index}")

@@ -19,7 +19,7 @@ from taichi_mrf.datasets.stereo import kitti, rig_file
 from taichi_mrf.datasets.synthetic import corridor, mesh_sequence, room
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.system.files import exists, is_file, is_folder
+from taichi_mrf.system.files import exists, is_folder
 
 FORMATS: tuple[Format, ...] = (
     seven_scenes.FORMAT,
@@ -52,8 +52,8 @@ def open_dataset(
 ) -> Dataset:
     """Open a recording (a folder or a file) or a built-in source such as ``synthetic:room?frames=60``.
 
-    The keywords are the fields of :class:`ReadOptions`: what the recording does not say, or says wrongly.
-    Raises DatasetError, whose text names the source and says what was looked for.
+    The keywords are the fields of :class:`ReadOptions`. Raises DatasetError, which names the source and the
+    formats that were looked for.
     """
     options = ReadOptions(camera, depth_scale, color, max_time_gap, intrinsics, undistort, image_scale, track)
     path = Path(source)
@@ -148,7 +148,7 @@ def _not_recognised(path: Path) -> str:
     if hint is not None:
         return f"{path}: {hint}"
     looked_for = "; ".join(f"{each.name}: {each.looks_for}" for each in FORMATS)
-    if is_file(path):
+    if not is_folder(path):
         return (
             f"{path}: unsupported file type; for a recording of many files pass its folder. "
             f"Looked for {looked_for}"

@@ -1,9 +1,9 @@
-"""Frames whose pixels are picked anew from those of another dataset: undistorted, thinned out, or both.
+"""Frames whose pixels are picked from those of another dataset: undistorted, thinned out, or both.
 
-Each pixel that comes out holds one recorded measurement, nearest to where its ray went through the recorded
-image; nothing is averaged. Depths on either side of an edge would otherwise mix into surfaces that are not
-there, and the mean or the least of several pixels would have another noise than the sensor model says (the
-least of four is one sigma too near).
+Each output pixel is one recorded measurement: the one nearest to where its ray crosses the recorded image.
+Nothing is averaged. An average would mix the depths on both sides of an edge into surfaces that do not exist,
+and the mean or the minimum of several pixels has another noise than the sensor model assumes (the minimum of
+four is one sigma too near).
 """
 
 from collections.abc import Sequence

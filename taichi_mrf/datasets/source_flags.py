@@ -1,7 +1,7 @@
-"""The flags that say of a recording what its files do not say: one group for every command that reads one.
+"""The flags that set how a recording is read: one group for every command that reads one.
 
-Whether the values make sense is checked where they are used (base.ReadOptions). Nothing is imported here that
-would make the command line's help wait.
+Whether the values make sense is checked where they are used (base.ReadOptions). Heavy libraries are not
+imported here, so that the command line's help stays fast.
 """
 
 import math
@@ -13,13 +13,13 @@ from taichi_mrf.errors import ConfigError
 
 @dataclass(frozen=True)
 class SourceFlags:
-    """What a user says about SOURCE; :meth:`keywords` are arguments of ``open_dataset``."""
+    """How SOURCE is read; :meth:`keywords` are arguments of ``open_dataset``."""
 
     depth_scale: float | None = None
-    """Steps of the depth images per metre, such as 1000 for millimetres, in place of the format's own."""
+    """Steps of the depth images per metre, such as 1000 for millimetres, instead of the format's own."""
 
     camera: str | None = None
-    """Intrinsics fx,fy,cx,cy in pixels, in place of the recording's."""
+    """Intrinsics fx,fy,cx,cy in pixels, instead of the recording's."""
 
     undistort: str | None = None
     """Undo a lens' distortion k1,k2,p1,p2[,k3] (as OpenCV has them); zeros leave the images as they are."""
@@ -34,7 +34,7 @@ class SourceFlags:
         self.keywords()
 
     def keywords(self) -> dict[str, Any]:
-        """The arguments of ``open_dataset`` that say the same. Raises ConfigError, which names the flag."""
+        """The same as arguments of ``open_dataset``. Raises ConfigError, which names the flag."""
         return {
             "depth_scale": self.depth_scale,
             "intrinsics": _numbers("--camera", self.camera, (4,), "fx,fy,cx,cy"),

@@ -15,9 +15,9 @@ LOOKED_AT = 8
 @dataclass(frozen=True)
 class Summary:
     """``frames`` is None for a source without end. ``depth_range`` are the 1st and 99th percentile of the
-    depths in metres of the frames that were looked at, ``measured`` the share of their pixels that have one;
-    ``centre_range`` the lowest and the highest camera position in metres. The three are None if no frame
-    could be read, for ``problem``.
+    depths in metres of the frames that were read, ``measured`` the share of their pixels that have one;
+    ``centre_range`` the lowest and the highest camera position in metres. The three are None if no
+    frame could be read; ``problem`` says why.
     """
 
     frames: int | None
@@ -28,12 +28,11 @@ class Summary:
     centre_range: tuple[tuple[float, ...], tuple[float, ...]] | None
     problem: str | None
     usable: bool
-    """Whether one of the frames that were looked at can be read: otherwise there is nothing to map."""
+    """Whether any of the frames could be read; otherwise there is nothing to map."""
 
 
 def summarise(dataset: Dataset) -> Summary:
-    """Read a few frames of a sequence. Those that are broken are left out, the first one's problem being
-    kept."""
+    """Read a few frames of a sequence. Broken ones are left out; the problem of the first is kept."""
     count = 1 if dataset.endless else len(dataset)
     indices = np.unique(np.linspace(0, count - 1, min(count, LOOKED_AT)).round().astype(int))
     depths, centres, stamps, problem = [], [], [], None

@@ -1,9 +1,9 @@
 """Poses with stamps, and the pose in between two of them.
 
-A body that moves on while its pose is taken at its own times is, at the time of a depth image, on the
+Poses and depth images have stamps of their own. At the time of a depth image the body is assumed on the
 straight line between the neighbouring positions and on the great circle between the neighbouring rotations
-(slerp: K. Shoemake, "Animating Rotation with Quaternion Curves", SIGGRAPH 1985). How far apart these may be
-in time is bounded, so that nothing is made up where a trajectory has a hole.
+(slerp: K. Shoemake, "Animating Rotation with Quaternion Curves", SIGGRAPH 1985). The gap
+in time is bounded, so that no pose is invented where a trajectory has a hole.
 """
 
 from collections.abc import Sequence
@@ -17,15 +17,14 @@ from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose
 
 INTERPOLATION_GAP = 0.1
-"""Seconds that a neighbouring pose may be away from an image if nothing else is said: poses at 5 Hz and
-more."""
+"""Default of the largest time in seconds between an image and a neighbouring pose: poses at 5 Hz and more."""
 
 _NEARLY_EQUAL = 1e-9
 """Below this angle (radians) the chord stands for the arc, whose formula divides by its sine."""
 
 
 class TimedPoses:
-    """A trajectory that can be asked for the pose at any time inside it.
+    """A trajectory that interpolates the pose at any time inside it.
 
     ``stamps`` (N,) float64 are seconds, ascending; ``poses`` (N, 4, 4) take points of the moving frame to the
     fixed one.
@@ -49,7 +48,7 @@ class TimedPoses:
         ``largest_gap`` seconds away. A pose with this very stamp is its own neighbour on both sides.
         """
         after = int(np.searchsorted(self.stamps, stamp))
-        # A little wider than the gap, so that the rounding of a difference decides nothing.
+        # A little wider than the gap, to absorb the rounding of a difference.
         window = largest_gap + 2 * np.spacing(abs(stamp) + largest_gap)
         if after < len(self) and self.stamps[after] == stamp:
             return self.poses[after].copy()
@@ -96,8 +95,8 @@ def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
 def read_timed_poses(path: Path) -> TimedPoses:
     """A file of ``stamp tx ty tz qx qy qz qw`` lines (TUM RGB-D), T_world_camera.
 
-    Raises DatasetError, whose text names the file and the line, if it is missing, of another layout, or holds
-    a pose that is none.
+    Raises DatasetError, whose text names the file and the line, if it is missing, of another layout, or
+    contains an invalid pose.
     """
     trajectory = read_trajectory(path)
     if trajectory.layout != "stamped":

@@ -5,8 +5,8 @@
 - ``log``: Choi's format (Redwood): a line of three integers, the first being the frame's number, then
   the four rows of the 4 x 4 matrix
 
-Lines that are empty or start with ``#`` are left out. A file whose layout is broken is an error at
-once; a pose whose values make no rigid transform is one when that pose is asked for, so that a recording
+Lines that are empty or start with ``#`` are left out. A broken layout is an error at
+once; a pose that is not a rigid transform is an error only when that pose is read, so that a recording
 with one bad pose can still be used.
 """
 
@@ -56,12 +56,12 @@ class Trajectory:
 def read_trajectory(path: Path) -> Trajectory:
     """Read a file of poses, recognising its layout by the first line.
 
-    Raises DatasetError, whose text names the file and the line, if it cannot be read, holds no pose,
+    Raises DatasetError, whose text names the file and the line, if it cannot be read, contains no pose,
     or a line has too few or too many numbers or something that is not a number.
     """
     lines = _read_numbers(path)
     if not lines:
-        raise DatasetError(f"{path}: holds no pose")
+        raise DatasetError(f"{path}: contains no pose")
     columns = len(lines[0][1])
     if columns == 8:
         return Trajectory(path, "stamped", tuple(_stamped(path, line) for line in lines))
@@ -99,7 +99,7 @@ def read_matrix_file(path: Path) -> Pose:
         raise DatasetError(f"{path}: the pose is missing")
     numbers = [number for _, row in _read_numbers(path) for number in row]
     if len(numbers) not in (12, 16):
-        raise DatasetError(f"{path}: holds {len(numbers)} numbers; a pose is a 4 x 4 matrix")
+        raise DatasetError(f"{path}: contains {len(numbers)} numbers; a pose is a 4 x 4 matrix")
     return as_pose(np.reshape(numbers, (-1, 4)))
 
 
@@ -109,7 +109,7 @@ def pose_from_quaternion(values: NDArray[np.float64]) -> Pose:
     Raises KeyframeError if a value is not finite or the quaternion is zero.
     """
     if not np.isfinite(values).all():
-        raise KeyframeError("a pose holds a value that is not finite (NaN or infinity)")
+        raise KeyframeError("a pose contains a value that is not finite (NaN or infinity)")
     norm = np.linalg.norm(values[3:])
     if norm < 1e-6:
         raise KeyframeError("the quaternion of a pose is zero")
@@ -165,7 +165,7 @@ def _read_numbers(path: Path) -> list[Line]:
             try:
                 lines.append((number, _numbers(line)))
             except ValueError:
-                raise DatasetError(f"{path} line {number}: holds something that is not a number") from None
+                raise DatasetError(f"{path} line {number}: contains something that is not a number") from None
     return lines
 
 

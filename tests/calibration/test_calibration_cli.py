@@ -219,12 +219,12 @@ def test_bad_depth_is_refused_in_one_line(tmp_path: Path, refused: Refused) -> N
     large = write_depth(tmp_path / "large", (120, 160))
     assert "a.npy: 160 x 120 pixels, but the camera has 80 x 60" in refused(depth, "--true-depth", large)
     zero = write_depth(tmp_path / "zero", (60, 80), value=0.0)
-    assert "none of the 3 depth images holds a single measurement" in refused(zero, "--true-depth", depth)
+    assert "none of the 3 depth images contains a measurement" in refused(zero, "--true-depth", depth)
     assert "too few samples: 14,400 pixels" in refused(depth, "--true-depth", depth)
     others = write_depth(tmp_path / "others", (60, 80), names="xyz")
     assert "has no image of the same name" in refused(depth, "--true-depth", others)
     (tmp_path / "nothing").mkdir()
-    assert "holds no depth images" in refused(tmp_path / "nothing", "--true-depth", depth)
+    assert "contains no depth images" in refused(tmp_path / "nothing", "--true-depth", depth)
     assert "is neither a folder nor" in refused(tmp_path / "missing", "--true-depth", depth)
     (depth / "b.npy").write_bytes(b"no array")
     assert "b.npy: cannot be read as an array" in refused(depth, "--true-depth", depth)
@@ -234,7 +234,7 @@ def test_bad_stacks_are_refused_in_one_line(tmp_path: Path, refused: Refused) ->
     depth = write_depth(tmp_path / "depth", (60, 80))
     stack = tmp_path / "stack.npz"
     np.savez(stack, one=np.zeros((2, 6, 8)), two=np.zeros(3))
-    assert "holds no array 'depth_m' but one, two" in refused(stack, "--true-depth", depth)
+    assert "contains no array 'depth_m' but one, two" in refused(stack, "--true-depth", depth)
     np.savez(stack, depth_m=np.zeros(3))
     assert "array of shape (3,), not depth images" in refused(stack, "--true-depth", depth)
 
@@ -243,7 +243,7 @@ def test_bad_chessboards_are_refused_in_one_line(tmp_path: Path, refused: Refuse
     depth = write_depth(tmp_path / "depth", (240, 320))
     images = tmp_path / "ir"
     images.mkdir()
-    assert "holds no images" in refused(
+    assert "contains no images" in refused(
         depth, "--images", images, "--camera", *CAMERA_TEXT.split(), *BOARD_FLAGS
     )
     for name in "ab":

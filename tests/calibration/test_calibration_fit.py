@@ -204,7 +204,7 @@ def test_images_without_measurements_are_an_error(tables: Tables) -> None:
             pair = super().read(name)
             return DepthPair(name, np.zeros_like(pair.measured_m), pair.true_m)
 
-    with pytest.raises(DatasetError, match="none of the 3 depth images holds a single measurement"):
+    with pytest.raises(DatasetError, match="none of the 3 depth images contains a measurement"):
         calibrate(Blank(tables, 3, 1, 2), CAMERA, CalibrationConfig())
     with pytest.raises(DatasetError, match=r"in none of 3 images .* from 8 to 9 m"):
         calibrate(Planes(tables, 3, 1, 2), CAMERA, CalibrationConfig(min_depth=8, max_depth=9))

@@ -92,7 +92,7 @@ def test_hand_eye_is_exact_without_noise() -> None:
     T_camera_body, T_body_board = hand_eye(T_camera_board, M)
     np.testing.assert_allclose(T_camera_body, capture.T_camera_body, atol=1e-9)
     np.testing.assert_allclose(T_body_board, capture.T_body_board, atol=1e-9)
-    with pytest.raises(DatasetError, match="tilt it about two axes"):
+    with pytest.raises(DatasetError, match="tilt the board about two axes"):
         hand_eye(np.repeat(T_camera_board[:1], 5, axis=0), np.repeat(M[:1], 5, axis=0))
 
 

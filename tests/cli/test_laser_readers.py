@@ -186,7 +186,7 @@ def test_a_log_without_scans_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "empty.log"
     path.write_bytes(text.encode("latin-1"))
     for skip in (False, True):
-        with pytest.raises(DatasetError, match=r"empty\.log: holds no scans"):
+        with pytest.raises(DatasetError, match=r"empty\.log: contains no scans"):
             open_scans(path, skip_bad_scans=skip)
 
 
@@ -252,7 +252,7 @@ BROKEN_ARRAYS = {
     "angle not finite": ({"angle_rad": np.array([0, np.nan, 1])}, "angle_rad"),
     "zero scans": (
         {"range_m": np.zeros((0, 3)), "pose_x_y_theta": np.zeros((0, 3)), "hit": np.zeros((0, 3))},
-        "holds no scans",
+        "contains no scans",
     ),
     "zero beams": ({"range_m": np.zeros((2, 0))}, "(scans, beams)"),
     "objects": ({"range_m": np.array([[{}]], dtype=object)}, "range_m cannot be read"),
@@ -297,7 +297,7 @@ def test_a_truncated_npz_file_is_named(tmp_path: Path, kept: int) -> None:
 def test_sources_that_do_not_exist_are_named(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"nowhere\.log: no such file"):
         open_scans(tmp_path / "nowhere.log")
-    with pytest.raises(DatasetError, match=r"holds no scans\.npz"):
+    with pytest.raises(DatasetError, match=r"contains no scans\.npz"):
         open_scans(tmp_path)
     with pytest.raises(DatasetError, match="synthetic:floor-plan"):
         open_scans("synthetic:castle")

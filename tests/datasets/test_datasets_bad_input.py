@@ -144,7 +144,7 @@ def test_a_time_gap_that_is_none(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "text", "problem"),
     [
-        ("camera.txt", "640 480 525", "holds 3 numbers"),
+        ("camera.txt", "640 480 525", "contains 3 numbers"),
         ("camera.txt", "640 480 fx fy 1 1", "not a number"),
         ("camera.txt", "16 12 -14 15 7.5 5.5", "both must be positive"),
         ("camera.txt", "16 12 nan 15 7.5 5.5", "fx is not finite"),

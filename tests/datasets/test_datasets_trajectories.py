@@ -89,10 +89,10 @@ GOOD = "0 1 2 3 0 0 0 1"
     ("lines", "problem"),
     [
         ([GOOD, "1 1 2 3 0 0 1"], "line 2: 7 numbers, expected 8"),
-        (["# head", GOOD, "1 1 2 three 0 0 0 1"], "line 3: holds something that is not a number"),
+        (["# head", GOOD, "1 1 2 three 0 0 0 1"], "line 3: contains something that is not a number"),
         ([GOOD, "nan 1 2 3 0 0 0 1"], "line 2: the stamp is not finite"),
         (["1 2 3 4 5"], "line 1: 5 numbers"),
-        (["# nothing else"], "holds no pose"),
+        (["# nothing else"], "contains no pose"),
         (["0 0 1", "1 0 0 0", "0 1 0 0"], "line 1: the file ends inside this pose"),
         (["0 0 1", "1 0 0 0", "0 1 0"], "line 3: 3 numbers, expected 4"),
         (
@@ -138,7 +138,7 @@ def test_a_file_that_is_no_text_or_not_there(tmp_path: Path) -> None:
         read_trajectory(tmp_path / "none.txt")
     with pytest.raises(DatasetError, match=r"none\.txt: the pose is missing"):
         read_matrix_file(tmp_path / "none.txt")
-    with pytest.raises(DatasetError, match="holds 3 numbers"):
+    with pytest.raises(DatasetError, match="contains 3 numbers"):
         read_matrix_file(write(tmp_path / "short.txt", "1 2 3"))
 
 

@@ -301,11 +301,11 @@ BAD: dict[str, tuple[tuple[Write, ...], str, tuple[str, ...]]] = {
     "colour as depth": (
         (only_color,),
         "?depth=/camera/color/image_raw",
-        ("topic /camera/color/image_raw", "'rgb8' is no depth", "16UC1"),
+        ("topic /camera/color/image_raw", "'rgb8' is not depth", "16UC1"),
     ),
     "no such topic": ((plain,), "?depth=/nowhere", ("no topic /nowhere", "/camera/depth/image_raw")),
     "not an image": ((plain,), "?depth=/odom", ("topic /odom", "nav_msgs/msg/Odometry")),
-    "no poses": ((images,), "", ("holds no poses", "?poses=FILE")),
+    "no poses": ((images,), "", ("contains no poses", "?poses=FILE")),
     "no such pose": ((plain,), "?pose=/nowhere", ("no topic /nowhere", "/odom")),
     "not a pose": (
         (plain,),
@@ -366,7 +366,7 @@ def test_a_damaged_image_is_a_broken_frame(make: Callable[..., Path]) -> None:
     assert len(dataset) == COUNT + 2
     with pytest.raises(FrameError, match=r"frame 000001: .*topic /camera/depth/image_raw: .* 16 x 6 pixels"):
         dataset.read(1)
-    with pytest.raises(FrameError, match=r"frame 000004: .*walk\.bag: topic .*'8UC1' is no depth"):
+    with pytest.raises(FrameError, match=r"frame 000004: .*walk\.bag: topic .*'8UC1' is not depth"):
         dataset.read(4)
     assert (dataset.read(5).depth_m > 0).any()
 

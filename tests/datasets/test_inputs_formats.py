@@ -132,7 +132,7 @@ def test_open3d_with_a_json(tmp_path: Path, content: Content, kind: str) -> None
 @pytest.mark.parametrize(
     ("name", "text", "said"),
     [
-        ("trajectory.json", '{"class_name": "PoseGraph", "nodes": []}', "holds no pose"),
+        ("trajectory.json", '{"class_name": "PoseGraph", "nodes": []}', "contains no pose"),
         ("trajectory.json", '{"class_name": "PoseGraph", "nodes": [{"pose": [1]}]}', "entry 0: needs the 16"),
         ("trajectory.json", '{"class_name": "Mesh"}', "without a trajectory"),
         ("trajectory.json", "[1]", "without a trajectory"),

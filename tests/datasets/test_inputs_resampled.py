@@ -171,7 +171,7 @@ def test_the_time_gap_of_a_format_holds_unless_told_otherwise(tmp_path: Path) ->
         ({"undistort": (0.1, 0.2)}, "undistort takes k1,k2,p1,p2"),
         ({"undistort": (0.1, 0.2, float("nan"), 0.0)}, "undistort takes"),
         ({"intrinsics": (0.0, 1.0, 1.0, 1.0)}, "both must be positive"),
-        ({"intrinsics": (1.0, 1.0, 1.0, 1.0), "camera": CAMERA}, "give one of them"),
+        ({"intrinsics": (1.0, 1.0, 1.0, 1.0), "camera": CAMERA}, "pass only one of them"),
     ],
 )
 def test_values_that_make_no_sense(folder: Path, options: dict, said: str) -> None:

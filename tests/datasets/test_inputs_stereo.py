@@ -84,7 +84,7 @@ def test_stamps_in_a_file(tmp_path: Path) -> None:
     assert len(dataset) == 3
     np.testing.assert_allclose(dataset.read(2).T_world_camera, pose(2), atol=1e-6)
     (tmp_path / "times.txt").write_text("5.0")
-    with pytest.raises(DatasetError, match=r"times\.txt: holds 1 stamps for 3 pairs"):
+    with pytest.raises(DatasetError, match=r"times\.txt: contains 1 stamps for 3 pairs"):
         open_dataset(path)
 
 
@@ -123,7 +123,7 @@ def test_a_file_that_is_no_description(tmp_path: Path, text: str) -> None:
 def test_poses_that_do_not_fit(tmp_path: Path) -> None:
     path = write(tmp_path, NAMES)
     write_rows(tmp_path / "poses.txt", [pose(0)])
-    with pytest.raises(DatasetError, match=r"poses\.txt: holds 1 poses for 3 stereo pairs"):
+    with pytest.raises(DatasetError, match=r"poses\.txt: contains 1 poses for 3 stereo pairs"):
         open_dataset(path)
     (tmp_path / "poses.txt").write_text(stamped_line(0.0, pose(0)))
     with pytest.raises(DatasetError, match=r"poses\.txt: has stamps, but the images have none"):

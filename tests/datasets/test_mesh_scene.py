@@ -222,7 +222,7 @@ def test_meshes_that_are_none(files: tuple[Path, Path], tmp_path: Path) -> None:
 def test_points_without_triangles(tmp_path: Path) -> None:
     path = tmp_path / "cloud.ply"
     trimesh.PointCloud(np.eye(3)).export(path)
-    with pytest.raises(DatasetError, match=r"cloud\.ply: holds no triangles"):
+    with pytest.raises(DatasetError, match=r"cloud\.ply: contains no triangles"):
         load_mesh(path)
 
 

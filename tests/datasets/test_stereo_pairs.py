@@ -137,10 +137,14 @@ def test_a_pose_that_is_none_is_named(folder: Path) -> None:
 @pytest.mark.parametrize("change", [-1, 1])
 def test_a_wrong_number_of_poses_or_stamps_is_refused(folder: Path, change: int) -> None:
     (folder / "times.txt").write_text("\n".join(str(i) for i in range(COUNT + change)))
-    with pytest.raises(DatasetError, match=rf"times\.txt: holds {COUNT + change} stamps for 3 stereo pairs"):
+    with pytest.raises(
+        DatasetError, match=rf"times\.txt: contains {COUNT + change} stamps for 3 stereo pairs"
+    ):
         open_dataset(folder)
     write_rows(folder / "poses.txt", [np.eye(4)[:3]] * (COUNT + change))
-    with pytest.raises(DatasetError, match=rf"poses\.txt: holds {COUNT + change} poses for 3 stereo pairs"):
+    with pytest.raises(
+        DatasetError, match=rf"poses\.txt: contains {COUNT + change} poses for 3 stereo pairs"
+    ):
         open_dataset(folder)
 
 
@@ -152,7 +156,7 @@ def test_a_wrong_number_of_poses_or_stamps_is_refused(folder: Path, change: int)
         (f"P0: {row_of(P0)}\nP2: {row_of(P1)}", "P1 is missing"),
         (f"{row_of(P0)}\n{row_of(P1)} 1", "P1 must be 12 finite numbers .* has 13"),
         (f"{row_of(P0)}\n{row_of(P1).replace('80.5', 'nan')}", "P1 must be 12 finite numbers"),
-        (f"{row_of(P0)}\n{row_of(P1).replace('80.5', 'wide')}", "P1 holds something that is not a number"),
+        (f"{row_of(P0)}\n{row_of(P1).replace('80.5', 'wide')}", "P1 contains something that is not a number"),
         (f"{row_of(P0)}\n{row_of(P1 + np.eye(3, 4))}", "no rectified pair"),
         (f"{row_of(P0)}\n{row_of(P0)}", "baseline_m must be a positive"),
         (f"{row_of(P1)}\n{row_of(P0)}", "P0 must be at the origin"),

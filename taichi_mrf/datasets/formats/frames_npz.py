@@ -3,7 +3,7 @@
 ``depth_m`` (N, H, W) float is axial depth in metres, 0 or NaN where there is none, or uint16 with
 ``depth_scale``, its steps per metre; ``T_world_camera`` is (N, 4, 4) or (N, 3, 4); ``K`` (3, 3), or ``fx``,
 ``fy``, ``cx``, ``cy``. ``stamp`` (N,) in seconds and ``color`` (N, H, W, 3) uint8 RGB may be left out, and
-so may poses that are to be found (``ReadOptions.track``). Without the N, a file is one frame.
+and so may poses with ``ReadOptions.track``. Without the N, a file is one frame.
 """
 
 import math
@@ -60,8 +60,8 @@ class FramesNpz(Dataset):
         return self._names
 
     def read(self, index: int) -> Frame:
-        """Read one frame. Raises FrameError, which names frame, file and field, for images that are damaged,
-        and for a pose that is none; IndexError outside 0 to len - 1."""
+        """Read one frame. Raises FrameError, which names frame, file and field, for damaged images and
+        for an invalid pose; IndexError outside 0 to len - 1."""
         if not 0 <= index < len(self._places):
             raise IndexError(f"{self.name} has {len(self._places)} frames, there is no frame {index}")
         part, i = self._places[index]
@@ -105,7 +105,7 @@ def recognises(path: Path) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             return {f"{DEPTH}.npy", f"{POSE}.npy"} & set(archive.namelist()) != set()
-    except Exception:  # zipfile raises whatever its parsing stumbles over; opening the file says what it is
+    except Exception:  # zipfile's parser raises many kinds; opening the file names the problem
         return path.suffix == ".npz"
 
 
@@ -205,10 +205,10 @@ def _opened(path: Path) -> AbstractContextManager[NpzFile]:
 
 
 def _numbers(file: NpzFile, path: Path, name: str) -> NDArray:
-    """An array of real numbers, whatever their kind."""
+    """An array of integers or floating-point numbers."""
     found = file[name]
     if found.dtype.kind not in "fiu":
-        raise DatasetError(f"{path}: {name} is {found.dtype}, which are no numbers")
+        raise DatasetError(f"{path}: {name} is {found.dtype}, not numbers")
     return found
 
 

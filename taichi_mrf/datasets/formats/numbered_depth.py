@@ -1,7 +1,7 @@
 """ICL-NUIM, Redwood and their like: numbered depth PNGs and one file with the trajectory.
 
-The images lie in the folder itself or in ``depth/`` (colour in ``rgb/``, ``color/`` or ``image/``). What the
-trajectory's layout says of the recording:
+The images lie in the folder itself or in ``depth/`` (colour in ``rgb/``, ``color/`` or ``image/``). The
+trajectory's layout decides the defaults:
 
 - stamped (``*.freiburg``; Handa et al., ICRA 2014): the stamp is the image's number; ICL-NUIM's camera, 5000
   steps a metre. ICL-NUIM's world and camera have y up and are left-handed (its fy is -480); both are
@@ -11,7 +11,8 @@ trajectory's layout says of the recording:
 - rows of 3 x 4 matrices: 5000 steps a metre, ICL-NUIM's camera where the folder's name holds ``icl``, else
   Redwood's.
 
-A camera file in the folder or the caller's word wins over all of these; what was assumed is in the notes.
+A camera file in the folder or the caller's options replace all of these. An assumed depth scale is checked
+against the poses (depth_scale.py), and the notes name what was assumed.
 """
 
 import re
@@ -43,7 +44,7 @@ _MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 def recognises(folder: Path) -> bool:
-    """Whether there are numbered PNGs. That there is no trajectory is then said on opening."""
+    """Whether there are numbered PNGs. Opening reports a missing trajectory."""
     return bool(_numbered_images(folder))
 
 
@@ -93,7 +94,7 @@ def _numbered_images(folder: Path) -> dict[int, Path]:
 
 
 def _find_trajectory(folder: Path, images: Sequence[Path]) -> tuple[Trajectory, PinholeCamera | None]:
-    """The only trajectory of a recording, and the camera that it holds, if it does."""
+    """The only trajectory of a recording, and the camera in it, if there is one."""
     suffixes = (".txt", ".log", ".freiburg")
     candidates = [
         path
@@ -118,7 +119,7 @@ def _find_trajectory(folder: Path, images: Sequence[Path]) -> tuple[Trajectory, 
 def _poses_by_number(
     numbers: list[int], trajectory: Trajectory
 ) -> tuple[dict[int, RecordedPose | None], list[str]]:
-    """The pose of each image number, None where one is missing, and what a report should say of it.
+    """The pose of each image number, None where one is missing, and notes for the report.
 
     Numbers outside a stamped trajectory are left out. Poses without stamps go with the images in their
     order if there are as many, else by number.

@@ -1,8 +1,7 @@
 """The JSON files of Open3D: a camera's intrinsics, and trajectories of cameras.
 
-Open3D writes matrices column by column. A PinholeCameraTrajectory holds for each image its intrinsics and its
-``extrinsic``, which takes the world to the camera; a PoseGraph holds for each node its ``pose``, which takes
-the camera to the world.
+Open3D writes matrices column by column. A PinholeCameraTrajectory has for each image its intrinsics and its
+``extrinsic``, T_camera_world; a PoseGraph has for each node its ``pose``, T_world_camera.
 """
 
 import json
@@ -26,7 +25,7 @@ def read_intrinsics(path: Path) -> PinholeCamera:
 
 
 def is_trajectory_json(path: Path) -> bool:
-    """Whether a file is JSON and says that it is one of the two kinds of trajectory."""
+    """Whether a file is JSON of one of the two kinds of trajectory."""
     try:
         return _values(path).get("class_name") in _LISTS
     except (DatasetError, AttributeError):
@@ -42,7 +41,7 @@ def read_trajectory_json(path: Path) -> tuple[Trajectory, PinholeCamera | None]:
     values = _values(path)
     entries = values.get(_LISTS[values["class_name"]])
     if not isinstance(entries, list) or not entries:
-        raise DatasetError(f"{path}: holds no pose")
+        raise DatasetError(f"{path}: contains no pose")
     poses = [_pose(path, index, entry) for index, entry in enumerate(entries)]
     camera = _camera(path, entries[0]["intrinsic"]) if "intrinsic" in entries[0] else None
     return Trajectory(path, "log", tuple(poses)), camera
@@ -59,7 +58,7 @@ def _pose(path: Path, index: int, entry: Any) -> RecordedPose:
         try:
             matrix = inverse(as_pose(matrix))
         except KeyframeError:
-            matrix = np.full((4, 4), np.nan)  # named when its frame is read
+            matrix = np.full((4, 4), np.nan)  # reported when its frame is read
     return RecordedPose(index, matrix, source)
 
 

@@ -28,7 +28,7 @@ _DEPTH = re.compile(r"depth(\d+)\.png")
 
 
 def recognises(folder: Path) -> bool:
-    """Whether there are depth images of such names. That poses are missing is said on opening."""
+    """Whether there are depth images with such names. Opening reports missing poses."""
     results = folder / "results"
     return results.is_dir() and any(_DEPTH.fullmatch(path.name) for path in results.iterdir())
 

@@ -19,13 +19,13 @@ from taichi_mrf.system.files import read_text
 
 NAME = "ScanNet"
 CAMERA = PinholeCamera(width=640, height=480, fx=577.870605, fy=577.870605, cx=319.5, cy=239.5)
-"""That of most of its scenes."""
+"""The camera of most scenes."""
 
 INTRINSICS = "intrinsic/intrinsic_depth.txt"
 STEPS_PER_METRE = 1000.0
 FRAMES_PER_SECOND = 30.0
 LOST = "inf"
-"""What stands in the pose of an image that could not be tracked."""
+"""The text in the pose file of an image that could not be tracked."""
 
 
 def recognises(folder: Path) -> bool:
@@ -41,7 +41,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         key=lambda path: int(path.stem),
     )
     if not images:
-        raise DatasetError(f"{folder / 'depth'}: holds no N.png")
+        raise DatasetError(f"{folder / 'depth'}: contains no N.png")
     tracked = [path for path in images if not _lost(folder / "pose" / f"{path.stem}.txt")]
     if not tracked:
         raise DatasetError(f"{folder / 'pose'}: tracking was lost in all {len(images)} images")

@@ -28,7 +28,7 @@ _FILE = re.compile(r"(frame-(\d+))\.(depth\.png|pose\.txt)")
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder holds at least one depth image or pose with such a name."""
+    """Whether the folder contains at least one depth image or pose with such a name."""
     return folder.is_dir() and any(_FILE.fullmatch(path.name) for path in folder.iterdir())
 
 

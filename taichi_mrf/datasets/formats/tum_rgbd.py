@@ -25,9 +25,9 @@ from taichi_mrf.system.files import is_file, read_text
 NAME = "TUM RGB-D"
 STEPS_PER_METRE = 5000.0
 LARGEST_GAP = 0.02
-"""Seconds between a depth image and its pose if nothing else is said."""
+"""Default of the largest time in seconds between a depth image and its pose."""
 LONGEST_NAME = 255
-"""Bytes; no file system that is in use has longer names."""
+"""Bytes; common file systems allow no longer names."""
 DEPTH_LIST, COLOR_LIST, POSES = "depth.txt", "rgb.txt", "groundtruth.txt"
 
 CAMERAS = {
@@ -39,7 +39,7 @@ CAMERAS = {
 
 
 def recognises(folder: Path) -> bool:
-    """Whether the folder has the list of depth images. That poses are missing is then said on opening."""
+    """Whether the folder has the list of depth images. Opening reports missing poses."""
     return is_file(folder / DEPTH_LIST)
 
 
@@ -71,7 +71,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     camera, notes = find_camera(folder, options, default, default_name, (f.depth_file for f in frames))
     dropped = len(depth) - len(frames)
     if dropped:
-        notes.append(f"{dropped} of {len(depth)} depth images dropped: no pose of their own within {gap:g} s")
+        notes.append(f"{dropped} of {len(depth)} depth images dropped: no unused pose within {gap:g} s")
     return Recording(
         name=folder.name,
         camera=camera,
@@ -94,7 +94,7 @@ def associate(stamps: Sequence[float], others: Sequence[float], largest_gap: flo
     ordered = np.asarray(others, dtype=np.float64)[order]
     pairs = []
     for i, stamp in enumerate(stamps):
-        # A little wider than the gap, so that the rounding of stamp +- gap decides nothing.
+        # A little wider than the gap, to absorb the rounding of stamp +- gap.
         window = largest_gap + 2 * np.spacing(abs(stamp) + largest_gap)
         first = np.searchsorted(ordered, stamp - window, side="left")
         last = np.searchsorted(ordered, stamp + window, side="right")

@@ -4,8 +4,8 @@
     ROBOTLASER1 type start_angle field_of_view step max_range accuracy remission_mode
                 n r_1 .. r_n  m remission_1 .. remission_m  x y theta  ...
 
-x y theta is the pose of the scanner (of the rear one in RLASER); all other lines are of no interest here.
-FLASER and RLASER do not say where their beams go: over 180 degrees.
+x y theta is the pose of the scanner (of the rear one in RLASER); all other lines are skipped.
+FLASER and RLASER do not give the directions of their beams: they cover 180 degrees.
 """
 
 import gzip
@@ -40,7 +40,7 @@ class _Scan:
 
 
 class _BadLineError(Exception):
-    """What is wrong with a line, without its place."""
+    """The problem with a line, without its place."""
 
 
 def read_carmen_log(
@@ -74,7 +74,7 @@ def read_carmen_log(
     if not scans:
         wanted = f"{', '.join(_OLD)} or {_NEW}"
         raise DatasetError(
-            problems[0] if problems else f"{path}: holds no scans, which are lines of {wanted}"
+            problems[0] if problems else f"{path}: contains no scans, which are lines of {wanted}"
         )
     range_m = np.stack([scan.range_m for scan in scans]).astype(np.float32)
     pose = np.stack([scan.pose_x_y_theta for scan in scans])

@@ -1,7 +1,7 @@
 """``synthetic:floor-plan``: laser scans of the simulated building, with its floor plan as the truth.
 
 Options follow a question mark, ``synthetic:floor-plan?scans=200&beams=181&noise=0.02&seed=1``; the fields of
-:class:`FloorPlanOptions` are all there are.
+:class:`FloorPlanOptions` are the options.
 """
 
 import math
@@ -21,7 +21,7 @@ NAME = "synthetic:floor-plan"
 
 @dataclass(frozen=True)
 class FloorPlanOptions:
-    """What the name of the built-in scans may be followed by."""
+    """The options of the built-in scans."""
 
     scans: int = 200
     """Scans, evenly spread along the robot's way."""
@@ -33,7 +33,7 @@ class FloorPlanOptions:
     """Angle between the first and the last beam, in degrees; the middle one looks ahead."""
 
     max_range: float = 8.0
-    """What is further away than this (metres) sends nothing back."""
+    """Surfaces further away than this (metres) return nothing."""
 
     noise: float = 0.02
     """Standard deviation of the measured range in metres."""

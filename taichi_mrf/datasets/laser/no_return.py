@@ -1,4 +1,4 @@
-"""Which range a laser scanner reports where nothing came back, found in the scans themselves.
+"""Find in the scans which range a laser scanner reports for a beam without a return.
 
 A scanner without a return reports its greatest range or an error code just below it: 81.91 and 81.83 m, 50 m,
 32.77 m, ... Such beams pile up at one value, however far the robot moves; real surfaces do not.
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 DEFAULT_M = 49.5
-"""Ranges from here on count as no return where the scans do not tell: no wall indoors is as far away."""
+"""Without a peak in the scans, ranges from here on count as no return: no wall indoors is as far away."""
 
 TOLERANCE = 0.003
 """Ranges within this share of the largest one mean no return too: 81.83 to 81.91 m are error codes."""

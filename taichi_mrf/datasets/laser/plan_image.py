@@ -37,11 +37,11 @@ class FloorPlan:
         )
 
     def moved(self, x: float, y: float) -> "FloorPlan":
-        """The plan, shifted by so many metres."""
+        """The plan, shifted by ``x`` and ``y`` metres."""
         return replace(self, lower_x_y=(self.lower_x_y[0] + x, self.lower_x_y[1] + y))
 
     def with_margin(self, pixels: int, *, wall: bool) -> "FloorPlan":
-        """The plan with so many more pixels on every side, all of them wall or all of them open."""
+        """The plan with more pixels on every side, all of them wall or all of them open."""
         x, y = self.pixel_x_y
         return replace(
             self,
@@ -62,7 +62,7 @@ class FloorPlan:
 
 
 def read_floor_plan(path: str | Path, size_x_y: tuple[float, float]) -> FloorPlan:
-    """Read an image of a floor plan, dark where there is a wall, that is so many metres wide and high.
+    """Read an image of a floor plan, dark where there is a wall, of a given width and height in metres.
 
     It is centred on the world's origin, as Player/Stage places its bitmaps. Raises DatasetError.
     """

@@ -18,7 +18,7 @@ _LOOKED_AT_BYTES = 1 << 16
 def open_scans(
     source: str | Path, *, skip_bad_scans: bool = False, no_return_m: float | None = None
 ) -> LaserScans:
-    """Read a CARMEN log (plain or gzip), an npz file or a folder that holds ``scans.npz``, or make the
+    """Read a CARMEN log (plain or gzip), an npz file or a folder with ``scans.npz``, or make the
     scans of a built-in source such as ``synthetic:floor-plan?scans=200``.
 
     Beams of at least ``no_return_m`` metres have no return; None leaves it to the reader. Raises
@@ -32,7 +32,9 @@ def open_scans(
     if is_folder(path):
         path = path / scan_npz.FILE_NAME
         if not exists(path):
-            raise DatasetError(f"{source}: the folder holds no {scan_npz.FILE_NAME}; pass a log by its name")
+            raise DatasetError(
+                f"{source}: the folder contains no {scan_npz.FILE_NAME}; pass a log by its name"
+            )
     if not exists(path):
         raise DatasetError(
             f"{source}: no such file, and no built-in scans of that name ({floor_plan_scans.NAME})"
@@ -46,7 +48,7 @@ def open_scans(
 
 
 def holds_scans(path: Path) -> bool:
-    """Whether a file, or a folder with ``scans.npz``, holds 2D laser scans, whatever state they are in."""
+    """Whether a file, or a folder with ``scans.npz``, contains 2D laser scans, damaged or not."""
     if is_folder(path):
         path = path / scan_npz.FILE_NAME
     if not is_file(path):

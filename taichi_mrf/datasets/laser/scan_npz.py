@@ -13,19 +13,19 @@ from taichi_mrf.system.files import open_regular
 from taichi_mrf.system.npz_file import open_npz
 
 FILE_NAME = "scans.npz"
-"""What the file is called where a folder is given."""
+"""The file's name in a folder."""
 
 _ZIP_MAGIC = b"PK"
 
 
 def recognises(path: Path) -> bool:
-    """Whether a file is of this format, whatever state it is in."""
+    """Whether a file is of this format, damaged or not."""
     with open_regular(path, DatasetError) as file:
         return file.read(len(_ZIP_MAGIC)) == _ZIP_MAGIC or path.suffix == ".npz"
 
 
 def holds_ranges(path: Path) -> bool:
-    """Whether an npz file has an array of ranges, whatever state the others are in."""
+    """Whether an npz file has an array of ranges."""
     try:
         with open_npz(path, DatasetError, "an npz file that can be read") as file:
             return "range_m" in file
@@ -53,7 +53,7 @@ def read_scan_npz(
         keep[scan] = False
         problems.append(problem)
     if not keep.any():
-        raise DatasetError(problems[0] if problems else f"{path}: holds no scans")
+        raise DatasetError(problems[0] if problems else f"{path}: contains no scans")
     range_m, pose, hit = range_m[keep], pose[keep], (arrays["hit"] != 0)[keep]
     notes = skipped_note(problems)
     if no_return_m is not None:
@@ -81,11 +81,11 @@ def _arrays(path: Path) -> dict[str, NDArray[Any]]:
         for name in ("range_m", "angle_rad", "pose_x_y_theta", "hit"):
             if name not in file:
                 held = ", ".join(file.names) or "nothing"
-                raise DatasetError(f"{path}: holds no array '{name}', only {held}")
+                raise DatasetError(f"{path}: contains no array '{name}', only {held}")
             arrays[name] = file[name]
     for name, array in arrays.items():
         if not (np.issubdtype(array.dtype, np.number) or array.dtype == np.bool_) or np.iscomplexobj(array):
-            raise DatasetError(f"{path}: {name} holds {array.dtype}, not numbers")
+            raise DatasetError(f"{path}: {name} contains {array.dtype}, not numbers")
     if arrays["range_m"].ndim != 2 or arrays["range_m"].shape[1] == 0:
         raise DatasetError(
             f"{path}: range_m must have the shape (scans, beams), not {arrays['range_m'].shape}"
@@ -97,5 +97,5 @@ def _arrays(path: Path) -> dict[str, NDArray[Any]]:
                 f"{path}: {name} has the shape {arrays[name].shape}; with range_m's it must be {shape}"
             )
     if not np.isfinite(arrays["angle_rad"]).all():
-        raise DatasetError(f"{path}: angle_rad holds a value that is not finite")
+        raise DatasetError(f"{path}: angle_rad contains a value that is not finite")
     return arrays

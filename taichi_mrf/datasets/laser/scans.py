@@ -14,14 +14,14 @@ class LaserScans:
     """N scans of B beams each, in one world frame.
 
     A beam of scan i leaves ``pose_x_y_theta[i]``, the pose of the scanner, at the angle theta + ``angle_rad``
-    from the world's x axis, counter-clockwise. Ranges are positive; a range of 0 is a beam that measured
-    nothing at all.
+    from the world's x axis, counter-clockwise. Ranges are positive; beams
+    of range 0 are left out.
     """
 
     name: str
 
     range_m: NDArray[np.float32]
-    """(N, B) measured range in metres; where nothing came back, how far the scanner would have seen."""
+    """(N, B) measured range in metres; for a beam without a return, the scanner's greatest range."""
 
     angle_rad: NDArray[np.float64]
     """(B,) angles of the beams in the scanner's frame."""
@@ -30,35 +30,35 @@ class LaserScans:
     """(N, 3) metres, metres, radians."""
 
     hit: NDArray[np.bool_]
-    """(N, B): False where nothing came back."""
+    """(N, B): False for beams without a return."""
 
     no_return_is_free: bool = True
-    """Whether a beam that did not come back says that the space up to its range is free. In logs of real
-    scanners most such beams met glass or something dark and say nothing."""
+    """Whether a beam without a return is evidence that the space up to its range is free. In logs of real
+    scanners most such beams met glass or something dark, and carry no evidence."""
 
     floor_plan: FloorPlan | None = None
-    """The truth, if it comes with the scans."""
+    """The true floor plan, if it comes with the scans."""
 
     notes: tuple[str, ...] = ()
-    """Sentences that a report should show: what was assumed or left out."""
+    """Sentences for the report: what was assumed or left out."""
 
     def __len__(self) -> int:
         return len(self.range_m)
 
 
 def problem_of_scan(range_m: NDArray[np.floating], pose_x_y_theta: NDArray[np.floating]) -> str | None:
-    """What is wrong with the values of one scan, (B,) and (3,), or None."""
+    """The problem with the values of one scan, (B,) and (3,), or None."""
     bad = ~np.isfinite(range_m) | (range_m < 0)
     if bad.any():
         beam = int(bad.argmax())
         return f"the range of beam {beam + 1} is {range_m[beam]:g}; ranges are finite and not negative"
     if not np.isfinite(pose_x_y_theta).all():
-        return f"the pose holds a value that is not finite: {' '.join(f'{v:g}' for v in pose_x_y_theta)}"
+        return f"the pose contains a value that is not finite: {' '.join(f'{v:g}' for v in pose_x_y_theta)}"
     return None
 
 
 def skipped_note(problems: list[str]) -> tuple[str, ...]:
-    """The note on scans that were left out, of which each has an error text; none if there are none."""
+    """The note on scans that were left out, with one error text each; empty without such scans."""
     if not problems:
         return ()
     return (f"{len(problems)} broken scans were left out; the first: {problems[0]}",)
@@ -67,9 +67,9 @@ def skipped_note(problems: list[str]) -> tuple[str, ...]:
 def beams_of(scans: LaserScans, max_range_m: float = 0.0, no_return_is_free: bool | None = None) -> Beams:
     """All beams of all scans, in their order, in the plane z = 0 of the world frame.
 
-    A beam longer than ``max_range_m`` (0: no limit) is cut there and then says only that its way is free.
-    Beams that measured nothing (range 0) are left out, and so are those that did not come back, unless that
-    says that their way is free: by ``no_return_is_free``, or if it is None as the scans have it.
+    A beam longer than ``max_range_m`` (0: no limit) is cut there and then only marks its way as free.
+    Beams of range 0 are left out, and so are those without a return, unless they mark their way as free:
+    ``no_return_is_free``, or by default what the scans have.
     """
     count, beams = scans.range_m.shape
     angle = scans.pose_x_y_theta[:, 2:] + scans.angle_rad

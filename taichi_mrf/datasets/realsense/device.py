@@ -2,9 +2,9 @@
 
 ``realsense:width=848&height=480&fps=30`` is a camera, as long as it is plugged in; ``realsense:FILE`` is what
 its library has recorded (recorded.py). ``?poses=FILE`` gives the poses of the depth camera in TUM's
-layout, by the stamps of its images; ``?poses=track`` leaves them to be found by whoever maps the frames.
-Without either the camera is taken to stand still: its pose is one and the same for all frames, at the origin,
-level, looking along x.
+layout, by the stamps of its images; ``?poses=track`` finds them from the images while mapping.
+Without either the camera is assumed to stand still: all frames have one pose, at the origin, level, looking
+along x.
 """
 
 import weakref
@@ -29,19 +29,17 @@ from taichi_mrf.system.libraries import library
 NAME = "realsense:"
 
 TIMEOUT_MS = 500
-"""A camera that sends nothing for so long has missed an image; it is lost after MISSES in a row."""
+"""A camera that delivers nothing for this long has missed an image; after MISSES in a row it is lost."""
 
 MISSES = 4
 
-STANDS_STILL = (
-    "the camera is taken to stand still: ?poses=FILE gives the poses of one that moves, or ?poses=track"
-)
-ENDLESS = "frames come without end: --keep-live N bounds the memory, --keyframes.* thins them out"
+STANDS_STILL = "the camera is assumed to stand still; for one that moves add ?poses=FILE or ?poses=track"
+ENDLESS = "the camera never ends: --keep-live N bounds the memory, --keyframes.* selects fewer keyframes"
 
 
 @dataclass(frozen=True)
 class RealSenseOptions:
-    """What the camera is asked for; it must offer this very depth stream."""
+    """The depth stream that is requested; the camera must offer exactly this one."""
 
     width: int = 640
     """Columns of the images."""
@@ -57,7 +55,7 @@ class RealSenseOptions:
 
 
 class _EndlessNames(Sequence[str]):
-    """Names of frames that are counted as they come."""
+    """Names of frames that are numbered as they arrive."""
 
     def __len__(self) -> int:
         return 2**31 - 1
@@ -125,12 +123,12 @@ def open_realsense(text: str, options: ReadOptions) -> Dataset:
     """Start the first RealSense camera that is found, or open a recording: ``FILE?option=value&...``, where
     either may be missing.
 
-    Raises DatasetError, whose text says what to install or what the camera's library says, for a wrong
-    option, and for a depth scale, which the camera knows itself.
+    Raises DatasetError for a missing library (with how to install it), for an error of the library, for a
+    wrong option, and for a depth scale, which the camera reports itself.
     """
     file, wanted = _file_and_options(text)
     if options.depth_scale is not None:
-        raise DatasetError(f"{NAME} has no depth_scale, the camera knows its own")
+        raise DatasetError(f"{NAME} takes no depth_scale: the camera reports its own")
     tracked = options.track or wanted.poses == TRACK
     trajectory = read_timed_poses(Path(wanted.poses)) if wanted.poses and not tracked else None
     rs = library("pyrealsense2", f"{NAME} needs", "realsense", DatasetError)
@@ -147,7 +145,7 @@ def open_realsense(text: str, options: ReadOptions) -> Dataset:
 
 
 def _file_and_options(text: str) -> tuple[str, RealSenseOptions]:
-    """What follows the colon, as a file's name and options; options alone may do without the question
+    """What follows the colon, as a file's name and options; options alone need no question
     mark."""
     file, mark, query = text.partition("?")
     if not mark and "=" in text and not exists(Path(text)):
@@ -183,11 +181,11 @@ def _open_recording(
     rs: Any, path: Path, trajectory: TimedPoses | None, gap: float, options: ReadOptions
 ) -> RealSenseRecording:
     if not is_file(path):
-        raise DatasetError(f"{NAME}{path}: there is no such file")
+        raise DatasetError(f"{NAME}{path}: no such file")
     player = Player(rs, path)
     images = [listed for listed, _ in player.images()]
     if not images:
-        raise DatasetError(f"{path}: holds no depth images")
+        raise DatasetError(f"{path}: contains no depth images")
     still = start_pose()
     poses = [still if trajectory is None else trajectory.at(each.stamp, gap) for each in images]
     posed = [(each, pose) for each, pose in zip(images, poses, strict=True) if pose is not None]

@@ -19,8 +19,7 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 
 END_MS = 500
-"""A recording that gives nothing for so long has ended: it is read from the disk as fast as it is asked
-for."""
+"""A recording that delivers no image for this long has ended: it is read from disk without waiting."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ class Player:
         self._start()
 
     def images(self) -> Iterator[tuple[RecordedImage, Any]]:
-        """The depth images that are still to come."""
+        """The depth images from here to the end."""
         while True:
             try:
                 image = self._pipeline.wait_for_frames(END_MS).get_depth_frame()
@@ -50,12 +49,12 @@ class Player:
             yield RecordedImage(image.get_frame_number(), image.get_timestamp() / 1000.0), image
 
     def rewind(self) -> None:
-        """Begin anew."""
+        """Start again from the first image."""
         self.close()
         self._start()
 
     def close(self) -> None:
-        """Let the file go."""
+        """Close the file."""
         if self._pipeline is not None:
             self._pipeline.stop()
             self._pipeline = None
@@ -99,8 +98,8 @@ class RealSenseRecording(Dataset):
         return self._names
 
     def read(self, index: int) -> Frame:
-        """Play on to an image, from the beginning if it has been passed. Raises FrameError, which names the
-        frame, if it does not come again or has another size; IndexError outside 0 to len - 1."""
+        """Play on to an image, from the beginning if it lies behind. Raises FrameError, which names the
+        frame, if it is missing or has another size; IndexError outside 0 to len - 1."""
         if not 0 <= index < len(self.listed):
             raise IndexError(f"{self.name} has {len(self.listed)} frames, there is no frame {index}")
         name, wanted = self._names[index], self.listed[index]
@@ -110,8 +109,8 @@ class RealSenseRecording(Dataset):
         self._last = index
         image = next((image for found, image in self._coming if found.number == wanted.number), None)
         if image is None:
-            self._last = len(self.listed)  # all have been passed
-            raise FrameError(f"frame {name}: {self.name}: the image does not come a second time")
+            self._last = len(self.listed)  # the player is at the end
+            raise FrameError(f"frame {name}: {self.name}: the image is missing when the file is played again")
         steps = np.asanyarray(image.get_data())
         if steps.shape != self.camera.shape:
             raise FrameError(f"frame {name}: the image has the shape {steps.shape}, not {self.camera.shape}")

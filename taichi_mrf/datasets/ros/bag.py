@@ -1,9 +1,9 @@
 """ROS 1 bags, ROS 2 bags and MCAP files: ``walk.bag?depth=/camera/depth/image_raw&pose=/odom&frame=map``.
 
-The fields of :class:`BagOptions` are all options that there are; without any, the only depth topic and the
-only source of poses are taken. On opening, each depth message is looked at for its stamp; images are decoded
+The fields of :class:`BagOptions` are the options; without any, the only depth topic and the only source of
+poses are used. On opening, the stamp of each depth message is read; images are decoded
 when their frame is read. A pose is interpolated between its neighbours in time, and an image that has none
-near enough is left out and counted. ``poses=track`` leaves all poses to be found by whoever maps the frames.
+near enough is left out and counted. ``poses=track`` finds all poses from the images while mapping.
 Reading needs the extra ``ros``.
 """
 
@@ -25,12 +25,12 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 
 REALSENSE = "/device_0/sensor_"
-"""How topics begin in the files of Intel's library, whose messages are not quite those of ROS."""
+"""The beginning of topics in the files of Intel's library, whose messages differ from those of ROS."""
 
 
 @dataclass(frozen=True)
 class BagOptions(PoseChoice):
-    """What the name of a bag may be followed by."""
+    """The options after the name of a bag."""
 
     depth: str = ""
     """The topic of depth images."""
@@ -84,7 +84,7 @@ def open_bag(path: Path, query: str, options: ReadOptions) -> RosBag:
     """Open a bag with the options after the question mark of its name.
 
     Raises DatasetError, whose text names the file and where it applies the topic, for a bag that cannot be
-    read, topics that are missing or cannot be told apart, a camera that is not known, and if no image has a
+    read, missing or ambiguous topics, an unknown camera, and if no image has a
     pose.
     """
     chosen = parse_options(BagOptions, query, str(path))
@@ -156,7 +156,7 @@ def _depth_topic(reader: RosReader, wanted: str) -> DepthTopic:
 def _camera(
     reader: RosReader, depth: DepthTopic, wanted: str, options: ReadOptions
 ) -> tuple[PinholeCamera, tuple[float, ...]]:
-    """The camera of a topic's images and the distortion that its CameraInfo knows."""
+    """The camera of a topic's images and the distortion in its CameraInfo."""
     if options.camera is not None:
         return options.camera, ()
     if options.intrinsics is not None:
@@ -166,7 +166,7 @@ def _camera(
     name = choose(reader, "info", wanted, depth.info, f"topics of the CameraInfo of {depth.name}")
     message = reader.first(name)
     if message is None or reader.topics[name].type != messages.CAMERA_INFO:
-        raise DatasetError(f"{reader.path}: topic {name} holds no {messages.CAMERA_INFO}")
+        raise DatasetError(f"{reader.path}: topic {name} contains no {messages.CAMERA_INFO}")
     try:
         return messages.camera_of(message, depth.rectified)
     except DatasetError as error:

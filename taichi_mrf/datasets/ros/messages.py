@@ -1,4 +1,4 @@
-"""What the messages of depth cameras and trackers mean: images to metres, CameraInfo to a camera, poses.
+"""Decoding the messages of depth cameras and trackers: images to metres, CameraInfo to a camera, poses.
 
 ROS calls depth images by their encodings: 16UC1 (and mono16, as RealSense writes it) are millimetres, 32FC1
 metres (REP 118). A CompressedImage of the transport ``compressedDepth`` is a PNG behind 12 bytes: an integer
@@ -30,7 +30,7 @@ TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 MILLIMETRES = ("16UC1", "mono16")
 METRES = "32FC1"
 PNG = "png"
-"""What a CompressedImage may call 16-bit images that are PNG files as they are: millimetres."""
+"""The format of a CompressedImage that is a plain 16-bit PNG file: millimetres."""
 
 ENCODINGS = f"{MILLIMETRES[0]} (millimetres), {METRES} (metres), or compressedDepth of the two as PNG"
 STEPS_PER_METRE = 1000.0
@@ -40,15 +40,15 @@ _LENS_MODELS = ("plumb_bob", "rational_polynomial", "", "none")
 
 
 def encoding(message: Any) -> str:
-    """What an Image or a CompressedImage says of its content, such as ``16UC1; compressedDepth``."""
+    """The encoding of an Image or a CompressedImage, such as ``16UC1; compressedDepth``."""
     return str(message.format if hasattr(message, "format") else message.encoding)
 
 
 def check_depth(encoding: str) -> None:
-    """Raises DatasetError, which does not name the topic, if an image of this encoding is no depth."""
+    """Raises DatasetError, which does not name the topic, if an image of this encoding is not depth."""
     kind = encoding.split(";")[0].strip()
     if kind not in (*MILLIMETRES, METRES, PNG):
-        raise DatasetError(f"encoding {encoding!r} is no depth; known are {ENCODINGS}")
+        raise DatasetError(f"encoding {encoding!r} is not depth; supported are {ENCODINGS}")
 
 
 def depth_image(message: Any, depth_scale: float | None) -> NDArray[np.float32]:
@@ -67,7 +67,7 @@ def _raw(message: Any) -> tuple[NDArray, float]:
     """The values of an Image, (H, W), and how many of their steps are a metre."""
     kinds = {**dict.fromkeys(MILLIMETRES, ("u2", STEPS_PER_METRE)), METRES: ("f4", 1.0)}
     if message.encoding not in kinds:
-        raise DatasetError(f"encoding {message.encoding!r} is no depth; known are {ENCODINGS}")
+        raise DatasetError(f"encoding {message.encoding!r} is not depth; supported are {ENCODINGS}")
     kind, steps = kinds[message.encoding]
     height, width, step = int(message.height), int(message.width), int(message.step)
     dtype = np.dtype(f"{'>' if message.is_bigendian else '<'}{kind}")
@@ -118,8 +118,8 @@ def camera_of(info: Any, rectified: bool) -> tuple[PinholeCamera, tuple[float, .
         return camera, ()
     if info.distortion_model not in _LENS_MODELS or len(D) not in DISTORTION_COUNTS:
         raise DatasetError(
-            f"distortion model {info.distortion_model!r} with {len(D)} coefficients is not known: "
-            "--undistort 0,0,0,0 takes the images as they are"
+            f"distortion model {info.distortion_model!r} with {len(D)} coefficients is not supported; "
+            "--undistort 0,0,0,0 uses the images as they are"
         )
     return camera, tuple(float(k) for k in D)
 

@@ -1,12 +1,10 @@
-"""Where a bag's camera was at a time: from a topic of poses, from the tree of frames, or from a file beside
-the bag.
+"""The pose of a bag's camera at a time: from a topic of poses, from the tree of frames, or from a file.
 
-- A topic of poses tells where a **body** is in the frame of its header: Odometry names the body, the other
-  types do not. From there to the camera's optical frame it goes by the tree's transforms, where there are
-  any.
-- The tree alone tells it if the camera's frame hangs in it by something that moves.
-- A file of poses in TUM's layout tells where the camera is, by the stamps of the bag's images.
-- Nothing tells it, and whoever maps the images is to find it.
+- A topic of poses gives the pose of a **body** in the frame of its header: Odometry names the body, the other
+  types do not. The tree's transforms, if there are any, lead from the body to the camera's optical frame.
+- The tree alone gives the pose if a transform between its root and the camera moves.
+- A file of poses in TUM's layout gives the camera's pose, by the stamps of the bag's images.
+- Without any of these, mapping finds the poses from the images.
 """
 
 from collections.abc import Callable
@@ -25,15 +23,15 @@ from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
 
 NO_POSES = (
-    "{path}: holds no poses (no Odometry, PoseStamped or tf of a moving {frame}); ?poses=FILE takes them "
-    "from lines of stamp tx ty tz qx qy qz qw, as a tracker or SLAM writes them, and ?poses=track finds them "
-    "from the images"
+    "{path}: contains no poses (no Odometry, PoseStamped or tf of a moving {frame}); add ?poses=FILE, with "
+    "lines of stamp tx ty tz qx qy qz qw from a tracker or SLAM, or ?poses=track, which finds them from the "
+    "images"
 )
 
 
 @dataclass(frozen=True)
 class PoseChoice:
-    """How a user chooses among what a bag offers; empty texts leave it to the bag."""
+    """How the poses are chosen; an empty text takes the bag's only candidate."""
 
     pose: str = ""
     """The topic of poses, or tf."""
@@ -54,8 +52,8 @@ class PoseChoice:
 
 @dataclass
 class BagPoses:
-    """``at(stamp, largest_gap)`` is T_fixed_camera, (4, 4), or None; ``source`` says what was asked and the
-    span of time that it knows."""
+    """``at(stamp, largest_gap)`` is T_fixed_camera, (4, 4), or None; ``source`` names the origin of the
+    poses and the time that they span."""
 
     at: Callable[[float, float], Pose | None]
     source: str
@@ -63,13 +61,13 @@ class BagPoses:
 
 
 def pose_candidates(reader: RosReader, tree: TransformTree, optical: str) -> list[str]:
-    """What the option ``pose`` may be: topics, and ``tf`` if the camera's frame moves in the tree."""
+    """The values of the option ``pose``: topics, and ``tf`` if the camera's frame moves in the tree."""
     root = tree.ancestors(optical)[-1]
     return [*pose_topics(reader), *([FROM_TF] if tree.moves(root, optical) else [])]
 
 
 def find_poses(reader: RosReader, depth: DepthTopic, choice: PoseChoice) -> BagPoses:
-    """The camera's poses as the user chose, else from the only place where the bag holds them.
+    """The camera's poses as the user chose, else from the only source in the bag.
 
     Raises DatasetError, whose text names the file and lists the candidates or the frames, if there are none
     or several, or if frames that were named do not hang together.
@@ -154,19 +152,18 @@ def _read_poses(reader: RosReader, name: str) -> tuple[TimedPoses, str, str, lis
 
 
 def _body(tree: TransformTree, optical: str, named: str) -> tuple[str, str]:
-    """The frame that a topic's poses are of, so that it is connected to the camera's, and what to say of
-    it."""
+    """The frame that a topic's poses are of, so that it is connected to the camera's, and a note."""
     if not named:
         body = tree.body(optical)
         if body == optical:
             return (
                 optical,
-                f", taken to be of the camera ({optical}) itself: the bag says nothing of its mounting",
+                f", assumed to be of the camera ({optical}) itself: the bag has no transform to it",
             )
-        return body, f", taken to be of {body}, which has {optical} fixed to it (?body=FRAME says otherwise)"
+        return body, f", assumed to be of {body}, to which {optical} is fixed (?body=FRAME sets another)"
     if named != optical and not tree.connects(named, optical):
         return optical, (
-            f", of {named}, taken to be of the camera itself: "
+            f", of {named}, assumed to be of the camera itself: "
             f"no transform from {named} to {optical} is in the bag"
         )
     return named, f", of {named}" + (f", from there to {optical} by tf" if named != optical else "")
@@ -177,7 +174,7 @@ def _must_connect(reader: RosReader, tree: TransformTree, a: str, b: str) -> Non
         if a != b and frame not in tree.frames:
             raise _unknown_frame(reader, tree, frame)
     if not tree.connects(a, b):
-        raise DatasetError(f"{reader.path}: tf has no way from {a} to {b}")
+        raise DatasetError(f"{reader.path}: tf does not connect {a} and {b}")
 
 
 def _unknown_frame(reader: RosReader, tree: TransformTree, frame: str) -> DatasetError:

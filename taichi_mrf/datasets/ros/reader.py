@@ -1,7 +1,7 @@
 """A ROS 1 bag, a ROS 2 bag or an MCAP file as topics and messages, read with the library ``rosbags``.
 
-It needs no ROS, and comes with the extra ``ros``. Whatever it says about a file that it cannot read becomes
-one DatasetError here; the rest of the package sees topics by name and messages as objects with their fields.
+It needs no ROS, and comes with the extra ``ros``. Its errors become
+DatasetError here; the rest of the package sees topics by name and messages as objects with their fields.
 """
 
 import contextlib
@@ -71,7 +71,7 @@ class RosReader:
                 for name, each in sorted(self._connections.items())
             }
             self.duration = max(0, self._reader.duration) / _NANOSECONDS if self.topics else 0.0
-        except Exception as error:  # the library raises whatever its parsing stumbles over
+        except Exception as error:  # the library raises many kinds of errors
             with contextlib.suppress(Exception):
                 self._reader.close()
             raise DatasetError(
@@ -80,7 +80,7 @@ class RosReader:
         self._open = True
 
     def close(self) -> None:
-        """Let the file go."""
+        """Close the file."""
         if self._open:
             self._open = False
             self._reader.close()
@@ -103,14 +103,14 @@ class RosReader:
         for ordinal, (_, message) in enumerate(found):
             if ordinal == entry.ordinal:
                 return message
-        raise DatasetError(f"{self.path}: topic {topic}: a message is gone")
+        raise DatasetError(f"{self.path}: topic {topic}: a message is missing")
 
     def _read(self, topic: str, start: int | None, stop: int | None) -> Iterator[tuple[int, Any]]:
         try:
             found = self._reader.messages(self._connections[topic], start=start, stop=stop)
             for connection, recorded_ns, data in found:
                 if connection.msgtype != self.topics[topic].type:  # in a damaged file
-                    raise ValueError(f"holds a {connection.msgtype}")
+                    raise ValueError(f"contains a {connection.msgtype}")
                 yield recorded_ns, self._reader.deserialize(data, connection.msgtype)
         except Exception as error:  # as on opening
             raise DatasetError(f"{self.path}: topic {topic}: cannot be read: {said(error)}") from error

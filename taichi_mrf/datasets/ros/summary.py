@@ -1,5 +1,4 @@
-"""What is in a bag, for a person who wants to map it: topics, frames, and how to say which of them are
-meant."""
+"""The contents of a bag for a user who wants to map it: topics, frames, and the options that choose them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from taichi_mrf.errors import DatasetError
 class BagSummary:
     """The contents of a bag.
 
-    ``remarks`` say of topics, by name, what they hold beside their type. ``transforms`` are the tree's edges
+    ``remarks`` describe topics, by name, beyond their type. ``transforms`` are the tree's edges
     in words. ``sources`` are what to call the bag so that it can be mapped, with ``flags`` to add; the first
     needs the least to be filled in.
     """

@@ -1,8 +1,7 @@
-"""What a bag offers to a mapper: depth topics, cameras, pose topics and the tree of frames; and the choice of
-them.
+"""Choosing among the contents of a bag: depth topics, cameras, pose topics and the tree of frames.
 
-Where there is one candidate it is taken, where there are several the user must say which one, and the error
-lists them in the words in which they are chosen.
+A single candidate is taken. Of several the user must choose one, and the error lists them as the options
+that choose them.
 """
 
 from collections.abc import Sequence
@@ -17,7 +16,7 @@ from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
 
 FROM_TF = "tf"
-"""What the option ``pose`` calls poses out of the tree of frames."""
+"""The value of the option ``pose`` for poses from the tree of frames."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ def described(reader: RosReader, name: str) -> DepthTopic:
         raise DatasetError(f"{reader.path}: topic {name} is of type {topic.type}, not {messages.IMAGE}")
     message = reader.first(name)
     if message is None:
-        raise DatasetError(f"{reader.path}: topic {name} holds no message")
+        raise DatasetError(f"{reader.path}: topic {name} contains no message")
     frame = frame_name(message.header.frame_id)
     return DepthTopic(name, messages.encoding(message), frame, _camera_topics(reader, name))
 
@@ -87,7 +86,7 @@ def choose(reader: RosReader, option: str, wanted: str, candidates: Sequence[str
     """The topic that the user named, or the only candidate.
 
     Raises DatasetError, whose text names the file and lists the candidates, if the bag has no topic of that
-    name, if there are several candidates and none was named, or none at all.
+    name, if there are several candidates and none was named, or no candidate.
     """
     path = reader.path
     if wanted:
@@ -102,14 +101,14 @@ def choose(reader: RosReader, option: str, wanted: str, candidates: Sequence[str
         topics = (
             ", ".join(f"{t.name} ({t.type.rpartition('/')[2]})" for t in reader.topics.values()) or "none"
         )
-        raise DatasetError(f"{path}: holds no {what}; its topics: {topics}")
+        raise DatasetError(f"{path}: contains no {what}; its topics: {topics}")
     choices = ", ".join(f"{option}={name}" for name in candidates)
-    raise DatasetError(f"{path}: holds several {what}: choose one with ?{choices.replace(', ', ' or ?')}")
+    raise DatasetError(f"{path}: contains several {what}: choose one with ?{choices.replace(', ', ' or ?')}")
 
 
 def read_tree(reader: RosReader) -> TransformTree:
-    """All transforms of a bag's tf topics. What is on a topic called tf_static is fixed, the last word
-    counting."""
+    """All transforms of a bag's tf topics. Those on a topic called tf_static are fixed; the last
+    message counts."""
     fixed: dict[str, tuple[str, Pose]] = {}
     moving: dict[str, tuple[str, list[float], list[Pose]]] = {}
     for topic in reader.topics.values():

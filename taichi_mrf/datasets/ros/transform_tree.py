@@ -66,8 +66,7 @@ class TransformTree:
         return inverse(T_top_target) @ T_top_source
 
     def _sides(self, a: str, b: str) -> tuple[list[str], list[str]]:
-        """The frames from each of two up to below the first that both hang on, so that nothing above it is
-        asked for."""
+        """The frames from each of two up to, but without, their first common ancestor."""
         of_a, of_b = self.ancestors(a), self.ancestors(b)
         common = next(frame for frame in of_a if frame in of_b)
         return of_a[: of_a.index(common)], of_b[: of_b.index(common)]

@@ -33,7 +33,7 @@ _SAME = 1e-6
 
 
 def recognises(folder: Path) -> bool:
-    """Whether both image folders are there. That calibration or poses are missing is said on opening."""
+    """Whether both image folders exist. Opening reports a missing calibration or missing poses."""
     return any((folder / left).is_dir() and (folder / right).is_dir() for left, right in FOLDERS)
 
 
@@ -41,7 +41,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     """List the pairs in the order of their names. One that lacks an image is listed, and named in an error
     when it is read."""
     if options.depth_scale is not None:
-        raise DatasetError(f"{folder}: depth comes from stereo pairs, a depth_scale has nothing to act on")
+        raise DatasetError(f"{folder}: takes no depth_scale: depth comes from stereo pairs")
     left, right = next(pair for pair in FOLDERS if all((folder / side).is_dir() for side in pair))
     names = sorted(_images(folder / left) | _images(folder / right), key=_number)
     if not names:
@@ -56,7 +56,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         (folder / TIMES, "stamps", len(stamps)),
     ):
         if count != len(names):
-            raise DatasetError(f"{path}: holds {count} {what} for {len(names)} stereo pairs")
+            raise DatasetError(f"{path}: contains {count} {what} for {len(names)} stereo pairs")
     pairs = [
         RecordedPair(folder / left / name, folder / right / name, stamp, pose)
         for name, stamp, pose in zip(names, stamps, poses.poses, strict=True)
@@ -144,7 +144,7 @@ def _projection(path: Path, name: str, rows: dict[str, list[str]]) -> NDArray[np
     try:
         numbers = np.array([float(word) for word in words])
     except ValueError:
-        raise DatasetError(f"{path}: {name} holds something that is not a number") from None
+        raise DatasetError(f"{path}: {name} contains something that is not a number") from None
     if len(numbers) != 12 or not np.isfinite(numbers).all():
         raise DatasetError(
             f"{path}: {name} must be 12 finite numbers (a 3 x 4 matrix), it has {len(numbers)}"

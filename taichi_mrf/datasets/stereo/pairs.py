@@ -1,4 +1,4 @@
-"""Rectified stereo pairs as depth frames, whatever the layout of the recording.
+"""Rectified stereo pairs as depth frames, independent of the recording's layout.
 
 Depth is not recorded: it is matched when a frame is read.
 """
@@ -60,7 +60,7 @@ class StereoPairs(Dataset):
         """Read and match one pair.
 
         Raises FrameError, which names the frame and the file, if an image is missing, damaged or of
-        another size than the camera's, or if the pose is none. Raises IndexError outside 0 to len - 1.
+        another size than the camera's, or if the pose is invalid. Raises IndexError outside 0 to len - 1.
         """
         if not 0 <= index < len(self.pairs):
             raise IndexError(f"{self.name} has {len(self.pairs)} frames, there is no frame {index}")

@@ -41,7 +41,7 @@ _NANOSECOND_DIGITS = 16
 
 @dataclass(frozen=True)
 class RigFile:
-    """What the file says. Paths are relative to it."""
+    """The content of the file. Paths are relative to it."""
 
     fx: float
     """Focal length across, in pixels."""
@@ -78,7 +78,7 @@ def open_file(path: Path, options: ReadOptions) -> Dataset:
     """List the pairs of a description. Raises DatasetError, whose text names the file and the field."""
     described, folder = _read(path), path.parent
     if options.depth_scale is not None:
-        raise DatasetError(f"{path}: depth comes from stereo pairs, a depth_scale has nothing to act on")
+        raise DatasetError(f"{path}: takes no depth_scale: depth comes from stereo pairs")
     left, right = (_images(path, side, getattr(described, side)) for side in ("left", "right"))
     if len(left) != len(right):
         raise DatasetError(f"{path}: {len(left)} left images but {len(right)} right ones")
@@ -134,12 +134,12 @@ def _rig(path: Path, described: RigFile, left: Sequence[Path], options: ReadOpti
 
 
 def _stamps(folder: Path, described: RigFile, left: Sequence[Path]) -> list[float] | None:
-    """Each pair's stamp in seconds, None if neither a file nor the names tell it."""
+    """Each pair's stamp in seconds, None if neither a file nor the names give it."""
     if described.times is not None:
         stamps = read_times(folder / described.times)
         if len(stamps) != len(left):
             raise DatasetError(
-                f"{folder / described.times}: holds {len(stamps)} stamps for {len(left)} pairs"
+                f"{folder / described.times}: contains {len(stamps)} stamps for {len(left)} pairs"
             )
         return stamps
     try:
@@ -164,12 +164,12 @@ def _pairs(
     trajectory = read_trajectory(poses_file)
     if trajectory.layout == "stamped":
         if stamps is None:
-            raise DatasetError(f"{poses_file}: has stamps, but the images have none: times: FILE gives them")
+            raise DatasetError(f"{poses_file}: has stamps, but the images have none; add times: FILE")
         timed = read_timed_poses(poses_file)
         return _interpolated(poses_file, images, stamps, timed, options)
     if len(trajectory.poses) != len(images):
         raise DatasetError(
-            f"{poses_file}: holds {len(trajectory.poses)} poses for {len(images)} stereo pairs"
+            f"{poses_file}: contains {len(trajectory.poses)} poses for {len(images)} stereo pairs"
         )
     notes = []
     if stamps is None:

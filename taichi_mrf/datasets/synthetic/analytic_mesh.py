@@ -1,6 +1,6 @@
-"""The surfaces of an analytic scene as triangles, for whatever takes meshes.
+"""The surfaces of an analytic scene as a triangle mesh.
 
-Solids may overlap, so there are triangles inside of other solids too; nobody sees them.
+Solids may overlap, so there are triangles inside of other solids too; no camera sees them.
 """
 
 import math

@@ -1,7 +1,7 @@
 """``synthetic:corridor``: a long walk through a corridor and the furnished rooms off it, with ground truth.
 
 Options follow a question mark, ``synthetic:corridor?rooms=4&frames=200&width=160&height=120``; the fields of
-:class:`CorridorOptions` are all there are.
+:class:`CorridorOptions` are the options.
 """
 
 from dataclasses import dataclass, replace
@@ -24,7 +24,7 @@ LAMP_OVER_EYE_M = 0.6
 
 @dataclass(frozen=True)
 class CorridorOptions(RenderOptions):
-    """What the name of the built-in corridor may be followed by."""
+    """The options of the built-in corridor."""
 
     frames: int = 600
     """Views, evenly spread over the camera's way; 540 are left for the map when one in ten is kept out."""
@@ -69,7 +69,7 @@ def open_synthetic_corridor(query: str, options: ReadOptions) -> SyntheticCorrid
     type or out of range, and for a depth scale, which rendered depth does not have.
     """
     if options.depth_scale is not None:
-        raise DatasetError(f"{NAME}: has no depth_scale, its depth is in metres")
+        raise DatasetError(f"{NAME}: takes no depth_scale: its depth is in metres")
     corridor = parse_options(CorridorOptions, query, NAME)
     return SyntheticCorridor(NAME, options.camera or corridor.camera(), options=corridor, color=options.color)
 

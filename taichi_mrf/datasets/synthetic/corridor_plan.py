@@ -1,4 +1,4 @@
-"""What the synthetic corridor is made of: furnished rooms on both sides, and the way from room to room.
+"""The parts of the synthetic corridor: furnished rooms on both sides, and the path from room to room.
 
 Plan frame: x along the corridor from its west end, y to the north from its middle, z up from the floor.
 Every room is a variation of the synthetic room: turned about the vertical, mirrored, with another table and

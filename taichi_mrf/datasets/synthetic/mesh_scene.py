@@ -75,16 +75,16 @@ def load_mesh(path: Path) -> TriangleMesh:
     try:
         loaded = trimesh.load_mesh(path, process=False)
         vertices = np.array(loaded.vertices, np.float64).reshape(-1, 3)
-        # A cloud of points has no faces at all.
+        # A point cloud has no faces.
         triangles = np.array(getattr(loaded, "faces", ()), np.int32).reshape(-1, 3)
-    except Exception as error:  # trimesh's readers raise whatever their parsing stumbles over
+    except Exception as error:  # trimesh's readers raise many kinds of errors
         raise DatasetError(f"{path}: cannot be read as a mesh: {said(error)}") from error
     if len(triangles) == 0:
-        raise DatasetError(f"{path}: holds no triangles")
+        raise DatasetError(f"{path}: contains no triangles")
     if triangles.min() < 0 or triangles.max() >= len(vertices):
         raise DatasetError(f"{path}: a triangle names vertex {triangles.max()} of {len(vertices)}")
     if not np.isfinite(vertices).all():
-        raise DatasetError(f"{path}: holds a vertex that is not finite")
+        raise DatasetError(f"{path}: contains a vertex that is not finite")
     return TriangleMesh(vertices, triangles)
 
 

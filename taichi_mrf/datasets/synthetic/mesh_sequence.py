@@ -1,7 +1,7 @@
 """``mesh:FILE?poses=FILE``: a triangle mesh seen from recorded poses, with the truth and a simulated sensor.
 
 More options follow after ``&``, as in ``mesh:house.ply?poses=T_world_camera.txt&noise=kinect&seed=1``; the
-fields of :class:`MeshOptions` are all there are. The poses take the mesh's frame for the world; their file
+fields of :class:`MeshOptions` are the options. The mesh's frame is the world; their file
 is in any layout that recordings use (trajectories.py). Paths are relative to the working folder.
 """
 
@@ -34,13 +34,13 @@ SENSORS = {"kinect": KINECT_1, "kinect-lateral": KINECT_1_LATERAL}
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """What the name of a mesh may be followed by."""
+    """The options of a mesh."""
 
     poses: str = ""
     """The file of poses T_world_camera, one for each frame."""
 
     noise: Literal["none", "kinect", "kinect-lateral"] = "none"
-    """What the depth images suffer: nothing, the axial noise of a Kinect 1, or its lateral noise too."""
+    """Noise of the depth images: none, the axial noise of a Kinect 1, or its lateral noise too."""
 
     seed: int = 0
     """Starts the random numbers of the noise; a frame's noise depends on this and its index alone."""
@@ -72,7 +72,7 @@ class MeshOptions:
         self.camera()
 
     def camera(self) -> PinholeCamera:
-        """The camera that these options describe. Raises ConfigError if it is none."""
+        """The camera that these options describe. Raises ConfigError if it is invalid."""
         fx = PRIMESENSE.fx * self.width / PRIMESENSE.width if self.fx is None else self.fx
         return PinholeCamera(
             self.width,
@@ -86,7 +86,7 @@ class MeshOptions:
 
 @dataclass
 class MeshSequence(Dataset):
-    """A mesh as a sequence of frames, rendered when asked for, with the truth beside it."""
+    """A mesh as a sequence of frames, rendered on request, with ground truth."""
 
     scene: MeshScene = field(kw_only=True)
     trajectory: Trajectory = field(kw_only=True)
@@ -94,11 +94,11 @@ class MeshSequence(Dataset):
 
     @cached_property
     def frame_names(self) -> Sequence[str]:
-        """What reports call the frames, in their order."""
+        """The names of the frames in order, for reports."""
         return [f"{self.name}-{index:04d}" for index in range(len(self.trajectory.poses))]
 
     def pose(self, index: int) -> Pose:
-        """T_world_camera of a frame, (4, 4). Raises FrameError if what was recorded is no pose."""
+        """T_world_camera of a frame, (4, 4). Raises FrameError for an invalid pose."""
         if not 0 <= index < len(self):
             raise IndexError(f"{self.name} has {len(self)} frames, there is no frame {index}")
         recorded = self.trajectory.poses[index]
@@ -134,7 +134,7 @@ def open_mesh(source: str, options: ReadOptions) -> MeshSequence:
     if not file:
         raise DatasetError(f"{NAME} needs a file: {NAME}FILE?poses=FILE")
     if options.depth_scale is not None:
-        raise DatasetError(f"{name}: has no depth_scale, its depth is in metres")
+        raise DatasetError(f"{name}: takes no depth_scale: its depth is in metres")
     chosen = parse_options(MeshOptions, query, name)
     scene = MeshScene(load_mesh(Path(file)))
     trajectory = read_trajectory(Path(chosen.poses))

@@ -25,7 +25,7 @@ FRAMES_PER_SECOND = 5.0
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """What the name of every built-in scene may be followed by."""
+    """The options of every built-in scene."""
 
     frames: int = 32
     """Views, evenly spread over the camera's way."""
@@ -37,7 +37,7 @@ class RenderOptions:
     """Rows of the images."""
 
     noise: Literal["kinect", "none"] = "kinect"
-    """What the depth images suffer: the noise of a Kinect 1, or nothing."""
+    """Noise of the depth images: that of a Kinect 1, or none."""
 
     seed: int = 0
     """Starts the random numbers of the noise; a frame's noise depends on this and its index alone."""
@@ -84,7 +84,7 @@ class RenderedSequence(Dataset):
 
     @cached_property
     def frame_names(self) -> Sequence[str]:
-        """What reports call the frames, in their order."""
+        """The names of the frames in order, for reports."""
         place = self.name.partition(":")[2]
         return [f"{place}-{index:04d}" for index in range(self.options.frames)]
 

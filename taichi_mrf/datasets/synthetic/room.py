@@ -1,7 +1,7 @@
 """``synthetic:room``: a furnished room that needs no download, with ground truth and a simulated sensor.
 
 Options follow a question mark, ``synthetic:room?frames=60&width=640&height=480&noise=none&seed=1``; the
-fields of :class:`RoomOptions` are all there are.
+fields of :class:`RoomOptions` are the options.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ NAME = "synthetic:room"
 
 @dataclass(frozen=True)
 class RoomOptions(RenderOptions):
-    """What the name of the built-in room may be followed by. At 32 frames the camera takes 6.4 s for its
+    """The options of the built-in room. At 32 frames the camera takes 6.4 s for its
     round."""
 
 
@@ -47,7 +47,7 @@ def open_synthetic_room(query: str, options: ReadOptions) -> SyntheticRoom:
     type or out of range, and for a depth scale, which rendered depth does not have.
     """
     if options.depth_scale is not None:
-        raise DatasetError(f"{NAME}: has no depth_scale, its depth is in metres")
+        raise DatasetError(f"{NAME}: takes no depth_scale: its depth is in metres")
     room = parse_options(RoomOptions, query, NAME)
     return SyntheticRoom(NAME, options.camera or room.camera(), options=room, color=options.color)
 

@@ -1,4 +1,4 @@
-"""What stands in the synthetic room, and the way that the camera takes through it.
+"""The furniture of the synthetic room, and the camera's path through it.
 
 Furniture is placed in the room's own frame: x and y from the middle of the floor, z up from the floor.
 ROOM_IN_WORLD moves it all so that the world's origin lies inside the room, half way up, and no wall
