@@ -167,7 +167,7 @@ class RuntimeConfig:
     """Backend: cuda, vulkan, cpu, or auto for the first of these that is available."""
 
     threads: int = 0
-    """CPU threads; 0 means all cores."""
+    """CPU threads, at most one for each core. 0 means all cores."""
 
     debug: bool = False
     """Check array bounds in kernels (slow)."""

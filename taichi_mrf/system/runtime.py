@@ -173,7 +173,8 @@ def _device(name: str, allow_software: bool) -> tuple[str, bool]:
 def _start(name: str, software: bool, threads: int, debug: bool, profile: bool) -> None:
     """Start Taichi on one backend, quietly. Raises BackendError if Taichi cannot."""
     ti = _quiet_taichi()
-    options: dict[str, Any] = {"cpu_max_num_threads": threads} if threads else {}
+    # Taichi starts as many threads as it is told to; more than there are cores only cost memory.
+    options: dict[str, Any] = {"cpu_max_num_threads": min(threads, os.cpu_count() or 1)} if threads else {}
     options["kernel_profiler"] = profile
     if software:
         options["default_gpu_block_dim"] = SOFTWARE_BLOCK

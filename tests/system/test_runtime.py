@@ -3,6 +3,8 @@
 A process can start Taichi once, so that most of these tests run a program of their own.
 """
 
+import os
+
 import pytest
 from new_interpreter import output
 
@@ -177,3 +179,14 @@ def test_the_versions_are_those_that_are_installed() -> None:
 
 def test_the_backend_of_this_run_is_the_one_asked_for(backend: str, request: pytest.FixtureRequest) -> None:
     assert backend == runtime.active() == request.config.getoption("--arch")
+
+
+def test_a_process_has_no_more_threads_than_the_machine_has_cores() -> None:
+    program = """
+import os
+import taichi_mrf as tm
+tm.init("cpu", threads=100000)
+tm.MRFMap(0.1).voxels()
+print(len(os.listdir("/proc/self/task")))
+"""
+    assert int(output(program)) < 4 * os.cpu_count() + 16
