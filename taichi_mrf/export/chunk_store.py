@@ -73,7 +73,11 @@ class ChunkStore:
                 LOG_ODDS, shape=tuple(shape.tolist()), chunks=(CHUNK_VOXELS,) * 3, dtype="float32",
                 fill_value=float("nan"), dimension_names=("x", "y", "z"),
             )  # fmt: skip
-            group.create_array(CHUNKS, data=np.ascontiguousarray(chunks, np.int32).reshape(-1, 3))
+            listed = np.ascontiguousarray(chunks, np.int32).reshape(-1, 3)
+            in_one_file = (max(1, len(listed)), 3)
+            group.create_array(CHUNKS, shape=listed.shape, chunks=in_one_file, dtype="int32", fill_value=0)[
+                :
+            ] = listed
         except OSError as error:
             raise MapFileError(f"{path}: cannot be written: {error.strerror or error}") from error
         return cls(path, group, read_layout(path))

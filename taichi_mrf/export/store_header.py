@@ -149,7 +149,8 @@ def _array(folder: Path, name: str, data_type: str, missing: object, dimensions:
 
 def _document(folder: Path, name: str, kind: str) -> dict[str, Any]:
     path = folder / name / "zarr.json"
-    text = read_text(path, MapFileError, "not a readable map in chunks", _MOST_BYTES)
+    missing = "damaged: there is no such file" if name else "not a readable map in chunks"
+    text = read_text(path, MapFileError, missing, _MOST_BYTES)
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
