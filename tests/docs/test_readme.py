@@ -1,4 +1,4 @@
-"""The README's first example, as a person would paste it."""
+"""The README: its first screen, and its first example as a user pastes it."""
 
 import re
 import subprocess
@@ -18,3 +18,9 @@ def test_the_example_runs(tmp_path: Path, repository: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     assert "voxels are occupied" in done.stdout
     assert (tmp_path / "map.npz").stat().st_size > 0
+
+
+def test_the_first_screen_shows_a_picture_how_to_install_and_where_the_program_is(repository: Path) -> None:
+    first_screen = "\n".join((repository / "README.md").read_text(encoding="utf-8").splitlines()[:30])
+    for needed in ("![", "pip install", "make run ", "make test ", ".venv/bin/taichi-mrf", "taichi-mrf live"):
+        assert needed in first_screen, needed
