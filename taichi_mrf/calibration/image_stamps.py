@@ -55,6 +55,6 @@ def stamps_of(names: Sequence[str], file: Path | None) -> dict[str, float]:
             stamps[name] = float(name)
         except ValueError:
             raise DatasetError(
-                f"image {name}: its name is no stamp in seconds; --stamps FILE gives stamps"
+                f"image {name}: its name is not a stamp in seconds; pass --stamps FILE"
             ) from None
     return stamps

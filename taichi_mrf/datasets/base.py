@@ -37,8 +37,8 @@ class Format:
 
 @dataclass(frozen=True)
 class BuiltIn:
-    """A source that is no file: its entry in the registry. ``open`` gets the text after the name's question
-    mark, or after a name that ends in a colon."""
+    """A source that is not a file: its entry in the registry. ``open`` gets the text after the question mark
+    in the source's name, or after a name that ends in a colon."""
 
     name: str
     open: Callable[[str, ReadOptions], "Dataset"]

@@ -257,7 +257,7 @@ def test_bad_chessboards_are_refused_in_one_line(tmp_path: Path, refused: Refuse
     poses = tmp_path / "poses.txt"
     poses.write_text("1 0 0 0 0 0 0 1\n", encoding="utf-8")
     motion = ("--camera-poses", poses, "--board-poses", poses)
-    assert "its name is no stamp in seconds" in refused(depth, "--images", images, *motion, *BOARD_FLAGS)
+    assert "its name is not a stamp in seconds" in refused(depth, "--images", images, *motion, *BOARD_FLAGS)
 
 
 def test_flags_that_do_not_go_together_are_refused(tmp_path: Path, refused: Refused) -> None:

@@ -175,7 +175,7 @@ def test_stamps_come_from_a_file_or_from_the_names(tmp_path: Path) -> None:
     assert stamps_of(["1305031102.160407"], None) == {"1305031102.160407": 1305031102.160407}
     with pytest.raises(DatasetError, match=r"stamps\.txt: has no stamp for 0002"):
         stamps_of(["0002"], file)
-    with pytest.raises(DatasetError, match="image frame-1: its name is no stamp"):
+    with pytest.raises(DatasetError, match="image frame-1: its name is not a stamp"):
         stamps_of(["frame-1"], None)
     file.write_text("one 0000.png\n")
     with pytest.raises(DatasetError, match=r"stamps\.txt line 1: expected a stamp"):

@@ -99,7 +99,7 @@ def test_stamps_in_a_file(tmp_path: Path) -> None:
         ({"focal": 1.0}, "unknown parameter 'focal'"),
         ({"left": "cam7/*.png"}, r"left: no file matches cam7/\*\.png"),
         ({"right": "cam1/b.png"}, "3 left images but 1 right ones"),
-        ({"right": "/cam1/*.png"}, "right: .* is no relative pattern"),
+        ({"right": "/cam1/*.png"}, "right: .* is not a relative pattern"),
         ({"poses": "nowhere.txt"}, r"nowhere\.txt: there is no such file"),
         ({"matching": {"paths": 7}}, "paths must be one of 3, 4, 5, 8"),
         ({"matching": {"block_size": 4}}, "stereo block_size must be odd"),

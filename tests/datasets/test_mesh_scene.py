@@ -198,7 +198,7 @@ def test_meshes_that_are_none(files: tuple[Path, Path], tmp_path: Path) -> None:
     assert "needs a file" in refused(f"mesh:{query}")
     assert f"{tmp_path / 'gone.ply'}: the mesh is missing" in refused(f"mesh:{tmp_path / 'gone.ply'}{query}")
     (tmp_path / "folder.ply").mkdir()
-    assert "folder.ply: is no file" in refused(f"mesh:{tmp_path / 'folder.ply'}{query}")
+    assert "folder.ply: is not a file" in refused(f"mesh:{tmp_path / 'folder.ply'}{query}")
     contents = {
         "nonsense.ply": (b"this is no mesh", "cannot be read as a mesh"),
         "cut.ply": (files[0].read_bytes()[:250], "cannot be read as a mesh"),

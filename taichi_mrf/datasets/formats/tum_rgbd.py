@@ -46,7 +46,7 @@ def recognises(folder: Path) -> bool:
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     """List the depth images that have a pose within the largest gap, by their stamps."""
     if not is_file(folder / POSES):
-        raise DatasetError(f"{folder / POSES}: is missing; {DEPTH_LIST} lies beside it without poses")
+        raise DatasetError(f"{folder / POSES}: is missing; {DEPTH_LIST} needs it for the poses")
     depth = _read_list(folder / DEPTH_LIST)
     trajectory = read_trajectory(folder / POSES)
     if trajectory.layout != "stamped":

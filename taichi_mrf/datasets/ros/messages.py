@@ -86,7 +86,7 @@ def _compressed(message: Any) -> tuple[NDArray, float]:
     kind = message.format.split(";")[0].strip()
     start = data.find(PNG_SIGNATURE, 0, _HEADER_BYTES + len(PNG_SIGNATURE))
     if start not in (0, _HEADER_BYTES) or kind not in (*MILLIMETRES, METRES, PNG):
-        raise DatasetError(f"format {message.format!r} is no depth as PNG; known are {ENCODINGS}")
+        raise DatasetError(f"format {message.format!r} is not depth as PNG; supported are {ENCODINGS}")
     steps = decode_16_bit(data[start:], message.format)
     if kind != METRES:
         return steps, STEPS_PER_METRE

@@ -146,7 +146,7 @@ def _read_poses(reader: RosReader, name: str) -> tuple[TimedPoses, str, str, lis
         parent = parent or frame_name(message.header.frame_id)
         child = child or frame_name(getattr(message, "child_frame_id", ""))
     if not poses:
-        raise DatasetError(f"{reader.path}: topic {name}: none of its {broken} messages is a pose")
+        raise DatasetError(f"{reader.path}: topic {name}: none of its {broken} messages is a valid pose")
     notes = [f"{broken} messages of {name} left out: not finite, or no rotation"] if broken else []
     return TimedPoses(stamps, poses), parent, child, notes
 

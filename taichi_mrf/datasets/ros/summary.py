@@ -70,7 +70,7 @@ def _sources(reader: RosReader, tree: TransformTree, depth: Sequence[DepthTopic]
     for topic in depth:
         try:
             poses = [f"pose={name}" for name in pose_candidates(reader, tree, topic.frame)]
-        except DatasetError:  # frames that hang on each other in a circle
+        except DatasetError:  # frames that form a circle
             poses = []
         for pose in poses or ["poses=FILE"]:
             options = [f"depth={topic.name}"] if len(depth) > 1 else []

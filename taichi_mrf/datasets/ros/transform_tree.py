@@ -31,7 +31,7 @@ class TransformTree:
         while path[-1] in self.edges:
             parent = self.edges[path[-1]][0]
             if parent in path:
-                raise DatasetError(f"tf: the frames {', '.join(path)} hang on each other in a circle")
+                raise DatasetError(f"tf: the frames {', '.join(path)} form a circle")
             path.append(parent)
         return path
 

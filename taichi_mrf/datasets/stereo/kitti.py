@@ -116,7 +116,9 @@ def read_rig(path: Path, width: int, height: int) -> StereoRig:
     K = P_left[:, :3]
     fx = K[0, 0]
     if fx <= 0 or K[0, 1] or K[1, 0] or tuple(K[2]) != (0.0, 0.0, 1.0):
-        raise DatasetError(f"{path}: P0 is no pinhole camera without skew: fx 0 cx 0 / 0 fy cy 0 / 0 0 1 0")
+        raise DatasetError(
+            f"{path}: P0 is not the matrix of a pinhole camera without skew: fx 0 cx 0 / 0 fy cy 0 / 0 0 1 0"
+        )
     if np.abs(K - P_right[:, :3]).max() > _SAME * fx:
         raise DatasetError(f"{path}: P0 and P1 differ in focal length or principal point: no rectified pair")
     if np.abs(P_left[:, 3]).max() > _SAME * fx or np.abs(P_right[1:, 3]).max() > _SAME * fx:

@@ -115,7 +115,9 @@ def _images(path: Path, side: str, pattern: str) -> list[Path]:
     try:
         found = sorted(path.parent.glob(pattern), key=lambda image: (len(image.stem), image.name))
     except (ValueError, NotImplementedError) as error:  # an absolute or an empty pattern
-        raise DatasetError(f"{path}: {side}: {pattern!r} is no relative pattern of files: {error}") from error
+        raise DatasetError(
+            f"{path}: {side}: {pattern!r} is not a relative pattern of files: {error}"
+        ) from error
     if not found:
         raise DatasetError(f"{path}: {side}: no file matches {pattern}")
     return found

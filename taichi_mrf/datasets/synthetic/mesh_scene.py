@@ -71,7 +71,7 @@ def load_mesh(path: Path) -> TriangleMesh:
     """
     trimesh = _library("trimesh")
     if not is_file(path):
-        raise DatasetError(f"{path}: {'is no file' if exists(path) else 'the mesh is missing'}")
+        raise DatasetError(f"{path}: {'is not a file' if exists(path) else 'the mesh is missing'}")
     try:
         loaded = trimesh.load_mesh(path, process=False)
         vertices = np.array(loaded.vertices, np.float64).reshape(-1, 3)
