@@ -27,19 +27,19 @@ def main(folder: Path) -> None:
     flags = ["map", "anything", "--out", "x", "--method", "toy", "--toy.boldness", "0.8"]
     _, options = parse(flags)
     settings = options.settings
-    frame, later = small_room.frames()[:2]
-    mapper = Mapper(create_map(settings, frame.camera))
-    entry = mapper.take_in(frame)
-    mapper.take_in(later)
+    frames = small_room.frames()[:2]
+    m = create_map(settings, frames[0].camera)
+    first, _ = [small_room.add(m, frame) for frame in frames]
+    mapper = Mapper(m)
     try:
-        mapper.freeze(entry.id)
+        mapper.freeze(first)
         refused = ""
     except TaichiMRFError as error:
         refused = str(error)
-    mapper.switch(entry.id, on=False)
+    mapper.switch(first, on=False)
     stale = mapper.stale
     settled = mapper.settle(lambda step: True)
-    mapper.map.save(folder / "map.npz")
+    m.save(folder / "map.npz")
     loaded = load_map(folder / "map.npz")
     found = {
         "yaml": load(folder / "config.yaml").method,
