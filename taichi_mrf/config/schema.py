@@ -21,6 +21,8 @@ from taichi_mrf.config.values import check_field, from_dict
 
 Arch = Literal["auto", "cuda", "vulkan", "cpu"]
 
+_LARGEST_VOXEL_M = 1000.0
+
 
 @dataclass(frozen=True)
 class SensorConfig:
@@ -242,6 +244,9 @@ class Config(_Tail, _MethodSections, _Head):
     def __post_init__(self) -> None:
         ok = 0 < real(self.voxel_size, "voxel_size") < math.inf
         check_field(ok, "voxel_size", f"must be a positive number of metres, not {self.voxel_size}")
+        small = self.voxel_size <= _LARGEST_VOXEL_M  # coordinates of voxels are float32 in many formats
+        most = f"must be at most {_LARGEST_VOXEL_M:g} metres, not {self.voxel_size:g}"
+        check_field(small, "voxel_size", most)
 
 
 def load(path: str | Path) -> Config:

@@ -147,6 +147,7 @@ def test_the_default_sensor_is_the_kinect_1(repository: Path) -> None:
         ("voxel_sise: 0.1", "unknown parameter 'voxel_sise'; did you mean 'voxel_size'"),
         ("inference: {sweps: 2}", "inference: unknown parameter 'sweps'; did you mean 'sweeps'"),
         ("zebra: 1", "known are: voxel_size"),
+        ("voxel_size: 1.0e+300", "voxel_size must be at most 1000 metres"),
         ("voxel_size: -0.05", "voxel_size must be a positive number of metres, not -0.05"),
         ("voxel_size: .nan", "voxel_size must be a positive"),
         ("voxel_size: five", "voxel_size must be a number, not 'five'"),
