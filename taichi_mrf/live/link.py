@@ -23,6 +23,9 @@ FORCE_SECONDS = 0.1
 """How long it may take after each signal."""
 
 
+MOST_REQUESTS = 1000
+"""Requests that are read at once, at most: browsers that send without end cannot keep the session reading."""
+
 Serve = Callable[[Connection, str, int], None]
 """The main function of a viewer's process: its end of the connection, host and port."""
 
@@ -118,7 +121,9 @@ class ViewerLink:
         """Read what has come from the viewer. Where the connection ends, so does the process; if it does
         not, that is noted here."""
         try:
-            while self._connection.poll():
+            for _ in range(MOST_REQUESTS):
+                if not self._connection.poll():
+                    break
                 request = self._connection.recv()
                 if isinstance(request, Notice):  # there is no page, and this is why
                     self._lost = request.text

@@ -1,4 +1,4 @@
-"""How far the depths that a map predicts can be trusted, where nothing but measurements is known.
+"""Calibration of the depths that a map predicts, from measurements alone.
 
 A map and its sensor's noise predict a distribution of the measurement of each pixel: the one whose density
 accuracy.py takes the logarithm of. If it is right, a measurement falls below the distribution's q-quantile
@@ -34,7 +34,7 @@ from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, walk_
 from taichi_mrf.voxels.window import Window
 
 LEVELS = np.linspace(0.05, 0.95, 19)
-"""Central intervals of so much probability are looked at."""
+"""Probabilities of the central intervals that are compared."""
 
 
 @ti.dataclass
@@ -58,7 +58,7 @@ def probability_below(
     max_depth: float,
 ) -> NDArray[np.float32]:
     """For each measurement of (H, W) ``measured_m`` that is not 0, row by row, the probability that the map
-    gives to measuring no more than that, (n,). ``max_depth`` is where rays end, in metres."""
+    gives to a measurement of at most that, (n,). ``max_depth`` is where rays end, in metres."""
     chosen = np.flatnonzero((measured_m > 0) & (measured_m <= max_depth)).astype(np.int32)
     below = np.zeros(len(chosen), np.float32)
     slots = view.pool.in_use

@@ -1,4 +1,5 @@
-"""Where a map is right in the held-out views, kept for every try so that any two can be compared."""
+"""Pictures of where a map is right in the held-out views, kept for every try, so that any two can be
+compared."""
 
 from collections.abc import Sequence
 
@@ -16,7 +17,7 @@ BETTER, WORSE, SAME = (0, 114, 178), (213, 94, 0), (225, 225, 225)
 """Colours of a pixel that is right only now, that was right only before, and of any other."""
 
 _MOST_TRIES = 500
-"""Pictures of more tries than this are not kept, but for the pinned one."""
+"""The pictures of this many tries are kept, besides those of the pinned one."""
 
 
 class HeldOutPictures:
@@ -27,14 +28,14 @@ class HeldOutPictures:
         self._verdicts: dict[int, list[tuple[bytes, float, float]]] = {}
 
     def keep(self, number: int, views: Sequence[JudgedView], pixel_stride: int, pinned: int) -> None:
-        """Remember how the map of a try did in each view."""
+        """Keep the pictures of a try."""
         self._verdicts[number] = [_packed(view, pixel_stride) for view in views]
         for old in list(self._verdicts):
             if len(self._verdicts) > _MOST_TRIES and old not in (number, pinned):
                 del self._verdicts[old]
 
     def show(self, view: int, number: int, history: History) -> HeldOutView | None:
-        """One view under a try, beside the reference; None if there is no such view or no picture yet."""
+        """One view of a try, beside that of the reference; None if there is no such view or picture."""
         if not 0 <= view < len(self._frames) or number not in self._verdicts:
             return None
         frame = self._frames[view]

@@ -1,4 +1,4 @@
-"""The table of all tries: their parameters, their scores, which of them is the reference; as files."""
+"""The table of all tries: parameters, scores, the reference; and the files made of it."""
 
 import csv
 import dataclasses

@@ -1,4 +1,4 @@
-"""The map of the try that is looked at, on its way to the page: what has changed from the map before."""
+"""Sends the map of the selected try to the page, as changes to the map before."""
 
 from taichi_mrf.live.link import Link
 from taichi_mrf.live.mapper import Mapper
@@ -9,7 +9,7 @@ from taichi_mrf.viewer.messages import Hello
 
 
 class MapPublisher:
-    """Sends one map after the other, each in the place of the one before."""
+    """Sends one map after the other; each replaces the one before."""
 
     def __init__(self, source: str, link: Link) -> None:
         self._source, self._link = source, link
@@ -17,8 +17,8 @@ class MapPublisher:
         self._hello: Hello | None = None
 
     def show(self, trial: Trial) -> None:
-        """Send a map with its keyframes. Where grid, prior and keyframes are those of the map before, only
-        its bricks change, so that the picture does not go black in between."""
+        """Send a map with its keyframes. If grid, prior and keyframes are those of the map before, only
+        bricks are sent, so that the picture does not go black in between."""
         before, self._shown = self._shown, Mapper(trial.map)
         hello, publisher = self._describe(trial), self._shown.publisher
         bricks = publisher.changes() or publisher.everything_gone()

@@ -1,4 +1,4 @@
-"""What the map itself says of the sensor's noise: how measurements scatter around the depth it expects."""
+"""The sensor's noise as the map sees it: how measurements scatter around the expected depth."""
 
 from collections.abc import Sequence
 
@@ -12,14 +12,14 @@ BINS = 12
 FEWEST_IN_A_BIN = 20
 
 FURTHEST_SPREADS = 8.0
-"""A residual of more than so many times the middle bin's spread is an outlier, and not drawn."""
+"""Residuals larger than this many times the middle bin's spread are outliers, and not drawn."""
 
 
 def residuals_of(number: int, views: Sequence[JudgedView]) -> Residuals:
-    """Measured minus expected depth at the measured pixels of some views that the map has an answer for.
+    """Measured minus expected depth at the measured pixels of some views for which the map predicts a depth.
 
-    The map was made of other measurements of the same sensor, so a constant bias that the map does not know
-    of is in both and cancels; one that grows with depth shows where the views are further away.
+    The map was made of other measurements of the same sensor, so a constant bias that the noise model lacks
+    is in both and cancels; one that grows with depth shows where the views are further away.
     """
     depth, residual = np.zeros(0, np.float32), np.zeros(0, np.float32)
     for view in views:

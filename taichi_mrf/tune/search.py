@@ -2,8 +2,8 @@
 
 The search itself is Optuna's tree-structured Parzen estimator (Bergstra et al., NIPS 2011), which comes with
 the extra ``auto``. What is maximised is the log-likelihood of the held-out measurements under map and noise
-together: a sigma that is too small is punished by what it calls impossible, one that is too large by its
-flat density.
+together: a sigma that is too small makes measured values improbable, one that is too large spreads the
+density.
 """
 
 import dataclasses
@@ -19,12 +19,12 @@ from taichi_mrf.system.libraries import library
 from taichi_mrf.viewer.tune.knobs import KNOBS, Knob
 
 SIGMA_SCALE = "sensor.sigma_scale"
-"""No parameter of its own: all coefficients of sensor.sigma times this."""
+"""Not a parameter itself: multiplies all coefficients of sensor.sigma."""
 
 SIGMA_SCALES = Range(0.25, 16.0, 0.0)
 
 DEFAULT_SEARCH = (*(knob.name for knob in KNOBS if knob.searched), SIGMA_SCALE)
-"""What is searched unless told: what depends on the sensor and the scene more than on the map's purpose."""
+"""The default search: parameters that depend on the sensor and the scene rather than on the map's purpose."""
 
 Scalar = float | int | str | bool
 
@@ -53,7 +53,7 @@ def dimensions(names: Sequence[str], start: Config) -> list[Dimension]:
 
 
 class Search:
-    """A search of ``tries`` steps. Ask for parameters, try them, tell how that went.
+    """A search of ``tries`` steps: :meth:`ask` for parameters, try them, :meth:`tell` the score.
 
     ``told`` counts the steps that were made, ``best`` is what did best among them, None before the first.
     """
@@ -94,7 +94,7 @@ class Search:
         return self._asked[1]
 
     def tell(self, log_likelihood: float) -> None:
-        """How the last one did; NaN if it could not be mapped or judged."""
+        """The log-likelihood of the last parameters; NaN if they could not be mapped or judged."""
         assert self._asked is not None
         (trial, config), self._asked = self._asked, None
         self.told += 1
@@ -158,7 +158,7 @@ def _suggest(trial: Any, dimension: Dimension) -> Scalar:
 
 
 def _value_of(config: Config, dimension: Dimension) -> Scalar:
-    """Where the search begins, brought into the range."""
+    """The start value of a parameter, clipped to its range."""
     if dimension.name == SIGMA_SCALE:
         return 1.0
     value: Scalar = _knob(dimension.name).value_of(config)
@@ -177,5 +177,5 @@ def _with_value(config: Config, dimension: Dimension, value: Scalar, start: Conf
 
 
 def _rounded(value: float) -> float:
-    """To four digits: more mean nothing, and nobody can read them."""
+    """Rounded to four significant digits, which is all that counts."""
     return float(f"{value:.4g}")

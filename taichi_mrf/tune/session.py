@@ -1,8 +1,8 @@
-"""A tuning session: parameters come from a person or from the search, maps and scores go to the page.
+"""A tuning session: takes parameters from a person or the search, and sends maps and scores to the page.
 
-One thread does all of it, because Taichi has one owner. A try is made in two passes, of some of the pixels
-first and then of all, and between two keyframes requests are heard: parameters that are newer than those
-being tried end the try at once, so what is worked on is never older than the last touch of a slider.
+One thread does all of it, because Taichi has one owner. A try has two passes, the first with a part of the
+pixels. Requests are looked at between two keyframes: newer parameters end the present try at once, so that
+the newest slider values are always the ones being tried.
 """
 
 from collections.abc import Callable
@@ -45,9 +45,9 @@ from taichi_mrf.viewer.tune.messages import (
 
 @dataclass(frozen=True)
 class Policy:
-    """What a session does by itself. ``out``: folder for the files that a user saves. ``search_stride``: the
-    automatic search looks at every so many-th pixel, 0 for that of a first look. ``leave_when_done``: end
-    with the search."""
+    """What a session does without being asked. ``out``: folder for the files that a user saves.
+    ``search_stride``: the automatic search looks at every so many-th pixel, 0 for that of a first look.
+    ``leave_when_done``: end with the search."""
 
     out: Path | None = None
     search_stride: int = 0
@@ -72,9 +72,9 @@ class TuneSession(SessionCore):
         tried: Callable[[Attempt], None] = lambda attempt: None,
         judged: Callable[[list[Judged]], None] = lambda verdict: None,
     ) -> None:
-        """Reads the working set and tells the page of it. ``search`` is carried out at first. ``listening``
-        is called when the viewer says where its page is, ``tried`` after each try, ``judged`` with the
-        scores on unseen views once the search has ended. Raises TaichiMRFError."""
+        """Reads the working set and sends it to the page. ``search`` is carried out first. ``listening`` is
+        called with the address of the page, ``tried`` after each try, ``judged`` with the scores on unseen
+        views once the search has ended. Raises TaichiMRFError."""
         super().__init__(link)
         self._dataset, self._config, self._policy = dataset, config, policy
         self.search, self._tried, self._judged = search, tried, judged
@@ -112,7 +112,7 @@ class TuneSession(SessionCore):
                 self.link.wait(WAIT_SECONDS)
 
     def _begin(self, choice: FrameChoice) -> None:
-        """Start on a working set, with an empty table; what is raised leaves the old one in place."""
+        """Start on a working set, with an empty table. If it raises, the old one stays."""
         self.frames: WorkingSet = read_working_set(self._dataset, choice, keep_unseen=self.search is not None)
         self.history = History(self.frames.source)
         self._pictures = HeldOutPictures(self.frames.held_out)
@@ -151,7 +151,7 @@ class TuneSession(SessionCore):
         self._newer += 1
 
     def _go_on(self) -> Callable[[str, float], bool]:
-        """Whether a try that begins now is still wanted."""
+        """The function that tells a try which begins now whether to go on."""
         began_with = self._newer
 
         def go_on(activity: str, share: float) -> bool:
@@ -163,7 +163,7 @@ class TuneSession(SessionCore):
         return go_on
 
     def _try_wanted(self) -> None:
-        """Both passes of what was asked for last."""
+        """Both passes with the latest requested parameters."""
         assert self._wanted is not None
         (config, by), self._wanted = self._wanted, None
         for pixel_stride in dict.fromkeys((self._coarse, 1)):
@@ -176,7 +176,7 @@ class TuneSession(SessionCore):
                 self._show(trial, attempt)
 
     def _search_once(self) -> None:
-        """One step of the search. Abandoned for a person's wish, it is made again afterwards."""
+        """One step of the search. If a person's request interrupts it, it is repeated afterwards."""
         assert self.search is not None
         config, stride = self.search.ask(), self._policy.search_stride or self._coarse
         try:
@@ -194,7 +194,7 @@ class TuneSession(SessionCore):
             self._show_found()
 
     def _show_found(self) -> None:
-        """Map with what the search has found, with all pixels."""
+        """Map with the parameters that the search has found, with all pixels."""
         assert self.search is not None
         if self.search.best is not None:
             self._wanted = self.search.best, "search"
@@ -206,7 +206,7 @@ class TuneSession(SessionCore):
             self._show_found()
 
     def _judge_found(self) -> None:
-        """Once, after the search: what it was worth on the views that were kept back."""
+        """Once, after the search: score its result on the unseen views."""
         assert self.search is not None
         assert self.search.best is not None
         compared = contenders(self.search.start, self.search.best)
@@ -230,7 +230,7 @@ class TuneSession(SessionCore):
         return f"search, {self.search.told + 1} of {self.search.tries}"
 
     def _note(self, trial: Trial, by: By) -> Attempt:
-        """Enter a try into the table, and tell of it."""
+        """Add a try to the table, and send it to the page."""
         attempt = self.history.note(trial.config, trial.scores, by)
         self._pictures.keep(attempt.number, trial.views, trial.scores.pixel_stride, self.history.pinned)
         self.send(attempt.message())
@@ -243,7 +243,7 @@ class TuneSession(SessionCore):
         return attempt
 
     def _show(self, trial: Trial, attempt: Attempt) -> None:
-        """Let map, plot and pictures be those of a try."""
+        """Show map, plot and pictures of a try."""
         self._current = attempt.number
         self.send(Chosen(attempt.number, attempt.config))
         self._publisher.show(trial)

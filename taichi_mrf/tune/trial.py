@@ -22,17 +22,17 @@ from taichi_mrf.tune.working_set import WorkingSet, thinned
 from taichi_mrf.viewer.tune.scores import Scores
 
 INTERVAL_PIXELS = 5_000
-"""Measurements of a view that the calibration of depths is worked out from."""
+"""Measurements of a view from which the calibration of depths is computed."""
 
 GoOn = Callable[[str, float], bool]
-"""Asked between two keyframes: told what is being done and how much of it is (0 to 1), it says whether the
-try is still wanted."""
+"""Called between two keyframes with the present activity and the share that is done (0 to 1); returns
+whether to go on."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A try that ran to its end: its map, the held-out views as they were judged, and what the map had to
-    say of the parameters."""
+    """A complete try: its map, the judged held-out views, and the warnings that the map gave about the
+    parameters."""
 
     config: Config
     map: OccupancyMap
@@ -51,7 +51,7 @@ def run_trial(
 ) -> Trial | None:
     """Map the training frames with some parameters and judge the map; None if it was abandoned.
 
-    Of the training frames those are mapped that the configuration's thresholds take for keyframes. With
+    The training frames that pass the configuration's keyframe thresholds are mapped. With
     ``pixel_stride`` only every so many-th pixel along both sides is mapped and judged. ``judged`` are the
     frames that score, the held-out ones by default. Raises what the map raises, TaichiMRFError among it.
     """
@@ -78,7 +78,7 @@ def run_trial(
 
 
 def judge(m: OccupancyMap, frame: Frame, pixel_stride: int = 1) -> JudgedView:
-    """A frame followed through the map, with the noise that the map believes in. Raises FrameError if it
+    """Judge the map's depth in the view of a frame, with the map's noise model. Raises FrameError if it
     holds no measurement in the sensor's range."""
     depth_m = thinned(frame, pixel_stride).depth_m
     return judge_view(m, depth_m, frame.T_world_camera, frame.camera, noise=m.noise)
@@ -105,7 +105,7 @@ def _build(config: Config, frames: WorkingSet, pixel_stride: int, go_on: GoOn) -
 
 
 def _probability_below(m: OccupancyMap, view: JudgedView, frame: Frame) -> NDArray[np.float32]:
-    """Of some of a view's measurements, evenly spread over its rows."""
+    """Probabilities of some of a view's measurements, evenly spread over its rows."""
     pixels = np.flatnonzero(view.measured_m)
     some = np.zeros_like(view.measured_m)
     kept = pixels[:: max(1, len(pixels) // INTERVAL_PIXELS)]
@@ -121,7 +121,7 @@ def _score(
     pixel_stride: int,
     truth: VoxelTruth | None,
 ) -> Scores:
-    """The figures of all views' pixels together."""
+    """The scores over the pixels of all views."""
     pixels = np.array([int(view.judged.sum()) for view in views])
 
     def pooled(of_view: Callable[[JudgedView], float]) -> float:

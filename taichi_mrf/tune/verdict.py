@@ -1,4 +1,5 @@
-"""What a search was worth: the scores of what it found on views that neither maps nor search have seen."""
+"""The result of a search: scores of the parameters that it has found on views that were used neither for
+maps nor for the search."""
 
 import dataclasses
 import math
@@ -23,8 +24,8 @@ class Judged:
 
 
 def contenders(start: Config, found: Config) -> list[tuple[str, Config]]:
-    """Whose scores are compared: the shipped defaults at the same voxel size and by the same method, where
-    the search began if that is not the same, and what was found."""
+    """The configurations to compare: the shipped defaults with the same voxel size and method, the start of
+    the search if it differs, and the result."""
     shipped = dataclasses.replace(
         Config(),
         voxel_size=start.voxel_size,

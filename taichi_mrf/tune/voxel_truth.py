@@ -1,4 +1,4 @@
-"""Which voxels are occupied in truth, for sequences that know their scene: rendered ones."""
+"""True occupancy of voxels, for rendered sequences, whose scene is known."""
 
 from collections.abc import Sequence
 
@@ -14,14 +14,14 @@ from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.camera import PinholeCamera
 
 MOST_VOXELS = 2_000_000
-"""So many voxels are asked for; of more, every second, third, ... one."""
+"""Most voxels that are compared; of more, every second, third, ... one is."""
 
 _KEPT_SIZES = 4
-"""The truth of so many voxel sizes is kept."""
+"""Voxel sizes whose truth is kept in memory."""
 
 
 class VoxelTruth:
-    """The truth of the voxels that some clean views see, at any voxel size."""
+    """The true occupancy of the voxels in some noiseless views, at any voxel size."""
 
     def __init__(
         self,
@@ -30,13 +30,12 @@ class VoxelTruth:
         poses: Sequence[Pose],
         camera: PinholeCamera,
     ) -> None:
-        """The arguments are those of evaluation.ground_truth.occupancy_truth."""
+        """The arguments are those of evaluation.occupancy_truth.occupancy_truth."""
         self._scene = (mesh, tuple(clean_depths_m), tuple(poses), camera)
         self._known: dict[float, OccupancyTruth] = {}
 
     def calibration_error(self, m: OccupancyMap) -> float:
-        """Expected calibration error of a map's probabilities over the voxels that are known, each as often
-        as it is there."""
+        """Expected calibration error of a map's probabilities over the voxels whose truth is known."""
         probability: list[NDArray[np.float32]] = []
         occupied: list[NDArray[np.bool_]] = []
         known = self._at(m.voxel_size)
@@ -57,7 +56,7 @@ class VoxelTruth:
 
 
 def truth_of(dataset: Dataset, indices: Sequence[int]) -> VoxelTruth | None:
-    """What is known of the voxels that some frames of a dataset see; None for one that was recorded."""
+    """The true occupancy of the voxels that some frames of a dataset see; None for a real recording."""
     mesh = _mesh_of(dataset)
     if mesh is None:
         return None

@@ -1,7 +1,7 @@
-"""The few frames of a sequence that parameters are tuned on, and who among them does what.
+"""The frames on which parameters are tuned: training, held-out and unseen.
 
-Training frames make the map, held-out frames score it, and unseen frames, which an automatic search keeps
-back, say at the end whether what was found holds for views that nobody has tuned on.
+Training frames make the map, and held-out frames score it. Unseen frames, which an automatic search keeps
+back, show at the end whether its result holds for views that were not used for tuning.
 """
 
 import dataclasses
@@ -25,8 +25,8 @@ FIRST_LOOK_COLUMNS = 160
 
 @dataclass(frozen=True)
 class WorkingSet:
-    """Frames in memory. ``choice`` is what was asked for, with the stride that was taken; ``skipped`` names
-    the frames that could not be read, and why; ``truth`` is what is known of the scene, if it is."""
+    """Frames in memory. ``choice`` is the request, with the stride that was chosen; ``skipped`` has the
+    error of each unreadable frame; ``truth`` is the true occupancy, if the scene is known."""
 
     source: str
     camera: PinholeCamera
@@ -85,7 +85,7 @@ def read_working_set(dataset: Dataset, choice: FrameChoice, keep_unseen: bool = 
 
 
 def coarse_stride(camera: PinholeCamera) -> int:
-    """Every so many-th pixel along both sides is enough for a first look: about 160 columns."""
+    """The pixel stride of a first look: about 160 columns."""
     return max(1, camera.width // FIRST_LOOK_COLUMNS)
 
 
@@ -104,7 +104,7 @@ def thinned(frame: Frame, pixel_stride: int) -> Frame:
 
 
 def _settled(choice: FrameChoice, frames: int) -> FrameChoice:
-    """The choice with a stride: by default frames are spread evenly, but not too far apart."""
+    """The choice with its stride filled in: by default frames are spread evenly, but not too far apart."""
     if not 0 <= choice.first < frames:
         raise ConfigError(f"the first frame must lie between 0 and {frames - 1}, not {choice.first}")
     if choice.stride > 0:
