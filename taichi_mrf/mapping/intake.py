@@ -128,10 +128,9 @@ class Intake:
             if is_held_out(number, self._hold_out):
                 self.result.held_out.append(index)
                 return Passed(HELD_OUT.reason, frame)
-        if not self._selector.wants(frame.T_world_camera):
-            return Passed("too near to a keyframe", frame)
-        if not (frame.depth_m > 0).any():
-            return Passed("no pixel holds a measurement", frame)
+        objection = self._selector.objection(frame.T_world_camera, bool((frame.depth_m > 0).any()))
+        if objection is not None:
+            return Passed(objection, frame)
         self._before_adding(frame)
         try:
             keyframe = self._added(frame)

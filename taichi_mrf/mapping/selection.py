@@ -30,6 +30,13 @@ class KeyframeSelector:
         compared = self._accepted if self._config.against == "all" else self._accepted[-1:]
         return all(self._is_far(T_world_keyframe, T_world_camera) for T_world_keyframe in compared)
 
+    def objection(self, T_world_camera: Pose, measured: bool) -> str | None:
+        """Why a frame with this pose, (4, 4), does not become a keyframe; None if it does. ``measured``: its
+        image holds a measurement."""
+        if not self.wants(T_world_camera):
+            return "too near to a keyframe"
+        return None if measured else "no pixel holds a measurement"
+
     def accept(self, T_world_camera: Pose) -> None:
         """Note the pose of a frame that has become a keyframe."""
         self._accepted.append(T_world_camera)

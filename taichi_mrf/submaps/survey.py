@@ -113,7 +113,7 @@ def _chosen(
             if not skip_bad_frames:
                 raise FrameError(str(frame.problem))
             skipped[frame.name] = str(frame.problem)
-        elif frame.measured and selector.wants(frame.T_world_camera):
+        elif selector.objection(frame.T_world_camera, frame.measured) is None:
             selector.accept(frame.T_world_camera)
             if len(frame.chunks):  # else no ray is cast for it
                 x, y, z = frame.T_world_camera[:3, 3].tolist()
