@@ -2,44 +2,52 @@
 
 import json
 import os
+import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from taichi_mrf.cli.options.export import Export
 from taichi_mrf.cli.shared.terminal import Terminal
-from taichi_mrf.errors import ConfigError
-from taichi_mrf.export.chunk_store import SUFFIX
+from taichi_mrf.errors import ConfigError, MapFileError, TaichiMRFError
+from taichi_mrf.export.chunk_store import SUFFIX, new_store
 from taichi_mrf.export.formats import ExportedMap, export_map, export_note, writer_of
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import take_part
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.system import runtime
+from taichi_mrf.system.atomic import atomic_path
+from taichi_mrf.system.files import exists, is_file, is_folder
 
 
 def run_export(options: Export) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError.
 
-    All names are looked at before the map is read, which can take long.
+    All names are checked before the map is read. Files are made beside their places and moved there when all
+    are done: if one cannot be made, none is written.
     """
-    if not options.to:
-        raise ConfigError("--to needs at least one file")
-    for path in options.to:
-        writer_of(path)
-        if os.path.realpath(path) == os.path.realpath(options.map):
-            raise ConfigError(f"{path}: the map itself would be overwritten")
+    _check_names(options)
     runtime.init(options.arch)
     console = Terminal()
     m = _opened(options)
     written: list[dict[str, Any]] = []
+    with ExitStack() as stack:
+        made: list[tuple[Path, Path]] = []
+        for path in options.to:
+            staging = Path(stack.enter_context(_staging(path)))
+            begin = time.perf_counter()
+            files = _export(m, staging / path.name, path, options)
+            seconds = round(time.perf_counter() - begin, 3)
+            made += [(file, path.parent / file.name) for file in files]
+            written += [{"file": str(path.parent / file.name), "seconds": seconds} for file in files]
+        for file, place in made:
+            _move(file, place)
+    for entry in written:
+        entry["bytes"] = _size(Path(entry["file"]))
+        if not options.json:
+            _tell(console, entry)
     for path in options.to:
-        begin = time.perf_counter()
-        files = export_map(m, path, options.options)
-        seconds = round(time.perf_counter() - begin, 3)
-        for file in files:
-            written.append({"file": str(file), "bytes": _size(file), "seconds": seconds})
-            if not options.json:
-                _tell(console, file, seconds)
         note = export_note(m, path, options.options)
         if note is not None and not options.json:
             console.say(f"{path.name}: {note}")
@@ -48,12 +56,49 @@ def run_export(options: Export) -> int:
     return 0
 
 
+def _check_names(options: Export) -> None:
+    """Raise ConfigError or MapFileError for what can be said of the files without the map."""
+    if not options.to:
+        raise ConfigError("--to needs at least one file")
+    places = [os.path.realpath(path) for path in options.to]
+    for path, place in zip(options.to, places, strict=True):
+        writer_of(path)
+        if place == os.path.realpath(options.map):
+            raise ConfigError(f"{path}: the map itself would be overwritten")
+        if places.count(place) > 1:
+            raise ConfigError(f"{path}: is named twice")
+        if not is_folder(path.parent):
+            raise MapFileError(f"{path}: cannot be written: there is no folder {path.parent}")
+        if not os.access(path.parent, os.W_OK):
+            raise MapFileError(f"{path}: cannot be written: Permission denied")
+        if exists(path) and not is_file(path) and path.suffix != SUFFIX:
+            raise MapFileError(f"{path}: cannot be written: it is no regular file")
+
+
+def _staging(path: Path) -> "tempfile.TemporaryDirectory[str]":
+    """A folder beside the file, so that moving the file is a rename."""
+    return tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent)
+
+
+def _export(m: ExportedMap, staged: Path, path: Path, options: Export) -> list[Path]:
+    """Make one file; an error names the place that it is for."""
+    try:
+        return export_map(m, staged, options.options)
+    except TaichiMRFError as error:
+        raise type(error)(str(error).replace(str(staged.parent), str(path.parent))) from error
+
+
+def _move(file: Path, place: Path) -> None:
+    with new_store(place) if is_folder(file) else atomic_path(place) as temporary:
+        os.replace(file, temporary)
+
+
 def _opened(options: Export) -> ExportedMap:
     """The map, or the part of a map in chunks that was asked for."""
     if options.map.suffix == SUFFIX:
         return take_part(ChunkedMap.open(options.map), options.lower, options.upper)
     if options.lower is not None or options.upper is not None:
-        raise ConfigError(f"--lower and --upper take a part of a map in chunks; {options.map} is none")
+        raise ConfigError(f"--lower and --upper need a map in chunks (.zarr); {options.map} is none")
     return load_map(options.map)
 
 
@@ -63,6 +108,5 @@ def _size(path: Path) -> int:
     return sum(file.stat().st_size for file in files if file.is_file())
 
 
-def _tell(console: Terminal, file: Path, seconds: float) -> None:
-    size = f"{_size(file) / 1e6:.2f} MB, {seconds:.1f} s"
-    console.say(f"{file} ({size})")
+def _tell(console: Terminal, entry: dict[str, Any]) -> None:
+    console.say(f"{entry['file']} ({entry['bytes'] / 1e6:.2f} MB, {entry['seconds']:.1f} s)")

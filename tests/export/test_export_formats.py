@@ -46,6 +46,27 @@ def run_export(*arguments: object) -> int:
     return carry_out("export", *arguments, "--arch", arch)
 
 
+@pytest.mark.parametrize(
+    ("second", "error"),
+    [
+        (["b.pgm"], ConfigError),  # without a band of heights
+        (["b.stl", "--threshold", "0.9999999"], ConfigError),  # no voxel is that sure
+        (["missing/b.bt"], MapFileError),
+        (["a.ply"], ConfigError),  # twice
+        (["folder.npz"], MapFileError),
+    ],
+)
+def test_if_one_file_cannot_be_made_none_is_written(
+    saved: dict[str, Path], tmp_path: Path, second: list[str], error: type[Exception]
+) -> None:
+    (tmp_path / "folder.npz").mkdir()
+    name, *flags = second
+    with pytest.raises(error) as caught:
+        run_export(saved["mrf"], "--to", tmp_path / "a.ply", tmp_path / name, *flags)
+    assert ".export-" not in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["folder.npz"]
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_all_formats_of_a_saved_map(
     saved: dict[str, Path], method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
