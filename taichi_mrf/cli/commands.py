@@ -76,7 +76,7 @@ _BENCH_FLAGS = (
 )
 
 COMMANDS = {
-    "map": Command(Map, "taichi_mrf.cli.map.command:run", mapping_parameters, _MAP_FLAGS),
+    "map": Command(Map, "taichi_mrf.cli.map.many:run", mapping_parameters, _MAP_FLAGS),
     "live": Command(Live, "taichi_mrf.cli.live:run_live", mapping_parameters, _LIVE_FLAGS),
     "tune": Command(Tune, "taichi_mrf.cli.tune:run_tune", mapping_parameters, _TUNE_FLAGS),
     "export": Command(Export, "taichi_mrf.cli.export:run_export"),

@@ -42,7 +42,7 @@ def run_import(options: Import) -> int:
         return 0
     console = Terminal()
     text = (
-        f"{facts['leaves']:,} leaves of OctoMap's: {facts['occupied']:,} occupied and {facts['free']:,} free "
+        f"{facts['leaves']:,} OctoMap leaves: {facts['occupied']:,} occupied and {facts['free']:,} free "
         f"voxels of {leaves.voxel_size:g} m in {facts['bricks']:,} bricks"
     )
     for line in (text, str(options.out)):

@@ -17,7 +17,7 @@ from taichi_mrf.live.link import ViewerLink
 from taichi_mrf.viewer.messages import Listening, Status, Update
 
 SHORTEST_LIFE_SECONDS = 30.0
-"""A viewer that ends sooner than this is not started once more."""
+"""A viewer that lives shorter than this is not restarted."""
 
 
 def run_live(options: Live) -> int:
@@ -121,8 +121,8 @@ def _run(
     page: _Page,
     request: StopRequest,
 ) -> str | None:
-    """Map to the end; a viewer that was killed is started once more. Returns what has ended the run, if that
-    was not meant to be."""
+    """Map to the end; a viewer that was killed is restarted. Returns what ended the run, if that was not
+    intended."""
     while True:
         run(request)
         lost = page.link.lost

@@ -1,6 +1,8 @@
 """From the words of the command line to the options of a command, and the overview of all commands."""
 
+import dataclasses
 import inspect
+import typing
 from collections.abc import Sequence
 from difflib import get_close_matches
 from functools import reduce
@@ -8,13 +10,29 @@ from operator import or_
 from typing import Annotated, Any
 
 import tyro
+from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
+from taichi_mrf.calibration import options as calibration_options
 from taichi_mrf.cli.commands import COMMANDS, Command
 from taichi_mrf.cli.flag_list import brief_help, flags_of
-from taichi_mrf.cli.shared.flags import registry
 from taichi_mrf.cli.shared.terminal import PROGRAM
+from taichi_mrf.config import schema as config
+from taichi_mrf.config.registry import METHODS
+from taichi_mrf.config.text import field_help
 from taichi_mrf.config.values import nearest
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.factor_graph import config as factor_graph_config
+
+DEFINITIONS = (
+    config.__name__,
+    *(method.section_class.__module__ for method in METHODS.values()),
+    calibration_options.__name__,
+    factor_graph_config.__name__,
+)
+"""The modules whose dataclasses are parameters."""
+
+registry = ConstructorRegistry()
+"""For :func:`tyro.cli`, which by itself keeps the line breaks that the source code has in a help text."""
 
 _HELP, _HELP_ALL = ("-h", "--help"), "--help-all"
 _ABOUT = "Probabilistic occupancy maps from depth cameras."
@@ -87,3 +105,17 @@ def _print_completion(arguments: Sequence[str]) -> None:
             Annotated[command.options, tyro.conf.subcommand(name, default=default, prefix_name=False)]
         )
     tyro.cli(reduce(or_, commands), prog=PROGRAM, args=arguments, registry=registry)
+
+
+@registry.struct_rule
+def configuration_flags(info: StructTypeInfo) -> StructConstructorSpec | None:
+    """One flag a field for the dataclasses of DEFINITIONS; nothing for any other type."""
+    if not (dataclasses.is_dataclass(info.type) and info.type.__module__ in DEFINITIONS):
+        return None
+    hints, texts = typing.get_type_hints(info.type), field_help(info.type)
+    defaults = info.default if isinstance(info.default, info.type) else info.type()
+    fields = (
+        StructFieldSpec(field.name, hints[field.name], getattr(defaults, field.name), texts[field.name])
+        for field in dataclasses.fields(info.type)
+    )
+    return StructConstructorSpec(info.type, tuple(fields))

@@ -3,17 +3,11 @@
 import os
 
 from taichi_mrf.system import devices
+from taichi_mrf.system.devices import cores
 
 VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"
 THREADS = ("TI_CPU_MAX_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 """What Taichi, NumPy's BLAS and OpenCV read; ``runtime.threads``, where it is given, wins over the first."""
-
-
-def cores() -> int:
-    """The cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def gpus() -> list[str]:

@@ -6,6 +6,7 @@ software, and why CUDA is not available. Their C interfaces start quickly, and n
 
 import ctypes
 import ctypes.util
+import os
 import sys
 from dataclasses import dataclass
 
@@ -137,3 +138,10 @@ def _library(title: str, names: dict[str, str], otherwise: str) -> ctypes.CDLL:
         return ctypes.CDLL(name)
     except OSError:
         raise BackendError(f"no {title} on this machine ({name} is not installed)") from None
+
+
+def cores() -> int:
+    """The cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS and Windows
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

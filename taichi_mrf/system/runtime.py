@@ -173,8 +173,7 @@ def _device(name: str, allow_software: bool) -> tuple[str, bool]:
 def _start(name: str, software: bool, threads: int, debug: bool, profile: bool) -> None:
     """Start Taichi on one backend, quietly. Raises BackendError if Taichi cannot."""
     ti = _quiet_taichi()
-    # Taichi starts as many threads as it is told to; more than there are cores only cost memory.
-    options: dict[str, Any] = {"cpu_max_num_threads": min(threads, os.cpu_count() or 1)} if threads else {}
+    options: dict[str, Any] = {"cpu_max_num_threads": _usable(threads)} if threads else {}
     options["kernel_profiler"] = profile
     if software:
         options["default_gpu_block_dim"] = SOFTWARE_BLOCK
@@ -190,6 +189,16 @@ def _start(name: str, software: bool, threads: int, debug: bool, profile: bool) 
             ti.init(arch=arch, debug=debug, log_level=ti.ERROR, enable_fallback=False, **options)
         except RuntimeError as error:
             raise BackendError(f"Taichi does not start on it: {' '.join(str(error).split())}") from error
+
+
+def _usable(threads: int) -> int:
+    """No more threads than the machine has cores: Taichi would start them all."""
+    if threads <= devices.cores():
+        return threads
+    _log.warning(
+        "runtime.threads is %d, but this machine has %d cores; so many are used", threads, devices.cores()
+    )
+    return devices.cores()
 
 
 def _already_running() -> Backend | None:

@@ -100,7 +100,7 @@ def test_ctrl_c_keeps_what_was_found(table3: tuple[Path, str], data: Path, tmp_p
         process.send_signal(signal.SIGINT)
         printed, said = process.communicate()
     assert (process.returncode, said) == (130, "")
-    assert "the same command goes on from here" in " ".join(printed.split())
+    assert "the same command continues from here" in " ".join(printed.split())
     kept = ledger.read_text()
     assert 1 <= kept.count("\n") - 1 < (table3[0] / "table3.jsonl").read_text().count("\n") - 1
     assert not (tmp_path / "table3.csv").exists()

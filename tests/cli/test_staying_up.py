@@ -58,7 +58,7 @@ def test_what_does_not_fit_into_memory_is_named_and_the_rest_is_kept(
     assert done.returncode == 3, done.stderr
     assert done.stderr.count("\n") == 1
     assert "does not fit: " in done.stderr
-    assert "--resume with more memory goes on" in done.stderr
+    assert "--resume with more memory continues" in done.stderr
     report = json.loads((out / "report.json").read_text())
     assert report["interrupted"] is True
     assert report["did_not_fit"] in done.stderr
@@ -148,7 +148,7 @@ def test_a_run_goes_on_with_what_it_kept_of_the_same_frames_and_parameters_only(
 
 def test_what_cannot_be_kept_on_the_way_does_not_end_the_run(tmp_path: Path) -> None:
     keeper = Keeper(tmp_path / "gone", ALL_FRAMES, 0.0, lambda result: {})
-    with pytest.warns(UserWarning, match="nothing could be kept on the way: .*gone"):
+    with pytest.warns(UserWarning, match="the checkpoint could not be written: .*gone"):
         assert len(names(map_sequence(sequence(), ALL_FRAMES, keep=keeper).map)) == 6
 
 

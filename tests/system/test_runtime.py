@@ -190,3 +190,13 @@ tm.MRFMap(0.1).voxels()
 print(len(os.listdir("/proc/self/task")))
 """
     assert int(output(program)) < 4 * os.cpu_count() + 16
+
+
+def test_more_threads_than_cores_are_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    cores = devices.cores()
+    assert runtime._usable(cores) == cores
+    assert not caplog.messages
+    assert runtime._usable(100_000) == cores
+    assert caplog.messages == [
+        f"runtime.threads is 100000, but this machine has {cores} cores; so many are used"
+    ]

@@ -1,8 +1,7 @@
-"""What a run of ``taichi-mrf map`` keeps on its way, so that a killed one can be resumed, and what it goes on
-with.
+"""Checkpoints of a mapping run, and how a run resumes from one.
 
-The report goes first and says that the run is not finished, the map last: whatever the moment of a kill, the
-files are whole, none of them calls the map finished that is not, and --resume finds a map of its parameters.
+The report is written first and says that the run is unfinished, the map last: whenever the process is killed,
+every file is whole, no report calls an unfinished map finished, and --resume finds a map with its parameters.
 """
 
 import json
@@ -30,8 +29,8 @@ MOST_OF_THE_TIME = 0.05
 
 
 class Keeper:
-    """Saves the map of a run when it is called and enough time has gone by: ``every_s`` seconds, and so long
-    that saving takes no more than its share. ``report`` makes the report of an unfinished run."""
+    """Saves the map of a run when it is called and enough time has passed: ``every_s`` seconds, and long
+    enough that saving takes at most its share. ``report`` makes the report of an unfinished run."""
 
     def __init__(
         self,
@@ -45,8 +44,8 @@ class Keeper:
         self._last, self._cost = time.perf_counter(), 0.0
 
     def __call__(self, result: MappingResult) -> None:
-        """Save what there is, if it is time. What cannot be written is warned of: the run goes on, and there
-        may be room for the files at its end."""
+        """Save the map if it is time. A failure is only a warning: the run continues, and the disk may have
+        space at its end."""
         begin = time.perf_counter()
         if begin - self._last < max(self._every_s, self._cost / MOST_OF_THE_TIME):
             return
@@ -56,7 +55,7 @@ class Keeper:
                 write_text(self._folder / CONFIG_FILE, commented_yaml(self._settings))
                 result.map.save(self._folder / MAP_FILE)
             except MapFileError as error:
-                warnings.warn(f"nothing could be kept on the way: {error}", stacklevel=2)
+                warnings.warn(f"the checkpoint could not be written: {error}", stacklevel=2)
         self._last = time.perf_counter()
         self._cost = self._last - begin
 

@@ -9,7 +9,7 @@ import taichi_mrf
 from taichi_mrf.cli.map.earlier import refuse_other_run
 from taichi_mrf.cli.map.keep import refuse_changes
 from taichi_mrf.cli.map.process import Outcome, finished_before, map_in_process
-from taichi_mrf.cli.map.run import exit_status, print_run
+from taichi_mrf.cli.map.run import exit_status, print_run, run_map
 from taichi_mrf.cli.map.source_names import folder_names
 from taichi_mrf.cli.map.summary import (
     Row,
@@ -40,7 +40,7 @@ _TOP_VIEW = "top_view.png"
 
 @dataclass
 class _Batch:
-    """The tasks of a command and what has become of them, by the task's index."""
+    """The tasks of a command and their outcomes, by the task's index."""
 
     options: Map
     names: list[str]
@@ -55,6 +55,16 @@ class _Batch:
         """The row of one sequence."""
         outcome = self.outcomes.get(number, Outcome("not done"))
         return summary_row(self.names[number], self.tasks[number].source, outcome)
+
+
+def run(options: Map) -> int:
+    """Carry out the command: one sequence here, several or a cluster, or one in submaps; returns the exit
+    status. Raises TaichiMRFError."""
+    if options.submap_size is not None:
+        from taichi_mrf.cli.map.submaps import run_submaps
+
+        return run_submaps(options, options.submap_size)
+    return run_map(options) if len(options.sources) == 1 and options.scheduler is None else run_many(options)
 
 
 def run_many(options: Map) -> int:
@@ -90,22 +100,24 @@ def run_many(options: Map) -> int:
 
 
 def _did_not_fit(outcome: Outcome | None) -> bool:
-    """Whether there is a map of as much as there was memory for."""
+    """Whether memory ran out, and the map so far was saved."""
     return outcome is not None and outcome.report is not None and bool(outcome.report.get("did_not_fit"))
 
 
 def _map_all(batch: _Batch, console: Terminal, request: StopRequest) -> None:
-    """Fill in the outcomes, as far as nobody asks to stop."""
+    """Run the tasks and fill in their outcomes, until the user stops the run."""
     count = len(batch.tasks)
     with ProgressBar(console, batch.options.printing) as bar:
 
         def done(number: int, outcome: Outcome) -> None:
             batch.outcomes[number] = outcome
-            bar.advance("Mapping", len(batch.outcomes), count)
+            if console.is_terminal:  # elsewhere the lines below say as much
+                bar.advance("Mapping", len(batch.outcomes), count)
             line = f"[{len(batch.outcomes)}/{count}] {summary_line(batch.row(number))}"
             console.say(line)
 
-        bar.advance("Mapping", 0, count)
+        if console.is_terminal:
+            bar.advance("Mapping", 0, count)
         waiting: list[int] = []
         try:
             with open_runner(batch.options.jobs, batch.options.scheduler) as runner:
@@ -171,7 +183,7 @@ def _tell_all(batch: _Batch, console: Terminal, seconds: float) -> None:
         return
     print_summary(console, rows)
     if any(row.status in ("stopped", "not done") for row in rows):
-        console.say("Stopped before the end; --resume goes on from here.", "yellow")
+        console.say("Stopped before the end; --resume continues from here.", "yellow")
     for path in written:
         console.say(str(path))
 

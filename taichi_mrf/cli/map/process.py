@@ -22,7 +22,7 @@ Status = Literal["mapped", "finished before", "stopped", "failed", "not done"]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What has become of a sequence: the report of its run, or in one line why there is none."""
+    """The outcome of a sequence: the report of its run, or one line that says why there is none."""
 
     status: Status
     report: dict[str, Any] | None = None

@@ -21,7 +21,7 @@ def print_report(console: Terminal, report: dict[str, Any], written: list[Path])
     for problem in report["skipped_frames"].values():
         console.say(f"Skipped: {problem}")
     if report["interrupted"]:
-        console.say("Stopped before the end; --resume goes on from here.", "yellow")
+        console.say("Stopped before the end; --resume continues from here.", "yellow")
     for path in written:
         console.say(str(path))
 

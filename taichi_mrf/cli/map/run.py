@@ -52,7 +52,7 @@ def run_map(options: Map) -> int:
             report, written = map_to_folder(task, progress, request)
         print_run(console, options, report, written)
     if report["did_not_fit"] is not None and request.signal is None:
-        kept = f"the map of {report['keyframes']} keyframes is kept; --resume with more memory goes on"
+        kept = f"the map of {report['keyframes']} keyframes is kept; --resume with more memory continues"
         tell_problem(f"{report['did_not_fit']}; {kept}")
     return exit_status(request, report["did_not_fit"])
 
@@ -64,7 +64,7 @@ def _tell_finished(console: Terminal, options: Map, report: dict[str, Any]) -> N
 
 
 def print_run(console: Terminal, options: Map, report: dict[str, Any], written: list[Path]) -> None:
-    """Tell what one source has become."""
+    """Print the result of one source."""
     if options.json:
         print(report_json(report), end="")
         return

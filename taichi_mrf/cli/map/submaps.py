@@ -36,7 +36,7 @@ def run_submaps(options: Map, submap_size: float) -> int:
     if len(options.sources) != 1:
         raise ConfigError("--submap-size takes one SOURCE")
     if options.poses.track_poses:
-        raise ConfigError("--track-poses does not go with --submap-size: no task sees all keyframes")
+        raise ConfigError("--track-poses does not work with --submap-size: no task has all keyframes")
     library("zarr", "maps in chunks need", "store")  # said before the work, not after it
     settings = with_absolute_tables(options.poses.parameters(options.settings), Path.cwd())
     source = absolute_source(options.sources[0])
@@ -69,7 +69,7 @@ def run_submaps(options: Map, submap_size: float) -> int:
         except KeyboardInterrupt:
             if request.aborted or not request():
                 raise
-            console.say("Stopped before the end; --resume goes on from here.", "yellow")
+            console.say("Stopped before the end; --resume continues from here.", "yellow")
             return exit_status(request)
         _tell(console, options, result, _write(options, result))
     return exit_status(request)
@@ -85,7 +85,7 @@ def _refuse_to_replace(options: Map) -> None:
 
 
 def _write(options: Map, result: SubmapsResult) -> list[Path]:
-    """What lies beside the map; returns the names of all."""
+    """Write the files beside the map; returns the paths of all files."""
     out = options.out
     write_text(out / CONFIG_FILE, commented_yaml(result.job.config))
     written = [out / MAP_FOLDER, out / CONFIG_FILE]
@@ -157,4 +157,4 @@ def _tell(console: Terminal, options: Map, result: SubmapsResult, written: list[
     for path in written:
         console.say(str(path))
     console.say(f"taichi-mrf export {options.out / MAP_FOLDER} --to part.ply --lower X Y Z --upper X Y Z "
-        "takes a box out of it for other programs.")  # fmt: skip
+        "exports a box of it.")  # fmt: skip

@@ -28,18 +28,18 @@ class Bench:
     """Voxel sizes in metres."""
 
     frames: int = 40
-    """How many frames to map, from the first on."""
+    """Number of frames to map, from the first on."""
 
     octomap: bool = True
     """Insert the same frames into OctoMap, where the extra 'bench' is installed."""
 
     profile: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Say instead where the time goes: every kernel beside the least that its bytes could take, and the
+    """Show instead where the time goes: every kernel next to the bound that memory bandwidth sets, and the
     host's functions."""
 
     growth: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Measure instead how a new keyframe's cost and the memory grow with old keyframes that it sees, and with
-    those that it does not: the frames in eight laps, at one place and at places 100 m apart."""
+    """Measure instead how cost and memory grow with the number of earlier keyframes, in view and out of view:
+    eight laps of the frames, at one place and at places 100 m apart."""
 
     viewer: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Measure instead what each keyframe costs the live view: time on the server and bytes to a browser."""
@@ -63,6 +63,6 @@ class Bench:
         if len(chosen) > 1:
             raise ConfigError(f"{' and '.join(chosen)} do not go together")
         if self.plot is not None and self.viewer:
-            raise ConfigError("--plot has nothing to draw of --viewer")
+            raise ConfigError("--plot does not go with --viewer")
         if self.plot is not None and self.plot.suffix not in (".png", ".svg", ".pdf"):
             raise ConfigError(f"--plot {self.plot}: the file must end in .png, .svg or .pdf")

@@ -16,15 +16,15 @@ class Calibrate:
     """Learn a depth camera's bias and sigma for each patch of pixels.
 
     The true depth comes from --true-depth, or from a chessboard in --images, or from the motion capture of
-    camera and board in --camera-poses and --board-poses (with --images). docs/calibration.md tells how to
-    record. Example: taichi-mrf calibrate depth/ --true-depth true/ --out sensor/
+    camera and board in --camera-poses and --board-poses (with --images). docs/calibration.md explains how
+    to record. Example: taichi-mrf calibrate depth/ --true-depth true/ --out sensor/
     """
 
     depth: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DEPTH")]
     """A folder of measured depth (16-bit PNG, .npy, .npz stacks), or one stack."""
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
-    """Folder for the results; it is made if need be."""
+    """Folder for the results; created if needed."""
 
     true_depth: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """True depth images of the same names as the measured ones, or one stack."""
@@ -46,10 +46,10 @@ class Calibrate:
         tuple[float, float, float, float, float, float] | None,
         tyro.conf.arg(metavar="WIDTH HEIGHT FX FY CX CY"),
     ] = None
-    """Intrinsics of the depth camera in pixels; else a camera.txt or the like beside the depth tells."""
+    """Intrinsics of the depth camera in pixels; by default read from a camera.txt beside the depth."""
 
     depth_scale: float = 1000.0
-    """Steps of the measured depth's whole numbers per metre."""
+    """Integer steps per metre in the measured depth."""
 
     true_depth_scale: float | None = None
     """The same for the true depth, where it differs."""

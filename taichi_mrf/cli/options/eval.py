@@ -28,7 +28,7 @@ class Eval:
     maps the built-in corridor in parts and compares that with the map of a single machine, or all."""
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("runs/eval")
-    """Folder for the results; it is made if need be."""
+    """Folder for the results; created if needed."""
 
     data: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("../shared/data")
     """Folder with the scenes, as data/README.md describes them."""
@@ -40,7 +40,7 @@ class Eval:
     """Draws of the simulated noise: the first for every method, the others for the spread of MRFMap."""
 
     limit: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Use no more than N views or folds, for a quick look."""
+    """Use at most N views or folds, for a quick look."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
     """How much is printed."""

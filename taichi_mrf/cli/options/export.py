@@ -12,7 +12,7 @@ from taichi_mrf.export.options import ExportOptions
 
 @dataclass(frozen=True)
 class Export:
-    """Write a saved map for other programs, in the formats that the files' extensions say.
+    """Write a saved map in other formats, chosen by the files' extensions.
 
     .ply points, cubes or a mesh; .glb, .obj, .stl a mesh; .bt, .ot OctoMap; .pgm with .yaml a 2D map for
     ROS's map_server; .npz arrays; .html a page that any browser opens; .zarr chunks of 64^3 voxels. Example:
@@ -27,15 +27,16 @@ class Export:
     """The files to write."""
 
     lower: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
-    """Lowest corner, in metres, of the box to take out of a map in chunks; without it, all from its begin."""
+    """Lower corner (metres) of the box to export from a map in chunks; without it, the box starts where the
+    map does."""
 
     upper: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
-    """Highest corner of that box."""
+    """Upper corner of that box."""
 
     options: Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.FlagCreatePairsOff] = field(
         default_factory=ExportOptions
     )
-    """What the files hold."""
+    """What the files contain."""
 
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print what was written as JSON."""

@@ -9,9 +9,9 @@ import tyro
 
 @dataclass(frozen=True)
 class Import:
-    """Make a map of a file of OctoMap's (.bt or .ot), with its voxels and log-odds.
+    """Convert an OctoMap file (.bt or .ot) into a map with the same voxels and log-odds.
 
-    The map is a LogOddsMap without keyframes: it can be asked, compared, exported and added to.
+    The map is a LogOddsMap without keyframes: it can be queried, compared, exported and extended.
     Example: taichi-mrf import building.bt --out building.npz
     """
 

@@ -17,8 +17,8 @@ from taichi_mrf.factor_graph.config import LaserConfig, Method
 class Laser:
     """Map 2D laser scans with known poses by inference on a factor graph whose factors are whole beams.
 
-    Flags take precedence over the file of --config, and that over the defaults. Ctrl-C ends the method that
-    runs, and keeps the map that it has by then (exit status 130). Example: taichi-mrf laser walk.log.gz --out
+    Flags override the file of --config, which overrides the defaults. Ctrl-C ends the current
+    method and saves its map so far (exit status 130). Example: taichi-mrf laser walk.log.gz --out
     runs/floor --cell-size 0.05
     """
 
@@ -27,7 +27,7 @@ class Laser:
     synthetic:floor-plan."""
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
-    """Folder for the results; it is made if need be."""
+    """Folder for the results; created if needed."""
 
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
     """A YAML file of parameters, such as the config.yaml of an earlier run."""
@@ -39,30 +39,30 @@ class Laser:
     """Run dual decomposition with each of these first steps, and draw their energies against time."""
 
     truth: Annotated[Path | None, tyro.conf.arg(metavar="IMAGE")] = None
-    """Floor plan to judge the map by, dark where there is a wall, centred on the scans' origin."""
+    """Floor plan to score the map against, dark at walls, centred on the scans' origin."""
 
     truth_size: Annotated[str | None, tyro.conf.arg(metavar="W,H")] = None
     """Width and height of the floor plan's image in metres."""
 
     every: Annotated[int, tyro.conf.arg(metavar="N")] = 1
-    """Use every N-th scan only."""
+    """Use only every N-th scan."""
 
     limit: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Use no more than N scans."""
+    """Use at most N scans."""
 
     skip_bad_scans: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Leave broken scans out and count them in the report, instead of stopping at the first."""
+    """Skip unreadable scans and count them in the report, instead of stopping at the first."""
 
     no_returns: Literal["auto", "free", "ignore"] = "auto"
-    """What a beam that did not come back says: that its way is free, or nothing (ignore). auto ignores those
-    of CARMEN logs, most of which met glass or something dark, and believes the others."""
+    """What a beam without a return means: its path is free, or nothing (ignore). auto ignores those of CARMEN
+    logs, most of which met glass or dark surfaces, and uses the others."""
 
     no_return_range: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
     """Beams of at least this range did not come back. Without it the range is found in a CARMEN log, where it
     stands out, and an npz file says it itself."""
 
     memory_limit_gb: float = 0.0
-    """Most memory for the factor graph in GB; 0 means what the machine has free."""
+    """Memory limit of the factor graph in GB; 0 uses what the machine has free."""
 
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the report as JSON, and nothing else, on stdout."""

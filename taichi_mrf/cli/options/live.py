@@ -17,8 +17,8 @@ from taichi_mrf.errors import ConfigError
 class Live:
     """Map a sequence or a camera, and show the map in the browser while it grows.
 
-    Keyframes can be switched off and on, moved and frozen there, and rays asked what they meet. Ctrl-C ends
-    it and, with --out, keeps what is mapped (exit status 130). Example: taichi-mrf live recording/ --out
+    Keyframes can be switched off and on, moved and frozen there, and rays inspected. Ctrl-C ends the run
+    and, with --out, saves the map (exit status 130). Example: taichi-mrf live recording/ --out
     runs/desk --open
     """
 
@@ -34,26 +34,26 @@ class Live:
     """A YAML file of parameters, such as those in configs/."""
 
     every: Annotated[int, tyro.conf.arg(metavar="N")] = 1
-    """Look at every N-th frame only."""
+    """Use only every N-th frame."""
 
     limit: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Look at no more than N frames."""
+    """Use at most N frames."""
 
     speed: Annotated[float, tyro.conf.arg(metavar="X")] = 0.0
-    """Replay at X times the recording's own pace; 0 is as fast as it goes."""
+    """Replay at X times the recorded speed; 0 replays as fast as possible."""
 
     loop: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Begin again when the sequence has ended, with the frames as new keyframes."""
+    """Start over when the sequence ends; its frames become new keyframes."""
 
     keep_live: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Freeze keyframes when there are more than N that could still be changed, first those that have left the
-    view, so that an endless run needs no more and more memory."""
+    """Keep at most N keyframes editable and freeze the others, those out of view first, so that an endless
+    run needs a bounded amount of memory."""
 
     exit_when_done: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """End once the sequence is mapped."""
 
     host: str = "127.0.0.1"
-    """Address to serve the page at; others than this one let everybody in who can reach it."""
+    """Address to serve the page at. With any other address, everyone who can reach it can use the page."""
 
     port: int = 8080
     """Port to serve the page at; the next free one is taken if it is busy."""
@@ -65,7 +65,7 @@ class Live:
     """How SOURCE is read."""
 
     poses: Annotated[PoseFlags, tyro.conf.arg(name="")] = field(default_factory=PoseFlags)
-    """What becomes of SOURCE's poses."""
+    """How SOURCE's poses are used."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
     """How much is printed."""

@@ -1,7 +1,4 @@
-"""The flags of map and live that say what is to become of the poses that frames were recorded with.
-
-Nothing is imported here that would make the command line's help wait.
-"""
+"""The flags of map and live that say how recorded poses are used."""
 
 from dataclasses import dataclass, replace
 from typing import Annotated
@@ -20,8 +17,8 @@ class PoseFlags:
     --poses.refine."""
 
     track_poses: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Find the pose of each frame by aligning it with the map so far; SOURCE's own poses, if it has any, are
-    not used but for the first. realsense:?poses=track says the same."""
+    """Find the pose of each frame by aligning it with the map so far; SOURCE's own poses, if any, are
+    ignored except for the first. realsense:?poses=track does the same."""
 
     def parameters(self, settings: Config) -> Config:
         """The parameters with what these flags say."""

@@ -18,8 +18,8 @@ FRAMES_BY_HAND, FRAMES_TO_SEARCH = 12, 30
 class Tune:
     """Tune parameters on a few frames of a sequence, and see at once what they do.
 
-    The page has sliders for the parameters; after each change a fresh map is made of some frames and scored
-    on others. With --auto a search does it. Ctrl-C ends it and, with --out, keeps what is found (exit
+    The page has sliders for the parameters; after each change a new map is built from some frames and scored
+    on others. --auto searches instead. Ctrl-C ends the session and, with --out, saves the results (exit
     status 130). Example: taichi-mrf tune recording/ --auto 60 --out runs/tuned
     """
 
@@ -27,45 +27,45 @@ class Tune:
     """A folder, whose format is recognised, or a built-in sequence such as synthetic:room."""
 
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Folder for tries.csv and the YAML files that are saved, and with --auto for best.yaml; it is made if
-    need be."""
+    """Folder for tries.csv and the YAML files that are saved, and with --auto for best.yaml; created if
+    needed."""
 
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
     """A YAML file of parameters to begin with, such as those in configs/."""
 
     frames: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """How many frames to take, those that are held out included; 12 by default, 30 with --auto."""
+    """Number of frames, including those that are held out; 12 by default, 30 with --auto."""
 
     first: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Index of the first frame to take."""
+    """Index of the first frame."""
 
     stride: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Take every N-th frame from there; 0 spreads them evenly over the sequence, at most 10 apart."""
 
     hold_out: Annotated[int, tyro.conf.arg(metavar="N")] = 3
-    """One frame in N is kept out of the map, to score it. With --auto every second of these is kept back
-    from the search as well, for the final scores."""
+    """One frame in N is held out of the map to score it. With --auto every second of these is hidden from the
+    search, too, and used for the final scores."""
 
     auto: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Search for parameters, in N tries, under which held-out measurements are likelier (needs the extra
-    auto: Optuna)."""
+    """Search in N trials for parameters that make held-out measurements more likely (needs the extra auto:
+    Optuna)."""
 
     search: Annotated[str, tyro.conf.arg(metavar="NAME,...")] = ""
-    """Parameters to search, with commas between them; sensor.sigma_scale stands for all coefficients of
+    """Parameters to search, separated by commas; sensor.sigma_scale stands for all coefficients of
     sensor.sigma together. By default prior, outlier floor, message clamp, free share and sigma's scale."""
 
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Starts the random numbers of the search."""
+    """Seed of the search's random numbers."""
 
     search_stride: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """The search maps and judges every N-th pixel along both sides; 0 takes so many that 160 columns are
-    left. Final scores are of all pixels."""
+    """The search maps and scores every N-th pixel in both directions; 0 chooses N so that 160 columns are
+    left. Final scores use all pixels."""
 
     viewer: bool = True
-    """Serve the page; without it only --auto makes sense."""
+    """Serve the page; --no-viewer needs --auto."""
 
     host: str = "127.0.0.1"
-    """Address to serve the page at; others than this one let everybody in who can reach it."""
+    """Address to serve the page at. With any other address, everyone who can reach it can use the page."""
 
     port: int = 8080
     """Port to serve the page at; the next free one is taken if it is busy."""

@@ -18,7 +18,7 @@ from taichi_mrf.system.atomic import atomic_path, remove_leftovers
 from taichi_mrf.system.files import exists, is_folder
 
 DID_NOT_FIT = 3
-"""Exit status of a run for which memory was not enough: what did fit is mapped and kept."""
+"""Exit status of a run that ran out of memory: the map of the frames that fit was saved."""
 
 LOCK_FILE = ".lock"
 

@@ -1,4 +1,4 @@
-"""What the commands with a page have in common: who may reach it, where it is, and who goes first."""
+"""What the commands with a page share: who can reach it, its address, and the priority of processes."""
 
 import os
 import webbrowser
@@ -9,18 +9,18 @@ from taichi_mrf.viewer.messages import Listening
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 NICENESS = 10
-"""Mapping leaves the page the processor when both want it."""
+"""How much lower the priority of mapping is than that of the page."""
 
 Say = Callable[[str], None]
 
 
 def warn_of_host(host: str, port: int, what_they_can: str, say: Say) -> None:
-    """Say what it means to serve the page to other machines, if that is what ``host`` does."""
+    """Warn if ``host`` serves the page to other machines."""
     if host in LOOPBACK:
         return
     say(
         f"Warning: the page at --host {host} has no password: whoever can reach this machine can "
-        f"{what_they_can}. It is safer to leave --host away and to tunnel from where you watch: "
+        f"{what_they_can}. It is safer to omit --host and to tunnel from where you watch: "
         f"ssh -L {port}:127.0.0.1:{port} USER@THIS-MACHINE"
     )
 
@@ -33,8 +33,8 @@ def let_the_page_go_first() -> None:
 
 
 def tell_address(where: Listening, what: str, wanted_port: int, open_browser: bool, say: Say) -> None:
-    """Say that another port was taken than the wanted one (0: any), if so, and then where the page is, which
-    is what a reader waits for; open a browser if asked."""
+    """Print the page's address, and before it that another port was taken than the requested one (0: any);
+    open a browser if asked."""
     host = f"[{where.host}]" if ":" in where.host else where.host
     address = f"http://{host}:{where.port}"
     if wanted_port not in (0, where.port):
