@@ -13,7 +13,7 @@ class Verbosity:
     """How much is printed."""
 
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print nothing but problems (and with --json the JSON)."""
+    """Print only problems, and JSON where it was asked for."""
 
     verbose: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print every step instead of a progress bar, and which backend was chosen and why."""
