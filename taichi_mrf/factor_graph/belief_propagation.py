@@ -11,23 +11,19 @@ incoming messages have changed or whose own are not yet what they should be (res
 over disagreeing nodes only.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.graph import FactorGraph
-from taichi_mrf.factor_graph.potentials import (
-    beam_of,
-    energy_of_first,
-    energy_of_none,
-    model_kind,
-    sensor_vector,
-    tables,
-)
-from taichi_mrf.factor_graph.workers import Workers, share_begin
+from taichi_mrf.factor_graph.potentials import BeamGraph, beam_graph
+from taichi_mrf.factor_graph.workers import Workers, workers_for
 from taichi_mrf.inference.first_occupied import NEVER, message, next_ahead, next_behind
-from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, I64Array, IVec3, Template, Vec5
+from taichi_mrf.kernels.bundles import Bundle, kernel
+from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, I64Array, Template
 
 FINE = 2.0**20
 """Beliefs are counted in integers of 1 / FINE: exact to 1e-6, and a million beams fit 64 bits."""
@@ -39,55 +35,70 @@ def to_fine(value: F32) -> ti.i64:
     return ti.cast(ti.round(value * FINE), ti.i64)
 
 
-@ti.kernel
+@dataclass(frozen=True)
+class _State(Bundle):
+    """Messages and beliefs: what occupied costs more than free."""
+
+    belief: I64Array
+    """(cells), in 1 / FINE."""
+
+    messages: F32Array
+    """(edges), from a beam to a cell."""
+
+    change: I64Array
+    """(cells): what messages have changed of beliefs that is not in them yet, in 1 / FINE."""
+
+    awake: I32Array
+    """(beams): 1 for a beam whose messages are out of date."""
+
+
+@kernel
 def send(
-    order: I32Array, begin: I32, end: I32,
-    begins: I32Array, cells: I32Array, hits: I32Array, model: F32Array2, shape: IVec3, sensor: Vec5,
-    belief: I64Array, messages: F32Array, change: I64Array, damping: F32, tolerance: F32, awake: I32Array,
-    scratch: F32Array2, longest: I32, workers: I32, spread: I32, kind: Template, soft: Template,
-):  # fmt: skip
+    order: I32Array, begin: I32, end: I32, graph: BeamGraph, state: _State, damping: F32, tolerance: F32,
+    scratch: F32Array2, workers: Workers, soft: Template,
+) -> None:  # fmt: skip
     """Renew the messages of beams ``order[begin:end]`` (eqs. 17 and 20), and add what they changed up.
 
-    A beam of which damping has held a message back by more than ``tolerance`` stays awake.
+    A beam of which damping has held a message back by more than ``tolerance`` stays awake. ``order`` is
+    (beams) or shorter; ``scratch`` (workers * longest, 2) holds the incoming messages and ``ahead``.
     """
-    for iteration in range(workers * spread):
-        if iteration % spread == 0:
-            worker = iteration // spread
-            trace = worker * longest
-            for i in range(
-                share_begin(worker, workers, begin, end), share_begin(worker + 1, workers, begin, end)
-            ):
-                beam = beam_of(order[i], begins, hits, model, kind)
+    for iteration in range(workers.number * workers.spread):
+        if iteration % workers.spread == 0:
+            worker = iteration // workers.spread
+            trace = worker * workers.longest
+            for i in range(workers.begin(worker, begin, end), workers.begin(worker + 1, begin, end)):
+                beam = graph.beam(order[i])
                 ahead = NEVER
                 held_back = 0.0
                 for step in range(beam.steps):
                     edge = beam.begin + step
-                    cell = cells[edge]
-                    incoming = ti.cast(belief[cell] - to_fine(messages[edge]), ti.f32) / FINE
+                    cell = graph.cells[edge]
+                    incoming = ti.cast(state.belief[cell] - to_fine(state.messages[edge]), ti.f32) / FINE
                     scratch[trace + step, 0] = incoming
                     scratch[trace + step, 1] = ahead
-                    here = energy_of_first(beam, step, cell, model, sensor, shape, kind)
+                    here = graph.energy_of_first(beam, step, cell)
                     ahead = next_ahead(ahead, here, incoming, soft)
-                behind = energy_of_none(beam, model, sensor, kind)
+                behind = graph.energy_of_none(beam)
                 for back in range(beam.steps):
                     step = beam.steps - 1 - back
                     edge = beam.begin + step
-                    cell = cells[edge]
-                    here = energy_of_first(beam, step, cell, model, sensor, shape, kind)
-                    old = messages[edge]
+                    cell = graph.cells[edge]
+                    here = graph.energy_of_first(beam, step, cell)
+                    old = state.messages[edge]
                     wanted = message(scratch[trace + step, 1], here, behind, soft)
                     new = old + (1.0 - damping) * (wanted - old)
                     held_back = ti.max(held_back, ti.abs(wanted - new))
                     moved = to_fine(new) - to_fine(old)
                     if moved != 0:
-                        ti.atomic_add(change[cell], moved)
-                        messages[edge] = new
+                        ti.atomic_add(state.change[cell], moved)
+                        state.messages[edge] = new
                     behind = next_behind(behind, here, scratch[trace + step, 0], soft)
-                awake[order[i]] = ti.cast(held_back > tolerance, ti.i32)
+                state.awake[order[i]] = ti.cast(held_back > tolerance, ti.i32)
 
 
 @ti.kernel
 def _apply(belief: I64Array, change: I64Array):
+    """Add the changes to the beliefs; both (cells), in 1 / FINE."""
     for cell in range(belief.shape[0]):
         if change[cell] != 0:
             belief[cell] += change[cell]
@@ -96,6 +107,7 @@ def _apply(belief: I64Array, change: I64Array):
 
 @ti.func
 def _clipped(belief: ti.i64, most: ti.i64) -> ti.i64:
+    """A belief as far as it matters."""
     return ti.max(-most, ti.min(most, belief))
 
 
@@ -103,7 +115,11 @@ def _clipped(belief: ti.i64, most: ti.i64) -> ti.i64:
 def _mark_changed(
     belief: I64Array, seen: I64Array, most: ti.i64, tolerance: ti.i64, changed: I32Array
 ) -> ti.i32:
-    """Mark the cells whose belief has moved by more than ``tolerance`` since it was last seen."""
+    """Mark the cells whose belief has moved by more than ``tolerance`` since it was last seen.
+
+    ``belief`` and ``seen`` are (cells) in 1 / FINE, ``changed`` (cells) receives the marks. Returns their
+    number.
+    """
     number = 0
     for cell in range(belief.shape[0]):
         now = _clipped(belief[cell], most)
@@ -117,7 +133,10 @@ def _mark_changed(
 
 @ti.kernel
 def _mark_awake(begins: I32Array, cells: I32Array, changed: I32Array, awake: I32Array):
-    """Mark also the beams that cross a marked cell."""
+    """Mark also the beams that cross a marked cell: ``awake`` (beams), from the marks ``changed`` (cells).
+
+    ``begins`` (beams + 1) and ``cells`` (edges) are those of the graph.
+    """
     for f in range(begins.shape[0] - 1):
         edge = begins[f]
         while awake[f] == 0 and edge < begins[f + 1]:
@@ -131,7 +150,8 @@ class BeliefPropagation:
     def __init__(self, graph: FactorGraph, config: LaserConfig) -> None:
         self.graph, self.config = graph, config
         self.soft = config.method == "bp"
-        self.workers = Workers(graph)
+        self.workers = workers_for(graph)
+        self.scratch = ti.ndarray(ti.f32, (self.workers.number * graph.longest, 2))
         self.messages = ti.ndarray(ti.f32, max(1, graph.edges))
         self.messages.fill(0.0)
         cells = graph.grid.cells
@@ -173,15 +193,14 @@ class BeliefPropagation:
         return (1.0 / (1.0 + np.exp(np.clip(self.belief / FINE, -700, 700)))).astype(np.float32)
 
     def _send(self, order: NDArray[np.int32], batches: int) -> None:
-        graph, workers = self.graph, self.workers
+        graph = self.graph
         if len(order) == 0:
             return
         size = -(-graph.beams // batches)
         for begin in range(0, len(order), size):
             send(
-                order, begin, min(begin + size, len(order)), *tables(graph),
-                sensor_vector(graph, self.config), self.belief, self.messages, self.change,
-                self.config.damping, self.config.tolerance, self.awake, workers.scratch, workers.longest,
-                workers.number, workers.spread, model_kind(graph, self.config), self.soft,
+                order, begin, min(begin + size, len(order)), beam_graph(graph, self.config),
+                _State(self.belief, self.messages, self.change, self.awake),
+                self.config.damping, self.config.tolerance, self.scratch, self.workers, self.soft,
             )  # fmt: skip
             _apply(self.belief, self.change)

@@ -14,6 +14,8 @@ the m-th part of each is the mean of m such steps, and a minimum of linear funct
 Everything is whole units, as in dual_decomposition.py, so the bound is exact.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
@@ -21,18 +23,11 @@ from numpy.typing import NDArray
 from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.dual_decomposition import units32
 from taichi_mrf.factor_graph.graph import FactorGraph
-from taichi_mrf.factor_graph.potentials import (
-    UNITS,
-    beam_of,
-    energy_of_first,
-    energy_of_none,
-    model_kind,
-    sensor_vector,
-    tables,
-)
-from taichi_mrf.factor_graph.workers import Workers, share_begin
+from taichi_mrf.factor_graph.potentials import UNITS, BeamGraph, beam_graph
+from taichi_mrf.factor_graph.workers import Workers, workers_for
 from taichi_mrf.inference.first_occupied import left_alone, message, next_ahead, next_behind
-from taichi_mrf.kernels.types import I32, F32Array2, I32Array, I64Array, IVec3, Template, Vec5
+from taichi_mrf.kernels.bundles import Bundle, kernel
+from taichi_mrf.kernels.types import I32Array, I64Array
 
 NEVER = 2**29
 """Stands for an infinite cost, in units; far above every energy, and its double still fits 32 bits."""
@@ -41,64 +36,79 @@ MOST_GIVEN = 4000 * int(UNITS)
 """A beam gives no more than this at once; less than all is as good, and multipliers stay within 32 bits."""
 
 
-@ti.kernel
-def _gather_and_give(
-    begins: I32Array, cells: I32Array, hits: I32Array, model: F32Array2, shape: IVec3, sensor: Vec5,
-    multipliers: I32Array, share: I32Array, contested: I32Array,
-    given: I64Array, marginal: I64Array, want_free: I32Array, want_occupied: I32Array, bound: I64Array,
-    scratch: I32Array, longest: I32, workers: I32, spread: I32, kind: Template,
-):  # fmt: skip
-    """One iteration over all beams.
+@dataclass(frozen=True)
+class _Found(Bundle):
+    """What an iteration finds out, summed up over all beams."""
 
-    ``share`` is what each beam takes of a cell's rest. ``given`` receives what they give back, ``marginal``
-    the sum of their min-marginals, the wants which labels they ask for, and ``bound`` the sum of the slaves'
-    minima after gathering.
+    given: I64Array
+    """(cells): what beams give back."""
+
+    marginal: I64Array
+    """(cells): the sum of their min-marginals."""
+
+    want_free: I32Array
+    """(cells): 1 where a beam asks for free."""
+
+    want_occupied: I32Array
+    """(cells): 1 where one asks for occupied."""
+
+    bound: I64Array
+    """(1): the sum of the slaves' minima after gathering."""
+
+
+@kernel
+def _gather_and_give(
+    graph: BeamGraph, multipliers: I32Array, share: I32Array, contested: I32Array, found: _Found,
+    scratch: I32Array, workers: Workers,
+) -> None:  # fmt: skip
+    """One iteration over all beams. All values are in units.
+
+    ``multipliers`` (edges) are changed; ``share`` (cells) is what each beam takes of a cell's rest;
+    ``contested`` (cells) is 1 where beams want different labels; ``scratch`` is (workers * longest).
     """
-    for iteration in range(workers * spread):
-        if iteration % spread == 0:
-            worker = iteration // spread
-            trace = worker * longest
-            beams = begins.shape[0] - 1
-            for f in range(
-                share_begin(worker, workers, 0, beams), share_begin(worker + 1, workers, 0, beams)
-            ):
-                beam = beam_of(f, begins, hits, model, kind)
+    for iteration in range(workers.number * workers.spread):
+        if iteration % workers.spread == 0:
+            worker = iteration // workers.spread
+            trace = worker * workers.longest
+            beams = graph.begins.shape[0] - 1
+            for f in range(workers.begin(worker, 0, beams), workers.begin(worker + 1, 0, beams)):
+                beam = graph.beam(f)
                 ahead = NEVER
                 open_cells = 0
                 alone = ti.cast(0, ti.i64)
                 for step in range(beam.steps):
                     edge = beam.begin + step
-                    cell = cells[edge]
+                    cell = graph.cells[edge]
                     t = multipliers[edge] + share[cell]
                     multipliers[edge] = t
                     open_cells += contested[cell]
                     scratch[trace + step] = ahead
-                    here = units32(energy_of_first(beam, step, cell, model, sensor, shape, kind))
+                    here = units32(graph.energy_of_first(beam, step, cell))
                     # Nothing behind a cell that is surely occupied depends on how sure it is.
                     ahead = ti.max(-NEVER, next_ahead(ahead, here, t, False))
                     alone += left_alone(t, False)
-                behind = units32(energy_of_none(beam, model, sensor, kind))
+                behind = units32(graph.energy_of_none(beam))
                 for back in range(beam.steps):
                     step = beam.steps - 1 - back
                     edge = beam.begin + step
-                    cell = cells[edge]
+                    cell = graph.cells[edge]
                     t = multipliers[edge]
-                    here = units32(energy_of_first(beam, step, cell, model, sensor, shape, kind))
+                    here = units32(graph.energy_of_first(beam, step, cell))
                     both = t + message(scratch[trace + step], here, behind, False)
                     if both < 0:
-                        want_occupied[cell] = 1
+                        found.want_occupied[cell] = 1
                     elif both > 0:
-                        want_free[cell] = 1
-                    ti.atomic_add(marginal[cell], ti.cast(both, ti.i64))
+                        found.want_free[cell] = 1
+                    ti.atomic_add(found.marginal[cell], ti.cast(both, ti.i64))
                     if contested[cell] == 1:
                         # Towards zero: a beam that gave a unit too much could lower the bound.
                         gift = ti.min(MOST_GIVEN, ti.abs(both)) // open_cells
                         if both < 0:
                             gift = -gift
                         multipliers[edge] = t - gift
-                        ti.atomic_add(given[cell], ti.cast(gift, ti.i64))
+                        ti.atomic_add(found.given[cell], ti.cast(gift, ti.i64))
                     behind = next_behind(behind, here, t, False)
-                ti.atomic_add(bound[0], behind + alone)
+                ti.atomic_add(found.bound[0], behind + alone)
 
 
 class BlockAscent:
@@ -106,7 +116,7 @@ class BlockAscent:
 
     def __init__(self, graph: FactorGraph, config: LaserConfig) -> None:
         self.graph, self.config = graph, config
-        self.workers = Workers(graph)
+        self.workers = workers_for(graph)
         self.scratch = ti.ndarray(ti.i32, self.workers.number * graph.longest)
         self.multipliers = ti.ndarray(ti.i32, max(1, graph.edges))
         self.multipliers.fill(0)
@@ -121,15 +131,15 @@ class BlockAscent:
 
     def iterate(self) -> float:
         """Gather, note the bound, give; returns the share of cells on which beams do not agree."""
-        graph, workers = self.graph, self.workers
+        graph = self.graph
         share = np.sign(self.rest) * np.minimum(np.abs(self.rest) // self.degrees, MOST_GIVEN)
         self.rest -= share * graph.degrees.to_numpy()
-        for found in (self.given, self.sums, self.bound, self.want_free, self.want_occupied):
-            found.fill(0)
+        found = _Found(self.given, self.sums, self.want_free, self.want_occupied, self.bound)
+        for array in (self.given, self.sums, self.bound, self.want_free, self.want_occupied):
+            array.fill(0)
         _gather_and_give(
-            *tables(graph), sensor_vector(graph, self.config), self.multipliers, share.astype(np.int32),
-            self.contested, self.given, self.sums, self.want_free, self.want_occupied, self.bound,
-            self.scratch, workers.longest, workers.number, workers.spread, model_kind(graph, self.config),
+            beam_graph(graph, self.config), self.multipliers, share.astype(np.int32), self.contested, found,
+            self.scratch, self.workers,
         )  # fmt: skip
         self.marginal = self.sums.to_numpy()
         self.dual = max(

@@ -5,35 +5,32 @@ labellings that a single flip improves. Cells are taken in the order of their nu
 """
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.flips import SPREAD, find_firsts, flip, flip_change
-from taichi_mrf.factor_graph.graph import FactorGraph
-from taichi_mrf.factor_graph.potentials import model_kind, sensor_vector, tables
-from taichi_mrf.kernels.types import I32, AnyArray, F32Array2, I32Array, IVec3, Template, Vec5
+from taichi_mrf.factor_graph.graph import CellLists, FactorGraph
+from taichi_mrf.factor_graph.potentials import BeamGraph, beam_graph
+from taichi_mrf.kernels.bundles import kernel
+from taichi_mrf.kernels.types import I32, I32Array
 
 
-@ti.kernel
+@kernel
 def _descend(
-    begins: I32Array, cells: I32Array, hits: I32Array, model: F32Array2, shape: IVec3, sensor: Vec5,
-    cell_begins: I32Array, cell_beams: I32Array, cell_steps: AnyArray,
-    labels: I32Array, firsts: I32Array, kind: Template, spread: I32,
-) -> ti.i32:  # fmt: skip
-    """One sweep over all cells, by one thread; returns how many were flipped."""
-    flips = 0
+    graph: BeamGraph, lists: CellLists, labels: I32Array, firsts: I32Array, flips: I32Array, spread: I32
+) -> None:
+    """One sweep over all cells, by one thread.
+
+    ``labels`` (cells) is 1 for occupied, ``firsts`` (beams) each beam's first occupied step. ``flips`` (1)
+    receives how many cells were flipped.
+    """
     for iteration in range(spread):
         if iteration == 0:
+            flips[0] = 0
             for cell in range(labels.shape[0]):
-                change = flip_change(
-                    cell, labels, 0, firsts, 0, begins, cells, hits, model, shape, sensor,
-                    cell_begins, cell_beams, cell_steps, kind,
-                )  # fmt: skip
-                if change < 0:
-                    flip(cell, labels, 0, firsts, 0, begins, cells, cell_begins, cell_beams, cell_steps)
-                    flips += 1
-    return flips
+                if flip_change(cell, labels, 0, firsts, 0, graph, lists) < 0:
+                    flip(cell, labels, 0, firsts, 0, graph, lists)
+                    flips[0] += 1
 
 
 def descended(
@@ -44,12 +41,9 @@ def descended(
     if graph.beams == 0:
         return labels
     find_firsts(graph.begins, graph.cells, state, firsts, 1, graph.grid.cells)
-    lists = graph.lists
+    beams, flips = beam_graph(graph, config), np.zeros(1, np.int32)
     for _ in range(sweeps):
-        flips = _descend(
-            *tables(graph), sensor_vector(graph, config), lists.begins, lists.beams, lists.steps, state,
-            firsts, model_kind(graph, config), SPREAD,
-        )  # fmt: skip
-        if flips == 0:
+        _descend(beams, graph.lists, state, firsts, flips, SPREAD)
+        if flips[0] == 0:
             break
     return state.astype(np.uint8)

@@ -26,19 +26,10 @@ from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.graph import FactorGraph
-from taichi_mrf.factor_graph.potentials import (
-    GAUSSIAN,
-    UNITS,
-    Beam,
-    beam_of,
-    energy_of_first,
-    energy_of_none,
-    model_kind,
-    sensor_vector,
-    tables,
-)
+from taichi_mrf.factor_graph.potentials import GAUSSIAN, UNITS, Beam, BeamGraph, beam_graph
 from taichi_mrf.inference.first_occupied import left_alone, next_behind
-from taichi_mrf.kernels.types import I32, F32Array2, I32Array, I64Array, IVec3, Template, Vec5
+from taichi_mrf.kernels.bundles import kernel
+from taichi_mrf.kernels.types import I32, I32Array, I64Array, Template
 
 
 @ti.func
@@ -48,29 +39,21 @@ def units32(value: ti.f32) -> I32:
 
 
 @ti.func
-def solve_slave(
-    beam: Beam,
-    cells: Template,
-    multipliers: Template,
-    model: Template,
-    sensor: Vec5,
-    shape: IVec3,
-    kind: Template,
-):
+def solve_slave(graph: Template, beam: Beam, multipliers: Template):
     """(value, step of the first occupied cell) of a beam's least energy with its multipliers, in units.
 
     Behind its first occupied cell, whatever has a negative multiplier is occupied.
     """
-    behind = units32(energy_of_none(beam, model, sensor, kind))
+    behind = units32(graph.energy_of_none(beam))
     alone = ti.cast(0, ti.i64)
     first: ti.i32 = beam.steps
     for back in range(beam.steps):
         step = beam.steps - 1 - back
         t = multipliers[beam.begin + step]
         cell = 0
-        if ti.static(kind == GAUSSIAN):
-            cell = cells[beam.begin + step]
-        here = units32(energy_of_first(beam, step, cell, model, sensor, shape, kind))
+        if ti.static(graph.kind == GAUSSIAN):
+            cell = graph.cells[beam.begin + step]
+        here = units32(graph.energy_of_first(beam, step, cell))
         if here + ti.max(0, t) < behind + ti.max(0, -t):
             first = step
         behind = next_behind(behind, here, t, False)
@@ -78,24 +61,28 @@ def solve_slave(
     return behind + alone, first
 
 
-@ti.kernel
+@kernel
 def _solve_slaves(
-    begins: I32Array, cells: I32Array, hits: I32Array, model: F32Array2, shape: IVec3, sensor: Vec5,
-    multipliers: I32Array, awake: I32Array, firsts: I32Array, values: I64Array, ones: I32Array,
-    sums: I64Array, kind: Template,
-):  # fmt: skip
-    """Eq. 23 for every beam whose multipliers have changed; count each cell's ones, and sum the values."""
-    for f in range(begins.shape[0] - 1):
+    graph: BeamGraph, multipliers: I32Array, awake: I32Array, firsts: I32Array, values: I64Array,
+    ones: I32Array, sums: I64Array,
+) -> None:  # fmt: skip
+    """Eq. 23 for every beam whose multipliers have changed; count each cell's ones, and sum the values.
+
+    ``multipliers`` (edges) and ``values`` (beams), the slaves' minima, are in units; ``awake`` (beams) is 1
+    for a beam to be solved; ``firsts`` (beams) receives the first occupied step, ``ones`` (cells) how many
+    slaves say occupied, ``sums[0]`` the change of the sum of values.
+    """
+    for f in range(graph.begins.shape[0] - 1):
         if awake[f] == 1:
-            beam = beam_of(f, begins, hits, model, kind)
-            value, first = solve_slave(beam, cells, multipliers, model, sensor, shape, kind)
+            beam = graph.beam(f)
+            value, first = solve_slave(graph, beam, multipliers)
             ti.atomic_add(sums[0], value - values[f])
             values[f] = value
             firsts[f] = first
-        first_edge = begins[f] + firsts[f]
-        for edge in range(first_edge, begins[f + 1]):
+        first_edge = graph.begins[f] + firsts[f]
+        for edge in range(first_edge, graph.begins[f + 1]):
             if edge == first_edge or multipliers[edge] < 0:
-                ti.atomic_add(ones[cells[edge]], 1)
+                ti.atomic_add(ones[graph.cells[edge]], 1)
 
 
 @ti.kernel
@@ -103,11 +90,12 @@ def _choose_steps(
     ones: I32Array, degrees: I32Array, rest: I64Array, charged: I64Array, step: ti.f32,
     if_free: I32Array, if_occupied: I32Array, sums: I64Array, whole: Template,
 ):  # fmt: skip
-    """What each cell's multipliers grow by where a slave says free, and where it says occupied.
+    """What each cell's multipliers grow by where a slave says free (``if_free``), and where it says occupied
+    (``if_occupied``). All arrays are (cells), but ``sums`` (3); values are in units.
 
-    ``rest`` is minus the sum of a cell's multipliers; ``charged`` what slaves were charged for occupied less
-    what they were for free (eq. 24). sums[1] is the value of the rest's own slaves, sums[2] counts
-    disagreeing cells.
+    ``ones`` of a cell's ``degrees`` slaves say occupied. ``rest`` is minus the sum of a cell's multipliers;
+    ``charged`` what slaves were charged for occupied less what they were for free (eq. 24). sums[1] is the
+    value of the rest's own slaves, sums[2] counts disagreeing cells.
     """
     for cell in range(ones.shape[0]):
         yes, all_of_them = ones[cell], degrees[cell]
@@ -133,7 +121,11 @@ def _change_multipliers(
     begins: I32Array, cells: I32Array, firsts: I32Array, if_free: I32Array, if_occupied: I32Array,
     multipliers: I32Array, awake: I32Array,
 ):  # fmt: skip
-    """Take the step in every cell on which slaves disagree, and mark the beams that it concerns."""
+    """Take the step in every cell on which slaves disagree, and mark the beams that it concerns.
+
+    Arrays as in :func:`_solve_slaves` and :func:`_choose_steps`; ``begins`` (beams + 1) and ``cells`` (edges)
+    are those of the graph.
+    """
     for f in range(begins.shape[0] - 1):
         first_edge = begins[f] + firsts[f]
         concerned = 0
@@ -168,8 +160,8 @@ class DualDecomposition:
         graph, sums = self.graph, np.zeros(3, np.int64)
         self.ones.fill(0)
         _solve_slaves(
-            *tables(graph), sensor_vector(graph, self.config), self.multipliers, self.awake, self.firsts,
-            self.values, self.ones, sums, model_kind(graph, self.config),
+            beam_graph(graph, self.config), self.multipliers, self.awake, self.firsts, self.values, self.ones,
+            sums,
         )  # fmt: skip
         step = self.config.step / (self.iteration + 1)
         _choose_steps(

@@ -8,8 +8,8 @@ along the beam. Several labellings may be kept at once, one behind the other: a 
 
 import taichi as ti
 
-from taichi_mrf.factor_graph.potentials import beam_of, energy_of, to_units
-from taichi_mrf.kernels.types import I32, I32Array, IVec3, Template, Vec5
+from taichi_mrf.factor_graph.potentials import to_units
+from taichi_mrf.kernels.types import I32, I32Array, Template
 
 SPREAD = 512
 """Taichi gives a CPU thread no fewer iterations of a loop at a time: one long task stands for that many."""
@@ -19,7 +19,11 @@ SPREAD = 512
 def find_firsts(
     begins: I32Array, cells: I32Array, labels: I32Array, firsts: I32Array, chains: I32, size: I32
 ):
-    """Each beam's first occupied step, for each chain."""
+    """Each beam's first occupied step, for each chain.
+
+    ``begins`` (beams + 1) and ``cells`` (edges) are those of the graph, ``labels`` (chains * size) 1 for
+    occupied; ``firsts`` (chains * beams) receives the steps.
+    """
     beams = begins.shape[0] - 1
     for i in range(chains * beams):
         chain, f = i // beams, i % beams
@@ -49,39 +53,39 @@ def after_flip(
 
 @ti.func
 def flip_change(
-    cell: I32, labels: Template, base: I32, firsts: Template, beam_base: I32,
-    begins: Template, cells: Template, hits: Template, model: Template, shape: IVec3, sensor: Vec5,
-    cell_begins: Template, cell_beams: Template, cell_steps: Template, kind: Template,
-):  # fmt: skip
-    """What flipping ``cell`` adds to the energy, in units: a sum of integers, so the list's order is free."""
+    cell: I32, labels: Template, base: I32, firsts: Template, beam_base: I32, graph: Template, lists: Template
+):
+    """What flipping ``cell`` adds to the energy, in units: a sum of integers, so the list's order is free.
+
+    ``graph`` is a BeamGraph, ``lists`` are its CellLists.
+    """
     occupied = labels[base + cell]
     change = ti.cast(0, ti.i64)
-    for i in range(cell_begins[cell], cell_begins[cell + 1]):
-        f = cell_beams[i]
-        step = ti.cast(cell_steps[i], ti.i32)
+    for i in range(lists.begins[cell], lists.begins[cell + 1]):
+        f = lists.beams[i]
+        step = ti.cast(lists.steps[i], ti.i32)
         first = firsts[beam_base + f]
         if step <= first:
-            beam = beam_of(f, begins, hits, model, kind)
-            new = after_flip(first, step, occupied, beam.begin, beam.steps, cells, labels, base)
-            change += to_units(energy_of(beam, new, cells, model, sensor, shape, kind))
-            change -= to_units(energy_of(beam, first, cells, model, sensor, shape, kind))
+            beam = graph.beam(f)
+            new = after_flip(first, step, occupied, beam.begin, beam.steps, graph.cells, labels, base)
+            change += to_units(graph.energy_of(beam, new))
+            change -= to_units(graph.energy_of(beam, first))
     return change
 
 
 @ti.func
 def flip(
-    cell: I32, labels: Template, base: I32, firsts: Template, beam_base: I32,
-    begins: Template, cells: Template,
-    cell_begins: Template, cell_beams: Template, cell_steps: Template,
-):  # fmt: skip
+    cell: I32, labels: Template, base: I32, firsts: Template, beam_base: I32, graph: Template, lists: Template
+):
     """Flip ``cell``, and renew the first occupied steps of its beams."""
     occupied = labels[base + cell]
-    for i in range(cell_begins[cell], cell_begins[cell + 1]):
-        f = cell_beams[i]
-        step = ti.cast(cell_steps[i], ti.i32)
+    for i in range(lists.begins[cell], lists.begins[cell + 1]):
+        f = lists.beams[i]
+        step = ti.cast(lists.steps[i], ti.i32)
         first = firsts[beam_base + f]
         if step <= first:
+            begin, end = graph.begins[f], graph.begins[f + 1]
             firsts[beam_base + f] = after_flip(
-                first, step, occupied, begins[f], begins[f + 1] - begins[f], cells, labels, base
+                first, step, occupied, begin, end - begin, graph.cells, labels, base
             )
     labels[base + cell] = 1 - occupied

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.factor_graph.beams import Beams, BrickCells, Grid
 from taichi_mrf.factor_graph.kernels import count_cells, count_degrees, write_beams_of_cells, write_cells
+from taichi_mrf.kernels.bundles import Bundle
+from taichi_mrf.kernels.types import AnyArray, I32Array
 from taichi_mrf.system.memory import available_bytes
 
 EDGE_BYTES = 4 + 6 + 4
@@ -32,17 +34,17 @@ MOST_EDGES = 2**31 - 1
 
 
 @dataclass(frozen=True)
-class CellLists:
+class CellLists(Bundle):
     """For each cell the beams that cross it: those of cell i are ``begins[i]`` to ``begins[i + 1]``."""
 
-    begins: ti.Ndarray
-    """(cells + 1,) int32."""
+    begins: I32Array
+    """(cells + 1)."""
 
-    beams: ti.Ndarray
-    """(edges,) int32."""
+    beams: I32Array
+    """(edges)."""
 
-    steps: ti.Ndarray
-    """(edges,) int16: the place of the cell among the beam's cells."""
+    steps: AnyArray
+    """(edges) int16: the place of the cell among the beam's cells."""
 
 
 @dataclass(frozen=True)

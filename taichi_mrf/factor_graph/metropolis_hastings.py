@@ -5,8 +5,11 @@ cross the cell are looked at (eq. 16; flips.py).
 
 Parallel are independent chains, each of which is the sequential algorithm as it stands: detailed balance
 holds for every one of them, and their marginals may be averaged. Cells are drawn with fixed weights, which
-do not depend on the labels, so the heat map's proposals are as symmetric as eq. 15's.
+do not depend on the labels, so the heat map's proposals are as symmetric as eq. 15's. Random numbers depend
+on a seed, a stream and a counter alone, whichever thread asks for them.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
@@ -14,65 +17,121 @@ from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.flips import SPREAD, find_firsts, flip, flip_change
-from taichi_mrf.factor_graph.graph import FactorGraph
+from taichi_mrf.factor_graph.graph import CellLists, FactorGraph
 from taichi_mrf.factor_graph.inverse import ends_of_beams, inverse_model
-from taichi_mrf.factor_graph.potentials import (
-    UNITS,
-    model_kind,
-    sensor_vector,
-    tables,
-)
-from taichi_mrf.factor_graph.random_numbers import random_bits, uniform
-from taichi_mrf.kernels.types import I32, AnyArray, F32Array2, I32Array, I64Array, IVec3, Template, Vec5
+from taichi_mrf.factor_graph.potentials import UNITS, BeamGraph, beam_graph
+from taichi_mrf.kernels.bundles import Bundle, kernel
+from taichi_mrf.kernels.types import F32, I32, I32Array, I64Array, Template
 
 PROPOSAL, ACCEPTANCE = 0, 1
 """What a random number is for."""
 
 
-@ti.kernel
-def _run(
-    begins: I32Array, cells: I32Array, hits: I32Array, model: F32Array2, shape: IVec3, sensor: Vec5,
-    cell_begins: I32Array, cell_beams: I32Array, cell_steps: AnyArray,
-    warm: I32Array, heated: I32, bias: I32, base_bias: I32, seed: I32, chains: I32, size: I32,
-    counter: ti.i64, proposals: I32,
-    labels: I32Array, firsts: I32Array, occupied_since: I64Array, occupied_for: I64Array, energies: I64Array,
-    kind: Template, spread: I32,
-):  # fmt: skip
-    """Alg. 1: make ``proposals`` in every chain, from number ``counter`` on.
+@ti.func
+def mixed(x: ti.u32) -> ti.u32:
+    """A permutation of 32 bits in which each bit of ``x`` sways every other (xorshift and multiply)."""
+    x ^= x >> 16
+    x *= ti.u32(0x7FEB352D)
+    x ^= x >> 15
+    x *= ti.u32(0x846CA68B)
+    x ^= x >> 16
+    return x
 
-    ``warm`` lists the cells that may be drawn, the ``heated`` first ones with weight ``bias`` against
-    ``base_bias``. A chain's labels and times are ``size`` apart, its energy is kept in units.
-    """
-    beams = begins.shape[0] - 1
-    for iteration in range(chains * spread):
+
+@ti.func
+def random_bits(seed: Template, stream: Template, counter: ti.i64, purpose: Template) -> ti.u32:
+    """32 random bits: number ``counter`` of a stream, for one of several purposes."""
+    low, high = ti.cast(counter, ti.u32), ti.cast(counter >> 32, ti.u32)
+    key = mixed(mixed(ti.cast(seed, ti.u32)) + ti.cast(stream, ti.u32))
+    return mixed(mixed(mixed(key + low) + high) + ti.cast(purpose, ti.u32))
+
+
+@ti.func
+def uniform(bits: ti.u32) -> F32:
+    """24 of the bits as a number above 0, up to 1: its logarithm is finite."""
+    return (ti.cast(bits >> 8, ti.f32) + 1.0) * ti.static(2.0**-24)
+
+
+@dataclass(frozen=True)
+class _Proposals(Bundle):
+    """How cells are drawn."""
+
+    warm: I32Array
+    """(n): the cells that may be drawn, the heated ones first."""
+
+    heated: I32
+    """How many are heated."""
+
+    bias: I32
+    """The weight of a heated cell."""
+
+    base_bias: I32
+    """The weight of another."""
+
+    seed: I32
+
+    counter: ti.i64
+    """The number of the first proposal."""
+
+    number: I32
+    """How many are made."""
+
+
+@dataclass(frozen=True)
+class _Chains(Bundle):
+    """The states of all chains, one behind the other."""
+
+    number: I32
+
+    size: I32
+    """Cells."""
+
+    labels: I32Array
+    """(chains * cells): 1 for occupied."""
+
+    firsts: I32Array
+    """(chains * beams): each beam's first occupied step."""
+
+    occupied_since: I64Array
+    """(chains * cells): the proposal that a cell was last occupied by."""
+
+    occupied_for: I64Array
+    """(chains * cells): proposals for which it was occupied before."""
+
+    energies: I64Array
+    """(chains): what the energy has changed by, in units."""
+
+
+@kernel
+def _run(graph: BeamGraph, lists: CellLists, proposals: _Proposals, chains: _Chains, spread: I32) -> None:
+    """Alg. 1: make proposals in every chain. A chain stands for ``spread`` iterations of the parallel
+    loop."""
+    beams = graph.begins.shape[0] - 1
+    for iteration in range(chains.number * spread):
         if iteration % spread == 0:
             chain = iteration // spread
-            base = chain * size
-            heated_weight = heated * bias
-            weights = heated_weight + (warm.shape[0] - heated) * base_bias
-            for turn in range(proposals):
-                now = counter + turn
-                drawn = ti.cast(random_bits(seed, chain, now, PROPOSAL) % ti.cast(weights, ti.u32), ti.i32)
-                place = drawn // bias
+            base = chain * chains.size
+            heated_weight = proposals.heated * proposals.bias
+            others = proposals.warm.shape[0] - proposals.heated
+            weights = ti.cast(heated_weight + others * proposals.base_bias, ti.u32)
+            for turn in range(proposals.number):
+                now = proposals.counter + turn
+                drawn = ti.cast(random_bits(proposals.seed, chain, now, PROPOSAL) % weights, ti.i32)
+                place = drawn // proposals.bias
                 if drawn >= heated_weight:
-                    place = heated + (drawn - heated_weight) // base_bias
-                cell = warm[place]
-                occupied = labels[base + cell]
-                change = flip_change(
-                    cell, labels, base, firsts, chain * beams, begins, cells, hits, model, shape, sensor,
-                    cell_begins, cell_beams, cell_steps, kind,
-                )  # fmt: skip
-                chance = ti.log(uniform(random_bits(seed, chain, now, ACCEPTANCE)))
+                    place = proposals.heated + (drawn - heated_weight) // proposals.base_bias
+                cell = proposals.warm[place]
+                occupied = chains.labels[base + cell]
+                change = flip_change(cell, chains.labels, base, chains.firsts, chain * beams, graph, lists)
+                chance = ti.log(uniform(random_bits(proposals.seed, chain, now, ACCEPTANCE)))
                 if change <= 0 or chance < -ti.cast(change, ti.f32) / UNITS:
-                    flip(
-                        cell, labels, base, firsts, chain * beams, begins, cells,
-                        cell_begins, cell_beams, cell_steps,
-                    )  # fmt: skip
-                    energies[chain] += change
+                    flip(cell, chains.labels, base, chains.firsts, chain * beams, graph, lists)
+                    chains.energies[chain] += change
+                    i = base + cell
                     if occupied == 1:
-                        occupied_for[base + cell] += now + 1 - occupied_since[base + cell]
+                        chains.occupied_for[i] += now + 1 - chains.occupied_since[i]
                     else:
-                        occupied_since[base + cell] = now + 1
+                        chains.occupied_since[i] = now + 1
 
 
 class MetropolisHastings:
@@ -108,12 +167,14 @@ class MetropolisHastings:
             return 0.0
         before = self.state.copy()
         bias = max(1, round(1000 * config.heat_bias))
-        lists = graph.lists
         _run(
-            *tables(graph), sensor_vector(graph, config), lists.begins, lists.beams, lists.steps,
-            self.warm, self.heated, bias, 1000, config.seed, config.chains, graph.grid.cells,
-            self.counter, proposals, self.state, self.firsts, self.occupied_since, self.occupied_for,
-            self.changes, model_kind(graph, config), SPREAD,
+            beam_graph(graph, config), graph.lists,
+            _Proposals(self.warm, self.heated, bias, 1000, config.seed, self.counter, proposals),
+            _Chains(
+                config.chains, graph.grid.cells, self.state, self.firsts, self.occupied_since,
+                self.occupied_for, self.changes,
+            ),
+            SPREAD,
         )  # fmt: skip
         self.counter += proposals
         return float((before != self.state).sum()) / (proposals * config.chains)

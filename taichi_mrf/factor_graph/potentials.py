@@ -14,6 +14,7 @@ one pass there and one back (inference/first_occupied.py).
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.graph import FactorGraph
+from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import (
     F32,
     I32,
@@ -76,43 +78,102 @@ def model_kind(graph: FactorGraph, config: LaserConfig) -> int:
     return GAUSSIAN if config.sensor == "gaussian" else PIECEWISE
 
 
-@ti.func
-def beam_of(f: I32, begins: Template, hits: Template, model: Template, kind: Template) -> Beam:
-    """Factor f; its geometry is only read for the Gaussian model."""
-    origin, direction, reach = Vec3(0.0), Vec3(0.0), 0.0
-    if ti.static(kind == GAUSSIAN):
-        origin = Vec3(model[f, 0], model[f, 1], model[f, 2])
-        direction = Vec3(model[f, 3], model[f, 4], model[f, 5])
-        reach = model[f, 6]
-    return Beam(f, begins[f], begins[f + 1] - begins[f], hits[f], origin, direction, reach)
+@dataclass(frozen=True)
+class BeamGraph(Bundle):
+    """A factor graph as kernels over beams read it, with the sensor model of its factors."""
+
+    begins: I32Array
+    """(beams + 1): the edges of beam f are ``begins[f]`` to ``begins[f + 1] - 1``."""
+
+    cells: I32Array
+    """(edges): the cell of each edge."""
+
+    hits: I32Array
+    """(beams): 1 where something returned."""
+
+    model: F32Array2
+    """(beams, 7): each beam's origin, direction and range in cell sizes; or (edges + beams, 1): its energies
+    (FactorGraph.model)."""
+
+    shape: IVec3
+    """The grid's size in cells."""
+
+    sensor: Vec5
+    """The sensor model's numbers (sensor_vector)."""
+
+    kind: Template
+    """PIECEWISE, GAUSSIAN or TABLE."""
+
+    @ti.func
+    def beam(self, f: I32):
+        """Factor f; its geometry is only read for the Gaussian model."""
+        origin, direction, reach = Vec3(0.0), Vec3(0.0), 0.0
+        if ti.static(self.kind == GAUSSIAN):
+            origin = Vec3(self.model[f, 0], self.model[f, 1], self.model[f, 2])
+            direction = Vec3(self.model[f, 3], self.model[f, 4], self.model[f, 5])
+            reach = self.model[f, 6]
+        begin = self.begins[f]
+        return Beam(f, begin, self.begins[f + 1] - begin, self.hits[f], origin, direction, reach)
+
+    @ti.func
+    def energy_of_first(self, beam: Beam, step: I32, cell: I32):
+        """Energy of a beam whose first occupied cell is its ``step``-th, which has the number ``cell``."""
+        energy = self.sensor[WRONG]
+        if ti.static(self.kind == TABLE):
+            energy = self.model[beam.begin + beam.number + step, 0]
+        elif beam.hit == 1:
+            if ti.static(self.kind == GAUSSIAN):
+                rows, layers = self.shape[1], self.shape[2]
+                layer, row, column = cell % layers, cell // layers % rows, cell // layers // rows
+                centre = Vec3(column + 0.5, row + 0.5, layer + 0.5)
+                deviation = (centre - beam.origin).dot(beam.direction) - beam.reach
+                energy = ti.min(energy, self.sensor[OFFSET] + self.sensor[PRECISION] * deviation * deviation)
+            elif step == beam.steps - 1:
+                energy = self.sensor[EXPLAINED]
+        return energy
+
+    @ti.func
+    def energy_of_none(self, beam: Beam):
+        """Energy of a beam whose cells are all free."""
+        energy = self.sensor[FREE] if beam.hit == 1 else self.sensor[EXPLAINED]
+        if ti.static(self.kind == TABLE):
+            energy = self.model[beam.begin + beam.number + beam.steps, 0]
+        return energy
+
+    @ti.func
+    def energy_of(self, beam: Beam, first: I32):
+        """Energy of a beam whose first occupied cell is step ``first``, or of all free at the number of
+        steps."""
+        energy = self.energy_of_none(beam)
+        if first < beam.steps:
+            energy = self.energy_of_first(beam, first, self.cells[beam.begin + first])
+        return energy
+
+    @ti.func
+    def first_occupied(self, beam: Beam, labels: Template):
+        """The step of the first occupied cell, or the number of steps where all are free."""
+        step = 0
+        while step < beam.steps and labels[self.cells[beam.begin + step]] == 0:
+            step += 1
+        return step
+
+    @ti.func
+    def is_explained(self, beam: Beam, first: I32, energy: F32):
+        """Whether ``first`` is what the beam's measurement asks for."""
+        explained = ti.cast(first == beam.steps - beam.hit, ti.i32)
+        if ti.static(self.kind == TABLE):
+            least = energy
+            for other in range(beam.steps + 1):
+                least = ti.min(least, self.energy_of(beam, other))
+            explained = ti.cast(energy <= least + NEARLY_BEST, ti.i32)
+        return explained
 
 
-@ti.func
-def energy_of_first(
-    beam: Beam, step: I32, cell: I32, model: Template, sensor: Vec5, shape: IVec3, kind: Template
-) -> F32:
-    """Energy of a beam whose first occupied cell is its ``step``-th, which has the number ``cell``."""
-    energy = sensor[WRONG]
-    if ti.static(kind == TABLE):
-        energy = model[beam.begin + beam.number + step, 0]
-    elif beam.hit == 1:
-        if ti.static(kind == GAUSSIAN):
-            layer, row, column = cell % shape[2], cell // shape[2] % shape[1], cell // shape[2] // shape[1]
-            centre = Vec3(column + 0.5, row + 0.5, layer + 0.5)
-            deviation = (centre - beam.origin).dot(beam.direction) - beam.reach
-            energy = ti.min(energy, sensor[OFFSET] + sensor[PRECISION] * deviation * deviation)
-        elif step == beam.steps - 1:
-            energy = sensor[EXPLAINED]
-    return energy
-
-
-@ti.func
-def energy_of_none(beam: Beam, model: Template, sensor: Vec5, kind: Template) -> F32:
-    """Energy of a beam whose cells are all free."""
-    energy = sensor[FREE] if beam.hit == 1 else sensor[EXPLAINED]
-    if ti.static(kind == TABLE):
-        energy = model[beam.begin + beam.number + beam.steps, 0]
-    return energy
+def beam_graph(graph: FactorGraph, config: LaserConfig) -> BeamGraph:
+    """A graph as kernels take it."""
+    shape = ti.Vector(graph.grid.shape, ti.i32)
+    sensor, kind = sensor_vector(graph, config), model_kind(graph, config)
+    return BeamGraph(graph.begins, graph.cells, graph.hits, graph.model, shape, sensor, kind)
 
 
 @ti.func
@@ -121,53 +182,19 @@ def to_units(value: F32) -> ti.i64:
     return ti.cast(ti.round(value * UNITS), ti.i64)
 
 
-@ti.func
-def first_occupied(beam: Beam, cells: Template, labels: Template) -> I32:
-    """The step of the first occupied cell, or the number of steps where all are free."""
-    step = 0
-    while step < beam.steps and labels[cells[beam.begin + step]] == 0:
-        step += 1
-    return step
+@kernel
+def _judge(graph: BeamGraph, labels: I32Array, sums: I64Array) -> None:
+    """Add up the energies of all beams, in units, in ``sums[0]``, and count the explained ones in
+    ``sums[1]``.
 
-
-@ti.func
-def energy_of(
-    beam: Beam, first: I32, cells: Template, model: Template, sensor: Vec5, shape: IVec3, kind: Template
-) -> F32:
-    """Energy of a beam whose first occupied cell is step ``first``, or of all free at the number of steps."""
-    energy = energy_of_none(beam, model, sensor, kind)
-    if first < beam.steps:
-        energy = energy_of_first(beam, first, cells[beam.begin + first], model, sensor, shape, kind)
-    return energy
-
-
-@ti.func
-def is_explained(
-    beam: Beam, first: I32, energy: F32, cells: Template, model: Template, sensor: Vec5, shape: IVec3,
-    kind: Template,
-) -> I32:  # fmt: skip
-    """Whether ``first`` is what the beam's measurement asks for."""
-    explained = ti.cast(first == beam.steps - beam.hit, ti.i32)
-    if ti.static(kind == TABLE):
-        least = energy
-        for other in range(beam.steps + 1):
-            least = ti.min(least, energy_of(beam, other, cells, model, sensor, shape, kind))
-        explained = ti.cast(energy <= least + NEARLY_BEST, ti.i32)
-    return explained
-
-
-@ti.kernel
-def _judge(
-    begins: I32Array, cells: I32Array, hits: I32Array, model: F32Array2, shape: IVec3, sensor: Vec5,
-    labels: I32Array, sums: I64Array, kind: Template,
-):  # fmt: skip
-    """Add up the energies of all beams, in units, and count the explained ones."""
-    for f in range(begins.shape[0] - 1):
-        beam = beam_of(f, begins, hits, model, kind)
-        first = first_occupied(beam, cells, labels)
-        energy = energy_of(beam, first, cells, model, sensor, shape, kind)
+    ``labels`` (cells) is 1 for occupied.
+    """
+    for f in range(graph.begins.shape[0] - 1):
+        beam = graph.beam(f)
+        first = graph.first_occupied(beam, labels)
+        energy = graph.energy_of(beam, first)
         ti.atomic_add(sums[0], to_units(energy))
-        if is_explained(beam, first, energy, cells, model, sensor, shape, kind):
+        if graph.is_explained(beam, first, energy):
             ti.atomic_add(sums[1], ti.cast(1, ti.i64))
 
 
@@ -179,19 +206,10 @@ def judged(graph: FactorGraph, config: LaserConfig, labels: NDArray[np.uint8]) -
     """
     sums = np.zeros(2, np.int64)
     if graph.beams:
-        _judge(
-            *tables(graph), sensor_vector(graph, config), np.ascontiguousarray(labels, np.int32), sums,
-            model_kind(graph, config),
-        )  # fmt: skip
+        _judge(beam_graph(graph, config), np.ascontiguousarray(labels, np.int32), sums)
     return float(sums[0]) / UNITS, float(sums[1]) / max(1, graph.beams)
 
 
 def energy(graph: FactorGraph, config: LaserConfig, labels: NDArray[np.uint8]) -> float:
     """The energy of a labelling, (cells,), 1 for occupied: the one judge of all methods."""
     return judged(graph, config, labels)[0]
-
-
-def tables(graph: FactorGraph) -> "tuple[ti.Ndarray, ti.Ndarray, ti.Ndarray, ti.Ndarray, ti.Vector]":
-    """What kernels over beams read: where each one's cells begin, cells, hits, geometry or table, and the
-    grid's shape."""
-    return graph.begins, graph.cells, graph.hits, graph.model, ti.Vector(graph.grid.shape, ti.i32)
