@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 
 ROOM = "synthetic:room?frames=6&width=96&height=72"
 COARSE = ("--voxel-size", "0.08", "--runtime.arch", "cpu")
-FILES = {"map.npz", "voxels.ply", "config.yaml"}
+FILES = {"map.npz", "voxels.ply", "config.yaml", "report.json"}
+PICTURES = {"top_view.png", "depth.png", "perspective.png"}
+"""What a run that ends by itself leaves in addition."""
+
 NO_SERVER = ("WebSocket connection to", "Failed to open WebSocket")
 """Beginnings of what a browser reports while there is no server, as it must."""
 
@@ -42,7 +45,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with LiveProgram(ROOM, *COARSE, "--out", out, "--exit-when-done") as program:
         assert program.wait() == 0
         program.wait_until_nothing_is_left()
-    assert {path.name for path in out.iterdir()} == FILES
+    assert {path.name for path in out.iterdir()} == FILES | PICTURES
     return out / "map.npz"
 
 
