@@ -90,8 +90,8 @@ class BrickMap(Owned):
         shown: VolumeConfig,
         occlusion: Occlusion,
     ) -> None:
-        """Allocate the grid. ``seen_free_log_odds`` is what a place holds that was seen but has no brick;
-        ``shown`` and ``occlusion`` are the View's."""
+        """Set the configuration and the noise, and make the empty grid. ``seen_free_log_odds`` are the log-
+        odds of a place that rays cross but that has no brick; ``shown`` and ``occlusion`` are the View's."""
         if noise is not None:
             instance(noise, NoiseModel, "noise", "a noise model such as PolynomialNoise")
         runtime.init()
@@ -109,6 +109,8 @@ class BrickMap(Owned):
     @classmethod
     def from_config(cls: type[MapT], config: Config, camera: PinholeCamera) -> MapT:
         """A map with a configuration's parameters; ``camera`` is what its noise tables must fit."""
+        instance(config, Config, "config", "a Config")
+        check_camera(camera)
         return cls.with_noise(config, noise_from_config(config.sensor, camera))
 
     @classmethod

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf.config.arguments import real
 from taichi_mrf.config.files import parse_yaml
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.values import from_dict
@@ -44,7 +45,7 @@ class ChunkedMap:
 
     def __init__(self, store: ChunkStore, cache_mb: float = 256.0) -> None:
         """Raises ConfigError for a cache smaller than one chunk."""
-        if not cache_mb * 1e6 >= CHUNK_BYTES:
+        if not real(cache_mb, "cache_mb") * 1e6 >= CHUNK_BYTES:
             raise ConfigError(f"cache_mb must be at least {CHUNK_BYTES / 1e6:.3g}, not {cache_mb}")
         self.store, self.header = store, store.header
         self.voxel_size = store.header.voxel_size

@@ -53,6 +53,14 @@ def test_a_constructor_names_what_is_wrong(
     assert isinstance(caught.value, TaichiMRFError)
 
 
+@pytest.mark.parametrize("kind", MAPS)
+def test_a_map_is_made_from_a_configuration_and_a_camera(one_backend: str, kind: type) -> None:
+    with pytest.raises(TypeError, match="config must be a Config, not None"):
+        kind.from_config(None, CAMERA)
+    with pytest.raises(TypeError, match="camera must be a PinholeCamera, not None"):
+        kind.from_config(tm.Config(), None)
+
+
 def test_a_parameter_of_the_wrong_type_is_named(one_backend: str) -> None:
     with pytest.raises(TypeError, match="MRFMap: surface_density must be a number, not '2'"):
         tm.MRFMap(surface_density="2")
