@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import (
     Config,
     EvaluationConfig,
@@ -26,20 +27,16 @@ from taichi_mrf.config.schema import (
 )
 from taichi_mrf.config.text import commented_yaml, differences, field_help
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.methods.log_odds.plug import LogOddsConfig
-from taichi_mrf.methods.visibility.plug import VisibilityConfig
 
 SECTIONS = (
     Config,
     SensorConfig,
-    InferenceConfig,
-    LogOddsConfig,
-    VisibilityConfig,
     KeyframeConfig,
     PoseConfig,
     VolumeConfig,
     EvaluationConfig,
     RuntimeConfig,
+    *(method.section_class for method in METHODS.values()),
 )
 Depths = NDArray[np.float64]
 DEPTHS = np.linspace(0.4, 5.0, 50)
