@@ -17,8 +17,10 @@ SOURCES = ("taichi_mrf", "configs", "pyproject.toml", "setup.py", "MANIFEST.in",
 
 
 @pytest.fixture(scope="module")
-def wheel(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def wheel(request: pytest.FixtureRequest, repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Built from a copy, so that nothing is left in the source tree."""
+    if request.config.getoption("--quick"):
+        pytest.skip("left out by --quick: it starts processes")
     pytest.importorskip("setuptools", minversion="77")
     folder = tmp_path_factory.mktemp("wheel")
     for name in SOURCES:
