@@ -161,8 +161,8 @@ def test_a_wrong_number_of_poses_or_stamps_is_refused(folder: Path, change: int)
         (f"{row_of(P0)}\n{row_of(P0)}", "baseline_m must be a positive"),
         (f"{row_of(P1)}\n{row_of(P0)}", "P0 must be at the origin"),
         (f"{row_of(P0)}\n{row_of(P1 + np.eye(3, 4, 2))}", "no rectified pair"),
-        (f"{row_of(-P0)}\n{row_of(P1)}", "P0 is no pinhole camera"),
-        (f"{row_of(P0 + np.eye(3, 4, 1))}\n{row_of(P1)}", "P0 is no pinhole camera"),
+        (f"{row_of(-P0)}\n{row_of(P1)}", "P0 is not the matrix of a pinhole camera"),
+        (f"{row_of(P0 + np.eye(3, 4, 1))}\n{row_of(P1)}", "P0 is not the matrix of a pinhole camera"),
     ],
 )
 def test_a_bad_calibration_is_refused(folder: Path, text: str, said: str) -> None:
