@@ -30,6 +30,7 @@ from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.timed_poses import read_timed_poses
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose, tangent_norms
+from taichi_mrf.live.replay import Replay
 from taichi_mrf.live.run import Policy
 from taichi_mrf.live.session import Session
 from taichi_mrf.mapping.pipeline import map_sequence
@@ -236,6 +237,22 @@ def test_a_tracked_camera_gives_the_map_of_its_batch_run(tmp_path: Path) -> None
     found = read_timed_poses(tmp_path / TRAJECTORY_FILE)
     assert len(found) == 12
     assert errors(dict(enumerate(found.poses)))[:, 1].max() < 0.05
+
+
+def test_held_out_frames_of_a_tracked_camera_have_poses_as_in_a_batch_run(tmp_path: Path) -> None:
+    config = replace(tracked_room.CONFIG, evaluation=EvaluationConfig(hold_out=4))
+    dataset = walk(range(12))
+    replayed = replace(
+        source(dataset, config), new_replay=lambda: Replay(dataset), tracked=True, dataset=dataset
+    )
+    session = Session(replayed, FakeLink(), Policy(out=tmp_path, leave_when_done=True))
+    finished(session)
+    batch = map_sequence(walk(range(12)), config)
+    result = session.state.result()
+    assert marginals(result.map) == marginals(batch.map)
+    assert result.held_out == batch.held_out == [2, 6, 10]
+    report, _ = write_run(tmp_path, result, session.state.facts, pictures=False)
+    assert report["accuracy"]["frames"] == 3
 
 
 def test_the_page_is_told_once_that_tracking_is_lost_and_that_it_goes_on() -> None:
