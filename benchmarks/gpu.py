@@ -115,7 +115,7 @@ def _run_part(options: Options, name: str, seconds: int) -> dict[str, Any]:
 
 def tests(options: Options) -> dict[str, Any]:
     """The tests of kernels and maps that use a backend, on this one."""
-    names = ("vectors",) if options.quick else TESTS
+    names = ("resident",) if options.quick else TESTS
     files = [str(next((ROOT / "tests").rglob(f"test_{name}.py"))) for name in names]
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--arch", options.arch, *files]
     done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)

@@ -129,7 +129,7 @@ def time_taichi(problem: Path, threads: int) -> None:
     from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
     from taichi_mrf.inference.sweep import TRACE_BYTES
     from taichi_mrf.inference.workers import workers_for
-    from taichi_mrf.kernels.vectors import vec4_array
+    from taichi_mrf.kernels.resident import vec4_array
     from taichi_mrf.sensor.camera import PinholeCamera
     from taichi_mrf.sensor.forward import CENTRE
     from taichi_mrf.sensor.noise import PolynomialNoise

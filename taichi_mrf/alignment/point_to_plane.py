@@ -150,6 +150,12 @@ def accumulate(
 ):  # fmt: skip
     """Sum up H (36), g (6), cost, points, weights and weighted squares, one row of ``sums`` for each strip.
 
+    ``points`` (N, 3) metres, ``normals`` (N, 3) and ``sigmas`` (N) metres are OrientedPoints, of which
+    ``total`` are used. ``centre`` and ``to_cells`` are the camera in the grid's window (traversal.Viewpoint),
+    ``rotation`` its own in the world, ``cell_size`` metres. ``shape`` and ``bricks`` are those of the
+    window's index, ``places`` (bricks * 512) and ``planes`` (M, 7) those of SurfelGrid. ``sums`` is (strips,
+    46).
+
     A strip's points are added up one after the other, so that the sums do not depend on the number of
     threads. On a CPU a strip stands for ``spread`` iterations, of which Taichi gives a thread no fewer.
     """

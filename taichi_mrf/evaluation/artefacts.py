@@ -155,6 +155,7 @@ class _Sight(Struct):
 
 @ti.func
 def _see(sight: Template, seen: Template, voxel: I32, t: F32, t_leave: F32):
+    """One voxel of a ray."""
     probability = seen.probability[voxel]
     if probability >= 0.0:
         if t_leave < sight.near:

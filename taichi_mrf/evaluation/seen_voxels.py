@@ -93,6 +93,7 @@ class _Nothing(Struct):
 
 @ti.func
 def _cross(state: Template, crossed: Template, voxel: I32, t: F32, t_leave: F32):
+    """One voxel of a ray."""
     mark(crossed, voxel)
     return 1
 
@@ -124,6 +125,8 @@ def _see(
 
 @ti.kernel
 def _enter_all(bricks: I32Array, chunks: I32Array):
+    """Make all bricks of a window exist: ``bricks`` and ``chunks`` of traversal.Space, with bricks
+    counted."""
     for brick in range(bricks.shape[0]):
         bricks[brick] = brick
     for chunk in range(chunks.shape[0]):

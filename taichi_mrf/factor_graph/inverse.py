@@ -12,6 +12,10 @@ from taichi_mrf.kernels.types import I32Array
 
 @ti.kernel
 def _count_ends(begins: I32Array, cells: I32Array, hits: I32Array, ends: I32Array):
+    """Count into ``ends`` (cells) the beams with a return that end in each cell.
+
+    ``begins`` (beams + 1), ``cells`` (edges) and ``hits`` (beams) are those of the graph.
+    """
     for f in range(begins.shape[0] - 1):
         if hits[f] == 1 and begins[f + 1] > begins[f]:
             ti.atomic_add(ends[cells[begins[f + 1] - 1]], 1)

@@ -36,18 +36,24 @@ def walk_cells(
 
 @ti.func
 def _count(state: Template, context: Template, cell: ti.i32):
+    """One cell of a beam whose cells are counted."""
     state.next += 1
 
 
 @ti.func
 def _write(state: Template, context: Template, cell: ti.i32):
+    """One cell of a beam."""
     context[state.next] = cell
     state.next += 1
 
 
 @ti.kernel
 def count_cells(rays: F32Array2, shape: IVec3, counts: I32Array):
-    """How many cells each beam crosses."""
+    """How many cells each beam crosses, into ``counts`` (beams).
+
+    ``rays`` is (beams, 7): origin, direction and range in cell sizes from the corner of a grid of ``shape``
+    cells.
+    """
     for beam in range(counts.shape[0]):
         place = _Place(0)
         walk_cells(rays, beam, shape, _count, place, counts)
@@ -56,7 +62,8 @@ def count_cells(rays: F32Array2, shape: IVec3, counts: I32Array):
 
 @ti.kernel
 def write_cells(rays: F32Array2, shape: IVec3, begins: I32Array, cells: I32Array):
-    """Which cells each beam crosses, from ``begins`` on."""
+    """Which cells each beam crosses, into ``cells`` (edges) from ``begins`` (beams + 1) on; ``rays`` as
+    above."""
     for beam in range(begins.shape[0] - 1):
         place = _Place(begins[beam])
         walk_cells(rays, beam, shape, _write, place, cells)
@@ -64,7 +71,7 @@ def write_cells(rays: F32Array2, shape: IVec3, begins: I32Array, cells: I32Array
 
 @ti.kernel
 def count_degrees(cells: I32Array, edges: ti.i32, degrees: I32Array):
-    """How many beams cross each cell."""
+    """How many beams cross each cell: ``cells`` (edges) counted into ``degrees`` (cells)."""
     for edge in range(edges):
         ti.atomic_add(degrees[cells[edge]], 1)
 
@@ -73,7 +80,8 @@ def count_degrees(cells: I32Array, edges: ti.i32, degrees: I32Array):
 def write_beams_of_cells(
     begins: I32Array, cells: I32Array, places: I32Array, beams: I32Array, steps: AnyArray
 ):
-    """Each cell's beams and their steps; ``places`` is where each cell's list begins, and is used up.
+    """Each cell's ``beams`` and their ``steps`` (edges); ``places`` (cells) is where each cell's list begins,
+    and is used up. ``begins`` (beams + 1) and ``cells`` (edges) are those of the graph.
 
     The order within a cell's list depends on the threads: whoever adds up over it must not depend on it.
     """

@@ -1,9 +1,9 @@
-"""Incremental inference: which keyframes to sweep again when others have changed what they are told.
+"""Incremental inference: which keyframes to sweep again after the beliefs of their voxels have changed.
 
-A keyframe's messages follow from what all others believe of the voxels that it sees. The pool counts, brick
-by brick, how often marginals have moved; a keyframe knows the count at its own last sweep. The difference
-says how much of what it was told is out of date, and the keyframe with the largest share goes first.
-Keyframes that no moved brick lies near are not even looked at: a new one costs no more in a large map.
+A keyframe's messages follow from its cavity beliefs. The pool counts, for each brick, how often marginals
+have changed; a keyframe keeps the counts at its last sweep. The difference is the share of its cavity that is
+out of date, and the keyframe with the largest share is swept first. Keyframes far from all changed bricks are
+not examined, so a new keyframe costs no more in a large map.
 """
 
 import time
@@ -26,24 +26,24 @@ def moved_share(keyframe: Keyframe, pool: BrickPool) -> float:
     """The share of the voxels seen by a keyframe whose marginals have moved since its last sweep; 1 if it was
     never swept. A marginal counts each time that it moves by over 0.01, a brick as its voxels at most."""
     visible = keyframe.visible if keyframe.pending_visible is None else keyframe.pending_visible
-    heard = change_count_seen_by(keyframe, visible)
-    if heard is None or keyframe.messages is None:
+    seen_count = change_count_seen_by(keyframe, visible)
+    if seen_count is None or keyframe.messages is None:
         return 1.0
-    if len(heard) == 0:
+    if len(seen_count) == 0:
         return 0.0
-    moved = np.minimum(pool.change_count[visible.slots] - heard, VOXELS)
+    moved = np.minimum(pool.change_count[visible.slots] - seen_count, VOXELS)
     return float(moved.sum()) / (len(moved) * VOXELS)
 
 
 def change_count_seen_by(keyframe: Keyframe, visible: VisibleBricks) -> NDArray[np.int64] | None:
-    """``heard`` of a keyframe for a newer list of its bricks: nothing of one that was not on the old, all of
-    which then counts as moved."""
+    """The change counts at a keyframe's last sweep, for a newer list of its bricks. A brick that was not on
+    the old list counts as changed in all voxels."""
     if visible is keyframe.visible or keyframe.change_count_at_last_sweep is None:
         return keyframe.change_count_at_last_sweep
     place = places_of(keyframe.visible, visible)
-    heard = np.full(len(place), -VOXELS, np.int64)
-    heard[place >= 0] = keyframe.change_count_at_last_sweep[place[place >= 0]]
-    return heard
+    seen_count = np.full(len(place), -VOXELS, np.int64)
+    seen_count[place >= 0] = keyframe.change_count_at_last_sweep[place[place >= 0]]
+    return seen_count
 
 
 class IncrementalInference:

@@ -1,4 +1,4 @@
-"""A keyframe: a depth image, where it was taken, which bricks it touches, and what it says of them."""
+"""A keyframe: a depth image, its pose, the bricks that its rays cross, and its messages to their voxels."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Which keyframes look at a part of space: a test of boxes that costs next to nothing for those far away."""
+"""Which keyframes see a part of space: a quick test of their bounding boxes."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -16,7 +16,7 @@ from taichi_mrf.voxels.strips import strip_begin, strip_length
 
 
 def new_messages(visible: VisibleBricks, precision: str) -> "ti.Ndarray":
-    """(bricks * 512) messages that say nothing yet (log-odds 0), in float16 or float32."""
+    """(bricks * 512) messages of log-odds 0, in float16 or float32."""
     messages = ti.ndarray(ti.f16 if precision == "float16" else ti.f32, max(1, len(visible.cells)) * VOXELS)
     messages.fill(0)
     return messages
@@ -57,11 +57,11 @@ def places_of(old: VisibleBricks, visible: VisibleBricks) -> NDArray[np.int32]:
 
 
 def count_observations(
-    slots: NDArray[np.int32], spoken: Iterable[tuple[VisibleBricks, "ti.Ndarray"]], pool: BrickPool
+    slots: NDArray[np.int32], keyframes: Iterable[tuple[VisibleBricks, "ti.Ndarray"]], pool: BrickPool
 ) -> NDArray[np.uint8]:
-    """How many keyframes say something of each voxel of some bricks, (n,) -> (n, 512); 255 is "or more".
+    """How many keyframes have a message to each voxel of some bricks, (n,) -> (n, 512); 255 is "or more".
 
-    ``spoken`` are the keyframes' lists with their messages. What has been frozen counts as one.
+    ``keyframes`` are their lists of bricks with their messages. All frozen keyframes count as one.
     """
     if len(slots) == 0:
         return np.zeros((0, VOXELS), np.uint8)
@@ -69,7 +69,7 @@ def count_observations(
     row_of[slots] = np.arange(len(slots))
     counts = ti.ndarray(ti.i32, len(slots) * VOXELS)
     counts.fill(0)
-    for visible, messages in spoken:
+    for visible, messages in keyframes:
         rows = row_of[visible.slots]
         rows[pool.identity[visible.slots] != visible.identity] = -1  # the slot has changed hands
         places = np.flatnonzero(rows >= 0).astype(np.int32)
@@ -86,6 +86,10 @@ def count_observations(
 def _count_messages(
     places: I32Array, rows: I32Array, messages: AnyArray, counts: I32Array, strip: Template
 ):  # fmt: skip
+    """Add 1 to the ``counts`` (rows * 512) of voxels to which a keyframe sends a message.
+
+    ``places`` (n) are bricks of its ``messages`` (bricks * 512), ``rows`` (n) their rows in the counts.
+    """
     for part in range(places.shape[0] * (VOXELS // strip)):
         _, source = strip_begin(part, places, strip)
         _, target = strip_begin(part, rows, strip)
@@ -95,6 +99,8 @@ def _count_messages(
 
 @ti.kernel
 def _count_evidence(slots: I32Array, evidence: F32Array, prior: F32, counts: I32Array, strip: Template):
+    """Add 1 to the ``counts`` (n * 512) of voxels of the bricks in ``slots`` (n) whose ``evidence`` (pool *
+    512) is not the ``prior`` log-odds."""
     for part in range(slots.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, slots, strip)
         for k in range(strip):
@@ -103,6 +109,8 @@ def _count_evidence(slots: I32Array, evidence: F32Array, prior: F32, counts: I32
 
 @ti.kernel
 def _copy_bricks(place: I32Array, old: AnyArray, new: AnyArray, strip: Template):
+    """Copy messages of bricks: brick i of ``new`` (n * 512) from brick ``place[i]`` (n) of ``old``, -1 for
+    none."""
     for part in range(place.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, place, strip)
         if place[i // VOXELS] >= 0:

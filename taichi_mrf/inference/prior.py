@@ -1,4 +1,4 @@
-"""What is believed of a voxel before anybody has looked."""
+"""The prior probability of a voxel."""
 
 import math
 

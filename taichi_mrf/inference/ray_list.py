@@ -1,9 +1,9 @@
 """Which rays a keyframe casts: its pixels, or bundles of pixels where a voxel covers many.
 
-Near the camera a voxel covers hundreds of pixels, whose rays all tell it the same. Blocks of pixels are
-therefore put together, two of a size at a time, as long as a voxel at their depth is still met by the wanted
-number of rays and their measurements agree. The ray through a block's middle carries their mean depth, and
-counts as many as they are. What does not agree, such as the rim of a surface, stays in single pixels.
+Near the camera a voxel covers hundreds of pixels, whose rays send it nearly the same message. Blocks of
+pixels are therefore merged, two of a size at a time, as long as enough rays still meet a voxel at their depth
+and their measurements agree. The ray through a block's middle has their mean depth, and their number as its
+weight. Pixels that do not agree, such as those at the edge of a surface, keep rays of their own.
 """
 
 import math

@@ -1,9 +1,8 @@
 """In which order keyframes are swept, and how often.
 
-Loopy belief propagation stopped after a few sweeps depends on where it began and on the order of its
-messages. A map must depend on neither: full inference begins with no messages and takes the keyframes
-in an order that follows from what they hold and not from when they came, so that any history of adding,
-removing and moving keyframes ends in the map that the final set gives.
+Loopy belief propagation that stops after a few sweeps depends on its initial messages and on their order. A
+map must depend on neither: full inference starts without messages and orders the keyframes by their content,
+so any history of adding, removing and moving keyframes ends in the map of the final set.
 """
 
 import hashlib

@@ -13,8 +13,7 @@ from taichi_mrf.inference.accumulators import finest_scale
 from taichi_mrf.inference.keyframe import Keyframe, RayList
 from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
 from taichi_mrf.inference.workers import workers_for
-from taichi_mrf.kernels.resident import on_host
-from taichi_mrf.kernels.vectors import vec4_array
+from taichi_mrf.kernels.resident import on_host, vec4_array
 from taichi_mrf.sensor.forward import AUTO, CENTRE, SEGMENT
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import VOXELS
@@ -39,7 +38,7 @@ def least_log_odds(inference: InferenceConfig, prior_log_odds: float) -> float:
 
 
 def unknown_entry_depths(rays: RayList) -> "ti.Ndarray":
-    """The depth at which each ray meets its first brick: not known, so never."""
+    """Entry depths, (rays), before the first sweep has found them."""
     entry_depths = ti.ndarray(ti.f32, rays.blocks.shape[0])
     entry_depths.fill(FAR)
     return entry_depths
@@ -77,10 +76,10 @@ class Sweeper:
         return int(self.steps.to_numpy()[: self._workers].sum(dtype=np.int64))
 
     def sweep(self, keyframe: Keyframe, pool: BrickPool) -> bool:
-        """Send one keyframe's messages anew. ``keyframe.messages`` must fit ``keyframe.visible``.
+        """Compute one keyframe's messages again. ``keyframe.messages`` must fit ``keyframe.visible``.
 
-        False if it sees no brick. The host does not wait for the device: what has moved, :meth:`take_moved`
-        asks, before the next sweep over the same keyframe.
+        False if it sees no brick. The host does not wait for the device: call :meth:`take_moved` before the
+        next sweep over the same keyframe.
         """
         config, image, rays = self.inference, keyframe.image, keyframe.ray_list
         visible, footprint = keyframe.visible, keyframe.footprint
@@ -142,7 +141,7 @@ class Sweeper:
 
     def take_moved(self, keyframe: Keyframe, pool: BrickPool) -> NDArray[np.int32]:
         """How many voxels of each visible brick moved in the keyframe's last sweep, (n,). The pool adds
-        them to its change counts, which the keyframe keeps. Ask keyframes in the order of their sweeps."""
+        them to its change counts, which the keyframe keeps. Call it in the order of the sweeps."""
         visible = keyframe.visible
         moved = np.array(on_host(visible.on_device().moved))
         pool.count_changes(visible.slots, moved)

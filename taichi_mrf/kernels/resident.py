@@ -1,19 +1,26 @@
-"""Arrays that the host fills once and kernels then read again and again, without waiting for the host."""
+"""Arrays for kernels: those that the host fills once, and arrays of vectors that give their memory back.
 
+Kernels read the first again and again without waiting for the host. The second are freed when Python collects
+them, as Taichi's arrays of scalars are.
+"""
+
+import weakref
 from typing import Any, TypeAlias
 
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
+from taichi.lang import impl
 from taichi.lang.util import to_taichi_type
 
+from taichi_mrf.kernels.types import Vec4
 from taichi_mrf.system import runtime
 
 Resident: TypeAlias = "NDArray[Any] | ti.Ndarray"
 
 
 def resident(values: NDArray[Any]) -> Resident:
-    """The values where kernels reach them: on a CPU the array itself, which nobody may change from now on,
+    """The values where kernels reach them: on a CPU the array itself, which must not change from now on,
     elsewhere a copy in the device's memory."""
     values = np.ascontiguousarray(values)
     if runtime.active() == "cpu":
@@ -26,3 +33,20 @@ def resident(values: NDArray[Any]) -> Resident:
 def on_host(array: Resident) -> NDArray[Any]:
     """The values again, to be read only."""
     return array if isinstance(array, np.ndarray) else array.to_numpy()
+
+
+def vec4_array(length: int) -> "ti.Ndarray":
+    """An array of 4-vectors of float32, all zero.
+
+    Taichi 1.7.4 itself never gives the memory of such an array back, and on Vulkan not always when asked to:
+    for what is made again and again, such as for each scan, take an array of scalars.
+    """
+    array = ti.ndarray(Vec4, length)
+    weakref.finalize(array, _free, array.arr).atexit = False
+    return array
+
+
+def _free(memory: Any) -> None:
+    program = impl.get_runtime().prog
+    if program is not None:
+        program.delete_ndarray(memory)

@@ -45,6 +45,11 @@ def extract_voxels(
 
 @ti.kernel
 def _count(belief: F32Array, slots: I32Array, threshold: F32, counts: I32Array):
+    """Count, for each brick in ``slots`` (n), the voxels of at least ``threshold`` log-odds, into ``counts``
+    (n).
+
+    ``belief`` is (pool * 512) log-odds.
+    """
     for row in range(slots.shape[0]):
         n = 0
         for v in range(VOXELS):
@@ -58,6 +63,8 @@ def _collect(
     belief: F32Array, slots: I32Array, threshold: F32,
     begins: I32Array, rows: I32Array, numbers: I32Array, log_odds: F32Array,
 ):  # fmt: skip
+    """List the same voxels from place ``begins`` (n) on: their ``rows`` in ``slots``, their ``numbers`` in
+    the brick and their ``log_odds``, (m) each."""
     for row in range(slots.shape[0]):
         i = begins[row]
         for v in range(VOXELS):

@@ -78,6 +78,8 @@ def probability(log_odds: NDArray[np.float32]) -> NDArray[np.float32]:
 def _gather(
     belief: F32Array, slots: I32Array, numbers: I32Array, without_brick: F32Array, log_odds: F32Array
 ):
+    """Log-odds of points: those of voxel ``numbers`` (N) of the bricks in ``slots`` (N), or ``without_brick``
+    (N) where the slot is -1, into ``log_odds`` (N). ``belief`` is (pool * 512)."""
     for i in range(slots.shape[0]):
         here = without_brick[i]
         if slots[i] >= 0:

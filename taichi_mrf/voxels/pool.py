@@ -1,4 +1,4 @@
-"""Where the voxels live: arrays of bricks that grow, and give bricks back.
+"""Storage of voxels: arrays of bricks that grow, with a free list.
 
 A brick has a slot; voxel v of the brick in slot s stands at s * 512 + v of each channel. The channels
 are Taichi ndarrays, which kernels take as arguments, and not fields, for which they would be compiled
@@ -56,7 +56,7 @@ class BrickPool:
         self.change_count = np.zeros(0, np.int64)  # marginals that have moved in each brick since it was born
         self.revision = 0  # changes whenever the beliefs do
         self._touched = np.zeros(0, bool)
-        self._stirring = np.zeros(0, bool)
+        self._changed = np.zeros(0, bool)
         self._free: list[int] = []
         self._born = 0
 
@@ -77,7 +77,7 @@ class BrickPool:
         return 8 if self.evidence is not None else 4
 
     def allocate(self, bricks: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Slots for new bricks, (n, 3) -> (n,), their voxels at the prior and owned by nobody yet.
+        """Slots for new bricks, (n, 3) -> (n,), their voxels at the prior and without owners.
 
         The lowest free slots go first, so that equal histories give equal pools.
         Raises CapacityError if there is not enough memory.
@@ -87,11 +87,11 @@ class BrickPool:
             self._grow(self.capacity + missing)
         slots = np.array([heapq.heappop(self._free) for _ in range(len(bricks))], np.int32)
         self.bricks[slots] = bricks
-        # An identity is never given twice, so a slot that changes hands can be told from one that did not.
+        # Identities are unique, so a slot that was freed and allocated again is recognised.
         self.identity[slots] = self._born + np.arange(len(bricks))
         self._born += len(bricks)
         self.change_count[slots] = 0
-        self._stirring[slots] = True
+        self._changed[slots] = True
         self.touch(slots)
         _fill_bricks(self.belief, slots, self.prior_log_odds, strip_length())
         if self.evidence is not None:
@@ -99,7 +99,7 @@ class BrickPool:
         return slots
 
     def release(self, slots: NDArray[np.int32]) -> None:
-        """Give bricks back; nobody may own them any more."""
+        """Free bricks, which must have no owners."""
         self.identity[slots] = -1
         self.owners[slots] = 0
         for slot in slots.tolist():
@@ -127,13 +127,13 @@ class BrickPool:
     def count_changes(self, slots: NDArray[np.int32], moved: NDArray[np.int32]) -> None:
         """Count marginals that have moved in some bricks, (n,) each."""
         self.change_count[slots] += moved
-        self._stirring[slots[moved > 0]] = True
+        self._changed[slots[moved > 0]] = True
 
     def take_changed(self) -> NDArray[np.int32]:
         """Coordinates (n, 3) of the bricks that are new, or in which marginals have moved, since this was
         last called."""
-        bricks = self.bricks[self._stirring & (self.owners > 0)]
-        self._stirring[:] = False
+        bricks = self.bricks[self._changed & (self.owners > 0)]
+        self._changed[:] = False
         return bricks
 
     def snapshot(self) -> PoolSnapshot:
@@ -209,7 +209,7 @@ class BrickPool:
         self.identity = np.concatenate([self.identity, np.full(more, -1, np.int64)])
         self.change_count = np.concatenate([self.change_count, np.zeros(more, np.int64)])
         self._touched = np.concatenate([self._touched, np.zeros(more, bool)])
-        self._stirring = np.concatenate([self._stirring, np.zeros(more, bool)])
+        self._changed = np.concatenate([self._changed, np.zeros(more, bool)])
         for slot in range(self.capacity, capacity):
             heapq.heappush(self._free, slot)
         self.capacity = capacity
@@ -224,6 +224,8 @@ def _grown(old: "ti.Ndarray", old_capacity: int, capacity: int) -> "ti.Ndarray":
 
 @ti.kernel
 def _copy(source: F32Array, target: F32Array, bricks: I32, strip: Template):
+    """Copy the voxels of the first ``bricks`` bricks. ``source`` and ``target`` are channels (capacity *
+    512); ``strip`` here and below: voxels/strips.py."""
     for part in range(bricks * (VOXELS // strip)):
         for k in range(strip):
             target[part * strip + k] = source[part * strip + k]
@@ -231,6 +233,7 @@ def _copy(source: F32Array, target: F32Array, bricks: I32, strip: Template):
 
 @ti.kernel
 def _fill_bricks(channel: F32Array, slots: I32Array, value: F32, strip: Template):
+    """Set all voxels of the bricks in ``slots`` (n) of a ``channel`` (capacity * 512)."""
     for part in range(slots.shape[0] * (VOXELS // strip)):
         _, j = strip_begin(part, slots, strip)
         for k in range(strip):
@@ -239,6 +242,7 @@ def _fill_bricks(channel: F32Array, slots: I32Array, value: F32, strip: Template
 
 @ti.kernel
 def _read_bricks(channel: F32Array, slots: I32Array, out: F32Array, strip: Template):
+    """Copy the bricks in ``slots`` (n) of a ``channel`` (capacity * 512) to ``out`` (n * 512)."""
     for part in range(slots.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, slots, strip)
         for k in range(strip):
@@ -247,6 +251,7 @@ def _read_bricks(channel: F32Array, slots: I32Array, out: F32Array, strip: Templ
 
 @ti.kernel
 def _write_bricks(channel: F32Array, slots: I32Array, values: F32Array, strip: Template):
+    """Copy ``values`` (n * 512) to the bricks in ``slots`` (n) of a ``channel`` (capacity * 512)."""
     for part in range(slots.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, slots, strip)
         for k in range(strip):

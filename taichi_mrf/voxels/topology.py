@@ -103,18 +103,22 @@ class _Tree:
 
     @ti.func
     def cell(self, bricks: Template, i: I32, layer: I32):
+        """The cell of brick i of (n, 3) world coordinates in a layer of the tree."""
         return IVec4(
             bricks[i, 0] + self.HALF_SPAN, bricks[i, 1] + self.HALF_SPAN, bricks[i, 2] + self.HALF_SPAN, layer
         )
 
     @ti.func
     def in_span(self, cell: IVec4) -> I32:
+        """Whether a cell lies within the tree."""
         return ti.min(cell[0], cell[1], cell[2]) >= 0 and (
             ti.max(cell[0], cell[1], cell[2]) < 2 * self.HALF_SPAN
         )
 
     @ti.kernel
     def write(self, bricks: AnyArray, values: I32Array, layer: I32):
+        """Set the slots of bricks (n, 3) of a layer to ``values`` (n), which are slots + 1; 0 takes them
+        out."""
         for i in range(values.shape[0]):
             cell = self.cell(bricks, i, layer)
             # Writing a leaf activates its parents; ti.activate would not.
@@ -124,6 +128,7 @@ class _Tree:
 
     @ti.kernel
     def count(self, bricks: AnyArray, number: I32, layer: I32):
+        """Add ``number`` to the crossings of bricks (n, 3) of a layer; each brick may occur once."""
         for i in range(bricks.shape[0]):
             cell = self.cell(bricks, i, layer)
             self.crossing[cell] += number
@@ -132,6 +137,7 @@ class _Tree:
 
     @ti.kernel
     def read(self, bricks: AnyArray, out: I32Array, channel: I32, layer: I32):
+        """Read slots + 1 (``channel`` 0) or crossings (1) of bricks (n, 3) of a layer into ``out`` (n)."""
         for i in range(out.shape[0]):
             cell = self.cell(bricks, i, layer)
             if self.in_span(cell):  # a query may ask for any point
@@ -148,6 +154,7 @@ class _Tree:
 
     @ti.kernel
     def clear_chunks(self, layer: I32):
+        """Deactivate all chunks of a layer."""
         for i, j, k in ti.ndrange(self.REGIONS, self.REGIONS, self.REGIONS):
             if ti.is_active(self.regions, [i, j, k, layer]):
                 for di, dj, dk in ti.ndrange(self.REGION, self.REGION, self.REGION):
@@ -157,6 +164,7 @@ class _Tree:
 
     @ti.kernel
     def clear_regions(self, layer: I32):
+        """Deactivate all regions of a layer, whose chunks are gone."""
         for i, j, k in ti.ndrange(self.REGIONS, self.REGIONS, self.REGIONS):
             if ti.is_active(self.regions, [i, j, k, layer]):
                 ti.deactivate(self.regions, [i, j, k, layer])
@@ -277,6 +285,11 @@ class DenseTopology:
 
 @ti.kernel
 def _dense_write(index: I32Array, bricks: AnyArray, values: I32Array, side: I32, add: I32):
+    """Set the cells of bricks (n, 3), counted from the volume's corner, to ``values`` (n); with ``add`` 1,
+    add them.
+
+    ``index`` is (side^3), row by row. Bricks outside the volume are left out.
+    """
     for i in range(values.shape[0]):
         cell = IVec3(bricks[i, 0], bricks[i, 1], bricks[i, 2])
         if cell.min() >= 0 and cell.max() < side:
@@ -285,6 +298,7 @@ def _dense_write(index: I32Array, bricks: AnyArray, values: I32Array, side: I32,
 
 @ti.kernel
 def _dense_read(index: I32Array, bricks: AnyArray, out: I32Array, side: I32):
+    """Read the cells of bricks (n, 3) from ``index`` (side^3) into ``out`` (n), 0 outside the volume."""
     for i in range(out.shape[0]):
         cell = IVec3(bricks[i, 0], bricks[i, 1], bricks[i, 2])
         found = 0

@@ -84,8 +84,10 @@ def _mark_rows(
     triangles: I32Array, rows: I32Array, shapes: F32Array3, origins: I32Array, axes: I32Array,
     shape: IVec3, grown: F32, marks: I32Array,
 ):  # fmt: skip
-    """For each row of each triangle. Along the axes a, b, c of a triangle it has the corners of ``shapes``
-    [triangle, 0:3] and the normal [triangle, 3]; the voxel that they are counted from is in ``origins``."""
+    """For each row of each triangle: item i is row ``rows[i]`` of triangle ``triangles[i]`` (n). Along the
+    axes a, b, c of a triangle it has the corners of ``shapes`` [triangle, 0:3] and the normal [triangle, 3];
+    the voxel that they are counted from is in ``origins`` [3 * triangle], the axis that c is in ``axes`` (T).
+    ``marks`` are those of a window of ``shape`` bricks."""
     for item in range(triangles.shape[0]):
         t, j = triangles[item], rows[item]
         a = Vec3(shapes[t, 0, 0], shapes[t, 1, 0], shapes[t, 2, 0])

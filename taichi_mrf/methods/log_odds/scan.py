@@ -125,11 +125,13 @@ def log_odds(probability: float) -> float:
 
 @ti.func
 def _end_voxel(end: Vec4) -> IVec3:
+    """The voxel that a ray's end lies in."""
     return ti.floor(Vec3(end[0], end[1], end[2]), ti.i32)
 
 
 @ti.func
 def _in_box(voxel: IVec3, lower: Vec3, upper: Vec3) -> I32:
+    """Whether a voxel lies in the mapped box."""
     centre = ti.cast(voxel, ti.f32) + 0.5
     return (centre - lower).min() > 0.0 and (upper - centre).min() > 0.0
 

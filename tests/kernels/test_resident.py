@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from taichi_mrf.kernels.vectors import vec4_array
+from taichi_mrf.kernels.resident import vec4_array
 from taichi_mrf.system import runtime
 
 STATM = Path("/proc/self/statm")
