@@ -231,7 +231,7 @@ def test_freiburgs_building_79(
         2 ** leaves.level[ours].astype(int), np.rint(size / 0.08).astype(int)[order]
     )
     run_import(source, "--out", tmp_path / "geb079.npz")
-    assert f"{len(theirs):,} leaves" in capsys.readouterr().out
+    assert f"{len(theirs):,} OctoMap leaves" in capsys.readouterr().out
     m = LogOddsMap.load(tmp_path / "geb079.npz")
     assert m.voxel_size == 0.08
     # Every leaf is known, and occupied where OctoMap says so; and nothing else is known.
