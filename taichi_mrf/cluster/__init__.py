@@ -1,4 +1,4 @@
 """Tasks in processes of their own: on this machine, or on those of a Dask cluster.
 
-Knows nothing of maps: a task is any value that can be pickled, and a function that can be imported.
+It does not depend on maps: a task is any value that can be pickled, with a function that can be imported.
 """

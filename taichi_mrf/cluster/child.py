@@ -1,7 +1,7 @@
-"""What runs in the process of one task: read the task, carry it out, answer, and never outlive the parent.
+"""The process of one task: it reads the task, runs it, answers, and ends when its parent does.
 
-The task comes through stdin, which then stays open: its end is how the process learns that its parent has
-died. The answer goes to where stdout was; what the task prints goes to stderr.
+The task comes through stdin, which then stays open: its end means that the parent has died. The answer goes
+to the original stdout; what the task prints goes to stderr.
 """
 
 import os
@@ -23,7 +23,7 @@ ORPHANED = 70
 
 @dataclass(frozen=True)
 class Answer:
-    """What became of a task: its result, or the exception and where it was raised."""
+    """The outcome of a task: its result, or the exception and where it was raised."""
 
     result: Any = None
     error: Exception | None = None
@@ -31,7 +31,7 @@ class Answer:
 
 
 def main() -> None:
-    """Carry out the one task that comes through stdin."""
+    """Run the one task that comes through stdin."""
     answers = os.fdopen(os.dup(_STDOUT), "wb")
     os.dup2(_STDERR, _STDOUT)
     with os.fdopen(os.dup(_STDIN), "rb", buffering=0) as stdin:
@@ -58,7 +58,7 @@ def pickled_task(function: Callable[[Any], Any], task: Any) -> bytes:
 
 
 def result_of(answer: bytes) -> Any:
-    """The result in a pickled Answer. Raises the exception that is in it instead."""
+    """The result in a pickled Answer. Raises the exception that the answer holds."""
     said: Answer = pickle.loads(answer)
     if said.error is not None:
         raise said.error from ClusterError(f"in the process of the task:\n{said.where}")
@@ -91,12 +91,12 @@ def _read(stream: IO[bytes], count: int) -> bytes:
 
 
 def _pickled_error(error: Exception) -> bytes:
-    """The exception if it survives the way, else its text."""
+    """The exception if it can be pickled, else its text."""
     where = traceback.format_exc()
     try:
         block = pickle.dumps(Answer(error=error, where=where))
         pickle.loads(block)
-    except Exception:  # what a foreign exception's own code may raise
+    except Exception:  # pickling runs the exception's own code
         return pickle.dumps(Answer(error=ClusterError(f"{type(error).__name__}: {error}"), where=where))
     return block
 

@@ -1,4 +1,4 @@
-"""Which runner carries out the tasks of a command."""
+"""The choice of the runner for the tasks of a command."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,8 +1,8 @@
-"""Tasks on a Dask cluster: one that is there, or Dask's own on this machine.
+"""Tasks on a Dask cluster: an existing one, or one that is started on this machine.
 
-Dask deals the tasks out, moves them away from workers that die, and brings the answers back. On the worker a
-task still runs in a process of its own: Taichi wants a main thread and the backend of this task, and a worker
-that has to answer its scheduler has neither to give.
+Dask distributes the tasks, moves them away from workers that die, and returns the answers. On the worker a
+task still runs in a process of its own: Taichi needs the main thread and one backend for the whole process,
+and a worker needs its own main thread to answer the scheduler.
 """
 
 import contextlib
@@ -22,19 +22,20 @@ from taichi_mrf.errors import ClusterError
 from taichi_mrf.system.libraries import library
 
 LOCAL = "local"
-"""In place of a scheduler's address: a cluster of Dask's own on this machine."""
+"""In place of a scheduler's address: start a Dask cluster on this machine."""
 
 CONNECT_SECONDS = 20.0
-"""How long a scheduler may take to answer."""
+"""Longest wait for a scheduler's answer, in seconds."""
 
 _GLANCE = 0.5
-"""Seconds between looks whether a task is still wanted."""
+"""Seconds between checks whether a task was cancelled."""
 
 
 class DaskTasks:
     """Tasks on the workers of a scheduler, ``jobs`` of them if it is LOCAL; use it as a context, or close it.
 
-    Raises TaichiMRFError if Dask is not installed, and as a context ClusterError if nobody answers.
+    Raises TaichiMRFError if Dask is not installed, and as a context ClusterError if the scheduler does not
+    answer.
     """
 
     def __init__(self, scheduler: str = LOCAL, jobs: int = 1) -> None:
@@ -51,18 +52,18 @@ class DaskTasks:
         self.close()
 
     def close(self) -> None:
-        """Leave the scheduler; end the cluster if it is our own."""
+        """Disconnect from the scheduler; end the cluster if it was started here."""
         self._client = None
         self._open.close()
 
     def run(
         self, function: Callable[[T], R], tasks: Sequence[T], done: Callable[[int, R], None] = nothing
     ) -> list[R]:
-        """See TaskRunner. Where no worker is there yet, it waits for one. A task whose Dask worker has died
-        begins again on another, as often as the scheduler's ``allowed-failures`` says.
+        """See TaskRunner. Waits for a worker if there is none. A task whose Dask worker has died is
+        restarted on another, up to the scheduler's ``allowed-failures``.
 
-        On an exception and on Ctrl-C the tasks under way are asked to stop, and what they then give is
-        dropped. Raises ClusterError if the scheduler does not answer, or not any more.
+        On an exception and on Ctrl-C the running tasks are stopped, and their results dropped. Raises
+        ClusterError if the scheduler does not answer, or stops answering.
         """
         client = self._connected()
         share = _Share(self.jobs if self.scheduler == LOCAL else 0, self._slots_by_host(client))
@@ -108,7 +109,7 @@ class DaskTasks:
                 where = self._open.enter_context(self._own_cluster())
             client = self._distributed.Client(where, timeout=CONNECT_SECONDS, set_as_default=False)
         except BaseException as error:
-            self.close()  # nobody else would: the context has not begun
+            self.close()  # __exit__ is not called: the context has not begun
             if isinstance(error, (OSError, ValueError)):
                 raise ClusterError(f"no Dask scheduler answers at {self.scheduler}: {error}") from error
             raise
@@ -121,9 +122,9 @@ class DaskTasks:
         return self._distributed.LocalCluster(
             n_workers=self.jobs,
             threads_per_worker=1,
-            memory_limit=0,  # that of a worker, which says nothing of the processes of its tasks
+            memory_limit=0,  # that of a worker, which does not include the processes of its tasks
             dashboard_address=None,
-            silence_logs=logging.CRITICAL,  # a death is told by the exception, if it comes to one
+            silence_logs=logging.CRITICAL,  # a worker's death is reported by the exception
         )
 
     def _slots_by_host(self, client: Any) -> dict[str, int]:
@@ -135,7 +136,7 @@ class DaskTasks:
 
 
 class _Share:
-    """Who shares a task's machine: the workers of our own cluster, or the slots of each host."""
+    """How many tasks share a machine: the workers of our own cluster, or the slots of each host."""
 
     def __init__(self, workers: int, slots: dict[str, int]) -> None:
         self.workers, self.slots = workers, slots
@@ -148,7 +149,7 @@ class _Share:
 
 
 def answer_on_worker(payload: bytes, share: _Share) -> bytes:
-    """What runs in a thread of a Dask worker: the task in a process of its own, as long as it is wanted."""
+    """Runs in a thread of a Dask worker: the task in a process of its own, until it is cancelled."""
     from distributed import get_worker
 
     worker = get_worker()

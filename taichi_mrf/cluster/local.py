@@ -13,7 +13,7 @@ from taichi_mrf.cluster.share import environment_of
 from taichi_mrf.errors import ConfigError
 
 _GLANCE = 0.5
-"""Seconds after which a wait looks for Ctrl-C, which on Windows does not end one."""
+"""Seconds between checks for Ctrl-C, which on Windows does not end a wait."""
 
 
 class LocalProcesses:
@@ -63,7 +63,7 @@ class LocalProcesses:
 
 
 def _persistent_answer(processes: TaskProcesses, payload: bytes, environment: dict[str, str]) -> bytes:
-    """The answer of the first process that lives to give one. Raises TaskLostError if none does."""
+    """The answer of the first process that does not die. Raises TaskLostError if all die."""
     for attempt in range(1, ATTEMPTS + 1):
         try:
             return processes.answer(payload, environment)
@@ -74,11 +74,11 @@ def _persistent_answer(processes: TaskProcesses, payload: bytes, environment: di
 
 
 def _take_last(finished: Iterator[tuple[int, Callable[[], R]]], done: Callable[[int, R], None]) -> None:
-    """Hand over what tasks that were asked to stop still give."""
+    """Hand over the results of tasks that were asked to stop."""
     for index, answer in finished:
         try:
             result = answer()
-        except Exception:  # the first exception is the one that is told
+        except Exception:  # only the first exception is reported
             continue
         done(index, result)
 

@@ -1,8 +1,8 @@
 """The processes of tasks, seen from the one that starts them.
 
-Neither multiprocessing nor ProcessPoolExecutor can do this: a Dask worker is a daemon, which may not start
-their processes; a pool breaks as a whole when one process is killed; and the environment of a process has to
-be set before it starts, because NumPy and Taichi look at it when they are loaded.
+Neither multiprocessing nor ProcessPoolExecutor works here: a Dask worker is a daemon, which must not start
+their processes; a pool breaks as a whole when one process is killed; and the environment of a process has
+to be set before it starts, because NumPy and Taichi read it when they are loaded.
 """
 
 import contextlib
@@ -16,19 +16,19 @@ from collections.abc import Mapping
 from taichi_mrf.cluster.child import read_block, write_block
 
 _LAST_SECONDS = 60.0
-"""Longest wait for the end of a process that has answered."""
+"""Longest wait for the end of a process that has answered, in seconds."""
 
 
 class ProcessDiedError(Exception):
-    """A process has died before it gave an answer; the text says how."""
+    """A process died before it answered; the text says how."""
 
 
 class StoppedError(Exception):
-    """The tasks were asked to stop before this one could give an answer."""
+    """The tasks were stopped before this one answered."""
 
 
 class TaskProcesses:
-    """The processes of the tasks that are under way; used from several threads."""
+    """The processes of the running tasks; used from several threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -36,7 +36,8 @@ class TaskProcesses:
         self._stopping = False
 
     def answer(self, payload: bytes, environment: Mapping[str, str]) -> bytes:
-        """What child.answer_to says of the payload, from a new process with these environment variables too.
+        """The result of child.answer_to for the payload, from a new process with these environment
+        variables added.
 
         Raises ProcessDiedError if the process dies, StoppedError if the tasks were asked to stop.
         """
@@ -75,13 +76,13 @@ class TaskProcesses:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 env={**os.environ, **environment},
-                start_new_session=True,  # Ctrl-C is for the parent, which tells its children
+                start_new_session=True,  # Ctrl-C goes to the parent only, which stops its children
             )
             self._running.add(process)
             return process
 
     def _forget(self, process: "subprocess.Popen[bytes]") -> None:
-        """A process that has answered may end in peace, when Taichi saves its compiled kernels."""
+        """Let a process that has answered end by itself: Taichi saves its compiled kernels then."""
         try:
             if process.poll() is None and not self._stopping:
                 process.wait(_LAST_SECONDS)

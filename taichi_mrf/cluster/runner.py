@@ -1,4 +1,4 @@
-"""What a task runner promises, and the simplest one."""
+"""The interface of a task runner, and the simplest one."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol, TypeVar
@@ -9,45 +9,45 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 ATTEMPTS = 3
-"""How often a task is begun, at most, when the processes that take it die."""
+"""How often a task is started, at most, when its processes die."""
 
 _LONGEST_NAME = 60
 
 
 def nothing(index: int, result: Any) -> None:
-    """What is done with a result as soon as it is there, if nobody says."""
+    """The default for ``done``: ignore the result."""
 
 
 class TaskRunner(Protocol):
-    """Carries out tasks that do not depend on each other."""
+    """Runs tasks that do not depend on each other."""
 
     def run(
         self, function: Callable[[T], R], tasks: Sequence[T], done: Callable[[int, R], None] = nothing
     ) -> list[R]:
         """``function(task)`` for each task, each in a process of its own; results in the order of the tasks.
 
-        ``done`` is called, in the caller's thread, with a task's index and result as soon as it is there, and
-        once for each task. ``function`` can be imported by name, tasks and results can be pickled. The
-        function runs on its process' main thread; what it prints goes to stderr.
+        ``done`` is called in the caller's thread, once for each task, with its index and its result as soon
+        as the task has finished. ``function`` can be imported by name, tasks and results can be pickled.
+        The function runs on its process' main thread; what it prints goes to stderr.
 
-        A task whose process dies (killed, out of memory, crashed) begins again in another, ATTEMPTS times at
-        most; a task may therefore find what an earlier attempt has written. A task that is lost all the same
-        lets the others finish; then ClusterError is raised, which names the lost ones.
+        A task whose process dies (killed, out of memory, crashed) is restarted in another, up to ATTEMPTS
+        starts; it may therefore find files of an earlier attempt. If a task is lost nevertheless, the
+        others finish; then ClusterError is raised, which names the lost ones.
 
-        An exception of the function itself, which another attempt would only repeat, stops the other tasks
-        and is raised. So does whatever ``done`` raises, and Ctrl-C: the tasks under way are asked to stop
-        (SIGTERM, which a function may use to save what it has), the results that they still give are handed
-        to ``done``, then KeyboardInterrupt is raised again. A second Ctrl-C kills them.
+        An exception of the function itself, which a restart would only repeat, stops the other tasks and is
+        raised. So do exceptions of ``done``, and Ctrl-C: the running tasks are asked to stop (SIGTERM, on
+        which a function may save its work), their last results are passed to ``done``, then
+        KeyboardInterrupt is raised again. A second Ctrl-C kills them.
         """
 
 
 class InProcess:
-    """One task after the other in this process: for tests, and to step through with a debugger."""
+    """One task after the other in this process, for tests and debugging."""
 
     def run(
         self, function: Callable[[T], R], tasks: Sequence[T], done: Callable[[int, R], None] = nothing
     ) -> list[R]:
-        """See TaskRunner; nothing survives the death of this process."""
+        """See TaskRunner, without its protection against dying processes."""
         results = []
         for index, task in enumerate(tasks):
             results.append(function(task))
@@ -56,21 +56,21 @@ class InProcess:
 
 
 class TaskLostError(ClusterError):
-    """Every process that took a task has died."""
+    """All processes that were started for a task have died."""
 
     @classmethod
     def after(cls, death: Exception) -> "TaskLostError":
-        """As often as a task is begun; ``death`` was the last."""
+        """The error after ATTEMPTS deaths; ``death`` was the last."""
         return cls(f"{death}, {ATTEMPTS} times")
 
 
 def gather(
     tasks: Sequence[T], finished: Iterable[tuple[int, Callable[[], R]]], done: Callable[[int, R], None]
 ) -> list[R]:
-    """The results in the order of the tasks, from (index, answer) in the order in which they come.
+    """The results in the order of the tasks, from (index, answer) in the order in which tasks finish.
 
-    ``answer()`` gives the result or raises. Raises what it raises, but TaskLostError only after the others as
-    ClusterError.
+    ``answer()`` returns the result or raises. Its exceptions are raised, TaskLostError only after the other
+    tasks, as ClusterError.
     """
     results: dict[int, R] = {}
     lost: dict[int, str] = {}

@@ -1,4 +1,4 @@
-"""Which part of a machine a task gets: its share of the cores, and one GPU where there are several."""
+"""The share of a machine that a task gets: some of the cores, and one GPU if there are several."""
 
 import os
 
@@ -28,6 +28,7 @@ def environment_of(worker: int, workers: int) -> dict[str, str]:
 
 
 def threads_for(workers: int) -> dict[str, str]:
-    """The environment variables that divide the cores among so many; what the user has set stays."""
+    """The environment variables that divide the cores among so many; variables that the user has set are
+    not changed."""
     threads = str(max(1, cores() // workers))
     return {name: threads for name in THREADS if workers > 1 and name not in os.environ}
