@@ -57,7 +57,7 @@ def run_export(options: Export) -> int:
 
 
 def _check_names(options: Export) -> None:
-    """Raise ConfigError or MapFileError for what can be said of the files without the map."""
+    """Check what can be checked without the map. Raises ConfigError, MapFileError."""
     if not options.to:
         raise ConfigError("--to needs at least one file")
     places = [os.path.realpath(path) for path in options.to]

@@ -137,4 +137,4 @@ def _is_map_file(path: Path) -> bool:
         with zipfile.ZipFile(path) as file:
             return {"keyframe_ids.npy", "format.npy"} <= set(file.namelist())
     except (OSError, zipfile.BadZipFile):
-        return True  # whatever is wrong with it is said when it is read as a map
+        return True  # reading it as a map reports what is wrong with it

@@ -96,7 +96,7 @@ class _ToldLink(ViewerLink):
 
 
 class _Page:
-    """The viewer of the moment, and what is told of it on the terminal."""
+    """The current viewer, and what is printed about it."""
 
     def __init__(self, options: Live, say: Say, bar: ProgressBar, stack: ExitStack) -> None:
         self._options, self._say, self._bar, self._stack = options, say, bar, stack

@@ -53,7 +53,7 @@ class _Run:
         self.title = f"{name}, {count} keyframes, on {self.device}"
 
     def each_size(self, what: str = "") -> Iterator[tuple[Config, Callable[[int], None]]]:
-        """Each voxel size's parameters, and what is to be told the number of frames done."""
+        """Each voxel size's parameters, and a function to call with the number of frames done."""
         for config in self.configs:
             stage = f"{config.voxel_size:g} m{what}"
             yield config, partial(_advance, self.progress, stage, len(self.frames))

@@ -1,4 +1,4 @@
-"""What ``taichi-mrf laser`` tells at its end: the contents of ``report.json`` and a table of the methods."""
+"""The report of ``taichi-mrf laser``: the contents of ``report.json``, and a table of the methods."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -85,7 +85,7 @@ def run_laser(options: Laser) -> int:
 
 
 def _some(scans: LaserScans, options: Laser) -> LaserScans:
-    """The scans that --every and --limit leave."""
+    """The scans that --every and --limit select."""
     chosen = slice(None, None if options.limit is None else options.limit * options.every, options.every)
     return dataclasses.replace(
         scans,
@@ -127,7 +127,7 @@ def _solve_all(
 
 
 def _listener(name: str, iterations: int, bar: ProgressBar, request: StopRequest) -> Callable[[Step], bool]:
-    """What shows each step of a method, and tells it whether to go on."""
+    """A listener that shows each step of a method; it returns whether to continue."""
 
     def listen(step: Step) -> bool:
         done = min(step.iteration + 1, iterations)  # the descent at the end is one step more

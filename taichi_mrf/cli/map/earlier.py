@@ -16,7 +16,7 @@ _FILES = (MAP_FILE, VOXEL_FILE, CONFIG_FILE)
 
 
 def refuse_other_run(task: MapTask) -> dict[str, Any] | None:
-    """What stands in the way of a task in its folder, unless it is to resume or overwrite that.
+    """Check the run that a task's folder holds, unless the task is to resume or overwrite it.
 
     Returns the report if the folder holds the finished run of this very task, None if it holds no run. Raises
     ConfigError, which says what to do, for any other run.

@@ -22,7 +22,7 @@ from taichi_mrf.runs.report import report_json
 from taichi_mrf.system.atomic import write_text
 
 MAY_CHANGE = ("inference.sweeps", "inference.tolerance", "runtime.", "volume.memory_limit_gb")
-"""Parameters (or groups) that may differ from those of the run that --resume goes on with."""
+"""Parameters (or groups) in which a resumed run may differ."""
 
 MOST_OF_THE_TIME = 0.05
 """Share of a run's time that saving the map on the way may take."""

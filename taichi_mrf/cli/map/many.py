@@ -90,7 +90,7 @@ def run_many(options: Map) -> int:
         return exit_status(request)
     failed = [row for row in batch.rows() if row.status not in ("mapped", "finished before")]
     if failed:
-        if single and _did_not_fit(batch.outcomes.get(0)):  # of which its report has told
+        if single and _did_not_fit(batch.outcomes.get(0)):  # the report says so
             return DID_NOT_FIT
         problem = failed[0].error or failed[0].status
         first = problem if single else f"{failed[0].name}: {problem}"

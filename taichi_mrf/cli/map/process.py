@@ -60,7 +60,7 @@ def finished_before(task: MapTask) -> Outcome | None:
 
 
 def _one_line(error: Exception) -> str:
-    """The text of an error. One that this package does not raise on purpose is told in full on stderr."""
+    """The text of an error. The traceback of an unexpected one goes to stderr."""
     if isinstance(error, TaichiMRFError):
         return str(error)
     if isinstance(error, OSError):

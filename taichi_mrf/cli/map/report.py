@@ -48,7 +48,9 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _tracking_text(tracking: dict[str, int]) -> str:
     text = f"{tracking['frames']} frames found, {tracking['lost']} lost"
-    return text + (f", {tracking['unsure']} where depth told too little" if tracking["unsure"] else "")
+    return text + (
+        f", {tracking['unsure']} where depth constrained the pose too little" if tracking["unsure"] else ""
+    )
 
 
 def _accuracy_text(accuracy: dict[str, Any] | None) -> str:

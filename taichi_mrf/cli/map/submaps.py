@@ -37,7 +37,7 @@ def run_submaps(options: Map, submap_size: float) -> int:
         raise ConfigError("--submap-size takes one SOURCE")
     if options.poses.track_poses:
         raise ConfigError("--track-poses does not work with --submap-size: no task has all keyframes")
-    library("zarr", "maps in chunks need", "store")  # said before the work, not after it
+    library("zarr", "maps in chunks need", "store")  # fails before the work, not after it
     settings = with_absolute_tables(options.poses.parameters(options.settings), Path.cwd())
     source = absolute_source(options.sources[0])
     sequence = Sequence(source, options.reading.keywords(), options.every, options.limit)
@@ -76,7 +76,7 @@ def run_submaps(options: Map, submap_size: float) -> int:
 
 
 def _refuse_to_replace(options: Map) -> None:
-    """Raise ConfigError if the folder holds a run, and nobody has said that it may be replaced."""
+    """Raise ConfigError if the folder holds a run and --overwrite was not given."""
     held = [name for name in (CONFIG_FILE, REPORT_FILE, MAP_FOLDER) if (options.out / name).exists()]
     if held and not options.overwrite:
         raise ConfigError(

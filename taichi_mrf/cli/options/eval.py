@@ -15,8 +15,8 @@ from taichi_mrf.errors import ConfigError
 class Eval:
     """Repeat an evaluation of the papers, and print it beside what they report.
 
-    Tables are written as CSV, LaTeX and PNG, with the configuration of every map. A run that was
-    interrupted goes on where it was when it is started again with the same --out.
+    Tables are written as CSV, LaTeX and PNG, with the configuration of every map. An
+    interrupted run continues when it is started again with the same --out.
     Example: taichi-mrf eval table1 --data scenes/ --voxel-sizes 0.05 --limit 3
     """
 
