@@ -22,6 +22,8 @@ def print_table(console: Terminal, table: Table) -> None:
     # Chopped words and numbers cannot be read: rather let a narrow terminal wrap the lines of a wide table.
     needed = Measurement.get(console, console.options.update(max_width=_WIDEST), shown)
     width = needed.minimum if console.is_terminal else needed.maximum
-    console.print(shown, width=max(console.width, width), crop=False)
+    wide = Terminal(stderr=console.stderr, quiet=console.quiet)
+    wide.width = max(console.width, width)
+    wide.print(shown)
     for note in table.notes:
         console.print(note)
