@@ -7,6 +7,7 @@ runs only the tests that use the ``backend`` fixture, on Vulkan (a software devi
 import multiprocessing.process
 import os
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -78,19 +79,20 @@ def _is_smoke(item: pytest.Item) -> bool:
     return item.get_closest_marker("smoke") is not None
 
 
-@pytest.fixture(autouse=True)
-def quick_guard(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With --quick, skip a test at the point where it starts Taichi or a process."""
-    if not request.config.getoption("--quick"):
-        return
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """With --quick, skip a test at the point where it, or a fixture, starts Taichi or a process."""
+    with pytest.MonkeyPatch.context() as patch:
+        if item.config.getoption("--quick"):
+            patch.setattr(subprocess.Popen, "__init__", _leave_out)
+            patch.setattr(multiprocessing.process.BaseProcess, "start", _leave_out)
+            if not _is_smoke(item):
+                patch.setattr(runtime, "init", _leave_out)
+        yield
 
-    def skip(*args: Any, **kwargs: Any) -> NoReturn:
-        pytest.skip("left out by --quick: it starts Taichi or a process")
 
-    monkeypatch.setattr(subprocess.Popen, "__init__", skip)
-    monkeypatch.setattr(multiprocessing.process.BaseProcess, "start", skip)
-    if not _is_smoke(request.node):
-        monkeypatch.setattr(runtime, "init", skip)
+def _leave_out(*args: Any, **kwargs: Any) -> NoReturn:
+    pytest.skip("left out by --quick: it starts Taichi or a process")
 
 
 def _take_fewer_examples(item: pytest.Item) -> None:

@@ -18,7 +18,7 @@ from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Template
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.model import Sensor
-from taichi_mrf.voxels.traversal import make_ray
+from taichi_mrf.voxels.traversal import pixel_ray
 
 LEVELS = 10
 """A block of level n has 2^n pixels: the odd levels put two blocks side by side, the even ones two above each
@@ -47,9 +47,7 @@ def listed_ray(rays: Template, i: I32, sensor: Template, view: Template):
     """Ray i of a list (keyframe.RayList): the ray through the middle of its block, the noise there, and how
     many pixels the block has."""
     u, v, wide, high = block_of(rays.blocks[i], sensor.camera.width)
-    # Not pixel_ray: the product with a named vector rounds differently, as every map so far has it.
-    middle = sensor.direction(u + 0.5 * (wide - 1), v + 0.5 * (high - 1))
-    ray = make_ray(view.centre, view.to_voxels @ middle)
+    ray = pixel_ray(sensor, view, u + 0.5 * (wide - 1), v + 0.5 * (high - 1))
     return ray, sensor.noise_at(u + wide // 2, v + high // 2), wide * high
 
 

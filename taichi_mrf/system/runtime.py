@@ -88,7 +88,16 @@ def init(arch: str = "auto", threads: int = 0, debug: bool = False, profile: boo
         raise BackendError(
             f"Taichi already runs on {_chosen.name}: a process has one backend, {arch} needs another process"
         )
+    if profile and not _profiles_kernels():
+        raise BackendError("Taichi already runs without its kernel profiler: profiling needs another process")
     return _chosen.name
+
+
+def _profiles_kernels() -> bool:
+    """Whether Taichi was started with its kernel profiler, which it has on all backends but Vulkan."""
+    import taichi as ti
+
+    return active() == "vulkan" or bool(ti.cfg.kernel_profiler)
 
 
 def choice() -> Backend | None:

@@ -87,7 +87,9 @@ def make_ray(origin: Vec3, direction: Vec3) -> Ray:
 @ti.func
 def pixel_ray(sensor: Template, view: Template, u: F32, v: F32) -> Ray:
     """The ray of pixel (u, v) of a sensor (sensor/model.py) in a window; t is depth in metres."""
-    return make_ray(view.centre, view.to_voxels @ sensor.direction(u, v))
+    # A vector with a name of its own: a product with the bare call is compiled to other roundings.
+    direction = sensor.direction(u, v)
+    return make_ray(view.centre, view.to_voxels @ direction)
 
 
 @ti.func

@@ -6,7 +6,7 @@ A process can start Taichi once, so that most of these tests run a program of th
 import os
 
 import pytest
-from new_interpreter import output
+from new_interpreter import output, python
 
 from taichi_mrf.errors import BackendError
 from taichi_mrf.system import devices, runtime
@@ -189,7 +189,7 @@ tm.init("cpu", threads=100000)
 tm.MRFMap(0.1).voxels()
 print(len(os.listdir("/proc/self/task")))
 """
-    assert int(output(program)) < 4 * os.cpu_count() + 16
+    assert int(python(program).stdout) < 4 * os.cpu_count() + 16  # stderr has the warning
 
 
 def test_more_threads_than_cores_are_a_warning(caplog: pytest.LogCaptureFixture) -> None:
@@ -200,3 +200,11 @@ def test_more_threads_than_cores_are_a_warning(caplog: pytest.LogCaptureFixture)
     assert caplog.messages == [
         f"runtime.threads is 100000, but this machine has {cores} cores; so many are used"
     ]
+
+
+@pytest.mark.usefixtures("backend")
+def test_profiling_is_refused_once_taichi_runs_without_its_profiler() -> None:
+    if runtime.active() == "vulkan":
+        pytest.skip("on Vulkan launches are timed instead of kernels")
+    with pytest.raises(BackendError, match="without its kernel profiler"):
+        runtime.init(profile=True)
