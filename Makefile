@@ -21,7 +21,7 @@ run: $(VENV)/.installed
 	@$(BIN)/taichi-mrf map "$(SOURCE)" --out "$(OUT)"
 
 check: lint
-	@$(BIN)/python -m pytest --quick --quiet
+	@$(BIN)/python -m pytest --quick --quiet -r fE
 
 test: lint
 	@$(BIN)/python tests/backends.py

@@ -4,6 +4,7 @@ Taichi can be started once in a process, so each backend is a run of its own: ``
 runs only the tests that use the ``backend`` fixture, on Vulkan (a software device will do).
 """
 
+import importlib.util
 import multiprocessing.process
 import os
 import subprocess
@@ -86,6 +87,8 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
         if item.config.getoption("--quick"):
             patch.setattr(subprocess.Popen, "__init__", _leave_out)
             patch.setattr(multiprocessing.process.BaseProcess, "start", _leave_out)
+            if importlib.util.find_spec("playwright") is not None:  # its own way to start Chromium
+                patch.setattr("playwright.sync_api.sync_playwright", _leave_out)
             if not _is_smoke(item):
                 patch.setattr(runtime, "init", _leave_out)
         yield
