@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import trimesh
 from console import COARSE, FAST, ROOM, as_process, assert_refused, mapped, report_of, taichi_mrf
+from new_interpreter import obey_hangups
 
 from taichi_mrf.cli.commands import COMMANDS
 from taichi_mrf.cli.flag_list import flags_of
@@ -315,6 +316,7 @@ def interrupted_run(out: Path, number: int, presses: int = 1, flags: tuple[str, 
         stdin=program_end,
         stdout=program_end,
         stderr=program_end,
+        preexec_fn=obey_hangups,
     ) as process:
         os.close(program_end)
         shown = b""

@@ -4,12 +4,21 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 
 import pytest
 
 from taichi_mrf.cli.shared import interrupt
 from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.errors import CutShortError
+
+
+@pytest.fixture(autouse=True)
+def hangups() -> Iterator[None]:
+    """SIGHUP has its usual effect, even if the tests run under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
 
 
 def received(*numbers: int) -> tuple[StopRequest, list[str]]:

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 import trimesh
 from live_program import DEADLINE_S
+from new_interpreter import obey_hangups
 
 ROOM = "synthetic:room?frames=6&width=80&height=60"
 FLAGS = ("--voxel-size", "0.1", "--runtime.arch", "cpu", "--port", "0")
@@ -104,6 +105,7 @@ def running(*arguments: str | Path, start: tuple[str, str] = PROGRAM) -> Iterato
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        preexec_fn=obey_hangups,
     ) as process:
         try:
             yield Running(process)

@@ -1,6 +1,7 @@
 """Programs for a new interpreter, where a test needs a process in which Taichi has not been started."""
 
 import os
+import signal
 import subprocess
 import sys
 
@@ -18,3 +19,8 @@ def output(program: str, **environment: str) -> str:
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     return done.stdout.strip()
+
+
+def obey_hangups() -> None:
+    """For a new process: SIGHUP has its usual effect, even if the tests run under nohup."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
