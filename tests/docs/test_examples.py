@@ -73,4 +73,5 @@ def test_comparing_methods(tmp_path: Path) -> None:
             r"^(.{24}) +([0-9.]+) +([0-9.]+) +([0-9]+)$", printed(EXAMPLES[5], tmp_path), re.M
         )
     }
-    assert rows["MRFMap"][1] > rows["OctoMap-style log-odds"][1] > rows["visibility map"][1]
+    baselines = (rows["OctoMap-style log-odds"][1], rows["visibility map"][1])
+    assert rows["MRFMap"][1] > max(baselines)

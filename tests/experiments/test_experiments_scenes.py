@@ -263,9 +263,9 @@ HOUSE, KITCHEN = "house_livingroom", "seven_scenes_redkitchen"
     [
         (house_scene, remove(f"{HOUSE}/T_world_camera.txt"), [HOUSE, "without a trajectory"]),
         (house_scene, garble(f"{HOUSE}/0001.png"), ["frame 0001", "0001.png"]),
-        (house_scene, remove(f"{HOUSE}/camera.txt"), ["frame 0000", "80 x 60", "640 x 480"]),
+        (house_scene, remove(f"{HOUSE}/camera.txt"), [HOUSE, "80 x 60", "640 x 480"]),
         (kitchen_scene, remove(f"{KITCHEN}/frame-000001.pose.txt"), ["frame-000001.pose.txt"]),
-        (kitchen_scene, remove(f"{KITCHEN}/camera.txt"), ["frame-000000", "80 x 60", "640 x 480"]),
+        (kitchen_scene, remove(f"{KITCHEN}/camera.txt"), [KITCHEN, "80 x 60", "640 x 480"]),
     ],
 )
 def test_a_broken_recording_is_named_in_one_line(
