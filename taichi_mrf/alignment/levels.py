@@ -25,7 +25,7 @@ LEAST_POINTS = 50
 
 
 def margin_m(cell_size: float) -> float:
-    """How far around the points the surface is asked for, in metres."""
+    """How far around the points the surface is looked up, in metres."""
     return 2 * max(cell_size, COARSEST_M)
 
 

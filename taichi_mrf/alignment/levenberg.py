@@ -1,4 +1,5 @@
-"""Gauss-Newton with Levenberg's damping on SE(3), which leaves alone what the points do not tell.
+"""Gauss-Newton with Levenberg's damping on SE(3), which leaves directions alone that the points do not
+determine.
 
 A camera that sees one flat wall can slide along it and turn about its normal without any residual changing.
 Such directions are found among the eigenvectors of the normal equations, with rotations measured by how far
@@ -27,7 +28,7 @@ OBSERVABLE = 0.005
 
 @dataclass(frozen=True)
 class Aligned:
-    """Where a level ended, with the equations there and how many of the six directions were told."""
+    """Where a level ended, with the equations there and how many of the six directions were determined."""
 
     T_world_camera: Pose
     equations: NormalEquations
@@ -73,8 +74,8 @@ def solve(
     damping: float,
     observable: float = OBSERVABLE,
 ) -> tuple[NDArray[np.float64], int]:
-    """The damped step (6,) from the pose T, 0 along directions that the points do not tell, and the number of
-    those that they do."""
+    """The damped step (6,) from the pose T, 0 along directions that the points do not determine, and the
+    number of those that they do."""
     scale = _scale(lever_m)
     values, vectors = np.linalg.eigh(equations.H / np.outer(scale, scale))
     told = vectors[:, values > observable * max(values[-1], 1e-12)]

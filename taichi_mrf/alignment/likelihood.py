@@ -12,7 +12,7 @@ from taichi_mrf.queries.view import View
 from taichi_mrf.system import runtime
 
 STRIDE = 4
-"""Every how many-th pixel, both ways, is asked."""
+"""One pixel in so many, along both axes, is compared."""
 
 OUTLIERS = 0.01
 """Share of the measurements that may come from anywhere in the sensor's range."""

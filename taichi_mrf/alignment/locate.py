@@ -38,7 +38,7 @@ class Located:
 
     ``overlap`` is the share of its points with a surface near them, ``agreement`` the share of those that lie
     on it, by Tukey's measure; ``residual_m`` their RMS distance from it, and ``directions`` how many of the
-    six directions the points tell. In the others the pose is that of the guess.
+    six directions the points determine. In the others the pose is that of the guess.
     """
 
     T_world_camera: Pose | None
@@ -67,7 +67,7 @@ class Locator:
         config: PoseConfig,
     ) -> Located:
         """The pose of an image in what some keyframes have measured. A search begins at each of the guesses;
-        the end that fits best and is nearest to its guess counts. ``config`` says how far from a guess, and
+        the end that fits best and is nearest to its guess counts. ``config`` bounds how far from a guess, and
         how much overlap is needed."""
         points = oriented_points(image, self._surface.max_depth)
         if len(points.points) < LEAST_POINTS:
@@ -79,7 +79,7 @@ class Locator:
         ends = [
             aligned(levels, T, prior, lever_m, OBSERVABLE) for T, prior in zip(guesses, priors, strict=True)
         ]
-        # Where depth tells too little, ends that fit alike differ in how far they are from their guess.
+        # Where depth determines too little, ends that fit alike differ in how far they are from their guess.
         worth = max(end.equations.worth for end in ends)
         costs = [
             worth * end.equations.cost + prior.cost(end.T_world_camera)

@@ -32,7 +32,7 @@ LEAST_SHARE = 0.6
 """A plane needs this share of the square's pixels."""
 
 STEEPEST = 0.2
-"""Cosine of the largest incidence (78 degrees) at which a measurement still says where a surface is."""
+"""Cosine of the largest incidence (78 degrees) at which a measurement still locates a surface."""
 
 
 @dataclass(frozen=True)

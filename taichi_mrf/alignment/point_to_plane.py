@@ -27,7 +27,7 @@ from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat, voxel_number
 
 TUKEY = 4.685
-"""Sigmas beyond which a residual says nothing (95% efficiency for normal errors)."""
+"""Sigmas beyond which a residual has no weight (95% efficiency for normal errors)."""
 
 LARGEST_COST = TUKEY**2 / 6
 """What a residual beyond that costs, and a point that has no surface near it."""
@@ -69,8 +69,8 @@ class NormalEquations:
 
     @property
     def worth(self) -> float:
-        """The factor that makes of all points one measurement with the sigma of a surface, less where few of
-        them overlap."""
+        """The factor that turns all points into one measurement with the sigma of a surface, less where few
+        of them overlap."""
         return self.overlap / (self.weight * SURFACE_SIGMA_M**2) if self.weight > 0 else 0.0
 
 

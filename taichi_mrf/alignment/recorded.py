@@ -1,8 +1,8 @@
-"""What it is worth that a keyframe was recorded where it was, beside what its depth says.
+"""The weight of a keyframe's recorded pose, beside the evidence of its depth.
 
 Recorded poses are wrong by PoseConfig's sigmas. Thousands of points err together, by whole surfaces, as
-sensors are bent and scaled a little: all of them tell no more than one measurement along each direction with
-the standard deviation SURFACE_SIGMA_M.
+sensors are bent and scaled a little: together they count no more than one measurement along each direction
+with the standard deviation SURFACE_SIGMA_M.
 """
 
 import numpy as np

@@ -29,7 +29,7 @@ class RefinedPose:
     ``rotation_rad`` are how far it was moved. Residuals are the robust RMS distance of its points from the
     others' surface, in metres; log-likelihoods the mean per pixel of its depth in the others' map, per metre.
     ``pixels`` is the number of points that met a surface and ``overlap`` their share; ``directions`` how many
-    of the six were told. If not ``accepted``, ``reason`` says why, and the keyframe stays where it was.
+    of the six were determined. If not ``accepted``, ``reason`` says why, and the keyframe stays where it was.
     """
 
     keyframe: int

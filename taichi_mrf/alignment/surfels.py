@@ -1,6 +1,6 @@
 """The surface that keyframes have measured, more finely than voxels: a point and a normal for each cell.
 
-A voxel of 5 cm says that a wall is in it, but not where in it, and the poses that are to be found are wrong
+A voxel of 5 cm shows that a wall is in it, but not where in it, and the poses that are to be found are wrong
 by less. So there are, for every voxel that a keyframe has measured something in, sums over its points there,
 which are added up over keyframes as messages are.
 """

@@ -1,7 +1,7 @@
 """Loopy belief propagation (section V-A): sum-product, and max-product as its limit.
 
 A message is what occupied costs more than free, in one number for each edge, from the beam to the cell.
-What a cell tells a beam is its belief, the sum of all messages to it (eqs. 18, 19), less the beam's own.
+A cell's message to a beam is its belief, the sum of all messages to it (eqs. 18, 19), less the beam's own.
 Beliefs are sums of integers, kept while messages change, so that neither the order nor the number of
 threads matters.
 

@@ -110,7 +110,7 @@ def _follow(
 
     ``depth`` is (H * W) metres. Counts the voxels on each ray's way into ``begins[beam + i + 1]`` (beams +
     1), or, with ``write``, writes them to ``cells`` (edges), and the energies to ``table`` (edges + beams,
-    1), where ``begins`` says.
+    1), at the places in ``begins``.
     """
     for i in range(pixels.shape[0]):
         u, v = sensor.pixel(pixels[i])

@@ -5,11 +5,11 @@ what occupied costs this beam more than free. If a cell's multipliers sum to zer
 whole graph costs the same with them as without, so the sum of the slaves' minima is a lower bound of the
 least energy. In a cell on which slaves disagree, Alg. 2 charges each of them the step for its own choice,
 
-    t_if += step / (r + 1)      where the slave says occupied, and -= where it says free
+    t_if += step / (r + 1)      where the slave labels it occupied, and -= where free
 
 (``charge: whole``). Where opinions are even that is the subgradient of the bound, projected onto multipliers
 that sum to zero, up to a common offset; but where one beam of a thousand disagrees, all the others are turned
-against what they said. The projected subgradient itself (``charge: mean``) is
+against their labels. The projected subgradient itself (``charge: mean``) is
 
     t_if += step / (r + 1) * (x_i^f - mean over f of x_i^f)
 
@@ -70,7 +70,7 @@ def _solve_slaves(
 
     ``multipliers`` (edges) and ``values`` (beams), the slaves' minima, are in units; ``awake`` (beams) is 1
     for a beam to be solved; ``firsts`` (beams) receives the first occupied step, ``ones`` (cells) how many
-    slaves say occupied, ``sums[0]`` the change of the sum of values.
+    slaves label the cell occupied, ``sums[0]`` the change of the sum of values.
     """
     for f in range(graph.begins.shape[0] - 1):
         if awake[f] == 1:
@@ -90,12 +90,12 @@ def _choose_steps(
     ones: I32Array, degrees: I32Array, rest: I64Array, charged: I64Array, step: ti.f32,
     if_free: I32Array, if_occupied: I32Array, sums: I64Array, whole: Template,
 ):  # fmt: skip
-    """What each cell's multipliers grow by where a slave says free (``if_free``), and where it says occupied
+    """What each cell's multipliers grow by where a slave labels it free (``if_free``), and where occupied
     (``if_occupied``). All arrays are (cells), but ``sums`` (3); values are in units.
 
-    ``ones`` of a cell's ``degrees`` slaves say occupied. ``rest`` is minus the sum of a cell's multipliers;
-    ``charged`` what slaves were charged for occupied less what they were for free (eq. 24). sums[1] is the
-    value of the rest's own slaves, sums[2] counts disagreeing cells.
+    ``ones`` of a cell's ``degrees`` slaves label it occupied. ``rest`` is minus the sum of a cell's
+    multipliers; ``charged`` what slaves were charged for occupied less what they were for free (eq. 24).
+    sums[1] is the value of the rest's own slaves, sums[2] counts disagreeing cells.
     """
     for cell in range(ones.shape[0]):
         yes, all_of_them = ones[cell], degrees[cell]
@@ -140,7 +140,7 @@ def _change_multipliers(
 
 
 class DualDecomposition:
-    """Multipliers and what the slaves last said; one iteration of Alg. 2 at a time."""
+    """Multipliers and the slaves' last labels; one iteration of Alg. 2 at a time."""
 
     def __init__(self, graph: FactorGraph, config: LaserConfig) -> None:
         self.graph, self.config = graph, config

@@ -2,7 +2,7 @@
 
 Two compressed lists. That of a beam holds its cells in their order from the origin; it is found with the
 traversal that all rays use, in a pass that counts and one that writes. That of a cell holds its beams, and
-at which step each of them comes through; only some methods need it, so it is made when first asked for. A
+at which step each of them comes through; only some methods need it, so it is made when it is first used. A
 beam is the factor of its number; an edge is a place in the beams' list.
 """
 

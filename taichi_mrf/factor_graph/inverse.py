@@ -38,7 +38,7 @@ def ends_of_beams(graph: FactorGraph) -> NDArray[np.int32]:
 
 
 def inverse_model(graph: FactorGraph, log_odds: float) -> InverseModel:
-    """A return says occupied of the cell that it lies in, by ``log_odds``, and free of each one before it."""
+    """A return makes its own cell more occupied by ``log_odds``, and each cell before it more free."""
     returns = ends_of_beams(graph)
     votes = 2 * returns.astype(np.int64) - graph.degrees.to_numpy()
     marginals = 1.0 / (1.0 + np.exp(np.clip(-log_odds * votes, -700, 700)))

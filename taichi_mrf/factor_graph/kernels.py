@@ -83,7 +83,7 @@ def write_beams_of_cells(
     """Each cell's ``beams`` and their ``steps`` (edges); ``places`` (cells) is where each cell's list begins,
     and is used up. ``begins`` (beams + 1) and ``cells`` (edges) are those of the graph.
 
-    The order within a cell's list depends on the threads: whoever adds up over it must not depend on it.
+    The order within a cell's list depends on the threads: sums over it must not depend on it.
     """
     for beam in range(begins.shape[0] - 1):
         for edge in range(begins[beam], begins[beam + 1]):

@@ -72,8 +72,8 @@ class IncrementalInference:
         seconds: float | None,
         progress: Progress | None = None,
     ) -> InferReport:
-        """Sweep ``first``, in their order, then whoever is affected most, until nobody is by more than
-        ``tolerance`` or the time is over; what is left waits for the next call.
+        """Sweep ``first``, in their order, then the most affected keyframe, until none is affected by more
+        than ``tolerance`` or the time is over; what is left waits for the next call.
 
         ``residual`` of the report is the largest share that is left; ``complete`` is False if it is more than
         the tolerance.
@@ -101,9 +101,7 @@ class IncrementalInference:
             if self.sweeper.sweep(keyframe, self.pool):
                 self.sweeper.take_moved(keyframe, self.pool)
             else:
-                keyframe.change_count_at_last_sweep = np.zeros(
-                    0, np.int64
-                )  # it sees no brick, so there is nothing to say
+                keyframe.change_count_at_last_sweep = np.zeros(0, np.int64)  # it sees no brick
             rays, swept = rays + keyframe.rays, swept + 1
             if progress is not None and not progress(InferProgress(1, 1, swept, swept, keyframe.rays)):
                 break
@@ -111,8 +109,8 @@ class IncrementalInference:
         return InferReport(time.perf_counter() - begin, largest, swept, rays, largest <= tolerance)
 
     def _shares(self, keyframes: Mapping[int, Keyframe], tolerance: float) -> dict[int, float]:
-        """How much of what the waiting keyframes were told is out of date, if it is too much; those that
-        nobody would sweep wait no longer."""
+        """The share of each waiting keyframe's cavity that is out of date, if it is too large; the other
+        keyframes wait no longer."""
         shares = {}
         for id in self._waiting & keyframes.keys():
             self.look_again(keyframes[id])

@@ -64,7 +64,7 @@ class DepthImage:
 
     @staticmethod
     def upload(depth_m: NDArray[np.float32], camera: Camera, noise: NoiseModel) -> "DepthImage":
-        """Put :func:`checked_depth` (H, W), which nobody may change from now on, where kernels can reach it.
+        """Put :func:`checked_depth` (H, W), which must not change from now on, where kernels can reach it.
         Raises ConfigError if the noise model does not fit the camera."""
         table = noise.table(camera)
         depth, sensor = resident(depth_m.reshape(-1)), table.sensor(camera)
@@ -137,7 +137,7 @@ class BrickArrays:
 class VisibleBricks:
     """The bricks of the map that a keyframe's rays cross, in the order of its messages.
 
-    ``cells`` in the keyframe's window (ascending), ``slots`` in the pool, ``identity`` to tell whether
+    ``cells`` in the keyframe's window (ascending), ``slots`` in the pool, ``identity`` shows whether
     that is still the same brick, and ``version`` of the map's set of bricks at which this was true.
     ``arrays`` and the ``scale`` of the accumulators are made when a sweep first needs them.
     """

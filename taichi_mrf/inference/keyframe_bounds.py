@@ -7,7 +7,7 @@ from taichi_mrf.voxels.window import Window
 
 
 class KeyframeBounds:
-    """The boxes of bricks that keyframes look at, all in one array, to be asked at once."""
+    """The boxes of bricks that keyframes look at, all in one array, so that one comparison tests them all."""
 
     def __init__(self) -> None:
         self._row_of: dict[int, int] = {}

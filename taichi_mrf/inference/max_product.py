@@ -1,10 +1,10 @@
-"""The maximising form of sum_product.py: what the best explanation of a measurement says of each voxel.
+"""The maximising form of sum_product.py: the message of the best explanation of a measurement to each voxel.
 
-Max-product belief propagation (eq. 20 of Dhiman, Kundu, Dellaert and Corso, ICRA 2014) on the rays of
-MRFMap. Where sum-product adds up the probabilities of all ways to explain a measurement, this takes the
-likeliest of them, for either state of a voxel. Costs are negative logarithms; a ray's cost depends on its
-first occupied voxel alone, and first_occupied.py says how all its messages are found in one pass there and
-one back. A voxel that the ray crosses for the length l is free with probability (1 - m)^l, as it is there.
+Max-product belief propagation (eq. 20 of Dhiman, Kundu, Dellaert and Corso, ICRA 2014) on the rays of MRFMap.
+Where sum-product adds up the probabilities of all ways to explain a measurement, this takes the likeliest of
+them, for either state of a voxel. Costs are negative logarithms; a ray's cost depends on its first occupied
+voxel alone, and first_occupied.py describes how all its messages are found in one pass there and one back. A
+voxel that the ray crosses for the length l is free with probability (1 - m)^l, as it is there.
 """
 
 import taichi as ti
@@ -22,7 +22,7 @@ def cost(density: F32, floor: F32) -> F32:
 
 @ti.func
 def see_best(ahead: Template, length: F32, log_free: F32, density: F32, floor: F32) -> Vec4:
-    """One voxel on the way out: renews ``ahead``, and returns what the way back needs to know.
+    """One voxel on the way out: renews ``ahead``, and returns what the way back needs.
 
     That is the length; what occupied costs more than free, as all others believe; the cost of its being the
     first occupied voxel; and ``ahead`` as it was before it.

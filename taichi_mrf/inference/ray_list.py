@@ -95,7 +95,7 @@ class RayBundler:
 
 @dataclass(frozen=True)
 class _MergeRule(Bundle):
-    """What is asked of a block of pixels before it becomes one ray."""
+    """The conditions under which a block of pixels becomes one ray."""
 
     stride_metres: F32
     """See :func:`stride_metres`."""

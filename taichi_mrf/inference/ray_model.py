@@ -1,4 +1,4 @@
-"""What the rays of a sweep (sum_product.py) are told and share: their model, the voxels, and the trace."""
+"""What the rays of a sweep (sum_product.py) share: their model, the voxels, and the trace."""
 
 from dataclasses import dataclass
 

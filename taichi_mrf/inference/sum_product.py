@@ -2,7 +2,7 @@
 
     p(o, d) = 1/Z  prod_i phi(o_i)  prod_r psi_r(o_r, d_r)                                    (1)
 
-A voxel o_i is 1 if occupied; a ray r is a factor over all voxels that it crosses, and says how well the
+A voxel o_i is 1 if occupied; a ray r is a factor over all voxels that it crosses, and rates how well the
 first occupied one among them explains the measured depth (eqs. 3 to 5). Equation numbers are those of
 Shankar & Michael, "MRFMap: Online Probabilistic 3D Mapping using Forward Ray Sensor Models" (RSS 2020);
 the supplement's are marked S.
@@ -99,8 +99,7 @@ def cavity(
     ``slots`` (n) are the visible bricks' places in the pool, ``belief`` (pool * 512) log-odds and
     ``messages`` (n * 512) log-odds, float16 or float32. Writes log(1 - m) to ``log_free`` (n * 512), with
     log-odds bounded by ``lowest`` and ``highest``, and sets the ``sums`` (n * 512) to zero. ``strip`` is the
-    number of voxels
-    for an iteration (voxels/strips.py), here and below.
+    number of voxels for an iteration (voxels/strips.py), here and below.
     """
     for part in range(slots.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, slots, strip)
@@ -142,7 +141,7 @@ def send_messages(
                     ray.direction.norm(), ti.cast(pixels, ti.f32),
                 )  # fmt: skip
 
-                # The ray ends where its measurement has nothing more to say, or where the map does.
+                # The ray ends where its measurement carries no more evidence, or where the map ends.
                 last = sensor.farthest_depth(measured, noise, model.end_sigmas)
                 begin, end = 0.0, ti.min(last, model.max_depth)
                 if entry_depths_known == 1:
@@ -320,8 +319,7 @@ def finish(
     ``slots`` (n) are the visible bricks' places in the pool, ``belief`` (pool * 512) and ``messages`` (n *
     512) log-odds, ``sums`` (n * 512) those of the rays. A voxel that rays crossed for ``min_length`` voxel
     sizes or less keeps its message. ``damping`` is the share of the old message that stays. ``moved`` (n)
-    counts,
-    for each brick, the voxels whose marginal changed by more than MOVED.
+    counts, for each brick, the voxels whose marginal changed by more than MOVED.
     """
     for part in range(slots.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, slots, strip)

@@ -65,7 +65,7 @@ def read_box(m: QueriedMap, lower: ArrayLike, upper: ArrayLike) -> BoxOfVoxels:
 
 
 def map_extent(m: QueriedMap) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Two corners, (3,) in metres, of the box around all that the map says anything of; it ends at bricks of
+    """Two corners, (3,) in metres, of the box around all that is known in the map; it ends at bricks of
     8 voxels. Raises ConfigError for an empty map."""
     bricks = known_bricks(m)
     if not len(bricks):
@@ -94,7 +94,7 @@ def voxel_box(
 ) -> BoxOfVoxels:
     """The voxels from ``first`` up to, but without, ``after``, (3,) voxel coordinates each.
 
-    ``reader`` saves time where many boxes of the same map are asked for. Raises CapacityError.
+    ``reader`` saves time where many boxes of the same map are read. Raises CapacityError.
     """
     lowest, highest = first // BRICK, (after - 1) // BRICK
     shape = highest - lowest + 1

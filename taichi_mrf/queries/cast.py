@@ -1,4 +1,4 @@
-"""Where rays meet something: many rays at once, with a stated policy for space that nobody has seen."""
+"""Where rays meet something: many rays at once, with a stated policy for unknown space."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -151,7 +151,7 @@ def _launch(
 
 @ti.dataclass
 class _Search(Struct):
-    """A ray that looks for its end, and by what it knows it."""
+    """A ray on the way to its end, and the condition that ends it."""
 
     prior: F32
     min_evidence: F32

@@ -20,7 +20,7 @@ class MapChange:
 
     ``counts`` (3, 3) int64 is the number of voxels by state in a (row) and in b (column): UNKNOWN, FREE,
     OCCUPIED, without those that are unknown in both. ``mean_difference`` is the mean of |p_b - p_a| over the
-    voxels that both know, ``mean_difference_known`` over those that either knows; 0 without any.
+    voxels known in both maps, ``mean_difference_known`` over those known in either; 0 without any.
     ``points`` (n, 3) are the centres, in metres, of the voxels whose state has changed, ``before`` and
     ``after`` (n,) int8 their states, ``difference`` (n,) float32 p_b - p_a.
     """
@@ -35,27 +35,27 @@ class MapChange:
 
     @property
     def only_in_a(self) -> int:
-        """Voxels that a knows and b does not."""
+        """Voxels that are known in a and unknown in b."""
         return int(self.counts[UNKNOWN + 1 :, UNKNOWN].sum())
 
     @property
     def only_in_b(self) -> int:
-        """Voxels that b knows and a does not."""
+        """Voxels that are known in b and unknown in a."""
         return int(self.counts[UNKNOWN, UNKNOWN + 1 :].sum())
 
     @property
     def in_both(self) -> int:
-        """Voxels that both know."""
+        """Voxels that are known in both maps."""
         return int(self.counts[1:, 1:].sum())
 
     @property
     def changed(self) -> int:
-        """Voxels that both know, of different states."""
+        """Voxels that are known in both maps and differ in state."""
         return int(self.counts[1, 2] + self.counts[2, 1])
 
 
 def compare_maps(a: QueriedMap, b: QueriedMap) -> MapChange:
-    """Compare two maps over all that either knows anything of, also what was seen free and has no voxels.
+    """Compare two maps over all that is known in either, also seen-free space without voxels.
 
     The maps can be of different methods. Raises ConfigError if their voxels are of different sizes.
     """

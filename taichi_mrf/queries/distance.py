@@ -70,9 +70,9 @@ def distance_field(
 ) -> DistanceField:
     """Distances everywhere in a box, (3,) corners in metres, to obstacles inside it and around it.
 
-    ``unknown`` says whether unknown voxels are obstacles. Raises ConfigError for corners that make no box and
-    a distance that is not positive, CapacityError for a box that does not fit memory, TaichiMRFError without
-    SciPy.
+    ``unknown`` decides whether unknown voxels are obstacles. Raises ConfigError for corners that make no box
+    and a distance that is not positive, CapacityError for a box that does not fit memory, TaichiMRFError
+    without SciPy.
     """
     images = library("scipy.ndimage", "distances need", "mesh")
     if unknown not in ("free", "occupied"):

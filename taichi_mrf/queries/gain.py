@@ -1,4 +1,4 @@
-"""How much a view of the map would tell: the uncertainty that its rays would look at.
+"""The information gain of a view: the uncertainty along its rays.
 
 A ray gains the entropy of what it sees, in bits, weighted by whether it is seen:
 
@@ -7,7 +7,7 @@ A ray gains the entropy of what it sees, in bits, weighted by whether it is seen
 
 V falls as exp(-alpha t) within a voxel, alpha = -ln(1 - p) / voxel size, so the integral is exact. It is the
 occlusion-aware information of Isler et al. (ICRA 2016), with true lengths in place of a count of voxels.
-Unknown voxels have the entropy of what the map says of them: that of its prior in an MRFMap, 1 bit in maps
+Unknown voxels have the entropy of their probability: that of the prior in an MRFMap, 1 bit in maps
 that integrate scan by scan. What rays pass as empty holds nothing to be learnt: bricks without voxels that
 were seen to be free, and in maps that integrate scan by scan the free voxels (see Occlusion.empty_below).
 """
@@ -37,7 +37,7 @@ _THINNEST = 1e-6
 def view_gain(
     m: QueriedMap, camera: Camera, T_world_camera: ArrayLike, max_depth: float
 ) -> NDArray[np.float64]:
-    """What views would tell, in bits: poses (N, 4, 4) -> (N,), or (4, 4) -> a number of shape ().
+    """Information gain of views, in bits: poses (N, 4, 4) -> (N,), or (4, 4) -> a number of shape ().
 
     The sum of :func:`pixel_gain` over the image. A voxel that several rays cross counts for each, so gains
     compare among views of one camera; few pixels are enough to rank views. Raises what that raises.
@@ -54,7 +54,7 @@ def view_gain(
 def pixel_gain(
     m: QueriedMap, camera: Camera, T_world_camera: ArrayLike, max_depth: float
 ) -> NDArray[np.float32]:
-    """What the ray of each pixel would tell up to an axial depth in metres, (H, W) float32 in bits.
+    """Information gain of each pixel's ray up to an axial depth in metres, (H, W) float32 in bits.
 
     Raises KeyframeError for a pose that is none, ConfigError for a depth that is not positive, CapacityError
     if the view reaches through more space than fits memory.

@@ -1,5 +1,5 @@
-"""Which bricks a map knows something of, and what their voxels hold: the ground that queries over space and
-exports stand on. It asks a map for no more than every map can answer, whatever its method.
+"""The known bricks of a map and the values of their voxels: what queries over space and exports are made of.
+Every mapping method provides what is used here.
 """
 
 from collections.abc import Iterator, Mapping
@@ -72,7 +72,7 @@ class BrickReader:
 
     def log_odds(self, bricks: Bricks) -> NDArray[np.float32]:
         """(n, 512) log-odds of being occupied; the same everywhere in a brick without voxels: the prior, or
-        what the map says of space that was seen to be free."""
+        the value of seen-free space."""
         slots = self.slots(bricks)
         exist = slots >= 0
         out = np.empty((len(bricks), VOXELS), np.float32)
@@ -101,7 +101,7 @@ class BrickReader:
 
 
 def seen_free_bricks(m: QueriedMap) -> Bricks:
-    """Bricks (n, 3), ascending, that rays have crossed and in which nobody has met a surface: they are free
+    """Bricks (n, 3), ascending, that rays have crossed and in which no surface was measured: they are free
     and have no voxels of their own. Maps that integrate scan by scan keep voxels for all they have seen.
 
     They are looked for around the bricks that have voxels and the cameras, ever further out for as long as
@@ -120,7 +120,7 @@ def seen_free_bricks(m: QueriedMap) -> Bricks:
 
 
 def known_bricks(m: QueriedMap) -> Bricks:
-    """All bricks (n, 3), ascending, that the map says anything of: those with voxels and the seen-free."""
+    """All known bricks (n, 3), ascending: those with voxels and the seen-free."""
     return sorted_bricks(np.concatenate([BrickReader(m).bricks, seen_free_bricks(m)]))
 
 

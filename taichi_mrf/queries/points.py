@@ -1,4 +1,4 @@
-"""What the map says of points: how probable it is that they are occupied, and whether they are known."""
+"""The probability of occupied at points, and whether they are known."""
 
 import numpy as np
 import taichi as ti
@@ -27,7 +27,7 @@ def point_log_odds(
 ) -> NDArray[np.float32]:
     """(N, 3) points in metres -> (N,) log-odds of being occupied.
 
-    Where no brick exists it is the prior if nobody has looked there, else ``seen_free``. A point that is
+    Where no brick exists it is the prior where no ray has passed, else ``seen_free``. A point that is
     not finite raises ConfigError.
     """
     points_m = checked_points(points)

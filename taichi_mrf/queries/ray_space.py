@@ -1,7 +1,7 @@
 """The space that rays go through, with what is not known of it: for queries that must not look through it.
 
 The index of a window (voxels/window.py) names the bricks that exist. Here it also names, by the slot behind
-the pool's last, every brick that nobody has looked into, so that a ray meets its voxels as it meets others;
+the pool's last, every brick that no ray has crossed, so that a ray meets its voxels as it meets others;
 what was seen to be free and has no voxels stays out of the index and is skipped.
 """
 
@@ -28,7 +28,7 @@ class RaySpace:
 
     @property
     def unknown_from(self) -> int:
-        """Voxels of the index from this number on are those of bricks that nobody has looked into."""
+        """Voxels of the index from this number on are those of bricks that no ray has crossed."""
         return self._reader.pool.capacity * VOXELS
 
     def known_box_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:

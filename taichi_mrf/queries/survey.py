@@ -30,7 +30,7 @@ class SurfaceSurvey:
     ``near`` and ``far`` bound the ray's segment in the voxel with the largest omega, 0 where the ray meets
     nothing; ``visibility`` is what is left of the ray at its end; ``expected`` the mean depth of the
     surface, given that there is one, 0 where there is none. ``likelihood`` is the density, per metre, of
-    the measurement if the surface lies where Omega says; 0 without a measurement.
+    the measurement if the surface is distributed as Omega; 0 without a measurement.
     """
 
     near: NDArray[np.float32]

@@ -25,9 +25,9 @@ _NO_SKEW = 1e-6
 class Camera(Protocol):
     """What mapping asks of a camera.
 
-    A camera is immutable, equal to another that maps pixels to the same rays, and its ``repr`` says all of
-    it. Depth is the parameter of a ray along its direction: axial depth if directions have z = 1, range if
-    they have the length 1.
+    A camera is immutable, equal to another that maps pixels to the same rays, and its ``repr`` is complete.
+    Depth is the parameter of a ray along its direction: axial depth if directions have z = 1, range if they
+    have the length 1.
     """
 
     @property

@@ -1,4 +1,5 @@
-"""The sensor as all kernels see it: one bundle that says where rays go and how likely measurements are.
+"""The sensor as all kernels see it: one bundle with the directions of rays and the likelihoods of
+measurements.
 
 A kernel takes a ``Sensor`` and asks nothing else about cameras or noise. What can be plugged in:
 

@@ -1,8 +1,8 @@
 """Simulated sensor noise on clean axial depth: what a perfect renderer lacks to be a test of a mapper.
 
-There are two sensors. :func:`simulate` is a structured-light camera with all that the literature says of a
-Kinect 1, which no map's noise model knows in full. :func:`simulate_model` draws from a noise model itself,
-such as a learnt table, so that a map can be judged with exactly the sensor that it believes in.
+There are two sensors. :func:`simulate` is a structured-light camera with all effects that the literature
+describes for a Kinect 1, which no map's noise model covers in full. :func:`simulate_model` draws from a noise
+model itself, such as a learnt table, so that a map can be judged with exactly the sensor that it believes in.
 """
 
 from collections.abc import Sequence
@@ -104,7 +104,7 @@ def simulate(
 def simulate_model(
     depth_m: NDArray[np.float32], camera: PinholeCamera, noise: NoiseModel, seed: Seed = 0
 ) -> NDArray[np.float32]:
-    """Draw a measured depth image, (H, W) float32, from what ``noise`` says of each pixel.
+    """Draw a measured depth image, (H, W) float32, from the ``noise`` of each pixel.
 
     measured = true + bias(true) + max(sigma(true), LEAST_SIGMA_M) * n with n standard normal, drawn for all
     pixels, row by row, by ``numpy.random.default_rng(seed)``. Nothing else is lost or rounded: 0 (no

@@ -32,7 +32,7 @@ def offsets_in_brick() -> NDArray[np.int32]:
 def grid_keys(cells: NDArray[np.integer] | NDArray[np.floating]) -> NDArray[np.int64]:
     """A number for each cell of a grid, whole coordinates (n, 3) -> (n,), ascending in x, then y, then z.
 
-    It tells cells apart within 2^20 of the origin: bricks, and voxels or other cells as well.
+    It distinguishes cells within 2^20 of the origin: bricks, and voxels or other cells as well.
     """
     i, j, k = (cells.astype(np.int64) + (1 << 20)).T
     return (i << 42) | (j << 21) | k

@@ -60,7 +60,8 @@ def create_topology(arch: str, dense_bricks: int) -> Topology:
     if the process has too many maps."""
     key = dense_bricks if arch == "vulkan" else 0
     if not _spare.get(key) and SparseTopology.all_taken():
-        gc.collect()  # nobody may reach those maps any more: the traceback of an old exception holds its map
+        # maps may be unreachable but not collected: the traceback of an old exception holds its map
+        gc.collect()
     if _spare.get(key):
         topology = _spare[key].pop()
         topology.clear()
@@ -185,7 +186,7 @@ class SparseTopology:
         self._tree = SparseTopology.tree
         self.layer = self._tree.unused.pop(0)
         weakref.finalize(self, self._tree.unused.append, self.layer)
-        self.clear()  # whoever had the layer before has left it as it was
+        self.clear()  # the map that used the layer before left its bricks in it
 
     @classmethod
     def all_taken(cls) -> bool:
