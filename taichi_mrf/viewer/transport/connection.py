@@ -78,11 +78,12 @@ class GuardedConnection(ServerConnection):
         """Messages that are admitted later unless others replace them, with the time when they are due."""
         self._camera_due = 0.0
         self._picture_begun = self._picture_arrived = False
+        self._picture_bytes = 0
 
     def data_received(self, data: bytes) -> None:
         """Take in bytes; a client whose next message is already too large loses its connection."""
         super().data_received(data)
-        if self.protocol.state is State.OPEN and not self._is_within_size():
+        if self.protocol.state is State.OPEN and not self._is_within_size(len(data)):
             self.protocol.fail(CloseCode.MESSAGE_TOO_BIG, "the message is too large")
             self.send_data()
 
@@ -111,22 +112,27 @@ class GuardedConnection(ServerConnection):
         finally:
             cut_off.cancel()
 
-    def _is_within_size(self) -> bool:
-        """Whether the message that is arriving has not outgrown its bound. A picture that was asked for may
-        be large, once."""
+    def _is_within_size(self, received: int) -> bool:
+        """Whether the message that is arriving has not outgrown its bound, with the ``received`` bytes of it
+        or of those before it. A picture that was asked for may be large, once.
+
+        One read can end a message and begin the next, so the bytes of the picture are counted as well.
+        """
         size = len(self.protocol.reader.buffer) + (self.protocol.current_size or 0)
         if size <= LARGEST_MESSAGE and not self._picture_begun and not self._picture_arrived:
             return True
         client_id = None if self.gate is None else self.gate.client_id(self)
         if self.gate is None or client_id is None or not self.gate.awaits_picture(client_id):
             self._picture_begun = self._picture_arrived = False
+            self._picture_bytes = 0
             return size <= LARGEST_MESSAGE
         if size <= LARGEST_MESSAGE:
             self._picture_arrived |= self._picture_begun
             self._picture_begun = False
             return True
+        self._picture_bytes += received if self._picture_begun else size
         self._picture_begun = True
-        return size <= LARGEST_PICTURE and not self._picture_arrived
+        return self._picture_bytes <= LARGEST_PICTURE and not self._picture_arrived
 
     def _due_message(self) -> AnyClientMessage | None:
         """A message that was held back and whose time has come."""
