@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import imageio.v3
@@ -23,9 +24,11 @@ from taichi_mrf.viewer.transport.client_messages import AnyClientMessage, Undeco
 from taichi_mrf.viewer.transport.connection import (
     CAMERA_INTERVAL_S,
     LARGEST_MESSAGE,
+    LARGEST_PICTURE,
     MESSAGES_PER_SECOND,
     TYPING_REST_S,
     Budget,
+    GuardedConnection,
 )
 
 if TYPE_CHECKING:
@@ -438,3 +441,21 @@ def test_decoding_either_reads_refuses_or_says_undecodable(encoded: bytes) -> No
     except Undecodable:
         return
     assert message is None or isinstance(message, AnyClientMessage)
+
+
+def test_pictures_that_end_within_a_read_count_together() -> None:
+    """Each read ends a picture of 4 MiB and begins the next, so no read ends between two of them."""
+    read, picture = 2**18, 2**22
+    connection = GuardedConnection.__new__(GuardedConnection)
+    connection.gate = SimpleNamespace(client_id=lambda _: 0, awaits_picture=lambda _: True)  # type: ignore[assignment]
+    connection._picture_begun = connection._picture_arrived = False
+    connection._picture_bytes = 0
+    taken = 0
+    for arrived in range(read - 1000, 20 * picture, read):
+        unfinished = SimpleNamespace(buffer=bytes(arrived % picture))
+        connection.protocol = SimpleNamespace(reader=unfinished, current_size=None)  # type: ignore[assignment]
+        assert arrived % picture > LARGEST_MESSAGE
+        if not connection._is_within_size(read):
+            break
+        taken = arrived
+    assert picture < taken <= LARGEST_PICTURE
