@@ -18,13 +18,15 @@ from numpy.typing import NDArray
 
 from taichi_mrf.alignment.oriented_points import OrientedPoints
 from taichi_mrf.alignment.recorded import SURFACE_SIGMA_M
-from taichi_mrf.alignment.surfel_grid import SurfelGrid
+from taichi_mrf.alignment.surfel_grid import SurfelGrid, SurfelPlanes
 from taichi_mrf.alignment.surfels import ROUGHNESS
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, IVec3, Mat3, Template, Vec3
+from taichi_mrf.kernels.bundles import Bundle, kernel
+from taichi_mrf.kernels.types import I32, F32Array, F32Array2, IVec3, Mat3, Template, Vec3
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat, voxel_number
+from taichi_mrf.voxels.traversal import Viewpoint
 
 TUKEY = 4.685
 """Sigmas beyond which a residual has no weight (95% efficiency for normal errors)."""
@@ -74,27 +76,49 @@ class NormalEquations:
         return self.overlap / (self.weight * SURFACE_SIGMA_M**2) if self.weight > 0 else 0.0
 
 
+@dataclass(frozen=True)
+class _Points(Bundle):
+    """OrientedPoints on the device, of which the first ``total`` are used."""
+
+    positions: F32Array2
+    """(N, 3) metres, in the camera frame."""
+
+    normals: F32Array2
+    """(N, 3), of length one."""
+
+    sigmas: F32Array
+    """(N) metres, along the normals."""
+
+    total: I32
+
+
+@dataclass(frozen=True)
+class _Strips(Bundle):
+    """How the points are divided: a strip's points are added up one after the other, so that the sums do not
+    depend on the number of threads."""
+
+    number: I32
+
+    spread: I32
+    """Iterations that a strip stands for: on a CPU Taichi gives a thread no fewer than 512."""
+
+
 class PointToPlane:
     """The residuals of some points against some surfels, for one pose after the other."""
 
     def __init__(self, points: OrientedPoints, grid: SurfelGrid) -> None:
         self.grid, self.total = grid, len(points.points)
-        self._points, self._normals = _upload(points.points), _upload(points.normals)
-        self._sigmas = _upload(points.sigmas)
-        cpu = runtime.active() == "cpu"
-        self._strips, self._spread = (64, 512) if cpu else (2048, 1)
+        positions, normals = _upload(points.points), _upload(points.normals)
+        self._points = _Points(positions, normals, _upload(points.sigmas), self.total)
+        self._strips = _Strips(64, 512) if runtime.active() == "cpu" else _Strips(2048, 1)
 
     def linearised(self, T_world_camera: Pose) -> NormalEquations:
         """Residuals and their derivatives at a pose."""
-        sums = np.zeros((self._strips, _TERMS), np.float32)
+        sums = np.zeros((self._strips.number, _TERMS), np.float32)
         if self.total and self.grid.count:
             view = self.grid.window.viewpoint(T_world_camera)
             rotation = ti.Matrix(T_world_camera[:3, :3].tolist(), ti.f32)
-            accumulate(
-                self._points, self._normals, self._sigmas, self.total, view.centre, view.to_voxels, rotation,
-                self.grid.cell_size, self.grid.window.shape_vector, self.grid.index.bricks,
-                self.grid.places, self.grid.planes, self._strips, self._spread, sums,
-            )  # fmt: skip
+            accumulate(self._points, view, rotation, self.grid.planes, self._strips, sums)
             runtime.settle()
         total = sums.sum(axis=0, dtype=np.float64)
         matched = round(total[_POINTS])
@@ -113,19 +137,20 @@ def _upload(values: NDArray[np.float32]) -> "ti.Ndarray":
 
 
 @ti.func
-def surface_at(P: Vec3, normal: Vec3, shape: IVec3, bricks: Template, places: Template, planes: Template):
-    """(signed distance in cells, unit normal, weight) of the surface around P, in cells from the window's
-    corner, whose normal is like ``normal``; the weight is 0 where there is none."""
+def surface_at(P: Vec3, normal: Vec3, surface: Template):
+    """(signed distance in cells, unit normal, weight) of the surface (SurfelPlanes) around P, in cells from
+    the window's corner, whose normal is like ``normal``; the weight is 0 where there is none."""
     weight, distance = 0.0, 0.0
     mean = Vec3(0.0)
     base = ti.floor(P, ti.i32)
     for dx, dy, dz in ti.static(ti.ndrange((-1, 2), (-1, 2), (-1, 2))):
         cell = base + IVec3(dx, dy, dz)
-        if cell.min() >= 0 and (shape * BRICK - cell).min() > 0:
-            brick = bricks[flat(cell // BRICK, shape)]
+        if cell.min() >= 0 and (surface.shape * BRICK - cell).min() > 0:
+            brick = surface.bricks[flat(cell // BRICK, surface.shape)]
             if brick >= 0:
-                row = places[brick * VOXELS + voxel_number(cell % BRICK)]
+                row = surface.places[brick * VOXELS + voxel_number(cell % BRICK)]
                 if row >= 0:
+                    planes = ti.static(surface.planes)
                     away = P - Vec3(planes[row, 1], planes[row, 2], planes[row, 3])
                     n = Vec3(planes[row, 4], planes[row, 5], planes[row, 6])
                     if n.dot(normal) > ALIKE:
@@ -141,38 +166,34 @@ def surface_at(P: Vec3, normal: Vec3, shape: IVec3, bricks: Template, places: Te
     return distance, mean, weight
 
 
-@ti.kernel
+@ti.func
+def _vector(rows: Template, i: I32):
+    """Row i of an array (n, 3)."""
+    return Vec3(rows[i, 0], rows[i, 1], rows[i, 2])
+
+
+@kernel
 def accumulate(
-    points: F32Array2, normals: F32Array2, sigmas: F32Array, total: I32,
-    centre: Vec3, to_cells: Mat3, rotation: Mat3, cell_size: F32,
-    shape: IVec3, bricks: I32Array, places: I32Array, planes: F32Array2,
-    strips: I32, spread: I32, sums: F32Array2,
-):  # fmt: skip
-    """Sum up H (36), g (6), cost, points, weights and weighted squares, one row of ``sums`` for each strip.
+    points: _Points, view: Viewpoint, rotation: Mat3, surface: SurfelPlanes, strips: _Strips, sums: F32Array2
+) -> None:
+    """Sum up H (36), g (6), cost, points, weights and weighted squares: ``sums`` is (strips, 46).
 
-    ``points`` (N, 3) metres, ``normals`` (N, 3) and ``sigmas`` (N) metres are OrientedPoints, of which
-    ``total`` are used. ``centre`` and ``to_cells`` are the camera in the grid's window (traversal.Viewpoint),
-    ``rotation`` its own in the world, ``cell_size`` metres. ``shape`` and ``bricks`` are those of the
-    window's index, ``places`` (bricks * 512) and ``planes`` (M, 7) those of SurfelGrid. ``sums`` is (strips,
-    46).
-
-    A strip's points are added up one after the other, so that the sums do not depend on the number of
-    threads. On a CPU a strip stands for ``spread`` iterations, of which Taichi gives a thread no fewer.
+    ``view`` is the camera in the window of the ``surface``, ``rotation`` the camera's own in the world.
     """
-    for iteration in range(strips * spread):
-        if iteration % spread == 0:
-            strip = iteration // spread
+    for iteration in range(strips.number * strips.spread):
+        if iteration % strips.spread == 0:
+            strip = iteration // strips.spread
             H = ti.Matrix.zero(ti.f32, 6, 6)
             g = ti.Vector.zero(ti.f32, 6)
             cost, found, weights, squares = 0.0, 0.0, 0.0, 0.0
-            size = (total + strips - 1) // strips
-            for i in range(strip * size, ti.min(total, (strip + 1) * size)):
-                p = Vec3(points[i, 0], points[i, 1], points[i, 2])
-                facing = rotation @ Vec3(normals[i, 0], normals[i, 1], normals[i, 2])
-                distance, n, weight = surface_at(centre + to_cells @ p, facing, shape, bricks, places, planes)
+            size = (points.total + strips.number - 1) // strips.number
+            for i in range(strip * size, ti.min(points.total, (strip + 1) * size)):
+                p = _vector(points.positions, i)
+                facing = rotation @ _vector(points.normals, i)
+                distance, n, weight = surface_at(view.centre + view.to_voxels @ p, facing, surface)
                 if weight > 0.0:
-                    r = distance * cell_size
-                    sigma = ti.sqrt(sigmas[i] ** 2 + (ROUGHNESS * cell_size) ** 2)
+                    r = distance * surface.cell_size_m
+                    sigma = ti.sqrt(points.sigmas[i] ** 2 + (ROUGHNESS * surface.cell_size_m) ** 2)
                     inside = ti.max(0.0, 1.0 - (r / (TUKEY * sigma)) ** 2)
                     w = inside * inside / (sigma * sigma)
                     m = rotation.transpose() @ n

@@ -1,20 +1,39 @@
 """Surfels where kernels find them: an index over cells, brick by brick, and the planes that it points to."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import taichi as ti
 
 from taichi_mrf.alignment.surfels import Surfels
+from taichi_mrf.kernels.bundles import Bundle
+from taichi_mrf.kernels.types import F32, F32Array2, I32Array, IVec3
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.window import Window, WindowIndex
 
 
-class SurfelGrid:
-    """The planes of some surfels in a window of bricks of cells.
+@dataclass(frozen=True)
+class SurfelPlanes(Bundle):
+    """Surfels as kernels read them: bricks of cells, whose places point to rows of ``planes``."""
 
-    ``index`` gives the number of each brick, ``places`` (bricks * 512) the row of each cell or -1. A row of
-    ``planes`` (M, 7) float32 is a weight, a point in cells from the window's corner, and a unit normal.
-    """
+    cell_size_m: F32
+
+    shape: IVec3
+    """Of the window, in bricks."""
+
+    bricks: I32Array
+    """(shape) number of each brick of the window, -1 where it has none."""
+
+    places: I32Array
+    """(bricks * 512) row of each cell, -1 without a surfel."""
+
+    planes: F32Array2
+    """(M, 7) weight, a point in cells from the window's corner, and a unit normal."""
+
+
+class SurfelGrid:
+    """The planes of some surfels in a window of bricks of cells; :attr:`planes` has them on the device."""
 
     def __init__(self, surfels: Surfels) -> None:
         surface = surfels.planes()
@@ -34,8 +53,8 @@ class SurfelGrid:
             planes[:, 1:4] = self.window.to_voxels(surface.points_m)
             numbers = np.arange(len(bricks), dtype=np.int32)
             self.index.fill(self.window, self.window.cells_of(bricks), numbers)
-        self.places = ti.ndarray(ti.i32, places.shape)
-        self.places.from_numpy(places)
-        self.planes = ti.ndarray(ti.f32, planes.shape)
-        self.planes.from_numpy(planes)
+        on_device = ti.ndarray(ti.i32, places.shape), ti.ndarray(ti.f32, planes.shape)
+        on_device[0].from_numpy(places)
+        on_device[1].from_numpy(planes)
         runtime.settle()
+        self.planes = SurfelPlanes(self.cell_size, self.window.shape_vector, self.index.bricks, *on_device)
