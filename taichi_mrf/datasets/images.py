@@ -8,12 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.image_header import KNOWN, PNG_SIGNATURE, claimed_size
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import read_bytes
 from taichi_mrf.system.npz_file import DEFLATE_RATIO
-
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 def read_depth(
@@ -67,18 +66,21 @@ def _image_file(path: Path) -> bytes:
 
 
 def _decode(data: bytes, where: str, flags: int, camera: PinholeCamera | None = None) -> NDArray:
-    claimed = _claimed_size(data)  # before any of it is unpacked
-    if claimed is not None:
+    is_png, claimed = data.startswith(PNG_SIGNATURE), claimed_size(data)
+    if claimed is not None:  # before any of it is unpacked
         _check_size(where, *claimed, camera)
-    problem = _png_damage(data) if data.startswith(PNG_SIGNATURE) else None
+    problem = _png_damage(data) if is_png else None
     if problem:
         raise DatasetError(f"{where}: {problem}")
+    if claimed is None:
+        what = f"no {KNOWN}, or its header is damaged" if data else "the file is empty"
+        raise DatasetError(f"{where}: not a readable image ({what})")
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except (cv2.error, MemoryError):
         image = None
     if image is None:
-        raise DatasetError(f"{where}: not a readable image{'' if data else ' (the file is empty)'}")
+        raise DatasetError(f"{where}: not a readable image")
     _check_size(where, image.shape[1], image.shape[0], camera)
     return image
 
@@ -90,20 +92,6 @@ def _check_size(where: str, width: int, height: int, camera: PinholeCamera | Non
         )
     if width * height > _MOST_PIXELS:
         raise DatasetError(f"{where}: {width} x {height} pixels; at most {_MOST_PIXELS:,} are read")
-
-
-def _claimed_size(data: bytes) -> tuple[int, int] | None:
-    """(width, height) by the header of a PNG or JPEG, None for other formats and damaged headers."""
-    if data.startswith(PNG_SIGNATURE) and data[12:16] == b"IHDR" and len(data) >= 24:
-        width, height = struct.unpack_from(">II", data, 16)
-        return width, height
-    position = 2
-    while data.startswith(b"\xff\xd8") and position + 9 <= len(data) and data[position] == 0xFF:
-        if data[position + 1] in _JPEG_FRAMES:
-            height, width = struct.unpack_from(">HH", data, position + 5)
-            return width, height
-        position += 2 + struct.unpack_from(">H", data, position + 2)[0]
-    return None
 
 
 def _png_damage(data: bytes) -> str | None:
@@ -158,9 +146,6 @@ def _png_content_damage(data: bytes, packed: bytes) -> str | None:
 
 _MOST_PIXELS = 1 << 27
 """Far more than a camera has; a packed image of a few megabytes may claim a hundred times as many."""
-
-_JPEG_FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}
-"""Markers of a JPEG's segments that begin with its size."""
 
 _CHUNK_BYTES = 12
 _PIECE = 1 << 20

@@ -21,9 +21,11 @@ from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from taichi_mrf.calibration.depth_files import DepthFiles
 from taichi_mrf.config.schema import load
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.image_header import claimed_size
 from taichi_mrf.datasets.images import read_color, read_depth, read_grey
 from taichi_mrf.datasets.laser.readers import open_scans
-from taichi_mrf.datasets.ros.unpacking import bound_chunks
+from taichi_mrf.datasets.ros import unpacking
+from taichi_mrf.datasets.ros.unpacking import bound_unpacking
 from taichi_mrf.datasets.trajectories import read_trajectory
 from taichi_mrf.errors import DatasetError, FrameError, TaichiMRFError
 from taichi_mrf.export.octomap_reader import read_octomap
@@ -143,6 +145,84 @@ def test_an_image_that_claims_too_many_pixels_is_refused_by_its_header(
         read(path)
 
 
+def bmp(width: int, height: int) -> bytes:
+    return b"BM" + struct.pack("<IIIIiiHHIIiiII", 200, 0, 54, 40, width, -height, 1, 24, 0, 0, 1, 1, 0, 0)
+
+
+def tiff(order: str, width: int, height: int, *more: tuple[int, int]) -> bytes:
+    mark = b"II*\0" if order == "<" else b"MM\0*"
+    entries = [(256, width), (257, height), *more]
+    head = mark + struct.pack(f"{order}IH", 8, len(entries))
+    return head + b"".join(struct.pack(f"{order}HHII", tag, 4, 1, value) for tag, value in entries)
+
+
+def webp(kind: bytes, data: bytes) -> bytes:
+    return b"RIFF\0\0\0\0WEBP" + kind + struct.pack("<I", len(data)) + data
+
+
+LARGE_FILES = {
+    "bmp": (bmp(*LARGE), "30000 x 30000"),
+    "pgm": (b"P5\n# made by hand\n30000 30000\n65535\n", "30000 x 30000"),
+    "ppm": (b"P6 30000 30000 255 ", "30000 x 30000"),
+    "tiff": (tiff("<", *LARGE), "30000 x 30000"),
+    "tiff of Motorola": (tiff(">", *LARGE), "30000 x 30000"),
+    "tiff with one large tile": (tiff("<", 64, 48, (322, 1 << 20), (323, 1 << 20)), "1048576 x 1048576"),
+    "webp": (webp(b"VP8X", bytes(4) + (29_999).to_bytes(3, "little") * 2), "30000 x 30000"),
+    "webp, lossless": (webp(b"VP8L", b"\x2f" + struct.pack("<I", 16_382 << 14 | 16_382)), "16383 x 16383"),
+    "webp, lossy": (
+        webp(b"VP8 ", b"\0\0\0\x9d\x01\x2a" + struct.pack("<HH", 16_383, 16_383)),
+        "16383 x 16383",
+    ),
+}
+
+
+@pytest.mark.parametrize(("data", "size"), LARGE_FILES.values(), ids=LARGE_FILES)
+def test_other_images_that_claim_too_many_pixels_are_refused_by_their_header(
+    tmp_path: Path, nothing_is_unpacked: None, data: bytes, size: str
+) -> None:
+    path = tmp_path / "large"
+    path.write_bytes(data + bytes(100))
+    with pytest.raises(DatasetError, match=f"{size} pixels; at most 134,217,728 are read"):
+        read_grey(path)
+
+
+OTHER_FILES = {
+    "OpenEXR": b"\x76\x2f\x31\x01",
+    "Radiance": b"#?RADIANCE\n",
+    "JPEG 2000": b"\0\0\0\x0cjP  \r\n\x87\n",
+    "GIF": b"GIF89a",
+    "PFM": b"Pf\n4 4\n-1.0\n",
+    "Sun": b"\x59\xa6\x6a\x95",
+    "TIFF with more than 4 GB": b"II\x2b\0\x08\0\0\0",
+    "TIFF without a size": tiff("<", 0, 0)[:10],
+    "JPEG without a size": b"\xff\xd8\xff\xd9",
+}
+
+
+@pytest.mark.parametrize("data", OTHER_FILES.values(), ids=OTHER_FILES)
+def test_images_whose_size_cannot_be_read_first_are_not_decoded(
+    tmp_path: Path, nothing_is_unpacked: None, data: bytes
+) -> None:
+    path = tmp_path / "image"
+    path.write_bytes(data + bytes(100))
+    with pytest.raises(DatasetError, match=r"not a readable image \(no PNG, JPEG, TIFF"):
+        read_grey(path)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tiff", ".webp", ".pgm", ".ppm"])
+def test_the_size_that_a_header_claims_is_that_of_the_image(tmp_path: Path, suffix: str) -> None:
+    image = np.full((12, 16, 3) if suffix != ".pgm" else (12, 16), 99, np.uint8)
+    path = write_image(tmp_path / f"a{suffix}", image)
+    assert claimed_size(path.read_bytes()) == (16, 12)
+    assert read_color(path).shape == (12, 16, 3)
+
+
+@pytest.mark.parametrize("suffix", [".tiff", ".pgm"])
+def test_depth_images_of_other_formats_are_read(tmp_path: Path, suffix: str) -> None:
+    path = write_image(tmp_path / f"a{suffix}", np.full((12, 16), 1500, np.uint16))
+    np.testing.assert_array_equal(read_depth(path, 1000.0), 1.5)
+
+
 def test_a_jpeg_of_the_cameras_size_is_read(tmp_path: Path) -> None:
     path = write_image(tmp_path / "a.jpg", np.full((12, 16, 3), 99, np.uint8))
     assert read_color(path).shape == (12, 16, 3)
@@ -171,7 +251,7 @@ def test_a_chunk_of_an_mcap_that_unpacks_to_more_than_it_says_is_refused(tmp_pat
 
 @pytest.mark.parametrize("codec", ["bz2", "lz4", "zstd"])
 def test_unpackers_are_bounded_and_give_what_is_packed(codec: str) -> None:
-    bound_chunks()
+    bound_unpacking()
     with_size = (1_000_000,)
     calls = [(storage_mcap.DECOMPRESSORS, with_size), (rosbag1.decompressors, ())]
     found = [(table[codec], size) for table, size in calls if codec in table]
@@ -187,7 +267,24 @@ def test_unpackers_are_bounded_and_give_what_is_packed(codec: str) -> None:
     ("codec", "claimed"), [("bz2", ()), ("zstd", (1000,)), ("zstd", (300_000_000,)), ("lz4", (1000,))]
 )
 def test_nothing_is_unpacked_beyond_what_is_claimed_or_likely(codec: str, claimed: tuple[int, ...]) -> None:
-    bound_chunks()
+    bound_unpacking()
     table = storage_mcap.DECOMPRESSORS if claimed else rosbag1.decompressors
     with pytest.raises(ValueError, match="unpack to more than it may"):
         table[codec](packed_zeros(codec, 300_000_000), *claimed)
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+@pytest.mark.parametrize("mode", [CompressionMode.MESSAGE, CompressionMode.FILE])
+def test_bags_with_compressed_messages_or_files_are_read_and_bounded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, storage: StoragePlugin, mode: CompressionMode
+) -> None:
+    writer: Any = Writer2(tmp_path / "walk", version=9, storage_plugin=storage)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        plain(Bag("mcap" if storage is StoragePlugin.MCAP else "db3", writer))
+    assert len(open_dataset(tmp_path / "walk")) > 0
+    for bound in ("_LEAST_BOUND", "_LARGEST_RATIO", "_LEAST_FILE", "_LARGEST_FILE_RATIO"):
+        monkeypatch.setattr(unpacking, bound, 1)
+    what = "message" if mode is CompressionMode.MESSAGE else "file"
+    with pytest.raises(DatasetError, match=rf"a {what} of [\d,]+ bytes .*unpacks? to more than it may"):
+        open_dataset(tmp_path / "walk").read(0)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from taichi_mrf.datasets.ros.messages import header_ns
-from taichi_mrf.datasets.ros.unpacking import bound_chunks
+from taichi_mrf.datasets.ros.unpacking import bound_unpacking
 from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.system.files import check_regular, is_file, is_folder
 from taichi_mrf.system.libraries import library
@@ -58,7 +58,7 @@ class RosReader:
                 check_regular(file, DatasetError)
         highlevel, typesys = _library("rosbags.highlevel"), _library("rosbags.typesys")
         try:
-            bound_chunks()
+            bound_unpacking()
             # Before ROS Iron, bags hold no definitions of their messages; those read here never changed.
             types = typesys.get_typestore(typesys.Stores.LATEST)
             self._reader = highlevel.AnyReader([path], default_typestore=types)
