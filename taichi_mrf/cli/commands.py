@@ -61,7 +61,7 @@ class Command:
 
 _COMMON = ("out", "voxel-size", "method", "config", "every", "limit")
 _MAP_FLAGS = (*_COMMON, "resume", "overwrite", "jobs", "track-poses")
-_LIVE_FLAGS = (*_COMMON, "speed", "track-poses", "port", "open")
+_LIVE_FLAGS = (*_COMMON, "overwrite", "speed", "track-poses", "port", "open")
 _TUNE_FLAGS = ("out", "voxel-size", "config", "frames", "first", "stride", "auto", "search", "port", "open")
 _BENCH_FLAGS = (
     "voxel-sizes",
@@ -75,6 +75,19 @@ _BENCH_FLAGS = (
     "runtime.arch",
 )
 
+_LASER_FLAGS = (
+    "out",
+    "cell-size",
+    "method",
+    "config",
+    "every",
+    "limit",
+    "compare",
+    "no-returns",
+    "no-return-range",
+    "truth",
+)
+
 COMMANDS = {
     "map": Command(Map, "taichi_mrf.cli.map.many:run", mapping_parameters, _MAP_FLAGS),
     "live": Command(Live, "taichi_mrf.cli.live:run_live", mapping_parameters, _LIVE_FLAGS),
@@ -86,6 +99,6 @@ COMMANDS = {
     "bench": Command(Bench, "taichi_mrf.cli.bench.run:run_bench", None, _BENCH_FLAGS),
     "calibrate": Command(Calibrate, "taichi_mrf.cli.calibrate:run_calibrate"),
     "eval": Command(Eval, "taichi_mrf.cli.eval:run_eval"),
-    "laser": Command(Laser, "taichi_mrf.cli.laser.run:run_laser", laser_parameters),
+    "laser": Command(Laser, "taichi_mrf.cli.laser.run:run_laser", laser_parameters, _LASER_FLAGS),
 }
 """Every command by name, in the order of the help."""

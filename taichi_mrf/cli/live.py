@@ -12,8 +12,9 @@ from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.serving import Say, let_the_page_go_first, tell_address, warn_of_host
 from taichi_mrf.cli.shared.terminal import tell_problem
 from taichi_mrf.config.schema import with_absolute_tables
-from taichi_mrf.errors import TaichiMRFError
+from taichi_mrf.errors import ConfigError, TaichiMRFError
 from taichi_mrf.live.link import ViewerLink
+from taichi_mrf.runs.files import holds_run
 from taichi_mrf.viewer.messages import Listening, Status, Update
 
 SHORTEST_LIFE_SECONDS = 30.0
@@ -29,6 +30,10 @@ def run_live(options: Live) -> int:
     with ExitStack() as stack:
         if options.out is not None:
             stack.enter_context(output_folder(options.out))
+            if holds_run(options.out) and not options.overwrite:
+                raise ConfigError(
+                    f"{options.out}: holds a run: choose another --out, or add --overwrite to replace it"
+                )
         request = stack.enter_context(stop_on_signals(say, keeps=options.out is not None))
         warn_of_host(options.host, options.port, "watch and change the map", say)
         bar = ProgressBar(console, options.printing)

@@ -12,7 +12,8 @@ from taichi_mrf.live.live_keyframes import LiveKeyframe
 from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.live.ray_answers import pixel_answer, point_answer
 from taichi_mrf.live.run import Run
-from taichi_mrf.runs.folder import MAP_FILE, VOXEL_FILE, write_report, write_voxel_file
+from taichi_mrf.runs.files import MAP_FILE, VOXEL_FILE
+from taichi_mrf.runs.folder import write_report, write_voxel_file
 from taichi_mrf.viewer.messages import (
     File,
     Freeze,

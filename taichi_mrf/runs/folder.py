@@ -19,13 +19,18 @@ from taichi_mrf.export.ply import write_voxels
 from taichi_mrf.export.trajectory import write_trajectory
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.runs.files import (
+    CONFIG_FILE,
+    MAP_FILE,
+    REPORT_FILE,
+    TRAJECTORY_FILE,
+    VOXEL_FILE,
+    remove_files_of_earlier_run,
+)
 from taichi_mrf.runs.report import report_json, rounded, run_report, unfinished_report
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.system.memory import peak_memory_mb
-
-MAP_FILE, VOXEL_FILE, CONFIG_FILE = "map.npz", "voxels.ply", "config.yaml"
-REPORT_FILE, TRAJECTORY_FILE = "report.json", "trajectory.txt"
 
 PICTURED_FRAMES = 3
 """Held-out frames in the picture of measured and rendered depth, at most."""
@@ -95,7 +100,7 @@ def write_run(
 ) -> tuple[dict[str, Any], list[Path]]:
     """Write all files of a run to a folder that exists: the map first, because the time went into it, the
     report last. With ``check`` the held-out frames are compared with the map, and the poses with the depth;
-    with ``pictures`` it is drawn; both are left out in ``haste``.
+    with ``pictures`` it is drawn; both are left out in ``haste``. Pictures of an earlier run are removed.
 
     Returns the report and the paths. Raises MapFileError.
     """
@@ -115,6 +120,7 @@ def write_run(
         report["notes"].append(_nothing_occupied(facts.config))
     if pictures:
         written += _write_pictures(folder, result, posed, haste, advance)
+    remove_files_of_earlier_run(folder, written)
     report |= {"seconds": rounded(result.seconds), "peak_memory_mb": peak_memory_mb()}
     write_text(folder / REPORT_FILE, report_json(report))
     return report, [*written, folder / REPORT_FILE]

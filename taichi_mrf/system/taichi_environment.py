@@ -1,7 +1,8 @@
-"""The environment that Taichi needs before it is loaded: no banner, and a writable cache folder.
+"""The environment that Taichi and matplotlib need before they are loaded: no banner, writable folders.
 
 Taichi 1.7.4 aborts on import if neither HOME nor XDG_CACHE_HOME is set, and ends in a segmentation fault if
-its cache cannot be written, even when the cache is switched off (TI_OFFLINE_CACHE=0).
+its cache cannot be written, even when the cache is switched off (TI_OFFLINE_CACHE=0). matplotlib prints two
+lines on stderr if its folder cannot be written.
 """
 
 import contextlib
@@ -11,6 +12,7 @@ import warnings
 
 _CACHE = "TI_OFFLINE_CACHE_FILE_PATH"
 _BASE = "XDG_CACHE_HOME"
+_MATPLOTLIB = "MPLCONFIGDIR"
 
 cache_note: str | None = None
 """Why Taichi's compiled kernels are not in the usual folder, and where they are."""
@@ -22,6 +24,7 @@ def prepare() -> None:
     warnings.filterwarnings("ignore", category=DeprecationWarning, module=r"taichi(\.|$)")
     if os.name != "nt":  # on Windows Taichi needs no variable
         _choose_cache()
+        _choose_matplotlib_folder()
 
 
 def cache_folder() -> str | None:
@@ -54,6 +57,19 @@ def _choose_cache() -> None:
         # Taichi takes an empty name for the root of the file system, and aborts without any.
         home = os.environ.get("HOME")
         os.environ[_BASE] = os.path.join(home, ".cache") if home else os.environ.get(_CACHE) or os.devnull
+
+
+def _choose_matplotlib_folder() -> None:
+    """Give matplotlib a private folder where it cannot write to its usual ones."""
+    if os.environ.get(_MATPLOTLIB):
+        return
+    home = os.path.expanduser("~")
+    configuration = os.environ.get("XDG_CONFIG_HOME") or os.path.join(home, ".config")
+    cache = os.environ.get(_BASE) or os.path.join(home, ".cache")
+    if not all(_is_writable(os.path.join(base, "matplotlib")) for base in (configuration, cache)):
+        folder = _private_folder()
+        if folder is not None:
+            os.environ[_MATPLOTLIB] = os.path.join(folder, "matplotlib")
 
 
 def _is_writable(folder: str) -> bool:

@@ -77,6 +77,14 @@ def test_an_unknown_command_gets_a_suggestion(word: str, hint: str) -> None:
     assert_refused(taichi_mrf(word, "map.npz"), f"unknown command '{word}'", hint)
 
 
+@pytest.mark.parametrize("name", ["map", "live", "tune", "bench", "laser"])
+def test_the_short_help_fits_a_screen(name: str) -> None:
+    short, long = taichi_mrf(name, "--help").stdout, taichi_mrf(name, "--help-all").stdout
+    assert len(short.splitlines()) < 60
+    assert "--help-all" in short
+    assert len(long.splitlines()) > 1.5 * len(short.splitlines())
+
+
 def test_the_short_help_of_map_fits_a_screen_and_the_long_one_shows_every_parameter() -> None:
     short, long = taichi_mrf("map", "--help"), taichi_mrf("map", "--help-all")
     assert short.returncode == long.returncode == 0
@@ -188,6 +196,8 @@ def test_a_run_of_other_parameters_is_replaced_only_if_asked(tmp_path: Path) -> 
     assert (tmp_path / "report.json").read_bytes() == before
     assert f"{tmp_path} holds this run already" in mapped(ROOM, "--out", tmp_path, "--limit", "2", *FAST)
     assert (tmp_path / "report.json").read_bytes() == before
+    for stale in ("top_view.png", "perspective.png", "depth.png", "trajectory.txt"):
+        (tmp_path / stale).touch()
     mapped(*other[1:], "--overwrite")
     assert report_of(tmp_path)["keyframes"] == 3
     assert {path.name for path in tmp_path.iterdir()} == FILES

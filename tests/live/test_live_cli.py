@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 import trimesh
+from console import complaints
 from live_program import DEADLINE_S
 from new_interpreter import obey_hangups
 
@@ -128,7 +129,7 @@ def read_report(folder: Path) -> dict[str, Any]:
 
 def test_a_run_that_ends_by_itself_leaves_the_map_that_map_makes(tmp_path: Path) -> None:
     done = live(ROOM, "--exit-when-done", "--out", tmp_path / "live", *FLAGS)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (done.returncode, complaints(done.stderr)) == (0, "")
     assert re.search(r"The map is at http://127\.0\.0\.1:\d+ ", done.stdout)
     assert {path.name for path in (tmp_path / "live").iterdir()} == FILES | PICTURES
     batch = command("map", ROOM, "--out", tmp_path / "batch", *FLAGS[:-2])
@@ -153,7 +154,7 @@ def test_a_signal_ends_it_with_its_files_and_without_orphans(
         run.viewer()
         (os.killpg if whole_group else os.kill)(run.process.pid, number)
         status, errors = run.wait()
-    assert (status, errors) == (128 + number, "")
+    assert (status, complaints(errors)) == (128 + number, "")
     assert {path.name for path in tmp_path.iterdir()} == FILES
     assert "Stopping" in run.said[-1]
     for child in children:
@@ -176,7 +177,7 @@ def test_a_viewer_that_is_killed_at_once_ends_the_run_but_not_its_map(tmp_path: 
         status, errors = run.wait()
     assert status == 2
     assert "the viewer's process has ended (exit status -9)" in errors
-    assert errors.count("\n") == 1
+    assert complaints(errors).count("\n") == 1
     assert {path.name for path in tmp_path.iterdir()} == FILES
 
 
@@ -200,10 +201,24 @@ def test_a_page_for_everybody_is_warned_of() -> None:
     assert "Warning" not in live(ROOM, "--limit", "2", "--exit-when-done", *FLAGS).stdout
 
 
+def test_the_folder_of_another_run_is_replaced_only_if_asked(tmp_path: Path) -> None:
+    for name in ("map.npz", "top_view.png", "trajectory.txt"):
+        (tmp_path / name).write_bytes(b"of another run")
+    refused = live(ROOM, "--exit-when-done", "--out", tmp_path, *FLAGS)
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert refused.stderr.count("\n") == 1
+    assert f"{tmp_path}: holds a run: choose another --out, or add --overwrite" in refused.stderr
+    assert (tmp_path / "map.npz").read_bytes() == b"of another run"
+    done = live(ROOM, "--exit-when-done", "--out", tmp_path, "--overwrite", *FLAGS)
+    assert (done.returncode, complaints(done.stderr)) == (0, "")
+    assert {path.name for path in tmp_path.iterdir()} == FILES | PICTURES
+    assert (tmp_path / "top_view.png").read_bytes() != b"of another run"
+
+
 def test_a_saved_map_is_shown_with_its_own_parameters(tmp_path: Path) -> None:
     live(ROOM, "--exit-when-done", "--out", tmp_path / "first", *FLAGS)
     again = live(tmp_path / "first" / "map.npz", "--exit-when-done", "--out", tmp_path / "again", *FLAGS[2:])
-    assert (again.returncode, again.stderr) == (0, "")
+    assert (again.returncode, complaints(again.stderr)) == (0, "")
     assert "its own parameters are in force" in again.stdout
     assert voxels(tmp_path / "again") == voxels(tmp_path / "first")
     assert "voxel_size: 0.1" in (tmp_path / "again" / "config.yaml").read_text()

@@ -35,7 +35,8 @@ from taichi_mrf.live.run import Policy
 from taichi_mrf.live.session import Session
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.runs.folder import TRAJECTORY_FILE, write_run
+from taichi_mrf.runs.files import TRAJECTORY_FILE
+from taichi_mrf.runs.folder import write_run
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.viewer.messages import (
     CurrentCamera,

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import subprocess
 import sys
 import warnings
@@ -9,9 +10,11 @@ from collections.abc import Callable
 from contextlib import ExitStack, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from taichi_mrf.cli.main import main
 from taichi_mrf.cli.parser import parse
+from taichi_mrf.cli.shared import progress
 from taichi_mrf.system import runtime
 
 Done = subprocess.CompletedProcess[str]
@@ -27,13 +30,14 @@ def taichi_mrf(
     """Run the program and return its exit status and what it printed.
 
     It runs in this process, whose kernels are compiled, unless the interpreter's ``options`` or a call
-    ``before`` the program starts need a new one.
+    ``before`` the program starts need a new one. A slow machine adds no lines of progress to stderr.
     """
     if options or before is not None:
         return as_process(*arguments, options=options, before=before)
     runtime.init("cpu")
     out, err = io.StringIO(), io.StringIO()
     with ExitStack() as stack:
+        stack.enter_context(patch.object(progress, "LINE_SECONDS", float("inf")))
         stack.enter_context(redirect_stdout(out))
         stack.enter_context(redirect_stderr(err))
         stack.enter_context(warnings.catch_warnings())
@@ -57,6 +61,12 @@ def as_process(
         check=False,
         preexec_fn=before,
     )
+
+
+def complaints(stderr: str) -> str:
+    """What a process printed on stderr, without the lines that say how far it is."""
+    lines = stderr.splitlines(keepends=True)
+    return "".join(line for line in lines if not re.match(r"\w+ \d+( of \d+)?(, |$)", line))
 
 
 def _show_warning(

@@ -78,6 +78,7 @@ def raw_client(
         additional_headers={} if origin == "none" else {"Origin": origin},
         subprotocols=[f"viser-v{version}"],  # type: ignore[list-item]
         compression=None,
+        max_size=None,  # as in a browser
     ) as connection:
         yield RawClient(connection)
 

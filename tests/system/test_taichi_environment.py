@@ -24,7 +24,7 @@ def one() -> ti.i32:
 
 print(one())
 """
-NAMES = ("HOME", "XDG_CACHE_HOME", "TI_OFFLINE_CACHE_FILE_PATH")
+NAMES = ("HOME", "XDG_CACHE_HOME", "XDG_CONFIG_HOME", "MPLCONFIGDIR", "TI_OFFLINE_CACHE_FILE_PATH")
 
 
 def run(tmp_path: Path, *, program: str = KERNEL, **variables: str) -> subprocess.CompletedProcess[str]:
@@ -68,6 +68,17 @@ def test_a_folder_that_can_be_made_is_used_without_a_word(tmp_path: Path, name: 
     assert any((tmp_path / "new").rglob("*.tcb"))
     if name == "TI_OFFLINE_CACHE_FILE_PATH":
         assert not any((tmp_path / "tmp").glob("taichi-mrf-*/*"))
+
+
+@pytest.mark.parametrize(
+    "variables", [{"HOME": "/dev/null"}, {"HOME": "/tmp", "XDG_CONFIG_HOME": "/dev/null"}]
+)
+def test_matplotlib_prints_nothing_where_home_cannot_be_written_to(
+    tmp_path: Path, variables: dict[str, str]
+) -> None:
+    done = run(tmp_path, program="import taichi_mrf, matplotlib.font_manager\n", **variables)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert (tmp_path / "tmp" / f"taichi-mrf-{os.getuid()}" / "matplotlib").is_dir()
 
 
 def test_a_folder_that_others_can_write_to_is_not_trusted(

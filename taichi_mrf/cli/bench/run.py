@@ -20,7 +20,6 @@ from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.live.bench import bench_viewer
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import write_text
@@ -90,6 +89,8 @@ class _Run:
         return [growth_table(rows, self.title)], [row.to_json() for row in rows], draw
 
     def viewer(self) -> Measured:
+        from taichi_mrf.live.bench import bench_viewer  # the page's packages are slow to import
+
         rows = [bench_viewer(self.frames, config, advance) for config, advance in self.each_size()]
         figures = [
             {"voxel_size": config.voxel_size, "keyframes": [dataclasses.asdict(each) for each in row]}

@@ -2,6 +2,7 @@
 
 import statistics
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 
@@ -10,7 +11,9 @@ from taichi_mrf.benchmark.bench import BenchRow
 from taichi_mrf.benchmark.growth import Growth, Lap, Line
 from taichi_mrf.benchmark.keyframe_cost import Seconds
 from taichi_mrf.benchmark.profile import KernelCost, Profile
-from taichi_mrf.live.bench import ViewerRow
+
+if TYPE_CHECKING:  # the page's packages are slow to import
+    from taichi_mrf.live.bench import ViewerRow
 
 HOST_ROWS = 12
 """Functions of the host that are listed, at most; the rest is one row."""
@@ -144,7 +147,7 @@ def _line(line: Line, scale: float) -> str:
     return f"{line.at_zero * scale:.1f} + {line.slope * scale:.4f}{error}"
 
 
-def viewer_table(voxel_sizes: Sequence[float], benches: Sequence[Sequence[ViewerRow]], title: str) -> Table:
+def viewer_table(voxel_sizes: Sequence[float], benches: "Sequence[Sequence[ViewerRow]]", title: str) -> Table:
     """Medians over keyframes, and the largest."""
     table = Table(title=f"Live view: {title}", title_justify="left")
     table.add_column("a keyframe: median (largest)")

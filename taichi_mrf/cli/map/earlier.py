@@ -10,7 +10,7 @@ from taichi_mrf.config.text import differences
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.errors import ConfigError, MapFileError
-from taichi_mrf.runs.folder import CONFIG_FILE, MAP_FILE, REPORT_FILE, VOXEL_FILE
+from taichi_mrf.runs.files import CONFIG_FILE, MAP_FILE, REPORT_FILE, VOXEL_FILE, holds_run
 
 _FILES = (MAP_FILE, VOXEL_FILE, CONFIG_FILE)
 
@@ -21,11 +21,7 @@ def refuse_other_run(task: MapTask) -> dict[str, Any] | None:
     Returns the report if the folder holds the finished run of this very task, None if it holds no run. Raises
     ConfigError, which says what to do, for any other run.
     """
-    if (
-        task.resume
-        or task.overwrite
-        or not any((task.out / name).exists() for name in (*_FILES, REPORT_FILE))
-    ):
+    if task.resume or task.overwrite or not holds_run(task.out):
         return None
     report = report_in(task.out)
     if report is None or not (task.out / CONFIG_FILE).is_file():

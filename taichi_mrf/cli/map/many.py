@@ -31,7 +31,7 @@ from taichi_mrf.config.schema import load
 from taichi_mrf.config.text import commented_yaml, differences
 from taichi_mrf.errors import ClusterError, TaichiMRFError
 from taichi_mrf.evaluation.pictures.contact_sheet import Tile, write_contact_sheet
-from taichi_mrf.runs.folder import CONFIG_FILE, REPORT_FILE
+from taichi_mrf.runs.files import CONFIG_FILE, REPORT_FILE
 from taichi_mrf.system.atomic import write_text
 
 SUMMARY_JSON, SUMMARY_CSV, SUMMARY_PICTURE = "summary.json", "summary.csv", "summary.png"

@@ -27,7 +27,8 @@ from taichi_mrf.mapping.pipeline import (
     Listener,
     map_sequence,
 )
-from taichi_mrf.runs.folder import MAP_FILE, RunFacts, write_run
+from taichi_mrf.runs.files import MAP_FILE
+from taichi_mrf.runs.folder import RunFacts, write_run
 from taichi_mrf.runs.report import report_json
 from taichi_mrf.system import runtime
 

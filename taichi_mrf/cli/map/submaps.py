@@ -18,7 +18,7 @@ from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets.registry import absolute_source
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.methods.chunked import ChunkedMap
-from taichi_mrf.runs.folder import CONFIG_FILE, REPORT_FILE
+from taichi_mrf.runs.files import CONFIG_FILE, REPORT_FILE
 from taichi_mrf.runs.report import report_json
 from taichi_mrf.submaps.job import Sequence
 from taichi_mrf.submaps.picture import write_submap_picture

@@ -30,6 +30,9 @@ class Live:
     """Folder for the files that map writes too: map.npz, voxels.ply, config.yaml, report.json, pictures if
     the run ends by itself, trajectory.txt if poses are tracked. It is created if it does not exist."""
 
+    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Replace the run that DIR holds. Without it, a folder that holds a run is refused."""
+
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
     """A YAML file of parameters, such as those in configs/."""
 

@@ -1,4 +1,8 @@
-"""How far a command is: a bar on a terminal, elsewhere a line every few seconds."""
+"""How far a command is: a bar on a terminal, elsewhere a line on stderr every few seconds.
+
+Results go to stdout, everything about the work to stderr: `taichi-mrf map ... > result.txt` keeps its
+progress on the screen.
+"""
 
 import contextlib
 import logging
@@ -22,14 +26,14 @@ LINE_SECONDS = 5.0
 
 
 def open_terminal(verbosity: Verbosity, stderr: bool = False) -> Terminal:
-    """What a command prints to: nothing with --quiet, the library's log too with --verbose. ``stderr`` leaves
-    stdout to --json."""
+    """The console that a command prints to. --quiet prints nothing, --verbose also logs to stderr. ``stderr``
+    leaves stdout to --json."""
     terminal = Terminal(stderr=stderr, quiet=verbosity.quiet)
     log = logging.getLogger("taichi_mrf")
     for handler in [each for each in log.handlers if isinstance(each, _LogLines)]:
         log.removeHandler(handler)
     if verbosity.verbose:
-        log.addHandler(_LogLines(terminal))
+        log.addHandler(_LogLines(Terminal(stderr=True)))
         log.setLevel(logging.INFO)
     return terminal
 
@@ -49,13 +53,14 @@ class _LogLines(logging.Handler):
 class ProgressBar:
     """Shows one stage at a time; used as a context, at whose end the bar is gone.
 
-    On a terminal it is a bar. Elsewhere it is a line every few seconds, with --verbose a line for every step,
-    with --quiet nothing.
+    On a terminal it is a bar. Elsewhere it is a line on stderr every few seconds, with --verbose a line for
+    every step, with --quiet nothing.
     """
 
     def __init__(self, terminal: Terminal, verbosity: Verbosity | None = None) -> None:
         verbosity = verbosity or Verbosity()
-        self._terminal, self._verbose = terminal, verbosity.verbose
+        self._line_terminal = Terminal(stderr=True, quiet=terminal.quiet)
+        self._verbose = verbosity.verbose
         self._lines = not terminal.is_terminal or verbosity.verbose
         self._progress = Progress(
             TextColumn("{task.description:9}", markup=False),
@@ -89,8 +94,8 @@ class ProgressBar:
         elif self._verbose or now - self._last_line >= LINE_SECONDS:
             self._last_line = now
             of = "" if total is None else f" of {total}"
-            with contextlib.suppress(OSError):  # whoever read the lines has seen enough: the run goes on
-                self._terminal.say(f"{stage} {done}{of}" + (f", {note}" if note else ""))
+            with contextlib.suppress(OSError):  # the reader of the lines is gone: the run continues
+                self._line_terminal.say(f"{stage} {done}{of}" + (f", {note}" if note else ""))
 
     def _rate(self, now: float) -> str:
         seconds = now - self._begin

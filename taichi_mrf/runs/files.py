@@ -1,0 +1,20 @@
+"""The names of the files in a run's folder, and whether a folder holds a run. Quick to import."""
+
+from pathlib import Path
+
+MAP_FILE, VOXEL_FILE, CONFIG_FILE = "map.npz", "voxels.ply", "config.yaml"
+REPORT_FILE, TRAJECTORY_FILE = "report.json", "trajectory.txt"
+PICTURE_FILES = ("top_view.png", "perspective.png", "depth.png")
+
+
+def holds_run(folder: Path) -> bool:
+    """Whether a folder holds files of a run, complete or not."""
+    return any((folder / name).exists() for name in (MAP_FILE, VOXEL_FILE, CONFIG_FILE, REPORT_FILE))
+
+
+def remove_files_of_earlier_run(folder: Path, written: list[Path]) -> None:
+    """Remove the pictures and the trajectory that the present run has not ``written``: they show a run that
+    it replaced."""
+    for name in (*PICTURE_FILES, TRAJECTORY_FILE):
+        if folder / name not in written:
+            (folder / name).unlink(missing_ok=True)
