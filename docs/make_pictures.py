@@ -50,7 +50,7 @@ OF_THE_LIVE_PAGE: dict[str, Draw] = {
     "live_cut.jpg": page_pictures.live_cut,
     "live_keyframes.jpg": page_pictures.live_keyframes,
     "live_images.jpg": page_pictures.live_images,
-    "live_beside.jpg": page_pictures.live_beside,
+    "live_baseline.jpg": page_pictures.live_baseline,
 }
 OF_THE_TUNING_PAGE: dict[str, Draw] = {
     "tune.jpg": page_pictures.tune_noise,

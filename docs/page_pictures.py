@@ -76,21 +76,21 @@ def live_images(page: LivePage) -> Image.Image:
     return picture
 
 
-def live_beside(page: LivePage) -> Image.Image:
+def live_baseline(page: LivePage) -> Image.Image:
     """The map of OctoMap's update from the same keyframes, next to this one."""
     page.tab("Map")
     page.select("Cut axis", "z")
     page.slide("Cut at", 0.6)
     page.tick("Show baseline")
-    page.until(lambda seen: seen.beside, "the other map")
+    page.until(lambda seen: seen.baseline, "the other map")
     counts: list[int] = []
     while len(counts) < 2 or counts[-1] != counts[-2]:  # it grows for as long as keyframes come
         page.pause(STEADY_S)
-        counts.append(page.until(lambda seen: seen.settled, "the other map").beside)
+        counts.append(page.until(lambda seen: seen.settled, "the other map").baseline)
     picture = shot(page)
     page.tick("Show baseline", on=False)
     page.select("Cut axis", "none")
-    page.until(lambda seen: seen.settled and not seen.beside, "one map")
+    page.until(lambda seen: seen.settled and not seen.baseline, "one map")
     return picture
 
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.cli.options.import_map import Import
 from taichi_mrf.cli.shared.terminal import Terminal
+from taichi_mrf.config.registry import octomap_method
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.octomap_reader import read_octomap
@@ -24,7 +25,7 @@ def run_import(options: Import) -> int:
     leaves = read_octomap(options.file)
     leaves = dataclasses.replace(leaves, log_odds=_known(leaves.log_odds))
     bricks, log_odds = leaves.bricks()
-    config = Config(leaves.voxel_size, "log_odds")
+    config = Config(leaves.voxel_size, octomap_method().name)
     noise = PolynomialNoise(config.sensor.sigma, config.sensor.bias)
     contents = RecursiveContents(MapHeader(config, noise, [], 0), bricks, log_odds, stale=False)
     write_recursive(options.out, contents)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from taichi_mrf.cli.shared.terminal import Terminal
+from taichi_mrf.config.registry import octomap_method
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import differences
 from taichi_mrf.export.octomap_reader import read_octomap
@@ -99,7 +100,7 @@ def _octomap(path: Path) -> Facts:
     bricks, _ = leaves.bricks()
     return {
         "format": f"OctoMap ({path.suffix})",
-        "method": "log_odds",
+        "method": octomap_method().name,
         "voxel_size": leaves.voxel_size,
         "voxels": leaves.voxels,
         "extent": _extent(np.asarray(bricks), BRICK * leaves.voxel_size),

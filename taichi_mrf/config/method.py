@@ -52,6 +52,10 @@ class Method:
     prior_is_unknown: bool = False
     """A voxel is unknown exactly if it still holds the prior. Otherwise ``volume.min_evidence`` decides."""
 
+    is_octomap: bool = False
+    """Its voxels hold what OctoMap's leaves hold: an imported OctoMap file is a map of this method, and the
+    live page shows its map of the same keyframes as the baseline. One method has this."""
+
     if_empty: str = ""
     """What to try when a map of this method has no occupied voxel, as the end of a sentence."""
 

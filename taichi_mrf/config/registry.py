@@ -25,6 +25,11 @@ def methods_with(capability: str) -> str:
     return " or ".join(method.name for method in METHODS.values() if getattr(method, capability))
 
 
+def octomap_method() -> Method:
+    """The method whose maps hold what OctoMap's do."""
+    return next(method for method in METHODS.values() if method.is_octomap)
+
+
 if TYPE_CHECKING:
     MethodName = str
 else:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf import MRFMap, PinholeCamera, PolynomialNoise
+from taichi_mrf import PinholeCamera, PolynomialNoise
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.config.schema import PoseConfig, VolumeConfig
 from taichi_mrf.datasets.synthetic.room import RoomOptions, SyntheticRoom
@@ -26,6 +26,7 @@ from taichi_mrf.experiments.scenes import Scene, SceneView, house_scene, kitchen
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.mapping.refinement import PoseRefiner
 from taichi_mrf.mapping.rounds import AlignmentRounds, PlainMover
+from taichi_mrf.methods.capabilities import AligningMap, can_refine_poses
 from taichi_mrf.sensor.simulate import KINECT_1
 
 DISTURBED_M, DISTURBED_RAD = 0.02, np.radians(1.0)
@@ -138,7 +139,7 @@ def build_and_judge(case: Case, scene: Scene, voxel_size: float) -> Result:
     begin = time.perf_counter()
     contender = mrf()
     m = contender.make(scene, voxel_size)
-    assert isinstance(m, MRFMap)
+    assert can_refine_poses(m)
     refiner = PoseRefiner(m, REFINED)
     for index, T_world_camera in zip(mapped, poses, strict=True):
         view = scene.views[index]
@@ -157,7 +158,7 @@ def build_and_judge(case: Case, scene: Scene, voxel_size: float) -> Result:
     return result | {"rotation_rad": rotation.tolist(), "translation_m": translation.tolist()}
 
 
-def aligned(m: MRFMap, scene: Scene, view: SceneView) -> SceneView:
+def aligned(m: AligningMap, scene: Scene, view: SceneView) -> SceneView:
     """A view from where it fits the map, which stays as it is."""
     keyframe = m.add_keyframe(view.measured_m, view.T_world_camera, scene.camera, view.name)
     T_world_camera = m.refine_pose(keyframe).T_world_camera

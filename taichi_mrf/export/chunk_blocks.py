@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,13 +34,26 @@ def chunk_block(
     return block.reshape((CHUNK_VOXELS,) * 3)
 
 
-def write_chunks(path: str | Path, m: QueriedMap, config: Config) -> None:
-    """Write a map in memory, made with ``config``, to a store, chunk by chunk. Raises MapFileError,
+class StorableMap(QueriedMap, Protocol):
+    """A map in memory that can be written to a store."""
+
+    @property
+    def config(self) -> Config: ...
+
+    @property
+    def seen_free_log_odds(self) -> float:
+        """Log-odds of a place that rays cross but that has no brick."""
+        ...
+
+
+def write_chunks(path: str | Path, m: StorableMap) -> None:
+    """Write a map in memory to a store, chunk by chunk. Raises MapFileError,
     TaichiMRFError without zarr."""
     reader = BrickReader(m)
     bricks = known_bricks(m)
     with new_store(path) as folder:
-        header = StoreHeader.of(config, reader.pool.prior_log_odds, m.view.volume.min_evidence)
+        evidence = m.view.volume.min_evidence
+        header = StoreHeader.of(m.config, reader.pool.prior_log_odds, m.seen_free_log_odds, evidence)
         store = ChunkStore.create(folder, header, np.unique(bricks // CHUNK, axis=0))
         for chunk, rows in by_chunk(bricks):
             log_odds = reader.log_odds(bricks[rows])

@@ -8,10 +8,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.arrays import write_arrays
-from taichi_mrf.export.chunk_blocks import write_chunks
+from taichi_mrf.export.chunk_blocks import StorableMap, write_chunks
 from taichi_mrf.export.chunk_store import SUFFIX
 from taichi_mrf.export.level_map import level_map
 from taichi_mrf.export.map_server import grey_image, write_map_server
@@ -21,17 +20,13 @@ from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.export.ply import write_voxels
 from taichi_mrf.export.surface import smooth_surface, voxel_surface
 from taichi_mrf.geometry.up import Up, plan_axes, up_from_name, up_name, up_of_first, y_up
-from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN
 
 _DEFAULTS = ExportOptions()
 
 
-class ExportedMap(QueriedMap, Protocol):
+class ExportedMap(StorableMap, Protocol):
     """The parts of a map that exports use; all maps of methods/protocol.py have them."""
-
-    @property
-    def config(self) -> Config: ...
 
     def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]: ...
 
@@ -132,7 +127,7 @@ def _arrays(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
 
 
 def _chunks(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
-    write_chunks(path, m, m.config)
+    write_chunks(path, m)
     return [path]
 
 

@@ -41,12 +41,14 @@ class StoreHeader:
     version: str
 
     @staticmethod
-    def of(config: Config, prior_log_odds: float, min_evidence: float) -> "StoreHeader":
+    def of(
+        config: Config, prior_log_odds: float, seen_free_log_odds: float, min_evidence: float
+    ) -> "StoreHeader":
         """The header of a map that this version has made with a configuration."""
         return StoreHeader(
             voxel_size=config.voxel_size,
             prior_log_odds=prior_log_odds,
-            seen_free_log_odds=prior_log_odds - config.inference.message_clamp,
+            seen_free_log_odds=seen_free_log_odds,
             min_evidence=min_evidence,
             config=to_yaml(config),
             version=taichi_mrf.__version__,

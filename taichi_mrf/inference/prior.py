@@ -18,3 +18,11 @@ def prior_probability(inference: InferenceConfig, voxel_size: float) -> float:
             f"of {prior}"
         )
     return prior
+
+
+def log_odds_without_bricks(inference: InferenceConfig, voxel_size: float) -> tuple[float, float]:
+    """Log-odds of places where no brick is allocated: the prior's, where no ray came, and those of a place
+    that rays crossed without a surface near."""
+    prior = prior_probability(inference, voxel_size)
+    prior_log_odds = math.log(prior / (1 - prior))
+    return prior_log_odds, prior_log_odds - inference.message_clamp

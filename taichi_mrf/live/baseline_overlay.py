@@ -1,13 +1,13 @@
-"""The same keyframes mapped by OctoMap's method, shown beside the map on demand."""
+"""The baseline: the same keyframes mapped by OctoMap's method, shown next to the map on demand."""
 
 import numpy as np
 
+from taichi_mrf.config.registry import octomap_method
 from taichi_mrf.config.schema import Config
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.schedule import Progress
 from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.live.publish import Publisher
-from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.viewer.messages import Bricks
@@ -18,13 +18,13 @@ crosses exists, seven in ten of them free at 2 cm, and a voxel seen to be free n
 
 
 class BaselineOverlay:
-    """A LogOddsMap that follows a mapper's keyframes, one piece of work at a time."""
+    """A map by OctoMap's method that follows a mapper's keyframes, one piece of work at a time."""
 
     def __init__(self, config: Config, noise: NoiseModel) -> None:
         """An empty map with a configuration's parameters."""
-        self.map: OccupancyMap = LogOddsMap.with_noise(config, noise)
+        self.map: OccupancyMap = octomap_method().load_class().with_noise(config, noise)
         self._publisher = Publisher(
-            "beside",
+            "baseline",
             self.map.view.pool,
             self.map.seen_by,
             prior_is_unknown=True,

@@ -10,7 +10,7 @@ from taichi_mrf.live.pictures import view_images
 from taichi_mrf.live.run import Run
 from taichi_mrf.viewer.messages import Notice, Watch
 
-NOTHING = Watch(images=False, view=None, beside=False)
+NOTHING = Watch(images=False, view=None, baseline=False)
 
 IMAGE_SECONDS = 1.0
 """Images are made at most so often."""
@@ -22,7 +22,7 @@ class Extras:
     def __init__(self, run: Run) -> None:
         self._run = run
         self._watch = NOTHING
-        self._beside: BaselineOverlay | None = None
+        self._baseline: BaselineOverlay | None = None
         self._shown_version = -1
         self._images_made = float("-inf")
 
@@ -33,11 +33,11 @@ class Extras:
 
     def nothing_wanted(self) -> None:
         """Start without extras: the viewer is a new one."""
-        self._watch, self._beside = NOTHING, None
+        self._watch, self._baseline = NOTHING, None
 
     def start_over(self) -> None:
         """Start over with a new map; what is wanted stays the same."""
-        self._beside, self._shown_version = None, -1
+        self._baseline, self._shown_version = None, -1
 
     def work(self, progress: Progress) -> bool:
         """Do one piece of the work that is left; returns whether there was any. ``progress`` can stop it."""
@@ -48,16 +48,16 @@ class Extras:
             return True
         if self._make_images():
             return True
-        if not self._watch.beside:
-            if self._beside is not None:
-                self._run.send(self._beside.everything_gone())
-                self._beside = None
+        if not self._watch.baseline:
+            if self._baseline is not None:
+                self._run.send(self._baseline.everything_gone())
+                self._baseline = None
             return False
         try:
             return self._catch_up(progress)
-        except Exception as error:  # the map itself goes on without the one beside it
-            self._run.send(Notice(f"beside the map: {error}", "error"))
-            self._watch = dataclasses.replace(self._watch, beside=False)
+        except Exception as error:  # the map itself goes on without the baseline
+            self._run.send(Notice(f"baseline: {error}", "error"))
+            self._watch = dataclasses.replace(self._watch, baseline=False)
             return True
 
     def answer(self) -> None:
@@ -66,15 +66,15 @@ class Extras:
 
     def _catch_up(self, progress: Progress) -> bool:
         mapper = self._run.mapper
-        if self._beside is None:
-            self._beside = BaselineOverlay(self._run.source.config, mapper.map.noise)
+        if self._baseline is None:
+            self._baseline = BaselineOverlay(self._run.source.config, mapper.map.noise)
             frozen = len(mapper.roster.with_state("frozen"))
             if frozen:
-                text = f"beside the map {frozen} frozen keyframes are missing: their images are forgotten"
+                text = f"the baseline lacks {frozen} frozen keyframes: their images are no longer in memory"
                 self._run.send(Notice(text, "warning"))
-        if not self._beside.catch_up(mapper, progress):
+        if not self._baseline.catch_up(mapper, progress):
             return False
-        changes = self._beside.changes()
+        changes = self._baseline.changes()
         if changes is not None:
             self._run.send(changes)
         return True

@@ -9,7 +9,7 @@ One thread does all of it, one piece after the other, because Taichi has one own
     else sweep more keyframes whose cavity has changed, if any are left
     else rounds of alignment                   once the sequence has ended, if poses are to be refined
     else full inference, if the map needs it   requests are answered from the map as it was before
-    else what is shown beside the map
+    else the images of a view and the baseline, if they are shown
     else wait
 """
 

@@ -76,6 +76,9 @@ class BrickMap(Owned):
 
     view: View = owned_attribute()
 
+    seen_free_log_odds: float
+    """Log-odds of a place that rays cross but that has no brick."""
+
     def _set_up(self, config: Config, noise: NoiseModel | None) -> None:
         """Make the empty map of a whole configuration, which describes the noise unless it is given. Every
         constructor ends here; subclasses extend it."""
@@ -90,8 +93,8 @@ class BrickMap(Owned):
         shown: VolumeConfig,
         occlusion: Occlusion,
     ) -> None:
-        """Set the configuration and the noise, and make the empty grid. ``seen_free_log_odds`` are the log-
-        odds of a place that rays cross but that has no brick; ``shown`` and ``occlusion`` are the View's."""
+        """Set the configuration and the noise, and make the empty grid. ``shown`` and ``occlusion``
+        are the View's."""
         if noise is not None:
             instance(noise, NoiseModel, "noise", "a noise model such as PolynomialNoise")
         runtime.init()
@@ -103,7 +106,7 @@ class BrickMap(Owned):
         topology = create_topology(runtime.active() or "cpu", config.volume.dense_bricks)
         weakref.finalize(self, recycle, topology)
         self._registry = BrickRegistry(topology, self._pool, self.voxel_size)
-        self._seen_free_log_odds = seen_free_log_odds
+        self.seen_free_log_odds = seen_free_log_odds
         self.view = View(self._pool, self.voxel_size, shown, occlusion)
 
     @classmethod
@@ -149,4 +152,4 @@ class BrickMap(Owned):
 
     def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
         topology, pool = self._registry.topology, self._pool
-        return point_log_odds(points, self.voxel_size, topology, pool, self._seen_free_log_odds)
+        return point_log_odds(points, self.voxel_size, topology, pool, self.seen_free_log_odds)

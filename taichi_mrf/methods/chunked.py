@@ -13,6 +13,7 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import ConfigError, MapFileError, said
 from taichi_mrf.export.chunk_store import CHUNK_BYTES, Chunk, ChunkStore
+from taichi_mrf.methods.map_file import check_registered
 from taichi_mrf.queries.box import BoxOfVoxels, voxels_of_box
 from taichi_mrf.queries.points import checked_points, classify, probability
 from taichi_mrf.system.memory import check_memory
@@ -24,7 +25,10 @@ _BYTES_PER_VOXEL = 9
 
 def _config_of(store: ChunkStore) -> Config:
     try:
-        config = from_dict(Config, parse_yaml(store.header.config), str(store.path))
+        values = parse_yaml(store.header.config)
+        if isinstance(values, dict) and isinstance(values.get("method"), str):
+            check_registered(store.path, values["method"])
+        config = from_dict(Config, values, str(store.path))
     except ValueError as error:
         raise MapFileError(
             f"{store.path}: damaged: its configuration cannot be read: {said(error)}"

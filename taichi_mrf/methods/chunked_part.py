@@ -39,6 +39,11 @@ class MapPart:
         """The parameters that the map was made with."""
         return self.source.config
 
+    @property
+    def seen_free_log_odds(self) -> float:
+        """Log-odds of space that was seen to be free without a surface near."""
+        return self.source.header.seen_free_log_odds
+
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
         """Probability of occupied at (N, 3) points in metres, (N,)."""
         points_m = checked_points(points)

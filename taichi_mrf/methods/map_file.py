@@ -99,14 +99,23 @@ def open_map_file(path: Path, method: str | None = None) -> Iterator[NpzFile]:
         if format > 1:
             file.check_manifest()
         found = method_of(file)
-        if found not in METHODS:
-            raise MapFileError(f"{path}: a map of the method '{found}', which this version does not know")
+        check_registered(path, found)
         if method is not None and found != method:
             raise MapFileError(
                 f"{path}: a map of the method '{found}', which {METHODS[found].class_name}.load reads, "
                 f"not {METHODS[method].class_name}.load"
             )
         yield file
+
+
+def check_registered(path: Path, method: str) -> None:
+    """Raise MapFileError if a file's mapping method is not among those of this program."""
+    if method not in METHODS:
+        raise MapFileError(
+            f"{path}: saved by the mapping method '{method}', which is not registered (registered: "
+            f"{', '.join(METHODS)}): load it with the program that adds this method to "
+            "taichi_mrf.config.plugs.PLUGS, or update taichi_mrf"
+        )
 
 
 @contextmanager

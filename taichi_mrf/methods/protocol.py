@@ -56,6 +56,8 @@ class OccupancyMap(Protocol):
     voxel_size: float
     view: View
     """Follows rays through the map."""
+    seen_free_log_odds: float
+    """Log-odds of a place that rays cross but that has no brick."""
 
     @property
     def keyframes(self) -> Mapping[int, MappedKeyframe]: ...

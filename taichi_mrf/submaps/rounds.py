@@ -1,7 +1,6 @@
 """A long sequence in, one map in chunks out: survey, plan, rounds of inference and exchange, merge."""
 
 import json
-import math
 import shutil
 import time
 from collections.abc import Callable
@@ -18,7 +17,7 @@ from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.export.chunk_blocks import by_chunk, chunk_block
 from taichi_mrf.export.chunk_store import ChunkStore, StoreHeader, new_store
-from taichi_mrf.inference.prior import prior_probability
+from taichi_mrf.inference.prior import log_odds_without_bricks
 from taichi_mrf.submaps.job import PLAN_FILE, Job, Sequence
 from taichi_mrf.submaps.plan import plan_submaps
 from taichi_mrf.submaps.round_files import SubmapReport, read_core, read_places, round_path
@@ -222,8 +221,9 @@ def _merge(folder: Path, job: Job, round: int, path: Path) -> None:
     """Write the cores of all submaps after a round as one map in chunks. A chunk belongs to one submap
     alone, so each is written once, and only one submap's core is in memory at a time. Raises MapFileError."""
     files = [round_path(folder, round, number) for number in range(len(job.plan.submaps))]
-    prior = prior_probability(job.config.inference, job.config.voxel_size)
-    header = StoreHeader.of(job.config, math.log(prior / (1 - prior)), job.config.volume.min_evidence)
+    config = job.config
+    log_odds = log_odds_without_bricks(config.inference, config.voxel_size)
+    header = StoreHeader.of(config, *log_odds, config.volume.min_evidence)
     chunks = [np.unique(np.concatenate(read_places(file)) // CHUNK, axis=0) for file in files]
     with new_store(path) as place:
         store = ChunkStore.create(place, header, np.unique(np.concatenate(chunks), axis=0))

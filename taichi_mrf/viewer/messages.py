@@ -18,7 +18,7 @@ LOG_ODDS_STEP = 1 / 512
 """Log-odds are sent as int16 multiples of this. They are rounded down, so that their sign, and with it the
 threshold of one half, is exact; beyond +-64 they are clipped."""
 
-Layer = Literal["map", "beside"]
+Layer = Literal["map", "baseline"]
 """The map itself, or the baseline beside it: OctoMap's log-odds update of the same keyframes."""
 
 KeyframeState = Literal["on", "off", "frozen"]
@@ -259,7 +259,7 @@ class Watch(Request):
 
     images: bool
     view: int | None
-    beside: bool
+    baseline: bool
     counts: bool = False
 
 

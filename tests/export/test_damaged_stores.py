@@ -41,7 +41,7 @@ CHUNK = (0, 0, 0)
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("store") / "map.zarr"
     store = ChunkStore.create(
-        path, StoreHeader.of(Config(), -2.0, 0.05), np.array([CHUNK, (0, 1, 0)], np.int32)
+        path, StoreHeader.of(Config(), -2.0, -8.9, 0.05), np.array([CHUNK, (0, 1, 0)], np.int32)
     )
     for chunk in store.chunks:
         store.write(chunk, np.random.default_rng(0).normal(size=(64, 64, 64)).astype(np.float32))

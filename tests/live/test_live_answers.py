@@ -65,7 +65,7 @@ def test_a_ray_through_a_point_is_that_of_a_keyframe_that_sees_it() -> None:
 def test_images_of_a_view_are_small_and_scored() -> None:
     link = FakeLink()
     session = session_of(link, room(2))
-    link.ask(Watch(images=True, view=None, beside=False))
+    link.ask(Watch(images=True, view=None, baseline=False))
     finished(session)
     images = link.of_type(Images)
     assert images[0].title == small_room.frames()[0].name
@@ -78,7 +78,7 @@ def test_images_of_a_view_are_small_and_scored() -> None:
 
 def test_octomaps_way_follows_the_keyframes_and_goes_away_again() -> None:
     def beside() -> set[tuple[int, int, int]]:
-        return shown(link.sent).voxels("beside")
+        return shown(link.sent).voxels("baseline")
 
     def log_odds_voxels(chosen: Iterable[int]) -> set[tuple[int, int, int]]:
         config = Config(voxel_size=CONFIG.voxel_size, method="log_odds")
@@ -89,12 +89,12 @@ def test_octomaps_way_follows_the_keyframes_and_goes_away_again() -> None:
 
     link = FakeLink()
     session = session_of(link)
-    link.ask(Watch(images=False, view=None, beside=True))
+    link.ask(Watch(images=False, view=None, baseline=True))
     finished(session)
     assert beside() == log_odds_voxels(range(4))
     link.ask(Switch(1, on=False))
     finished(session)
     assert beside() == log_odds_voxels([0, 2, 3])
-    link.ask(Watch(images=False, view=None, beside=False))
+    link.ask(Watch(images=False, view=None, baseline=False))
     finished(session)
-    assert shown(link.sent).bricks["beside"] == {}
+    assert shown(link.sent).bricks["baseline"] == {}

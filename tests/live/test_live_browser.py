@@ -269,11 +269,11 @@ def page_chosen(page: LivePage) -> str:
 def test_the_baseline_is_shown_beside_the_map(page: LivePage) -> None:
     before = page.look()
     page.tick("Show baseline")
-    seen = page.until(lambda seen: seen.settled and seen.beside > 1000, "the other map")
+    seen = page.until(lambda seen: seen.settled and seen.baseline > 1000, "the other map")
     assert seen.voxels == before.voxels
-    page.screenshot("beside")
+    page.screenshot("baseline")
     page.tick("Show baseline", on=False)
-    page.until(lambda seen: seen.agrees and seen.said_beside == 0, "the map alone")
+    page.until(lambda seen: seen.agrees and seen.said_baseline == 0, "the map alone")
 
 
 def test_two_viewers_in_a_wide_and_a_narrow_window(

@@ -72,7 +72,7 @@ PLACES = st.integers(0, 7)
 def brick_updates(draw: st.DrawFn) -> Bricks:
     there = draw(st.dictionaries(PLACES, st.integers(0, 255), max_size=5))
     gone = draw(st.sets(PLACES, max_size=4)) - there.keys()
-    return bricks(there, tuple(gone), draw(st.sampled_from(["map", "beside"])))
+    return bricks(there, tuple(gone), draw(st.sampled_from(["map", "baseline"])))
 
 
 @given(st.lists(st.one_of(brick_updates(), st.just(HELLO), st.just(None)), max_size=30))

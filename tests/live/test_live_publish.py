@@ -145,18 +145,18 @@ def test_what_is_told_rebuilds_the_voxels(method: str) -> None:
 
 def test_bricks_without_a_likely_voxel_can_be_left_out() -> None:
     m = create_map(live_scene.Config(voxel_size=0.1, method="log_odds"), small_room.frames()[0].camera)
-    publisher = Publisher("beside", m.view.pool, m.seen_by, prior_is_unknown=True, least_log_odds=0.0)
+    publisher = Publisher("baseline", m.view.pool, m.seen_by, prior_is_unknown=True, least_log_odds=0.0)
     view = Shown()
     ids = [small_room.add(m, small_room.frames()[i]) for i in range(3)]
     for _ in range(2):
         update = publisher.changes()
         assert update is not None
         view.hear(update)
-        assert view.voxels("beside") == map_voxels(m)
+        assert view.voxels("baseline") == map_voxels(m)
         pool = m.view.pool
         belief = pool.read("belief", pool.in_use)
         likely = pool.bricks[pool.in_use][(belief > 0).any(axis=1)]
-        assert set(view.bricks["beside"]) == {tuple(brick) for brick in likely.tolist()}
+        assert set(view.bricks["baseline"]) == {tuple(brick) for brick in likely.tolist()}
         assert 0 < len(likely) < len(belief)
         m.remove_keyframe(ids.pop())
         m.infer()

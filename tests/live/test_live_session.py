@@ -76,7 +76,7 @@ def test_a_run_ends_in_the_map_of_its_frames() -> None:
 
 def test_the_number_of_keyframes_that_see_a_voxel_is_that_of_their_messages() -> None:
     link = FakeLink()
-    link.ask(Watch(images=False, view=None, beside=False, counts=True))
+    link.ask(Watch(images=False, view=None, baseline=False, counts=True))
     m = finished(session_of(link))
     seen = shown(link.sent).bricks["map"]
     pool = m.view.pool
@@ -94,7 +94,7 @@ def test_the_number_of_keyframes_that_see_a_voxel_is_that_of_their_messages() ->
     ("request_", "kind"),
     [
         (PixelRay(1, 80.0, 60.0), RayAnswer),
-        (Watch(images=True, view=0, beside=False), Images),
+        (Watch(images=True, view=0, baseline=False), Images),
         (Save("map", 7), File),
         (Save("ply", 7), File),
         (Speed(2.0), Status),

@@ -146,9 +146,9 @@ def test_a_folder_that_is_something_else_is_left_alone(tmp_path: Path) -> None:
 
 def test_a_store_is_whole_or_as_it_was(stores: dict[str, Path], tmp_path: Path) -> None:
     path = tmp_path / "map.zarr"
-    write_chunks(path, room_map("mrf"), room_map("mrf").config)
+    write_chunks(path, room_map("mrf"))
     before = ChunkedMap.open(path).chunks
-    header = StoreHeader.of(room_map("mrf").config, -2.0, 0.1)
+    header = StoreHeader.of(room_map("mrf").config, -2.0, -8.9, 0.1)
 
     def fail() -> None:
         with new_store(path) as place:
@@ -163,7 +163,7 @@ def test_a_store_is_whole_or_as_it_was(stores: dict[str, Path], tmp_path: Path) 
 
 def test_damage_and_newer_formats_are_told(stores: dict[str, Path], tmp_path: Path) -> None:
     path = tmp_path / "map.zarr"
-    write_chunks(path, room_map("mrf"), room_map("mrf").config)
+    write_chunks(path, room_map("mrf"))
     victim = next(file for file in sorted((path / "log_odds" / "c").rglob("*")) if file.is_file())
     victim.write_bytes(victim.read_bytes()[:20])
     damaged = ChunkedMap.open(path)
@@ -176,6 +176,26 @@ def test_damage_and_newer_formats_are_told(stores: dict[str, Path], tmp_path: Pa
         ChunkedMap.open(path)
     with pytest.raises(MapFileError, match=r"ChunkedMap\.open"):
         load_map(path)
+
+
+def test_the_method_says_what_seen_free_space_holds(stores: dict[str, Path]) -> None:
+    config = room_map("mrf").config
+    header = ChunkStore.open(stores["mrf"]).header
+    assert header.seen_free_log_odds == header.prior_log_odds - config.inference.message_clamp
+    header = ChunkStore.open(stores["log_odds"]).header  # all bricks that rays cross exist
+    assert header.seen_free_log_odds == header.prior_log_odds
+
+
+def test_a_map_of_a_method_that_is_not_registered_says_so(stores: dict[str, Path], tmp_path: Path) -> None:
+    path = tmp_path / "map.zarr"
+    write_chunks(path, room_map("log_odds"))
+    meta = json.loads((path / "zarr.json").read_text())
+    changed = meta["attributes"]["config"].replace("method: log_odds", "method: toy")
+    assert changed != meta["attributes"]["config"]
+    meta["attributes"]["config"] = changed + "\ntoy:\n  boldness: 0.7\n"
+    (path / "zarr.json").write_text(json.dumps(meta))
+    with pytest.raises(MapFileError, match=r"method 'toy', which is not registered .*PLUGS"):
+        ChunkedMap.open(path)
 
 
 def test_without_zarr_one_line_says_what_to_install(

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +20,30 @@ def test_an_entry_fits_its_class_and_its_section(method: Method) -> None:
     assert method.load_class().METHOD is method
     assert getattr(Config(), method.section) == method.section_class()
     assert {slider.name for slider in method.sliders} <= set(vars(method.section_class()))
+
+
+def test_nothing_outside_the_methods_asks_for_their_classes(repository: Path) -> None:
+    names = "|".join(method.class_name for method in METHODS.values())
+    asks = re.compile(
+        rf"isinstance\([^)]*\b({names}|RecursiveMap|BrickMap)\b|['\"]({'|'.join(METHODS)})['\"]"
+    )
+    # A picture of a ray is labelled "visibility", a mean of messages is one of log-odds, and so on.
+    words = {
+        "config/inference.py",
+        "inference/sweep.py",
+        "viewer/scene/ray_plot.py",
+        "export/store_header.py",
+    }
+    words |= {"factor_graph/config.py"}
+    package = repository / "taichi_mrf"
+    found = [
+        f"{name}: {line.strip()}"
+        for path in sorted(package.rglob("*.py"))
+        if not (name := path.relative_to(package).as_posix()).startswith("methods/") and name not in words
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if asks.search(line)
+    ]
+    assert not found
 
 
 def test_plugs_load_without_taichi() -> None:

@@ -51,12 +51,12 @@ _LOOK = """() => {
     }
     return false;
   };
-  const seen = {voxels: 0, beside: 0, colors: 0, nodes: []};
+  const seen = {voxels: 0, baseline: 0, colors: 0, nodes: []};
   for (const [name, node] of Object.entries(mutable?.nodeRefFromName ?? {}).sort()) {
     if (!node || !inScene(node)) continue;
     seen.nodes.push(name);
     const root = name.split('/')[1];
-    if (!(root in {voxels: 0, beside: 0}) || name.split('/').length < 3) continue;
+    if (!(root in {voxels: 0, baseline: 0}) || name.split('/').length < 3) continue;
     node.traverse(object => {
       if (!object.isPoints) return;
       seen[root] += object.geometry.attributes.position?.count ?? 0;
@@ -142,15 +142,15 @@ def _chromium() -> str | None:
 class Seen:
     """One look at a page: what it says of itself, and what is in its scene.
 
-    ``said`` and ``said_beside`` are the counts that the page gives, ``voxels`` and ``beside`` the points that
-    it draws; ``colors`` changes with any colour of any point. ``table`` is that of the tab About, empty while
-    another one is in front.
+    ``said`` and ``said_baseline`` are the counts that the page gives, ``voxels`` and ``baseline`` the points
+    that it draws; ``colors`` changes with any colour of any point. ``table`` is that of the tab About, empty
+    while another one is in front.
     """
 
     said: int
-    said_beside: int
+    said_baseline: int
     voxels: int
-    beside: int
+    baseline: int
     colors: int
     nodes: tuple[str, ...]
     activity: str
@@ -164,7 +164,7 @@ class Seen:
     @property
     def agrees(self) -> bool:
         """Whether the scene holds as many voxels as the page says."""
-        return (self.said, self.said_beside) == (self.voxels, self.beside)
+        return (self.said, self.said_baseline) == (self.voxels, self.baseline)
 
     @property
     def settled(self) -> bool:
@@ -189,8 +189,8 @@ class LivePage:
         found = self.page.evaluate(_LOOK)
         words = found.pop("counts").replace(",", "").split()
         said = int(words[0]) if words else 0
-        said_beside = int(words[words.index("baseline") - 3]) if "baseline" in words else 0
-        return Seen(said=said, said_beside=said_beside, nodes=tuple(found.pop("nodes")), **found)
+        said_baseline = int(words[words.index("baseline") - 3]) if "baseline" in words else 0
+        return Seen(said=said, said_baseline=said_baseline, nodes=tuple(found.pop("nodes")), **found)
 
     def until(self, condition: Callable[[Seen], object], what: str) -> Seen:
         """Look until a condition holds; returns what was then to be seen."""

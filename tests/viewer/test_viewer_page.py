@@ -193,7 +193,7 @@ def test_the_baseline_does_not_discard_the_viewpoint(handled: HandledPage, brows
     bricks, log_odds = np.zeros((1, 3), np.int32), np.full((1, 512), 900, np.int16)
     seen = np.ones((1, 512), np.uint8)
     handled.page.options = replace(ViewOptions(), show_baseline=True)
-    for layer in ("map", "beside"):
+    for layer in ("map", "baseline"):
         handled.take(m.Bricks(layer, bricks, log_odds, seen, np.zeros((0, 3), np.int32)))
     handled.page._flush()
     assert handled.page._with_baseline

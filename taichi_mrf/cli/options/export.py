@@ -20,8 +20,8 @@ class Export:
     """
 
     map: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MAP")]
-    """A file of MRFMap.save, LogOddsMap.save or VisibilityMap.save, such as the map.npz of a run, or a map in
-    chunks, such as the map.zarr of a run with --submap-size."""
+    """A saved map, such as the map.npz of a run, or a map in chunks, such as the map.zarr of a run with
+    --submap-size."""
 
     to: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE [FILE ...]")]
     """The files to write."""

@@ -6,7 +6,7 @@ import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from taichi_mrf import ChunkedMap, Config, MRFMap
+from taichi_mrf import ChunkedMap, Config
 from taichi_mrf.cluster.local import LocalProcesses
 from taichi_mrf.config.schema import EvaluationConfig
 from taichi_mrf.datasets.source_flags import SourceFlags
@@ -18,6 +18,9 @@ from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.submaps.costs import MeasuredCost, costs_table
 from taichi_mrf.experiments.submaps.equality import KilledOnce, compare, infer_or_be_killed
 from taichi_mrf.mapping.pipeline import map_sequence
+from taichi_mrf.methods.capabilities import has_messages
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.methods.registry import create_map
 from taichi_mrf.submaps.job import Job, Sequence
 from taichi_mrf.submaps.plan import Plan, Submap
 from taichi_mrf.submaps.rounds import SETTLED, SubmapsResult, map_in_submaps
@@ -72,7 +75,6 @@ def measure(experiment: Experiment, voxel_size: float, frames: int) -> Result:
     sequence = Sequence(source, SourceFlags().keywords())
     begin = time.perf_counter()
     single = map_sequence(sequence.open(), config).map
-    assert isinstance(single, MRFMap)
     single_seconds = time.perf_counter() - begin
     single_mb = single.statistics().memory_mb
     folder = experiment.out / f"submaps_{voxel_size * 100:g}cm"
@@ -125,7 +127,7 @@ def without_overlap(job: Job) -> Job:
     return replace(job, plan=Plan(job.plan.chunks_across, tuple(s for s in submaps if s.keyframes)))
 
 
-def _compared(name: str, single: MRFMap, result: SubmapsResult, path: Path) -> Result:
+def _compared(name: str, single: OccupancyMap, result: SubmapsResult, path: Path) -> Result:
     last = result.rounds[-1]
     found = {"round": name, "seconds": last.seconds, "moved": last.moved, "halo_moved": last.halo_moved}
     return found | asdict(compare(single, ChunkedMap.open(path)))
@@ -137,11 +139,12 @@ def _settled_after(result: SubmapsResult) -> int:
     return next(still, len(result.rounds) - 1) + 1
 
 
-def _cost(config: Config, result: SubmapsResult, single: MRFMap, path: Path) -> MeasuredCost:
+def _cost(config: Config, result: SubmapsResult, single: OccupancyMap, path: Path) -> MeasuredCost:
     """What a keyframe of a real camera costs, and what the corridor's map takes."""
     source = f"{NAME}?rooms=2&frames={FULL_FRAMES}&width={FULL_WIDTH}&height={FULL_HEIGHT}"
     dataset = Sequence(source, SourceFlags().keywords()).open()
-    m = MRFMap.from_config(config, dataset.camera)
+    m = create_map(config, dataset.camera)
+    assert has_messages(m)
     for index in range(len(dataset)):
         frame = dataset.read(index)
         m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera)

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf import UNKNOWN, ChunkedMap, MRFMap
+from taichi_mrf import UNKNOWN, ChunkedMap
 from taichi_mrf.inference.schedule import InferProgress
+from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.queries.known_bricks import BrickReader, known_bricks
 from taichi_mrf.queries.points import probability
 from taichi_mrf.submaps.round_files import SubmapReport
@@ -36,7 +37,7 @@ class Equality:
     largest: float
 
 
-def compare(single: MRFMap, merged: ChunkedMap) -> Equality:
+def compare(single: OccupancyMap, merged: ChunkedMap) -> Equality:
     """Compare all voxels, chunk by chunk. What has no brick in one of the maps counts as the prior there."""
     reader = BrickReader(single)
     voxels = known = within = known_within = same = looked_at = 0
@@ -63,7 +64,9 @@ def compare(single: MRFMap, merged: ChunkedMap) -> Equality:
     )
 
 
-def _bricks_of(single: MRFMap, merged: ChunkedMap) -> Iterator[tuple[NDArray[np.int32], NDArray[np.float32]]]:
+def _bricks_of(
+    single: OccupancyMap, merged: ChunkedMap
+) -> Iterator[tuple[NDArray[np.int32], NDArray[np.float32]]]:
     """All bricks of either map, a chunk at a time, with the merged map's log-odds, (n, 512)."""
     chunks = np.unique(np.concatenate([known_bricks(single) // CHUNK, merged.chunks]), axis=0)
     for chunk in chunks:

@@ -62,4 +62,5 @@ METHOD = Method(
         Slider("correct_bias"),
     ),
     prior_is_unknown=True,
+    is_octomap=True,
 )

@@ -3,7 +3,6 @@
 The class manages keyframes, bricks and messages. The computation itself is inference/sum_product.py.
 """
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +27,7 @@ from taichi_mrf.inference.incremental import IncrementalInference
 from taichi_mrf.inference.keyframe import DepthImage, Keyframe, checked_depth
 from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
 from taichi_mrf.inference.messages import count_observations
-from taichi_mrf.inference.prior import prior_probability
+from taichi_mrf.inference.prior import log_odds_without_bricks, prior_probability
 from taichi_mrf.inference.ray_list import RayBundler
 from taichi_mrf.inference.schedule import InferReport, Progress, content_key, run_sweeps
 from taichi_mrf.inference.sweep import Sweeper, unknown_entry_depths
@@ -77,9 +76,8 @@ class MRFMap(BrickMap):
     def _set_up(self, config: Config, noise: NoiseModel | None) -> None:
         inference = config.inference
         self.prior = prior_probability(inference, config.voxel_size)
-        prior_log_odds = math.log(self.prior / (1 - self.prior))
-        seen_free_log_odds = prior_log_odds - inference.message_clamp
-        self._make_bricks(config, noise, prior_log_odds, seen_free_log_odds, config.volume, Occlusion())
+        log_odds = log_odds_without_bricks(inference, config.voxel_size)
+        self._make_bricks(config, noise, *log_odds, config.volume, Occlusion())
         bundler = RayBundler(self.voxel_size, inference)
         bounds = KeyframeBounds()
         parts = (self.sensor, inference, self.config.volume)

@@ -131,7 +131,7 @@ class BasePage(Generic[P]):
         crossed = self.keyframes.roster.crossed()
         if not self.map.flush(self.options, self.viewpoint.up, crossed, self._announce):
             return
-        with_baseline = bool(self.map.layers["beside"].store.chunks)
+        with_baseline = bool(self.map.layers["baseline"].store.chunks)
         if with_baseline != self._with_baseline:
             self._with_baseline = with_baseline
             self.viewpoint.look_at_everything()

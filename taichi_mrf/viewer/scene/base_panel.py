@@ -72,7 +72,7 @@ class BasePanel:
 
     def show_counts(self, voxels: Mapping[Layer, int], recording: bool) -> None:
         """Show how many voxels of each layer the page shows, and whether the scene is being recorded."""
-        baseline = voxels["beside"]
+        baseline = voxels["baseline"]
         text = f"{voxels['map']:,} voxels shown" + (f", {baseline:,} of the baseline" if baseline else "")
         self._shown.content = text + (" · recording" if recording else "")
 

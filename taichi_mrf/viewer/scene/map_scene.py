@@ -29,21 +29,21 @@ _GAP_M = 0.5
 """Distance between the map and the baseline's map, in metres."""
 
 
-_NAMES: dict[Layer, str] = {"map": "this map", "beside": "baseline (OctoMap)"}
+_NAMES: dict[Layer, str] = {"map": "this map", "baseline": "baseline (OctoMap)"}
 
 
 class MapScene:
-    """Owns the scene nodes /voxels, /beside, /cut, /bricks and /names."""
+    """Owns the scene nodes /voxels, /baseline, /cut, /bricks and /names."""
 
     def __init__(self, server: viser.ViserServer, hello: Hello) -> None:
         self._server, self._hello = server, hello
         self.layers: dict[Layer, VoxelLayer] = {
             "map": VoxelLayer(server.scene, "/voxels", hello.voxel_size),
-            "beside": VoxelLayer(server.scene, "/beside", hello.voxel_size),
+            "baseline": VoxelLayer(server.scene, "/baseline", hello.voxel_size),
         }
         self._cut_plane = CutPlane(server.scene, hello.voxel_size)
         self._brick_lines = BrickLines(server.scene, hello.voxel_size)
-        self._dirty: dict[Layer, set[ChunkKey]] = {"map": set(), "beside": set()}
+        self._dirty: dict[Layer, set[ChunkKey]] = {"map": set(), "baseline": set()}
         self._all_dirty = True
         self._look: Look | None = None
         self._news_at = self._sent_at = 0.0
@@ -122,7 +122,7 @@ class MapScene:
         # A scale of heights or a cut that moves with the map's size changes every chunk.
         everything = self._all_dirty or (self._look is not None and look != self._look)
         map_changed = everything or bool(self._dirty["map"])
-        any_changed = map_changed or bool(self._dirty["beside"])
+        any_changed = map_changed or bool(self._dirty["baseline"])
         for name, layer in self.layers.items():
             chunks = layer.all_chunks() if everything else self._dirty[name]
             layer.prepare(chunks | (layer.inexact() if rested else set()), look, exactly=rested)
@@ -135,7 +135,7 @@ class MapScene:
                 self._draw_cut(look, crossed)
                 self._brick_lines.show(self.store.bricks() if options.bricks else None)
             if any_changed:
-                self.layers["beside"].place(self._beside_m(up))
+                self.layers["baseline"].place(self._baseline_m(up))
                 self._draw_names(up)
         self._look, self._all_dirty, self._sent_at = look, False, time.monotonic()
         return True
@@ -151,7 +151,7 @@ class MapScene:
 
     def _draw_names(self, up: Up) -> None:
         """Put a label above each map if there are two."""
-        two = bool(self.layers["beside"].store.chunks)
+        two = bool(self.layers["baseline"].store.chunks)
         for layer, text in _NAMES.items():
             if not two:
                 self._server.scene.remove_by_name(f"/names/{layer}")
@@ -165,7 +165,7 @@ class MapScene:
             above[axis] = ends[:, axis].max() if sign > 0 else ends[:, axis].min()
             self._server.scene.add_label(f"/names/{layer}", text, position=above)
 
-    def _beside_m(self, up: Up) -> NDArray[np.float64]:
+    def _baseline_m(self, up: Up) -> NDArray[np.float64]:
         """The shift of the baseline's map, in metres: past the map, along a horizontal axis."""
         shift = np.zeros(3)
         bounds = self.store.bounds()
