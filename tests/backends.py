@@ -3,8 +3,9 @@ those that use a backend.
 
     python tests/backends.py [options of pytest]
 
-The CPU's tests go in two halves, and all runs side by side, because one alone seldom keeps two cores busy.
-Each one's output is printed in one piece: that of the first half as it comes, the others' when that is done.
+Two processes run the CPU's tests; each takes the next file of tests that is not taken yet. All run side by
+side, because one alone seldom keeps two cores busy. Each one's output is printed in one piece: that of the
+first as it comes, the others' when that is done.
 """
 
 import subprocess
@@ -15,7 +16,7 @@ from typing import IO
 
 from taichi_mrf.system import runtime
 
-HALVES = ("1/2", "2/2")
+PROCESSES = 2
 
 Run = tuple[str, subprocess.Popen[bytes], IO[bytes]]
 
@@ -27,20 +28,26 @@ def main() -> int:
         print("Taichi has no backend here", file=sys.stderr)
         return 1
     first, *others = found
-    command = [sys.executable, "-m", "pytest", *sys.argv[1:], "--arch"]
-    beside = {arch: [*command, arch] for arch in others}
-    beside |= {f"{first}, part {part}": [*command, first, "--part", part] for part in HALVES[1:]}
-    with ExitStack() as files:
+    with ExitStack() as stack:
+        queue = stack.enter_context(tempfile.TemporaryDirectory())
+        command = [sys.executable, "-m", "pytest", *sys.argv[1:], "--arch"]
+        share = [*command, first, "--queue", queue]
+        beside = {arch: [*command, arch] for arch in others}
+        beside |= {_name(first, number): share for number in range(2, PROCESSES + 1)}
         runs = []
         for name, its_command in beside.items():
-            output = files.enter_context(tempfile.TemporaryFile())
+            output = stack.enter_context(tempfile.TemporaryFile())
             process = subprocess.Popen(its_command, stdout=output, stderr=subprocess.STDOUT)
             runs.append((name, process, output))
-        return _finish(f"{first}, part {HALVES[0]}", [*command, first, "--part", HALVES[0]], runs)
+        return _finish(_name(first, 1), share, runs)
+
+
+def _name(arch: str, number: int) -> str:
+    return f"{arch}, process {number} of {PROCESSES}"
 
 
 def _finish(first: str, command: list[str], runs: list[Run]) -> int:
-    """Run one command here, then wait for the others and print what they said."""
+    """Run one command here, then wait for the others and print what they printed."""
     print(f"== pytest on {first}; beside it: {'; '.join(name for name, _, _ in runs)}", flush=True)
     status = subprocess.run(command, check=False).returncode
     for name, process, output in runs:

@@ -4,6 +4,7 @@ Taichi can be started once in a process, so each backend is a run of its own: ``
 runs only the tests that use the ``backend`` fixture, on Vulkan (a software device will do).
 """
 
+import contextlib
 import importlib.util
 import multiprocessing.process
 import os
@@ -35,7 +36,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--arch", choices=runtime.BACKENDS, default="cpu", help="the Taichi backend to test (default: cpu)"
     )
 
-    parser.addoption("--part", default="1/1", help="1/2 or 2/2: every second test file (default: all)")
+    parser.addoption(
+        "--queue",
+        type=Path,
+        metavar="DIR",
+        help="run only test files that no other run with this folder has taken (see tests/backends.py)",
+    )
 
     parser.addoption(
         "--quick",
@@ -45,7 +51,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    _take_a_part(config, items)
     if config.getoption("--quick"):
         left_out = [item for item in items if _uses(item, "backend") and not _is_smoke(item)]
         config.hook.pytest_deselected(items=left_out)
@@ -60,12 +65,39 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             _take_fewer_examples(item)
 
 
-def _take_a_part(config: pytest.Config, items: list[pytest.Item]) -> None:
-    part, parts = (int(number) for number in config.getoption("--part").split("/"))
-    files = sorted({item.path for item in items})
-    mine = set(files[part - 1 :: parts])
-    config.hook.pytest_deselected(items=[item for item in items if item.path not in mine])
-    items[:] = [item for item in items if item.path in mine]
+def pytest_runtestloop(session: pytest.Session) -> bool | None:
+    """With --queue, take one file of tests after the other until none is left."""
+    folder: Path | None = session.config.getoption("--queue")
+    if folder is None or session.testsfailed or session.config.option.collectonly:
+        return None  # pytest's own loop
+    tests = _taken_tests(folder, session.items)
+    test = next(tests, None)
+    while test is not None:
+        following = next(tests, None)
+        session.config.hook.pytest_runtest_protocol(item=test, nextitem=following)
+        if session.shouldfail:
+            raise session.Failed(session.shouldfail)
+        if session.shouldstop:
+            raise session.Interrupted(session.shouldstop)
+        test = following
+    return True
+
+
+def _taken_tests(folder: Path, items: list[pytest.Item]) -> Iterator[pytest.Item]:
+    """The tests of the files that this process is the first to take: those with most tests of kernels first,
+    for the processes to end at the same time."""
+    files: dict[Path, list[pytest.Item]] = {}
+    for item in items:
+        files.setdefault(item.path, []).append(item)
+    for path in sorted(files, key=lambda path: _weight(files[path]), reverse=True):
+        name = "-".join(path.relative_to(REPOSITORY).parts)
+        with contextlib.suppress(FileExistsError):
+            (folder / name).touch(exist_ok=False)
+            yield from files[path]
+
+
+def _weight(items: list[pytest.Item]) -> tuple[int, int]:
+    return sum(_uses(item, "backend") for item in items), len(items)
 
 
 def _is_for_every_backend(item: pytest.Item) -> bool:

@@ -34,7 +34,10 @@ from typing import Any, TypeVar
 
 import taichi as ti
 
+from taichi_mrf.kernels import positions
 from taichi_mrf.kernels.types import Template
+
+positions.shorten()
 
 
 class Bundle:

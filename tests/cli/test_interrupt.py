@@ -1,5 +1,7 @@
 """What signals mean to a run."""
 
+import contextlib
+import io
 import os
 import signal
 import subprocess
@@ -9,7 +11,8 @@ from collections.abc import Iterator
 import pytest
 
 from taichi_mrf.cli.shared import interrupt
-from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
+from taichi_mrf.cli.shared.interrupt import StopRequest, interrupt_on_signals, stop_on_signals
+from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.errors import CutShortError
 
 
@@ -91,3 +94,31 @@ def leave_out(request: StopRequest, reached: list[str]) -> None:
         reached.append("begin")
         os.kill(os.getpid(), signal.SIGTERM)
         reached.append("end")
+
+
+class Pipe(io.RawIOBase):
+    """What a program prints to, whose reader sends SIGTERM as soon as it has read the first line."""
+
+    def __init__(self) -> None:
+        self.read = b""
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: bytes) -> int:  # type: ignore[override]
+        self.read += bytes(data)
+        if len(self.read) == len(data):
+            os.kill(os.getpid(), signal.SIGTERM)
+        return len(data)
+
+
+def test_a_signal_in_the_middle_of_a_line_stops_the_run_too() -> None:
+    pipe = Pipe()
+    stream = io.TextIOWrapper(io.BufferedWriter(pipe))
+    with contextlib.redirect_stdout(stream):
+        terminal = Terminal()
+        with pytest.raises(KeyboardInterrupt), interrupt_on_signals(terminal.say) as request:
+            terminal.say("first")
+    assert request.signal == signal.SIGTERM
+    last = pipe.read.decode().splitlines()[-1]
+    assert last == "Stopping. What is done so far is saved. Press Ctrl-C again to abort."

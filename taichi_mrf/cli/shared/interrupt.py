@@ -9,6 +9,7 @@ import contextlib
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -97,12 +98,18 @@ def interrupt_on_signals(tell: Callable[[str], None]) -> Iterator[StopRequest]:
 def _handled(tell: Callable[[str], None], keeps: bool, raise_at_once: bool) -> Iterator[StopRequest]:
     request = StopRequest()
     fate = "What is done so far is saved." if keeps else "Nothing is saved: there is no --out."
+    telling: list[threading.Thread] = []
+
+    def tell_fate() -> None:
+        with contextlib.suppress(OSError):  # the terminal may be gone
+            tell(f"Stopping. {fate} Press Ctrl-C again to abort.")
 
     def handle(number: int, frame: FrameType | None) -> None:
         if not request.take(number):
             return
-        with contextlib.suppress(OSError):  # the terminal may be gone
-            tell(f"Stopping. {fate} Press Ctrl-C again to abort.")
+        # The signal may come while this thread prints, and a stream refuses a thread's write within a write.
+        telling.append(threading.Thread(target=tell_fate))
+        telling[-1].start()
         if raise_at_once:
             raise KeyboardInterrupt
 
@@ -114,6 +121,8 @@ def _handled(tell: Callable[[str], None], keeps: bool, raise_at_once: bool) -> I
     finally:
         for number, handler in saved.items():
             signal.signal(number, handler)
+        for thread in telling:
+            thread.join()
 
 
 def _is_taken(number: int | None) -> bool:

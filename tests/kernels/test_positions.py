@@ -1,0 +1,34 @@
+# ruff: noqa: ANN202 - Taichi does not allow `-> None` on a kernel or a func.
+"""Notes of where a part of a kernel stands: short while it compiles, whole in an error."""
+
+import ast
+
+import pytest
+import taichi as ti
+from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+
+import taichi_mrf.kernels.bundles  # noqa: F401 - shortens the notes
+
+
+@pytest.mark.usefixtures("backend")
+def test_notes_are_a_line_and_an_error_shows_the_source(monkeypatch: pytest.MonkeyPatch) -> None:
+    noted: list[str] = []
+    note = ASTTransformerContext.get_pos_info
+
+    def noted_too(context: ASTTransformerContext, node: ast.expr) -> str:
+        noted.append(note(context, node))
+        return noted[-1]
+
+    monkeypatch.setattr(ASTTransformerContext, "get_pos_info", noted_too)
+
+    @ti.kernel
+    def faulty():
+        first = 1
+        print(first + of_no_kind)  # noqa: F821
+
+    with pytest.raises(ti.TaichiCompilationError) as caught:
+        faulty()
+    assert "print(first + of_no_kind)" in str(caught.value)
+    before = [text for text in noted if text not in str(caught.value)]
+    assert before
+    assert all(text.count("\n") == 1 and text.startswith(f'File "{__file__}", line ') for text in before)
