@@ -53,6 +53,8 @@ def print_map(console: Terminal, facts: Facts) -> None:
     if facts["extent"] is not None:
         corners = zip("xyz", *facts["extent"], strict=True)
         table.add_row("extent", ", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in corners) + " m")
+    if facts.get("up"):
+        table.add_row("up", facts["up"])
     if "keyframes" in facts:
         names = facts["keyframe_names"]
         table.add_row("keyframes", str(facts["keyframes"]) + (f", {names[0]} to {names[1]}" if names else ""))
@@ -76,6 +78,7 @@ def _run_map(path: Path) -> Facts:
         "voxel_size": header.config.voxel_size,
         "voxels": len(bricks) * VOXELS,
         "extent": _extent(bricks, BRICK * header.config.voxel_size),
+        "up": header.up_axis or None,
         "keyframes": len(names),
         "keyframe_names": [names[0], names[-1]] if names else [],
         "inferred": header.settled,
@@ -91,6 +94,7 @@ def _chunked_map(path: Path) -> Facts:
         "voxel_size": m.voxel_size,
         "voxels": len(m.chunks) * CHUNK_VOXELS**3,
         "extent": [corner.tolist() for corner in m.extent] if len(m.chunks) else None,
+        "up": m.header.up or None,
         "configuration": _changed(m.config),
     }
 

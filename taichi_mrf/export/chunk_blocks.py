@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.export.chunk_store import Chunk, ChunkStore, StoreHeader, new_store
+from taichi_mrf.geometry.up import Up
 from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, known_bricks
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS
 
@@ -46,14 +47,14 @@ class StorableMap(QueriedMap, Protocol):
         ...
 
 
-def write_chunks(path: str | Path, m: StorableMap) -> None:
-    """Write a map in memory to a store, chunk by chunk. Raises MapFileError,
-    TaichiMRFError without zarr."""
+def write_chunks(path: str | Path, m: StorableMap, up: Up | None = None) -> None:
+    """Write a map in memory to a store, chunk by chunk; ``up`` (default: the map's) is kept in it. Raises
+    MapFileError, TaichiMRFError without zarr."""
     reader = BrickReader(m)
     bricks = known_bricks(m)
     with new_store(path) as folder:
-        evidence = m.view.volume.min_evidence
-        header = StoreHeader.of(m.config, reader.pool.prior_log_odds, m.seen_free_log_odds, evidence)
+        volume, prior = m.view.volume, reader.pool.prior_log_odds
+        header = StoreHeader.of(m.config, prior, m.seen_free_log_odds, volume.min_evidence, up or m.up)
         store = ChunkStore.create(folder, header, np.unique(bricks // CHUNK, axis=0))
         for chunk, rows in by_chunk(bricks):
             log_odds = reader.log_odds(bricks[rows])

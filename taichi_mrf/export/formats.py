@@ -19,7 +19,7 @@ from taichi_mrf.export.octomap import write_bt, write_ot
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.export.ply import write_voxels
 from taichi_mrf.export.surface import smooth_surface, voxel_surface
-from taichi_mrf.geometry.up import Up, plan_axes, up_from_name, up_name, up_of_first, y_up
+from taichi_mrf.geometry.up import Z_UP, Up, plan_axes, up_from_name, up_name, y_up
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN
 
 _DEFAULTS = ExportOptions()
@@ -71,14 +71,14 @@ def export_note(m: ExportedMap, path: str | Path, options: ExportOptions = _DEFA
     """What a user should be told about a file that was written: how a floor plan lies in the world."""
     if _WRITERS.get(Path(path).suffix.lower()) is not _level_map:
         return None
-    reason = "--up" if options.up != "auto" else "the first keyframe's image"
-    if options.up == "auto" and not m.keyframes:
-        reason = "the map has no keyframes to tell; --up sets another"
+    reason = "--up" if options.up != "auto" else "as in the map's first keyframe"
+    if options.up == "auto" and m.up is None:
+        reason = "assumed: the map does not hold which way is up; --up sets another"
     return f"{_plan_note(_up(m, options))} ({reason})"
 
 
 def _up(m: ExportedMap, options: ExportOptions) -> Up:
-    return up_of_first(m.keyframes.values()) if options.up == "auto" else up_from_name(options.up)
+    return m.up or Z_UP if options.up == "auto" else up_from_name(options.up)
 
 
 def _plan_note(up: Up) -> str:
@@ -127,7 +127,7 @@ def _arrays(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
 
 
 def _chunks(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
-    write_chunks(path, m)
+    write_chunks(path, m, _up(m, options) if options.up != "auto" else None)
     return [path]
 
 

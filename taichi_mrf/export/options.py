@@ -30,8 +30,8 @@ class ExportOptions:
     """Upper end in metres of the band of heights that a .pgm shows."""
 
     up: Literal["auto", "x", "y", "z", "-x", "-y", "-z"] = "auto"
-    """The world axis that is up in .pgm, .glb and .html. auto takes it from the first keyframe's image, or z
-    if the map has no keyframes."""
+    """The world axis that is up in .pgm, .glb, .html and .zarr. auto takes the map's own, that of its first
+    keyframe's image, or z if the map does not hold it."""
 
     occupied_from: float = 0.5
     """A cell of a .pgm is occupied if a voxel in the band has at least this probability."""

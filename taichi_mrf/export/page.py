@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.geometry.up import Up, up_of_first
+from taichi_mrf.geometry.up import Z_UP, Up
 from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.viewer.messages import pack_log_odds
@@ -23,8 +23,8 @@ _NOT_SHOWN = np.float32(-60)
 
 
 def write_page(path: str | Path, m: QueriedMap, threshold: float = 0.5, up: Up | None = None) -> None:
-    """Write a page that shows the voxels of at least this probability, ``up`` pointing up (default: as in
-    the first keyframe's image). Raises MapFileError, ViewerError."""
+    """Write a page that shows the voxels of at least this probability, ``up`` pointing up (default: the
+    map's). Raises MapFileError, ViewerError."""
     server = start_server("127.0.0.1", 0, Path(path).stem)
     try:
         layer = VoxelLayer(server.scene, "/voxels", m.voxel_size)
@@ -34,7 +34,7 @@ def write_page(path: str | Path, m: QueriedMap, threshold: float = 0.5, up: Up |
             seen = np.where(log_odds == reader.pool.prior_log_odds, _NOT_SHOWN, log_odds)
             layer.store.put(bricks, pack_log_odds(seen), np.zeros((len(bricks), VOXELS), np.uint8))
         eye = ViewpointController(server)
-        eye.set_up(up or up_of_first(m.keyframes.values()))
+        eye.set_up(up or m.up or Z_UP)
         bounds = layer.store.bounds()
         if bounds is not None:
             look = look_of(ViewOptions(threshold=threshold), layer.store, eye.up, m.voxel_size)

@@ -13,6 +13,7 @@ from typing import Any
 import taichi_mrf
 from taichi_mrf.config.schema import Config, to_yaml
 from taichi_mrf.errors import MapFileError, said
+from taichi_mrf.geometry.up import UP_NAMES, Up, up_name
 from taichi_mrf.system.files import check_regular, exists, open_regular, read_text
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
@@ -31,7 +32,8 @@ _KEYS = {"name": "default", "configuration": {"separator": "/"}}
 class StoreHeader:
     """What holds for all voxels: ``voxel_size`` in metres, the log-odds of the prior and of space that was
     seen to be free without a surface near, the evidence from which a voxel counts as known, the configuration
-    as YAML and the version of the package that made the map."""
+    as YAML, the version of the package that made the map, and the name of the world axis that is up, empty
+    if it is unknown."""
 
     voxel_size: float
     prior_log_odds: float
@@ -39,10 +41,15 @@ class StoreHeader:
     min_evidence: float
     config: str
     version: str
+    up: str = ""
 
     @staticmethod
     def of(
-        config: Config, prior_log_odds: float, seen_free_log_odds: float, min_evidence: float
+        config: Config,
+        prior_log_odds: float,
+        seen_free_log_odds: float,
+        min_evidence: float,
+        up: Up | None = None,
     ) -> "StoreHeader":
         """The header of a map that this version has made with a configuration."""
         return StoreHeader(
@@ -52,6 +59,7 @@ class StoreHeader:
             min_evidence=min_evidence,
             config=to_yaml(config),
             version=taichi_mrf.__version__,
+            up=up_name(up) if up else "",
         )
 
 
@@ -113,6 +121,7 @@ def _unpacked_size(head: bytes) -> int | None:
 
 
 def _header(folder: Path, attributes: dict[str, Any]) -> StoreHeader:
+    attributes = {"up": "", **attributes}  # earlier versions did not save it
     for field in fields(StoreHeader):
         value = attributes.get(field.name)
         kinds = (int, float) if field.type in (float, "float") else str
@@ -123,6 +132,8 @@ def _header(folder: Path, attributes: dict[str, Any]) -> StoreHeader:
     header = StoreHeader(**{field.name: attributes[field.name] for field in fields(StoreHeader)})
     if not 0 < header.voxel_size <= _LARGEST_VOXEL_M:
         raise _damaged(folder, f"voxel_size is {header.voxel_size:g}")
+    if header.up not in ("", *UP_NAMES):
+        raise _damaged(folder, f"up is {header.up!r}")
     if header.min_evidence < 0:
         raise _damaged(folder, f"min_evidence is {header.min_evidence:g}")
     return header

@@ -1,7 +1,7 @@
-"""Which way is up in a world frame: an axis and a sign, taken from how a camera was held."""
+"""Which way is up in a world frame: an axis and a sign, taken from how a camera was held.
 
-from collections.abc import Iterable
-from typing import Protocol
+A map keeps the direction of its first keyframe (``up`` in methods/protocol.py).
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +14,7 @@ Up = tuple[int, int]
 Z_UP: Up = (2, 1)
 
 
-class Posed(Protocol):
-    """Anything with a camera pose."""
-
-    @property
-    def T_world_camera(self) -> Pose: ...
+UP_NAMES = ("x", "y", "z", "-x", "-y", "-z")
 
 
 def up_of(T_world_camera: Pose) -> Up:
@@ -26,12 +22,6 @@ def up_of(T_world_camera: Pose) -> Up:
     upwards = -T_world_camera[:3, 1]
     axis = int(np.argmax(np.abs(upwards)))
     return axis, 1 if upwards[axis] > 0 else -1
-
-
-def up_of_first(keyframes: Iterable[Posed]) -> Up:
-    """The world axis that is up in the first keyframe's image; +z if there is none."""
-    first = next(iter(keyframes), None)
-    return Z_UP if first is None else up_of(first.T_world_camera)
 
 
 def up_vector(up: Up) -> NDArray[np.float64]:

@@ -16,7 +16,8 @@ from taichi_mrf.config.arguments import instance, iterable, real, whole
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
 from taichi_mrf.config.values import overridden
-from taichi_mrf.geometry.poses import as_pose
+from taichi_mrf.geometry.poses import Pose, as_pose
+from taichi_mrf.geometry.up import Up, up_of
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.sensor_section import describing
 from taichi_mrf.queries.extract import extract_voxels
@@ -107,6 +108,7 @@ class BrickMap(Owned):
         weakref.finalize(self, recycle, topology)
         self._registry = BrickRegistry(topology, self._pool, self.voxel_size)
         self.seen_free_log_odds = seen_free_log_odds
+        self._up: Up | None = None
         self.view = View(self._pool, self.voxel_size, shown, occlusion)
 
     @classmethod
@@ -122,6 +124,17 @@ class BrickMap(Owned):
         m = cls.__new__(cls)
         m._set_up(config, noise)
         return m
+
+    @property
+    def up(self) -> Up | None:
+        """The world axis that is up in the image of the first keyframe that was added, which may have been
+        removed since; None before it."""
+        return self._up
+
+    def _note_up(self, T_world_camera: Pose) -> None:
+        """Keep which way is up if this is the first keyframe."""
+        if self._up is None:
+            self._up = up_of(T_world_camera)
 
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
         """Probability of occupied at (N, 3) points in metres, (N,) float32; the prior where nothing was

@@ -13,6 +13,7 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import ConfigError, MapFileError, said
 from taichi_mrf.export.chunk_store import CHUNK_BYTES, Chunk, ChunkStore
+from taichi_mrf.geometry.up import Up, up_from_name
 from taichi_mrf.methods.map_file import check_registered
 from taichi_mrf.queries.box import BoxOfVoxels, voxels_of_box
 from taichi_mrf.queries.points import checked_points, classify, probability
@@ -64,6 +65,11 @@ class ChunkedMap:
     def open(cls, path: str | Path, cache_mb: float = 256.0) -> "ChunkedMap":
         """The map in a folder such as map.zarr. Raises MapFileError, TaichiMRFError without zarr."""
         return cls(ChunkStore.open(path), cache_mb)
+
+    @property
+    def up(self) -> Up | None:
+        """The world axis that is up, None if the store does not hold it."""
+        return up_from_name(self.header.up) if self.header.up else None
 
     @property
     def extent(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

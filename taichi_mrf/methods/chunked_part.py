@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.geometry.up import Up
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.queries.box import voxels_of_box
 from taichi_mrf.queries.known_bricks import Placed
@@ -43,6 +44,11 @@ class MapPart:
     def seen_free_log_odds(self) -> float:
         """Log-odds of space that was seen to be free without a surface near."""
         return self.source.header.seen_free_log_odds
+
+    @property
+    def up(self) -> Up | None:
+        """The world axis that is up, None if the store does not hold it."""
+        return self.source.up
 
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
         """Probability of occupied at (N, 3) points in metres, (N,)."""

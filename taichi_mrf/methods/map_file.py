@@ -19,6 +19,7 @@ from taichi_mrf.config.schema import Config, to_yaml
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import CapacityError, MapFileError, TaichiMRFError, said
 from taichi_mrf.geometry.poses import Pose, as_pose
+from taichi_mrf.geometry.up import UP_NAMES, Up, up_from_name, up_name, up_of
 from taichi_mrf.methods.sensor_section import describing
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
@@ -48,13 +49,20 @@ class StoredKeyframe:
 @dataclass(frozen=True)
 class MapHeader:
     """What the files of all methods hold; ``config.method`` names the method. ``settled`` says whether the
-    voxels are those that a full inference of these keyframes gives."""
+    voxels are those that a full inference of these keyframes gives; ``up`` is the world axis that is up, None
+    if it is unknown."""
 
     config: Config
     noise: NoiseModel
     keyframes: list[StoredKeyframe]
     next_id: int
     settled: bool = True
+    up: Up | None = None
+
+    @property
+    def up_axis(self) -> str:
+        """The name of the axis that is up, empty if it is unknown."""
+        return up_name(self.up) if self.up else ""
 
     def limited_to(self, memory_limit_gb: float | None) -> Config:
         """The configuration, with another memory limit unless it is None."""
@@ -76,6 +84,7 @@ class MapHeader:
             "keyframe_cameras": np.array([_camera_row(k.camera) for k in keyframes]).reshape(-1, 6),
             "next_id": np.asarray(self.next_id),
             "settled": np.asarray(self.settled),
+            "up": np.asarray(self.up_axis),
             **_noise_arrays(self.noise),
         }
         for number, keyframe in enumerate(keyframes):
@@ -153,7 +162,7 @@ def read_header(path: Path, file: NpzFile) -> MapHeader:
     # Maps of earlier versions saved the default sensor, whatever their noise.
     config = replace(config, sensor=describing(noise, config.sensor))
     settled = file.scalar("settled", "b") if "settled" in file else True  # earlier versions did not save it
-    return MapHeader(config, noise, keyframes, next_id, settled)
+    return MapHeader(config, noise, keyframes, next_id, settled, _up(path, file, keyframes))
 
 
 def read_bricks(path: Path, file: NpzFile) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
@@ -162,6 +171,15 @@ def read_bricks(path: Path, file: NpzFile) -> tuple[NDArray[np.int32], NDArray[n
     if len(np.unique(bricks, axis=0)) < len(bricks):
         raise MapFileError(f"{path}: damaged: a brick appears twice")
     return bricks.astype(np.int32), file.array("belief", "f", (len(bricks), VOXELS)).astype(np.float32)
+
+
+def _up(path: Path, file: NpzFile, keyframes: list[StoredKeyframe]) -> Up | None:
+    if "up" not in file:  # a file of an earlier version
+        return up_of(keyframes[0].T_world_camera) if keyframes else None
+    name = file.scalar("up", "U")
+    if name not in ("", *UP_NAMES):
+        raise MapFileError(f"{path}: damaged: up is {name!r}")
+    return up_from_name(name) if name else None
 
 
 def _config(path: Path, file: NpzFile) -> Config:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.geometry.up import Up
 from taichi_mrf.inference.schedule import InferReport, Progress
 from taichi_mrf.methods.statistics import MapStatistics
 from taichi_mrf.queries.profile import RayProfile
@@ -61,6 +62,12 @@ class OccupancyMap(Protocol):
 
     @property
     def keyframes(self) -> Mapping[int, MappedKeyframe]: ...
+
+    @property
+    def up(self) -> Up | None:
+        """The world axis that is up in the image of the first keyframe that was added, which may have been
+        removed since; None before it."""
+        ...
 
     @property
     def stale(self) -> bool:

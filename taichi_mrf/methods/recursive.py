@@ -159,6 +159,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         if not self._stale:
             self._add(record)
         self._keyframes[record.id] = record
+        self._note_up(T)
         self._next_id += 1
         return record.id
 
@@ -235,7 +236,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
             StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera)
             for k in self._keyframes.values()
         ]
-        header = MapHeader(self.config, self.noise, keyframes, self._next_id, self.settled)
+        header = MapHeader(self.config, self.noise, keyframes, self._next_id, self.settled, self.up)
         belief = self._pool.read("belief", slots)
         write_recursive(Path(path), RecursiveContents(header, self._pool.bricks[slots], belief, self._stale))
 
@@ -252,7 +253,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
                 m._pool.write("belief", m._registry.restore(bricks, 1), contents.belief)
         for k in header.keyframes:
             m._keyframes[k.id] = ScanRecord(k.id, k.name, k.depth_m, k.T_world_camera, k.camera)
-        m._next_id, m._stale = header.next_id, contents.stale
+        m._next_id, m._stale, m._up = header.next_id, contents.stale, header.up
         return m
 
     def _find(self, id: int) -> ScanRecord:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.geometry.up import Up
 from taichi_mrf.queries.points import FREE, classify
 from taichi_mrf.queries.view import View
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, grid_keys
@@ -38,6 +39,9 @@ class QueriedMap(Protocol):
 
     @property
     def keyframes(self) -> Mapping[int, Placed]: ...
+
+    @property
+    def up(self) -> Up | None: ...
 
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]: ...
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.geometry.up import plan_axes, up_of_first
+from taichi_mrf.geometry.up import Z_UP, plan_axes
 from taichi_mrf.queries.box import FARTHEST_VOXEL, map_extent, voxel_box, voxels_of_box
 from taichi_mrf.queries.known_bricks import QueriedMap
 
@@ -41,7 +41,7 @@ def slice_map(
 ) -> MapSlice:
     """The layer of voxels at ``at`` metres: at this height with "up", else at this place along the axis.
 
-    Up is the world's axis that is up in the first keyframe's image (z without keyframes). The layer shows the
+    Up is the map's ``up`` (z if it is unknown). The layer shows the
     whole map, or the part between ``lower`` and ``upper``, (2,) in metres along the image's two axes. A level
     layer is seen from above; in an upright one, up is up. Raises ConfigError for another axis, for corners
     that make no box and for an empty map, CapacityError if the layer does not fit memory.
@@ -50,7 +50,7 @@ def slice_map(
         raise ConfigError(f"axis must be up, x, y or z, not {axis!r}")
     if not np.isfinite(at):
         raise ConfigError(f"a slice needs a finite place along {axis}, not {at}")
-    up_axis, sign = up_of_first(m.keyframes.values())
+    up_axis, sign = m.up or Z_UP
     number = up_axis if axis == "up" else "xyz".index(axis)
     place_m = sign * at if axis == "up" else at
     if number == up_axis:

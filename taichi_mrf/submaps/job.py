@@ -38,7 +38,8 @@ class Sequence:
 @dataclass(frozen=True)
 class Job:
     """A sequence, how it is mapped, and how it is cut. ``skipped`` has the problem of each unreadable frame
-    by name; ``centres_m`` are the camera centres of all keyframes, by their index in the dataset."""
+    by name; ``centres_m`` are the camera centres of all keyframes, by their index in the dataset;
+    ``up`` is the name of the world axis that is up, empty in plans of earlier versions."""
 
     sequence: Sequence
     config: Config
@@ -46,6 +47,7 @@ class Job:
     plan: Plan
     centres_m: dict[int, tuple[float, float, float]]
     skipped: dict[str, str]
+    up: str = ""
 
     def write(self, folder: Path) -> None:
         """Write the plan's file. Raises MapFileError."""
@@ -56,6 +58,7 @@ class Job:
             "submap_size": self.submap_size,
             "centres_m": self.centres_m,
             "skipped": self.skipped,
+            "up": self.up,
             "plan": plan,
         }
         write_text(folder / PLAN_FILE, json.dumps(content) + "\n")
@@ -75,6 +78,7 @@ class Job:
                 Plan(plan["chunks_across"], tuple(submaps)),
                 {int(index): tuple(centre) for index, centre in content["centres_m"].items()},
                 content["skipped"],
+                content.get("up", ""),
             )
         except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             raise MapFileError(f"{path}: not a readable plan of submaps: {said(error)}") from error

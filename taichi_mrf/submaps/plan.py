@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.geometry.up import Z_UP, Up
 from taichi_mrf.voxels.layout import CHUNK, CHUNK_VOXELS
 
 Cell = tuple[int, int]
@@ -22,11 +23,12 @@ Cell = tuple[int, int]
 @dataclass(frozen=True)
 class SeenKeyframe:
     """What the plan needs of a keyframe: its index in the dataset, where the camera was, in metres, and the
-    chunks (n, 3) that its rays cross."""
+    chunks (n, 3) that its rays cross; ``up`` is the world axis that is up in its image."""
 
     index: int
     centre_m: tuple[float, float, float]
     chunks: NDArray[np.int32]
+    up: Up = Z_UP
 
 
 @dataclass(frozen=True)

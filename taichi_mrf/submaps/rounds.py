@@ -17,6 +17,7 @@ from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.export.chunk_blocks import by_chunk, chunk_block
 from taichi_mrf.export.chunk_store import ChunkStore, StoreHeader, new_store
+from taichi_mrf.geometry.up import up_from_name, up_name
 from taichi_mrf.inference.prior import log_odds_without_bricks
 from taichi_mrf.submaps.job import PLAN_FILE, Job, Sequence
 from taichi_mrf.submaps.plan import plan_submaps
@@ -142,7 +143,8 @@ def _job(
         sequence, config, runner, skip_bad_frames, lambda done, total: progress("Planning", done, total)
     )
     plan = plan_submaps(keyframes, submap_size, config.voxel_size)
-    job = Job(sequence, config, submap_size, plan, {k.index: k.centre_m for k in keyframes}, skipped)
+    centres_m = {k.index: k.centre_m for k in keyframes}
+    job = Job(sequence, config, submap_size, plan, centres_m, skipped, up_name(keyframes[0].up))
     job.write(folder)
     return job
 
@@ -221,9 +223,9 @@ def _merge(folder: Path, job: Job, round: int, path: Path) -> None:
     """Write the cores of all submaps after a round as one map in chunks. A chunk belongs to one submap
     alone, so each is written once, and only one submap's core is in memory at a time. Raises MapFileError."""
     files = [round_path(folder, round, number) for number in range(len(job.plan.submaps))]
-    config = job.config
+    config, up = job.config, up_from_name(job.up) if job.up else None
     log_odds = log_odds_without_bricks(config.inference, config.voxel_size)
-    header = StoreHeader.of(config, *log_odds, config.volume.min_evidence)
+    header = StoreHeader.of(config, *log_odds, config.volume.min_evidence, up)
     chunks = [np.unique(np.concatenate(read_places(file)) // CHUNK, axis=0) for file in files]
     with new_store(path) as place:
         store = ChunkStore.create(place, header, np.unique(np.concatenate(chunks), axis=0))

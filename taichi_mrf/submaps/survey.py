@@ -10,6 +10,7 @@ from taichi_mrf.cluster.runner import TaskRunner
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose, as_pose
+from taichi_mrf.geometry.up import up_of
 from taichi_mrf.mapping.selection import KeyframeSelector, is_held_out
 from taichi_mrf.submaps.job import Sequence
 from taichi_mrf.submaps.partial_map import PartialMap
@@ -116,6 +117,7 @@ def _chosen(
         elif selector.objection(frame.T_world_camera, frame.measured) is None:
             selector.accept(frame.T_world_camera)
             if len(frame.chunks):  # else no ray is cast for it
-                x, y, z = frame.T_world_camera[:3, 3].tolist()
-                keyframes.append(SeenKeyframe(frame.index, (x, y, z), frame.chunks))
+                T = frame.T_world_camera
+                x, y, z = T[:3, 3].tolist()
+                keyframes.append(SeenKeyframe(frame.index, (x, y, z), frame.chunks, up_of(T)))
     return keyframes, skipped

@@ -164,7 +164,7 @@ def test_the_2d_map_of_a_world_whose_y_points_down_is_a_floor_plan(backend: str,
     assert {0, 254} <= set(np.unique(image))
     sideways = ExportOptions(z_min=-1.6, z_max=-1.0, up="z")
     assert "(--up)" in str(export_note(m, "floor.pgm", sideways))
-    assert "the first keyframe's image" in str(export_note(m, "floor.pgm"))
+    assert "as in the map's first keyframe" in str(export_note(m, "floor.pgm"))
     assert export_note(m, "map.glb") is None
 
 

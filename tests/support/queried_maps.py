@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.geometry.up import Up, up_of
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.visibility.map import VisibilityMap
@@ -34,6 +35,10 @@ class HandMap:
     crossed: NDArray[np.int32]
     voxel_size: float = VOXEL
     keyframes: dict[int, Any] = field(default_factory=dict)
+
+    @property
+    def up(self) -> Up | None:
+        return next((up_of(keyframe.T_world_camera) for keyframe in self.keyframes.values()), None)
 
     def __post_init__(self) -> None:
         self.view = View(self.hand.pool, self.voxel_size, VolumeConfig(min_evidence=MIN_EVIDENCE))

@@ -10,6 +10,7 @@ from taichi_mrf.evaluation.depth_error import depth_error
 from taichi_mrf.evaluation.pictures.figures import new_figure, notice
 from taichi_mrf.evaluation.pictures.room_views import DrawnMap, perspective, top_view
 from taichi_mrf.evaluation.pictures.surfaces import seen_surfaces, up_direction
+from taichi_mrf.geometry.up import Z_UP
 from taichi_mrf.methods.protocol import OccupancyMap, PosedDepth
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.atomic import atomic_path
@@ -53,7 +54,7 @@ def _room_figures(m: OccupancyMap) -> dict[str, "Figure"]:
         probability=probability,
         normals=surfaces.thickened().normals_at(centres),
         voxel_size=m.voxel_size,
-        up=up_direction(poses, surfaces.normals),
+        up=up_direction(poses, surfaces.normals, m.up or Z_UP),
         T_world_cameras=poses,
     )
     return {"top_view.png": top_view(room), "perspective.png": perspective(room)}

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.geometry.up import Z_UP, Up, up_vector
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.voxels.layout import grid_keys
@@ -85,18 +86,20 @@ def seen_surfaces(m: OccupancyMap) -> Surfaces:
     return Surfaces(cell_m, keys, means)
 
 
-def up_direction(T_world_cameras: Iterable[Pose], normals: NDArray[np.floating]) -> NDArray[np.float64]:
+def up_direction(
+    T_world_cameras: Iterable[Pose], normals: NDArray[np.floating], otherwise: Up = Z_UP
+) -> NDArray[np.float64]:
     """Unit vector that points up, (3,), world frame.
 
     The first guess is the mean upward axis (-y) of the cameras. It is tilted where the camera looked
     down most of the time, so it is refined as by Gupta, Arbelaez and Malik (CVPR 2013, section 4): the
     direction that is most parallel to the nearly parallel surface normals (N, 3), of any length, and most
-    perpendicular to the nearly perpendicular ones. Without cameras it is the z axis.
+    perpendicular to the nearly perpendicular ones. Without cameras it is ``otherwise``.
     """
     axes = [-T[:3, 1] for T in T_world_cameras]
     mean = np.mean(axes, axis=0) if axes else np.zeros(3)
     if np.linalg.norm(mean) < 0.1:
-        return np.array([0.0, 0.0, 1.0])
+        return up_vector(otherwise)
     up = mean / np.linalg.norm(mean)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals / np.maximum(lengths, 1e-12)

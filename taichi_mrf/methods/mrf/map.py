@@ -132,6 +132,7 @@ class MRFMap(BrickMap):
         image = self._upload(depth_m, camera)
         keyframe = self._allocator.place(self._next_id, name or f"keyframe {self._next_id}", image, T)
         self._keyframes[keyframe.id] = keyframe
+        self._note_up(T)
         self._next_id += 1
         self._settled = False
         return keyframe.id
@@ -321,7 +322,7 @@ class MRFMap(BrickMap):
         """Write the map to one .npz file, under a temporary name first. Raises MapFileError."""
         keyframes = list(self._keyframes.values())
         stored = [StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera) for k in keyframes]
-        header = MapHeader(self.config, self.noise, stored, self._next_id, self._settled)
+        header = MapHeader(self.config, self.noise, stored, self._next_id, self._settled, self.up)
         write_contents(Path(path), contents_of(header, self._registry, keyframes, self._frozen))
 
     @classmethod
@@ -343,7 +344,7 @@ class MRFMap(BrickMap):
             m._pool.write("belief", slots, contents.belief)
             if contents.evidence is not None:
                 m._pool.write("evidence", slots, contents.evidence)
-        m._next_id = header.next_id
+        m._next_id, m._up = header.next_id, header.up
         m._messages_lost, m._settled = bool(m._keyframes), header.settled
         return m
 
