@@ -16,6 +16,7 @@ from taichi_mrf.viewer.scene.options import ViewOptions
 from taichi_mrf.viewer.scene.viewpoint import ViewpointController
 from taichi_mrf.viewer.scene.voxel_layer import VoxelLayer
 from taichi_mrf.viewer.transport.server import start_server
+from taichi_mrf.viewer.transport.standalone import standalone_page
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 
 _NOT_SHOWN = np.float32(-60)
@@ -42,6 +43,6 @@ def write_page(path: str | Path, m: QueriedMap, threshold: float = 0.5, up: Up |
             layer.send()
             low, high = (end.astype(np.float64) * BRICK * m.voxel_size for end in (bounds[0], bounds[1] + 1))
             eye.map_grew(low, high)
-        write_text(path, server.get_scene_serializer().as_html(dark_mode=False))
+        write_text(path, standalone_page(server.get_scene_serializer(), dark=False))
     finally:
         server.stop()

@@ -237,6 +237,8 @@ def test_a_click_on_a_keyframes_picture_chooses_it(page: LivePage) -> None:
     page.tab("Ray")
     page.until(lambda seen: f"room-{id:04d}, pixel (" in page.text(), "the ray of the pixel")
     u, v = map(float, re.search(r"pixel \((\S+), (\S+)\)", page.text()).groups())
+    boxes = page.input("Pixel (u, v)").locator("xpath=../../..").get_by_role("textbox")
+    page.until(lambda seen: [float(boxes.nth(i).input_value()) for i in (0, 1)] == [u, v], "its pixel")
     assert abs(u - 47.5) < 24
     assert abs(v - 35.5) < 18
 
@@ -267,13 +269,17 @@ def page_chosen(page: LivePage) -> str:
 
 
 def test_the_baseline_is_shown_beside_the_map(page: LivePage) -> None:
-    before = page.look()
+    page.page.mouse.move(400, 600)
+    page.page.mouse.wheel(0, -300)  # a viewpoint of the user's own
+    page.pause(1.0)
+    before, eye = page.look(), page.position()
     page.tick("Show baseline")
     seen = page.until(lambda seen: seen.settled and seen.baseline > 1000, "the other map")
     assert seen.voxels == before.voxels
     page.screenshot("baseline")
     page.tick("Show baseline", on=False)
     page.until(lambda seen: seen.agrees and seen.said_baseline == 0, "the map alone")
+    np.testing.assert_allclose(page.position(), eye, atol=1e-6)
 
 
 def test_two_viewers_in_a_wide_and_a_narrow_window(

@@ -171,6 +171,31 @@ def test_a_keyframe_is_moved_by_its_position_and_put_back(
     np.testing.assert_allclose(page.position(f"/keyframes/{KEYFRAME}"), start, atol=1e-6)
 
 
+def test_a_position_that_is_typed_moves_once_and_the_gizmo_goes_along(page: LivePage, edited: MRFMap) -> None:
+    node, start = f"/keyframes/{KEYFRAME}", page.position(f"/keyframes/{KEYFRAME}")
+    page.press("Move")
+    page.until(lambda seen: "/gizmo" in seen.nodes, "the gizmo")
+    box, places = page.input("Position (m)"), set()
+    box.press("Control+A")
+    for key in "1.25":  # 1, 1. and 1.2 on the way
+        box.press(key)
+        page.pause(0.3)
+        places.add(page.position(node))
+    page.until(lambda seen: abs(page.position(node)[0] - 1.25) < 1e-6, "the new place")
+    assert places == {start}
+    for what in ("typed", "back"):
+        page.until(
+            lambda seen: np.allclose(page.position("/gizmo"), page.position(node), atol=1e-6),
+            f"the gizmo at its keyframe, {what}",
+        )
+        if what == "typed":
+            page.press("Put back")
+            page.until(lambda seen: np.allclose(page.position(node), start, atol=1e-6), "the first place")
+    page.press("Move")
+    page.until(lambda seen: "/gizmo" not in seen.nodes, "no gizmo")
+    page.until_settled()
+
+
 def test_a_keyframe_is_dragged_by_its_gizmo(page: LivePage, edited: MRFMap) -> None:
     before, start = page.look(), page.position(f"/keyframes/{KEYFRAME}")
 
@@ -287,6 +312,10 @@ def test_a_frozen_keyframe_stays_in_the_map(page: LivePage, tmp_path: Path) -> N
     page.tab("Keyframes")
     page.press("Freeze")
     page.until(lambda seen: "(frozen)" in page.input("Keyframe").input_value(), "a frozen keyframe")
+    page.until(lambda seen: "frozen: it cannot be changed" in page.text(), "the reason")
+    for button in ("On/off", "Freeze", "Move", "Put back"):
+        assert page.page.get_by_role("button", name=button, exact=True).count() == 0
+    assert page.input("Position (m)").is_disabled()
     m.infer()
     m.freeze_keyframe(min(m.keyframes))
     until_count(page, settled_count(m), "with one frozen")

@@ -2,9 +2,9 @@
 
     python tests/support/signal_timing.py --settle 20 -- synthetic:room --voxel-size 0.05
 
-Per case: the program maps for --settle seconds, the clients ask (150 presses of Save; or 20 clients that move
-a keyframe for 8 s; or nothing), then the signal is sent. Prints one line a case with the seconds from the
-signal to the end of the program, its exit status, and the files that it left.
+Per case: the map settles (--settle: for how long at most), the clients ask (150 presses of Save; or 20
+clients that move a keyframe for 8 s; or nothing), then the signal is sent. Prints one line a case with the
+seconds from the signal to the end of the program, its exit status, and the files that it left.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from live_program import LiveProgram, wait_for
-from raw_viewer_client import RawClient, camera_message, raw_client, widget_message
+from raw_viewer_client import RawClient, camera_message, decode_frame, raw_client, widget_message
 from websockets.exceptions import ConnectionClosed
 
 CLIENTS, MOVING_S, PRESSES = 20, 8.0, 150
@@ -79,6 +79,7 @@ class _Client:
         self._context = raw_client(port)
         self.client = self._context.__enter__()
         self.client.say(camera_message())
+        self.settled = False
 
     def read_on(self) -> None:
         threading.Thread(target=self._read, daemon=True).start()
@@ -93,8 +94,19 @@ class _Client:
 
     def _read(self) -> None:
         with contextlib.suppress(ConnectionClosed, OSError):
-            for _ in self.client.connection:
-                pass
+            for frame in self.client.connection:
+                if len(frame) < 4096:
+                    self.settled = "is up to date" in str(decode_frame(frame)) or self.settled
+
+
+def _wait_until_settled(program: LiveProgram, patience_s: float) -> None:
+    """Wait until the page says that the map is up to date, or for so many seconds."""
+    client = _Client(program.port)
+    client.read_on()
+    until = time.monotonic() + patience_s
+    while not client.settled and time.monotonic() < until:
+        time.sleep(0.1)
+    client.close()
 
 
 def measure(options: list[str], case: str, number: signal.Signals, settle_s: float) -> str:
@@ -102,7 +114,7 @@ def measure(options: list[str], case: str, number: signal.Signals, settle_s: flo
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         with LiveProgram(*options, "--out", out) as program:
-            time.sleep(settle_s)
+            _wait_until_settled(program, settle_s)
             close = CASES[case](program)
             begin = time.monotonic()
             os.kill(program.pid, number)
@@ -119,7 +131,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
     parser.add_argument("--signals", nargs="+", choices=SIGNALS, default=list(SIGNALS))
-    parser.add_argument("--settle", type=float, default=20.0, help="seconds before the clients ask")
+    parser.add_argument("--settle", type=float, default=20.0, help="longest wait for the map, s")
     parser.add_argument("options", nargs="*", default=["synthetic:room"], help="what live is given, after --")
     arguments = parser.parse_args()
     for case in arguments.cases:

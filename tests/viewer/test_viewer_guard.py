@@ -416,6 +416,23 @@ def test_a_number_that_is_being_typed_is_not_clamped(guarded: GuardedPage, stran
     assert guarded.events == [("slider", 0.8)]
 
 
+def test_a_typed_position_is_taken_once(guarded: GuardedPage, stranger: RawClient) -> None:
+    """The browser sends a message for each key."""
+    for typed in (0, 0.2, 0.9):
+        stranger.say(widget_message(guarded.uuid("vector"), [typed, 0, 0]))
+        time.sleep(0.1 * TYPING_REST_S)
+    assert guarded.events == []
+    wait_for(lambda: guarded.events != [], "the position")
+    assert guarded.events == [("vector", (0.9, 0.0, 0.0))]
+
+
+def test_a_button_comes_after_what_was_typed_before_it(guarded: GuardedPage, stranger: RawClient) -> None:
+    stranger.say(widget_message(guarded.uuid("vector"), [0.5, 0, 0]))
+    stranger.say(widget_message(guarded.uuid("button"), True))
+    wait_for(lambda: len(guarded.events) == 2, "both")
+    assert [name for name, _ in guarded.events] == ["vector", "button"]
+
+
 def test_a_known_command_runs(guarded: GuardedPage, stranger: RawClient) -> None:
     command = guarded.server.gui.add_command("pause", description="")
     command.on_trigger(lambda event: guarded.events.append(("command", None)))

@@ -4,6 +4,7 @@ import html
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from taichi_mrf.viewer.live.page import Page
 from taichi_mrf.viewer.scene.safe_text import LONGEST, in_html, in_markdown
 from taichi_mrf.viewer.transport.process import AnyPage
 from taichi_mrf.viewer.transport.server import start_server
+from taichi_mrf.viewer.transport.standalone import standalone_page
 from taichi_mrf.viewer.tune import messages as t
 from taichi_mrf.viewer.tune.page import TunePage
 from taichi_mrf.viewer.tune.scores import Scores
@@ -187,3 +189,22 @@ def test_the_policy_stops_scripts_that_reach_the_page(browser: "Browser") -> Non
             assert "Content Security Policy" in blocked
     finally:
         server.stop()
+
+
+@needs_chromium
+def test_the_saved_page_runs_no_script_of_a_scene(browser: "Browser", tmp_path: Path) -> None:
+    """A label that is raw HTML stands for any text that somebody forgot to escape."""
+    server = start_server("127.0.0.1", 0, "Saved")
+    try:
+        server.scene.add_point_cloud("/voxels/0", np.zeros((3, 3), np.float32), np.zeros(3, np.uint8))
+        html = standalone_page(server.get_scene_serializer(), dark=False)
+    finally:
+        server.stop()
+    foreign = HOSTILE.partition("<a href")[0] + "<script>window.ran='script'</script><b id=there></b>"
+    (tmp_path / "map.html").write_text(html.replace("<body>", f"<body>{foreign}"), encoding="utf-8")
+    with LivePage(browser, (tmp_path / "map.html").as_uri()) as page:
+        page.until(lambda seen: seen.voxels == 3, "the points")
+        page.page.wait_for_selector("#there", state="attached")
+        page.pause(0.5)
+        assert page.page.evaluate(FOREIGN)["ran"] is None
+        assert "Content Security Policy" in "\n".join(page.problems)

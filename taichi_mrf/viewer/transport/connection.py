@@ -37,8 +37,8 @@ CAMERA_INTERVAL_S = 0.02
 """Cameras that come faster replace each other."""
 
 TYPING_REST_S = 1.0
-"""Seconds after which a number outside its range is clamped and taken, if no other number was typed. While
-0.8 is typed into a range that begins at 0.02, the browser sends 0 first."""
+"""Seconds without another key after which a number that may be unfinished is taken. The browser sends a
+message for every key: 0 before 0.8, and 1 and 1.2 before 1.25."""
 
 CLOSE_TIMEOUT_S = 0.5
 """How long a client may take to answer a close frame."""
@@ -145,6 +145,14 @@ class GuardedConnection(ServerConnection):
                 return message
         return None
 
+    def _typed_is_complete(self) -> bool:
+        """Release what is being typed, because the user has gone on to another widget; returns whether there
+        was anything."""
+        typed = [key for key, (_, message) in self._held.items() if isinstance(message, WidgetUpdate)]
+        for key in typed:
+            self._held[key] = monotonic(), self._held[key][1]
+        return bool(typed)
+
     def _patience_s(self) -> float | None:
         """Seconds until a message that is held back is due; None if there is none."""
         if not self._held:
@@ -194,5 +202,8 @@ class GuardedConnection(ServerConnection):
             self._held.pop(message.uuid, None)
             if self.gate.may_be_unfinished(client_id, message):
                 self._held[message.uuid] = monotonic() + TYPING_REST_S, message
+                return None
+            if self._typed_is_complete():
+                self._held[message.uuid] = monotonic(), message  # after what was typed
                 return None
         return message

@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 import viser
 
+from taichi_mrf.viewer.transport.standalone import standalone_page
+
 PICTURE_TIMEOUT_S = 30.0
 """How long a browser may take to draw and send a picture."""
 
@@ -60,7 +62,9 @@ class Downloads:
         """Give a browser the scene as one HTML file."""
         if self._begin(client, "page"):
             scene = self._server.get_scene_serializer()
-            self._later(client, "page", lambda: self.send(client, "map.html", scene.as_html(dark).encode()))
+            self._later(
+                client, "page", lambda: self.send(client, "map.html", standalone_page(scene, dark).encode())
+            )
 
     def toggle_recording(self, client: int) -> None:
         """Start to record, or stop and give the browser the file."""

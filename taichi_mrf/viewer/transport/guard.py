@@ -49,12 +49,13 @@ class Gate:
         return internals.awaits_picture(self._server, client_id)
 
     def may_be_unfinished(self, client_id: ClientId, message: AnyClientMessage) -> bool:
-        """Whether the message may be a number that is still being typed: outside the range of its widget, as
-        the 0 of 0.8 is."""
+        """Whether the message may be a number that is still being typed: one outside the range of its widget,
+        as the 0 of 0.8 is, and any of a vector, each of whose values may move a keyframe."""
         if not isinstance(message, WidgetUpdate):
             return False
         widget = internals.input_widget(self._server, client_id, message.uuid)
-        return widget is not None and is_out_of_range(widget, message.updates.value)
+        is_vector = isinstance(widget, viser.GuiVector2Handle | viser.GuiVector3Handle)
+        return is_vector or (widget is not None and is_out_of_range(widget, message.updates.value))
 
     def admit(self, client_id: ClientId, message: AnyClientMessage) -> AnyClientMessage | None:
         """The message as viser may have it; None if viser must not have it."""
