@@ -8,7 +8,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.errors import ConfigError
+from taichi_mrf.config.arguments import shown
+from taichi_mrf.errors import ArgumentTypeError, ConfigError
 from taichi_mrf.export.arrays import write_arrays
 from taichi_mrf.export.chunk_blocks import StorableMap, write_chunks
 from taichi_mrf.export.chunk_store import SUFFIX
@@ -43,10 +44,13 @@ def export_map(m: ExportedMap, path: str | Path, options: ExportOptions = _DEFAU
     2D map for ROS), ``.npz`` (arrays), ``.html`` (a page that shows the map) and ``.zarr`` (chunks, for
     :class:`ChunkedMap`). ``options`` are the formats' settings. A file is written completely or not at all.
 
-    Returns the paths of the files written; a 2D map has two. Raises ConfigError for an unknown extension and
-    for options that do not fit the map, MapFileError if the file cannot be written, CapacityError if there is
-    not enough memory, and TaichiMRFError if the format needs a library that is not installed.
+    Returns the paths of the files written; a 2D map has two. Raises ArgumentTypeError if ``m`` is no map,
+    ConfigError for an unknown extension and for options that do not fit the map, MapFileError if the file
+    cannot be written, CapacityError if there is not enough memory, and TaichiMRFError if the format needs a
+    library that is not installed.
     """
+    if not hasattr(m, "view"):
+        raise ArgumentTypeError(f"m must be a map, or a part of one from take_part, not {shown(m)}")
     return writer_of(path)(m, Path(path), options)
 
 

@@ -58,7 +58,7 @@ def test_what_does_not_fit_into_memory_is_named_and_the_rest_is_kept(
     assert done.returncode == 3, done.stderr
     assert done.stderr.count("\n") == 1
     assert "does not fit: " in done.stderr
-    assert "--resume with more memory continues" in done.stderr
+    assert f"keyframes was saved to {out}; --resume continues it" in done.stderr
     report = json.loads((out / "report.json").read_text())
     assert report["interrupted"] is True
     assert report["did_not_fit"] in done.stderr

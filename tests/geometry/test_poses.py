@@ -1,5 +1,6 @@
 """Poses: what is accepted, what is refused with which words, and the norms that select keyframes."""
 
+import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -117,3 +118,11 @@ def test_look_at_keeps_the_image_upright_and_looks_straight_down_too() -> None:
     assert look_at((0, 0, 1), (1, 0, 1))[2, 1] == pytest.approx(-1.0)  # image down is world down
     R = look_at((0, 0, 2), (0, 0, 0))[:3, :3]
     np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)
+
+
+def test_a_damaged_pose_far_away_is_far_without_a_warning() -> None:
+    far = np.eye(4)
+    far[0, 3] = 1e300
+    with np.errstate(over="raise"), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert tangent_norms(np.eye(4), far)[1] > 1e9

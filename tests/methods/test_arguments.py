@@ -1,6 +1,7 @@
 """The public face: a wrong argument is a TypeError or a ValueError of this package that names it."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -111,3 +112,8 @@ def test_a_pose_out_of_reach_is_refused(one_backend: str, kind: type, far: float
 def test_noise_names_its_coefficients() -> None:
     with pytest.raises(TypeError, match="sigma must be an array of numbers, not 'a'"):
         tm.PolynomialNoise("a")
+
+
+def test_exports_name_what_is_no_map(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match=r"m must be a map, or a part of one from take_part, not None"):
+        tm.export_map(None, tmp_path / "map.ply")  # type: ignore[arg-type]

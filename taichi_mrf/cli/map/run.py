@@ -53,8 +53,8 @@ def run_map(options: Map) -> int:
             report, written = map_to_folder(task, progress, request)
         print_run(console, options, report, written)
     if report["did_not_fit"] is not None and request.signal is None:
-        kept = f"the map of {report['keyframes']} keyframes is kept; --resume with more memory continues"
-        tell_problem(f"{report['did_not_fit']}; {kept}")
+        saved = f"the map of {report['keyframes']} keyframes was saved to {options.out}"
+        tell_problem(f"{report['did_not_fit']}; {saved}; --resume continues it")
     return exit_status(request, report["did_not_fit"])
 
 
