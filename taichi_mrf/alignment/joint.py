@@ -10,7 +10,7 @@ with T_i_k = inv(T_i) T_k, and e_i the way from where keyframe i was recorded, a
 the two is worth is in recorded.py.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Generator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,11 +49,10 @@ def align_jointly(
     T_recorded: Mapping[int, Pose],
     config: PoseConfig,
     fixed: Collection[int] = (),
-    on_pair: Callable[[], None] = lambda: None,
-) -> dict[int, Pose]:
+) -> Generator[None, None, dict[int, Pose]]:
     """The poses, by keyframe, under which all points fit each other and what was recorded; those that are
-    ``fixed`` stay, and that with the lowest id. ``T_world_camera`` is where the search begins. ``on_pair`` is
-    called for each pair of keyframes again and again; what it raises ends the search."""
+    ``fixed`` stay, and that with the lowest id. ``T_world_camera`` is where the search begins. A
+    generator: it yields for each pair of keyframes, again and again."""
     ids = sorted(points)
     free = np.repeat([i > 0 and id not in fixed for i, id in enumerate(ids)], 6)
     poses = [T_world_camera[id] for id in ids]
@@ -65,7 +64,7 @@ def align_jointly(
         thinned = [points[id].thinned(every) for id in ids]
         problems = {(i, k): PointToPlane(thinned[i], grids[k]) for i, k in pairs}
         for _ in range(STEPS):
-            H, g = _system(problems, poses, recorded, on_pair)
+            H, g = yield from _system(problems, poses, recorded)
             xi = np.zeros(6 * len(ids))
             xi[free] = np.linalg.solve(H[np.ix_(free, free)], -g[free])
             poses = [moved(T, xi[6 * i : 6 * i + 6]) for i, T in enumerate(poses)]
@@ -78,13 +77,12 @@ def _system(
     problems: Mapping[tuple[int, int], PointToPlane],
     poses: Sequence[Pose],
     recorded: Sequence[Recorded],
-    on_pair: Callable[[], None],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> Generator[None, None, tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """The normal equations of all poses' steps, (6 n, 6 n) and (6 n,)."""
     n = len(poses)
     H, g = np.zeros((n, 6, n, 6)), np.zeros((n, 6))
     for (i, k), problem in problems.items():
-        on_pair()
+        yield
         T_k_i = inverse(poses[k]) @ poses[i]
         pair = problem.linearised(T_k_i)
         worth = pair.worth

@@ -147,7 +147,7 @@ def build_and_judge(case: Case, scene: Scene, voxel_size: float) -> Result:
         if case.refined:
             refiner.place(keyframe)
     if case.refined:
-        AlignmentRounds(refiner, PlainMover(m), lambda step: True).run()
+        AlignmentRounds(refiner, PlainMover(m)).run()
     m.infer()
     seconds = time.perf_counter() - begin
     errors = [tangent_norms(a, k.T_world_camera) for a, k in zip(true, m.keyframes.values(), strict=True)]

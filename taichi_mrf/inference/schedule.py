@@ -7,8 +7,9 @@ so any history of adding, removing and moving keyframes ends in the map of the f
 
 import hashlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.sweep import Sweeper
@@ -43,6 +44,37 @@ class InferReport:
 
 Progress = Callable[[InferProgress], bool]
 
+InferSteps = Generator[InferProgress, None, InferReport]
+"""Inference step by step: it yields after each keyframe. StopRequestedError, thrown in, ends it early."""
+
+StepT = TypeVar("StepT")
+OutcomeT = TypeVar("OutcomeT")
+
+
+class StopRequestedError(Exception):
+    """Thrown into a generator of steps to stop it, which then cleans up and returns. ``at_once``: there is no
+    time for more steps."""
+
+    def __init__(self, at_once: bool = False) -> None:
+        super().__init__("stopped")
+        self.at_once = at_once
+
+
+def driven(
+    steps: Generator[StepT, None, OutcomeT], progress: Callable[[StepT], bool] | None = None
+) -> OutcomeT:
+    """Take all steps and return the outcome. ``progress`` is called after each; returning False stops."""
+    try:
+        step = next(steps)
+        while True:
+            go_on = progress is None or progress(step)
+            step = next(steps) if go_on else steps.throw(StopRequestedError())
+    except StopIteration as end:
+        outcome: OutcomeT = end.value
+        return outcome
+    finally:
+        steps.close()
+
 
 def content_key(keyframe: Keyframe) -> bytes:
     """What a keyframe holds, as bytes to sort by: measurement, pose and camera, but not its number."""
@@ -52,18 +84,17 @@ def content_key(keyframe: Keyframe) -> bytes:
     return digest.digest()
 
 
-def run_sweeps(
+def sweep_steps(
     keyframes: Sequence[Keyframe],
     pool: BrickPool,
     sweeper: Sweeper,
     sweeps: int,
     tolerance: float,
-    progress: Progress | None = None,
-) -> InferReport:
+) -> InferSteps:
     """Sweep over keyframes in the given order (Gauss-Seidel: each sees what the last has changed).
 
     Stops after ``sweeps``, or when the residual is at most ``tolerance`` (above 0), or, between two
-    keyframes, when ``progress`` returns False.
+    keyframes, on StopRequestedError.
     """
     begin = time.perf_counter()
     damping = sweeper.inference.damping
@@ -76,12 +107,10 @@ def run_sweeps(
                 if not _has_converged(keyframe, pool, damping) and sweeper.sweep(keyframe, pool):
                     swept.append(keyframe)
                 rays += keyframe.rays
-                if progress is not None and not progress(
-                    InferProgress(sweep, sweeps, number, len(keyframes), keyframe.rays)
-                ):
-                    complete = False
-                    break
-        finally:  # the beliefs have changed, even if ``progress`` raised
+                yield InferProgress(sweep, sweeps, number, len(keyframes), keyframe.rays)
+        except StopRequestedError:
+            complete = False
+        finally:  # the beliefs have changed, even if the caller has failed
             # Only now does the host ask, and wait for, what came of it.
             for keyframe in swept:
                 changed = sweeper.take_moved(keyframe, pool)

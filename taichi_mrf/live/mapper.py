@@ -5,14 +5,15 @@ quick, but the map depends on the order of events. Settling runs full inference,
 function of its keyframes, bit for bit, whatever has happened to them.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
-from taichi_mrf.inference.schedule import InferProgress, InferReport, Progress
+from taichi_mrf.inference.schedule import InferReport, InferSteps
 from taichi_mrf.live.live_keyframes import LiveKeyframe, LiveKeyframes
 from taichi_mrf.live.pictures import thumbnail
 from taichi_mrf.live.publish import Publisher
@@ -20,6 +21,7 @@ from taichi_mrf.live.ray_answers import PosedDepthImage
 from taichi_mrf.mapping.freezing import surplus
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.refinement import PoseRefiner
+from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.methods.capabilities import can_freeze, has_messages
 from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap
 from taichi_mrf.viewer import messages
@@ -84,10 +86,10 @@ class Mapper:
         if not self.stale:
             self.map.infer(sweeps=1, keyframes=[map_id])
 
-    def sweep_all(self, progress: Progress) -> None:
-        """Sweep all keyframes that are on once, the oldest first."""
+    def sweep_all(self) -> InferSteps:
+        """Sweep all keyframes that are on once, the oldest first, step by step."""
         ids = [self._map_id(entry) for entry in self.roster.with_state("on")]
-        self.map.infer(sweeps=1, keyframes=ids, progress=progress)
+        return self.map.infer_steps(sweeps=1, keyframes=ids)
 
     def switch(self, id: int, on: bool) -> LiveKeyframe:
         """Take a keyframe out of the map, keeping its image, or bring it back. Raises KeyframeError."""
@@ -157,32 +159,20 @@ class Mapper:
         entry_of = {self._map_id(entry): entry for entry in on}
         return [entry_of[id] for id in surplus(self.map, self._map_id(newest), keep)]
 
-    def settle(self, go_on: Callable[[InferProgress], bool]) -> bool:
-        """Full inference. ``go_on`` is called after each keyframe; while it runs, all queries and files show
-        the map as it was before. If it returns False the map is that again; returns whether it was completed.
-        """
-        m, pool = self.map, self.map.view.pool
-        checkpoint = m.checkpoint() if has_messages(m) else None
-        before = checkpoint.pool if checkpoint is not None else pool.snapshot()
-
-        def progress(step: InferProgress) -> bool:
-            with pool.showing(before):
-                return go_on(step)
-
-        complete = False
+    @contextmanager
+    def settling(self) -> Iterator[FullInference]:
+        """Full inference, whose steps are taken in the ``with`` block. With its ``showing_before`` all
+        queries and files show the map as it was before. If its outcome is None, the map is that again."""
         try:
-            self.inferred = m.infer(progress=progress)
-            complete = self.inferred.complete
+            with FullInference(self.map, keep_before=True) as inference:
+                yield inference
         except Exception:
             self.unsettled = self.lacks_messages = False  # or it would be tried again without end
             raise
-        finally:
-            if not complete and checkpoint is not None and has_messages(m):
-                m.restore(checkpoint)
-        if complete:
-            self.unsettled = self.edited = self.lacks_messages = False
-            self.unanswered = False
-        return complete
+        if inference.outcome is not None:
+            self.inferred, self.lacks_messages = inference.outcome, False
+            if inference.outcome.complete:
+                self.unsettled = self.edited = self.unanswered = False
 
     def describe(self, entry: LiveKeyframe) -> messages.KeyframeInfo:
         """The message that describes a keyframe to the viewer."""

@@ -18,7 +18,7 @@ from collections.abc import Callable
 
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.inference.schedule import InferProgress, Progress
+from taichi_mrf.inference.schedule import InferProgress, InferSteps
 from taichi_mrf.live.extras import Extras
 from taichi_mrf.live.link import Link
 from taichi_mrf.live.progress import sweeping
@@ -167,9 +167,14 @@ class Session:
 
     def _settle(self) -> bool:
         def settle() -> None:
-            with self.state.intake.result.timed("inferring"):
-                settled = self.state.mapper.settle(self._go_on_sweeping)
-            if settled:
+            mapper = self.state.mapper
+            with self.state.intake.result.timed("inferring"), mapper.settling() as inference:
+                for step in inference:
+                    with inference.showing_before():
+                        go_on = self._go_on_sweeping(step)
+                    if not go_on:
+                        inference.stop(at_once=True)
+            if inference.outcome is not None:
                 self.state.publish()
 
         self.state.guarded(settle)
@@ -184,9 +189,12 @@ class Session:
         def align() -> None:
             mapper.unaligned = False  # or a failure would be repeated without end
             mover = _ShowingMover(state)
-            with state.intake.result.timed("refining"):
-                complete = AlignmentRounds(refiner, mover, self._go_on_aligning).run(mover.placed_by_hand())
-            mapper.unaligned = not complete
+            rounds = AlignmentRounds(refiner, mover, mover.placed_by_hand())
+            with state.intake.result.timed("refining"), rounds:
+                for step in rounds:
+                    if not self._go_on_aligning(step):
+                        rounds.stop()
+            mapper.unaligned = not rounds.outcome
             state.publish()
 
         state.guarded(align)
@@ -248,5 +256,5 @@ class _ShowingMover:
             self._state.send(mapper.describe(entry))
             self._state.publish()
 
-    def sweep(self, progress: Progress) -> None:
-        self._state.mapper.sweep_all(progress)
+    def sweep(self) -> InferSteps:
+        return self._state.mapper.sweep_all()

@@ -12,7 +12,6 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import CapacityError, DatasetError, FrameError
 from taichi_mrf.inference.keyframe import checked_depth
-from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.mapping.intake import (
     HELD_OUT,
     Added,
@@ -24,7 +23,8 @@ from taichi_mrf.mapping.intake import (
     hold_out_of,
 )
 from taichi_mrf.mapping.result import MappingResult
-from taichi_mrf.mapping.rounds import AlignmentRounds, PlainMover, RoundStep
+from taichi_mrf.mapping.rounds import AlignmentRounds, PlainMover
+from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.sensor.frame import Frame
@@ -163,19 +163,18 @@ class _BatchRun:
         if refiner is None:
             return
         told = (0, 0)
-
-        def go_on(step: RoundStep) -> bool:
-            nonlocal told
-            if step.moved and (step.round, step.moved) != told:
-                told = step.round, step.moved
-                self.listener(KeyframeRefined(step.round, step.rounds, step.moved, step.keyframes))
-            self.result.interrupted = self.result.interrupted or self.should_stop()
-            return not self.result.interrupted
-
         with self.result.timed("refining"):
             if not self.result.interrupted:
                 try:
-                    AlignmentRounds(refiner, PlainMover(refiner.map), go_on).run()
+                    with AlignmentRounds(refiner, PlainMover(refiner.map)) as rounds:
+                        for step in rounds:
+                            if step.moved and (step.round, step.moved) != told:
+                                told = step.round, step.moved
+                                self.listener(
+                                    KeyframeRefined(step.round, step.rounds, step.moved, step.keyframes)
+                                )
+                            if self._is_stopped():
+                                rounds.stop()
                 except CapacityError as error:
                     self.result.full = self.result.full or f"aligning the keyframes does not fit: {error}"
         self.result.poses = refiner.changes()
@@ -183,24 +182,28 @@ class _BatchRun:
     def infer(self) -> None:
         """Run the sweeps. The first always runs to its end, so that every keyframe has sent its messages,
         unless there is no time; a run that was told to stop makes no other."""
-
-        def progress(step: InferProgress) -> bool:
-            self.listener(KeyframeSwept(step.sweep, step.sweeps, step.keyframe, step.keyframes, step.rays))
-            self.result.interrupted = self.result.interrupted or self.should_stop()
-            first_is_done = step.sweep > 1 or step.keyframe == step.keyframes
-            return not (self.result.interrupted and (first_is_done or self.out_of_time()))
-
         if self.out_of_time():
             self.result.interrupted = True
             return
         sweeps = 1 if self.result.interrupted else None
         try:
-            with self.result.timed("inferring"):
-                report = self.intake.map.infer(sweeps=sweeps, progress=progress)
+            with self.result.timed("inferring"), FullInference(self.intake.map, sweeps) as inference:
+                for step in inference:
+                    self.listener(
+                        KeyframeSwept(step.sweep, step.sweeps, step.keyframe, step.keyframes, step.rays)
+                    )
+                    if self._is_stopped():
+                        inference.stop(at_once=self.out_of_time())
         except CapacityError as error:
             self.result.full = f"inference does not fit: {error}"
             return
+        report = inference.outcome
+        assert report is not None, "without a copy the map does not go back"
         self.result.sweeps, self.result.residual = report.sweeps, report.residual
+
+    def _is_stopped(self) -> bool:
+        self.result.interrupted = self.result.interrupted or self.should_stop()
+        return self.result.interrupted
 
     def _go_on_from_mapped(self) -> tuple[set[str], int]:
         """Names of the frames that a resumed map holds already, and the index of the last of them, or -1."""

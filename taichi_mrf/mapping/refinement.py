@@ -5,7 +5,7 @@ alignment/joint.py moves all of them at once (rounds.py), because alignment one 
 only slowly that have added up on the way.
 """
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Collection, Generator, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,23 +81,21 @@ class PoseRefiner:
         self._recorded[keyframe] = T_recorded
         self.map.infer(keyframes=[keyframe], sweeps=1)
 
-    def joint(
-        self, fixed: Collection[int] = (), on_pair: Callable[[], None] = lambda: None
-    ) -> dict[int, Pose]:
+    def joint(self, fixed: Collection[int] = ()) -> Generator[None, None, dict[int, Pose]]:
         """The poses, by id, at which all keyframes fit each other and their recorded poses best; nothing is
         moved. One that would go further than the configuration allows stays, as do those that are ``fixed``.
-        ``on_pair`` is called after each pair of keyframes; an exception that it raises ends the search."""
+        A generator: it yields for each pair of keyframes."""
         stood = {id: keyframe.T_world_camera for id, keyframe in self.map.keyframes.items()}
-        found = align_jointly(self._points(), stood, self._recorded, self.config, fixed, on_pair)
+        found = yield from align_jointly(self._points(), stood, self._recorded, self.config, fixed)
         return {id: T if self._is_near(stood[id], T) else stood[id] for id, T in found.items()}
 
-    def log_likelihood(self, on_keyframe: Callable[[], None] = lambda: None) -> float:
+    def log_likelihood(self) -> Generator[None, None, float]:
         """Mean log-likelihood of the keyframes' depth, each in the map of the others, right after a sweep
-        over all of them."""
+        over all of them. A generator: it yields for each keyframe."""
         view, max_depth = self.map.view, self.map.sensor.max_depth
         found = []
         for keyframe in self.map.keyframes.values():
-            on_keyframe()
+            yield
             with map_of_others(view, keyframe):
                 found.append(log_likelihood(view, keyframe, keyframe.T_world_camera, max_depth))
         return float(np.nanmean(found)) if found else float("nan")

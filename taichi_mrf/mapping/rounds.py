@@ -1,19 +1,19 @@
 """Rounds of alignment once all frames are in: all keyframes with each other, until they stay where they are.
 
 A batch run and a live run do the same rounds. They differ in what moving a keyframe involves (a live run also
-sweeps it and shows it), which a :class:`KeyframeMover` says, and in what happens between two steps: a batch
-run tells of its progress, a live run carries out the requests that have come.
+sweeps it and shows it), which a :class:`KeyframeMover` says, and in what they do between two steps.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Generator, Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
 from taichi_mrf.geometry.poses import Pose, tangent_norms
-from taichi_mrf.inference.schedule import InferProgress, Progress
+from taichi_mrf.inference.schedule import InferSteps, StopRequestedError
 from taichi_mrf.mapping.refinement import PoseRefiner
+from taichi_mrf.mapping.settling import OutcomeT, Settling
 from taichi_mrf.methods.capabilities import AligningMap
 
 LOSS = 0.1
@@ -38,10 +38,6 @@ class RoundStep:
     judging: bool = False
 
 
-GoOn = Callable[[RoundStep], bool]
-"""Called after each step; returns whether to go on."""
-
-
 class KeyframeMover(Protocol):
     """How keyframes are moved and swept during the rounds."""
 
@@ -49,8 +45,8 @@ class KeyframeMover(Protocol):
         """Give a keyframe of the map another pose, (4, 4)."""
         ...
 
-    def sweep(self, progress: Progress) -> None:
-        """Sweep all keyframes once; ``progress`` returns False to stop."""
+    def sweep(self) -> InferSteps:
+        """Sweep all keyframes once, step by step."""
         ...
 
 
@@ -65,73 +61,66 @@ class PlainMover:
         if not np.array_equal(self._map.keyframes[id].T_world_camera, T_world_camera):
             self._map.move_keyframe(id, T_world_camera)
 
-    def sweep(self, progress: Progress) -> None:
+    def sweep(self) -> InferSteps:
         """Sweep all keyframes once, from no messages."""
-        self._map.infer(sweeps=1, progress=progress)
+        return self._map.infer_steps(sweeps=1)
 
 
-class _AbandonedError(Exception):
-    """``go_on`` has returned False."""
+class AlignmentRounds(Settling[RoundStep, bool]):
+    """The rounds of one map. The outcome is False if they were stopped; the round under way is then undone.
+    The marginals have to be inferred again afterwards."""
 
-
-class AlignmentRounds:
-    """The rounds of one map."""
-
-    def __init__(self, refiner: PoseRefiner, mover: KeyframeMover, go_on: GoOn) -> None:
-        self._map, self._refiner, self._mover, self._go_on = refiner.map, refiner, mover, go_on
-        self._step = RoundStep(0, refiner.config.rounds, 0, len(refiner.map.keyframes))
-
-    def run(self, fixed: Collection[int] = ()) -> bool:
+    def __init__(self, refiner: PoseRefiner, mover: KeyframeMover, fixed: Collection[int] = ()) -> None:
         """Align all keyframes with each other and with where they were recorded, but for the ``fixed`` ones
         (ids), until they stay where they are or the configuration's rounds are over. A round that makes
-        their depth less likely is undone.
+        their depth less likely is undone."""
+        self._map, self._refiner, self._mover = refiner.map, refiner, mover
+        self._step = RoundStep(0, refiner.config.rounds, 0, len(refiner.map.keyframes))
+        super().__init__(self._rounds(fixed))
 
-        Returns False if ``go_on`` ended the rounds; the one under way is then undone. The marginals have to
-        be inferred again afterwards.
-        """
+    def _rounds(self, fixed: Collection[int]) -> Generator[RoundStep, None, bool]:
         stood: dict[int, Pose] = {}
         rounds = self._refiner.config.rounds
         try:
-            before = self._log_likelihood() if rounds else 0.0
+            before = (yield from self._log_likelihood()) if rounds else 0.0
             for round in range(1, rounds + 1):
                 stood = {id: keyframe.T_world_camera for id, keyframe in self._map.keyframes.items()}
                 self._step = RoundStep(round, rounds, 0, len(stood))
-                found = self._refiner.joint(fixed, self._ask)
+                found = yield from self._each(self._refiner.joint(fixed))
                 for number, (id, T_world_camera) in enumerate(found.items(), start=1):
                     self._mover.move(id, T_world_camera)
                     self._step = RoundStep(round, rounds, number, len(stood))
-                    self._ask()
+                    yield self._step
                 if has_settled(self._map, stood):
                     break
-                after = self._log_likelihood()
+                after = yield from self._log_likelihood()
                 if is_worse(before, after):
                     self._move_all(stood)
                     break
                 before = after
-        except _AbandonedError:
+        except StopRequestedError:
             self._move_all(stood)
             return False
         return True
 
-    def _log_likelihood(self) -> float:
+    def _log_likelihood(self) -> Generator[RoundStep, None, float]:
         """Mean log-likelihood of the keyframes' depth, each in the map of the others, after one sweep over
         all."""
         self._step = replace(self._step, judging=True)
-        wanted = True
+        yield from self._each(self._mover.sweep())
+        return (yield from self._each(self._refiner.log_likelihood()))
 
-        def progress(step: InferProgress) -> bool:
-            nonlocal wanted
-            wanted = self._go_on(self._step)
-            return wanted
-
-        self._mover.sweep(progress)
-        if not wanted:
-            raise _AbandonedError
-        return self._refiner.log_likelihood(self._ask)
-
-    def _ask(self) -> None:
-        if not self._go_on(self._step):
-            raise _AbandonedError
+    def _each(self, steps: Generator[object, None, OutcomeT]) -> Generator[RoundStep, None, OutcomeT]:
+        """A RoundStep for each of some smaller steps; returns what came of them."""
+        try:
+            while True:
+                next(steps)
+                yield self._step
+        except StopIteration as end:
+            outcome: OutcomeT = end.value
+            return outcome
+        finally:
+            steps.close()
 
     def _move_all(self, poses: Mapping[int, Pose]) -> None:
         for id, T_world_camera in poses.items():

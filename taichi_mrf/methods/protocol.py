@@ -11,7 +11,7 @@ from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Up
-from taichi_mrf.inference.schedule import InferReport, Progress
+from taichi_mrf.inference.schedule import InferReport, InferSteps, Progress
 from taichi_mrf.methods.statistics import MapStatistics
 from taichi_mrf.queries.profile import RayProfile
 from taichi_mrf.queries.view import View
@@ -106,6 +106,16 @@ class OccupancyMap(Protocol):
         progress: Progress | None = None,
     ) -> InferReport:
         """Compute the map of all keyframes. ``progress`` is called after each; returning False stops."""
+        ...
+
+    def infer_steps(
+        self,
+        sweeps: int | None = None,
+        tolerance: float | None = None,
+        keyframes: Iterable[int] | None = None,
+    ) -> InferSteps:
+        """:meth:`infer` as a generator, which yields after each keyframe. Between two steps the map may be
+        queried but not changed."""
         ...
 
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:

@@ -22,7 +22,14 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.inference.keyframe import DepthImage, Footprint, checked_depth
-from taichi_mrf.inference.schedule import InferProgress, InferReport, Progress
+from taichi_mrf.inference.schedule import (
+    InferProgress,
+    InferReport,
+    InferSteps,
+    Progress,
+    StopRequestedError,
+    driven,
+)
 from taichi_mrf.methods.brick_map import BrickMap, check_inference
 from taichi_mrf.methods.map_file import MapHeader, StoredKeyframe, naming
 from taichi_mrf.methods.recursive_storage import RecursiveContents, read_recursive, write_recursive
@@ -188,6 +195,15 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         checked and ignored. ``progress`` is called after each scan; if it returns False, the map holds the
         scans up to there and stays stale. Raises CapacityError if there is not enough memory.
         """
+        return driven(self.infer_steps(sweeps, tolerance, keyframes), progress)
+
+    def infer_steps(
+        self,
+        sweeps: int | None = None,
+        tolerance: float | None = None,
+        keyframes: Iterable[int] | None = None,
+    ) -> InferSteps:
+        """:meth:`infer` as a generator, which yields an InferProgress after each scan."""
         for id in check_inference(sweeps, tolerance, keyframes) or ():
             self._find(id)
         begin = time.perf_counter()
@@ -195,12 +211,13 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         if self._stale:
             self._forget_voxels()
         rays, done, complete = 0, 0, True
-        for record in records:
-            self._add(record)
-            rays, done = rays + record.rays, done + 1
-            if progress is not None and not progress(InferProgress(1, 1, done, len(records), record.rays)):
-                complete = False
-                break
+        try:
+            for record in records:
+                self._add(record)
+                rays, done = rays + record.rays, done + 1
+                yield InferProgress(1, 1, done, len(records), record.rays)
+        except StopRequestedError:
+            complete = False
         self._stale = done < len(records)
         return InferReport(time.perf_counter() - begin, 0.0, int(done > 0), rays, complete)
 

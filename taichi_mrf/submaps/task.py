@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from taichi_mrf.inference.schedule import InferProgress
+from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.queries.points import probability
 from taichi_mrf.submaps.job import Job
 from taichi_mrf.submaps.partial_map import PartialMap
@@ -48,11 +49,11 @@ class SubmapTask:
 
 
 def infer_submap(
-    task: SubmapTask, progress: Callable[[InferProgress], bool] = lambda step: True
+    task: SubmapTask, on_step: Callable[[InferProgress], None] = lambda step: None
 ) -> SubmapReport:
     """Infer a submap with the evidence of its neighbours from the round before, and write the result.
 
-    Does nothing if the result is there already. ``progress`` is called after each keyframe's sweep. Raises
+    Does nothing if the result is there already. ``on_step`` is called after each keyframe's sweep. Raises
     MapFileError, DatasetError, CapacityError.
     """
     folder = Path(task.folder)
@@ -65,7 +66,7 @@ def infer_submap(
         bricks, belief, free = read_core(before)
         write_round(path, RoundResult(bricks, belief, free, {}, report))
         return report
-    result = _inferred(task, Job.read(folder), progress)
+    result = _inferred(task, Job.read(folder), on_step)
     if task.round > 0:
         told = [(evidence, read_halo(before, other)) for other, (_, evidence) in result.halos.items()]
         report = replace(
@@ -85,7 +86,7 @@ def is_idle(task: SubmapTask) -> bool:
     return task.round > 0 and not read_report(before).core_bricks
 
 
-def _inferred(task: SubmapTask, job: Job, progress: Callable[[InferProgress], bool]) -> RoundResult:
+def _inferred(task: SubmapTask, job: Job, on_step: Callable[[InferProgress], None]) -> RoundResult:
     begin = time.perf_counter()
     settings = job.config.runtime
     runtime.init(settings.arch, settings.threads, settings.debug)
@@ -99,7 +100,11 @@ def _inferred(task: SubmapTask, job: Job, progress: Callable[[InferProgress], bo
     if len(core):
         neighbours = job.plan.neighbours(task.submap)
         heard = _listen(m, task, neighbours)
-        inferring = m.infer(progress=progress).seconds
+        with FullInference(m) as inference:
+            for step in inference:
+                on_step(step)
+        assert inference.outcome is not None
+        inferring = inference.outcome.seconds
         halos = _spoken(m, job, task.submap, {n: [id_of[i] for i in c] for n, c in neighbours.items()})
     belief, size = m.beliefs(core), m.statistics()
     report = SubmapReport(

@@ -13,6 +13,7 @@ from taichi_mrf.config.schema import Config, PoseConfig
 from taichi_mrf.evaluation.accuracy import JudgedView, judge_view
 from taichi_mrf.evaluation.depth_error import pooled_depth_error
 from taichi_mrf.mapping.intake import Full, Intake
+from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.sensor.frame import Frame
@@ -95,13 +96,12 @@ def _build(config: Config, frames: WorkingSet, pixel_stride: int, go_on: GoOn) -
         answer = intake.offer(thinned(frame, pixel_stride))
         if isinstance(answer, Full):
             raise answer.error
-    report = m.infer(
-        progress=lambda step: go_on(
-            f"sweep {step.sweep} of {step.sweeps}",
-            ((step.sweep - 1) * step.keyframes + step.keyframe) / (step.sweeps * step.keyframes),
-        )
-    )
-    return m if report.complete else None
+    with FullInference(m) as inference:
+        for step in inference:
+            done = (step.sweep - 1) * step.keyframes + step.keyframe
+            if not go_on(f"sweep {step.sweep} of {step.sweeps}", done / (step.sweeps * step.keyframes)):
+                inference.stop(at_once=True)
+    return m if inference.outcome is not None and inference.outcome.complete else None
 
 
 def _probability_below(m: OccupancyMap, view: JudgedView, frame: Frame) -> NDArray[np.float32]:

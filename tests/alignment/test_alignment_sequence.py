@@ -20,6 +20,7 @@ from taichi_mrf.experiments.poses import DISTURBED_M, DISTURBED_RAD, halved, run
 from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.inference.keyframe import DepthImage
+from taichi_mrf.inference.schedule import driven
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.pipeline import Event, FrameOffered, KeyframeRefined, KeyframeSwept, map_sequence
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -78,7 +79,7 @@ def test_all_at_once_takes_back_more_than_half() -> None:
         for i, f in enumerate(true_frames())
     }
     start = dict(enumerate(disturbed(0)))
-    found = align_jointly(points, start, start, PoseConfig())
+    found = driven(align_jointly(points, start, start, PoseConfig()))
     before, after = errors(list(start.values())), errors(list(found.values()))
     assert (after < 0.5 * before).all()
 
@@ -90,7 +91,7 @@ def test_poses_recorded_well_are_trusted() -> None:
     }
     start = dict(enumerate(disturbed(0)[:3]))
     sure = PoseConfig(translation_sigma=1e-5, rotation_sigma=1e-5)
-    found = align_jointly(points, start, start, sure)
+    found = driven(align_jointly(points, start, start, sure))
     for id, T in found.items():
         np.testing.assert_allclose(T, start[id], atol=1e-4)
 
@@ -104,7 +105,7 @@ def test_a_keyframe_without_partners_stays_where_it_was_recorded() -> None:
     away = frames[1].T_world_camera.copy()
     away[:3, 3] += 30.0
     poses = {0: frames[0].T_world_camera, 1: away}
-    np.testing.assert_allclose(align_jointly(points, poses, poses, PoseConfig())[1], away, atol=1e-9)
+    np.testing.assert_allclose(driven(align_jointly(points, poses, poses, PoseConfig()))[1], away, atol=1e-9)
 
 
 def test_the_pipeline_corrects_poses_and_tells_both() -> None:

@@ -27,11 +27,11 @@ from live_scene import (
 
 from taichi_mrf.config.schema import Config, VolumeConfig
 from taichi_mrf.errors import CapacityError
-from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.live.run import Policy
 from taichi_mrf.live.session import Session
 from taichi_mrf.live.source import Source, open_source
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map, load_map
 from taichi_mrf.viewer.messages import (
     Bricks,
@@ -155,6 +155,20 @@ def test_a_stop_during_full_inference_leaves_the_map_that_was_shown() -> None:
     session.run(lambda: any(s.activity.startswith("sweeping keyframe 3 ") for s in link.of_type(Status)[-1:]))
     assert not session.state.is_done
     assert_shown_is(session, link)
+    assert marginals(finished(session)) == marginals(built(range(4)))
+
+
+def test_a_stop_after_the_first_sweep_keeps_what_was_computed() -> None:
+    link = FakeLink()
+    session = session_of(link)
+    second = "sweeping keyframe 2 of 4 (sweep 2 of 3)"
+    session.run(lambda: any(s.activity == second for s in link.of_type(Status)[-1:]))
+    assert not session.state.is_done
+    assert session.state.result().sweeps == 2
+    assert_shown_is(session, link)
+    twin = built(range(4))
+    twin.infer(progress=lambda step: (step.sweep, step.keyframe) != (2, 2))
+    assert marginals(session.state.mapper.map) == marginals(twin)
     assert marginals(finished(session)) == marginals(built(range(4)))
 
 
@@ -339,11 +353,10 @@ def test_a_viewer_that_goes_ends_the_run(lost: bool) -> None:
 
 
 def test_a_defect_in_inference_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    def defect(self: Mapper, go_on: object) -> bool:
-        self.unsettled = False
+    def defect(m: OccupancyMap, keep_before: bool) -> None:
         raise RuntimeError("something is wrong")
 
-    monkeypatch.setattr(Mapper, "settle", defect)
+    monkeypatch.setattr("taichi_mrf.live.mapper.FullInference", defect)
     link = FakeLink()
     session_of(link, room(2)).run(never)
     assert link.errors() == ["something is wrong"]

@@ -105,15 +105,14 @@ def infer_or_be_killed(task: SubmapTask) -> SubmapReport:
     does with a process for which there is no memory."""
     fault = KilledOnce(Path(task.folder))
 
-    def strike(step: InferProgress) -> bool:
+    def strike(step: InferProgress) -> None:
         if task.round == fault.round and step.keyframe > step.keyframes // 2:
             try:
                 fault.note.touch(exist_ok=False)
             except FileExistsError:
-                return True
+                return
             fault.note.write_text(f"{task}\n", encoding="utf-8")
             os.kill(os.getpid(), signal.SIGKILL)
             time.sleep(60)
-        return True
 
     return infer_submap(task, strike)

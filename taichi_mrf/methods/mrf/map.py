@@ -29,7 +29,14 @@ from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
 from taichi_mrf.inference.messages import count_observations
 from taichi_mrf.inference.prior import log_odds_without_bricks, prior_probability
 from taichi_mrf.inference.ray_list import RayBundler
-from taichi_mrf.inference.schedule import InferReport, Progress, content_key, run_sweeps
+from taichi_mrf.inference.schedule import (
+    InferReport,
+    InferSteps,
+    Progress,
+    content_key,
+    driven,
+    sweep_steps,
+)
 from taichi_mrf.inference.sweep import Sweeper, unknown_entry_depths
 from taichi_mrf.methods.brick_map import BrickMap, check_inference, own_parameters, own_section
 from taichi_mrf.methods.map_file import MapHeader, StoredKeyframe, naming
@@ -209,6 +216,17 @@ class MRFMap(BrickMap):
         configuration for this call, ``method`` from now on. ``progress`` is called after each keyframe;
         returning False stops. Raises ConfigError for an impossible argument, KeyframeError for an unknown id.
         """
+        return driven(self.infer_steps(sweeps, tolerance, keyframes, method), progress)
+
+    def infer_steps(
+        self,
+        sweeps: int | None = None,
+        tolerance: float | None = None,
+        keyframes: Iterable[int] | None = None,
+        method: Literal["sum-product", "max-product"] | None = None,
+    ) -> InferSteps:
+        """:meth:`infer` as a generator, which yields an InferProgress after each keyframe. Between two steps
+        the map may be queried but not changed."""
         chosen_ids = check_inference(sweeps, tolerance, keyframes)
         if method is not None and method != self.config.inference.method:
             self._use(method)
@@ -235,7 +253,7 @@ class MRFMap(BrickMap):
         as_configured = keyframes is None and (sweeps, tolerance) == (config.sweeps, config.tolerance)
         complete = False
         try:
-            report = run_sweeps(chosen, self._pool, self._sweeper, sweeps, tolerance, progress)
+            report = yield from sweep_steps(chosen, self._pool, self._sweeper, sweeps, tolerance)
             complete = report.complete
         finally:
             self._settled = complete and as_configured

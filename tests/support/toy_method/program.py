@@ -38,7 +38,8 @@ def main(folder: Path) -> None:
         refused = str(error)
     mapper.switch(first, on=False)
     stale = mapper.stale
-    settled = mapper.settle(lambda step: True)
+    with mapper.settling() as settling:
+        settled = settling.run() is not None
     m.save(folder / "map.npz")
     loaded = load_map(folder / "map.npz")
     found = {

@@ -1,0 +1,120 @@
+"""Full inference step by step: what a stop leaves, with and without a copy of the map before it."""
+
+import numpy as np
+import pytest
+import small_room
+from numpy.typing import NDArray
+
+from taichi_mrf.mapping.settling import FullInference
+from taichi_mrf.methods.log_odds.map import LogOddsMap
+from taichi_mrf.methods.mrf.map import MRFMap
+
+pytestmark = pytest.mark.usefixtures("one_backend")
+
+KEYFRAMES = 3
+
+
+def marginals(m: MRFMap | LogOddsMap) -> NDArray[np.float32]:
+    return m.occupancy(small_room.probes())
+
+
+def incremental() -> MRFMap:
+    """A map as a live run has it: each keyframe was swept once when it came."""
+    m = MRFMap(small_room.VOXEL_SIZE)
+    for frame in small_room.frames()[:KEYFRAMES]:
+        m.infer(sweeps=1, keyframes=[small_room.add(m, frame)])
+    return m
+
+
+def settled(m: MRFMap | LogOddsMap, stop_after: int, *, copy: bool, at_once: bool = False) -> FullInference:
+    """Inference that is told to stop after some steps; ``copy``: the map before it is kept."""
+    taken = 0
+    with FullInference(m, keep_before=copy) as inference:
+        for _ in inference:
+            taken += 1
+            if taken >= stop_after:
+                inference.stop(at_once)
+    return inference
+
+
+def test_all_steps_are_those_of_infer() -> None:
+    m, twin = incremental(), incremental()
+    with FullInference(m, keep_before=True) as inference:
+        steps = [(step.sweep, step.keyframe) for step in inference]
+    twin.infer()
+    assert steps == [(sweep, k) for sweep in (1, 2, 3) for k in range(1, KEYFRAMES + 1)]
+    assert inference.outcome is not None
+    assert inference.outcome.complete
+    assert m.settled
+    np.testing.assert_array_equal(marginals(m), marginals(twin))
+
+
+@pytest.mark.parametrize("stop_after", [KEYFRAMES, KEYFRAMES + 1, 2 * KEYFRAMES])
+def test_a_stop_after_the_first_sweep_keeps_what_was_computed_with_and_without_a_copy(
+    stop_after: int,
+) -> None:
+    maps = []
+    for copy in (False, True):
+        m = incremental()
+        inference = settled(m, stop_after, copy=copy)
+        assert inference.outcome is not None
+        assert not inference.outcome.complete
+        assert inference.outcome.sweeps == -(-stop_after // KEYFRAMES)
+        assert not m.settled
+        maps.append(marginals(m))
+    np.testing.assert_array_equal(*maps)
+
+
+def test_a_stop_in_the_first_sweep_goes_back_to_the_copy() -> None:
+    m = incremental()
+    before = marginals(m)
+    assert settled(m, 1, copy=True).outcome is None
+    np.testing.assert_array_equal(marginals(m), before)
+
+
+def test_without_a_copy_the_first_sweep_is_completed() -> None:
+    m, twin = incremental(), incremental()
+    inference = settled(m, 1, copy=False)
+    assert inference.outcome is not None
+    assert inference.outcome.sweeps == 1
+    twin.infer(sweeps=1)
+    np.testing.assert_array_equal(marginals(m), marginals(twin))
+
+
+def test_without_a_copy_and_time_it_ends_at_once() -> None:
+    m = incremental()
+    inference = settled(m, 1, copy=False, at_once=True)
+    assert inference.outcome is not None
+    assert inference.outcome.rays in [keyframe.rays for keyframe in m.keyframes.values()]
+
+
+def test_the_map_before_is_shown_between_the_steps_and_comes_back_after_an_error() -> None:
+    m = incremental()
+    before = marginals(m)
+
+    def fail_after_two_keyframes() -> None:
+        with FullInference(m, keep_before=True) as inference:
+            for step in inference:
+                with inference.showing_before():
+                    np.testing.assert_array_equal(marginals(m), before)
+                assert not np.array_equal(marginals(m), before)
+                if step.keyframe == 2:
+                    raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail_after_two_keyframes()
+    np.testing.assert_array_equal(marginals(m), before)
+    m.infer()
+    np.testing.assert_array_equal(marginals(m), marginals(small_room.build(range(KEYFRAMES))))
+
+
+def test_a_rebuilt_map_ends_where_it_is_told_and_stays_stale() -> None:
+    m = LogOddsMap(small_room.VOXEL_SIZE)
+    first, *_ = [small_room.add(m, frame) for frame in small_room.frames()[: KEYFRAMES + 1]]
+    m.remove_keyframe(first)
+    inference = settled(m, 1, copy=True, at_once=True)
+    assert inference.outcome is not None
+    assert not inference.outcome.complete
+    assert m.stale
+    assert settled(m, 1, copy=False).outcome is not None  # completed: all keyframes are in it
+    assert not m.stale
