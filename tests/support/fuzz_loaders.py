@@ -12,6 +12,7 @@ from dataclasses import astuple, dataclass
 from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from datasets_recordings import (
@@ -29,10 +30,13 @@ from datasets_recordings import (
     write_seven_scenes,
     write_tum,
 )
-from inputs_bags import Kind, plain, writing
+from inputs_bags import Bag, Kind, plain, writing
 from kitti_street import write_kitti
 from laser_logs import ODOMETRY, flaser, robotlaser
 from laser_logs import write_npz as write_scans
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from stereo_rig import write as write_stereo_file
 
 from taichi_mrf.calibration.depth_files import DepthFiles
@@ -41,6 +45,7 @@ from taichi_mrf.calibration.pose_stream import read_pose_stream
 from taichi_mrf.config.schema import Config, load
 from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets.images import read_grey
 from taichi_mrf.datasets.laser.plan_image import read_floor_plan
 from taichi_mrf.datasets.laser.readers import open_scans
 from taichi_mrf.datasets.synthetic.mesh_scene import load_mesh
@@ -285,6 +290,23 @@ def _bag(kind: Kind, folder: Path) -> Path:
     return path
 
 
+def _packed_bag(mode: CompressionMode, folder: Path) -> Path:
+    """A ROS 2 bag whose messages, or whose file, are compressed."""
+    writer: Any = Writer2(folder / "walk", version=9, storage_plugin=StoragePlugin.SQLITE3)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        plain(Bag("sqlite", writer))
+    return folder / "walk"
+
+
+def _image_file(suffix: str, folder: Path) -> Path:
+    return write_image(folder / f"image{suffix}", np.arange(48, dtype=np.uint8).reshape(6, 8))
+
+
+def _image(path: Path) -> bytes:
+    return read_grey(path).tobytes()
+
+
 def _carmen_text() -> str:
     lines = [ODOMETRY, flaser([1.0, 2.0, 3.0], [0.1, 0.2, 0.3]), ODOMETRY, flaser([1.5, 2, 60], [1, 2, 3])]
     return "\n".join([*lines, "PARAM x 1"])
@@ -413,6 +435,12 @@ LOADERS = [
     Loader("ROS 1 bag", partial(_bag, "ros1"), _dataset),
     Loader("ROS 2 bag, sqlite", partial(_bag, "sqlite"), _dataset),
     Loader("MCAP", partial(_bag, "mcap"), _dataset),
+    Loader("ROS 2 bag, packed messages", partial(_packed_bag, CompressionMode.MESSAGE), _dataset),
+    Loader("ROS 2 bag, packed file", partial(_packed_bag, CompressionMode.FILE), _dataset),
+    *(
+        Loader(f"image {suffix}", partial(_image_file, suffix), _image)
+        for suffix in (".jpg", ".tiff", ".webp", ".bmp", ".pgm")
+    ),
     Loader("CARMEN log", _carmen, _scans),
     Loader("CARMEN log, ROBOTLASER1", _robotlaser, _scans),
     Loader("CARMEN log, gzip", _carmen_gzip, _scans, sealed=True),
