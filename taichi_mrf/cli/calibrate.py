@@ -57,7 +57,9 @@ def run_calibrate(options: Calibrate) -> int:
         }
         write_text(options.out / REPORT_FILE, json.dumps(report, indent=2, allow_nan=False) + "\n")
         _print_report(console, report, [*written, options.out / REPORT_FILE])
-        console.say(f"Map with it: taichi-mrf map SOURCE --out DIR --config {options.out / CONFIG_FILE}")
+        console.print_line(
+            f"Map with it: taichi-mrf map SOURCE --out DIR --config {options.out / CONFIG_FILE}"
+        )
     return 0
 
 
@@ -124,11 +126,11 @@ def _print_report(console: Terminal, report: dict[str, Any], written: list[Path]
     console.print(table)
     console.print(_noise_table(report["noise"]))
     for sentence in report["not_covered"]:
-        console.say(sentence)
+        console.print_line(sentence)
     for note in report["notes"]:
-        console.say(f"Note: {note}")
+        console.print_line(f"Note: {note}")
     for path in written:
-        console.say(str(path))
+        console.print_line(str(path))
 
 
 def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:

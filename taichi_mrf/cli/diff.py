@@ -73,6 +73,6 @@ def _print(report: dict[str, Any]) -> None:
         lines.append(f"{report['changes']['file']} ({report['changes']['points']:,} points)")
     for line in lines:
         if isinstance(line, str):
-            console.say(line)
+            console.print_line(line)
         else:
             console.print(line)

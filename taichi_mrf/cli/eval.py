@@ -36,7 +36,7 @@ def run_eval(options: Eval) -> int:
         raise DatasetError(f"{options.data}: there is no such folder; --data names the one with the scenes")
     with (
         output_folder(options.out),
-        stop_on_signals(lambda text: console.say(text, "yellow")) as request,
+        stop_on_signals(lambda text: console.print_line(text, "yellow")) as request,
     ):
         runtime.init(options.runtime.arch, options.runtime.threads, options.runtime.debug)
         failed = 0
@@ -44,19 +44,19 @@ def run_eval(options: Eval) -> int:
             try:
                 tables, paths = _run(laboratory, name, options, console, request)
             except _StoppedError:
-                console.say("Stopped before the end; the same command continues from here.", "yellow")
+                console.print_line("Stopped before the end; the same command continues from here.", "yellow")
                 return 128 + (request.signal or 0)
             except TaichiMRFError as error:
                 if len(names) == 1:
                     raise
                 # One experiment that lacks its data or an extra does not keep the others from running.
-                console.say(f"{name}: {error}", "red")
+                console.print_line(f"{name}: {error}", "red")
                 failed += 1
                 continue
             for table in tables:
                 print_table(console, table)
             for path in paths:
-                console.say(str(path))
+                console.print_line(str(path))
     if failed:
         raise TaichiMRFError(f"{failed} of {len(names)} experiments could not be run")
     return 0

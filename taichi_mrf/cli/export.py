@@ -1,4 +1,4 @@
-"""What ``taichi-mrf export`` does: look at the names, load the map, write each file, say what was written."""
+"""What ``taichi-mrf export`` does: check the names, load the map, write each file, print the list."""
 
 import json
 import os
@@ -46,11 +46,11 @@ def run_export(options: Export) -> int:
     for entry in written:
         entry["bytes"] = _size(Path(entry["file"]))
         if not options.json:
-            _tell(console, entry)
+            _print_file(console, entry)
     for path in options.to:
         note = export_note(m, path, options.options)
         if note is not None and not options.json:
-            console.say(f"{path.name}: {note}")
+            console.print_line(f"{path.name}: {note}")
     if options.json:
         print(json.dumps(written, indent=2))
     return 0
@@ -108,5 +108,5 @@ def _size(path: Path) -> int:
     return sum(file.stat().st_size for file in files if file.is_file())
 
 
-def _tell(console: Terminal, entry: dict[str, Any]) -> None:
-    console.say(f"{entry['file']} ({entry['bytes'] / 1e6:.2f} MB, {entry['seconds']:.1f} s)")
+def _print_file(console: Terminal, entry: dict[str, Any]) -> None:
+    console.print_line(f"{entry['file']} ({entry['bytes'] / 1e6:.2f} MB, {entry['seconds']:.1f} s)")

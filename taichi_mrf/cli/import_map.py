@@ -1,4 +1,4 @@
-"""What ``taichi-mrf import`` does: read a file of OctoMap's, write it as a LogOddsMap, say what was in it."""
+"""What ``taichi-mrf import`` does: read an OctoMap file, write it as a LogOddsMap, print its size."""
 
 import dataclasses
 import json
@@ -47,7 +47,7 @@ def run_import(options: Import) -> int:
         f"voxels of {leaves.voxel_size:g} m in {facts['bricks']:,} bricks"
     )
     for line in (text, str(options.out)):
-        console.say(line)
+        console.print_line(line)
     return 0
 
 

@@ -89,7 +89,7 @@ def _print_backends(console: Terminal, arch: Arch) -> None:
         console.print(f"Not on {name}: {why}.")
     console.print(table)
     for name, version in runtime.versions().items():
-        console.say(f"{name} {version}")
+        console.print_line(f"{name} {version}")
 
 
 def _print_source(console: Terminal, source: str, arch: Arch, reading: SourceFlags) -> bool:
@@ -105,13 +105,13 @@ def _print_source(console: Terminal, source: str, arch: Arch, reading: SourceFla
     except DatasetError as error:
         if path is None:
             raise
-        console.say(f"It cannot be mapped like this: {error}")
+        console.print_line(f"It cannot be mapped like this: {error}")
         for name in bag.sources:
-            console.say(f"taichi-mrf map {shlex.quote(name)}{bag.flags} --out DIR")
+            console.print_line(f"taichi-mrf map {shlex.quote(name)}{bag.flags} --out DIR")
         return False
     usable = _print_frames(console, format_name(source), dataset)
     if path is not None and usable:
-        console.say(f"taichi-mrf map {shlex.quote(source)} --out DIR")
+        console.print_line(f"taichi-mrf map {shlex.quote(source)} --out DIR")
     return usable
 
 
@@ -125,7 +125,7 @@ def _print_topics(console: Terminal, bag: BagSummary) -> None:
         table.add_row(topic.name, topic.type, str(topic.messages), hz, bag.remarks.get(topic.name, ""))
     console.print(table)
     for transform in bag.transforms:
-        console.say(f"tf {transform}")
+        console.print_line(f"tf {transform}")
 
 
 def _print_frames(console: Terminal, format_name: str, dataset: Dataset) -> bool:
@@ -149,5 +149,5 @@ def _print_frames(console: Terminal, format_name: str, dataset: Dataset) -> bool
         table.add_row("way", f"{', '.join(axes)} m")
     console.print(table)
     for note in [*dataset.notes, *([found.problem] if found.problem else [])]:
-        console.say(f"Note: {note}")
+        console.print_line(f"Note: {note}")
     return found.usable and found.problem is None  # map stops at the first broken frame

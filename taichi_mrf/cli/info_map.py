@@ -64,7 +64,7 @@ def print_map(console: Terminal, facts: Facts) -> None:
     table.add_row("written", facts["written"])
     console.print(table)
     if "keyframes" in facts:
-        console.say(f"taichi-mrf live {facts['map']} shows it in the browser.")
+        console.print_line(f"taichi-mrf live {facts['map']} shows it in the browser.")
 
 
 def _run_map(path: Path) -> Facts:

@@ -9,8 +9,8 @@ from taichi_mrf.cli.options.live import Live
 from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
-from taichi_mrf.cli.shared.serving import Say, let_the_page_go_first, tell_address, warn_of_host
-from taichi_mrf.cli.shared.terminal import tell_problem
+from taichi_mrf.cli.shared.serving import PrintLine, let_the_page_go_first, print_address, warn_of_host
+from taichi_mrf.cli.shared.terminal import print_problem
 from taichi_mrf.config.schema import with_absolute_tables
 from taichi_mrf.errors import ConfigError, TaichiMRFError
 from taichi_mrf.live.link import ViewerLink
@@ -24,7 +24,7 @@ SHORTEST_LIFE_SECONDS = 30.0
 def run_live(options: Live) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
     console = open_terminal(options.printing)
-    say = console.say
+    print_line = console.print_line
 
     settings = with_absolute_tables(options.poses.parameters(options.settings), Path.cwd())
     with ExitStack() as stack:
@@ -34,10 +34,10 @@ def run_live(options: Live) -> int:
                 raise ConfigError(
                     f"{options.out}: holds a run: choose another --out, or add --overwrite to replace it"
                 )
-        request = stack.enter_context(stop_on_signals(say, keeps=options.out is not None))
-        warn_of_host(options.host, options.port, "watch and change the map", say)
+        request = stack.enter_context(stop_on_signals(print_line, keeps=options.out is not None))
+        warn_of_host(options.host, options.port, "watch and change the map", print_line)
         bar = ProgressBar(console, options.printing)
-        page = _Page(options, say, bar, stack)
+        page = _Page(options, print_line, bar, stack)
         let_the_page_go_first()
         # Imported late: the page starts meanwhile, in a process of its own.
         from taichi_mrf.live.run import Policy
@@ -56,7 +56,7 @@ def run_live(options: Live) -> int:
             track=options.poses.track_poses,
         )
         for note in notes:
-            say(note)
+            print_line(note)
         policy = Policy(options.keep_live, options.out, options.exit_when_done)
         session = Session(source, page.link, policy, page.listening)
         with bar:
@@ -65,20 +65,20 @@ def run_live(options: Live) -> int:
             state = session.state
             result = state.result()
             if result.track is not None:
-                say(f"tracking: {len(result.track.frames)} frames found, {result.track.lost} lost")
+                print_line(f"tracking: {len(result.track.frames)} frames found, {result.track.lost} lost")
             # A user who stops the run does not wait for the check and the pictures.
             whole = request.signal is None and not result.interrupted
             _, written = write_run(
                 options.out, result, state.facts, check=whole, pictures=whole, haste=request
             )
             for path in written:
-                say(f"wrote {path}")
+                print_line(f"wrote {path}")
     if problem is not None:
         raise TaichiMRFError(problem)
     if request.signal is not None:
         return 128 + request.signal
     if session.state.full is not None:
-        tell_problem(f"out of memory: {session.state.full}; the map of the frames before it is kept")
+        print_problem(f"out of memory: {session.state.full}; the map of the frames before it is kept")
         return DID_NOT_FIT
     return 0
 
@@ -103,8 +103,8 @@ class _ToldLink(ViewerLink):
 class _Page:
     """The current viewer, and what is printed about it."""
 
-    def __init__(self, options: Live, say: Say, bar: ProgressBar, stack: ExitStack) -> None:
-        self._options, self._say, self._bar, self._stack = options, say, bar, stack
+    def __init__(self, options: Live, print_line: PrintLine, bar: ProgressBar, stack: ExitStack) -> None:
+        self._options, self._print_line, self._bar, self._stack = options, print_line, bar, stack
         self._wanted_port = options.port
         self.start()
 
@@ -116,7 +116,7 @@ class _Page:
     def listening(self, where: Listening) -> None:
         """Tell the user where the page is."""
         wants_browser = self._options.open and not self.has_listened
-        tell_address(where, "The map", self._wanted_port, wants_browser, self._say)
+        print_address(where, "The map", self._wanted_port, wants_browser, self._print_line)
         self.has_listened, self._wanted_port = True, where.port
 
 
@@ -136,7 +136,7 @@ def _run(
         lives_long = time.monotonic() - page.started > SHORTEST_LIFE_SECONDS
         if not (page.has_listened and lives_long):
             return lost
-        tell_problem(f"{lost}; starting another")
+        print_problem(f"{lost}; starting another")
         page.link.close()
         page.start()
         reconnect(page.link)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import taichi_mrf
 from taichi_mrf.cli.parser import parse
-from taichi_mrf.cli.shared.terminal import PROGRAM, tell_problem
+from taichi_mrf.cli.shared.terminal import PROGRAM, print_problem
 from taichi_mrf.errors import TaichiMRFError
 
 BAD_INPUT = 2
@@ -24,14 +24,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command, options = parse(arguments)
         return command.run(options)
     except TaichiMRFError as error:
-        tell_problem(str(error))
+        print_problem(str(error))
         return BAD_INPUT
     except BrokenPipeError:  # the reader of our output has seen enough, as in `| head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
-        tell_problem(f"{error.filename or 'input or output'}: {error.strerror or error}")
+        print_problem(f"{error.filename or 'input or output'}: {error.strerror or error}")
         return BAD_INPUT
     except KeyboardInterrupt:
-        tell_problem("aborted")
+        print_problem("aborted")
         return ABORTED

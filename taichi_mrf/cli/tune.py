@@ -8,7 +8,7 @@ from taichi_mrf.cli.options.tune import FRAMES_BY_HAND, FRAMES_TO_SEARCH, Tune
 from taichi_mrf.cli.shared.interrupt import stop_on_signals
 from taichi_mrf.cli.shared.output import output_folder
 from taichi_mrf.cli.shared.progress import open_terminal
-from taichi_mrf.cli.shared.serving import Say, let_the_page_go_first, tell_address, warn_of_host
+from taichi_mrf.cli.shared.serving import PrintLine, let_the_page_go_first, print_address, warn_of_host
 from taichi_mrf.config.schema import with_absolute_tables
 from taichi_mrf.errors import TaichiMRFError
 from taichi_mrf.live.link import ViewerLink
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 def run_tune(options: Tune) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError."""
     console = open_terminal(options.printing)
-    say = console.say
+    print_line = console.print_line
 
     settings = with_absolute_tables(options.settings, Path.cwd())
     with ExitStack() as stack:
         if options.out is not None:
             stack.enter_context(output_folder(options.out))
-        request = stack.enter_context(stop_on_signals(say, keeps=options.out is not None))
-        link = _page(options, say, stack) if options.viewer else NoPage()
+        request = stack.enter_context(stop_on_signals(print_line, keeps=options.out is not None))
+        link = _page(options, print_line, stack) if options.viewer else NoPage()
         # Imported late: the page starts meanwhile, in a process of its own.
         from taichi_mrf.datasets import open_dataset
         from taichi_mrf.datasets.recorded_noise import with_recorded_noise
@@ -49,7 +49,7 @@ def run_tune(options: Tune) -> int:
         search = None
         if options.auto is not None:
             search = Search(settings, options.names or DEFAULT_SEARCH, options.auto, options.seed)
-        told: set[int] = set()
+        printed: set[int] = set()
         count = options.frames or (FRAMES_TO_SEARCH if search else FRAMES_BY_HAND)
         session = TuneSession(
             dataset,
@@ -58,47 +58,47 @@ def run_tune(options: Tune) -> int:
             link,
             Policy(options.out, options.search_stride, leave_when_done=not options.viewer),
             search=search,
-            listening=lambda where: tell_address(where, "The page", options.port, options.open, say),
-            tried=lambda attempt: _tell_try(attempt, session.search, told, say),
-            judged=lambda verdict: _tell_verdict(session, say),
+            listening=lambda where: print_address(where, "The page", options.port, options.open, print_line),
+            tried=lambda attempt: _print_trial(attempt, session.search, printed, print_line),
+            judged=lambda verdict: _print_verdict(session, print_line),
         )
         for note in dataset.notes:
-            say(note)
+            print_line(note)
         frames = session.frames
-        say(
+        print_line(
             f"{len(frames.training)} frames of {frames.source} make the map, {len(frames.held_out)} score it"
             + (f", {len(frames.unseen)} are kept back for the end" if frames.unseen else "")
             + f" (from frame {frames.choice.first} on, {frames.choice.stride} apart)"
         )
         session.run(request)
-        _finish(session, options, say)
+        _finish(session, options, print_line)
         lost = link.lost
     if lost is not None and not request():
         raise TaichiMRFError(lost)
     return 0 if request.signal is None else 128 + request.signal
 
 
-def _page(options: Tune, say: Say, stack: ExitStack) -> ViewerLink:
+def _page(options: Tune, print_line: PrintLine, stack: ExitStack) -> ViewerLink:
     """Start the page, which may compute before the tries do."""
-    warn_of_host(options.host, options.port, "use it", say)
+    warn_of_host(options.host, options.port, "use it", print_line)
     link = stack.enter_context(start_page(options.host, options.port))
     let_the_page_go_first()
     return link
 
 
-def _finish(session: "TuneSession", options: Tune, say: Say) -> None:
+def _finish(session: "TuneSession", options: Tune, print_line: PrintLine) -> None:
     """Write the table of all tries, and the parameters that the search has found."""
     from taichi_mrf.tune.history import BEST_FILE, TABLE_FILE
 
     if options.out is None or not session.history.attempts:
         return
     write_text(options.out / TABLE_FILE, session.history.to_csv())
-    say(f"wrote {options.out / TABLE_FILE}")
+    print_line(f"wrote {options.out / TABLE_FILE}")
     best = session.search.best if session.search is not None else None
     attempt = next((each for each in session.history.attempts if each.config == best), None)
     if attempt is not None:
         write_text(options.out / BEST_FILE, session.history.to_yaml(attempt.number, tuple(_verdict(session))))
-        say(f"wrote {options.out / BEST_FILE}")
+        print_line(f"wrote {options.out / BEST_FILE}")
 
 
 def _verdict(session: "TuneSession") -> list[str]:
@@ -108,20 +108,22 @@ def _verdict(session: "TuneSession") -> list[str]:
     return verdict_lines(session.verdict, len(session.frames.unseen)) if session.verdict else []
 
 
-def _tell_verdict(session: "TuneSession", say: Say) -> None:
+def _print_verdict(session: "TuneSession", print_line: PrintLine) -> None:
     """Print the verdict as soon as the search has ended; the page stays up."""
     for line in _verdict(session):
-        say(line)
+        print_line(line)
 
 
-def _tell_try(attempt: "Attempt", search: "Search | None", told: set[int], say: Say) -> None:
+def _print_trial(
+    attempt: "Attempt", search: "Search | None", printed: set[int], print_line: PrintLine
+) -> None:
     """One line for each try of the search, once; tries by hand are on the page."""
-    if attempt.by != "search" or search is None or attempt.number in told:
+    if attempt.by != "search" or search is None or attempt.number in printed:
         return
-    told.add(attempt.number)
+    printed.add(attempt.number)
     scores = attempt.scores
     best = " *" if attempt.config == search.best else ""
-    say(
+    print_line(
         f"try {attempt.number:3}  log-likelihood {scores.log_likelihood:+.3f}  "
         f"right {scores.accuracy_sigma:.1%}  median {1000 * scores.median_abs_m:.1f} mm{best}"
     )

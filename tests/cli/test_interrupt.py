@@ -25,25 +25,25 @@ def hangups() -> Iterator[None]:
 
 
 def received(*numbers: int) -> tuple[StopRequest, list[str]]:
-    """The request after these signals, and what the user was told."""
-    told: list[str] = []
-    with stop_on_signals(told.append) as request:
+    """The request after these signals, and what the user was printed."""
+    printed: list[str] = []
+    with stop_on_signals(printed.append) as request:
         for number in numbers:
             os.kill(os.getpid(), number)
-    return request, told
+    return request, printed
 
 
 def test_ctrl_c_asks_once_and_leaves_time() -> None:
-    request, told = received(signal.SIGINT)
+    request, printed = received(signal.SIGINT)
     assert (request.signal, request.hurried, request.out_of_time()) == (signal.SIGINT, False, False)
-    assert told == ["Stopping. What is done so far is saved. Press Ctrl-C again to abort."]
+    assert printed == ["Stopping. What is done so far is saved. Press Ctrl-C again to abort."]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_sigterm_and_sighup_leave_seconds(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    request, told = received(number)
+    request, printed = received(number)
     assert (request.signal, request.hurried, request.out_of_time()) == (number, True, False)
-    assert len(told) == 1
+    assert len(printed) == 1
     monkeypatch.setattr(interrupt, "INFER_SECONDS", 0.0)
     assert request.out_of_time()
 
@@ -55,18 +55,18 @@ def test_the_second_of_them_aborts(number: int) -> None:
 
 
 def test_a_closed_terminal_may_hang_up_twice_and_sigterm_hurries_a_stopping_run() -> None:
-    request, told = received(signal.SIGHUP, signal.SIGHUP)
-    assert (request.signal, request.aborted, len(told)) == (signal.SIGHUP, False, 1)
-    request, told = received(signal.SIGINT, signal.SIGTERM)
+    request, printed = received(signal.SIGHUP, signal.SIGHUP)
+    assert (request.signal, request.aborted, len(printed)) == (signal.SIGHUP, False, 1)
+    request, printed = received(signal.SIGINT, signal.SIGTERM)
     assert (request.signal, request.hurried, request.aborted) == (signal.SIGINT, True, False)
-    assert len(told) == 1
+    assert len(printed) == 1
 
 
 def test_what_nobody_saves_is_not_called_saved() -> None:
-    told: list[str] = []
-    with stop_on_signals(told.append, keeps=False):
+    printed: list[str] = []
+    with stop_on_signals(printed.append, keeps=False):
         os.kill(os.getpid(), signal.SIGINT)
-    assert told == ["Stopping. Nothing is saved: there is no --out. Press Ctrl-C again to abort."]
+    assert printed == ["Stopping. Nothing is saved: there is no --out. Press Ctrl-C again to abort."]
 
 
 def test_nohup_is_respected() -> None:
@@ -117,8 +117,8 @@ def test_a_signal_in_the_middle_of_a_line_stops_the_run_too() -> None:
     stream = io.TextIOWrapper(io.BufferedWriter(pipe))
     with contextlib.redirect_stdout(stream):
         terminal = Terminal()
-        with pytest.raises(KeyboardInterrupt), interrupt_on_signals(terminal.say) as request:
-            terminal.say("first")
+        with pytest.raises(KeyboardInterrupt), interrupt_on_signals(terminal.print_line) as request:
+            terminal.print_line("first")
     assert request.signal == signal.SIGTERM
     last = pipe.read.decode().splitlines()[-1]
     assert last == "Stopping. What is done so far is saved. Press Ctrl-C again to abort."

@@ -37,7 +37,7 @@ def test_control_characters_become_escapes(terminal: Terminal) -> None:
     table = Table("name [bold]", title=HOSTILE)
     table.add_row(HOSTILE)
     terminal.print(table)
-    terminal.say(f"[red]{HOSTILE}")
+    terminal.print_line(f"[red]{HOSTILE}")
     text = printed(terminal)
     assert text.count(r"\x1b]0;owned") == 3
     assert "[bold]" in text

@@ -61,7 +61,7 @@ class _Run:
         with_octomap = self.options.octomap and octomap_available()
         if self.options.octomap and not with_octomap:
             line = "OctoMap is left out: pip install 'taichi-mrf[bench]' brings it."
-            self.console.say(line)
+            self.console.print_line(line)
         rows: list[BenchRow] = []
         for config, advance in self.each_size():
             rows.append(bench_mapping(self.frames, config, with_octomap, advance))

@@ -119,7 +119,7 @@ def _host_table(row: Profile) -> Table:
 
 
 def growth_table(rows: Sequence[Growth], title: str) -> Table:
-    """One row for each voxel size and kind: straight lines, and what they say of a thousand keyframes."""
+    """One row for each voxel size and kind: fitted lines, and their values at a thousand keyframes."""
     table = Table(title=f"New keyframes beside old ones: {title}", title_justify="left")
     table.add_column("")
     table.add_column("old ones")

@@ -42,7 +42,7 @@ def run_laser(options: Laser) -> int:
     console = open_terminal(options.printing, stderr=options.json)
     with (
         output_folder(options.out),
-        stop_on_signals(lambda text: console.say(text, "yellow")) as request,
+        stop_on_signals(lambda text: console.print_line(text, "yellow")) as request,
     ):
         seconds: dict[str, float] = {}
         with _timed(seconds, "reading"):
@@ -76,11 +76,11 @@ def run_laser(options: Laser) -> int:
             f"{graph.grid.cell_size} m, {report['graph_memory_mb']:.0f} MB",
         )
         for note in report["notes"]:
-            console.say(f"Note: {note}")
+            console.print_line(f"Note: {note}")
         if interrupted:
-            console.say("Stopped before the end.", "yellow")
+            console.print_line("Stopped before the end.", "yellow")
         for path in [*written, options.out / REPORT_FILE]:
-            console.say(str(path))
+            console.print_line(str(path))
     return status
 
 

@@ -79,13 +79,13 @@ def run_many(options: Map) -> int:
     batch = _Batch(options, names, tasks)
     with (
         output_folder(options.out, locked=not single),  # the one task locks it itself
-        interrupt_on_signals(lambda text: console.say(text, "yellow")) as request,
+        interrupt_on_signals(lambda text: console.print_line(text, "yellow")) as request,
     ):
         _map_all(batch, console, request)
         if single and 0 in batch.outcomes:
-            _tell_single(batch, console)
+            _print_single(batch, console)
         elif not single:
-            _tell_all(batch, console, time.perf_counter() - start)
+            _print_all(batch, console, time.perf_counter() - start)
     if request():
         return exit_status(request)
     failed = [row for row in batch.rows() if row.status not in ("mapped", "finished before")]
@@ -111,10 +111,10 @@ def _map_all(batch: _Batch, console: Terminal, request: StopRequest) -> None:
 
         def done(number: int, outcome: Outcome) -> None:
             batch.outcomes[number] = outcome
-            if console.is_terminal:  # elsewhere the lines below say as much
+            if console.is_terminal:  # elsewhere the lines below show the same
                 bar.advance("Mapping", len(batch.outcomes), count)
             line = f"[{len(batch.outcomes)}/{count}] {summary_line(batch.row(number))}"
-            console.say(line)
+            console.print_line(line)
 
         if console.is_terminal:
             bar.advance("Mapping", 0, count)
@@ -155,14 +155,14 @@ def _waiting(batch: _Batch, done: Callable[[int, Outcome], None]) -> list[int]:
     return waiting
 
 
-def _tell_single(batch: _Batch, console: Terminal) -> None:
+def _print_single(batch: _Batch, console: Terminal) -> None:
     outcome, out = batch.outcomes[0], batch.options.out
     if outcome.report is not None:
         written = sorted(path for path in out.iterdir() if path.is_file() and not path.name.startswith("."))
         print_run(console, batch.options, outcome.report, written)
 
 
-def _tell_all(batch: _Batch, console: Terminal, seconds: float) -> None:
+def _print_all(batch: _Batch, console: Terminal, seconds: float) -> None:
     """Write and print the summary."""
     options, rows = batch.options, batch.rows()
     facts = {
@@ -183,9 +183,9 @@ def _tell_all(batch: _Batch, console: Terminal, seconds: float) -> None:
         return
     print_summary(console, rows)
     if any(row.status in ("stopped", "not done") for row in rows):
-        console.say("Stopped before the end; --resume continues from here.", "yellow")
+        console.print_line("Stopped before the end; --resume continues from here.", "yellow")
     for path in written:
-        console.say(str(path))
+        console.print_line(str(path))
 
 
 def _tiles(rows: Sequence[Row], folders: Sequence[Path]) -> list[Tile]:

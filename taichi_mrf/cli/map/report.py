@@ -17,13 +17,13 @@ def print_report(console: Terminal, report: dict[str, Any], written: list[Path])
         table.add_row(name, text)
     console.print(table)
     for note in report["notes"]:
-        console.say(f"Note: {note}")
+        console.print_line(f"Note: {note}")
     for problem in report["skipped_frames"].values():
-        console.say(f"Skipped: {problem}")
+        console.print_line(f"Skipped: {problem}")
     if report["interrupted"]:
-        console.say("Stopped before the end; --resume continues from here.", "yellow")
+        console.print_line("Stopped before the end; --resume continues from here.", "yellow")
     for path in written:
-        console.say(str(path))
+        console.print_line(str(path))
 
 
 def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:

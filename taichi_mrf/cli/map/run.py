@@ -15,7 +15,7 @@ from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
-from taichi_mrf.cli.shared.terminal import Terminal, tell_problem
+from taichi_mrf.cli.shared.terminal import Terminal, print_problem
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.mapping.intake import Added
@@ -43,25 +43,25 @@ def run_map(options: Map) -> int:
     task = map_task(options, options.sources[0], options.out)
     with (
         output_folder(task.out),
-        stop_on_signals(lambda text: console.say(text, "yellow")) as request,
+        stop_on_signals(lambda text: console.print_line(text, "yellow")) as request,
     ):
         finished = refuse_other_run(task)
         if finished is not None:
-            _tell_finished(console, options, finished)
+            _print_finished(console, options, finished)
             return 0
         with ProgressBar(console, options.printing) as progress:
             report, written = map_to_folder(task, progress, request)
         print_run(console, options, report, written)
     if report["did_not_fit"] is not None and request.signal is None:
         saved = f"the map of {report['keyframes']} keyframes was saved to {options.out}"
-        tell_problem(f"{report['did_not_fit']}; {saved}; --resume continues it")
+        print_problem(f"{report['did_not_fit']}; {saved}; --resume continues it")
     return exit_status(request, report["did_not_fit"])
 
 
-def _tell_finished(console: Terminal, options: Map, report: dict[str, Any]) -> None:
+def _print_finished(console: Terminal, options: Map, report: dict[str, Any]) -> None:
     if options.json:
         print(report_json(report), end="")
-    console.say(f"{options.out} holds this run already, finished; --overwrite maps it again.")
+    console.print_line(f"{options.out} holds this run already, finished; --overwrite maps it again.")
 
 
 def print_run(console: Terminal, options: Map, report: dict[str, Any], written: list[Path]) -> None:

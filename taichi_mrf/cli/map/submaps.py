@@ -43,7 +43,7 @@ def run_submaps(options: Map, submap_size: float) -> int:
     sequence = Sequence(source, options.reading.keywords(), options.every, options.limit)
     with (
         output_folder(options.out),
-        interrupt_on_signals(lambda text: console.say(text, "yellow")) as request,
+        interrupt_on_signals(lambda text: console.print_line(text, "yellow")) as request,
     ):
         if not options.resume:  # which takes its parameters from here
             _refuse_to_replace(options)
@@ -69,9 +69,9 @@ def run_submaps(options: Map, submap_size: float) -> int:
         except KeyboardInterrupt:
             if request.aborted or not request():
                 raise
-            console.say("Stopped before the end; --resume continues from here.", "yellow")
+            console.print_line("Stopped before the end; --resume continues from here.", "yellow")
             return exit_status(request)
-        _tell(console, options, result, _write(options, result))
+        _print_result(console, options, result, _write(options, result))
     return exit_status(request)
 
 
@@ -130,7 +130,7 @@ def submaps_report(result: SubmapsResult) -> dict[str, Any]:
     }
 
 
-def _tell(console: Terminal, options: Map, result: SubmapsResult, written: list[Path]) -> None:
+def _print_result(console: Terminal, options: Map, result: SubmapsResult, written: list[Path]) -> None:
     report = submaps_report(result)
     if options.json:
         print(report_json(report), end="")
@@ -153,8 +153,8 @@ def _tell(console: Terminal, options: Map, result: SubmapsResult, written: list[
     table.add_row("seconds", seconds)
     console.print(table)
     for problem in report["skipped_frames"].values():
-        console.say(f"Skipped: {problem}")
+        console.print_line(f"Skipped: {problem}")
     for path in written:
-        console.say(str(path))
-    console.say(f"taichi-mrf export {options.out / MAP_FOLDER} --to part.ply --lower X Y Z --upper X Y Z "
-        "exports a box of it.")  # fmt: skip
+        console.print_line(str(path))
+    box = "--lower X Y Z --upper X Y Z exports a box of it."
+    console.print_line(f"taichi-mrf export {options.out / MAP_FOLDER} --to part.ply {box}")

@@ -74,7 +74,7 @@ def summary_line(row: Row) -> str:
 
 
 def accuracy_text(row: Row) -> str:
-    """The median error, if held-out frames say it."""
+    """The median error on held-out frames, if there are any."""
     return "not checked" if row.median_abs is None else f"median error {100 * row.median_abs:.2f} cm"
 
 

@@ -1,4 +1,4 @@
-"""The flags of map and live that say how recorded poses are used."""
+"""Flags of map and live for the use of recorded poses."""
 
 from dataclasses import dataclass, replace
 from typing import Annotated
@@ -21,7 +21,7 @@ class PoseFlags:
     ignored except for the first. realsense:?poses=track does the same."""
 
     def parameters(self, settings: Config) -> Config:
-        """The parameters with what these flags say."""
+        """The parameters with these flags applied."""
         return (
             replace(settings, poses=replace(settings.poses, refine=True)) if self.refine_poses else settings
         )

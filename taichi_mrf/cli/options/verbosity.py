@@ -1,4 +1,4 @@
-"""The flags that say how much a command prints while it works."""
+"""Flags for how much a command prints while it works."""
 
 from dataclasses import dataclass
 from typing import Annotated

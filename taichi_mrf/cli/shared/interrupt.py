@@ -79,37 +79,37 @@ class StopRequest:
 
 
 @contextmanager
-def stop_on_signals(tell: Callable[[str], None], keeps: bool = True) -> Iterator[StopRequest]:
-    """While the block runs, SIGINT, SIGTERM and SIGHUP only set the yielded request and tell so; a second
-    SIGINT or SIGTERM raises KeyboardInterrupt. ``keeps`` says whether the run saves what is done."""
-    with _handled(tell, keeps, raise_at_once=False) as request:
+def stop_on_signals(announce: Callable[[str], None], keeps: bool = True) -> Iterator[StopRequest]:
+    """While the block runs, SIGINT, SIGTERM and SIGHUP only set the yielded request and announce it; a second
+    SIGINT or SIGTERM raises KeyboardInterrupt. ``keeps``: whether the run saves what is done."""
+    with _handled(announce, keeps, raise_at_once=False) as request:
         yield request
 
 
 @contextmanager
-def interrupt_on_signals(tell: Callable[[str], None]) -> Iterator[StopRequest]:
+def interrupt_on_signals(announce: Callable[[str], None]) -> Iterator[StopRequest]:
     """The same for work that other processes do: already the first signal raises KeyboardInterrupt, for the
     waiting to end."""
-    with _handled(tell, keeps=True, raise_at_once=True) as request:
+    with _handled(announce, keeps=True, raise_at_once=True) as request:
         yield request
 
 
 @contextmanager
-def _handled(tell: Callable[[str], None], keeps: bool, raise_at_once: bool) -> Iterator[StopRequest]:
+def _handled(announce: Callable[[str], None], keeps: bool, raise_at_once: bool) -> Iterator[StopRequest]:
     request = StopRequest()
-    fate = "What is done so far is saved." if keeps else "Nothing is saved: there is no --out."
-    telling: list[threading.Thread] = []
+    outcome = "What is done so far is saved." if keeps else "Nothing is saved: there is no --out."
+    announcing: list[threading.Thread] = []
 
-    def tell_fate() -> None:
+    def announce_outcome() -> None:
         with contextlib.suppress(OSError):  # the terminal may be gone
-            tell(f"Stopping. {fate} Press Ctrl-C again to abort.")
+            announce(f"Stopping. {outcome} Press Ctrl-C again to abort.")
 
     def handle(number: int, frame: FrameType | None) -> None:
         if not request.take(number):
             return
         # The signal may come while this thread prints, and a stream refuses a thread's write within a write.
-        telling.append(threading.Thread(target=tell_fate))
-        telling[-1].start()
+        announcing.append(threading.Thread(target=announce_outcome))
+        announcing[-1].start()
         if raise_at_once:
             raise KeyboardInterrupt
 
@@ -121,7 +121,7 @@ def _handled(tell: Callable[[str], None], keeps: bool, raise_at_once: bool) -> I
     finally:
         for number, handler in saved.items():
             signal.signal(number, handler)
-        for thread in telling:
+        for thread in announcing:
             thread.join()
 
 

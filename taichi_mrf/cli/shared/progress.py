@@ -47,7 +47,7 @@ class _LogLines(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print one record."""
-        self._terminal.say(record.getMessage())
+        self._terminal.print_line(record.getMessage())
 
 
 class ProgressBar:
@@ -95,7 +95,7 @@ class ProgressBar:
             self._last_line = now
             of = "" if total is None else f" of {total}"
             with contextlib.suppress(OSError):  # the reader of the lines is gone: the run continues
-                self._line_terminal.say(f"{stage} {done}{of}" + (f", {note}" if note else ""))
+                self._line_terminal.print_line(f"{stage} {done}{of}" + (f", {note}" if note else ""))
 
     def _rate(self, now: float) -> str:
         seconds = now - self._begin

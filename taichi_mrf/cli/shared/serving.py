@@ -11,14 +11,14 @@ LOOPBACK = ("127.0.0.1", "::1", "localhost")
 NICENESS = 10
 """How much lower the priority of mapping is than that of the page."""
 
-Say = Callable[[str], None]
+PrintLine = Callable[[str], None]
 
 
-def warn_of_host(host: str, port: int, what_they_can: str, say: Say) -> None:
+def warn_of_host(host: str, port: int, what_they_can: str, print_line: PrintLine) -> None:
     """Warn if ``host`` serves the page to other machines."""
     if host in LOOPBACK:
         return
-    say(
+    print_line(
         f"Warning: the page at --host {host} has no password: whoever can reach this machine can "
         f"{what_they_can}. It is safer to omit --host and to tunnel from where you watch: "
         f"ssh -L {port}:127.0.0.1:{port} USER@THIS-MACHINE"
@@ -32,13 +32,15 @@ def let_the_page_go_first() -> None:
         os.nice(NICENESS)
 
 
-def tell_address(where: Listening, what: str, wanted_port: int, open_browser: bool, say: Say) -> None:
+def print_address(
+    where: Listening, what: str, wanted_port: int, open_browser: bool, print_line: PrintLine
+) -> None:
     """Print the page's address, and before it that another port was taken than the requested one (0: any);
     open a browser if asked."""
     host = f"[{where.host}]" if ":" in where.host else where.host
     address = f"http://{host}:{where.port}"
     if wanted_port not in (0, where.port):
-        say(f"Port {wanted_port} is busy, so the page took {where.port}.")
-    say(f"{what} is at {address}  (Ctrl-C ends it)")
+        print_line(f"Port {wanted_port} is busy, so the page took {where.port}.")
+    print_line(f"{what} is at {address}  (Ctrl-C ends it)")
     if open_browser:
         webbrowser.open(address)

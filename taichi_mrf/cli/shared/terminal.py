@@ -34,12 +34,12 @@ class Terminal(Console):
         """What every string becomes that is printed or stands in a table."""
         return super().render_str(printable(text), **options)
 
-    def say(self, text: str, style: str | None = None) -> None:
+    def print_line(self, text: str, style: str | None = None) -> None:
         """Print a line without breaking it."""
         self.print(text, style=style, soft_wrap=True)
 
 
-def tell_problem(text: str) -> None:
+def print_problem(text: str) -> None:
     """Print one line on stderr that says what is wrong."""
     print(f"{PROGRAM}: {printable(text).translate(_ONE_LINE)}", file=sys.stderr)
 
