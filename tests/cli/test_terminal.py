@@ -93,7 +93,7 @@ def test_a_reader_that_has_gone_does_not_end_the_run(monkeypatch: pytest.MonkeyP
     def broken(self: Terminal, text: str) -> None:
         raise BrokenPipeError
 
-    monkeypatch.setattr(Terminal, "say", broken)
+    monkeypatch.setattr(Terminal, "print_line", broken)
     with ProgressBar(terminal, Verbosity(verbose=True)) as bar:
         bar.advance("Adding", 1, 2)
 
