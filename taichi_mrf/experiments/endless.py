@@ -21,7 +21,7 @@ from taichi_mrf.experiments.exact import room_scene
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene
-from taichi_mrf.mapping.freezing import surplus
+from taichi_mrf.mapping.selection import surplus
 from taichi_mrf.system.atomic import atomic_path
 
 if TYPE_CHECKING:

@@ -18,9 +18,9 @@ from taichi_mrf.live.live_keyframes import LiveKeyframe, LiveKeyframes
 from taichi_mrf.live.pictures import thumbnail
 from taichi_mrf.live.publish import Publisher
 from taichi_mrf.live.ray_answers import PosedDepthImage
-from taichi_mrf.mapping.freezing import surplus
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.refinement import PoseRefiner
+from taichi_mrf.mapping.selection import surplus
 from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.methods.capabilities import can_freeze, has_messages
 from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap

@@ -12,6 +12,7 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import CapacityError, DatasetError, FrameError
 from taichi_mrf.inference.keyframe import checked_depth
+from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.mapping.intake import (
     HELD_OUT,
     Added,
@@ -23,7 +24,7 @@ from taichi_mrf.mapping.intake import (
     hold_out_of,
 )
 from taichi_mrf.mapping.result import MappingResult
-from taichi_mrf.mapping.rounds import AlignmentRounds, PlainMover
+from taichi_mrf.mapping.rounds import AlignmentRounds, PlainMover, RoundStep
 from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
@@ -40,29 +41,9 @@ class FrameOffered:
     answer: Answer
 
 
-@dataclass(frozen=True)
-class KeyframeSwept:
-    """The messages of one more keyframe were renewed: the ``number``-th (from 1) of ``keyframes``."""
+Event = FrameOffered | RoundStep | InferProgress
+"""A frame was offered, one more keyframe was moved by a round of alignment, or one more was swept."""
 
-    sweep: int
-    sweeps: int
-    number: int
-    keyframes: int
-    rays: int
-
-
-@dataclass(frozen=True)
-class KeyframeRefined:
-    """One more keyframe was aligned with all others, or left alone: the ``number``-th (from 1) of
-    ``keyframes``."""
-
-    round: int
-    rounds: int
-    number: int
-    keyframes: int
-
-
-Event = FrameOffered | KeyframeSwept | KeyframeRefined
 Listener = Callable[[Event], None]
 
 
@@ -170,9 +151,7 @@ class _BatchRun:
                         for step in rounds:
                             if step.moved and (step.round, step.moved) != told:
                                 told = step.round, step.moved
-                                self.listener(
-                                    KeyframeRefined(step.round, step.rounds, step.moved, step.keyframes)
-                                )
+                                self.listener(step)
                             if self._is_stopped():
                                 rounds.stop()
                 except CapacityError as error:
@@ -189,9 +168,7 @@ class _BatchRun:
         try:
             with self.result.timed("inferring"), FullInference(self.intake.map, sweeps) as inference:
                 for step in inference:
-                    self.listener(
-                        KeyframeSwept(step.sweep, step.sweeps, step.keyframe, step.keyframes, step.rays)
-                    )
+                    self.listener(step)
                     if self._is_stopped():
                         inference.stop(at_once=self.out_of_time())
         except CapacityError as error:

@@ -1,8 +1,11 @@
 """Which frames become keyframes: not the held-out ones, and only those taken far enough from other keyframes
-(MRFMap, section V)."""
+(MRFMap, section V). And which keyframes to freeze when there are too many."""
+
+import numpy as np
 
 from taichi_mrf.config.schema import KeyframeConfig
 from taichi_mrf.geometry.poses import Pose, tangent_norms
+from taichi_mrf.methods.capabilities import FreezingMap
 
 
 def is_held_out(number: int, hold_out: int) -> bool:
@@ -46,3 +49,17 @@ class KeyframeSelector:
         turned = self._config.rotation > 0 and rotation > self._config.rotation
         moved = self._config.translation > 0 and translation > self._config.translation
         return turned or moved
+
+
+def surplus(m: FreezingMap, newest: int, keep: int) -> list[int]:
+    """The keyframes (ids) beyond ``keep`` to freeze, so that an endless run is bounded in time and memory.
+
+    Those that share the smallest part of what they see with keyframe ``newest`` come first, because they
+    will not change soon; of equal ones the oldest. Never ``newest``.
+    """
+    others = [k for id, k in m.keyframes.items() if id != newest and k.messages is not None]
+    number = max(0, len(m.keyframes) - max(1, keep))
+    in_view = np.zeros(m.view.pool.capacity, bool)
+    in_view[m.keyframes[newest].visible.slots] = True
+    shared = {k.id: float(in_view[k.visible.slots].mean()) if len(k.visible.slots) else 0.0 for k in others}
+    return sorted(shared, key=lambda id: (shared[id], id))[:number]

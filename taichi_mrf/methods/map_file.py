@@ -37,13 +37,26 @@ _CAMERA_VALUES = 6
 
 @dataclass(frozen=True)
 class StoredKeyframe:
-    """A keyframe's id, name, depth image ((H, W) axial depth in metres), pose and camera."""
+    """A keyframe in host memory, as it is saved; recursive maps hold their keyframes in this form.
+
+    ``depth_m`` is (H, W) float32 axial depth in metres, 0 where there is no measurement.
+    """
 
     id: int
     name: str
     depth_m: NDArray[np.float32]
     T_world_camera: Pose
     camera: Camera
+
+    @property
+    def rays(self) -> int:
+        """Number of pixels that hold a measurement."""
+        return int((self.depth_m > 0).sum())
+
+    @property
+    def image_bytes(self) -> int:
+        """Bytes of the depth image."""
+        return self.depth_m.nbytes
 
 
 @dataclass(frozen=True)

@@ -47,30 +47,6 @@ MapT = TypeVar("MapT", bound="RecursiveMap[Any]")
 
 
 @dataclass(frozen=True)
-class ScanRecord:
-    """A scan in host memory: what is needed to integrate it again.
-
-    ``depth_m`` is (H, W) float32 axial depth in metres, 0 where there is no measurement.
-    """
-
-    id: int
-    name: str
-    depth_m: NDArray[np.float32]
-    T_world_camera: Pose
-    camera: Camera
-
-    @property
-    def rays(self) -> int:
-        """Number of pixels that hold a measurement."""
-        return int((self.depth_m > 0).sum())
-
-    @property
-    def image_bytes(self) -> int:
-        """Bytes of the depth image."""
-        return self.depth_m.nbytes
-
-
-@dataclass(frozen=True)
 class Scan(Generic[FootprintT]):
     """A scan on the device, ready to be integrated.
 
@@ -111,7 +87,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         occlusion = Occlusion(unknown=UNKNOWN_LOG_ODDS, empty_below=0.0)
         # Every brick that a ray crosses is allocated, so no observed place is without one.
         self._make_bricks(config, noise, UNKNOWN_LOG_ODDS, UNKNOWN_LOG_ODDS, any_evidence_counts, occlusion)
-        self._keyframes: dict[int, ScanRecord] = {}
+        self._keyframes: dict[int, StoredKeyframe] = {}
         self._next_id = 0
         self._stale = False
 
@@ -130,7 +106,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         """Bytes of the memory that integration needs besides the voxels."""
 
     @property
-    def keyframes(self) -> Mapping[int, ScanRecord]:
+    def keyframes(self) -> Mapping[int, StoredKeyframe]:
         """The keyframes by id, in the order in which they were added."""
         return MappingProxyType(self._keyframes)
 
@@ -162,7 +138,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         depth = checked_depth(depth_m, camera, self.sensor.min_depth)
         if not self._keyframes:
             warn_of_bad_sigma(self.noise.table(camera), self.sensor.min_depth, self.sensor.max_depth)
-        record = ScanRecord(self._next_id, name or f"keyframe {self._next_id}", depth, T, camera)
+        record = StoredKeyframe(self._next_id, name or f"keyframe {self._next_id}", depth, T, camera)
         if not self._stale:
             self._add(record)
         self._keyframes[record.id] = record
@@ -249,10 +225,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
     def save(self, path: str | Path) -> None:
         """Write the map to one .npz file, under a temporary name first. Raises MapFileError."""
         slots = self._pool.in_order
-        keyframes = [
-            StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera)
-            for k in self._keyframes.values()
-        ]
+        keyframes = list(self._keyframes.values())
         header = MapHeader(self.config, self.noise, keyframes, self._next_id, self.settled, self.up)
         belief = self._pool.read("belief", slots)
         write_recursive(Path(path), RecursiveContents(header, self._pool.bricks[slots], belief, self._stale))
@@ -269,16 +242,16 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
             if len(bricks):
                 m._pool.write("belief", m._registry.restore(bricks, 1), contents.belief)
         for k in header.keyframes:
-            m._keyframes[k.id] = ScanRecord(k.id, k.name, k.depth_m, k.T_world_camera, k.camera)
+            m._keyframes[k.id] = k
         m._next_id, m._stale, m._up = header.next_id, contents.stale, header.up
         return m
 
-    def _find(self, id: int) -> ScanRecord:
+    def _find(self, id: int) -> StoredKeyframe:
         if id not in self._keyframes:
             raise KeyframeError(f"there is no keyframe {id}")
         return self._keyframes[id]
 
-    def _add(self, record: ScanRecord) -> None:
+    def _add(self, record: StoredKeyframe) -> None:
         """Allocate the bricks that a scan's rays cross and integrate it. An error leaves the map
         unchanged."""
         image = DepthImage.upload(record.depth_m, record.camera, self.noise)

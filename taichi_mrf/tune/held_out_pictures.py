@@ -1,5 +1,5 @@
-"""Pictures of where a map is right in the held-out views, kept for every try, so that any two can be
-compared."""
+"""What the page shows of the held-out views: pictures of where a map is right, kept for every try, so that
+any two can be compared, and how measurements scatter around the expected depth."""
 
 from collections.abc import Sequence
 
@@ -11,13 +11,20 @@ from taichi_mrf.evaluation.accuracy import RIGHT, JudgedView
 from taichi_mrf.live.pictures import ACCURACY_COLORS, IMAGE_WIDTH, depth_colors
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.tune.history import History
-from taichi_mrf.viewer.tune.messages import HeldOutView
+from taichi_mrf.viewer.tune.messages import HeldOutView, Residuals
 
 BETTER, WORSE, SAME = (0, 114, 178), (213, 94, 0), (225, 225, 225)
 """Colours of a pixel that is right only now, that was right only before, and of any other."""
 
 _MOST_TRIES = 500
 """The pictures of this many tries are kept, besides those of the pinned one."""
+
+MOST_POINTS = 1500
+BINS = 12
+FEWEST_IN_A_BIN = 20
+
+FURTHEST_SPREADS = 8.0
+"""Residuals larger than this many times the middle bin's spread are outliers, and not drawn."""
 
 
 class HeldOutPictures:
@@ -59,6 +66,40 @@ class HeldOutPictures:
             change=None if change is None else change.astype(np.uint8),
             change_title=change_title,
         )
+
+
+def residuals_of(number: int, views: Sequence[JudgedView]) -> Residuals:
+    """Measured minus expected depth at the measured pixels of some views for which the map predicts a depth.
+
+    The map was made of other measurements of the same sensor, so a constant bias that the noise model lacks
+    is in both and cancels; one that grows with depth shows where the views are further away.
+    """
+    depth, residual = np.zeros(0, np.float32), np.zeros(0, np.float32)
+    for view in views:
+        there = view.measured & view.answered & (view.survey.expected > 0)
+        depth = np.concatenate([depth, view.survey.expected[there]])
+        residual = np.concatenate([residual, (view.measured_m - view.survey.expected)[there]])
+    order = np.argsort(depth, kind="stable")
+    depth, residual = depth[order], residual[order]
+    # Bins of the same number of pixels, so that each one's spread is known about equally well.
+    bins = [b for b in np.array_split(np.arange(len(depth)), BINS) if len(b) >= FEWEST_IN_A_BIN]
+    low, middle, high = (
+        np.array([np.quantile(residual[each], q) for each in bins]) for q in (0.16, 0.5, 0.84)
+    )
+    bin_m = np.array([np.median(depth[each]) for each in bins])
+    if bins:
+        limit = FURTHEST_SPREADS * max(float(np.median(high - low)) / 2, 1e-4)
+        near = np.abs(residual - np.median(residual)) <= limit
+        depth, residual = depth[near], residual[near]
+    some = slice(None, None, -(-len(depth) // MOST_POINTS) or 1)
+    return Residuals(
+        number=number,
+        depth_m=depth[some].copy(),
+        residual_m=residual[some].copy(),
+        bin_m=bin_m,
+        median_m=middle,
+        spread_m=(high - low) / 2,
+    )
 
 
 def _packed(view: JudgedView, pixel_stride: int) -> tuple[bytes, float, float]:

@@ -18,10 +18,9 @@ from taichi_mrf.live.link import Link
 from taichi_mrf.live.session_core import WAIT_SECONDS, SessionCore
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import write_text
-from taichi_mrf.tune.held_out_pictures import HeldOutPictures
+from taichi_mrf.tune.held_out_pictures import HeldOutPictures, residuals_of
 from taichi_mrf.tune.history import Attempt, History
 from taichi_mrf.tune.map_publisher import MapPublisher
-from taichi_mrf.tune.residuals import residuals_of
 from taichi_mrf.tune.search import Search
 from taichi_mrf.tune.trial import Trial, run_trial
 from taichi_mrf.tune.verdict import Judged, contenders, judge_unseen

@@ -20,9 +20,10 @@ from taichi_mrf.experiments.poses import DISTURBED_M, DISTURBED_RAD, halved, run
 from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.inference.keyframe import DepthImage
-from taichi_mrf.inference.schedule import driven
+from taichi_mrf.inference.schedule import InferProgress, driven
 from taichi_mrf.mapping.intake import Added
-from taichi_mrf.mapping.pipeline import Event, FrameOffered, KeyframeRefined, KeyframeSwept, map_sequence
+from taichi_mrf.mapping.pipeline import Event, FrameOffered, map_sequence
+from taichi_mrf.mapping.rounds import RoundStep
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
@@ -122,8 +123,8 @@ def test_the_pipeline_corrects_poses_and_tells_both() -> None:
     assert (errors(refined) < 0.5 * errors(wrong)).all()
     assert "refining" in result.seconds
     kinds = [type(event) for event in events]
-    assert kinds.index(FrameOffered) < kinds.index(KeyframeRefined) < kinds.index(KeyframeSwept)
-    asked = [(e.round, e.rounds, e.number, e.keyframes) for e in events if isinstance(e, KeyframeRefined)]
+    assert kinds.index(FrameOffered) < kinds.index(RoundStep) < kinds.index(InferProgress)
+    asked = [(e.round, e.rounds, e.moved, e.keyframes) for e in events if isinstance(e, RoundStep)]
     assert asked == [(1, 1, number, COUNT) for number in range(1, COUNT + 1)]
     # The map is that of the refined poses, whatever was done on the way.
     again = MRFMap.from_config(result.map.config, result.map.keyframes[0].camera)
@@ -156,7 +157,7 @@ def test_a_stop_in_the_rounds_undoes_the_round() -> None:
     told: list[Event] = []
 
     def stop() -> bool:
-        return any(isinstance(event, KeyframeRefined) and event.number == 3 for event in told)
+        return any(isinstance(event, RoundStep) and event.moved == 3 for event in told)
 
     stopped = map_sequence(WrongPoses(wrong), REFINE, told.append, should_stop=stop)
     assert stopped.interrupted

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import small_room
 
-from taichi_mrf.mapping.freezing import surplus
+from taichi_mrf.mapping.selection import surplus
 from taichi_mrf.methods.mrf.map import MRFMap
 
 pytestmark = pytest.mark.usefixtures("one_backend")

@@ -9,11 +9,11 @@ from sliding_camera import ALL_FRAMES, CAMERA, WALL_M, SlidingCamera, StopAfter,
 from taichi_mrf.config.schema import EvaluationConfig, KeyframeConfig
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.evaluation.held_out import check_held_out
+from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.mapping.intake import Added, Passed, Skipped
 from taichi_mrf.mapping.pipeline import (
     Event,
     FrameOffered,
-    KeyframeSwept,
     map_sequence,
 )
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -77,7 +77,7 @@ def test_listeners_hear_every_frame_and_every_swept_keyframe() -> None:
     added = [event.answer for event in frames if isinstance(event.answer, Added)]
     assert [answer.keyframe for answer in added] == list(result.map.keyframes)
     assert all(answer.rays == CAMERA.width * CAMERA.height for answer in added)
-    swept = [(e.sweep, e.number, e.keyframes) for e in events if isinstance(e, KeyframeSwept)]
+    swept = [(e.sweep, e.keyframe, e.keyframes) for e in events if isinstance(e, InferProgress)]
     assert swept == [(sweep, number, 2) for sweep in (1, 2, 3) for number in (1, 2)]
 
 
@@ -113,7 +113,7 @@ def test_a_stop_while_adding_leaves_a_usable_map() -> None:
 
 def test_a_stop_in_the_first_sweep_still_hears_every_keyframe() -> None:
     events: list[Event] = []
-    stop = StopAfter(KeyframeSwept, 1)
+    stop = StopAfter(InferProgress, 1)
 
     def listen(event: Event) -> None:
         events.append(event)
@@ -121,13 +121,13 @@ def test_a_stop_in_the_first_sweep_still_hears_every_keyframe() -> None:
 
     result = map_sequence(sequence(), ALL_FRAMES, listen, should_stop=stop)
     assert result.interrupted
-    assert [(e.sweep, e.number) for e in events if isinstance(e, KeyframeSwept)] == [
+    assert [(e.sweep, e.keyframe) for e in events if isinstance(e, InferProgress)] == [
         (1, number) for number in range(1, 7)
     ]
 
 
 def test_a_stop_in_a_later_sweep_ends_at_the_next_keyframe() -> None:
-    stop = StopAfter(KeyframeSwept, 8)
+    stop = StopAfter(InferProgress, 8)
     result = map_sequence(sequence(), ALL_FRAMES, stop.listen, should_stop=stop)
     assert result.interrupted
     assert stop.left == 0

@@ -15,7 +15,7 @@ from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.tune.depth_intervals import interval_error, probability_below
-from taichi_mrf.tune.residuals import residuals_of
+from taichi_mrf.tune.held_out_pictures import residuals_of
 from taichi_mrf.tune.trial import run_trial
 from taichi_mrf.tune.working_set import coarse_stride, read_working_set, thinned
 from taichi_mrf.viewer.tune.messages import FrameChoice

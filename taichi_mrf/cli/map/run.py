@@ -19,14 +19,8 @@ from taichi_mrf.cli.shared.terminal import Terminal, print_problem
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.mapping.intake import Added
-from taichi_mrf.mapping.pipeline import (
-    Event,
-    FrameOffered,
-    KeyframeRefined,
-    KeyframeSwept,
-    Listener,
-    map_sequence,
-)
+from taichi_mrf.mapping.pipeline import Event, FrameOffered, Listener, map_sequence
+from taichi_mrf.mapping.rounds import RoundStep
 from taichi_mrf.runs.files import MAP_FILE
 from taichi_mrf.runs.folder import RunFacts, write_run
 from taichi_mrf.runs.report import report_json
@@ -118,12 +112,12 @@ def listener_of(progress: ProgressBar) -> Listener:
     def listen(event: Event) -> None:
         if isinstance(event, FrameOffered):
             progress.advance("Adding", event.number, event.frames, int(isinstance(event.answer, Added)))
-        elif isinstance(event, KeyframeSwept):
-            done = (event.sweep - 1) * event.keyframes + event.number
-            progress.advance("Inferring", done, event.sweeps * event.keyframes, 1)
-        elif isinstance(event, KeyframeRefined):
-            done = (event.round - 1) * event.keyframes + event.number
+        elif isinstance(event, RoundStep):
+            done = (event.round - 1) * event.keyframes + event.moved
             progress.advance("Aligning", done, event.rounds * event.keyframes, 1)
+        else:
+            done = (event.sweep - 1) * event.keyframes + event.keyframe
+            progress.advance("Inferring", done, event.sweeps * event.keyframes, 1)
 
     return listen
 

@@ -20,8 +20,7 @@ class Export:
     """
 
     map: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MAP")]
-    """A saved map, such as the map.npz of a run, or a map in chunks, such as the map.zarr of a run with
-    --submap-size."""
+    """A saved map: the map.npz of a run, or a map in chunks, such as the map.zarr of a run in submaps."""
 
     to: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE [FILE ...]")]
     """The files to write."""
