@@ -57,7 +57,7 @@ def _print(report: dict[str, Any]) -> None:
     console = Terminal()
     table = Table("voxels", *(f"{state} in B" for state in STATES), title_justify="left")
     for before, row in report["voxels"].items():
-        # Nobody can count what neither map knows.
+        # Voxels that are unknown in both maps cannot be counted.
         cells = ["" if before == after == STATES[0] else f"{count:,}" for after, count in row.items()]
         table.add_row(f"{before} in A", *cells)
     lines = [

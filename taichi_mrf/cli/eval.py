@@ -63,7 +63,7 @@ def run_eval(options: Eval) -> int:
 
 
 class _StoppedError(Exception):
-    """The user wants the run to end; what was found is kept."""
+    """The user has stopped the run; the results so far are kept."""
 
 
 def _run(laboratory: Any, name: str, options: Eval, console: Terminal, should_stop: StopRequest) -> Any:

@@ -25,7 +25,7 @@ def run_export(options: Export) -> int:
     """Carry out the command; returns the exit status. Raises TaichiMRFError.
 
     All names are checked before the map is read. Files are made beside their places and moved there when all
-    are done: if one cannot be made, none is written.
+    are complete: if one fails, none is written.
     """
     _check_names(options)
     runtime.init(options.arch)
@@ -98,7 +98,7 @@ def _opened(options: Export) -> ExportedMap:
     if options.map.suffix == SUFFIX:
         return take_part(ChunkedMap.open(options.map), options.lower, options.upper)
     if options.lower is not None or options.upper is not None:
-        raise ConfigError(f"--lower and --upper need a map in chunks (.zarr); {options.map} is none")
+        raise ConfigError(f"--lower and --upper need a map in chunks (.zarr); {options.map} is not one")
     return load_map(options.map)
 
 

@@ -26,7 +26,7 @@ Facts = dict[str, Any]
 def is_map(source: str) -> bool:
     """Whether the name is that of a saved map: the file of a run, a map in chunks, a file of OctoMap's.
 
-    An .npz of other arrays, such as laser scans, is none.
+    An .npz of other arrays, such as laser scans, is not a map.
     """
     path = Path(source)
     suffix = path.suffix.lower()

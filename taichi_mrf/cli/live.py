@@ -61,6 +61,7 @@ def run_live(options: Live) -> int:
         session = Session(source, page.link, policy, page.listening)
         with bar:
             problem = _run(session.run, session.reconnect, page, request)
+        page.link.ask_to_end()  # the page ends while the files are written
         if options.out is not None:
             state = session.state
             result = state.result()
@@ -83,8 +84,8 @@ def run_live(options: Live) -> int:
     return 0
 
 
-class _ToldLink(ViewerLink):
-    """A link that shows on the terminal, too, how the work stands."""
+class _ProgressLink(ViewerLink):
+    """A link that also shows the progress on the terminal."""
 
     def __init__(self, host: str, port: int, bar: ProgressBar) -> None:
         super().__init__(host, port)
@@ -111,7 +112,7 @@ class _Page:
     def start(self) -> None:
         """Start a viewer; it is closed with the stack."""
         self.has_listened, self.started = False, time.monotonic()
-        self.link = self._stack.enter_context(_ToldLink(self._options.host, self._wanted_port, self._bar))
+        self.link = self._stack.enter_context(_ProgressLink(self._options.host, self._wanted_port, self._bar))
 
     def listening(self, where: Listening) -> None:
         """Tell the user where the page is."""

@@ -56,7 +56,7 @@ class BaselineOverlay:
             return True
         for entry in mapper.roster.with_state("on"):
             if entry.id not in self._places:
-                depth_m = mapper.seer(entry).depth_m
+                depth_m = mapper.posed_image(entry).depth_m
                 here = self.map.add_keyframe(depth_m, entry.T_world_camera, entry.camera, entry.name)
                 self._places[entry.id] = here, entry.T_world_camera
                 return True

@@ -27,7 +27,7 @@ from taichi_mrf.viewer.scene.options import ViewOptions
 from taichi_mrf.viewer.transport.server import start_server
 
 _QUIET_S = 0.3
-"""A client that has received nothing for so long has received everything."""
+"""A client that has received nothing for this many seconds has received everything."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
-"""What is shown beside the map on request: images of a view, and the same keyframes mapped by OctoMap's
-method."""
+"""What the page shows beside the map on request: images of a view, and the same keyframes mapped by
+OctoMap's method."""
 
 import dataclasses
 import time
@@ -13,7 +13,7 @@ from taichi_mrf.viewer.messages import Notice, Watch
 NOTHING = Watch(images=False, view=None, baseline=False)
 
 IMAGE_SECONDS = 1.0
-"""Images are made at most so often."""
+"""Shortest time between two sets of images, in seconds."""
 
 
 class Extras:
@@ -27,16 +27,16 @@ class Extras:
         self._images_made = float("-inf")
 
     def watch(self, wanted: Watch) -> None:
-        """Note what is wanted; the work is done later."""
+        """Set what the page shows; the work is done later."""
         if wanted != self._watch:
             self._watch, self._shown_version = wanted, -1
 
     def nothing_wanted(self) -> None:
-        """Start without extras: the viewer is a new one."""
+        """Show no extras: a new viewer starts without them."""
         self._watch, self._baseline = NOTHING, None
 
     def start_over(self) -> None:
-        """Start over with a new map; what is wanted stays the same."""
+        """Start over with a new map; the page shows the same extras."""
         self._baseline, self._shown_version = None, -1
 
     def work(self, progress: Progress) -> bool:
@@ -55,13 +55,13 @@ class Extras:
             return False
         try:
             return self._catch_up(progress)
-        except Exception as error:  # the map itself goes on without the baseline
+        except Exception as error:  # mapping continues without the baseline
             self._run.send(Notice(f"baseline: {error}", "error"))
             self._watch = dataclasses.replace(self._watch, baseline=False)
             return True
 
     def answer(self) -> None:
-        """During inference: images of another view that is wanted, from the map before it."""
+        """During inference: make images of a newly chosen view, from the map before inference."""
         self._make_images()
 
     def _catch_up(self, progress: Progress) -> bool:

@@ -1,7 +1,7 @@
 """The connection to the viewer, a separate process that shows the page.
 
 The viewer is spawned, never forked: a fork of a process in which Taichi runs hangs. Sending never waits: one
-thread writes to the pipe whatever lies in the outbox. Requests are read between two pieces of mapping.
+thread writes the outbox to the pipe. Requests are read between two pieces of mapping.
 """
 
 import multiprocessing
@@ -22,9 +22,8 @@ GOODBYE_SECONDS = 0.5
 FORCE_SECONDS = 0.1
 """How long it may take after each signal."""
 
-
 MOST_REQUESTS = 1000
-"""Requests that are read at once, at most: browsers that send without end cannot keep the session reading."""
+"""Most requests that are read at once, so that a flood of them cannot keep the session from working."""
 
 Serve = Callable[[Connection, str, int], None]
 """The main function of a viewer's process: its end of the connection, host and port."""
@@ -69,7 +68,7 @@ class ViewerLink:
         theirs.close()  # so that the connection ends with their process
         self._outbox = Outbox() if outbox is None else outbox
         self._lost: str | None = None
-        self._heard: list[Request] = []
+        self._received: list[Request] = []
         self._sender = threading.Thread(target=self._send_all, name="viewer outbox", daemon=True)
         self._sender.start()
 
@@ -77,7 +76,7 @@ class ViewerLink:
     def lost(self) -> str | None:
         """Reason the viewer disconnected; None while connected."""
         if self._lost is None and not self._process.is_alive():
-            self._hear()  # its last message may give the reason
+            self._read()  # its last message may give the reason
             self._lost = (
                 self._lost or f"the viewer's process has ended (exit status {self._process.exitcode})"
             )
@@ -89,9 +88,9 @@ class ViewerLink:
 
     def requests(self) -> list[Request]:
         """The requests that have come since the last call."""
-        self._hear()
-        heard, self._heard = self._heard, []
-        return heard
+        self._read()
+        received, self._received = self._received, []
+        return received
 
     def wait(self, timeout: float) -> None:
         """Wait until the viewer sends something or ends, at most ``timeout`` seconds."""
@@ -100,9 +99,13 @@ class ViewerLink:
         else:
             time.sleep(timeout)
 
+    def ask_to_end(self) -> None:
+        """Ask the viewer to end, without waiting for it; :meth:`close` waits."""
+        self._outbox.close()
+
     def close(self) -> None:
         """End the viewer: ask it to, then terminate it, then kill it."""
-        self._outbox.close()
+        self.ask_to_end()
         self._process.join(GOODBYE_SECONDS)
         for end in (self._process.terminate, self._process.kill):
             if self._process.is_alive():
@@ -117,7 +120,7 @@ class ViewerLink:
     def __exit__(self, *exception: object) -> None:
         self.close()
 
-    def _hear(self) -> None:
+    def _read(self) -> None:
         """Read what has come from the viewer. Where the connection ends, so does the process; if it does
         not, that is noted here."""
         try:
@@ -128,18 +131,18 @@ class ViewerLink:
                 if isinstance(request, Notice):  # there is no page, and this is why
                     self._lost = request.text
                 else:
-                    self._heard.append(request)
+                    self._received.append(request)
         except (EOFError, OSError):
             self._process.join(GOODBYE_SECONDS)
             if self._process.is_alive():
-                self._lost = self._lost or "the viewer has closed the line"
+                self._lost = self._lost or "the viewer has closed the connection"
 
     def _send_all(self) -> None:
         try:
             while not isinstance(update := self._outbox.take(), Quit):
                 self._connection.send(update)
             self._connection.send(update)
-        except (OSError, ValueError):  # the viewer is gone, or the line is closed
+        except (OSError, ValueError):  # the viewer has ended, or the connection is closed
             self._outbox.close()
 
 

@@ -1,8 +1,8 @@
 """The map of a live run with its keyframes: adding, editing, and settling the map by full inference.
 
 While frames come, each new keyframe is swept once, and then those whose cavity it has changed. That is
-quick, but the map depends on the order of events. Settling runs full inference, after which the map is a
-function of its keyframes, bit for bit, whatever has happened to them.
+quick, but the map depends on the order of events. Settling runs full inference, after which the map depends
+only on its keyframes and their poses, bit for bit.
 """
 
 from collections.abc import Iterator
@@ -28,8 +28,7 @@ from taichi_mrf.viewer import messages
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 
 RENEW_SECONDS = 0.1
-"""Longest time for which keyframes are swept again at a stretch, in seconds, before frames and requests are
-looked at."""
+"""Seconds for which keyframes are swept again, at most, before frames and requests are handled."""
 
 FORGOTTEN = np.full((1, 1, 3), 90, np.uint8)
 """The picture of a keyframe whose depth image is no longer in memory."""
@@ -40,7 +39,7 @@ class Mapper:
 
     ``unsettled``: keyframes were added, removed or moved since the last full inference; ``edited``: some of
     them by a user; ``unaligned``: keyframes were added since all were aligned with each other, if poses are
-    refined; ``unanswered``: the cavity of some keyframes may have changed since their last sweep.
+    refined; ``cavities_changed``: the cavity of some keyframes may have changed since their last sweep.
     ``saved_unsettled``: the map comes from a file that was saved before its inference was complete.
     """
 
@@ -60,7 +59,7 @@ class Mapper:
         self.unsettled, self.edited = self.lacks_messages or self.stale, False
         self.saved_unsettled = bool(m.keyframes) and not m.settled
         self.unaligned = False
-        self.unanswered = False
+        self.cavities_changed = False
 
     @property
     def min_evidence(self) -> float:
@@ -74,7 +73,7 @@ class Mapper:
 
     def enter(self, added: Added) -> LiveKeyframe:
         """Note a keyframe that the intake has added to the map."""
-        self.unsettled = self.unanswered = True
+        self.unsettled = self.cavities_changed = True
         self.unaligned = self.refiner is not None
         frame = added.frame
         entry = self.roster.add(frame, added.rays, thumbnail(frame.depth_m), added.keyframe)
@@ -105,7 +104,7 @@ class Mapper:
             depth_m = self._keyframe(entry).depth_m
             self.map.remove_keyframe(self._map_id(entry))
             entry.map_id, entry.depth_m, entry.state = None, depth_m, "off"
-        self.unsettled = self.edited = self.unanswered = True
+        self.unsettled = self.edited = self.cavities_changed = True
         return entry
 
     def move(self, id: int, T_world_camera: Pose) -> LiveKeyframe:
@@ -114,7 +113,7 @@ class Mapper:
         if entry.state == "on":
             self.map.move_keyframe(self._map_id(entry), T)
             self.sweep(self._map_id(entry))
-            self.unsettled = self.edited = self.unanswered = True
+            self.unsettled = self.edited = self.cavities_changed = True
         entry.T_world_camera, entry.moved_by_hand = T, True
         return entry
 
@@ -129,7 +128,7 @@ class Mapper:
         return True
 
     def freeze(self, id: int, by_hand: bool = True) -> messages.KeyframeInfo:
-        """Freeze a keyframe: its evidence becomes part of the map for good, its image is dropped. Returns
+        """Freeze a keyframe: its evidence stays in the map permanently, its image is dropped. Returns
         the last message about it. Raises KeyframeError."""
         entry = self._changeable(id)
         if not can_freeze(self.map):
@@ -144,11 +143,11 @@ class Mapper:
         return self._message(entry, picture, crossed)
 
     def renew(self) -> None:
-        """Sweep the keyframes whose cavity has changed most, for RENEW_SECONDS at most; the rest waits."""
+        """Sweep the keyframes whose cavity has changed most, for at most RENEW_SECONDS."""
         if self.stale or not has_messages(self.map):
-            self.unanswered = False
+            self.cavities_changed = False
         else:
-            self.unanswered = not self.map.renew(seconds=RENEW_SECONDS).complete
+            self.cavities_changed = not self.map.renew(seconds=RENEW_SECONDS).complete
 
     def surplus(self, newest: LiveKeyframe, keep: int) -> list[LiveKeyframe]:
         """The keyframes to freeze if more than ``keep`` are on: those first that share least with the view
@@ -167,12 +166,12 @@ class Mapper:
             with FullInference(self.map, keep_before=True) as inference:
                 yield inference
         except Exception:
-            self.unsettled = self.lacks_messages = False  # or it would be tried again without end
+            self.unsettled = self.lacks_messages = False  # or it would be tried again forever
             raise
         if inference.outcome is not None:
             self.inferred, self.lacks_messages = inference.outcome, False
             if inference.outcome.complete:
-                self.unsettled = self.edited = self.unanswered = False
+                self.unsettled = self.edited = self.cavities_changed = False
 
     def describe(self, entry: LiveKeyframe) -> messages.KeyframeInfo:
         """The message that describes a keyframe to the viewer."""
@@ -189,19 +188,21 @@ class Mapper:
         """A keyframe's depth image, (H, W) in metres; None once it is frozen."""
         return self._keyframe(entry).depth_m if entry.state == "on" else entry.depth_m
 
-    def seer(self, entry: LiveKeyframe) -> PosedDepthImage:
+    def posed_image(self, entry: LiveKeyframe) -> PosedDepthImage:
         """A keyframe's depth image with its pose, for the rays of its pixels. Raises KeyframeError for a
         frozen one."""
         depth_m = self.depth_of(entry)
         if depth_m is None:
-            raise KeyframeError(f"keyframe {entry.id} ({entry.name}) is frozen: its image is forgotten")
+            raise KeyframeError(
+                f"keyframe {entry.id} ({entry.name}) is frozen: its depth image is no longer in memory"
+            )
         return PosedDepthImage(entry.name, entry.T_world_camera, entry.camera, depth_m, entry.id)
 
-    def seers_near(self, point: NDArray[np.float64]) -> Iterator[PosedDepthImage]:
+    def posed_images_near(self, point: NDArray[np.float64]) -> Iterator[PosedDepthImage]:
         """All keyframes that are on, the nearest to a point first."""
         entries = self.roster.with_state("on")
         entries.sort(key=lambda entry: float(np.linalg.norm(entry.T_world_camera[:3, 3] - point)))
-        return map(self.seer, entries)
+        return map(self.posed_image, entries)
 
     def _add(self, entry: LiveKeyframe) -> int:
         """Add a keyframe that was off, and sweep it once. If that fails, the map is unchanged."""

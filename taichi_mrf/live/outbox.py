@@ -37,8 +37,8 @@ MOST = {Notice: 50, File: 4}
 LATEST_ONLY = (Status, CurrentCamera, Images, RayAnswer)
 
 MERGE_FACTOR = 2
-"""Waiting bricks are merged when there are so many times more of them than after the last time, so that
-each is copied a few times at most."""
+"""Waiting bricks are merged when their number has grown by this factor since the last merge, so that each is
+copied a few times at most."""
 
 
 Waiting = Union[Update, "WaitingBricks", Quit]
@@ -74,7 +74,7 @@ class Outbox:
             self._changed.notify()
 
     def close(self) -> None:
-        """Drop all that waits; the last update to take is Quit."""
+        """Drop all waiting updates; :meth:`take` then returns Quit."""
         with self._changed:
             self._waiting = {"quit": Quit()}
             self._closed = True
@@ -110,8 +110,8 @@ class Outbox:
         return None
 
     def still_wanted(self, update: Update) -> Callable[[Waiting], bool] | None:
-        """Tells which waiting updates are still worth sending after this one; None: all. A Hello makes
-        obsolete all earlier updates of the map."""
+        """Which waiting updates are still sent after this one; None: all. A Hello makes earlier updates of
+        the map obsolete."""
         return (lambda waiting: isinstance(waiting, Notice | File)) if isinstance(update, Hello) else None
 
     def _place(self, update: Update) -> Hashable:
@@ -142,7 +142,7 @@ class WaitingBricks:
             self._merge()
 
     def take(self, count: int) -> tuple[Bricks, "WaitingBricks | None"]:
-        """Up to ``count`` of the bricks, with all that are gone, and what still waits."""
+        """Up to ``count`` of the bricks, with all removed ones, and the bricks that still wait."""
         whole = self._merge()
         part = _rows(whole, slice(count), whole.removed)
         if len(whole.bricks) <= count:

@@ -71,7 +71,7 @@ def view_images(
     rendered = m.render_depth(small, T_world_camera)
     if depth_m is None:
         nothing = np.full((*small.shape, 3), _NO_DEPTH, np.uint8)
-        score = "its depth image was forgotten when it was frozen"
+        score = "its depth image was dropped when it was frozen"
         return Images(name, nothing, depth_colors(rendered), nothing, score)
     measured = np.ascontiguousarray(depth_m[::step, ::step])
     bounds = depth_bounds(measured)

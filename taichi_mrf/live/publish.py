@@ -41,7 +41,7 @@ class Publisher:
         self._layer, self._pool, self._seen_by = layer, pool, seen_by
         self._prior_is_unknown, self._least = prior_is_unknown, least_log_odds
         self.counting = counting
-        self._told = _ToldBricks()
+        self._sent = _SentBricks()
         self._identity = pool.identity.copy()
         self._all = True
 
@@ -61,8 +61,8 @@ class Publisher:
     def everything_gone(self) -> Bricks:
         """The update that removes everything that was sent."""
         empty = np.zeros((0, VOXELS))
-        bricks = self._told.bricks()
-        self._told, self._all = _ToldBricks(), True
+        bricks = self._sent.bricks()
+        self._sent, self._all = _SentBricks(), True
         return Bricks(
             self._layer, bricks[:0].copy(), empty.astype(np.int16), empty.astype(np.uint8), removed=bricks
         )
@@ -75,7 +75,7 @@ class Publisher:
 
     def start_over(self) -> None:
         """Send the whole map with the next changes: the viewer is a new one."""
-        self._told, self._all = _ToldBricks(), True
+        self._sent, self._all = _SentBricks(), True
 
     def _changed(
         self, slots: NDArray[np.int32]
@@ -90,9 +90,9 @@ class Publisher:
         hidden = bricks[:0].copy()
         if self._least is not None:
             counts = (log_odds > self._least / LOG_ODDS_STEP).any(axis=1)
-            hidden = self._told.drop(bricks[~counts])
+            hidden = self._sent.drop(bricks[~counts])
             bricks, log_odds, seen = bricks[counts], log_odds[counts], seen[counts]
-        news = self._told.tell(bricks, log_odds, seen)
+        news = self._sent.note(bricks, log_odds, seen)
         return bricks[news], log_odds[news], seen[news], hidden
 
     def _gone(self) -> NDArray[np.int32]:
@@ -102,11 +102,11 @@ class Publisher:
         if (before[lived] == self._identity[: len(before)][lived]).all():
             return np.zeros((0, 3), np.int32)
         there = grid_keys(self._pool.bricks[self._pool.in_use])
-        told = self._told.bricks()
-        return self._told.drop(told[~np.isin(grid_keys(told), there)])
+        sent = self._sent.bricks()
+        return self._sent.drop(sent[~np.isin(grid_keys(sent), there)])
 
 
-class _ToldBricks:
+class _SentBricks:
     """What was sent to the viewer, by brick: rows of arrays that grow."""
 
     def __init__(self) -> None:
@@ -120,7 +120,7 @@ class _ToldBricks:
         """The coordinates of all, (n, 3)."""
         return self._bricks[np.fromiter(self._rows.values(), np.int64, len(self._rows))]
 
-    def tell(
+    def note(
         self, bricks: NDArray[np.int32], log_odds: NDArray[np.int16], seen: NDArray[np.uint8]
     ) -> NDArray[np.bool_]:
         """Note the content of some bricks, each at most once; returns which of them differ from before,

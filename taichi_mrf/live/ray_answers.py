@@ -15,7 +15,7 @@ from taichi_mrf.sensor.noise import LEAST_SIGMA_M, NoiseTable, evaluate
 from taichi_mrf.viewer.messages import RayAnswer
 
 BEHIND_SIGMAS = 3.0
-"""A keyframe sees a point that lies no further behind its measurement than so many sigma, or two voxels."""
+"""A keyframe sees a point that lies at most this many sigma, or two voxels, behind its measurement."""
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,12 @@ class PixelNoise:
     sigma_m: float
 
 
-def pixel_answer(m: OccupancyMap, seer: PosedDepthImage, u: float, v: float) -> RayAnswer:
+def pixel_answer(m: OccupancyMap, image: PosedDepthImage, u: float, v: float) -> RayAnswer:
     """The ray of a pixel. Raises KeyframeError if the image has no such pixel."""
-    along = pixel_direction(seer.camera, u, v)
-    if not _in_image(seer.camera, u, v):
-        raise KeyframeError(f"{seer.name} has no pixel ({u:g}, {v:g})")
-    return _answer(m, seer, u, v, along)
+    along = pixel_direction(image.camera, u, v)
+    if not _in_image(image.camera, u, v):
+        raise KeyframeError(f"{image.name} has no pixel ({u:g}, {v:g})")
+    return _answer(m, image, u, v, along)
 
 
 def point_answer(
@@ -61,22 +61,22 @@ def point_answer(
         raise KeyframeError("a point is not finite")
     if wanted is not None and (pixel := projected(wanted, where)) is not None:
         return _answer(m, wanted, pixel[0], pixel[1], pixel_direction(wanted.camera, pixel[0], pixel[1]))
-    for seer in others:
-        pixel = projected(seer, where)
-        if pixel is not None and _sees(m, seer, *pixel):
-            return _answer(m, seer, pixel[0], pixel[1], pixel_direction(seer.camera, pixel[0], pixel[1]))
+    for image in others:
+        pixel = projected(image, where)
+        if pixel is not None and _sees(m, image, *pixel):
+            return _answer(m, image, pixel[0], pixel[1], pixel_direction(image.camera, pixel[0], pixel[1]))
     start, along = np.asarray(eye, np.float64), where - np.asarray(eye, np.float64)
-    # The eye may be anywhere, also further away than any sensor reaches.
+    # The viewpoint may be further away than the range of any sensor.
     reach = max(m.sensor.max_depth, 1.2 * float(np.linalg.norm(along)))
     return _profiled(m, "from where you look; no keyframe sees this point", start, along, None, reach)
 
 
-def projected(seer: PosedDepthImage, point: NDArray[np.float64]) -> tuple[float, float, float] | None:
+def projected(image: PosedDepthImage, point: NDArray[np.float64]) -> tuple[float, float, float] | None:
     """(u, v, axial depth) of a world point in an image, None if it lies outside or behind."""
-    x, y, z = (inverse(seer.T_world_camera) @ np.append(point, 1.0))[:3]
+    x, y, z = (inverse(image.T_world_camera) @ np.append(point, 1.0))[:3]
     if z <= 0:
         return None
-    camera = seer.camera
+    camera = image.camera
     u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
     return (float(u), float(v), float(z)) if _in_image(camera, u, v) else None
 
@@ -97,18 +97,18 @@ def noise_at(
 
 
 def _answer(
-    m: OccupancyMap, seer: PosedDepthImage, u: float, v: float, along: NDArray[np.float64]
+    m: OccupancyMap, image: PosedDepthImage, u: float, v: float, along: NDArray[np.float64]
 ) -> RayAnswer:
-    column, row = _nearest(seer.camera, u, v)
-    depth, range_per_depth = float(seer.depth_m[row, column]), float(np.linalg.norm(along))
+    column, row = _nearest(image.camera, u, v)
+    depth, range_per_depth = float(image.depth_m[row, column]), float(np.linalg.norm(along))
     noise = None
     if depth > 0:
-        bias, sigma = noise_at(m.noise.table(seer.camera), seer.camera, u, v, depth)
+        bias, sigma = noise_at(m.noise.table(image.camera), image.camera, u, v, depth)
         noise = PixelNoise(depth * range_per_depth, bias * range_per_depth, sigma * range_per_depth)
-    title = f"{seer.name}, pixel ({column}, {row})"
-    start, turned = seer.T_world_camera[:3, 3], seer.T_world_camera[:3, :3] @ along
+    title = f"{image.name}, pixel ({column}, {row})"
+    start, turned = image.T_world_camera[:3, 3], image.T_world_camera[:3, :3] @ along
     answer = _profiled(m, title, start, turned, noise)
-    return dataclasses.replace(answer, keyframe=seer.keyframe, pixel=(column, row))
+    return dataclasses.replace(answer, keyframe=image.keyframe, pixel=(column, row))
 
 
 def _profiled(
@@ -136,13 +136,13 @@ def _profiled(
     )
 
 
-def _sees(m: OccupancyMap, seer: PosedDepthImage, u: float, v: float, depth_m: float) -> bool:
+def _sees(m: OccupancyMap, image: PosedDepthImage, u: float, v: float, depth_m: float) -> bool:
     """Whether the measurement at a pixel leaves the view free up to a depth."""
-    column, row = _nearest(seer.camera, u, v)
-    measured = float(seer.depth_m[row, column])
+    column, row = _nearest(image.camera, u, v)
+    measured = float(image.depth_m[row, column])
     if measured <= 0:
         return False
-    _, sigma = noise_at(m.noise.table(seer.camera), seer.camera, u, v, measured)
+    _, sigma = noise_at(m.noise.table(image.camera), image.camera, u, v, measured)
     return depth_m <= measured + max(BEHIND_SIGMAS * sigma, 2 * m.voxel_size)
 
 

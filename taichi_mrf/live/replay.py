@@ -1,7 +1,7 @@
-"""When the next frame of a source is due: at the recording's own pace, faster, slower, or at once.
+"""When the next frame of a source is due: at the recording's own pace, faster, slower, or immediately.
 
-A frame's stamp is known only once it has been read, so at a given pace the next frame is read ahead. Instead
-of a frame that cannot be read an UnreadableFrame is handed out.
+A frame's stamp is known only once it has been read, so at a given pace the next frame is read ahead. For a
+frame that cannot be read, an UnreadableFrame is returned.
 """
 
 import math
@@ -46,20 +46,20 @@ class Replay:
         self.held_out: dict[int, None] = {}
         """Dataset indices of the frames that were passed unread, to check the map against."""
         self._begin: tuple[float, float] | None = None
-        """A moment, and the stamp that was due then."""
+        """A time on the clock, and the stamp of the frame that was due then."""
         self.set_speed(speed)
         self._find_next()
 
     @property
     def frames(self) -> int:
-        """Frames in a round, 0 if there is no end."""
+        """Frames in one pass through the source; 0 for a source without an end."""
         if self._dataset.endless:
             return self._limit or 0
         return len(range(0, len(self._dataset), self._every)[: self._limit])
 
     @property
     def share(self) -> float:
-        """How much of the round has been taken, 0 if there is no end."""
+        """Share of the pass that has been taken, 0 to 1; 0 for a source without an end."""
         return min(1.0, self.number / self.frames) if self.frames else 0.0
 
     @property
@@ -88,7 +88,7 @@ class Replay:
         self.paused = True
 
     def resume(self) -> None:
-        """Go on where it was paused: the time in between does not count."""
+        """Continue after a pause, whose duration does not count."""
         self.paused, self._begin = False, None
 
     def due_in(self) -> float | None:
@@ -127,7 +127,7 @@ class Replay:
             return UnreadableFrame(self._name(index), str(error))
         except DatasetError as error:
             return UnreadableFrame(self._name(index), str(error), last=True)
-        except Exception as error:  # a reader's own mistake must not end mapping
+        except Exception as error:  # a defect in a reader must not end mapping
             return UnreadableFrame(self._name(index), f"{self._name(index)}: cannot be read: {error}")
 
     def _index(self, number: int) -> int:
@@ -138,7 +138,7 @@ class Replay:
         return names[index] if index < len(names) else f"frame {index}"
 
     def _find_next(self) -> None:
-        """Step over frames that are kept out, and into the next round if need be."""
+        """Skip held-out frames; at the end of a looped source, continue with the next pass."""
         while True:
             over = self._next > self.frames and (self.frames > 0 or not self._dataset.endless)
             if over and not (self._loop and self._readable):  # a round of broken frames is the last

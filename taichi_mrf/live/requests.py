@@ -34,13 +34,13 @@ from taichi_mrf.viewer.messages import (
 )
 
 
-def goes_on(request: Request) -> bool:
+def resumes_replay(request: Request) -> bool:
     """Whether a request starts a paused replay again."""
     return isinstance(request, Step) or (isinstance(request, Pause) and not request.on)
 
 
 class Requests:
-    """Carries requests out."""
+    """Carries out the requests of the page."""
 
     def __init__(
         self,
@@ -50,7 +50,7 @@ class Requests:
         begin_anew: Callable[[], None],
     ) -> None:
         self._run = run
-        self._ways: dict[type, Callable[[Any], None]] = {
+        self._handlers: dict[type, Callable[[Any], None]] = {
             Listening: listening,
             Pause: self._pause,
             Step: self._step,
@@ -69,8 +69,8 @@ class Requests:
         }
 
     def carry_out(self, request: Request) -> None:
-        """Carry a request out, or tell the user why not."""
-        self._run.guarded(lambda: self._ways[type(request)](request))
+        """Carry out a request; an error becomes a notice on the page."""
+        self._run.guarded(lambda: self._handlers[type(request)](request))
 
     def _quit(self, request: Quit) -> None:
         self._run.ended = True
@@ -111,14 +111,14 @@ class Requests:
         mapper, wanted = self._run.mapper, None
         if request.keyframe is not None:
             entry = mapper.roster.find(request.keyframe)
-            wanted = mapper.seer(entry) if entry.state != "frozen" else None
-        others = mapper.seers_near(np.asarray(request.point, np.float64))
+            wanted = mapper.posed_image(entry) if entry.state != "frozen" else None
+        others = mapper.posed_images_near(np.asarray(request.point, np.float64))
         self._run.send(point_answer(mapper.map, request.point, request.eye, wanted, others))
 
     def _pixel_ray(self, request: PixelRay) -> None:
         mapper = self._run.mapper
-        seer = mapper.seer(mapper.roster.find(request.keyframe))
-        self._run.send(pixel_answer(mapper.map, seer, request.u, request.v))
+        image = mapper.posed_image(mapper.roster.find(request.keyframe))
+        self._run.send(pixel_answer(mapper.map, image, request.u, request.v))
 
     def _save(self, request: Save) -> None:
         """Send a file to the browser that asked for it; with --out it is also left in the run's folder, with

@@ -22,7 +22,7 @@ from taichi_mrf.viewer.messages import CurrentCamera, Hello, KeyframeInfo, Notic
 
 @dataclass(frozen=True)
 class Policy:
-    """What a run does without being asked. ``keep_live``: most keyframes that are on before some are frozen,
+    """What a run does on its own. ``keep_live``: most keyframes that are on before some are frozen,
     None for no limit. ``out``: folder for the files that a user saves. ``leave_when_done``: end once the
     source has ended and the map is settled."""
 
@@ -35,7 +35,7 @@ class Run(SessionCore):
     """One live run. ``mapper`` holds the map, ``intake`` takes frames into it; ``replay`` has the frames,
     None if there are none to come.
 
-    ``stepping``: take frames until one more keyframe is added, whatever the pace. ``current`` is the frame
+    ``stepping``: take frames until one more keyframe is added, at any pace. ``current`` is the frame
     that was read last. ``version`` changes with the map that is shown and with the current camera. ``full``
     is the reason if the last frame did not fit into memory, else None.
     """
@@ -70,9 +70,9 @@ class Run(SessionCore):
         self.progress = Progress()
         self.current: Frame | None = None
         self.stepping, self.full = False, None
-        self.greet()
+        self.send_everything()
 
-    def greet(self) -> None:
+    def send_everything(self) -> None:
         """Send a viewer that has just started the whole state."""
         m, backend = self.mapper.map, runtime.choice()
         self.send(
@@ -115,8 +115,8 @@ class Run(SessionCore):
         """The message that describes a keyframe to the viewer."""
         return self.mapper.describe(self.mapper.roster.find(id))
 
-    def tell(self, activity: str, share: float) -> None:
-        """Tell the viewer the present activity, and the share of it that is done."""
+    def show_activity(self, activity: str, share: float) -> None:
+        """Show the present activity in the viewer, and the share of it that is done, 0 to 1."""
         waiting = self.inbox.has_edits()
         self.send(self.progress.status(activity, share, self.replay, self.mapper, waiting))
 
@@ -177,4 +177,4 @@ class Run(SessionCore):
 
     def _show_adding(self, frame: Frame) -> None:
         self.show_camera(frame)
-        self.tell(f"adding {frame.name}", self.replay.share if self.replay else 0.0)
+        self.show_activity(f"adding {frame.name}", self.replay.share if self.replay else 0.0)

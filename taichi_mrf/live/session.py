@@ -1,10 +1,10 @@
 """A live session: frames become keyframes, the map is published, and the viewer's requests are carried out.
 
-One thread does all of it, one piece after the other, because Taichi has one owner:
+One thread does all of it, one piece of work after the other, because Taichi may be used by one thread only:
 
-    requests that have come
-    a frame, if one is due                     find its pose if need be, add it, align it if poses are to be
-                                               refined, sweep it once, and for a while those whose cavity has
+    requests that have arrived
+    a frame, if one is due                     track its pose if it has none, add it, align it if poses are
+                                               refined, sweep it once, then the keyframes whose cavity has
                                                changed; publish the changes
     else sweep more keyframes whose cavity has changed, if any are left
     else rounds of alignment                   once the sequence has ended, if poses are to be refined
@@ -23,7 +23,7 @@ from taichi_mrf.live.extras import Extras
 from taichi_mrf.live.link import Link
 from taichi_mrf.live.progress import sweeping
 from taichi_mrf.live.replay import Replay
-from taichi_mrf.live.requests import Requests, goes_on
+from taichi_mrf.live.requests import Requests, resumes_replay
 from taichi_mrf.live.run import Policy, Run
 from taichi_mrf.live.session_core import EDITS, WAIT_SECONDS
 from taichi_mrf.live.source import Source
@@ -34,11 +34,11 @@ from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.viewer.messages import Listening, Notice, Request
 
 REQUEST_SECONDS = 0.25
-"""While frames come, requests are carried out for so long at most before the next frame is taken: many
+"""While frames arrive, the longest time for requests before the next frame is taken, in seconds, so that many
 clients cannot stop mapping."""
 
 ASK_SECONDS = 0.05
-"""Between two pairs of keyframes that are aligned, requests are looked at so often, at most."""
+"""Shortest time between two looks at requests while keyframes are aligned, in seconds."""
 
 WAY_BACK = "bring the camera back to where it was then, or to where it started"
 
@@ -68,12 +68,12 @@ class Session:
         state = self.state
         state.should_stop = should_stop
         while not state.is_over:
-            state.hear()
+            state.read_requests()
             self._carry_out_waiting()
             if not state.is_over and not self._work():
                 if state.policy.leave_when_done and state.is_done:
                     return
-                state.tell(state.idle_activity, 1.0)
+                state.show_activity(state.idle_activity, 1.0)
                 due = state.replay.due_in() if state.replay else None
                 state.link.wait(WAIT_SECONDS if due is None else min(due, WAIT_SECONDS))
 
@@ -81,7 +81,7 @@ class Session:
         """Go on with another viewer, which is sent the whole state."""
         self.state.link = link
         self._extras.nothing_wanted()
-        self.state.greet()
+        self.state.send_everything()
 
     def _begin_anew(self) -> None:
         self.state.begin(self.state.mapper.roster.next_id)
@@ -104,8 +104,8 @@ class Session:
             self._take_frame(state.replay)
             self._extras.work(self._go_on)
             return True
-        if mapper.unanswered and state.is_replaying:
-            state.tell("sweeping keyframes whose evidence has changed", 0.0)
+        if mapper.cavities_changed and state.is_replaying:
+            state.show_activity("sweeping keyframes whose evidence has changed", 0.0)
             state.guarded(mapper.renew)
             state.publish()
             return True
@@ -122,7 +122,7 @@ class Session:
         """Read the next frame, and offer it to the map."""
         state = self.state
         of = f" of {replay.frames}" if replay.frames else ""
-        state.tell(f"reading frame {replay.next_number}{of}", replay.share)
+        state.show_activity(f"reading frame {replay.next_number}{of}", replay.share)
         with state.intake.result.timed("reading"):
             frame = replay.take()
         if frame is not None:
@@ -207,22 +207,22 @@ class Session:
         self._asked = now
         doing = f"aligning all keyframes: round {step.round} of {step.rounds}"
         doing = "sweeping aligned keyframes" if step.judging else doing
-        self.state.tell(doing, max(step.round - 1, 0) / step.rounds)
+        self.state.show_activity(doing, max(step.round - 1, 0) / step.rounds)
         return self._go_on()
 
     def _go_on_sweeping(self, step: InferProgress) -> bool:
-        self.state.tell(*sweeping(step))
+        self.state.show_activity(*sweeping(step))
         return self._go_on(step)
 
     def _go_on(self, step: InferProgress | None = None) -> bool:
         """Between two steps of long work: carry out the requests that can be; returns whether to go on."""
         state = self.state
-        state.hear()
+        state.read_requests()
         kept: list[Request] = []
         go_on = not state.is_over
         while len(state.inbox) and go_on:
             request = state.inbox.take()
-            if isinstance(request, EDITS) or (goes_on(request) and state.has_frames_left):
+            if isinstance(request, EDITS) or (resumes_replay(request) and state.has_frames_left):
                 kept.append(request)
                 go_on = not self._may_carry_out(request)
             else:

@@ -1,8 +1,8 @@
-"""What live and tuning sessions share: the line to the page, and the requests that wait to be carried out.
+"""What live and tuning sessions share: the link to the page, and the requests that wait.
 
-One thread does all of a session's work, because Taichi has one owner. Between two pieces of work it takes in
-what the page asks for. Requests that arrive faster than they are carried out do not pile up: a later one
-replaces a waiting one of its kind (:class:`Inbox`).
+One thread does all of a session's work, because Taichi may be used by one thread only. Between two pieces of
+work it reads the page's requests. Requests that arrive faster than they are carried out do not pile up: a
+later one replaces a waiting one of its kind (:class:`Inbox`).
 """
 
 from collections import deque
@@ -45,7 +45,7 @@ class Inbox:
         self._waiting: deque[Request] = deque()
 
     def put(self, request: Request) -> None:
-        """Add a request that has just come."""
+        """Add a request that has just arrived."""
         if isinstance(request, Reset):
             self._waiting = deque(each for each in self._waiting if not isinstance(each, (*EDITS, Step)))
         subject = _subject(request)
@@ -55,11 +55,11 @@ class Inbox:
         self._waiting.append(request)
 
     def take(self) -> Request:
-        """The oldest request, which waits no longer."""
+        """Remove and return the oldest request."""
         return self._waiting.popleft()
 
     def put_back(self, requests: Iterable[Request]) -> None:
-        """Requests that were taken, in their order, wait again before all others."""
+        """Put requests that were taken back in front of all others, in their order."""
         self._waiting.extendleft(reversed(list(requests)))
 
     @property
@@ -92,11 +92,11 @@ def _subject(request: Request) -> Hashable:
 
 
 class SessionCore:
-    """The page's side of a session: ``link`` leads to it, ``inbox`` has its requests; ``ended`` says that the
-    user has quit."""
+    """The session's connection to its page: ``link`` sends and receives, ``inbox`` holds the requests that
+    wait; ``ended``: the user has quit."""
 
     EXPECTED: ClassVar[type[Exception]] = Exception
-    """What may go wrong with one piece of work without ending the session."""
+    """Errors in one piece of work that do not end the session."""
 
     def __init__(self, link: Link) -> None:
         self.link = link
@@ -106,21 +106,21 @@ class SessionCore:
 
     @property
     def is_over(self) -> bool:
-        """Whether to do nothing more: a signal has come, the user has quit, or the page is gone."""
+        """Whether to stop working: after a signal, after Quit, or when the page is lost."""
         return self.should_stop() or self.ended or self.link.lost is not None
 
-    def hear(self) -> None:
-        """Take in the requests that have come."""
+    def read_requests(self) -> None:
+        """Read the requests that have arrived."""
         for request in self.link.requests():
             self.inbox.put(request)
 
     def send(self, update: Update) -> None:
-        """Pass an update to the page."""
+        """Send an update to the page."""
         self.link.send(update)
 
     def guarded(self, work: Callable[[], None]) -> bool:
-        """Do some work. What goes wrong with one frame, one try or one request must not end the session, and
-        becomes a notice. Returns whether it went well."""
+        """Do some work. An error with one frame, one try or one request does not end the session: it is shown
+        as a notice. Returns whether the work succeeded."""
         try:
             work()
         except self.EXPECTED as error:
@@ -129,5 +129,5 @@ class SessionCore:
         return True
 
     def notice_error(self, error: Exception) -> None:
-        """Tell the page what went wrong."""
+        """Show an error on the page."""
         self.send(Notice(" ".join(str(error).split()) or type(error).__name__, "error"))

@@ -79,7 +79,7 @@ class TuneSession(SessionCore):
         self.search, self._tried, self._judged = search, tried, judged
         self.verdict: list[Judged] = []
         self._view = 0
-        self._ways: dict[type, Callable[[Any], None]] = {
+        self._handlers: dict[type, Callable[[Any], None]] = {
             Listening: listening,
             Try: self._want,
             Pin: self._pin,
@@ -95,7 +95,7 @@ class TuneSession(SessionCore):
         """Work until told to stop: by ``should_stop``, by the viewer, or because the link is lost."""
         self.should_stop = should_stop
         while not self.is_over:
-            self._hear()
+            self._carry_out_requests()
             if self.is_over:
                 return
             if self._wanted is not None:
@@ -138,12 +138,12 @@ class TuneSession(SessionCore):
         for problem in (*self._dataset.notes, *self.frames.skipped):
             self.send(Notice(problem, "warning"))
 
-    def _hear(self) -> None:
+    def _carry_out_requests(self) -> None:
         """Carry out what the page has asked for; signals are looked at between any two requests."""
-        self.hear()
+        self.read_requests()
         while len(self.inbox) and not self.is_over:
             request = self.inbox.take()
-            self.guarded(partial(self._ways[type(request)], request))
+            self.guarded(partial(self._handlers[type(request)], request))
 
     def _want(self, request: Try) -> None:
         self._wanted = request.config, "hand"
@@ -156,7 +156,7 @@ class TuneSession(SessionCore):
         def go_on(activity: str, share: float) -> bool:
             prefix = "" if self.search is None or self.search.done else f"{self._search_text()}: "
             self.send(Activity(prefix + activity, share, busy=True))
-            self._hear()
+            self._carry_out_requests()
             return self._newer == began_with and not self.is_over
 
         return go_on

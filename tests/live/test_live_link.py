@@ -9,6 +9,7 @@ import pytest
 import stand_in_viewers
 from hypothesis import given
 from hypothesis import strategies as st
+from live_program import wait_for
 from live_scene import Shown
 
 from taichi_mrf.live.link import ViewerLink
@@ -180,6 +181,13 @@ def test_a_viewer_says_where_it_is_gets_updates_and_ends_when_told(monkeypatch: 
     assert link._process.exitcode == 0
 
 
+def test_a_viewer_that_is_asked_to_end_does_so_while_the_session_works() -> None:
+    with ViewerLink("127.0.0.1", 1234, stand_in_viewers.echo) as link:
+        link.ask_to_end()
+        wait_for(lambda: link.lost is not None, "the end of the viewer")
+        assert "exit status 0" in str(link.lost)
+
+
 def test_a_viewer_that_reads_nothing_holds_nobody_up_and_is_ended_by_force() -> None:
     with ViewerLink("127.0.0.1", 1234, stand_in_viewers.deaf) as link:
         heard(link, 1)
@@ -209,7 +217,7 @@ def test_a_viewer_that_dies_is_noticed() -> None:
         heard(link, 1)
         link.send(Notice("hello"))
         wait_until(link, lambda: link.lost is not None)
-        assert "exit status 3" in link.lost or "closed the line" in link.lost
+        assert "exit status 3" in link.lost or "closed the connection" in link.lost
         link.send(Notice("is anybody there?"))
         assert link.requests() == []
 

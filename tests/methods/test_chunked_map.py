@@ -128,7 +128,7 @@ def test_the_command_takes_a_box_out(stores: dict[str, Path], tmp_path: Path) ->
     assert (found > np.array([-1, -1, -1]) - brick).all()
     assert (found < np.array([1, 2, 1]) + brick).all()
     room_map("mrf").save(tmp_path / "map.npz")
-    with pytest.raises(ConfigError, match="is none"):
+    with pytest.raises(ConfigError, match="is not one"):
         carry_out("export", tmp_path / "map.npz", *arguments[1:])
 
 

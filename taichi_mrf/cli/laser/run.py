@@ -34,7 +34,7 @@ from taichi_mrf.system.atomic import write_text
 CONFIG_FILE, REPORT_FILE = "config.yaml", "report.json"
 
 _NO_RETURN_IS_FREE = {"auto": None, "free": True, "ignore": False}
-"""What --no-returns says about a beam that did not come back; None is what the scans' reader knows."""
+"""Whether --no-returns takes a beam without a return as free; None leaves it to the scans' reader."""
 
 
 def run_laser(options: Laser) -> int:

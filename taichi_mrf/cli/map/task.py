@@ -11,7 +11,7 @@ from taichi_mrf.datasets.source_flags import SourceFlags
 
 @dataclass(frozen=True)
 class MapTask:
-    """One sequence to map into a folder; all that decides what the files will hold.
+    """One sequence to map into a folder; everything that decides what the files hold.
 
     Paths are relative to ``start``, the working directory of the command; those in ``settings`` are
     absolute.

@@ -1,8 +1,8 @@
 """Signals that stop a run and keep its work.
 
-The first Ctrl-C asks a run to finish early, the second aborts it. SIGTERM asks it to end within seconds, as
-containers and schedulers give it only those: what is only nice to have (pictures, scores) is left out then.
-SIGHUP, which a broken connection or a closed terminal sends, means the same, however often it comes.
+The first Ctrl-C asks a run to finish early, the second aborts it. SIGTERM asks it to end within seconds,
+because containers and schedulers kill it after ten: pictures and scores are left out. SIGHUP, which a broken
+connection or a closed terminal sends, means the same, however often it is sent.
 """
 
 import contextlib
@@ -30,7 +30,7 @@ class StopRequest:
         self.signal: int | None = None
         """The signal that came first."""
         self.aborted = False
-        """Whether the user wants the run to end at once, without its results."""
+        """Whether the user has asked the run to end at once, without its results."""
         self._hurried_at: float | None = None
         self._cuts_short = False
 
@@ -43,7 +43,7 @@ class StopRequest:
         return self._hurried_at is not None
 
     def out_of_time(self) -> bool:
-        """Whether computing has to end now, so that there is time to save."""
+        """Whether computing has to end now, so that enough time is left to save."""
         return self._hurried_at is not None and time.monotonic() - self._hurried_at > INFER_SECONDS
 
     @contextmanager
@@ -59,7 +59,7 @@ class StopRequest:
             self._cuts_short = False
 
     def take(self, number: int) -> bool:
-        """Note a signal; returns whether it is news. Raises KeyboardInterrupt if it means to abort."""
+        """Note a signal; returns whether it changes anything. Raises KeyboardInterrupt if it aborts."""
         if number == _HANG_UP:
             _let_go_of_the_terminal()
         hurries = number != signal.SIGINT
@@ -130,7 +130,7 @@ def _is_taken(number: int | None) -> bool:
 
 
 def _let_go_of_the_terminal() -> None:
-    """Printing to a terminal that is gone is an error, which must not end a run before it has saved."""
+    """Redirect a closed terminal to nowhere: an error while printing must not end a run before it saves."""
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(ValueError, AttributeError):  # a stream of a test has no descriptor
             descriptor = stream.fileno()

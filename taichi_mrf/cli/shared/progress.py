@@ -51,7 +51,7 @@ class _LogLines(logging.Handler):
 
 
 class ProgressBar:
-    """Shows one stage at a time; used as a context, at whose end the bar is gone.
+    """Shows one stage at a time; used as a context, which removes the bar at its end.
 
     On a terminal it is a bar. Elsewhere it is a line on stderr every few seconds, with --verbose a line for
     every step, with --quiet nothing.

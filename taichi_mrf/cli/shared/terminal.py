@@ -1,4 +1,4 @@
-"""The one way to the terminal: whatever is printed goes through here, and is made printable.
+"""The only way to the terminal: all text is made printable here.
 
 Names of files, frames and parameters come from data that somebody else may have written. A control character
 in them could move the cursor, change the window's title or hide text; it is shown as an escape: \\x1b.

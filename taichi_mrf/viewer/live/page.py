@@ -60,7 +60,7 @@ class Page(BasePage[Panel]):
         server.scene.on_click()(lambda event: inbox.put(Clicked(event.ray_origin, event.ray_direction)))
 
     def options_changed(self, before: ViewOptions) -> None:
-        """Tell the mapping process which extras are shown, and move the viewpoint if it shall follow."""
+        """Tell the mapping process which extras are shown, and follow the camera if asked."""
         self.viewpoint.set_following(self.options.follow)
         if _extras(self.options) != _extras(before):
             self._ask_for_extras()
@@ -97,7 +97,7 @@ class Page(BasePage[Panel]):
             self.panel.pixel.value = (float(answer.pixel[0]), float(answer.pixel[1]))
 
     def _reset(self, client: int) -> None:
-        """A map with keyframes is not thrown away on one click."""
+        """Ask before a map with keyframes is deleted."""
         handle = self.server.get_clients().get(client)
         if handle is None or not self.keyframes.keyframes:
             self.ask(m.Reset())

@@ -166,7 +166,7 @@ class Panel(BasePanel):
         self._score.content = ""
 
     def ask_before_reset(self, client: viser.ClientHandle) -> None:
-        """Ask one user whether the map shall be thrown away."""
+        """Ask one user to confirm that the map is deleted."""
         self.answer_reset(client.client_id)
         question = self._questions[client.client_id] = client.gui.add_modal("Reset the map?")
         with question:
@@ -183,7 +183,7 @@ class Panel(BasePanel):
                 button.on_click(partial(self._used, action=action))
 
     def answer_reset(self, client: int) -> None:
-        """Take the question away."""
+        """Close the question."""
         question = self._questions.pop(client, None)
         if question is not None and not question.closed:
             question.close()

@@ -144,7 +144,7 @@ class BasePage(Generic[P]):
 
 
 def _latest(batch: list[Item]) -> list[Item]:
-    """The batch without the items that a later one makes superfluous."""
+    """The batch without the items that a later one replaces."""
     kept: list[Item] = []
     seen: set[type] = set()
     for item in reversed(batch):

@@ -19,7 +19,7 @@ _MOST_NOTICES = 8
 
 
 class BasePanel:
-    """Adds widgets where the GUI stands; whatever a user does with them goes to ``tell`` as an event."""
+    """Adds widgets to the current container of the GUI; each use of them calls ``tell`` with an event."""
 
     def __init__(self, gui: viser.GuiApi, tell: Tell) -> None:
         """The first widgets of the panel; a subclass adds its own, ``add_legend`` and ``add_notices``."""

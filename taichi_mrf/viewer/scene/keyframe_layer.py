@@ -133,7 +133,7 @@ class KeyframeLayer:
             self.gizmo = None
 
     def _place_gizmo(self, keyframe: KeyframeInfo) -> None:
-        """The gizmo stays on its keyframe wherever that is put, but never jumps out of a user's hand."""
+        """Move the gizmo to its keyframe, unless a user is dragging it."""
         if self.gizmo is None or self.held:
             return
         if keyframe.state == "frozen":
@@ -143,7 +143,7 @@ class KeyframeLayer:
         self.gizmo.wxyz, self.gizmo.position = place.wxyz, place.position
 
     def clear(self) -> None:
-        """Forget all keyframes."""
+        """Remove all keyframes."""
         self.release()
         for frustum in self._frusta.values():
             frustum.remove()

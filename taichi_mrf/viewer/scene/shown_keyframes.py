@@ -10,11 +10,11 @@ from taichi_mrf.viewer.messages import KeyframeInfo
 MOST_FROZEN = 50
 MOST_WAYPOINTS = 2000
 LEAST_TO_MERGE = 4096
-"""Bricks that forgotten keyframes crossed are merged from this number on."""
+"""From this number on, the bricks that dropped keyframes crossed are merged."""
 
 
 class ShownKeyframes:
-    """Keyframes by number, and the camera's path through all of them, forgotten ones included."""
+    """Keyframes by number, and the camera's path through all of them, dropped ones included."""
 
     def __init__(self) -> None:
         self.keyframes: dict[int, KeyframeInfo] = {}

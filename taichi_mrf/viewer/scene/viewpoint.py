@@ -48,7 +48,7 @@ class ViewpointController:
             self._point(handle, *view)
 
     def camera_moved(self, T_world_camera: Pose) -> None:
-        """Remember the camera's pose, and follow it if that is wanted."""
+        """Store the camera's pose, and follow it if following is on."""
         self._camera = T_world_camera
         self._follow()
 

@@ -146,8 +146,8 @@ class GuardedConnection(ServerConnection):
         return None
 
     def _typed_is_complete(self) -> bool:
-        """Release what is being typed, because the user has gone on to another widget; returns whether there
-        was anything."""
+        """Release what is being typed, because the user now uses another widget; returns whether there was
+        anything."""
         typed = [key for key, (_, message) in self._held.items() if isinstance(message, WidgetUpdate)]
         for key in typed:
             self._held[key] = monotonic(), self._held[key][1]
@@ -160,7 +160,7 @@ class GuardedConnection(ServerConnection):
         return max(0.0, min(due for due, _ in self._held.values()) - monotonic())
 
     async def _receive(self, timeout_s: float | None) -> str | bytes | None:
-        """The next message as it came; None if there is none in time."""
+        """The next message as it arrived; None if none arrives in time."""
         if self._reading is None:
             self._reading = asyncio.create_task(super().recv())
         try:
@@ -174,7 +174,8 @@ class GuardedConnection(ServerConnection):
         return reading.result()
 
     async def _understand(self, received: str | bytes) -> AnyClientMessage | None:
-        """The message, unless it is refused or held back. Closes the connection if it is none of viser's."""
+        """The message, unless it is refused or held back. Closes the connection if viser's client cannot
+        have sent it."""
         if isinstance(received, str):
             await self.close(CloseCode.UNSUPPORTED_DATA)
             return None

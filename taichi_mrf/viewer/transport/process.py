@@ -1,6 +1,6 @@
 """The viewer's process: a page on its main thread, and a thread that reads what the mapping process sends.
 
-The mapping process starts it. It ends on Quit, and when the mapping process is gone.
+The mapping process starts it. It ends on Quit, and when the mapping process has ended.
 """
 
 import signal
@@ -33,7 +33,7 @@ NewPage = Callable[[viser.ViserServer, Callable[[Request], None]], AnyPage]
 
 
 def run_viewer(connection: "Connection[Any, Any]", host: str, port: int, new_page: NewPage) -> None:
-    """Serve a page until the mapping process sends Quit or is gone.
+    """Serve a page until the mapping process sends Quit or ends.
 
     The first message back is Listening, or a Notice that says why there is no page.
     """

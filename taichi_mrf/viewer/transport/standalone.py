@@ -14,8 +14,8 @@ POLICY = (
     "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; connect-src data: blob:; "
     "base-uri 'none'; form-action 'none'"
 )
-"""The file runs viser's scripts and no others, whatever texts the scene holds, and loads nothing from a
-network."""
+"""The file runs only viser's scripts, even if the scene holds text with scripts in it, and loads nothing from
+a network."""
 
 
 def standalone_page(scene: StateSerializer, dark: bool) -> str:
