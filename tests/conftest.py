@@ -84,20 +84,15 @@ def pytest_runtestloop(session: pytest.Session) -> bool | None:
 
 
 def _taken_tests(folder: Path, items: list[pytest.Item]) -> Iterator[pytest.Item]:
-    """The tests of the files that this process is the first to take: those with most tests of kernels first,
-    for the processes to end at the same time."""
+    """The tests of the files that this process is the first to take. Large files come first, so that all
+    processes end at about the same time."""
     files: dict[Path, list[pytest.Item]] = {}
     for item in items:
         files.setdefault(item.path, []).append(item)
-    for path in sorted(files, key=lambda path: _weight(files[path]), reverse=True):
-        name = "-".join(path.relative_to(REPOSITORY).parts)
+    for path in sorted(files, key=lambda path: path.stat().st_size, reverse=True):
         with contextlib.suppress(FileExistsError):
-            (folder / name).touch(exist_ok=False)
+            (folder / "-".join(path.relative_to(REPOSITORY).parts)).touch(exist_ok=False)
             yield from files[path]
-
-
-def _weight(items: list[pytest.Item]) -> tuple[int, int]:
-    return sum(_uses(item, "backend") for item in items), len(items)
 
 
 def _is_for_every_backend(item: pytest.Item) -> bool:
