@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.calibration.options import MotionCaptureConfig
-from taichi_mrf.calibration.pose_stream import PoseStream, inverses, rotation_vectors
+from taichi_mrf.calibration.rigid_motions import inverses, rotation_vectors
+from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.errors import DatasetError
 
 LEAST_PAIRS = 10
@@ -27,16 +28,16 @@ _COARSEST_STEP_S, _FINEST_STEP_S = 0.02, 0.002
 class BodyPair:
     """Camera and board as motion capture follows them: two bodies whose markers may sit anywhere on them."""
 
-    camera: PoseStream
-    board: PoseStream
+    camera: TimedPoses
+    board: TimedPoses
 
     def relative(
         self, times: NDArray[np.float64], largest_gap: float
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """The board's body in the camera's body at ``times`` (M,) of motion capture, (M, 4, 4), and
         where it is known."""
-        T_world_camera, has_camera = self.camera.at(times, largest_gap)
-        T_world_board, has_board = self.board.at(times, largest_gap)
+        T_world_camera, has_camera = self.camera.between(times, largest_gap)
+        T_world_board, has_board = self.board.between(times, largest_gap)
         return inverses(T_world_camera) @ T_world_board, has_camera & has_board
 
 

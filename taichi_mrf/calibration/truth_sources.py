@@ -13,8 +13,8 @@ from taichi_mrf.calibration.image_stamps import stamps_of
 from taichi_mrf.calibration.motion_capture import align
 from taichi_mrf.calibration.options import CalibrationConfig
 from taichi_mrf.calibration.pairs import BoardPairs, PairSource, RecordedPairs
-from taichi_mrf.calibration.pose_stream import read_pose_stream
 from taichi_mrf.calibration.time_lag import BodyPair
+from taichi_mrf.datasets.timed_poses import read_timed_poses
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -60,7 +60,7 @@ def from_motion_capture(
 ) -> GroundTruth:
     """Motion capture of camera and board, put into the images' time and onto the chessboard by those images
     that show it. It then gives the board's pose for every depth image. Raises TaichiMRFError."""
-    bodies = BodyPair(read_pose_stream(camera_poses), read_pose_stream(board_poses))
+    bodies = BodyPair(read_timed_poses(camera_poses), read_timed_poses(board_poses))
     stamp_of = stamps_of(depth.names, stamps)
     found, looked_at = _find_boards(depth, images, camera, options, progress)
     seen = sorted(found.views, key=lambda name: stamp_of[name])

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.trajectories import pose_from_quaternion, read_trajectory
+from taichi_mrf.datasets.trajectories import read_trajectory, rotation_of
 from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose
 
@@ -59,28 +59,62 @@ class TimedPoses:
             return None
         return interpolate(self.poses[after - 1], self.poses[after], (stamp - first) / (last - first))
 
+    def between(
+        self, times: NDArray[np.float64], largest_gap: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """The poses at many ``times`` (M,), (M, 4, 4), and which of them are known: those with a pose before
+        and one after that are at most ``largest_gap`` seconds apart. A trajectory of one pose stands still.
+        """
+        times = np.asarray(times, np.float64)
+        if len(self) == 1:
+            return np.repeat(self.poses, len(times), axis=0), np.ones(len(times), dtype=bool)
+        after = np.clip(np.searchsorted(self.stamps, times, side="right"), 1, len(self) - 1)
+        gap = self.stamps[after] - self.stamps[after - 1]
+        share = (times - self.stamps[after - 1]) / gap
+        known = (share >= 0) & (share <= 1) & (gap <= largest_gap)
+        return interpolate(self.poses[after - 1], self.poses[after], np.clip(share, 0, 1)), known
 
-def interpolate(T_first: Pose, T_last: Pose, share: float) -> Pose:
-    """The rigid transform (4, 4) at ``share`` (0 to 1) of the way from the first to the last: its translation
-    on the straight line, its rotation on the shorter arc, at constant angular velocity."""
-    q_first, q_last = quaternion(T_first[:3, :3]), quaternion(T_last[:3, :3])
-    cosine = float(q_first @ q_last)
-    if cosine < 0:  # q and -q are one rotation; this one lies on the shorter arc
-        q_last, cosine = -q_last, -cosine
-    angle = float(np.arctan2(np.linalg.norm(q_last - cosine * q_first), cosine))
-    if angle < _NEARLY_EQUAL:
-        q = (1 - share) * q_first + share * q_last
-    else:
-        q = (np.sin((1 - share) * angle) * q_first + np.sin(share * angle) * q_last) / np.sin(angle)
-    translation = (1 - share) * T_first[:3, 3] + share * T_last[:3, 3]
-    return pose_from_quaternion(np.concatenate([translation, q]))
+
+def interpolate(
+    T_first: NDArray[np.float64], T_last: NDArray[np.float64], share: float | NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The rigid transforms (..., 4, 4) at ``share`` (...), 0 to 1, of the way from the first to the last: the
+    translation on the straight line, the rotation on the shorter arc, at constant angular velocity."""
+    share = np.asarray(share, np.float64)
+    q_first, q_last = quaternion(T_first[..., :3, :3]), quaternion(T_last[..., :3, :3])
+    cosine = _dot(q_first, q_last)
+    # q and -q are one rotation; the one with the positive cosine lies on the shorter arc.
+    q_last, cosine = np.where((cosine < 0)[..., None], -q_last, q_last), np.abs(cosine)
+    angle = np.arctan2(_length(q_last - cosine[..., None] * q_first), cosine)
+    is_chord = angle < _NEARLY_EQUAL
+    sine = np.where(is_chord, 1.0, np.sin(angle))[..., None]
+    chord = (1 - share)[..., None] * q_first + share[..., None] * q_last
+    arc = np.sin((1 - share) * angle)[..., None] * q_first + np.sin(share * angle)[..., None] * q_last
+    q = np.where(is_chord[..., None], chord, arc / sine)
+    T = np.zeros((*share.shape, 4, 4))
+    T[..., :3, :3] = rotation_of(q / _length(q)[..., None])
+    T[..., :3, 3] = (1 - share)[..., None] * T_first[..., :3, 3] + share[..., None] * T_last[..., :3, 3]
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def _length(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lengths (...) of vectors (..., n)."""
+    length: NDArray[np.float64] = np.sqrt(_dot(vectors, vectors))
+    return length
+
+
+def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Scalar products (...) of vectors (..., n)."""
+    products: NDArray[np.float64] = (a[..., None, :] @ b[..., :, None])[..., 0, 0]
+    return products
 
 
 def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """x y z w, (4,), of a rotation (3, 3): the eigenvector to the largest eigenvalue of a symmetric matrix
-    (I. Bar-Itzhack, "New Method for Extracting the Quaternion from a Rotation Matrix", JGCD 2000), which
-    needs no cases and keeps its digits at every angle."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
+    """x y z w, (..., 4), of rotations (..., 3, 3): the eigenvector to the largest eigenvalue of a symmetric
+    matrix (I. Bar-Itzhack, "New Method for Extracting the Quaternion from a Rotation Matrix", JGCD 2000),
+    which needs no cases and keeps its digits at every angle."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(R, (-2, -1), (0, 1))
     K = np.array(
         [
             [xx - yy - zz, xy + yx, xz + zx, zy - yz],
@@ -89,18 +123,19 @@ def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
             [zy - yz, xz - zx, yx - xy, xx + yy + zz],
         ]
     )
-    return np.linalg.eigh(K)[1][:, -1]
+    vectors: NDArray[np.float64] = np.linalg.eigh(np.moveaxis(K, (0, 1), (-2, -1)))[1]
+    return vectors[..., -1]
 
 
 def read_timed_poses(path: Path) -> TimedPoses:
     """A file of ``stamp tx ty tz qx qy qz qw`` lines (TUM RGB-D), T_world_camera.
 
-    Raises DatasetError, whose text names the file and the line, if it is missing, of another layout, or
-    contains an invalid pose.
+    The lines may come in any order; a blank or a comma separates values. Raises DatasetError, whose text
+    names the file and the line, if it is missing, of another layout, or contains an invalid pose.
     """
     trajectory = read_trajectory(path)
     if trajectory.layout != "stamped":
-        raise DatasetError(f"{path}: expected lines of stamp tx ty tz qx qy qz qw")
+        raise DatasetError(f"{path}: poses without stamps; expected stamp tx ty tz qx qy qz qw on each line")
     poses = []
     for pose in trajectory.poses:
         try:

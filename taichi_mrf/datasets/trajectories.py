@@ -113,15 +113,21 @@ def pose_from_quaternion(values: NDArray[np.float64]) -> Pose:
     norm = np.linalg.norm(values[3:])
     if norm < 1e-6:
         raise KeyframeError("the quaternion of a pose is zero")
-    x, y, z, w = values[3:] / norm
     T = np.eye(4)
-    T[:3, :3] = [
+    T[:3, :3] = rotation_of(values[3:] / norm)
+    T[:3, 3] = values[:3]
+    return T
+
+
+def rotation_of(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotations (..., 3, 3) of quaternions x y z w of length one, (..., 4)."""
+    x, y, z, w = np.moveaxis(quaternions, -1, 0)
+    rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    T[:3, 3] = values[:3]
-    return T
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
 def _stamped(path: Path, line: Line) -> RecordedPose:

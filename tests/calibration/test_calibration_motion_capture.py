@@ -1,6 +1,5 @@
 """Motion capture on simulated streams: the time lag, where markers sit, and the board's pose from both."""
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +11,9 @@ from hypothesis import strategies as st
 from taichi_mrf.calibration.image_stamps import stamps_of
 from taichi_mrf.calibration.motion_capture import Alignment, align, hand_eye
 from taichi_mrf.calibration.options import BoardConfig, MotionCaptureConfig
-from taichi_mrf.calibration.pose_stream import (
-    PoseStream,
-    inverses,
-    read_pose_stream,
-    rotation_vectors,
-    rotations,
-)
+from taichi_mrf.calibration.rigid_motions import inverses, rotation_vectors, rotations
 from taichi_mrf.calibration.time_lag import BodyPair, estimate_lag
+from taichi_mrf.datasets.timed_poses import TimedPoses, read_timed_poses
 from taichi_mrf.errors import ConfigError, DatasetError
 
 OPTIONS = MotionCaptureConfig()
@@ -75,8 +69,8 @@ def test_a_camera_on_a_tripod_needs_one_pose() -> None:
     T_world_camera = np.eye(4)
     T_world_camera[:3, :3], T_world_camera[:3, 3] = rotations(np.array([[1.0, 0.2, -0.5]]))[0], [3, 2, 1]
     bodies = BodyPair(
-        PoseStream(np.array([0.0]), T_world_camera[None]),
-        PoseStream(times + 0.05, T_world_camera @ board_motion(times)),
+        TimedPoses(np.array([0.0]), T_world_camera[None]),
+        TimedPoses(times + 0.05, T_world_camera @ board_motion(times)),
     )
     random = np.random.default_rng(1)
     views = [ideal_view(T, random, 0.05) for T in board_motion(STAMPS)]
@@ -99,10 +93,10 @@ def test_hand_eye_is_exact_without_noise() -> None:
 def test_streams_that_do_not_belong_together_are_refused() -> None:
     capture = captured(0.0, SECONDS, np.random.default_rng(0))
     poses = board_motion(STAMPS)
-    faster = PoseStream(capture.board.stamps, capture.board.poses[::-1])
+    faster = TimedPoses(capture.board.stamps, capture.board.poses[::-1])
     with pytest.raises(DatasetError, match="does not move in the images as in motion capture"):
         estimate_lag(STAMPS, poses, BodyPair(capture.camera, faster), OPTIONS)
-    later = PoseStream(capture.board.stamps + 100, capture.board.poses)
+    later = TimedPoses(capture.board.stamps + 100, capture.board.poses)
     with pytest.raises(DatasetError, match="overlap too little"):
         estimate_lag(STAMPS, poses, BodyPair(capture.camera, later), OPTIONS)
     with pytest.raises(DatasetError, match="needs 10 views of the board"):
@@ -120,7 +114,7 @@ def test_slipped_markers_are_noticed() -> None:
     capture = captured(0.0, SECONDS, np.random.default_rng(0))
     slipped = capture.board.poses.copy()
     slipped[len(slipped) // 2 :, :3, 3] += slipped[len(slipped) // 2 :, :3, 0] * 0.3
-    bodies = BodyPair(capture.camera, dataclasses.replace(capture.board, poses=slipped))
+    bodies = BodyPair(capture.camera, TimedPoses(capture.board.stamps, slipped))
     views = [ideal_view(T, np.random.default_rng(0), 0.05) for T in board_motion(STAMPS)]
     with pytest.raises(DatasetError, match=r"pixels \(RMS\) from where the images show them"):
         align(STAMPS, views, bodies, BOARD, CAMERA, OPTIONS)
@@ -137,7 +131,7 @@ def test_poses_are_interpolated_along_the_shortest_way(
     T = np.repeat(np.eye(4)[None], 2, axis=0)
     T[:, :3, :3] = rotations(np.array([first]))[0] @ rotations(np.array([[0.0] * 3, turn]))
     T[:, :3, 3] = [[0, 1, 2], [2, 1, 0]]
-    between, known = PoseStream(np.array([5.0, 7.0]), T).at(np.array([5 + 2 * share]), 2.0)
+    between, known = TimedPoses(np.array([5.0, 7.0]), T).between(np.array([5 + 2 * share]), 2.0)
     assert known[0]
     np.testing.assert_allclose(between[0, :3, 3], [2 * share, 1, 2 - 2 * share], atol=1e-9)
     np.testing.assert_allclose(
@@ -146,8 +140,8 @@ def test_poses_are_interpolated_along_the_shortest_way(
 
 
 def test_nothing_is_interpolated_over_gaps_or_beyond_the_ends() -> None:
-    stream = PoseStream(np.array([0.0, 0.01, 1.0]), np.repeat(np.eye(4)[None], 3, axis=0))
-    _, known = stream.at(np.array([-0.1, 0.005, 0.5, 1.1]), 0.05)
+    stream = TimedPoses(np.array([0.0, 0.01, 1.0]), np.repeat(np.eye(4)[None], 3, axis=0))
+    _, known = stream.between(np.array([-0.1, 0.005, 0.5, 1.1]), 0.05)
     assert known.tolist() == [False, True, False, False]
 
 
@@ -156,15 +150,15 @@ def test_streams_are_read_back_whatever_their_order_and_separator(tmp_path: Path
     write_poses(tmp_path / "board.csv", stream)
     lines = (tmp_path / "board.csv").read_text().splitlines()
     (tmp_path / "board.csv").write_text("\n".join(line.replace(" ", ",") for line in reversed(lines)))
-    read = read_pose_stream(tmp_path / "board.csv")
+    read = read_timed_poses(tmp_path / "board.csv")
     np.testing.assert_allclose(read.stamps, stream.stamps, atol=1e-8)
     np.testing.assert_allclose(read.poses, stream.poses, atol=1e-7)
     (tmp_path / "rows.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
     with pytest.raises(DatasetError, match=r"rows\.txt: poses without stamps"):
-        read_pose_stream(tmp_path / "rows.txt")
+        read_timed_poses(tmp_path / "rows.txt")
     (tmp_path / "zero.txt").write_text("1 0 0 0 0 0 0 0\n")
     with pytest.raises(DatasetError, match=r"zero\.txt line 1: the quaternion of a pose is zero"):
-        read_pose_stream(tmp_path / "zero.txt")
+        read_timed_poses(tmp_path / "zero.txt")
 
 
 def test_stamps_come_from_a_file_or_from_the_names(tmp_path: Path) -> None:

@@ -54,6 +54,14 @@ def test_half_a_turn_has_a_quaternion(axis: int) -> None:
 STAMPS = [1.0, 1.1, 1.4, 1.5]
 
 
+def test_many_poses_are_interpolated_as_one_by_one() -> None:
+    random = np.random.default_rng(0)
+    T = np.stack([look_at(eye, target) for eye, target in random.normal(size=(40, 2, 3))])
+    share = np.concatenate([[0.0, 1.0], random.random(37)])
+    single = [interpolate(a, b, float(s)) for a, b, s in zip(T, T[1:], share, strict=False)]
+    np.testing.assert_array_equal(interpolate(T[:-1], T[1:], share), single)
+
+
 def ramp() -> TimedPoses:
     return TimedPoses(STAMPS, [look_at([stamp, 0, 0], [9, stamp, 0]) for stamp in STAMPS])
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from taichi_mrf.calibration.chessboard import BoardView, board_depth, camera_matrix, corner_points
 from taichi_mrf.calibration.options import BoardConfig
-from taichi_mrf.calibration.pose_stream import PoseStream, inverses, rotations
+from taichi_mrf.calibration.rigid_motions import inverses, rotations
+from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.sensor.camera import PinholeCamera
 
 CAMERA = PinholeCamera(width=320, height=240, fx=290, fy=292, cx=159.0, cy=120.5)
@@ -78,8 +79,8 @@ def render_board(
 class Capture:
     """Motion capture of the board's motion: marker bodies that sit somewhere on camera and board."""
 
-    camera: PoseStream
-    board: PoseStream
+    camera: TimedPoses
+    board: TimedPoses
     T_camera_body: NDArray[np.float64]
     T_body_board: NDArray[np.float64]
 
@@ -105,7 +106,7 @@ def captured(lag: float, seconds: float, random: np.random.Generator, noise: flo
         poses[:, :3, :3] = poses[:, :3, :3] @ rotations(noise / 0.2 * random.standard_normal((len(poses), 3)))
     stamps = image_time + lag
     return Capture(
-        PoseStream(stamps, camera_body), PoseStream(stamps, board_body), T_camera_body, T_body_board
+        TimedPoses(stamps, camera_body), TimedPoses(stamps, board_body), T_camera_body, T_body_board
     )
 
 
@@ -129,7 +130,7 @@ def write_recording(
     (folder / "stamps.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def write_poses(path: Path, stream: PoseStream) -> None:
+def write_poses(path: Path, stream: TimedPoses) -> None:
     """``stamp tx ty tz qx qy qz qw`` lines."""
     lines = []
     for stamp, T in zip(stream.stamps, stream.poses, strict=True):

@@ -41,7 +41,6 @@ from stereo_rig import write as write_stereo_file
 
 from taichi_mrf.calibration.depth_files import DepthFiles
 from taichi_mrf.calibration.image_stamps import read_stamps
-from taichi_mrf.calibration.pose_stream import read_pose_stream
 from taichi_mrf.config.schema import Config, load
 from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets import Dataset, open_dataset
@@ -49,6 +48,7 @@ from taichi_mrf.datasets.images import read_grey
 from taichi_mrf.datasets.laser.plan_image import read_floor_plan
 from taichi_mrf.datasets.laser.readers import open_scans
 from taichi_mrf.datasets.synthetic.mesh_scene import load_mesh
+from taichi_mrf.datasets.timed_poses import read_timed_poses
 from taichi_mrf.errors import FrameError, TaichiMRFError
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.export.octomap import write_bt, write_ot
@@ -198,7 +198,7 @@ def _noise(path: Path) -> bytes:
 
 
 def _stream(path: Path) -> bytes:
-    stream = read_pose_stream(path)
+    stream = read_timed_poses(path)
     return _arrays_of(stream.stamps, stream.poses)
 
 
