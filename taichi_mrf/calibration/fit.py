@@ -21,7 +21,7 @@ BEST_COVERED = 0.9
 
 @dataclass(frozen=True)
 class LearntNoise:
-    """Bias and sigma of each patch over depth in metres, and what they rest on.
+    """Bias and sigma of each patch over depth in metres, with the data they follow from.
 
     ``counts`` are the samples of each cell, (patches, bins); ``covered`` the cells that counted; ``own`` the
     patches that needed no neighbour; ``lifted`` those whose sigma had to be kept from falling to zero;
@@ -50,10 +50,10 @@ class LearntNoise:
 def learn(moments: Moments, counts: NDArray[np.int64]) -> LearntNoise:
     """Fit every patch; ``counts`` are all samples, outliers included, for the report.
 
-    A patch stands on its own if its bins are enough and span enough depth. Any other starts from the
-    mean and the spread of the curves of its nearest neighbours that do, and its own samples pull it away
-    from there as far as they are worth. With fewer than NEIGHBOURS patches of that kind in the image, the
-    others get one curve made from all samples.
+    A patch stands on its own if its bins are enough and span enough depth. For any other, the mean and
+    spread of the curves of its nearest neighbours that do are the prior, which its own samples update.
+    With fewer than NEIGHBOURS patches of that kind in the image, the others get one curve made from all
+    samples.
 
     Raises DatasetError if there are too few samples for a single polynomial.
     """
@@ -110,7 +110,7 @@ def _standing_alone(covered: NDArray[np.bool_], options: CalibrationConfig) -> N
 
 
 def _fit_all(sums: Sums, own: NDArray[np.bool_], columns: int) -> Fit:
-    """The curves over scaled depth of all patches, whether they stand alone or borrow."""
+    """The curves over scaled depth of all patches, own and borrowed."""
     patches, terms = len(own), sums.terms
     bias, sigma = _blank(patches, terms), _blank(patches, terms)
     misfit = np.full(patches, np.nan)

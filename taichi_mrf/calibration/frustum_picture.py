@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 SLICES = 8
 _COLORS = "RdYlBu"
-"""Red lacks data, blue has them; green would be lost on many readers."""
+"""Red lacks data, blue has enough; green would be hard to tell from red for many readers."""
 
 
 def frustum_picture(coverage: Coverage, counts: NDArray[np.int64]) -> "Figure":

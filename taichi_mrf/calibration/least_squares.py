@@ -2,7 +2,7 @@
 
 Bias: the errors regressed on powers of the true depth, each cell weighted with 1 / sigma^2.
 Sigma: the standard deviation of each cell's residuals, regressed likewise, with the weight 2 n / sigma^2 that
-the standard deviation of n normal samples has. Bias and sigma need one another and take turns.
+the standard deviation of n normal samples has. Each of the two needs the other, so they are fitted in turns.
 """
 
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ ROUNDS = 4
 
 _SIGMA_ROUNDS = 5
 _LEAST_SHARE = 0.1
-"""A cell's weight is never taken from a sigma below this share of the one it shows itself: a polynomial on
-its way to the solution may pass near zero."""
+"""Lower bound of the sigma that weights a cell, as a share of the cell's own spread: a polynomial may pass
+near zero before it converges."""
 
 _TINY_M = 1e-7
 
@@ -90,7 +90,7 @@ def fit_curves(sums: Sums, bias_prior: Prior, sigma_prior: Prior) -> Fit:
 def _residuals(
     sums: Sums, outer: NDArray[np.float64], weight: NDArray[np.float64], bias: Curves
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Each cell's sum of squared residuals, and its samples less what the fit has used up of them."""
+    """Each cell's sum of squared residuals, and its samples minus the degrees of freedom of the fit."""
     beta = bias.coefficients
     squares = (
         sums.squares
@@ -124,7 +124,7 @@ def _fit_sigma(
         beta = sigma.coefficients
         mean = np.einsum("pi,pbi->pb", beta, x)
         root = np.sqrt(np.maximum(np.einsum("pi,pbij,pj->pb", beta, outer, beta) / n, 0.0))
-        # A cell shows the root of its mean variance, a little more than its mean sigma where sigma is steep.
+        # A cell measures the root of its mean variance: more than its mean sigma where sigma is steep.
         excess = root - np.abs(mean)
         value = np.maximum(root, _LEAST_SHARE * shown)
     return sigma, value**2

@@ -3,7 +3,8 @@
 Markers sit neither in the camera's optical centre nor in the board's first corner. Where they sit, and the
 time lag to a fraction of a millisecond, are the values that put the corners found in the images where
 they were found: T_camera_board(t) = T_camera_body  M(t + lag)  T_body_board, with M the board's body in
-the camera's. A linear hand-eye solution starts it, Gauss-Newton on the reprojection error ends it.
+the camera's. The search starts from a linear hand-eye solution, and Gauss-Newton minimises the
+reprojection error.
 """
 
 from dataclasses import dataclass
@@ -47,7 +48,7 @@ class Alignment:
     def T_camera_board(
         self, stamps: NDArray[np.float64], bodies: BodyPair, largest_gap: float
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """The board's pose at image stamps (N,), (N, 4, 4), and where motion capture has it."""
+        """The board's pose at image stamps (N,), (N, 4, 4), and whether motion capture has it."""
         M, known = bodies.relative(np.asarray(stamps) + self.lag, largest_gap)
         return self.T_camera_body @ M @ self.T_body_board, known
 

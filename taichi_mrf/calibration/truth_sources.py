@@ -19,7 +19,7 @@ from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 
 Progress = Callable[[int, int], None]
-"""Told how many images are done, of how many."""
+"""Called with the number of images done and their total."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What the rest of the program needs to know of a mapping method: one entry, made in the method's own folder.
+"""The description of a mapping method for the rest of the program, made in the method's own folder.
 
 Kept apart from the list of entries (registry.py), because each method's folder imports this.
 """

@@ -15,7 +15,7 @@ class Range:
 
 
 def always(section: Any) -> bool:
-    """The condition of a parameter that counts whatever the others are."""
+    """The condition of a parameter that always has an effect."""
     return True
 
 

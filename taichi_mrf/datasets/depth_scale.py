@@ -19,7 +19,7 @@ USUAL = (1000.0, 5000.0)
 """Steps per metre of millimetres (Kinect, RealSense, Redwood) and of TUM RGB-D and ICL-NUIM."""
 
 PLAUSIBLE_MEDIAN_M = (0.1, 100.0)
-"""A median depth outside of this is doubted."""
+"""A median depth outside this range is reported as implausible."""
 
 _PLACES = 4
 _LEAST_BASELINE_M, _LARGEST_TURN = 0.1, 0.5

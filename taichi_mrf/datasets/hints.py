@@ -1,4 +1,4 @@
-"""What to do with data that no reader takes: laser and lidar scans, meshes, maps, a text file a frame."""
+"""Hints for data that no reader supports: laser and lidar scans, meshes, maps, a text file for each image."""
 
 import re
 import shlex
@@ -24,7 +24,7 @@ _POSE_TEXTS = (".txt", ".pose", ".cam", ".info")
 
 def hint_for(path: Path) -> str | None:
     """What a file, or most of a folder, holds instead of depth images, and which command reads it; None if
-    that is not known either."""
+    it is unknown."""
     if holds_scans(path):
         return (
             "contains scans of a 2D laser scanner, not depth images; map them with: "

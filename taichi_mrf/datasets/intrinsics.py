@@ -19,7 +19,7 @@ from taichi_mrf.system.files import read_text
 _NAMED = re.compile(r"\b(fx|fy|cx|cy|width|height|skew|s)\b\s*[:=]\s*([-+.\w]+)", re.IGNORECASE)
 
 PRIMESENSE = PinholeCamera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
-"""What drivers of PrimeSense cameras (Kinect 1, Xtion) assume, and ROS with them."""
+"""The defaults of PrimeSense drivers (Kinect 1, Xtion), which ROS uses too."""
 
 CAMERA_FILES = (
     "camera.txt",
@@ -50,7 +50,7 @@ def find_camera(
     """The camera of the recording in ``folder``, and a note where it was assumed and not read.
 
     ``depth_files`` tell the image size where the intrinsics' file does not. Raises DatasetError,
-    whose text names the file, if there is an intrinsics' file that makes no sense.
+    whose text names the file, for an intrinsics file that is not valid.
     """
     if options.camera is not None:
         return options.camera, []

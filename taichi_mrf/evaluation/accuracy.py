@@ -42,7 +42,7 @@ OUTLIERS = 0.01
 
 
 class JudgedMap(Protocol):
-    """What the judge asks of a map, whatever the method."""
+    """The part of a map that the metric uses."""
 
     @property
     def voxel_size(self) -> float: ...

@@ -1,4 +1,4 @@
-"""A table of results in every form that it is asked for: CSV, LaTeX, and a picture."""
+"""A table of results as CSV, LaTeX, and a picture."""
 
 import csv
 import io

@@ -93,7 +93,7 @@ class ChunkStore:
         try:
             group = zarr.open_group(store=str(path), mode="r+", zarr_format=3, use_consolidated=False)
             return cls(path, group, layout)
-        except Exception as error:  # zarr raises whatever its parsing stumbles over
+        except Exception as error:  # zarr's parsers raise many kinds of exceptions
             raise MapFileError(f"{path}: not a readable map in chunks: {said(error)}") from error
 
     @property

@@ -72,7 +72,7 @@ def extensions() -> Sequence[str]:
 
 
 def export_note(m: ExportedMap, path: str | Path, options: ExportOptions = _DEFAULTS) -> str | None:
-    """What a user should be told about a file that was written: how a floor plan lies in the world."""
+    """A note for the user on a written file: how a floor plan lies in the world."""
     if _WRITERS.get(Path(path).suffix.lower()) is not _level_map:
         return None
     reason = "--up" if options.up != "auto" else "as in the map's first keyframe"

@@ -1,4 +1,4 @@
-"""2D maps in the format of ROS's map_server: a grey image and a YAML file that says where it lies."""
+"""2D maps in the format of ROS's map_server: a grey image and a YAML file with its position."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from taichi_mrf.system.atomic import atomic_path, write_text
 
 OCCUPIED_GREY, FREE_GREY, UNKNOWN_GREY = 0, 254, 205
 OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196
-"""From which probability on map_server holds a cell to be occupied, and up to which to be free; the three
+"""map_server's thresholds: a cell is occupied from the first probability on, free up to the second; the three
 grey values stand for 1, 0.004 and 0.196, the last of which it reads as unknown."""
 
 

@@ -1,4 +1,4 @@
-"""Maps as OctoMap's files: ``.ot`` with the log-odds, ``.bt`` with what is free and what is occupied.
+"""Maps as OctoMap's files: ``.ot`` with the log-odds, ``.bt`` with free and occupied voxels.
 
 The format is that of OctoMap's AbstractOcTree::write and OccupancyOcTreeBase::writeBinary: a header in text,
 then the nodes in pre-order. In an ``.ot`` each has a float32 and a bit for each child; in a ``.bt`` only the
@@ -14,7 +14,7 @@ from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.system.atomic import atomic_path
 
 FULL_HEADER, BINARY_HEADER = "# Octomap OcTree file", "# Octomap OcTree binary file"
-"""First lines, by which OctoMap knows its files."""
+"""First lines that identify OctoMap files."""
 
 FULL_NODE = np.dtype([("value", "<f4"), ("children", "u1")])
 """A node of an ``.ot``."""

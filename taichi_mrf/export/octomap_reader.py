@@ -28,7 +28,7 @@ from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import VOXELS
 
 FREE_PROBABILITY, OCCUPIED_PROBABILITY = 0.1192, 0.971
-"""What OctoMap gives the leaves of a ``.bt``: the limits at which it clamps."""
+"""Probabilities of the leaves of a ``.bt``: the limits at which OctoMap clamps."""
 
 _NODE_BYTES = {"OcTree": 5, "ColorOcTree": 8}
 """Bytes of a node in an ``.ot``, by the kind of tree: value, colour if any, children."""
@@ -62,7 +62,7 @@ class OctomapLeaves:
         partly = np.unique(self.code[small] >> 3 * BRICK_LEVEL)
         whole_level = self.level[~small].astype(np.int64) - BRICK_LEVEL
         count = len(partly) + int((8**whole_level).sum())
-        what = f"{count * VOXELS / 1e6:.3g} million voxels, in {len(self.code):,} leaves of OctoMap's,"
+        what = f"{count * VOXELS / 1e6:.3g} million voxels, in {len(self.code):,} OctoMap leaves,"
         check_memory(float(count) * VOXELS * _BYTES_PER_VOXEL, f"{self.source}: {what}")
         values = np.zeros((count, VOXELS), np.float32)
         for level in range(BRICK_LEVEL):
@@ -91,10 +91,10 @@ def read_octomap(path: str | Path) -> OctomapLeaves:
     except (KeyError, ValueError) as error:
         raise MapFileError(f"{path}: its header lacks a resolution or a size") from error
     if not 0 < voxel_size < np.inf:
-        raise MapFileError(f"{path}: a resolution of {voxel_size} m makes no sense")
+        raise MapFileError(f"{path}: a resolution of {voxel_size} m is not valid")
     kind = header.get("id", "OcTree")
     if not binary and kind not in _NODE_BYTES:
-        raise MapFileError(f"{path}: a tree of the kind {kind[:40]}; those that can be read are {_KINDS}")
+        raise MapFileError(f"{path}: unsupported kind of tree {kind[:40]}; supported are {_KINDS}")
     try:
         if size == 0:
             leaves: _Leaves = 0, [], [], np.zeros(0, np.float32)
@@ -103,10 +103,10 @@ def read_octomap(path: str | Path) -> OctomapLeaves:
         else:
             leaves = _full_leaves(data, _NODE_BYTES[kind])
     except IndexError as error:
-        raise MapFileError(f"{path}: damaged: its nodes make no tree, or end too early") from error
+        raise MapFileError(f"{path}: damaged: its nodes do not form a tree, or end too early") from error
     nodes, codes, levels, values = leaves
     if nodes != size:  # which OctoMap's own reader refuses too
-        raise MapFileError(f"{path}: damaged: it has {nodes:,} nodes, where its header says {size:,}")
+        raise MapFileError(f"{path}: damaged: it has {nodes:,} nodes, but {size:,} by its header")
     if not np.isfinite(values).all():
         raise MapFileError(f"{path}: damaged: a node's value is not finite")
     return OctomapLeaves(np.array(codes, np.int64), np.array(levels, np.int8), values, voxel_size, str(path))
@@ -125,7 +125,7 @@ def _split(path: str | Path, content: bytes) -> tuple[dict[str, str], bytes]:
     match = re.search(rb"^data[ \t\r]*\n", content[:65536], re.MULTILINE)
     first = content.partition(b"\n")[0].decode("ascii", "replace").strip()
     if not first.startswith((FULL_HEADER, BINARY_HEADER)) or match is None:
-        raise MapFileError(f"{path}: not a file of OctoMap's (.bt or .ot)")
+        raise MapFileError(f"{path}: not an OctoMap file (.bt or .ot)")
     header = {"#": BINARY_HEADER if first.startswith(BINARY_HEADER) else FULL_HEADER}
     for line in content[: match.start()].decode("ascii", "replace").splitlines():
         word, _, value = line.partition(" ")
@@ -135,7 +135,7 @@ def _split(path: str | Path, content: bytes) -> tuple[dict[str, str], bytes]:
 
 
 def _full_leaves(data: bytes, node_bytes: int) -> _Leaves:
-    """Raises IndexError if the nodes make no tree."""
+    """Raises IndexError if the nodes do not form a tree."""
     count = len(data) // node_bytes
     table = np.frombuffer(data, np.uint8, count * node_bytes).reshape(count, node_bytes)
     rows, codes, levels, nodes = [], [], [], 0
@@ -159,7 +159,7 @@ def _full_leaves(data: bytes, node_bytes: int) -> _Leaves:
 
 
 def _binary_leaves(data: bytes) -> _Leaves:
-    """Raises IndexError if the nodes make no tree."""
+    """Raises IndexError if the nodes do not form a tree."""
     words = iter(np.frombuffer(data, "<u2", len(data) // 2).tolist())
     codes, levels, occupied, inner = [], [], [], 0
     stack = [(0, DEPTH)]

@@ -1,6 +1,6 @@
 """PLY files, which MeshLab, CloudCompare, Blender and Open3D open: points and surfaces, both in colours.
 
-All are binary and little-endian; a table of named columns says what a vertex has.
+All are binary and little-endian; a table of named columns defines a vertex.
 """
 
 from collections.abc import Sequence

@@ -1,6 +1,6 @@
-"""What a map in chunks says of itself on disk, checked before zarr follows it.
+"""The metadata of a map in chunks, checked before zarr uses it.
 
-zarr trusts these documents: with them a file decides how much memory is taken, which files are opened and how
+zarr trusts these documents, which determine how much memory is allocated, which files are opened and how
 they are unpacked. So only what this package writes is accepted.
 """
 
@@ -76,7 +76,7 @@ class StoreLayout:
 
 
 def read_layout(folder: Path) -> StoreLayout:
-    """What the documents in a store's folder say. Raises MapFileError, which names folder and value."""
+    """The metadata in a store's folder. Raises MapFileError, which names folder and value."""
     attributes = _document(folder, "", "group").get("attributes")
     if not isinstance(attributes, dict) or FORMAT_KEY not in attributes:
         raise MapFileError(f"{folder}: not a map of taichi_mrf in chunks")
@@ -172,7 +172,7 @@ def _document(folder: Path, name: str, kind: str) -> dict[str, Any]:
         3,
         kind,
     ):
-        raise MapFileError(f"{path}: damaged: it describes no {kind} of zarr 3")
+        raise MapFileError(f"{path}: damaged: it does not describe a zarr 3 {kind}")
     return document
 
 
@@ -182,7 +182,7 @@ def _whole_numbers(folder: Path, name: str, found: Any, count: int, least: int) 
     if not fits or not all(
         type(n) is int and least <= n <= _MOST_CHUNKS_ACROSS * CHUNK_VOXELS for n in found
     ):
-        raise _damaged(folder, f"{name} is not {count} whole numbers of a possible size")
+        raise _damaged(folder, f"{name} must be {count} whole numbers within the limits")
     return tuple(found)
 
 

@@ -94,7 +94,7 @@ def best_vulkan_device(allow_software: bool) -> VulkanDevice:
     """The Vulkan device of the fastest kind. Raises BackendError if there is none that may be used."""
     devices = sorted(vulkan_devices(), key=lambda device: _PREFERENCE.index(device.kind))
     if not devices:
-        raise BackendError("the Vulkan driver knows no device")
+        raise BackendError("the Vulkan driver lists no device")
     if devices[0].software and not allow_software:
         raise BackendError(
             f"the only Vulkan device is software ({devices[0].name}), which is used only on request"
@@ -120,14 +120,14 @@ def cuda_device_count() -> int:
 
 
 def _cuda_devices() -> tuple[ctypes.CDLL, int]:
-    """The started driver, and how many devices it knows. Raises BackendError if there is none."""
+    """The started driver, and the number of its devices. Raises BackendError if there is none."""
     cuda = _library("NVIDIA driver", {"win32": "nvcuda.dll"}, "libcuda.so.1")
     if code := cuda.cuInit(0):
         raise BackendError(f"the NVIDIA driver does not start (cuInit answers {code})")
     count = ctypes.c_int()
     cuda.cuDeviceGetCount(ctypes.byref(count))
     if count.value == 0:
-        raise BackendError("the NVIDIA driver knows no device")
+        raise BackendError("the NVIDIA driver lists no device")
     return cuda, count.value
 
 

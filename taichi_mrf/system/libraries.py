@@ -1,4 +1,4 @@
-"""Optional libraries: loaded when they are first used; without them, one line says what to install."""
+"""Optional libraries: loaded when they are first used; without them, the error names what to install."""
 
 import importlib
 from typing import Any

@@ -11,7 +11,7 @@ from taichi_mrf.errors import CapacityError
 
 def available_bytes() -> int | None:
     """Memory in bytes that this process can still allocate: what the machine has free, or less in a container
-    or under ``ulimit -v``. None where the system does not tell."""
+    or under ``ulimit -v``. None where the system does not report it."""
     known = [each for each in (_of_machine(), _of_container(), _of_process()) if each is not None]
     return min(known) if known else None
 

@@ -122,7 +122,7 @@ class NpzFile:
                 yield stream, shape, fortran, dtype
         except TaichiMRFError:
             raise
-        except Exception as error:  # zipfile, zlib and NumPy raise whatever their parsing stumbles over
+        except Exception as error:  # zipfile, zlib and NumPy raise many kinds of exceptions
             raise self._problem(name, f"cannot be read: {said(error)}") from error
 
     def _count_bytes(self, name: str, info: zipfile.ZipInfo) -> None:

@@ -90,7 +90,7 @@ class OwnedAttribute:
 
 
 def owned_attribute() -> Any:
-    """An OwnedAttribute, for a type checker of whatever type the attribute is declared."""
+    """An OwnedAttribute that a type checker accepts for an attribute of any type."""
     return OwnedAttribute()
 
 

@@ -61,7 +61,7 @@ _log = logging.getLogger(__name__)
 
 
 def init(arch: str = "auto", threads: int = 0, debug: bool = False, profile: bool = False) -> str:
-    """Start Taichi and return the backend's name; :func:`choice` and the log tell the rest.
+    """Start Taichi and return the backend's name; :func:`choice` and the log have the details.
 
     ``arch`` is "cuda", "vulkan", "cpu", or "auto" for the first of these that there is. A software
     Vulkan device is taken only for arch="vulkan". ``threads`` limits the CPU backend (0 = all cores),
@@ -70,7 +70,7 @@ def init(arch: str = "auto", threads: int = 0, debug: bool = False, profile: boo
     Taichi: maps can be used in no other thread (system/owner.py).
 
     Raises BackendError if the requested backend is not available or another one already runs, and in another
-    thread or a forked process. A backend that was asked for is never replaced by another one.
+    thread or a forked process. A requested backend is never replaced by another one.
     """
     global _chosen
     if arch not in ("auto", *BACKENDS):
@@ -205,7 +205,9 @@ def _usable(threads: int) -> int:
     if threads <= devices.cores():
         return threads
     _log.warning(
-        "runtime.threads is %d, but this machine has %d cores; so many are used", threads, devices.cores()
+        "runtime.threads is %d, but this machine has %d cores; one thread is used for each",
+        threads,
+        devices.cores(),
     )
     return devices.cores()
 

@@ -53,7 +53,7 @@ class BrickPool:
         self.bricks = np.zeros((0, 3), np.int32)
         self.owners = np.zeros(0, np.int32)
         self.identity = np.zeros(0, np.int64)
-        self.change_count = np.zeros(0, np.int64)  # marginals that have moved in each brick since it was born
+        self.change_count = np.zeros(0, np.int64)  # changed marginals in each brick since it was allocated
         self.revision = 0  # changes whenever the beliefs do
         self._touched = np.zeros(0, bool)
         self._changed = np.zeros(0, bool)
@@ -115,7 +115,7 @@ class BrickPool:
             self.belief.fill(self.prior_log_odds)
 
     def touch(self, slots: NDArray[np.int32]) -> None:
-        """Note that what is known of these bricks may have changed."""
+        """Mark these bricks as possibly changed."""
         self._touched[slots] = True
 
     def take_touched(self) -> NDArray[np.int32]:
@@ -125,12 +125,12 @@ class BrickPool:
         return slots
 
     def count_changes(self, slots: NDArray[np.int32], moved: NDArray[np.int32]) -> None:
-        """Count marginals that have moved in some bricks, (n,) each."""
+        """Count changed marginals in some bricks, (n,) each."""
         self.change_count[slots] += moved
         self._changed[slots[moved > 0]] = True
 
     def take_changed(self) -> NDArray[np.int32]:
-        """Coordinates (n, 3) of the bricks that are new, or in which marginals have moved, since this was
+        """Coordinates (n, 3) of the bricks that are new, or in which marginals have changed, since this was
         last called."""
         bricks = self.bricks[self._changed & (self.owners > 0)]
         self._changed[:] = False

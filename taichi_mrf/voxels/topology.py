@@ -3,11 +3,11 @@
 On CPU and CUDA it is a layer of a Taichi SNode tree, pointer -> pointer -> pointer -> bitmasked: a bitmasked
 cell is a brick, the pointer cell above it a chunk of 8^3 bricks, the one above that a region of 16^3 chunks,
 which together span 8192 bricks along each axis, and the uppermost a map. Vulkan has no sparse SNodes, so
-there the same interface is served by dense arrays over a bounded volume. Nothing outside this file knows
-which of the two it is.
+there the same interface is served by dense arrays over a bounded volume. Code outside this file does not
+depend on which of the two is used.
 
-Beside its slot each brick has a number of crossings: how many keyframes' rays pass through it. A brick
-without a slot that has been crossed is seen-free space, one that has not is unknown.
+Beside its slot each brick has a number of crossings: how many keyframes' rays pass through it. A crossed
+brick without a slot is seen-free space; one that was never crossed is unknown.
 """
 
 import gc
@@ -31,13 +31,13 @@ class Topology(Protocol):
     """The interface that both kinds of index serve. All arguments are NumPy arrays of one length."""
 
     def anchor(self, brick: Bricks) -> None:
-        """Tell where the map begins, (3,); a bounded index puts its volume around it, once."""
+        """Set where the map begins, (3,); a bounded index puts its volume around it, once."""
 
     def insert(self, bricks: Bricks, slots: NDArray[np.int32]) -> None:
         """Give bricks their slots; they must have passed :meth:`check`."""
 
     def erase(self, bricks: Bricks) -> None:
-        """Take bricks' slots away."""
+        """Remove bricks' slots."""
 
     def slots(self, bricks: Bricks) -> NDArray[np.int32]:
         """The slot of each brick, -1 where it does not exist."""

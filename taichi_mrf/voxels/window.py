@@ -1,6 +1,6 @@
 """A window: the box of bricks that one keyframe or one view looks at, as a dense index.
 
-Kernels that follow rays do not ask the topology: the bricks that matter to them are scattered into a
+Kernels that follow rays do not query the topology: the bricks that they need are scattered into a
 small dense array first, which is faster to read, the same on every backend, and needs no compilation
 for each map. The window's corner is also the origin of the rays' coordinates, worked out in float64
 on the host, so that float32 is exact enough anywhere in the world.
@@ -123,7 +123,7 @@ class WindowIndex:
         _enter(window.shape_vector, cells, slots, self.bricks, self.chunks)
 
     def clear(self, window: Window, cells: Resident) -> None:
-        """Take the same bricks out again, which costs less than filling the whole index."""
+        """Remove the same bricks, which costs less than clearing the whole index."""
         _take_out(window.shape_vector, cells, self.bricks, self.chunks)
 
     def space(

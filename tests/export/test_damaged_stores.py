@@ -106,9 +106,9 @@ def test_no_value_of_a_document_can_do_harm(store: Path, name: str) -> None:
         (lambda d: d["attributes"].update(voxel_size=0.06), "voxel_size is 0.06, in its configuration 0.05"),
         (lambda d: d["attributes"].update(min_evidence=-1), "min_evidence is -1"),
         (lambda d: d["attributes"].pop("prior_log_odds"), "prior_log_odds is missing"),
-        (lambda d: d["attributes"].update(lowest_chunk=[0, 0.5, 0]), "lowest_chunk is not 3 whole numbers"),
+        (lambda d: d["attributes"].update(lowest_chunk=[0, 0.5, 0]), "lowest_chunk must be 3 whole numbers"),
         (lambda d: d["attributes"].update(lowest_chunk=[9, 0, 0]), "or one outside of the array"),
-        (lambda d: d.update(zarr_format=2), "describes no group of zarr 3"),
+        (lambda d: d.update(zarr_format=2), "does not describe a zarr 3 group"),
     ],
 )
 def test_what_is_wrong_is_named(store: Path, change: Callable[[dict[str, Any]], object], said: str) -> None:

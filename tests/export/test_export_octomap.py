@@ -256,19 +256,19 @@ BINARY = HEADER.replace(b"OcTree file", b"OcTree binary file")
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
-        (b"ply\nformat ascii 1.0\n", "not a file of OctoMap's"),
-        (b"", "not a file of OctoMap's"),
+        (b"ply\nformat ascii 1.0\n", "not an OctoMap file"),
+        (b"", "not an OctoMap file"),
         (HEADER.replace(b"res 0.1\n", b""), "lacks a resolution"),
         (HEADER.replace(b"size 2", b"size many"), "lacks a resolution or a size"),
-        (HEADER.replace(b"0.1", b"-1"), "-1.0 m makes no sense"),
-        (HEADER.replace(b"id OcTree", b"id CountingOcTree"), "of the kind CountingOcTree"),
+        (HEADER.replace(b"0.1", b"-1"), "-1.0 m is not valid"),
+        (HEADER.replace(b"id OcTree", b"id CountingOcTree"), "unsupported kind of tree CountingOcTree"),
         (HEADER + b"\0\0\0\0\xff", "end too early"),
         (HEADER, "end too early"),
-        (HEADER + b"\0\0\0\0\x01" * 40, "make no tree"),
+        (HEADER + b"\0\0\0\0\x01" * 40, "do not form a tree"),
         (BINARY + b"\x03", "end too early"),
-        (BINARY + b"\x03\0" * 40, "make no tree"),
-        (HEADER + b"\0\0\0\0\0", "it has 1 nodes, where its header says 2"),
-        (BINARY + b"\x05\0", "it has 3 nodes, where its header says 2"),
+        (BINARY + b"\x03\0" * 40, "do not form a tree"),
+        (HEADER + b"\0\0\0\0\0", "it has 1 nodes, but 2 by its header"),
+        (BINARY + b"\x05\0", "it has 3 nodes, but 2 by its header"),
         (HEADER + b"\0\0\0\0\x01\0\0\xc0\x7f\0", "a node's value is not finite"),
     ],
 )
@@ -290,7 +290,7 @@ def test_a_leaf_that_stands_for_more_voxels_than_there_is_memory_for(tmp_path: P
     (tmp_path / "vast.bt").write_bytes(BINARY + b"\x01\0")
     leaves = read_octomap(tmp_path / "vast.bt")
     assert leaves.voxels == 32768**3
-    with pytest.raises(CapacityError, match="million voxels, in 1 leaves of OctoMap's, would need"):
+    with pytest.raises(CapacityError, match="million voxels, in 1 OctoMap leaves, would need"):
         leaves.bricks()
 
 

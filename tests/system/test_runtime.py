@@ -95,7 +95,7 @@ def test_what_is_asked_for_and_not_there_is_an_error(
     has(monkeypatch, None, [])
     with pytest.raises(BackendError, match="cuda cannot be used: no NVIDIA driver"):
         runtime.init("cuda")
-    with pytest.raises(BackendError, match="vulkan cannot be used: the Vulkan driver knows no device"):
+    with pytest.raises(BackendError, match="vulkan cannot be used: the Vulkan driver lists no device"):
         runtime.init("vulkan")
     with pytest.raises(BackendError, match="unknown backend 'metal'"):
         runtime.init("metal")
@@ -198,7 +198,7 @@ def test_more_threads_than_cores_are_a_warning(caplog: pytest.LogCaptureFixture)
     assert not caplog.messages
     assert runtime._usable(100_000) == cores
     assert caplog.messages == [
-        f"runtime.threads is 100000, but this machine has {cores} cores; so many are used"
+        f"runtime.threads is 100000, but this machine has {cores} cores; one thread is used for each"
     ]
 
 

@@ -70,7 +70,7 @@ def find_poses(reader: RosReader, depth: DepthTopic, choice: PoseChoice) -> BagP
     """The camera's poses as the user chose, else from the only source in the bag.
 
     Raises DatasetError, whose text names the file and lists the candidates or the frames, if there are none
-    or several, or if frames that were named do not hang together.
+    or several, or if the named frames are not connected.
     """
     if choice.poses == TRACK:
         return BagPoses(lambda stamp, largest_gap: start_pose(), "found from the images")
@@ -128,7 +128,7 @@ def _from_topic(
 
 
 def _read_poses(reader: RosReader, name: str) -> tuple[TimedPoses, str, str, list[str]]:
-    """A topic's poses, the frame that they are in, the frame that they are of (empty if unsaid), and
+    """A topic's poses, the frame that they are in, the frame that they are of (empty if not given), and
     notes."""
     topic = reader.topics[name]
     if topic.type not in messages.POSES:

@@ -64,13 +64,13 @@ def _transforms(tree: TransformTree) -> list[str]:
 
 
 def _sources(reader: RosReader, tree: TransformTree, depth: Sequence[DepthTopic]) -> list[str]:
-    """A name for each pair of a depth topic and something that tells where its camera was; only what the bag
-    leaves open is in it."""
+    """A source name for each pair of a depth topic and a source of poses, with the options that are
+    ambiguous."""
     sources = []
     for topic in depth:
         try:
             poses = [f"pose={name}" for name in pose_candidates(reader, tree, topic.frame)]
-        except DatasetError:  # frames that form a circle
+        except DatasetError:  # frames that form a cycle
             poses = []
         for pose in poses or ["poses=FILE"]:
             options = [f"depth={topic.name}"] if len(depth) > 1 else []

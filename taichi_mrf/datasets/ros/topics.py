@@ -36,7 +36,7 @@ class DepthTopic:
 
 
 def depth_topics(reader: RosReader) -> list[DepthTopic]:
-    """The topics whose first message is a depth image. mono16 is one if the topic calls itself depth:
+    """The topics whose first message is a depth image. mono16 counts if the topic's name contains depth:
     infrared images are mono16 too."""
     images = (messages.IMAGE, messages.COMPRESSED_IMAGE)
     names = [topic.name for topic in reader.topics.values() if topic.type in images and topic.messages]
@@ -120,7 +120,7 @@ def read_tree(reader: RosReader) -> TransformTree:
                 try:
                     T_parent_child = as_pose(messages.pose_of(transform))
                 except KeyframeError:
-                    continue  # an uninitialised transform; where it is needed there is a gap
+                    continue  # an uninitialised transform, which leaves a gap
                 if topic.name.endswith("tf_static"):
                     fixed[child] = parent, T_parent_child
                     continue

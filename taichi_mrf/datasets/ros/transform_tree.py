@@ -1,5 +1,5 @@
-"""A tree of coordinate frames, as ROS keeps it: each frame hangs on its parent by a fixed or a moving
-transform."""
+"""A tree of coordinate frames, as ROS keeps it: a fixed or moving transform connects each frame to its
+parent."""
 
 from collections.abc import Mapping
 
@@ -25,8 +25,7 @@ class TransformTree:
         return sorted({*self.edges, *(parent for parent, _ in self.edges.values())})
 
     def ancestors(self, frame: str) -> list[str]:
-        """The frame, its parent, its parent's parent, ... up to the root. Raises DatasetError for a
-        circle."""
+        """The frame, its parent, its parent's parent, ... up to the root. Raises DatasetError for a cycle."""
         path = [frame]
         while path[-1] in self.edges:
             parent = self.edges[path[-1]][0]
@@ -36,7 +35,7 @@ class TransformTree:
         return path
 
     def connects(self, a: str, b: str) -> bool:
-        """Whether there is a way from one frame to the other."""
+        """Whether two frames are connected."""
         return a == b or self.ancestors(a)[-1] == self.ancestors(b)[-1]
 
     def moves(self, a: str, b: str) -> bool:

@@ -74,7 +74,7 @@ class _BoundedFile:
 
 def _bounded(make: Callable[[], _Unpacker], what: str) -> Callable[..., bytes]:
     def unpack(packed: bytes, claimed: int | None = None) -> bytes:
-        """MCAP's reader says how much there should be, that of ROS 1 does not."""
+        """``claimed`` is the size that MCAP's reader expects; that of ROS 1 passes none."""
         most = max(_LEAST_BOUND, _LARGEST_RATIO * len(packed))
         unpacker = make()
         found = unpacker.decompress(packed, most + 1 if claimed is None else min(most, claimed) + 1)

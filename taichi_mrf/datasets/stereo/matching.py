@@ -64,8 +64,8 @@ class StereoMatching:
 
     least_texture: float = 0.1
     """Least RMS horizontal gradient (grey values per pixel, over 9 x 9 pixels) that counts as a measurement.
-    In an area that is quite flat or saturated the disparity is only guessed from its surroundings. The
-    noise of the camera makes gradients too: over 1 takes more of a noisy sky, and of pale walls with it."""
+    In an area that is quite flat or saturated the disparity is only guessed from its surroundings. Camera
+    noise makes gradients too: values above 1 drop more of a noisy sky, but also more of pale walls."""
 
     speckle_size: int = 200
     """Patches of disparities of up to this many pixels, cut off from what is around them, are dropped;

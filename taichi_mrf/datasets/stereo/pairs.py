@@ -79,7 +79,7 @@ class StereoPairs(Dataset):
 
 
 def noise_note(rig: StereoRig, left: str, right: str) -> str:
-    """What a report says of depth that is matched in the images ``left`` and ``right``."""
+    """The report's note on depth matched between the images ``left`` and ``right``."""
     lambda_ = rig.sigma()[2]
     return (
         f"depth comes from stereo: {left} and {right} by semi-global matching, "

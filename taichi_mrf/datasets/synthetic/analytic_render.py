@@ -43,7 +43,7 @@ def render(
 def _may_be_seen(
     geometry: NDArray[np.float32], camera: PinholeCamera, T_world_camera: Pose
 ) -> NDArray[np.int64]:
-    """Which solids, by their balls, reach into the cone around the image; at least one, however."""
+    """The solids whose bounding balls meet the cone around the image; at least one."""
     widest = float(np.arccos(1.0 / camera.largest_slant()))
     to_center = geometry[:, 1:4] - T_world_camera[:3, 3]
     distance = np.linalg.norm(to_center, axis=1)
@@ -117,7 +117,7 @@ def _nearest(geometry: Template, origin: Template, direction: Template):
     for i in range(geometry.shape[0]):
         to_center = ti.Vector([geometry[i, 1], geometry[i, 2], geometry[i, 3]]) - origin
         gap = to_center - to_center.dot(direction) * per_square * direction
-        # A ray passes most solids at a distance: their bounding balls tell so three times as fast.
+        # A ray passes most solids at a distance: testing their bounding balls first is three times as fast.
         if gap.dot(gap) <= geometry[i, 9]:
             t = _entry(geometry, i, origin, direction)
             if t < nearest:

@@ -43,7 +43,7 @@ DOOR_X, DOOR_WIDTH, DOOR_HEIGHT = 2.2, 0.92, 2.05
 
 EYE = 1.5
 METRES_PER_RADIAN = 0.5
-"""Turning by a radian takes as many frames as going so far."""
+"""Metres of travel that take as many frames as a turn of one radian."""
 
 CARPET: Color = (0.50, 0.52, 0.58)
 

@@ -1,7 +1,7 @@
 """A scene that is a triangle mesh in a file: reading it, and taking depth images of it.
 
-Files are read with trimesh and rays are cast by Embree (embreex), which only those need who use meshes:
-they come with the extra ``mesh``. World frame, metres.
+Files are read with trimesh and rays are cast by Embree (embreex), which are only needed for meshes and come
+with the extra ``mesh``. World frame, metres.
 """
 
 from dataclasses import dataclass

@@ -76,10 +76,10 @@ class RenderedSequence(Dataset):
 
     @abstractmethod
     def pose_at(self, index: int) -> Pose:
-        """T_world_camera of a frame that there is, (4, 4)."""
+        """T_world_camera of an existing frame, (4, 4)."""
 
     def lit_scene(self, T_world_camera: Pose) -> Scene:
-        """The scene with the lamp that a colour picture from there is taken by."""
+        """The scene with the lamp for a colour picture from this pose."""
         return self.scene
 
     @cached_property
