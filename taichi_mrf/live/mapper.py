@@ -98,7 +98,7 @@ class Mapper:
         if on:
             entry.map_id = self._add(entry)
             if self.refiner is not None:
-                self.refiner.know(entry.map_id, entry.T_recorded)
+                self.refiner.note_recorded(entry.map_id, entry.T_recorded)
             entry.depth_m, entry.state = None, "on"
         else:
             depth_m = self._keyframe(entry).depth_m

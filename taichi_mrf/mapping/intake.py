@@ -150,7 +150,7 @@ class Intake:
             self.tracker.resume(keyframe)
         if self.refiner is not None:
             T_world_camera = T_recorded
-            self.refiner.know(keyframe, T_recorded)
+            self.refiner.note_recorded(keyframe, T_recorded)
         self._selector.accept(T_world_camera)
 
     def _located(self, frame: Frame, index: int) -> Frame | Lost:
@@ -183,7 +183,7 @@ class Intake:
                     self._sweep(keyframe)
         except BaseException:
             if self.refiner is not None:
-                self.refiner.forget(keyframe)
+                self.refiner.drop_recorded(keyframe)
             self.map.remove_keyframe(keyframe)
             raise
         return keyframe

@@ -48,7 +48,7 @@ class PoseRefiner:
         self.map, self.config = m, config
         self._recorded: dict[int, Pose] = {}
 
-    def know(self, keyframe: int, T_recorded: Pose) -> None:
+    def note_recorded(self, keyframe: int, T_recorded: Pose) -> None:
         """Note the recorded pose of a keyframe that is placed already."""
         self._recorded[keyframe] = T_recorded
 
@@ -59,7 +59,7 @@ class PoseRefiner:
             id = self.map.add_keyframe(k.depth_m, k.T_world_camera, k.camera, k.name)
             self.map.infer(keyframes=[id], sweeps=1)
 
-    def forget(self, keyframe: int) -> None:
+    def drop_recorded(self, keyframe: int) -> None:
         """Drop the recorded pose of a keyframe that could not be placed."""
         self._recorded.pop(keyframe, None)
 

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import tyro
 
+from taichi_mrf.cli.options.checks import check_least
 from taichi_mrf.cli.options.verbosity import Verbosity
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
@@ -57,8 +58,7 @@ class Bench:
     """Parameters; the voxel size among them is not used."""
 
     def __post_init__(self) -> None:
-        if self.frames < 1:
-            raise ConfigError(f"--frames must be at least 1, not {self.frames}")
+        check_least(self, frames=1)
         chosen = [f"--{mode}" for mode in MODES if getattr(self, mode)]
         if len(chosen) > 1:
             raise ConfigError(f"{' and '.join(chosen)} do not go together")

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import tyro
 
+from taichi_mrf.cli.options.checks import check_least
 from taichi_mrf.cli.options.verbosity import Verbosity
 from taichi_mrf.config.schema import RuntimeConfig
 from taichi_mrf.errors import ConfigError
@@ -49,8 +50,7 @@ class Eval:
     """Where the kernels run."""
 
     def __post_init__(self) -> None:
-        if isinstance(self.limit, int) and self.limit < 1:
-            raise ConfigError(f"--limit must be at least 1, not {self.limit}")
+        check_least(self, limit=1)
         if not self.seeds:
             raise ConfigError("--seeds needs at least one number")
         if min(self.seeds) < 0:

@@ -7,6 +7,7 @@ from typing import Annotated, Literal, get_args
 
 import tyro
 
+from taichi_mrf.cli.options.checks import check_least
 from taichi_mrf.cli.options.verbosity import Verbosity
 from taichi_mrf.config.schema import RuntimeConfig
 from taichi_mrf.errors import ConfigError
@@ -77,10 +78,7 @@ class Laser:
     """Where the kernels run."""
 
     def __post_init__(self) -> None:
-        for name in ("every", "limit"):
-            value = getattr(self, name)
-            if isinstance(value, int) and value < 1:
-                raise ConfigError(f"--{name} must be at least 1, not {value}")
+        check_least(self, every=1, limit=1)
         if self.no_return_range is not None and not 0 < self.no_return_range < math.inf:
             raise ConfigError(f"--no-return-range must be a positive number, not {self.no_return_range}")
         if not 0 <= self.memory_limit_gb < math.inf:

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import tyro
 
+from taichi_mrf.cli.options.checks import check_least, check_port
 from taichi_mrf.cli.options.pose_flags import PoseFlags
 from taichi_mrf.cli.options.verbosity import Verbosity
 from taichi_mrf.config.schema import Config
@@ -77,11 +78,7 @@ class Live:
     """Parameters."""
 
     def __post_init__(self) -> None:
-        for name in ("every", "limit", "keep_live"):
-            value = getattr(self, name)
-            if isinstance(value, int) and value < 1:
-                raise ConfigError(f"--{name.replace('_', '-')} must be at least 1, not {value}")
+        check_least(self, every=1, limit=1, keep_live=1)
         if not 0 <= self.speed < float("inf"):
             raise ConfigError(f"--speed must be 0 or a positive number, not {self.speed:g}")
-        if not 0 <= self.port <= 65535:
-            raise ConfigError(f"--port must lie between 0 and 65535, not {self.port}")
+        check_port(self.port)

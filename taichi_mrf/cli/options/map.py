@@ -6,6 +6,7 @@ from typing import Annotated
 
 import tyro
 
+from taichi_mrf.cli.options.checks import check_least
 from taichi_mrf.cli.options.pose_flags import PoseFlags
 from taichi_mrf.cli.options.verbosity import Verbosity
 from taichi_mrf.config.schema import Config
@@ -91,10 +92,7 @@ class Map:
     """Parameters."""
 
     def __post_init__(self) -> None:
-        for name in ("every", "limit", "jobs"):
-            value = getattr(self, name)
-            if isinstance(value, int) and value < 1:
-                raise ConfigError(f"--{name} must be at least 1, not {value}")
+        check_least(self, every=1, limit=1, jobs=1)
         if self.sources is not tyro.MISSING and not self.sources:
             raise ConfigError("map needs a SOURCE")
         if self.resume and self.overwrite:

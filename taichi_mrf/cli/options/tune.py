@@ -6,6 +6,7 @@ from typing import Annotated
 
 import tyro
 
+from taichi_mrf.cli.options.checks import check_least, check_port
 from taichi_mrf.cli.options.verbosity import Verbosity
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets.source_flags import SourceFlags
@@ -83,21 +84,8 @@ class Tune:
     """Parameters to begin with."""
 
     def __post_init__(self) -> None:
-        least = {
-            "frames": 3,
-            "first": 0,
-            "stride": 0,
-            "hold_out": 2,
-            "auto": 1,
-            "seed": 0,
-            "search_stride": 0,
-        }
-        for name, lowest in least.items():
-            value = getattr(self, name)
-            if isinstance(value, int) and value < lowest:
-                raise ConfigError(f"--{name.replace('_', '-')} must be at least {lowest}, not {value}")
-        if not 0 <= self.port <= 65535:
-            raise ConfigError(f"--port must lie between 0 and 65535, not {self.port}")
+        check_least(self, frames=3, first=0, stride=0, hold_out=2, auto=1, seed=0, search_stride=0)
+        check_port(self.port)
         if self.search and self.auto is None:
             raise ConfigError("--search says what --auto searches: add --auto N")
         if not self.viewer and self.auto is None:
