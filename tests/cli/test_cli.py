@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import trimesh
 from console import COARSE, FAST, ROOM, as_process, assert_refused, mapped, report_of, taichi_mrf
-from new_interpreter import obey_hangups
+from new_interpreter import obey_hangups, output
 
 from taichi_mrf.cli.commands import COMMANDS
 from taichi_mrf.cli.flag_list import flags_of
@@ -62,6 +62,13 @@ def test_help_is_printed_without_loading_taichi_or_numpy() -> None:
     imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
     assert "taichi_mrf.cli.main" in imported
     assert not imported & {"taichi", "numpy", "cv2", "viser", "matplotlib"}
+
+
+def test_bench_without_a_viewer_loads_no_page() -> None:
+    program = (
+        "import sys, taichi_mrf.cli.bench.run; print('viser' in sys.modules, 'matplotlib' in sys.modules)"
+    )
+    assert output(program) == "False False"
 
 
 def test_every_command_names_a_function_that_exists() -> None:

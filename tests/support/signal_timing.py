@@ -95,8 +95,8 @@ class _Client:
     def _read(self) -> None:
         with contextlib.suppress(ConnectionClosed, OSError):
             for frame in self.client.connection:
-                if len(frame) < 4096:
-                    self.settled = "is up to date" in str(decode_frame(frame)) or self.settled
+                if not self.settled:
+                    self.settled = "is up to date" in str(decode_frame(frame))
 
 
 def _wait_until_settled(program: LiveProgram, patience_s: float) -> None:
