@@ -127,19 +127,28 @@ def read_report(folder: Path) -> dict[str, Any]:
     return report
 
 
-def test_a_run_that_ends_by_itself_leaves_the_map_that_map_makes(tmp_path: Path) -> None:
-    done = live(ROOM, "--exit-when-done", "--out", tmp_path / "live", *FLAGS)
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, "subprocess.CompletedProcess[str]"]:
+    """A run that ended by itself: its folder, and what it printed."""
+    out = tmp_path_factory.mktemp("ended") / "live"
+    return out, live(ROOM, "--exit-when-done", "--out", out, *FLAGS)
+
+
+def test_a_run_that_ends_by_itself_leaves_the_map_that_map_makes(
+    tmp_path: Path, ended: tuple[Path, "subprocess.CompletedProcess[str]"]
+) -> None:
+    out, done = ended
     assert (done.returncode, complaints(done.stderr)) == (0, "")
     assert re.search(r"The map is at http://127\.0\.0\.1:\d+ ", done.stdout)
-    assert {path.name for path in (tmp_path / "live").iterdir()} == FILES | PICTURES
+    assert {path.name for path in out.iterdir()} == FILES | PICTURES
     batch = command("map", ROOM, "--out", tmp_path / "batch", *FLAGS[:-2])
     subprocess.run(batch, check=True, capture_output=True)
     assert {path.name for path in (tmp_path / "batch").iterdir()} == FILES | PICTURES
-    live_report, batch_report = (read_report(tmp_path / name) for name in ("live", "batch"))
+    live_report, batch_report = (read_report(folder) for folder in (out, tmp_path / "batch"))
     assert live_report.keys() == batch_report.keys()
     different = {key for key in live_report if live_report[key] != batch_report[key]}
     assert different <= {"seconds", "peak_memory_mb", "map_memory_mb"}
-    assert voxels(tmp_path / "live") == voxels(tmp_path / "batch")
+    assert voxels(out) == voxels(tmp_path / "batch")
 
 
 @linux_only
@@ -215,12 +224,14 @@ def test_the_folder_of_another_run_is_replaced_only_if_asked(tmp_path: Path) -> 
     assert (tmp_path / "top_view.png").read_bytes() != b"of another run"
 
 
-def test_a_saved_map_is_shown_with_its_own_parameters(tmp_path: Path) -> None:
-    live(ROOM, "--exit-when-done", "--out", tmp_path / "first", *FLAGS)
-    again = live(tmp_path / "first" / "map.npz", "--exit-when-done", "--out", tmp_path / "again", *FLAGS[2:])
+def test_a_saved_map_is_shown_with_its_own_parameters(
+    tmp_path: Path, ended: tuple[Path, "subprocess.CompletedProcess[str]"]
+) -> None:
+    first, _ = ended
+    again = live(first / "map.npz", "--exit-when-done", "--out", tmp_path / "again", *FLAGS[2:])
     assert (again.returncode, complaints(again.stderr)) == (0, "")
     assert "its own parameters are in force" in again.stdout
-    assert voxels(tmp_path / "again") == voxels(tmp_path / "first")
+    assert voxels(tmp_path / "again") == voxels(first)
     assert "voxel_size: 0.1" in (tmp_path / "again" / "config.yaml").read_text()
 
 
