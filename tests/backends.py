@@ -31,7 +31,7 @@ def main() -> int:
     with ExitStack() as stack:
         queue = stack.enter_context(tempfile.TemporaryDirectory())
         command = [sys.executable, "-m", "pytest", *sys.argv[1:], "--arch"]
-        share = [*command, first, "--queue", queue]
+        share = [*command, first, f"--queue={queue}"]  # one word: pytest takes a folder for tests
         beside = {arch: [*command, arch] for arch in others}
         beside |= {_name(first, number): share for number in range(2, PROCESSES + 1)}
         runs = []
