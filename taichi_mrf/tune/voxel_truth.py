@@ -56,7 +56,8 @@ class VoxelTruth:
 
 
 def truth_of(dataset: Dataset, indices: Sequence[int]) -> VoxelTruth | None:
-    """The true occupancy of the voxels that some frames of a dataset see; None for a real recording."""
+    """The true occupancy of the voxels that some frames of a dataset see; None for a real recording and for a
+    scene in which something moves."""
     mesh = _mesh_of(dataset)
     if mesh is None:
         return None
@@ -73,5 +74,5 @@ def _mesh_of(dataset: Dataset) -> TriangleMesh | None:
     from taichi_mrf.datasets.synthetic.room import SyntheticRoom
 
     if isinstance(dataset, SyntheticRoom):
-        return scene_mesh(dataset.scene)
+        return scene_mesh(dataset.scene) if dataset.moving_scene is None else None
     return dataset.scene.mesh if isinstance(dataset, MeshSequence) else None

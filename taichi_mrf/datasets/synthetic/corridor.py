@@ -48,10 +48,10 @@ class SyntheticCorridor(RenderedSequence):
         """The corridor and its rooms, in the world frame."""
         return corridor_scene(self.options.rooms)
 
-    def lit_scene(self, T_world_camera: Pose) -> Scene:
-        """The scene in the light of a lamp over the camera."""
+    def lit(self, scene: Scene, T_world_camera: Pose) -> Scene:
+        """A scene in the light of a lamp over the camera."""
         x, y, z = T_world_camera[:3, 3].tolist()
-        return replace(self.scene, light=(x, y, z + LAMP_OVER_EYE_M))
+        return replace(scene, light=(x, y, z + LAMP_OVER_EYE_M))
 
     @cached_property
     def _way(self) -> NDArray[np.float64]:

@@ -20,7 +20,7 @@ from taichi_mrf.sensor.simulate import KINECT_1, simulate
 from taichi_mrf.system import runtime
 
 FRAMES_PER_SECOND = 5.0
-"""Sets the stamps only."""
+"""Of scenes in which nothing moves: sets the stamps only."""
 
 
 @dataclass(frozen=True)
@@ -72,15 +72,23 @@ class RenderedSequence(Dataset):
     @property
     @abstractmethod
     def scene(self) -> Scene:
-        """The solids, in the world frame."""
+        """The solids that never move, in the world frame."""
 
     @abstractmethod
     def pose_at(self, index: int) -> Pose:
         """T_world_camera of an existing frame, (4, 4)."""
 
-    def lit_scene(self, T_world_camera: Pose) -> Scene:
-        """The scene with the lamp for a colour picture from this pose."""
+    def scene_at(self, index: int) -> Scene:
+        """The solids at the time of a frame."""
         return self.scene
+
+    def stamp_at(self, index: int) -> float:
+        """The time of a frame in seconds."""
+        return index / FRAMES_PER_SECOND
+
+    def lit(self, scene: Scene, T_world_camera: Pose) -> Scene:
+        """A scene with the lamp for a colour picture from this pose."""
+        return scene
 
     @cached_property
     def frame_names(self) -> Sequence[str]:
@@ -96,29 +104,27 @@ class RenderedSequence(Dataset):
 
     def clean_depth(self, index: int) -> NDArray[np.float32]:
         """True axial depth of a frame, (H, W) float32 in metres."""
-        return self._render(self.pose(index), color=False)[0]
+        return self._render(index, color=False)[0]
 
     def signed_distance(self, points: ArrayLike) -> NDArray[np.float64]:
-        """True distance, (N,) in metres, of points (N, 3) to the nearest surface; negative in a solid."""
+        """True distance, (N,) in metres, of points (N, 3) to the nearest surface of :attr:`scene`; negative
+        in a solid."""
         return self.scene.signed_distance(points)
 
     def read(self, index: int) -> Frame:
         """Render one frame, with the noise that the options ask for."""
-        T_world_camera = self.pose(index)
-        depth_m, color = self._render(T_world_camera, self.color)
+        depth_m, color = self._render(index, self.color)
         if self.options.noise == "kinect":
             depth_m = simulate(depth_m, self.camera, KINECT_1, seed=(self.options.seed, index))
-        name, stamp = self.frame_names[index], index / FRAMES_PER_SECOND
-        return Frame(depth_m, T_world_camera, self.camera, stamp, name, color)
+        name, stamp = self.frame_names[index], self.stamp_at(index)
+        return Frame(depth_m, self.pose(index), self.camera, stamp, name, color)
 
-    def _render(
-        self, T_world_camera: Pose, color: bool
-    ) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
+    def _render(self, index: int, color: bool) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
+        T_world_camera = self.pose(index)
         if runtime.active() is None:
             raise BackendError(f"{self.name} is rendered with Taichi: call taichi_mrf.init() first")
         # Imported late: a wrong option, or the list of frames, should not wait for Taichi to load.
         from taichi_mrf.datasets.synthetic.analytic_render import render
 
-        return render(
-            self.lit_scene(T_world_camera) if color else self.scene, self.camera, T_world_camera, color
-        )
+        scene = self.scene_at(index)
+        return render(self.lit(scene, T_world_camera) if color else scene, self.camera, T_world_camera, color)

@@ -6,6 +6,7 @@ lies on a border of voxels of a round size.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -23,13 +24,22 @@ PLASTER: Color = (0.87, 0.83, 0.74)
 METAL: Color = (0.45, 0.46, 0.48)
 CLOTH: Color = (0.24, 0.37, 0.55)
 LEAF: Color = (0.22, 0.50, 0.24)
+NEAR_WALL: Color = (0.70, 0.76, 0.72)
 
 
 def room_scene() -> Scene:
     """The furnished room in the world frame, lit by a lamp under the ceiling."""
-    solids = [
-        *_shell(),
-        *_openings(),
+    x, y, z = ROOM_IN_WORLD
+    return Scene(translated(room_solids(), ROOM_IN_WORLD), light=(x - 0.2, y - 0.3, z + 2.5))
+
+
+def room_solids(doorway: Sequence[Solid] = ()) -> list[Solid]:
+    """All solids in the room's own frame. ``doorway`` replaces the wall at the lowest y and the shut door in
+    it."""
+    return [
+        *_shell(doorway or [_near_wall()]),
+        *(() if doorway else _shut_door()),
+        *_window_and_picture(),
         *dining_table(1.25, 0.85, yaw=0.3),
         *sofa(-2.5, -0.4),
         *coffee_table(-1.25, -0.35),
@@ -37,8 +47,6 @@ def room_scene() -> Scene:
         *sideboard(0.0, -2.22),
         *lamps_plant_and_pillar(),
     ]
-    x, y, z = ROOM_IN_WORLD
-    return Scene(translated(solids, ROOM_IN_WORLD), light=(x - 0.2, y - 0.3, z + 2.5))
 
 
 def camera_pose(phase: float) -> Pose:
@@ -57,11 +65,11 @@ def box(x: float, y: float, bottom: float, size: Point, color: Color, yaw: float
     return Solid("box", (x, y, bottom + half[2]), half, yaw, color)
 
 
-def _cylinder(x: float, y: float, bottom: float, radius: float, height: float, color: Color) -> Solid:
+def cylinder(x: float, y: float, bottom: float, radius: float, height: float, color: Color) -> Solid:
     return Solid("cylinder", (x, y, bottom + height / 2), (radius, radius, height / 2), 0.0, color)
 
 
-def _sphere(x: float, y: float, z: float, radius: float, color: Color) -> Solid:
+def sphere(x: float, y: float, z: float, radius: float, color: Color) -> Solid:
     return Solid("sphere", (x, y, z), (radius, radius, radius), 0.0, color)
 
 
@@ -71,7 +79,11 @@ def _turned(x: float, y: float, yaw: float, dx: float, dy: float) -> tuple[float
     return x + c * dx - s * dy, y + s * dx + c * dy
 
 
-def _shell() -> list[Solid]:
+def _near_wall() -> Solid:
+    return box(0, -(WIDTH + WALL) / 2, 0, (LENGTH + 2 * WALL, WALL, HEIGHT), NEAR_WALL)
+
+
+def _shell(near_wall: Sequence[Solid]) -> list[Solid]:
     outer = (LENGTH + 2 * WALL, WIDTH + 2 * WALL)
     across = (LENGTH + WALL) / 2, (WIDTH + WALL) / 2
     floor_half: Point = (outer[0] / 2, outer[1] / 2, WALL / 2)
@@ -80,16 +92,20 @@ def _shell() -> list[Solid]:
         box(0, 0, HEIGHT, (*outer, WALL), WHITE),
         box(-across[0], 0, 0, (WALL, outer[1], HEIGHT), PLASTER),
         box(across[0], 0, 0, (WALL, outer[1], HEIGHT), PLASTER),
-        box(0, -across[1], 0, (outer[0], WALL, HEIGHT), (0.70, 0.76, 0.72)),
+        *near_wall,
         box(0, across[1], 0, (outer[0], WALL, HEIGHT), PLASTER),
     ]
 
 
-def _openings() -> list[Solid]:
-    """Door and window (shut, so that the room stays closed) and a picture."""
+def _shut_door() -> list[Solid]:
     return [
         box(2.2, -2.47, 0, (0.92, 0.06, 2.05), DARK_WOOD),
-        _sphere(1.85, -2.40, 1.05, 0.035, METAL),
+        sphere(1.85, -2.40, 1.05, 0.035, METAL),
+    ]
+
+
+def _window_and_picture() -> list[Solid]:
+    return [
         box(2.98, -0.1, 0.95, (0.04, 1.7, 1.2), (0.62, 0.78, 0.92)),
         box(2.96, -0.1, 0.95, (0.06, 0.05, 1.2), WHITE),
         box(2.96, -0.1, 1.52, (0.06, 1.7, 0.05), WHITE),
@@ -107,14 +123,14 @@ def _legs(x: float, y: float, yaw: float, dx: float, dy: float, side: float, hei
 def dining_table(x: float, y: float, yaw: float) -> list[Solid]:
     solids = [box(x, y, 0.72, (1.5, 0.85, 0.04), WOOD, yaw), *_legs(x, y, yaw, 0.68, 0.36, 0.06, 0.72)]
     for dx, dy, turn in ((-0.38, -0.62, 0.1), (0.38, -0.64, -0.15), (-0.36, 0.62, 3.1), (0.4, 0.66, 3.3)):
-        solids += _chair(*_turned(x, y, yaw, dx, dy), yaw + turn)
+        solids += chair(*_turned(x, y, yaw, dx, dy), yaw + turn)
     vase = _turned(x, y, yaw, 0.1, 0.05)
-    solids += [_cylinder(*vase, 0.76, 0.06, 0.22, (0.75, 0.30, 0.25)), _sphere(*vase, 1.06, 0.11, LEAF)]
-    solids.append(_cylinder(*_turned(x, y, yaw, -0.45, -0.15), 0.76, 0.13, 0.02, WHITE))
+    solids += [cylinder(*vase, 0.76, 0.06, 0.22, (0.75, 0.30, 0.25)), sphere(*vase, 1.06, 0.11, LEAF)]
+    solids.append(cylinder(*_turned(x, y, yaw, -0.45, -0.15), 0.76, 0.13, 0.02, WHITE))
     return solids
 
 
-def _chair(x: float, y: float, yaw: float) -> list[Solid]:
+def chair(x: float, y: float, yaw: float) -> list[Solid]:
     back = _turned(x, y, yaw, 0.0, -0.19)
     return [
         box(x, y, 0.43, (0.42, 0.42, 0.04), CLOTH, yaw),
@@ -137,12 +153,12 @@ def sofa(x: float, y: float) -> list[Solid]:
 
 def coffee_table(x: float, y: float) -> list[Solid]:
     return [
-        _cylinder(x, y, 0, 1.0, 0.012, (0.62, 0.28, 0.26)),
+        cylinder(x, y, 0, 1.0, 0.012, (0.62, 0.28, 0.26)),
         box(x, y, 0.38, (0.60, 1.0, 0.04), DARK_WOOD),
         *_legs(x, y, 0.0, 0.25, 0.45, 0.05, 0.38),
         box(x + 0.05, y - 0.25, 0.42, (0.21, 0.29, 0.05), (0.75, 0.25, 0.22), yaw=0.4),
         box(x + 0.03, y - 0.24, 0.47, (0.18, 0.25, 0.03), (0.25, 0.35, 0.60), yaw=-0.2),
-        _sphere(x - 0.02, y + 0.25, 0.51, 0.09, (0.90, 0.58, 0.18)),
+        sphere(x - 0.02, y + 0.25, 0.51, 0.09, (0.90, 0.58, 0.18)),
     ]
 
 
@@ -163,7 +179,7 @@ def shelf(x: float, y: float) -> list[Solid]:
         box(x - 0.40, y, 0.09, (0.55, 0.30, 0.32), (0.80, 0.72, 0.55)),
         box(x + 0.35, y, 0.09, (0.45, 0.28, 0.25), (0.50, 0.60, 0.45)),
         box(x - 0.45, y, 1.01, (0.30, 0.25, 0.22), (0.80, 0.72, 0.55), yaw=0.3),
-        _sphere(x + 0.40, y, 1.60, 0.13, (0.85, 0.45, 0.20)),
+        sphere(x + 0.40, y, 1.60, 0.13, (0.85, 0.45, 0.20)),
     ]
     return solids
 
@@ -176,27 +192,27 @@ def sideboard(x: float, y: float) -> list[Solid]:
         box(x, y - 0.02, 0.55, (0.40, 0.22, 0.03), METAL),
         box(x, y - 0.05, 0.58, (0.06, 0.05, 0.10), METAL),
         box(x, y - 0.03, 0.66, (1.15, 0.05, 0.66), (0.10, 0.10, 0.12)),
-        _cylinder(x + 0.75, y, 0.55, 0.08, 0.30, (0.55, 0.62, 0.70)),
+        cylinder(x + 0.75, y, 0.55, 0.08, 0.30, (0.55, 0.62, 0.70)),
     ]
 
 
 def lamps_plant_and_pillar() -> list[Solid]:
     return [
         # floor lamp in the corner behind the sofa
-        _cylinder(-2.55, 1.15, 0, 0.16, 0.03, METAL),
-        _cylinder(-2.55, 1.15, 0.03, 0.02, 1.45, METAL),
-        _sphere(-2.55, 1.15, 1.60, 0.19, (0.98, 0.93, 0.75)),
+        cylinder(-2.55, 1.15, 0, 0.16, 0.03, METAL),
+        cylinder(-2.55, 1.15, 0.03, 0.02, 1.45, METAL),
+        sphere(-2.55, 1.15, 1.60, 0.19, (0.98, 0.93, 0.75)),
         # lamp above the dining table
-        _cylinder(1.25, 0.85, 2.05, 0.012, 0.65, METAL),
-        _sphere(1.25, 0.85, 1.95, 0.15, (0.98, 0.85, 0.55)),
+        cylinder(1.25, 0.85, 2.05, 0.012, 0.65, METAL),
+        sphere(1.25, 0.85, 1.95, 0.15, (0.98, 0.85, 0.55)),
         # plant between the window and the door
-        _cylinder(2.60, -1.65, 0, 0.19, 0.38, (0.70, 0.38, 0.26)),
-        _cylinder(2.60, -1.65, 0.38, 0.03, 0.45, DARK_WOOD),
-        _sphere(2.60, -1.65, 1.02, 0.28, LEAF),
-        _sphere(2.48, -1.52, 1.30, 0.18, (0.28, 0.58, 0.28)),
-        _sphere(2.70, -1.72, 1.38, 0.16, LEAF),
+        cylinder(2.60, -1.65, 0, 0.19, 0.38, (0.70, 0.38, 0.26)),
+        cylinder(2.60, -1.65, 0.38, 0.03, 0.45, DARK_WOOD),
+        sphere(2.60, -1.65, 1.02, 0.28, LEAF),
+        sphere(2.48, -1.52, 1.30, 0.18, (0.28, 0.58, 0.28)),
+        sphere(2.70, -1.72, 1.38, 0.16, LEAF),
         # pillar in a corner, ball and stool on the floor
-        _cylinder(2.70, 2.20, 0, 0.17, HEIGHT, PLASTER),
-        _sphere(-0.55, 1.10, 0.14, 0.14, (0.85, 0.25, 0.22)),
-        _cylinder(-2.30, -1.95, 0, 0.22, 0.45, (0.80, 0.62, 0.42)),
+        cylinder(2.70, 2.20, 0, 0.17, HEIGHT, PLASTER),
+        sphere(-0.55, 1.10, 0.14, 0.14, (0.85, 0.25, 0.22)),
+        cylinder(-2.30, -1.95, 0, 0.22, 0.45, (0.80, 0.62, 0.42)),
     ]
