@@ -16,7 +16,7 @@ import yaml
 
 from taichi_mrf.config.arguments import real
 from taichi_mrf.config.files import find_config, read_yaml
-from taichi_mrf.config.registry import METHODS, MethodName
+from taichi_mrf.config.registry import METHODS, MethodName, methods_with
 from taichi_mrf.config.values import check_field, from_dict
 
 Arch = Literal["auto", "cuda", "vulkan", "cpu"]
@@ -135,6 +135,11 @@ class VolumeConfig:
     memory_limit_gb: float = 0.0
     """Memory limit of the map in GB (voxels, images and messages). 0 means the free memory of the machine."""
 
+    window_m: float = 0.0
+    """Keep in memory what lies within this distance of the newest keyframe's camera (metres). What lies
+    further is frozen and written to disk, and comes back when the camera returns, so that memory is bounded
+    on an endless run (methods that can freeze keyframes: mrf). 0 keeps the whole map in memory."""
+
     min_evidence: float = 0.1
     """A voxel counts as unknown if its log-odds differ from the prior by less than this."""
 
@@ -145,6 +150,7 @@ class VolumeConfig:
             check_field(ok, "volume.upper", "must lie above volume.lower on every axis")
         check_field(8 <= self.dense_bricks <= 1024, "volume.dense_bricks", "must lie between 8 and 1024")
         check_field(self.memory_limit_gb >= 0, "volume.memory_limit_gb", "must not be negative")
+        check_field(0 <= self.window_m < math.inf, "volume.window_m", "must be 0 or a number of metres")
         check_field(self.min_evidence >= 0, "volume.min_evidence", "must not be negative")
 
 
@@ -247,6 +253,9 @@ class Config(_Tail, _MethodSections, _Head):
         small = self.voxel_size <= _LARGEST_VOXEL_M  # coordinates of voxels are float32 in many formats
         most = f"must be at most {_LARGEST_VOXEL_M:g} metres, not {self.voxel_size:g}"
         check_field(small, "voxel_size", most)
+        freezes = self.volume.window_m == 0 or METHODS[self.method].can_freeze
+        needed = f"needs the method {methods_with('can_freeze')}, not {self.method}"
+        check_field(freezes, "volume.window_m", needed)
 
 
 def load(path: str | Path) -> Config:

@@ -47,14 +47,19 @@ class StorableMap(QueriedMap, Protocol):
         ...
 
 
+def header_of(m: StorableMap, up: Up | None = None) -> StoreHeader:
+    """The header of a map's store; ``up`` (default: the map's) is kept in it."""
+    prior, volume = m.view.pool.prior_log_odds, m.view.volume
+    return StoreHeader.of(m.config, prior, m.seen_free_log_odds, volume.min_evidence, up or m.up)
+
+
 def write_chunks(path: str | Path, m: StorableMap, up: Up | None = None) -> None:
     """Write a map in memory to a store, chunk by chunk; ``up`` (default: the map's) is kept in it. Raises
     MapFileError, TaichiMRFError without zarr."""
     reader = BrickReader(m)
     bricks = known_bricks(m)
     with new_store(path) as folder:
-        volume, prior = m.view.volume, reader.pool.prior_log_odds
-        header = StoreHeader.of(m.config, prior, m.seen_free_log_odds, volume.min_evidence, up or m.up)
+        header = header_of(m, up)
         store = ChunkStore.create(folder, header, np.unique(bricks // CHUNK, axis=0))
         for chunk, rows in by_chunk(bricks):
             log_odds = reader.log_odds(bricks[rows])

@@ -39,6 +39,13 @@ SUFFIX = ".zarr"
 CHUNK_BYTES = 4 * CHUNK_VOXELS**3
 _LISTED_BYTES = 12
 
+FARTHEST = 1 << 17
+"""A store that grows has room for chunks up to this far from the origin: all that have keys
+(voxels.layout.grid_keys)."""
+
+LISTED_TOGETHER = 1 << 16
+"""Chunks in one file of the list of a store that grows."""
+
 Chunk = tuple[int, int, int]
 
 
@@ -52,8 +59,11 @@ class ChunkStore:
         self._array = group[LOG_ODDS]
 
     @classmethod
-    def create(cls, path: str | Path, header: StoreHeader, chunks: NDArray[np.int32]) -> "ChunkStore":
-        """An empty store for the bounding box of some chunks, (n, 3), which the caller then writes.
+    def create(
+        cls, path: str | Path, header: StoreHeader, chunks: NDArray[np.int32], grows: bool = False
+    ) -> "ChunkStore":
+        """An empty store for some chunks, (n, 3), which the caller then writes. Its array covers their
+        bounding box; if it ``grows`` (growing_store.py), all chunks within ``FARTHEST``.
 
         Raises MapFileError if it cannot be written, TaichiMRFError without zarr.
         """
@@ -62,6 +72,8 @@ class ChunkStore:
         lowest, highest = (
             (chunks.min(axis=0), chunks.max(axis=0)) if len(chunks) else (np.zeros(3), np.zeros(3))
         )
+        if grows:
+            lowest, highest = np.full(3, -FARTHEST), np.full(3, FARTHEST - 1)
         shape = (highest - lowest + 1).astype(int) * CHUNK_VOXELS
         origin_m = lowest * CHUNK_VOXELS * header.voxel_size
         place = {"lowest_chunk": lowest.astype(int).tolist(), "origin_m": origin_m.tolist()}
@@ -74,7 +86,7 @@ class ChunkStore:
                 fill_value=float("nan"), dimension_names=("x", "y", "z"),
             )  # fmt: skip
             listed = np.ascontiguousarray(chunks, np.int32).reshape(-1, 3)
-            in_one_file = (max(1, len(listed)), 3)
+            in_one_file = (LISTED_TOGETHER if grows else max(1, len(listed)), 3)
             group.create_array(CHUNKS, shape=listed.shape, chunks=in_one_file, dtype="int32", fill_value=0)[
                 :
             ] = listed
@@ -118,6 +130,15 @@ class ChunkStore:
             )
         return found
 
+    @property
+    def grows(self) -> bool:
+        """Whether chunks can be added to it (growing_store.py)."""
+        return self._layout.lowest_chunk == (-FARTHEST,) * 3
+
+    def file_of(self, chunk: Sequence[int]) -> Path:
+        """Where a chunk's voxels are, from the store's folder."""
+        return Path(LOG_ODDS, "c", *map(str, self._place(chunk)))
+
     def write(self, chunk: Sequence[int], log_odds: NDArray[np.float32]) -> None:
         """Write one chunk, (64, 64, 64) log-odds, NaN for unknown. Raises MapFileError."""
         try:
@@ -128,7 +149,7 @@ class ChunkStore:
     def read(self, chunk: Sequence[int]) -> NDArray[np.float32]:
         """One of :attr:`chunks`, (64, 64, 64). Raises MapFileError."""
         place = self._place(chunk)
-        check_packed(self.path.joinpath(LOG_ODDS, "c", *map(str, place)), CHUNK_BYTES)
+        check_packed(self.path / self.file_of(chunk), CHUNK_BYTES)
         try:
             found = np.asarray(self._array.blocks[place], np.float32)
         except Exception as error:  # as above

@@ -1,5 +1,7 @@
 """The baseline: the same keyframes mapped by OctoMap's method, shown next to the map on demand."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from taichi_mrf.config.registry import octomap_method
@@ -21,8 +23,9 @@ class BaselineOverlay:
     """A map by OctoMap's method that follows a mapper's keyframes, one piece of work at a time."""
 
     def __init__(self, config: Config, noise: NoiseModel) -> None:
-        """An empty map with a configuration's parameters."""
-        self.map: OccupancyMap = octomap_method().load_class().with_noise(config, noise)
+        """An empty map with a configuration's parameters, but for the window, which its method lacks."""
+        whole = replace(config, volume=replace(config.volume, window_m=0.0))
+        self.map: OccupancyMap = octomap_method().load_class().with_noise(whole, noise)
         self._publisher = Publisher(
             "baseline",
             self.map.view.pool,

@@ -6,12 +6,13 @@ means seen to be free. This module does not depend on what inference stores in t
 """
 
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.inference.keyframe import Footprint, VisibleBricks
-from taichi_mrf.voxels.layout import BRICK, grid_keys
+from taichi_mrf.voxels.layout import BRICK, CHUNK, grid_keys
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology
 
@@ -30,6 +31,7 @@ class BrickRegistry:
         self._changes: deque[Bricks] = deque(maxlen=REMEMBERED)
         self.frozen_crossed: Bricks = np.zeros((0, 3), np.int32)
         self._frozen_keys = np.zeros(0, np.int64)
+        self.before_claim: Callable[[Bricks], None] | None = None  # with the bricks (n, 3) to be crossed
 
     def claim(self, footprint: Footprint) -> None:
         """Allocate a keyframe's surface bricks and count its ownership and its crossings.
@@ -38,6 +40,8 @@ class BrickRegistry:
         """
         crossed = footprint.window.bricks_of(footprint.crossed)
         self.topology.check(crossed, self.voxel_size)
+        if self.before_claim is not None:
+            self.before_claim(crossed)
         surface = footprint.window.bricks_of(footprint.surface)
         slots = self.topology.slots(surface)
         missing = slots < 0
@@ -75,9 +79,7 @@ class BrickRegistry:
         self.pool.owners[slots] -= 1
         orphans = self.pool.owners[slots] == 0
         if orphans.any():
-            self.topology.erase(surface[orphans])
-            self.pool.release(slots[orphans])
-            self._note_change(surface[orphans])
+            self._release(slots[orphans])
 
     def freeze(self, footprint: Footprint) -> None:
         """Keep a footprint for good: its bricks stay allocated, and what it crossed stays crossed.
@@ -103,6 +105,16 @@ class BrickRegistry:
         self.frozen_crossed = np.insert(self.frozen_crossed, place, bricks, axis=0)
         self.topology.add_crossings(np.ascontiguousarray(bricks, np.int32), 1)
 
+    def leave(self, slots: NDArray[np.int32], chunks: NDArray[np.int32]) -> None:
+        """Release all that frozen keyframes have left in chunks (n, 3), which no other keyframe's rays cross:
+        the bricks in ``slots``, and what was crossed."""
+        if len(slots):
+            self._release(slots)
+        inside = np.isin(grid_keys(self.frozen_crossed // CHUNK), grid_keys(chunks))
+        self.topology.add_crossings(self.frozen_crossed[inside], -1)
+        self.frozen_crossed, self._frozen_keys = self.frozen_crossed[~inside], self._frozen_keys[~inside]
+        self.topology.drop_chunks(chunks)
+
     def start_over(self) -> None:
         """Mark all lists of visible bricks as outdated."""
         self.version += 1
@@ -121,6 +133,13 @@ class BrickRegistry:
                 return self.visible(footprint)
         old.version = self.version
         return old
+
+    def _release(self, slots: NDArray[np.int32]) -> None:
+        """Release bricks, which no keyframe owns any more."""
+        bricks = self.pool.bricks[slots]
+        self.topology.erase(bricks)
+        self.pool.release(slots)
+        self._note_change(bricks)
 
     def _note_change(self, bricks: Bricks) -> None:
         self.version += 1

@@ -51,6 +51,9 @@ class Topology(Protocol):
     def check(self, bricks: Bricks, voxel_size: float) -> None:
         """Raise CapacityError, in metres, if any of the bricks lies outside the volume."""
 
+    def drop_chunks(self, chunks: Bricks) -> None:
+        """Give back the memory of chunks (n, 3) of bricks, none of which has a slot or is crossed."""
+
     def clear(self) -> None:
         """Forget everything."""
 
@@ -147,6 +150,15 @@ class _Tree:
                 else:
                     out[i] = self.crossing[cell]
 
+    @ti.kernel
+    def drop_chunks(self, chunks: AnyArray, number: I32, layer: I32):
+        """Deactivate ``number`` chunks (n, 3) of a layer."""
+        for i in range(number):
+            half = self.HALF_SPAN // CHUNK
+            chunk = IVec4(chunks[i, 0] + half, chunks[i, 1] + half, chunks[i, 2] + half, layer)
+            if ti.is_active(self.chunks, chunk):
+                ti.deactivate(self.chunks, chunk)
+
     def clear(self, layer: int) -> None:
         """Empty a layer. Taichi does not give back what lies below a cell that is deactivated, so it is done
         from the bottom up."""
@@ -223,6 +235,9 @@ class SparseTopology:
                 f"at a voxel size of {voxel_size:g} m"
             )
 
+    def drop_chunks(self, chunks: Bricks) -> None:
+        self._tree.drop_chunks(np.ascontiguousarray(chunks, np.int32), len(chunks), self.layer)
+
     def clear(self) -> None:
         self._tree.clear(self.layer)
 
@@ -273,6 +288,9 @@ class DenseTopology:
                 f"the map would leave its volume of {extent:g} m around the first keyframe, which is "
                 f"bounded on Vulkan; raise volume.dense_bricks (now {self.side}) or use the CPU"
             )
+
+    def drop_chunks(self, chunks: Bricks) -> None:
+        """The arrays are as large as the volume, whatever is in it."""
 
     def clear(self) -> None:
         self.slot.fill(0)

@@ -29,20 +29,14 @@ from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
 from taichi_mrf.inference.messages import count_observations
 from taichi_mrf.inference.prior import log_odds_without_bricks, prior_probability
 from taichi_mrf.inference.ray_list import RayBundler
-from taichi_mrf.inference.schedule import (
-    InferReport,
-    InferSteps,
-    Progress,
-    content_key,
-    driven,
-    sweep_steps,
-)
+from taichi_mrf.inference.schedule import InferReport, InferSteps, Progress, content_key, driven, sweep_steps
 from taichi_mrf.inference.sweep import Sweeper, unknown_entry_depths
 from taichi_mrf.methods.brick_map import BrickMap, check_inference, own_parameters, own_section
 from taichi_mrf.methods.map_file import MapHeader, StoredKeyframe, naming
 from taichi_mrf.methods.mrf.checkpoint import Checkpoint, go_back, take_checkpoint
 from taichi_mrf.methods.mrf.keyframe_allocator import KeyframeAllocator
 from taichi_mrf.methods.mrf.memory_budget import MemoryBudget
+from taichi_mrf.methods.mrf.moving_window import MovingWindow
 from taichi_mrf.methods.mrf.plug import METHOD
 from taichi_mrf.methods.mrf.storage import contents_of, read_contents, write_contents
 from taichi_mrf.methods.statistics import MapStatistics, measure
@@ -99,6 +93,7 @@ class MRFMap(BrickMap):
         self._next_id = 0
         self._messages_lost = False  # a loaded map has beliefs, but no messages
         self._settled = True
+        self.window = MovingWindow.of(self.config.volume, self._registry)
 
     @property
     def keyframes(self) -> Mapping[int, Keyframe]:
@@ -142,6 +137,8 @@ class MRFMap(BrickMap):
         self._note_up(T)
         self._next_id += 1
         self._settled = False
+        if self.window is not None:
+            self.window.follow(self, T[:3, 3])
         return keyframe.id
 
     def remove_keyframe(self, id: int) -> None:
@@ -341,7 +338,10 @@ class MRFMap(BrickMap):
         keyframes = list(self._keyframes.values())
         stored = [StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera) for k in keyframes]
         header = MapHeader(self.config, self.noise, stored, self._next_id, self._settled, self.up)
-        write_contents(Path(path), contents_of(header, self._registry, keyframes, self._frozen))
+        parked = () if self.window is None else self.window.save_beside(Path(path), self)
+        write_contents(Path(path), contents_of(header, self._registry, keyframes, self._frozen, parked))
+        if self.window is not None:
+            self.window.saved(Path(path))
 
     @classmethod
     def load(cls, path: str | Path, memory_limit_gb: float | None = None) -> "MRFMap":
@@ -358,6 +358,8 @@ class MRFMap(BrickMap):
             for k in header.keyframes:
                 image = m._upload(k.depth_m, k.camera)
                 m._keyframes[k.id] = m._allocator.place(k.id, k.name, image, k.T_world_camera)
+            if m.window is not None:
+                m.window.resume(Path(path), contents.parked)
         if len(bricks):
             m._pool.write("belief", slots, contents.belief)
             if contents.evidence is not None:

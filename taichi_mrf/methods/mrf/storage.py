@@ -5,7 +5,7 @@ hold the messages: they are the largest part of a map in memory and can be compu
 the beliefs so that a loaded map answers queries at once.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +24,8 @@ from taichi_mrf.voxels.layout import VOXELS
 class MapContents:
     """The contents of an MRFMap's file. ``belief`` and ``evidence`` are (n, 512) log-odds of the ``bricks``
     (n, 3); ``frozen_owners`` (n,) counts the frozen keyframes that own each brick, ``frozen_crossed`` (m, 3)
-    are the bricks that they crossed, and ``frozen`` their names by id."""
+    are the bricks that they crossed, and ``frozen`` their names by id. ``parked`` names the files of the
+    chunks that are not in memory (parked_chunks.py)."""
 
     header: MapHeader
     bricks: NDArray[np.int32]
@@ -33,10 +34,15 @@ class MapContents:
     frozen_owners: NDArray[np.int32]
     frozen_crossed: NDArray[np.int32]
     frozen: dict[int, str]
+    parked: list[str]
 
 
 def contents_of(
-    header: MapHeader, registry: BrickRegistry, keyframes: Iterable[Keyframe], frozen: dict[int, str]
+    header: MapHeader,
+    registry: BrickRegistry,
+    keyframes: Iterable[Keyframe],
+    frozen: dict[int, str],
+    parked: Sequence[str] = (),
 ) -> MapContents:
     """The contents to store; ``keyframes`` are those that are not frozen."""
     pool = registry.pool
@@ -52,6 +58,7 @@ def contents_of(
         pool.owners[slots] - live[slots],
         registry.frozen_crossed,
         frozen,
+        list(parked),
     )
 
 
@@ -68,6 +75,8 @@ def write_contents(path: Path, contents: MapContents) -> None:
     }
     if contents.evidence is not None:
         arrays["evidence"] = contents.evidence
+    if contents.parked:
+        arrays["parked"] = np.array(contents.parked, np.str_)
     write_npz(path, arrays, manifest=True)
 
 
@@ -86,6 +95,7 @@ def read_contents(path: Path) -> MapContents:
             file.array("frozen_owners", "i", (n,)).astype(np.int32),
             file.array("frozen_crossed", "i", (None, 3)).astype(np.int32),
             dict(zip(frozen_ids, file.array("frozen_names", "U", (len(frozen_ids),)).tolist(), strict=True)),
+            file.array("parked", "U", (None,)).tolist() if "parked" in file else [],
         )
     if (contents.frozen_owners < 0).any():
         raise MapFileError(f"{path}: damaged: frozen_owners holds a negative number")

@@ -1,0 +1,227 @@
+"""A window that follows the camera: what lies outside of it is frozen, written to disk and released.
+
+With ``volume.window_m`` the memory of a map is bounded by what is near the newest keyframe:
+
+    before a keyframe is placed    chunks that its rays cross come back into memory
+    after it                       keyframes whose camera is outside of the window are frozen;
+                                   chunks that are further than LEAVE windows, and that no other keyframe's
+                                   rays cross, are written to disk and released;
+                                   chunks in the window come back
+
+A chunk comes back with its evidence, so inference goes on as if it had never been away. The rays of the
+keyframes in the window reach further than the window, hence what is in memory does too.
+"""
+
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.config.schema import VolumeConfig
+from taichi_mrf.errors import CapacityError, MapFileError
+from taichi_mrf.export.chunk_blocks import StorableMap, by_chunk, header_of
+from taichi_mrf.export.chunk_store import Chunk
+from taichi_mrf.export.store_header import StoreHeader
+from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.methods.brick_registry import BrickRegistry, Bricks
+from taichi_mrf.methods.mrf.parked_chunk import ParkedChunk
+from taichi_mrf.methods.mrf.parked_chunks import ParkedChunks, folder_beside, voxels_of
+from taichi_mrf.queries.known_bricks import bricks_between
+from taichi_mrf.system.libraries import library
+from taichi_mrf.voxels.layout import CHUNK, CHUNK_BRICKS, CHUNK_VOXELS, grid_keys
+
+LEAVE = 1.25
+"""Chunks leave memory at this many times the distance at which they come back, so that a camera that stays
+about one place does not move them to and fro."""
+
+STEP = 0.1
+"""Chunks that may leave are looked for whenever the camera has moved by this share of the window."""
+
+
+_NONE = np.zeros(0, np.int64)
+
+
+class WindowedMap(StorableMap, Protocol):
+    """What the window needs of its map."""
+
+    @property
+    def keyframes(self) -> Mapping[int, Keyframe]: ...
+
+    def infer(self, *, keyframes: Iterable[int] | None) -> object: ...
+
+    def freeze_keyframe(self, id: int) -> None: ...
+
+
+class MovingWindow:
+    """The window of one map, ``size_m`` metres around the newest keyframe's camera."""
+
+    def __init__(self, registry: BrickRegistry, size_m: float) -> None:
+        self.size_m = size_m
+        self.parked = ParkedChunks()
+        self._registry = registry
+        self._position_m: NDArray[np.float64] | None = None  # where chunks were last looked for
+        self._chunks = self.parked.chunks
+        registry.before_claim = self._fetch_crossed
+
+    @staticmethod
+    def of(volume: VolumeConfig, registry: BrickRegistry) -> "MovingWindow | None":
+        """The window that a configuration asks for. Raises TaichiMRFError without zarr."""
+        if volume.window_m == 0:
+            return None
+        library("zarr", "volume.window_m needs", "store")  # fails before the run, not in the middle
+        return MovingWindow(registry, volume.window_m)
+
+    @property
+    def folder(self) -> Path | None:
+        """The map in chunks that holds what is outside of the window; None while nothing is."""
+        return self.parked.folder
+
+    def park_in(self, folder: str | Path) -> None:
+        """Write what leaves the window to a folder, such as ``map_window.zarr``; without one it goes to a
+        temporary folder. An earlier run's is replaced. Raises MapFileError."""
+        self.parked.write_to(Path(folder))
+
+    def follow(self, m: WindowedMap, position_m: NDArray[np.float64]) -> None:
+        """Move the window to a position (3,): freeze the keyframes outside of it, write and release chunks,
+        and bring back those that are in it. Disk errors are warnings: the map in memory is whole."""
+        far = [
+            id
+            for id, keyframe in m.keyframes.items()
+            if np.linalg.norm(keyframe.T_world_camera[:3, 3] - position_m) > self.size_m
+        ]
+        if any(m.keyframes[id].messages is None for id in far):
+            m.infer(keyframes=list(m.keyframes))  # what is frozen cannot be swept again
+        for id in far:
+            m.freeze_keyframe(id)
+        moved = self._position_m is None or np.linalg.norm(position_m - self._position_m) > STEP * self.size_m
+        if moved or far:
+            self._position_m = position_m.copy()
+            self._leave(position_m, header_of(m))
+        near = self._chunks[self._distances(self._chunks, position_m) <= self.size_m]
+        try:
+            self._fetch(near)
+        except (MapFileError, CapacityError) as error:
+            warnings.warn(f"a chunk near the camera stays on disk: {error}", stacklevel=2)
+
+    def save_beside(self, path: Path, m: WindowedMap) -> list[str]:
+        """Make the folder beside a map's file hold the whole map; returns the names of the files of the
+        chunks that are not in memory. Raises MapFileError."""
+        header = header_of(m)
+        self.parked.complete(folder_beside(path), self._resident(m.keyframes.values(), header), header)
+        return self.parked.names
+
+    def saved(self, path: Path) -> None:
+        """The map's file was written."""
+        self.parked.tidy(folder_beside(path))
+
+    def resume(self, path: Path, names: list[str]) -> None:
+        """Go on with the chunks that a map's file names. Raises MapFileError."""
+        self.parked.resume(folder_beside(path), names)
+        self._chunks = self.parked.chunks
+
+    def _fetch_crossed(self, bricks: Bricks) -> None:
+        """Bring back the chunks of bricks (n, 3) that a keyframe's rays cross."""
+        if len(self._chunks):
+            keys = grid_keys(self._chunks)
+            self._fetch(self._chunks[np.isin(keys, grid_keys(bricks // CHUNK))])
+
+    def _fetch(self, chunks: NDArray[np.int32]) -> None:
+        """Bring chunks (n, 3) back into memory."""
+        registry = self._registry
+        for x, y, z in chunks.tolist():
+            found = self.parked.read((x, y, z))
+            if len(found.bricks):
+                slots = registry.restore(found.bricks, found.owners)
+                registry.pool.write("belief", slots, found.belief)
+                registry.pool.write("evidence", slots, found.evidence)
+            registry.see_for_good(found.crossed)
+            self.parked.drop((x, y, z))
+        if len(chunks):
+            self._chunks = self.parked.chunks
+
+    def _leave(self, position_m: NDArray[np.float64], header: StoreHeader) -> None:
+        """Write the chunks that are outside of the window, and release them. What cannot be written stays in
+        memory."""
+        chunks = self._chunks_in_memory()
+        chunks = chunks[self._distances(chunks, position_m) > LEAVE * self.size_m]
+        chunks = chunks[~self._seen_by_keyframes(chunks)]
+        if not len(chunks):
+            return
+        pool = self._registry.pool
+        slots = pool.in_order
+        slots = slots[np.isin(grid_keys(pool.bricks[slots] // CHUNK), grid_keys(chunks))]
+        try:
+            self.parked.add(self._contents(chunks, slots), header)
+        except MapFileError as error:
+            warnings.warn(f"what lies outside the window stays in memory: {error}", stacklevel=2)
+            return
+        self._registry.leave(slots, chunks)
+        self._chunks = self.parked.chunks
+
+    def _resident(
+        self, keyframes: Iterable[Keyframe], header: StoreHeader
+    ) -> Iterator[tuple[Chunk, NDArray[np.float32]]]:
+        """The voxels of all chunks in memory; ``keyframes`` are those that are not frozen."""
+        registry, pool = self._registry, self._registry.pool
+        crossed = [k.footprint.window.bricks_of(k.footprint.crossed) // CHUNK for k in keyframes]
+        chunks = _distinct(np.concatenate([self._chunks_in_memory(), *map(_distinct, crossed)]))
+        slots = pool.in_order
+        rows_of = dict(by_chunk(pool.bricks[slots]))
+        for x, y, z in chunks.tolist():
+            inside = slots[rows_of.get((x, y, z), _NONE)]
+            bricks = _bricks_of(np.array([(x, y, z)], np.int32))
+            seen = bricks[registry.topology.crossings(bricks) > 0]
+            belief = pool.read("belief", inside)
+            yield (x, y, z), voxels_of((x, y, z), pool.bricks[inside], belief, seen, header)
+
+    def _contents(self, chunks: NDArray[np.int32], slots: NDArray[np.int32]) -> dict[Chunk, ParkedChunk]:
+        """What frozen keyframes have left in some chunks (n, 3), whose bricks are in ``slots``."""
+        pool, frozen_crossed = self._registry.pool, self._registry.frozen_crossed
+        pool.keep_evidence()
+        slots_of, crossed_of = dict(by_chunk(pool.bricks[slots])), dict(by_chunk(frozen_crossed))
+        contents = {}
+        for x, y, z in chunks.tolist():
+            inside = slots[slots_of.get((x, y, z), _NONE)]
+            contents[x, y, z] = ParkedChunk(
+                pool.bricks[inside],
+                pool.read("belief", inside),
+                pool.read("evidence", inside),
+                pool.owners[inside],
+                frozen_crossed[crossed_of.get((x, y, z), _NONE)],
+            )
+        return contents
+
+    def _chunks_in_memory(self) -> NDArray[np.int32]:
+        """The chunks (n, 3) with voxels, or that frozen keyframes' rays cross."""
+        pool, registry = self._registry.pool, self._registry
+        chunks = np.concatenate([pool.bricks[pool.in_use], registry.frozen_crossed]) // CHUNK
+        return _distinct(chunks)
+
+    def _seen_by_keyframes(self, chunks: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Which of some chunks (n, 3) are crossed by keyframes that are not frozen, (n,)."""
+        registry, bricks = self._registry, _bricks_of(chunks)
+        by_frozen = np.isin(grid_keys(bricks), grid_keys(registry.frozen_crossed))
+        others = (registry.topology.crossings(bricks) > by_frozen).reshape(-1, CHUNK_BRICKS)
+        return np.asarray(others.any(axis=1))
+
+    def _distances(self, chunks: NDArray[np.int32], position_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Metres from a position (3,) to the nearest point of each chunk (n, 3)."""
+        side_m = CHUNK_VOXELS * self._registry.voxel_size
+        lower = chunks * side_m
+        beside = np.maximum(np.maximum(lower - position_m, position_m - (lower + side_m)), 0.0)
+        distances: NDArray[np.float64] = np.linalg.norm(beside, axis=1)
+        return distances
+
+
+def _distinct(chunks: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Each chunk (n, 3) once, ascending."""
+    return chunks[np.unique(grid_keys(chunks), return_index=True)[1]]
+
+
+def _bricks_of(chunks: NDArray[np.int32]) -> Bricks:
+    """All bricks of some chunks, (n, 3) -> (512 n, 3), chunk after chunk."""
+    offsets = bricks_between(np.zeros(3, np.int32), np.full(3, CHUNK - 1))
+    return (chunks[:, None] * CHUNK + offsets).reshape(-1, 3).astype(np.int32)
