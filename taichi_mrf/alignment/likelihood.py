@@ -24,7 +24,7 @@ def map_of_others(view: View, keyframe: Keyframe) -> Iterator[None]:
 
     The messages of ``keyframe``, if it has any, must fit its visible bricks, and those be up to date.
     """
-    cavity = view.pool.snapshot()
+    cavity = view.pool.snapshot(undated=True)
     if keyframe.messages is not None:
         withdraw_messages(keyframe.visible, keyframe.messages, cavity.belief)
     with view.pool.showing(cavity):

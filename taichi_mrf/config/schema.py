@@ -17,6 +17,7 @@ import yaml
 from taichi_mrf.config.arguments import real
 from taichi_mrf.config.files import find_config, read_yaml
 from taichi_mrf.config.registry import METHODS, MethodName, methods_with
+from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.config.values import check_field, from_dict
 
 Arch = Literal["auto", "cuda", "vulkan", "cpu"]
@@ -211,6 +212,9 @@ class _Tail:
 
     poses: PoseConfig = field(default_factory=PoseConfig)
     """Refinement of recorded poses."""
+
+    time: TimeConfig = field(default_factory=TimeConfig)
+    """How soon the world may change."""
 
     volume: VolumeConfig = field(default_factory=VolumeConfig)
     """The space and memory of the map."""

@@ -57,11 +57,15 @@ class IncrementalInference:
         look_again: Callable[[Keyframe], object],
         refresh: Callable[[Keyframe], object],
         usual: float,
+        note_sweep: Callable[[Keyframe, NDArray[np.int32], bool], object] | None = None,
     ) -> None:
         """``look_again`` brings the list of a keyframe's bricks up to date, ``refresh`` its messages too;
-        ``usual`` is the tolerance above which a keyframe waits even if a call tolerates more."""
+        ``usual`` is the tolerance above which a keyframe waits even if a call tolerates more. ``note_sweep``
+        is called after each sweep with the keyframe, how many marginals have moved in each of its bricks, and
+        whether it was its first."""
         self.pool, self.sweeper, self.bounds, self.usual = pool, sweeper, bounds, usual
         self.look_again, self.refresh = look_again, refresh
+        self._note_sweep = note_sweep
         self._waiting: set[int] = set()
 
     def run(
@@ -96,10 +100,13 @@ class IncrementalInference:
                 if seconds is not None and time.perf_counter() - begin >= seconds:
                     break
             keyframe = keyframes[id]
+            is_first = keyframe.messages is None
             self.refresh(keyframe)
             self.pool.touch(keyframe.visible.slots)
             if self.sweeper.sweep(keyframe, self.pool):
-                self.sweeper.take_moved(keyframe, self.pool)
+                moved = self.sweeper.take_moved(keyframe, self.pool)
+                if self._note_sweep is not None:
+                    self._note_sweep(keyframe, moved, is_first)
             else:
                 keyframe.change_count_at_last_sweep = np.zeros(0, np.int64)  # it sees no brick
             rays, swept = rays + keyframe.rays, swept + 1

@@ -161,7 +161,8 @@ class VisibleBricks:
 class Keyframe:
     """One keyframe of a map.
 
-    ``messages`` is (bricks * 512) log-odds, in the order of ``visible``. ``entry_depths`` is, for each ray of
+    ``stamp_s`` is when it was taken, in seconds. ``messages`` is (bricks * 512) log-odds, in the order of
+    ``visible``. ``entry_depths`` is, for each ray of
     the list, the depth up to which it crosses none of these bricks, once it is known. ``revision`` is that of
     the beliefs right after its last sweep, and ``change_count_at_last_sweep`` (bricks) how often marginals of
     each brick had changed by then. ``pending_visible`` is what the keyframe sees now, if its messages are
@@ -173,6 +174,7 @@ class Keyframe:
     image: DepthImage
     ray_list: RayList
     T_world_camera: Pose
+    stamp_s: float
     footprint: Footprint
     visible: VisibleBricks
     entry_depths: ti.Ndarray

@@ -98,7 +98,7 @@ class Sweeper:
 
         # Eq. 6: the belief of each voxel without this keyframe's message.
         sum_product.cavity(
-            bricks.slots, pool.belief, messages,
+            bricks.slots, pool.total, messages,
             least_log_odds(config, pool.prior_log_odds), config.cavity_clamp,
             swept.log_free, swept.sums, strip,
         )  # fmt: skip
@@ -118,7 +118,7 @@ class Sweeper:
         # Eqs. 7 and 8: the average over rays is the keyframe's new message, and changes the beliefs.
         bricks.moved.fill(0)  # a NumPy array's method or a Taichi array's
         sum_product.finish(
-            bricks.slots, pool.belief, messages, swept.sums, swept.scale, config.message_clamp,
+            bricks.slots, pool.total, messages, swept.sums, swept.scale, config.message_clamp,
             config.damping, config.min_length, bricks.moved, model.log_average, strip,
         )  # fmt: skip
         pool.revision += 1

@@ -52,3 +52,18 @@ def clamped_log_odds(occupied: F32, empty: F32, clamp: F32, largest: F32) -> F32
     elif occupied < empty * largest:
         message = 0.5 + 0.5 * ti.log(occupied / empty) / clamp
     return message
+
+
+@ti.func
+def faded(evidence: F32, left: F32, appeared: F32) -> F32:
+    """Evidence of the past, as log-odds, for a state that may have changed since (a binary channel).
+
+    ``left`` is the chance that what is free now was occupied then, ``appeared`` the chance that what is
+    occupied now was free then. No evidence stays none, and certainty becomes ``-log(left)`` or
+    ``log(appeared)``.
+    """
+    small = ti.exp(-ti.abs(evidence))
+    occupied, free = 1.0 - appeared + appeared * small, left + (1.0 - left) * small
+    if evidence < 0.0:
+        occupied, free = (1.0 - appeared) * small + appeared, 1.0 - left + left * small
+    return ti.log(occupied / free)

@@ -60,7 +60,8 @@ class BaselineOverlay:
         for entry in mapper.roster.with_state("on"):
             if entry.id not in self._places:
                 depth_m = mapper.posed_image(entry).depth_m
-                here = self.map.add_keyframe(depth_m, entry.T_world_camera, entry.camera, entry.name)
+                parts = (entry.T_world_camera, entry.camera, entry.name, entry.stamp_s)
+                here = self.map.add_keyframe(depth_m, *parts)
                 self._places[entry.id] = here, entry.T_world_camera
                 return True
         return False

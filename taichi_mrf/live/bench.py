@@ -62,7 +62,9 @@ def bench_viewer(
         reader.settled()
         rows = []
         for done, frame in enumerate(frames, start=1):
-            keyframe = m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera, name=frame.name)
+            keyframe = m.add_keyframe(
+                frame.depth_m, frame.T_world_camera, frame.camera, frame.name, frame.stamp
+            )
             m.infer(keyframes=[keyframe], sweeps=1)
             begin = time.perf_counter()
             changes = publisher.changes()

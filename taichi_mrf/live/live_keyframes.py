@@ -28,6 +28,7 @@ class LiveKeyframe:
     rays: int
     picture: NDArray[np.uint8]
     map_id: int | None
+    stamp_s: float
     state: KeyframeState = "on"
     depth_m: NDArray[np.float32] | None = None
     moved_by_hand: bool = False
@@ -43,14 +44,16 @@ class LiveKeyframes:
     entries: dict[int, LiveKeyframe] = field(default_factory=dict)
     next_id: int = 0
 
-    def add(self, frame: PosedDepth, rays: int, picture: NDArray[np.uint8], map_id: int) -> LiveKeyframe:
+    def add(
+        self, frame: PosedDepth, rays: int, picture: NDArray[np.uint8], map_id: int, stamp_s: float
+    ) -> LiveKeyframe:
         """Add a keyframe that has just been added to the map. Raises KeyframeError for one without a pinhole
         camera."""
         if not isinstance(frame.camera, PinholeCamera):
             kind = type(frame.camera).__name__
             raise KeyframeError(f"{frame.name}: the live page cannot show a camera of type {kind}")
         entry = LiveKeyframe(
-            self.next_id, frame.name, frame.T_world_camera, frame.camera, rays, picture, map_id
+            self.next_id, frame.name, frame.T_world_camera, frame.camera, rays, picture, map_id, stamp_s
         )
         self.entries[entry.id] = entry
         self.next_id += 1

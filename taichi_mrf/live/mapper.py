@@ -50,7 +50,7 @@ class Mapper:
         self.inferred: InferReport | None = None
         self.roster = LiveKeyframes(next_id=first_id)
         for id, keyframe in m.keyframes.items():
-            self.roster.add(keyframe, keyframe.rays, thumbnail(keyframe.depth_m), id)
+            self.roster.add(keyframe, keyframe.rays, thumbnail(keyframe.depth_m), id, keyframe.stamp_s)
         self.publisher = Publisher(
             "map", m.view.pool, m.seen_by, prior_is_unknown=m.METHOD.prior_is_unknown, counting=False
         )
@@ -76,7 +76,7 @@ class Mapper:
         self.unsettled = self.cavities_changed = True
         self.unaligned = self.refiner is not None
         frame = added.frame
-        entry = self.roster.add(frame, added.rays, thumbnail(frame.depth_m), added.keyframe)
+        entry = self.roster.add(frame, added.rays, thumbnail(frame.depth_m), added.keyframe, frame.stamp)
         entry.T_world_camera = entry.T_home = self.map.keyframes[added.keyframe].T_world_camera
         return entry
 
@@ -207,7 +207,8 @@ class Mapper:
     def _add(self, entry: LiveKeyframe) -> int:
         """Add a keyframe that was off, and sweep it once. If that fails, the map is unchanged."""
         assert entry.depth_m is not None
-        map_id = self.map.add_keyframe(entry.depth_m, entry.T_world_camera, entry.camera, entry.name)
+        parts = (entry.T_world_camera, entry.camera, entry.name, entry.stamp_s)
+        map_id = self.map.add_keyframe(entry.depth_m, *parts)
         try:
             self.sweep(map_id)
         except BaseException:

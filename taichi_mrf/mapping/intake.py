@@ -172,7 +172,7 @@ class Intake:
         """Add a frame as a keyframe and align it, or leave nothing of it; returns its number."""
         with self.result.timed("adding"):
             keyframe = self.map.add_keyframe(
-                frame.depth_m, frame.T_world_camera, frame.camera, name=frame.name
+                frame.depth_m, frame.T_world_camera, frame.camera, frame.name, frame.stamp
             )
         try:
             if self.refiner is not None:

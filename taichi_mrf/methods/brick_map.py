@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.config.arguments import instance, iterable, real, whole
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
+from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.config.values import overridden
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.geometry.up import Up, up_of
@@ -37,12 +38,17 @@ SectionT = TypeVar("SectionT")
 
 
 def own_parameters(
-    voxel_size: float, volume: VolumeConfig | None, min_depth: float, max_depth: float
+    voxel_size: float,
+    volume: VolumeConfig | None,
+    min_depth: float,
+    max_depth: float,
+    time: TimeConfig | None,
 ) -> dict[str, Any]:
     """The arguments that the constructors of all methods share, checked, as fields of Config."""
     sensor = SensorConfig(min_depth=real(min_depth, "min_depth"), max_depth=real(max_depth, "max_depth"))
     volume = instance(volume or VolumeConfig(), VolumeConfig, "volume", "of type VolumeConfig")
-    return {"voxel_size": real(voxel_size, "voxel_size"), "sensor": sensor, "volume": volume}
+    time = instance(time or TimeConfig(), TimeConfig, "time", "of type TimeConfig")
+    return {"voxel_size": real(voxel_size, "voxel_size"), "sensor": sensor, "volume": volume, "time": time}
 
 
 def own_section(
@@ -76,6 +82,9 @@ class BrickMap(Owned):
     """The entry of the map's method."""
 
     view: View = owned_attribute()
+
+    _next_id: int
+    """The id of the next keyframe: how many were added."""
 
     seen_free_log_odds: float
     """Log-odds of a place that rays cross but that has no brick."""
@@ -130,6 +139,10 @@ class BrickMap(Owned):
         """The world axis that is up in the image of the first keyframe that was added, which may have been
         removed since; None before it."""
         return self._up
+
+    def _stamp(self, stamp_s: Any) -> float:
+        """A new keyframe's stamp; the number of keyframes added before if it is None."""
+        return float(self._next_id) if stamp_s is None else real(stamp_s, "stamp_s")
 
     def _note_up(self, T_world_camera: Pose) -> None:
         """Keep which way is up if this is the first keyframe."""

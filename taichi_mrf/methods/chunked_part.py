@@ -93,7 +93,7 @@ def take_part(m: ChunkedMap, lower: ArrayLike | None = None, upper: ArrayLike | 
         if len(taken):
             slots = pool.allocate(bricks[taken].astype(np.int32))
             pool.owners[slots] = 1
-            pool.write("belief", slots, np.where(known, values, m.header.prior_log_odds)[taken])
+            pool.write("total", slots, np.where(known, values, m.header.prior_log_odds)[taken])
     if not len(pool.in_use):
         raise ConfigError("there is no surface in this box of the map")
     volume = replace(m.config.volume, min_evidence=m.header.min_evidence)

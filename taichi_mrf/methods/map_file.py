@@ -39,7 +39,8 @@ _CAMERA_VALUES = 6
 class StoredKeyframe:
     """A keyframe in host memory, as it is saved; recursive maps hold their keyframes in this form.
 
-    ``depth_m`` is (H, W) float32 axial depth in metres, 0 where there is no measurement.
+    ``depth_m`` is (H, W) float32 axial depth in metres, 0 where there is no measurement, and ``stamp_s``
+    when it was taken, in seconds.
     """
 
     id: int
@@ -47,6 +48,7 @@ class StoredKeyframe:
     depth_m: NDArray[np.float32]
     T_world_camera: Pose
     camera: Camera
+    stamp_s: float
 
     @property
     def rays(self) -> int:
@@ -95,6 +97,7 @@ class MapHeader:
             "keyframe_names": np.array([k.name for k in keyframes], np.str_),
             "keyframe_T_world_camera": np.array([k.T_world_camera for k in keyframes]).reshape(-1, 4, 4),
             "keyframe_cameras": np.array([_camera_row(k.camera) for k in keyframes]).reshape(-1, 6),
+            "keyframe_stamps": np.array([k.stamp_s for k in keyframes], np.float64),
             "next_id": np.asarray(self.next_id),
             "settled": np.asarray(self.settled),
             "up": np.asarray(self.up_axis),
@@ -163,11 +166,15 @@ def read_header(path: Path, file: NpzFile) -> MapHeader:
     names = file.array("keyframe_names", "U", (n,)).tolist()
     poses = file.array("keyframe_T_world_camera", "f", (n, 4, 4))
     cameras = file.array("keyframe_cameras", "fi", (n, _CAMERA_VALUES))
+    # Earlier versions saved no stamps: without one, the number of a keyframe counts.
+    stamps = file.array("keyframe_stamps", "f", (n,)) if "keyframe_stamps" in file else ids.astype(np.float64)
+    if not np.isfinite(stamps).all():
+        raise MapFileError(f"{path}: damaged: a keyframe's stamp is no number")
     keyframes = []
     for i, id in enumerate(ids.tolist()):
         camera = _camera(cameras[i])
         depth_m = file.array(f"keyframe_depth_{i}", "f", camera.shape)
-        keyframes.append(StoredKeyframe(id, names[i], depth_m, as_pose(poses[i]), camera))
+        keyframes.append(StoredKeyframe(id, names[i], depth_m, as_pose(poses[i]), camera, float(stamps[i])))
     next_id = file.scalar("next_id", "i")
     if len(set(ids.tolist())) < n or not all(0 <= id < next_id for id in ids.tolist()):
         raise MapFileError(f"{path}: damaged: the ids of its keyframes are not valid")

@@ -41,6 +41,11 @@ class MappedKeyframe(PosedDepth, Protocol):
         """Number of pixels that hold a measurement."""
         ...
 
+    @property
+    def stamp_s(self) -> float:
+        """When it was taken, in seconds."""
+        ...
+
 
 class OccupancyMap(Protocol):
     """A probabilistic occupancy map of depth keyframes, whatever its method.
@@ -85,9 +90,15 @@ class OccupancyMap(Protocol):
         ...
 
     def add_keyframe(
-        self, depth_m: ArrayLike, T_world_camera: ArrayLike, camera: Camera, name: str = ""
+        self,
+        depth_m: ArrayLike,
+        T_world_camera: ArrayLike,
+        camera: Camera,
+        name: str = "",
+        stamp_s: float | None = None,
     ) -> int:
-        """Add a depth image, (H, W) axial depth in metres, taken at a pose (4, 4); returns its id."""
+        """Add a depth image, (H, W) axial depth in metres, taken at a pose (4, 4) and a time in seconds, by
+        default the number of keyframes added before; returns its id."""
         ...
 
     def remove_keyframe(self, id: int) -> None:

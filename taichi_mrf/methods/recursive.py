@@ -6,6 +6,7 @@ method defines which bricks a scan reaches and how it changes their voxels; this
 """
 
 import dataclasses
+import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
@@ -33,13 +34,14 @@ from taichi_mrf.inference.schedule import (
 from taichi_mrf.methods.brick_map import BrickMap, check_inference
 from taichi_mrf.methods.map_file import MapHeader, StoredKeyframe, naming
 from taichi_mrf.methods.recursive_storage import RecursiveContents, read_recursive, write_recursive
-from taichi_mrf.methods.recursive_update import LEAST_LOG_ODDS, UNKNOWN_LOG_ODDS
+from taichi_mrf.methods.recursive_update import LEAST_LOG_ODDS, UNKNOWN_LOG_ODDS, fade_bricks
 from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.strips import strip_length
 from taichi_mrf.voxels.window import Window
 
 FootprintT = TypeVar("FootprintT", bound=Footprint)
@@ -90,6 +92,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         self._keyframes: dict[int, StoredKeyframe] = {}
         self._next_id = 0
         self._stale = False
+        self._newest_s = -math.inf
 
     @abstractmethod
     def _reach(self, image: DepthImage, T_world_camera: Pose) -> FootprintT:
@@ -126,19 +129,26 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         return np.zeros((0, 3), np.int32)
 
     def add_keyframe(
-        self, depth_m: ArrayLike, T_world_camera: ArrayLike, camera: Camera, name: str = ""
+        self,
+        depth_m: ArrayLike,
+        T_world_camera: ArrayLike,
+        camera: Camera,
+        name: str = "",
+        stamp_s: float | None = None,
     ) -> int:
         """Add a depth image and integrate it at once; in a stale map the next :meth:`infer` does.
 
         ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
-        ``T_world_camera`` is (4, 4). Returns the keyframe's id.
+        ``T_world_camera`` is (4, 4); ``stamp_s`` is when it was taken, in seconds, by default the number of
+        keyframes added before. Returns the keyframe's id.
         Raises KeyframeError for a wrong shape or pose, CapacityError if the map would not fit.
         """
         T, name = as_pose(T_world_camera), instance(name, str, "name", "a string")
         depth = checked_depth(depth_m, camera, self.sensor.min_depth)
         if not self._keyframes:
             warn_of_bad_sigma(self.noise.table(camera), self.sensor.min_depth, self.sensor.max_depth)
-        record = StoredKeyframe(self._next_id, name or f"keyframe {self._next_id}", depth, T, camera)
+        name = name or f"keyframe {self._next_id}"
+        record = StoredKeyframe(self._next_id, name, depth, T, camera, self._stamp(stamp_s))
         if not self._stale:
             self._add(record)
         self._keyframes[record.id] = record
@@ -240,10 +250,11 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         with naming(Path(path)):
             m = cls.with_noise(header.limited_to(memory_limit_gb), header.noise)
             if len(bricks):
-                m._pool.write("belief", m._registry.restore(bricks, 1), contents.belief)
+                m._pool.write("total", m._registry.restore(bricks, 1), contents.belief)
         for k in header.keyframes:
             m._keyframes[k.id] = k
         m._next_id, m._stale, m._up = header.next_id, contents.stale, header.up
+        m._newest_s = max((k.stamp_s for k in header.keyframes), default=-math.inf)
         return m
 
     def _find(self, id: int) -> StoredKeyframe:
@@ -256,6 +267,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         unchanged."""
         image = DepthImage.upload(record.depth_m, record.camera, self.noise)
         footprint = self._reach(image, record.T_world_camera)
+        self._fade(record.stamp_s)
         self._registry.anchor_at(record.T_world_camera[:3, 3])
         self._registry.claim(footprint)
         slots = self._registry.visible(footprint).slots
@@ -265,8 +277,21 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
             self._pool.touch(slots)
         runtime.settle()  # before the image's arrays are dropped
 
+    def _fade(self, stamp_s: float) -> None:
+        """Let the time up to a new scan pass for all voxels; a scan from the past changes nothing."""
+        forgotten = (
+            self.config.time.forgotten(stamp_s - self._newest_s) if self._newest_s > -math.inf else 0.0
+        )
+        self._newest_s = max(self._newest_s, stamp_s)
+        slots = self._pool.in_use
+        if forgotten > 0 and len(slots):
+            fade_bricks(slots, self._pool.total, forgotten / 2, strip_length())
+            self._pool.revision += 1
+            self._pool.touch(slots)
+
     def _forget_voxels(self) -> None:
         """Release all bricks."""
+        self._newest_s = -math.inf
         self._pool.release(self._pool.in_use)
         self._pool.revision += 1
         self._registry.topology.clear()

@@ -8,7 +8,10 @@ counts as occupied (OctoMap).
 
 import taichi as ti
 
-from taichi_mrf.kernels.types import F32
+from taichi_mrf.kernels.log_odds import faded
+from taichi_mrf.kernels.types import F32, F32Array, I32Array, Template
+from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.strips import strip_begin
 
 UNKNOWN_LOG_ODDS = 0.0
 """The log-odds of a voxel that no scan has observed."""
@@ -25,3 +28,13 @@ def updated(log_odds: F32, change: F32, lowest: F32, highest: F32) -> F32:
     if ti.abs(result) < LEAST_LOG_ODDS:
         result = LEAST_LOG_ODDS if result >= 0.0 else -LEAST_LOG_ODDS
     return result
+
+
+@ti.kernel
+def fade_bricks(slots: I32Array, belief: F32Array, flips: F32, strip: Template):
+    """Let time pass in bricks, (n) ``slots`` of ``belief`` (pool * 512), in which a voxel of either state has
+    changed it with the chance ``flips``. Unknown voxels stay unknown."""
+    for part in range(slots.shape[0] * (VOXELS // strip)):
+        _, j = strip_begin(part, slots, strip)
+        for k in range(strip):
+            belief[j + k] = faded(belief[j + k], flips, flips)

@@ -33,7 +33,7 @@ class PartialMap(MRFMap):
         """The log-odds in bricks that exist, (n, 3) -> (n, 512), less the messages of some keyframes, by id.
         Nothing may have been added or moved since the last :meth:`infer`."""
         slots = self._registry.topology.slots(bricks)
-        snapshot = self._pool.snapshot()
+        snapshot = self._pool.snapshot(undated=True)
         for id in without:
             keyframe = self._keyframes[id]
             if keyframe.messages is not None:

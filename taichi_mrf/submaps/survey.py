@@ -64,7 +64,7 @@ def survey_frames(task: SurveyTask) -> list[SurveyedFrame]:
         T_world_camera, chunks = as_pose(frame.T_world_camera), nowhere
         measured = bool((frame.depth_m > 0).any())
         if measured:
-            id = m.add_keyframe(frame.depth_m, T_world_camera, frame.camera, name)
+            id = m.add_keyframe(frame.depth_m, T_world_camera, frame.camera, name, frame.stamp)
             chunks = np.unique(m.all_crossed_bricks() // CHUNK, axis=0)
             m.remove_keyframe(id)
         found.append(SurveyedFrame(index, name, T_world_camera, chunks, measured))

@@ -9,6 +9,7 @@ import heapq
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import taichi as ti
@@ -30,26 +31,49 @@ MOST_BRICKS = 2**31 // VOXELS - 1
 
 @dataclass(frozen=True)
 class PoolSnapshot:
-    """What queries read of a pool, as it was at one moment."""
+    """A pool at one moment: the sums of messages, what queries read, and which bricks there were."""
 
+    total: "ti.Ndarray"
     belief: "ti.Ndarray"
     bricks: NDArray[np.int32]
     owners: NDArray[np.int32]
 
 
+class Dated(Protocol):
+    """What takes the place of the sums of messages for queries, in a map whose evidence has a date."""
+
+    def current(self) -> "ti.Ndarray":
+        """The log-odds of all voxels (capacity * 512), brought up to date."""
+        ...
+
+    def start(self, slots: NDArray[np.int32]) -> None:
+        """New bricks, (n,) slots: their voxels are at the prior."""
+        ...
+
+    def grow(self, old_capacity: int, capacity: int) -> None:
+        """Make room for ``capacity`` bricks."""
+        ...
+
+    @property
+    def bytes_per_voxel(self) -> int: ...
+
+
 class BrickPool:
     """The map's bricks with their beliefs.
 
-    ``belief`` holds the log-odds of each voxel's marginal; ``evidence``, once something has been frozen,
-    the log-odds that inference starts from (prior plus frozen messages).
+    ``total`` holds the log-odds of each voxel's marginal, the prior plus all messages; ``evidence``, once
+    something has been frozen, the log-odds that inference starts from (prior plus frozen messages).
+    Queries read ``belief``: ``total``, unless evidence is ``dated``.
     """
 
     def __init__(self, prior_log_odds: float, memory_limit_gb: float = 0.0) -> None:
         self.prior_log_odds = prior_log_odds
         self.memory_limit_gb = memory_limit_gb
         self.capacity = 0
-        self.belief = ti.ndarray(ti.f32, VOXELS)
+        self.total = ti.ndarray(ti.f32, VOXELS)
         self.evidence: ti.Ndarray | None = None
+        self.dated: Dated | None = None
+        self._shown: ti.Ndarray | None = None
         self.bricks = np.zeros((0, 3), np.int32)
         self.owners = np.zeros(0, np.int32)
         self.identity = np.zeros(0, np.int64)
@@ -59,6 +83,13 @@ class BrickPool:
         self._changed = np.zeros(0, bool)
         self._free: list[int] = []
         self._born = 0
+
+    @property
+    def belief(self) -> "ti.Ndarray":
+        """The log-odds (capacity * 512) that queries read."""
+        if self._shown is not None:
+            return self._shown
+        return self.total if self.dated is None else self.dated.current()
 
     @property
     def in_use(self) -> NDArray[np.int32]:
@@ -74,7 +105,8 @@ class BrickPool:
     @property
     def bytes_per_voxel(self) -> int:
         """Bytes of the channels for each allocated voxel."""
-        return 8 if self.evidence is not None else 4
+        dated = 0 if self.dated is None else self.dated.bytes_per_voxel
+        return (8 if self.evidence is not None else 4) + dated
 
     def allocate(self, bricks: NDArray[np.int32]) -> NDArray[np.int32]:
         """Slots for new bricks, (n, 3) -> (n,), their voxels at the prior and without owners.
@@ -93,9 +125,11 @@ class BrickPool:
         self.change_count[slots] = 0
         self._changed[slots] = True
         self.touch(slots)
-        _fill_bricks(self.belief, slots, self.prior_log_odds, strip_length())
+        fill_bricks(self.total, slots, self.prior_log_odds, strip_length())
         if self.evidence is not None:
-            _fill_bricks(self.evidence, slots, self.prior_log_odds, strip_length())
+            fill_bricks(self.evidence, slots, self.prior_log_odds, strip_length())
+        if self.dated is not None:
+            self.dated.start(slots)
         return slots
 
     def release(self, slots: NDArray[np.int32]) -> None:
@@ -110,9 +144,9 @@ class BrickPool:
         self.revision += 1
         self._touched[:] = True
         if self.evidence is not None:
-            self.belief.copy_from(self.evidence)
+            self.total.copy_from(self.evidence)
         else:
-            self.belief.fill(self.prior_log_odds)
+            self.total.fill(self.prior_log_odds)
 
     def touch(self, slots: NDArray[np.int32]) -> None:
         """Mark these bricks as possibly changed."""
@@ -136,28 +170,29 @@ class BrickPool:
         self._changed[:] = False
         return bricks
 
-    def snapshot(self) -> PoolSnapshot:
-        """The bricks and beliefs as they are now, which later changes do not touch."""
-        belief = ti.ndarray(ti.f32, self.belief.shape)
-        belief.copy_from(self.belief)
-        return PoolSnapshot(belief, self.bricks.copy(), self.owners.copy())
+    def snapshot(self, undated: bool = False) -> PoolSnapshot:
+        """The bricks and beliefs as they are now, which later changes do not touch. With ``undated``, queries
+        that are shown the snapshot read its sums of messages."""
+        total = _copied(self.total)
+        belief = total if undated or self.dated is None else _copied(self.belief)
+        return PoolSnapshot(total, belief, self.bricks.copy(), self.owners.copy())
 
     def restore(self, snapshot: PoolSnapshot) -> None:
-        """Set the beliefs back to a snapshot's. The bricks must still be the same."""
+        """Set the sums of messages back to a snapshot's. The bricks must still be the same."""
         self.revision += 1
         self._touched[:] = True
-        self.belief.copy_from(snapshot.belief)
+        self.total.copy_from(snapshot.total)
         runtime.settle()  # before the snapshot is dropped
 
     @contextmanager
     def showing(self, snapshot: PoolSnapshot) -> Iterator[None]:
         """Let queries and files see a snapshot while the block runs, which must not change the pool."""
-        now = PoolSnapshot(self.belief, self.bricks, self.owners)
-        self.belief, self.bricks, self.owners = snapshot.belief, snapshot.bricks, snapshot.owners
+        now = self._shown, self.bricks, self.owners
+        self._shown, self.bricks, self.owners = snapshot.belief, snapshot.bricks, snapshot.owners
         try:
             yield
         finally:
-            self.belief, self.bricks, self.owners = now.belief, now.bricks, now.owners
+            self._shown, self.bricks, self.owners = now
 
     def keep_evidence(self) -> "ti.Ndarray":
         """The evidence channel, made when something is frozen for the first time."""
@@ -167,20 +202,20 @@ class BrickPool:
         return self.evidence
 
     def read(self, channel: str, slots: NDArray[np.int32]) -> NDArray[np.float32]:
-        """The voxels of some bricks, (n, 512), from the channel "belief" or "evidence"."""
+        """The voxels of some bricks, (n, 512), from the channel "belief", "total" or "evidence"."""
         out = np.zeros(len(slots) * VOXELS, np.float32)
         if len(slots):
-            _read_bricks(getattr(self, channel), slots, out, strip_length())
+            read_bricks(getattr(self, channel), slots, out, strip_length())
         return out.reshape(-1, VOXELS)
 
     def write(self, channel: str, slots: NDArray[np.int32], values: NDArray[np.float32]) -> None:
-        """Set the voxels of some bricks, (n, 512)."""
+        """Set the voxels of some bricks, (n, 512), of the channel "total" or "evidence"."""
         self.revision += 1
         if channel == "evidence":
             self.keep_evidence()
         self.touch(slots)
         flat = np.ascontiguousarray(values, np.float32).reshape(-1)
-        _write_bricks(getattr(self, channel), slots, flat, strip_length())
+        write_bricks(getattr(self, channel), slots, flat, strip_length())
 
     def _affordable(self) -> int:
         """Bricks that the memory limit, if there is one, has room for."""
@@ -200,9 +235,11 @@ class BrickPool:
             self.memory_limit_gb,
         )
         capacity = max(bricks_needed, min(MOST_BRICKS, int(self.capacity * GROWTH), self._affordable()), 256)
-        self.belief = _grown(self.belief, self.capacity, capacity)
+        self.total = grown(self.total, self.capacity, capacity)
         if self.evidence is not None:
-            self.evidence = _grown(self.evidence, self.capacity, capacity)
+            self.evidence = grown(self.evidence, self.capacity, capacity)
+        if self.dated is not None:
+            self.dated.grow(self.capacity, capacity)
         more = capacity - self.capacity
         self.bricks = np.concatenate([self.bricks, np.zeros((more, 3), np.int32)])
         self.owners = np.concatenate([self.owners, np.zeros(more, np.int32)])
@@ -215,7 +252,14 @@ class BrickPool:
         self.capacity = capacity
 
 
-def _grown(old: "ti.Ndarray", old_capacity: int, capacity: int) -> "ti.Ndarray":
+def _copied(channel: "ti.Ndarray") -> "ti.Ndarray":
+    copy = ti.ndarray(ti.f32, channel.shape)
+    copy.copy_from(channel)
+    return copy
+
+
+def grown(old: "ti.Ndarray", old_capacity: int, capacity: int) -> "ti.Ndarray":
+    """A channel with room for ``capacity`` bricks, which holds the voxels of the old one."""
     new = ti.ndarray(ti.f32, capacity * VOXELS)
     _copy(old, new, old_capacity, strip_length())
     runtime.settle()
@@ -232,7 +276,7 @@ def _copy(source: F32Array, target: F32Array, bricks: I32, strip: Template):
 
 
 @ti.kernel
-def _fill_bricks(channel: F32Array, slots: I32Array, value: F32, strip: Template):
+def fill_bricks(channel: F32Array, slots: I32Array, value: F32, strip: Template):
     """Set all voxels of the bricks in ``slots`` (n) of a ``channel`` (capacity * 512)."""
     for part in range(slots.shape[0] * (VOXELS // strip)):
         _, j = strip_begin(part, slots, strip)
@@ -241,7 +285,7 @@ def _fill_bricks(channel: F32Array, slots: I32Array, value: F32, strip: Template
 
 
 @ti.kernel
-def _read_bricks(channel: F32Array, slots: I32Array, out: F32Array, strip: Template):
+def read_bricks(channel: F32Array, slots: I32Array, out: F32Array, strip: Template):
     """Copy the bricks in ``slots`` (n) of a ``channel`` (capacity * 512) to ``out`` (n * 512)."""
     for part in range(slots.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, slots, strip)
@@ -250,7 +294,7 @@ def _read_bricks(channel: F32Array, slots: I32Array, out: F32Array, strip: Templ
 
 
 @ti.kernel
-def _write_bricks(channel: F32Array, slots: I32Array, values: F32Array, strip: Template):
+def write_bricks(channel: F32Array, slots: I32Array, values: F32Array, strip: Template):
     """Copy ``values`` (n * 512) to the bricks in ``slots`` (n) of a ``channel`` (capacity * 512)."""
     for part in range(slots.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, slots, strip)

@@ -26,6 +26,7 @@ from taichi_mrf.config.schema import (
     to_yaml,
 )
 from taichi_mrf.config.text import commented_yaml, differences, field_help
+from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.errors import ConfigError
 
 SECTIONS = (
@@ -33,6 +34,7 @@ SECTIONS = (
     SensorConfig,
     KeyframeConfig,
     PoseConfig,
+    TimeConfig,
     VolumeConfig,
     EvaluationConfig,
     RuntimeConfig,

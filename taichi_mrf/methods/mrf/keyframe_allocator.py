@@ -9,6 +9,7 @@ from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference import sum_product
+from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.footprint import find_footprint
 from taichi_mrf.inference.incremental import change_count_seen_by
 from taichi_mrf.inference.keyframe import DepthImage, Footprint, Keyframe, RayList
@@ -36,8 +37,10 @@ class KeyframeAllocator:
     volume: VolumeConfig
     bounds: KeyframeBounds
     budget: MemoryBudget
+    dated: DatedBelief | None = None
+    """What follows the messages if evidence has a date."""
 
-    def place(self, id: int, name: str, image: DepthImage, T_world_camera: Pose) -> Keyframe:
+    def place(self, id: int, name: str, image: DepthImage, T_world_camera: Pose, stamp_s: float) -> Keyframe:
         """Find the bricks that a keyframe's rays cross and claim those near its surfaces. Raises
         CapacityError if there is not enough memory."""
         rays, voxel_size = self.bundler.rays_of(image), self.registry.voxel_size
@@ -45,22 +48,24 @@ class KeyframeAllocator:
         footprint = find_footprint(image, rays, T_world_camera, *parts, scouts=SCOUTS)
         self.budget.check(footprint, 4 * (image.depth.shape[0] + rays.blocks.shape[0]) + rays.nbytes)
         self.registry.anchor_at(T_world_camera[:3, 3])
-        return self._claimed(id, name, image, rays, T_world_camera, footprint)
+        return self._claimed(id, name, image, rays, T_world_camera, stamp_s, footprint)
 
     def put_back(self, keyframe: Keyframe) -> Keyframe:
         """Place a keyframe again, without messages, right after :meth:`take_out`. The memory that it needs
         was just released, so the budget is not checked."""
-        parts = (keyframe.image, keyframe.ray_list, keyframe.T_world_camera, keyframe.footprint)
-        return self._claimed(keyframe.id, keyframe.name, *parts)
+        parts = (keyframe.image, keyframe.ray_list, keyframe.T_world_camera, keyframe.stamp_s)
+        return self._claimed(keyframe.id, keyframe.name, *parts, keyframe.footprint)
 
     def _claimed(
-        self, id: int, name: str, image: DepthImage, rays: RayList, T_world_camera: Pose, footprint: Footprint
-    ) -> Keyframe:
+        self, id: int, name: str, image: DepthImage, rays: RayList, T_world_camera: Pose, stamp_s: float,
+        footprint: Footprint,
+    ) -> Keyframe:  # fmt: skip
         """Claim the bricks and return the keyframe, counted in the budget."""
         self.registry.claim(footprint)
         self.bounds.put(id, footprint.window)
         visible, entry_depths = self.registry.visible(footprint), unknown_entry_depths(rays)
-        keyframe = Keyframe(id, name, image, rays, T_world_camera, footprint, visible, entry_depths)
+        placed = (T_world_camera, stamp_s, footprint, visible, entry_depths)
+        keyframe = Keyframe(id, name, image, rays, *placed)
         self.budget.take(keyframe)
         return keyframe
 
@@ -70,9 +75,11 @@ class KeyframeAllocator:
         if keyframe.messages is not None:
             messages, slots = self.refresh(keyframe), keyframe.visible.slots
             if len(slots):
-                pool.count_changes(slots, withdraw_messages(keyframe.visible, messages, pool.belief))
+                pool.count_changes(slots, withdraw_messages(keyframe.visible, messages, pool.total))
                 pool.revision += 1
                 pool.touch(slots)
+                if self.dated is not None:
+                    self.dated.outdate(slots)
         self.registry.disclaim(keyframe.footprint)
         self.bounds.drop(keyframe.id)
         self.budget.give_back(keyframe.id)
@@ -84,6 +91,8 @@ class KeyframeAllocator:
         pool, messages = self.registry.pool, self.refresh(keyframe)
         if len(keyframe.visible.slots):
             sum_product.fold(keyframe.visible.slots, pool.keep_evidence(), messages, strip_length())
+            if self.dated is not None:
+                self.dated.freeze(keyframe)
         self.registry.freeze(keyframe.footprint)
         self.bounds.drop(keyframe.id)
         self.budget.give_back(keyframe.id)

@@ -3,10 +3,9 @@
 The class manages keyframes, bricks and messages. The computation itself is inference/sum_product.py.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -18,6 +17,7 @@ from taichi_mrf.config.arguments import instance, real
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, PoseConfig, SensorConfig, VolumeConfig
+from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.config.values import overridden
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.factor_graph.depth_graph import depth_graph
@@ -26,18 +26,18 @@ from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.inference.incremental import IncrementalInference
 from taichi_mrf.inference.keyframe import DepthImage, Keyframe, checked_depth
 from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
-from taichi_mrf.inference.messages import count_observations
 from taichi_mrf.inference.prior import log_odds_without_bricks, prior_probability
 from taichi_mrf.inference.ray_list import RayBundler
 from taichi_mrf.inference.schedule import InferReport, InferSteps, Progress, content_key, driven, sweep_steps
 from taichi_mrf.inference.sweep import Sweeper, unknown_entry_depths
-from taichi_mrf.methods.brick_map import BrickMap, check_inference, own_parameters, own_section
+from taichi_mrf.methods.brick_map import check_inference, own_parameters, own_section
 from taichi_mrf.methods.map_file import MapHeader, StoredKeyframe, naming
 from taichi_mrf.methods.mrf.checkpoint import Checkpoint, go_back, take_checkpoint
 from taichi_mrf.methods.mrf.keyframe_allocator import KeyframeAllocator
 from taichi_mrf.methods.mrf.memory_budget import MemoryBudget
 from taichi_mrf.methods.mrf.moving_window import MovingWindow
 from taichi_mrf.methods.mrf.plug import METHOD
+from taichi_mrf.methods.mrf.reading import ReadableMRF
 from taichi_mrf.methods.mrf.storage import contents_of, read_contents, write_contents
 from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.occlusion import Occlusion
@@ -46,7 +46,7 @@ from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
 from taichi_mrf.voxels.layout import VOXELS
 
 
-class MRFMap(BrickMap):
+class MRFMap(ReadableMRF):
     """A probabilistic occupancy map of any set of depth keyframes.
 
     Keyframes can be added, removed, moved and frozen in any order; after :meth:`infer` the map depends only
@@ -62,6 +62,7 @@ class MRFMap(BrickMap):
         *,
         inference: InferenceConfig | None = None,
         volume: VolumeConfig | None = None,
+        time: TimeConfig | None = None,
         min_depth: float = SensorConfig.min_depth,
         max_depth: float = SensorConfig.max_depth,
         **parameters: Any,
@@ -71,7 +72,7 @@ class MRFMap(BrickMap):
         ``noise`` defaults to a Kinect 1. Raises ConfigError for an unknown or impossible parameter.
         """
         section = own_section(inference, InferenceConfig, parameters, "inference", "MRFMap")
-        shared = own_parameters(voxel_size, volume, min_depth, max_depth)
+        shared = own_parameters(voxel_size, volume, min_depth, max_depth, time)
         self._set_up(Config(**shared, inference=section), noise)
 
     def _set_up(self, config: Config, noise: NoiseModel | None) -> None:
@@ -83,22 +84,19 @@ class MRFMap(BrickMap):
         bounds = KeyframeBounds()
         parts = (self.sensor, inference, self.config.volume)
         self._keyframes: dict[int, Keyframe] = {}
+        self._date(config.time)
         budget = MemoryBudget(self._pool, inference.message_precision)
-        self._allocator = KeyframeAllocator(self._registry, bundler, *parts, bounds, budget)
+        self._allocator = KeyframeAllocator(self._registry, bundler, *parts, bounds, budget, self._dated)
         self._sweeper = Sweeper(self.voxel_size, self.sensor, inference, self.config.volume)
-        kept = (bounds, self._allocator.look_again, self._allocator.refresh)
-        self._incremental = IncrementalInference(self._pool, self._sweeper, *kept, inference.renew_tolerance)
+        note_sweep = None if self._dated is None else self._dated.note_sweep
+        kept = (bounds, self._allocator.look_again, self._allocator.refresh, inference.renew_tolerance)
+        self._incremental = IncrementalInference(self._pool, self._sweeper, *kept, note_sweep)
         self.aligner = Aligner(self.view, KeyframeSurfels(self.voxel_size, self.sensor.max_depth))
         self._frozen: dict[int, str] = {}
         self._next_id = 0
         self._messages_lost = False  # a loaded map has beliefs, but no messages
         self._settled = True
         self.window = MovingWindow.of(self.config.volume, self._registry)
-
-    @property
-    def keyframes(self) -> Mapping[int, Keyframe]:
-        """The keyframes that can still be moved and removed, by id."""
-        return MappingProxyType(self._keyframes)
 
     @property
     def stale(self) -> bool:
@@ -111,28 +109,30 @@ class MRFMap(BrickMap):
         stopped, and no keyframe changed since."""
         return self._settled
 
-    def crossed_bricks(self, id: int) -> NDArray[np.int32]:
-        """The bricks that a keyframe's rays cross, (n, 3), whether they are allocated or not."""
-        footprint = self._find(id).footprint
-        return footprint.window.bricks_of(footprint.crossed)
-
-    @property
-    def frozen(self) -> Mapping[int, str]:
-        """Names of the keyframes that have been frozen, by id."""
-        return MappingProxyType(self._frozen)
-
     def add_keyframe(
-        self, depth_m: ArrayLike, T_world_camera: ArrayLike, camera: Camera, name: str = ""
+        self,
+        depth_m: ArrayLike,
+        T_world_camera: ArrayLike,
+        camera: Camera,
+        name: str = "",
+        stamp_s: float | None = None,
     ) -> int:
         """Add a depth image. It takes part in the next :meth:`infer`.
 
         ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
-        ``T_world_camera`` is (4, 4). Returns the keyframe's id.
+        ``T_world_camera`` is (4, 4); ``stamp_s`` is when it was taken, in seconds, by default the number of
+        keyframes added before. Returns the keyframe's id.
         Raises KeyframeError for a wrong shape or pose, CapacityError if the map would not fit.
         """
-        T, name = as_pose(T_world_camera), instance(name, str, "name", "a string")
+        T, name, stamp_s = (
+            as_pose(T_world_camera),
+            instance(name, str, "name", "a string"),
+            self._stamp(stamp_s),
+        )
         image = self._upload(depth_m, camera)
-        keyframe = self._allocator.place(self._next_id, name or f"keyframe {self._next_id}", image, T)
+        keyframe = self._allocator.place(
+            self._next_id, name or f"keyframe {self._next_id}", image, T, stamp_s
+        )
         self._keyframes[keyframe.id] = keyframe
         self._note_up(T)
         self._next_id += 1
@@ -159,7 +159,8 @@ class MRFMap(BrickMap):
         self._allocator.take_out(keyframe)
         self._settled = False
         try:
-            self._keyframes[id] = self._allocator.place(id, keyframe.name, keyframe.image, T)
+            parts = (keyframe.name, keyframe.image, T, keyframe.stamp_s)
+            self._keyframes[id] = self._allocator.place(id, *parts)
         except Exception:
             self._keyframes[id] = self._allocator.put_back(keyframe)
             raise
@@ -254,6 +255,8 @@ class MRFMap(BrickMap):
             complete = report.complete
         finally:
             self._settled = complete and as_configured
+            if self._dated is not None:
+                self._dated.outdate()
         return report
 
     def renew(
@@ -296,8 +299,7 @@ class MRFMap(BrickMap):
         for keyframe in self._keyframes.values():
             keyframe.messages = None
         self._allocator.mark_without_messages(self._keyframes.values())
-        self._pool.write("belief", self._pool.in_use, log_odds.reshape(-1, VOXELS).astype(np.float32))
-        self._pool.touch(self._pool.in_use)
+        self._show(self._pool.in_use, log_odds.reshape(-1, VOXELS).astype(np.float32))
         self._messages_lost, self._settled = bool(self._keyframes), False
 
     def checkpoint(self) -> Checkpoint:
@@ -309,12 +311,8 @@ class MRFMap(BrickMap):
         go_back(checkpoint, self._pool, self._keyframes.values())
         self._messages_lost, self._settled = checkpoint.messages_lost, checkpoint.settled
         self._allocator.mark_without_messages(self._keyframes.values())
-
-    def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """How many keyframes observe each voxel of some bricks of the pool, (n,) slots -> (n, 512). All
-        frozen ones count as one; 255 means 255 or more."""
-        sent = [(k.visible, k.messages) for k in self._keyframes.values() if k.messages is not None]
-        return count_observations(slots, sent, self._pool)
+        if self._dated is not None:
+            self._dated.outdate()
 
     @property
     def last_voxel_steps(self) -> int:
@@ -336,10 +334,14 @@ class MRFMap(BrickMap):
     def save(self, path: str | Path) -> None:
         """Write the map to one .npz file, under a temporary name first. Raises MapFileError."""
         keyframes = list(self._keyframes.values())
-        stored = [StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera) for k in keyframes]
+        stored = [
+            StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera, k.stamp_s) for k in keyframes
+        ]
         header = MapHeader(self.config, self.noise, stored, self._next_id, self._settled, self.up)
         parked = () if self.window is None else self.window.save_beside(Path(path), self)
-        write_contents(Path(path), contents_of(header, self._registry, keyframes, self._frozen, parked))
+        write_contents(
+            Path(path), contents_of(header, self._registry, keyframes, self._frozen, parked, self._dated)
+        )
         if self.window is not None:
             self.window.saved(Path(path))
 
@@ -357,23 +359,19 @@ class MRFMap(BrickMap):
             m._frozen = dict(contents.frozen)
             for k in header.keyframes:
                 image = m._upload(k.depth_m, k.camera)
-                m._keyframes[k.id] = m._allocator.place(k.id, k.name, image, k.T_world_camera)
+                parts = (image, k.T_world_camera, k.stamp_s)
+                m._keyframes[k.id] = m._allocator.place(k.id, k.name, *parts)
             if m.window is not None:
                 m.window.resume(Path(path), contents.parked)
         if len(bricks):
-            m._pool.write("belief", slots, contents.belief)
             if contents.evidence is not None:
                 m._pool.write("evidence", slots, contents.evidence)
+            if m._dated is not None and contents.frozen_dated is not None:
+                m._dated.restore_frozen(slots, *contents.frozen_dated)
+            m._show(slots, contents.belief)
         m._next_id, m._up = header.next_id, header.up
         m._messages_lost, m._settled = bool(m._keyframes), header.settled
         return m
-
-    def _find(self, id: int) -> Keyframe:
-        if id in self._frozen:
-            raise KeyframeError(f"keyframe {id} ({self._frozen[id]}) is frozen")
-        if id not in self._keyframes:
-            raise KeyframeError(f"there is no keyframe {id}")
-        return self._keyframes[id]
 
     def _upload(self, depth_m: ArrayLike, camera: Camera) -> DepthImage:
         image = DepthImage.upload(checked_depth(depth_m, camera, self.sensor.min_depth), camera, self.noise)

@@ -135,7 +135,7 @@ class MovingWindow:
             found = self.parked.read((x, y, z))
             if len(found.bricks):
                 slots = registry.restore(found.bricks, found.owners)
-                registry.pool.write("belief", slots, found.belief)
+                registry.pool.write("total", slots, found.belief)
                 registry.pool.write("evidence", slots, found.evidence)
             registry.see_for_good(found.crossed)
             self.parked.drop((x, y, z))

@@ -13,17 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
+from taichi_mrf.inference.dated import NEVER, DatedBelief
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.map_file import MapHeader, open_map_file, read_bricks, read_header
 from taichi_mrf.system.atomic import write_npz
+from taichi_mrf.system.npz_file import NpzFile
 from taichi_mrf.voxels.layout import VOXELS
+
+_BEFORE_ALL = float(np.finfo(np.float64).min)
+"""Stands for no stamp at all: a file holds finite numbers only."""
 
 
 @dataclass(frozen=True)
 class MapContents:
     """The contents of an MRFMap's file. ``belief`` and ``evidence`` are (n, 512) log-odds of the ``bricks``
-    (n, 3); ``frozen_owners`` (n,) counts the frozen keyframes that own each brick, ``frozen_crossed`` (m, 3)
+    (n, 3); ``frozen_dated`` is what frozen keyframes say of the voxels of a dated map, and as of when (n);
+    ``frozen_owners`` (n,) counts the frozen keyframes that own each brick, ``frozen_crossed`` (m, 3)
     are the bricks that they crossed, and ``frozen`` their names by id. ``parked`` names the files of the
     chunks that are not in memory (parked_chunks.py)."""
 
@@ -31,6 +37,7 @@ class MapContents:
     bricks: NDArray[np.int32]
     belief: NDArray[np.float32]
     evidence: NDArray[np.float32] | None
+    frozen_dated: tuple[NDArray[np.float32], NDArray[np.float64]] | None
     frozen_owners: NDArray[np.int32]
     frozen_crossed: NDArray[np.int32]
     frozen: dict[int, str]
@@ -43,6 +50,7 @@ def contents_of(
     keyframes: Iterable[Keyframe],
     frozen: dict[int, str],
     parked: Sequence[str] = (),
+    dated: DatedBelief | None = None,
 ) -> MapContents:
     """The contents to store; ``keyframes`` are those that are not frozen."""
     pool = registry.pool
@@ -55,6 +63,7 @@ def contents_of(
         pool.bricks[slots],
         pool.read("belief", slots),
         None if pool.evidence is None else pool.read("evidence", slots),
+        None if dated is None else dated.read_frozen(slots),
         pool.owners[slots] - live[slots],
         registry.frozen_crossed,
         frozen,
@@ -77,6 +86,9 @@ def write_contents(path: Path, contents: MapContents) -> None:
         arrays["evidence"] = contents.evidence
     if contents.parked:
         arrays["parked"] = np.array(contents.parked, np.str_)
+    if contents.frozen_dated is not None:
+        belief, stamps = contents.frozen_dated
+        arrays |= {"frozen_belief": belief, "frozen_stamps": np.maximum(stamps, _BEFORE_ALL)}
     write_npz(path, arrays, manifest=True)
 
 
@@ -92,6 +104,7 @@ def read_contents(path: Path) -> MapContents:
             bricks,
             belief,
             file.array("evidence", "f", (n, VOXELS)) if "evidence" in file else None,
+            _frozen_dated(file, n) if "frozen_belief" in file else None,
             file.array("frozen_owners", "i", (n,)).astype(np.int32),
             file.array("frozen_crossed", "i", (None, 3)).astype(np.int32),
             dict(zip(frozen_ids, file.array("frozen_names", "U", (len(frozen_ids),)).tolist(), strict=True)),
@@ -100,3 +113,9 @@ def read_contents(path: Path) -> MapContents:
     if (contents.frozen_owners < 0).any():
         raise MapFileError(f"{path}: damaged: frozen_owners holds a negative number")
     return contents
+
+
+def _frozen_dated(file: NpzFile, bricks: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    belief = file.array("frozen_belief", "f", (bricks, VOXELS))
+    stamps = file.array("frozen_stamps", "f", (bricks,)).astype(np.float64)
+    return belief.astype(np.float32), np.where(stamps > _BEFORE_ALL, stamps, NEVER)

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
+from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import DepthImage, Footprint
 from taichi_mrf.methods.brick_map import own_parameters, own_section
@@ -33,6 +34,7 @@ class VisibilityMap(RecursiveMap[Footprint]):
         *,
         visibility: VisibilityConfig | None = None,
         volume: VolumeConfig | None = None,
+        time: TimeConfig | None = None,
         min_depth: float = SensorConfig.min_depth,
         max_depth: float = SensorConfig.max_depth,
         **parameters: Any,
@@ -45,7 +47,7 @@ class VisibilityMap(RecursiveMap[Footprint]):
         Raises ConfigError for an unknown or impossible parameter.
         """
         section = own_section(visibility, VisibilityConfig, parameters, "visibility", "VisibilityMap")
-        shared = own_parameters(voxel_size, volume, min_depth, max_depth)
+        shared = own_parameters(voxel_size, volume, min_depth, max_depth, time)
         self._set_up(Config(**shared, visibility=section), noise)
 
     def _set_up(self, config: Config, noise: NoiseModel | None) -> None:

@@ -1,0 +1,156 @@
+"""What can be read of an MRFMap: its keyframes, and the map as it was believed at another time, or one layer
+of it."""
+
+import copy
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+
+import numpy as np
+import taichi as ti
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf.config.arguments import real
+from taichi_mrf.config.method import Method
+from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.errors import ConfigError, KeyframeError
+from taichi_mrf.geometry.up import Up
+from taichi_mrf.inference.dated import DatedBelief, layer_of
+from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.inference.messages import count_observations
+from taichi_mrf.methods.brick_map import BrickMap
+from taichi_mrf.methods.protocol import MappedKeyframe
+from taichi_mrf.queries.view import View
+
+
+class MapReading(BrickMap):
+    """Other beliefs over the bricks of a map: a map that can be queried and exported, but not changed.
+
+    It is good for as long as no keyframe of the map is added, removed, moved or frozen.
+    """
+
+    def __init__(self, source: BrickMap, belief: "ti.Ndarray") -> None:
+        """``belief`` (capacity * 512) are log-odds of the voxels of the source's pool."""
+        self.METHOD: Method = source.METHOD  # type: ignore[misc]
+        self.config, self.sensor, self.noise = source.config, source.sensor, source.noise
+        self.voxel_size = source.voxel_size
+        self._source, self._version = source, source._registry.version
+        self._registry, self._up = source._registry, source._up
+        self.seen_free_log_odds = source.seen_free_log_odds
+        self._pool = copy.copy(source._pool)
+        self._pool.dated, self._pool.total = None, belief
+        self._pool.bricks, self._pool.owners = source._pool.bricks.copy(), source._pool.owners.copy()
+        shown = source.view
+        self.view = View(self._pool, self.voxel_size, shown.volume, shown.occlusion)
+
+    @property
+    def keyframes(self) -> Mapping[int, MappedKeyframe]:
+        """The keyframes of the map that is read."""
+        keyframes: Mapping[int, MappedKeyframe] = self._source.keyframes  # type: ignore[attr-defined]
+        return keyframes
+
+    @property
+    def up(self) -> Up | None:
+        """The world axis that is up."""
+        return self._source.up
+
+    def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
+        if self._registry.version != self._version:
+            raise KeyframeError("the map has changed since it was read: call at(), static or dynamic again")
+        return super()._log_odds(points)
+
+
+class ReadableMRF(BrickMap):
+    """The part of an MRFMap that changes nothing."""
+
+    _keyframes: dict[int, Keyframe]
+    _frozen: dict[int, str]
+    _dated: DatedBelief | None
+
+    @property
+    def keyframes(self) -> Mapping[int, Keyframe]:
+        """The keyframes that can still be moved and removed, by id."""
+        return MappingProxyType(self._keyframes)
+
+    def crossed_bricks(self, id: int) -> NDArray[np.int32]:
+        """The bricks that a keyframe's rays cross, (n, 3), whether they are allocated or not."""
+        footprint = self._find(id).footprint
+        return footprint.window.bricks_of(footprint.crossed)
+
+    @property
+    def frozen(self) -> Mapping[int, str]:
+        """Names of the keyframes that have been frozen, by id."""
+        return MappingProxyType(self._frozen)
+
+    def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """How many keyframes observe each voxel of some bricks of the pool, (n,) slots -> (n, 512). All
+        frozen ones count as one; 255 means 255 or more."""
+        sent = [(k.visible, k.messages) for k in self._keyframes.values() if k.messages is not None]
+        return count_observations(slots, sent, self._pool)
+
+    def _date(self, time: TimeConfig) -> None:
+        """Give evidence a date, unless the world is static."""
+        self._dated = None
+        if not time.is_static:
+            self._dated = DatedBelief(self._pool, time, lambda: self._keyframes.values())
+            self._pool.dated = self._dated
+
+    @property
+    def now_s(self) -> float:
+        """The time that the map is for, in seconds: the newest keyframe's stamp; NaN without keyframes."""
+        if self._dated is not None:
+            now = self._dated.now_s
+        else:
+            now = max((keyframe.stamp_s for keyframe in self._keyframes.values()), default=-math.inf)
+        return now if math.isfinite(now) else math.nan
+
+    def at(self, stamp_s: float) -> MapReading:
+        """The map as it was believed at a time in seconds, from the keyframes up to then.
+
+        Frozen keyframes count from the newest of them on. Messages are those of now: they follow from all
+        keyframes, also from later ones. Raises ConfigError in a map of a static world
+        (``time.half_life_s`` is 0), where keyframes have no order.
+        """
+        stamp_s = real(stamp_s, "stamp_s")
+        dated = self._needs_dates("at()")
+        self._restore_messages()
+        return MapReading(self, dated.as_of(stamp_s))
+
+    @property
+    def static(self) -> MapReading:
+        """The static layer: the map without what came after its surroundings were mapped. Raises ConfigError
+        in a map of a static world."""
+        return self._layer(dynamic=False)
+
+    @property
+    def dynamic(self) -> MapReading:
+        """The dynamic layer: what is occupied now, although all keyframes together say free. All else is
+        unknown. Raises ConfigError in a map of a static world."""
+        return self._layer(dynamic=True)
+
+    def _layer(self, dynamic: bool) -> MapReading:
+        self._needs_dates("a layer")
+        self._restore_messages()
+        pool = self._pool
+        return MapReading(self, layer_of(pool.total, pool.belief, pool.prior_log_odds, dynamic))
+
+    def _needs_dates(self, what: str) -> DatedBelief:
+        if self._dated is None:
+            raise ConfigError(f"{what} needs a map whose world may change: set time.half_life_s")
+        return self._dated
+
+    def _find(self, id: int) -> Keyframe:
+        if id in self._frozen:
+            raise KeyframeError(f"keyframe {id} ({self._frozen[id]}) is frozen")
+        if id not in self._keyframes:
+            raise KeyframeError(f"there is no keyframe {id}")
+        return self._keyframes[id]
+
+    def _show(self, slots: NDArray[np.int32], log_odds: NDArray[np.float32]) -> None:
+        """Let queries read these log-odds, (n) -> (n, 512), until the next inference."""
+        self._pool.write("total", slots, log_odds)
+        if self._dated is not None:
+            self._dated.show(slots, log_odds, self._dated.now_s)
+
+    def _restore_messages(self) -> None:
+        raise NotImplementedError

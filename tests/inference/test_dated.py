@@ -1,0 +1,301 @@
+"""Evidence with a date: the channel through time, the fold over keyframes, maps of a world that changes."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import small_room
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.datasets.synthetic.analytic_render import render
+from taichi_mrf.datasets.synthetic.analytic_scene import Scene, Solid
+from taichi_mrf.datasets.synthetic.room_furniture import room_scene
+from taichi_mrf.errors import ConfigError, KeyframeError
+from taichi_mrf.inference.dated import in_time
+from taichi_mrf.kernels.bundles import kernel
+from taichi_mrf.kernels.log_odds import faded
+from taichi_mrf.kernels.types import F32, F32Array
+from taichi_mrf.methods.log_odds.map import LogOddsMap
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.voxels.layout import VOXELS
+
+TIME = TimeConfig(half_life_s=600.0)
+STEP_S = 4.0
+"""Seconds between the frames of the tests."""
+
+
+def through_time(
+    evidence: NDArray[np.float64], seconds: float, time: TimeConfig = TIME
+) -> NDArray[np.float64]:
+    """The oracle: what evidence is worth some seconds later, by Bayes' rule on the two states."""
+    forgotten = TIME.forgotten(seconds)
+    left, appeared = TIME.moving_share * forgotten, (1 - TIME.moving_share) * forgotten
+    ratio = np.exp(evidence)
+    return np.log(((1 - appeared) * ratio + appeared) / ((1 - left) + left * ratio))
+
+
+@kernel
+def fade_all(evidence: F32Array, left: F32, appeared: F32) -> None:
+    for i in range(evidence.shape[0]):
+        evidence[i] = faded(evidence[i], left, appeared)
+
+
+def dated_room(order: list[int], time: TimeConfig | None = TIME) -> MRFMap:
+    """A map of some frames of the small room, STEP_S apart by their numbers, fully inferred."""
+    m = MRFMap(small_room.VOXEL_SIZE, time=time)
+    for i in order:
+        add(m, i)
+    m.infer()
+    return m
+
+
+def add(m: MRFMap, i: int) -> int:
+    frame = small_room.frames()[i]
+    return m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera, frame.name, STEP_S * i)
+
+
+def beliefs(m: MRFMap) -> dict[tuple[int, int, int], NDArray[np.float32]]:
+    """The log-odds that queries read, by brick."""
+    pool = m.view.pool
+    slots = pool.in_order
+    return dict(zip(map(tuple, pool.bricks[slots].tolist()), pool.read("belief", slots), strict=True))
+
+
+def assert_equal_bits(a: MRFMap, b: MRFMap) -> None:
+    ours, theirs = beliefs(a), beliefs(b)
+    assert ours.keys() == theirs.keys()
+    assert all(np.array_equal(ours[brick], theirs[brick]) for brick in ours)
+
+
+def test_the_rate_follows_from_the_half_life() -> None:
+    assert TIME.forgotten(600.0) == pytest.approx(0.5)
+    assert TIME.flip_rate == pytest.approx(math.log(2) / 1200)
+    assert TimeConfig().is_static
+    assert TimeConfig().forgotten(1e9) == 0
+    for field in ("half_life_s", "moving_share", "glimpse_half_life_s"):
+        with pytest.raises(ConfigError, match=field):
+            TimeConfig(**{field: -1.0})
+
+
+@pytest.mark.usefixtures("backend")
+def test_the_channel_is_that_of_the_oracle() -> None:
+    evidence = np.linspace(-60, 60, 241)
+    for seconds in (0.0, 0.3, 60.0, 1e4, 1e7):
+        forgotten = TIME.forgotten(seconds)
+        left, appeared = TIME.moving_share * forgotten, (1 - TIME.moving_share) * forgotten
+        found = evidence.astype(np.float32)
+        fade_all(found, left, appeared)
+        np.testing.assert_allclose(found, through_time(evidence, seconds), atol=2e-4, rtol=1e-5)
+
+
+@given(st.floats(-30, 30), st.floats(0, 1e4), st.floats(0, 1e4))
+def test_time_in_two_steps_is_time_in_one(evidence: float, first: float, second: float) -> None:
+    at_once = through_time(np.array(evidence), first + second)
+    in_steps = through_time(through_time(np.array(evidence), first), second)
+    assert in_steps == pytest.approx(at_once, abs=1e-6)
+
+
+def test_thirty_old_views_do_not_outvote_three_new_ones() -> None:
+    free = np.zeros(())
+    for _ in range(30):
+        free = through_time(free, 1.0) - 4.0
+    newcomer = free
+    for _ in range(3):
+        newcomer = through_time(newcomer, 1.0) + 4.0
+    assert free > -12
+    assert newcomer > 0
+
+
+@pytest.mark.usefixtures("backend")
+def test_beliefs_are_the_fold_of_the_messages() -> None:
+    m = dated_room([0, 3, 1, 2])
+    pool, prior = m.view.pool, m.view.pool.prior_log_odds
+    expected = np.full((pool.capacity, VOXELS), prior)
+    last = np.full(pool.capacity, -np.inf)
+    for keyframe in in_time(m.keyframes.values()):
+        assert keyframe.messages is not None
+        messages = keyframe.messages.to_numpy().reshape(-1, VOXELS)
+        for row, slot in enumerate(keyframe.visible.slots.tolist()):
+            seconds = 0.0 if last[slot] == -np.inf else keyframe.stamp_s - last[slot]
+            evidence = through_time(expected[slot] - prior, seconds)
+            expected[slot] = prior + evidence + messages[row]
+            last[slot] = keyframe.stamp_s
+    seen = last == m.now_s
+    slots = np.flatnonzero(seen & (pool.owners > 0)).astype(np.int32)
+    assert len(slots) > 50
+    shown = pool.read("belief", slots)
+    glimpsed = shown > expected[slots] + 1.0
+    assert glimpsed.mean() < 0.01
+    np.testing.assert_allclose(shown[~glimpsed], expected[slots][~glimpsed], atol=0.02)
+
+
+@pytest.mark.usefixtures("backend")
+def test_stamps_do_not_matter_in_a_static_world() -> None:
+    with_stamps = dated_room([0, 1, 2], None)
+    assert_equal_bits(with_stamps, small_room.build([0, 1, 2]))
+    for verb in (lambda: with_stamps.at(1.0), lambda: with_stamps.dynamic, lambda: with_stamps.static):
+        with pytest.raises(ConfigError, match="half_life_s"):
+            verb()
+
+
+steps = st.lists(
+    st.tuples(st.sampled_from(["add", "remove", "move", "infer", "renew", "look"]), st.integers(0, 4)),
+    max_size=8,
+)
+
+
+@pytest.mark.usefixtures("backend")
+@settings(max_examples=6)
+@given(steps)
+def test_any_history_of_dated_keyframes_ends_in_the_same_map(history: list[tuple[str, int]]) -> None:
+    frames = small_room.frames()
+    m = MRFMap(small_room.VOXEL_SIZE, time=TIME)
+    present: dict[int, int] = {}
+    for verb, number in history:
+        ids = [id for i, id in present.items() if i == number]
+        if verb == "add" and not ids:
+            present[number] = add(m, number)
+        elif verb == "remove" and ids:
+            m.remove_keyframe(present.pop(number))
+        elif verb == "move" and ids:
+            m.move_keyframe(ids[0], frames[number + 1].T_world_camera)
+        elif verb == "infer":
+            m.infer(sweeps=1)
+        elif verb == "renew":
+            m.renew(ids)
+        elif verb == "look":
+            m.occupancy(small_room.probes()[:1000])
+    for number in (2, 0, 1):
+        if number not in present:
+            present[number] = add(m, number)
+        else:
+            m.move_keyframe(present[number], frames[number].T_world_camera)
+    for number in present.keys() - {0, 1, 2}:
+        m.remove_keyframe(present[number])
+    m.infer()
+    assert_equal_bits(m, dated_room([0, 1, 2]))
+
+
+@pytest.mark.usefixtures("backend")
+def test_the_map_of_another_time_holds_the_keyframes_up_to_then() -> None:
+    m = dated_room([0, 1, 2, 3])
+    assert m.now_s == 3 * STEP_S
+    centres, p = m.voxels(0.0)
+    np.testing.assert_allclose(m.at(m.now_s).occupancy(centres), p, atol=0.01)
+    first = m.at(0.0)
+    by_first = m.keyframes[0]
+    pool = m.view.pool
+    unseen = np.setdiff1d(pool.in_use, by_first.visible.slots)
+    assert len(unseen)
+    assert (first.view.pool.read("belief", unseen) == pool.prior_log_odds).all()
+    assert len(m.at(-1.0).voxels(0.5)[0]) == 0
+    assert len(first.voxels(0.5)[0]) > 100
+    m.remove_keyframe(0)
+    with pytest.raises(KeyframeError, match="has changed"):
+        first.occupancy(centres)
+
+
+@pytest.mark.usefixtures("backend")
+def test_frozen_evidence_passes_through_time_as_a_whole() -> None:
+    kept = dated_room([0, 1, 2])
+    frozen = dated_room([0, 1, 2])
+    for id in (0, 1):
+        frozen.freeze_keyframe(id)
+    assert_equal_bits(frozen, kept)
+    later = [add(m, 5) for m in (kept, frozen)]
+    for m, id in zip((kept, frozen), later, strict=True):
+        m.infer(keyframes=[id], sweeps=1)
+    ours, theirs = beliefs(frozen), beliefs(kept)
+    assert np.mean([np.abs(ours[b] - theirs[b]).mean() for b in ours]) < 0.05
+
+
+@pytest.mark.usefixtures("backend")
+def test_a_dated_map_keeps_its_stamps_and_beliefs_in_its_file(tmp_path: Path) -> None:
+    m = dated_room([0, 1, 2])
+    m.freeze_keyframe(0)
+    m.infer()
+    m.save(tmp_path / "map.npz")
+    loaded = MRFMap.load(tmp_path / "map.npz")
+    assert_equal_bits(loaded, m)
+    assert loaded.config.time == TIME
+    assert {k.stamp_s for k in loaded.keyframes.values()} == {STEP_S, 2 * STEP_S}
+    loaded.infer()
+    assert_equal_bits(loaded, m)
+
+
+BALL = Solid("sphere", (0.4, -0.36, 0.4), (0.25, 0.25, 0.25))
+
+
+def views(indices: list[int], ball: bool) -> list[tuple[NDArray[np.float32], NDArray[np.float64]]]:
+    """Clean depth images of the room, with or without a ball, from poses of the small room."""
+    scene = Scene(room_scene().solids + ((BALL,) if ball else ()), room_scene().light)
+    frames = small_room.frames()
+    return [
+        (render(scene, frames[i].camera, frames[i].T_world_camera, color=False)[0], frames[i].T_world_camera)
+        for i in indices
+    ]
+
+
+def ball_voxels(m: MRFMap) -> int:
+    centres, _ = m.voxels(0.5)
+    distance = np.linalg.norm(centres - np.array(BALL.center), axis=1)
+    return int((np.abs(distance - 0.25) < 1.5 * small_room.VOXEL_SIZE).sum())
+
+
+def in_turn(m: MRFMap, seen: list[tuple[NDArray[np.float32], NDArray[np.float64]]]) -> None:
+    camera = small_room.frames()[0].camera
+    for depth_m, T_world_camera in seen:
+        m.add_keyframe(depth_m, T_world_camera, camera)
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_a_newcomer_shows_where_many_views_saw_nothing() -> None:
+    everywhere = list(range(10))
+    before, after = views(everywhere * 2, ball=False), views(everywhere, ball=True)
+    seeing = [view for view, old in zip(after, before, strict=False) if (view[0] != old[0]).sum() > 200]
+    assert len(seeing) >= 3
+    alone, static, dated = (MRFMap(small_room.VOXEL_SIZE, time=time) for time in (None, None, TIME))
+    in_turn(alone, seeing[:3])
+    for m in (static, dated):
+        in_turn(m, before + seeing[:3])
+    for m in (alone, static, dated):
+        m.infer()
+    assert ball_voxels(static) < 0.25 * ball_voxels(alone)
+    assert ball_voxels(dated) > 0.5 * ball_voxels(alone)
+    layer = dated.dynamic
+    centres, _ = layer.voxels(0.5)
+    near = np.linalg.norm(centres - np.array(BALL.center), axis=1) < 0.25 + 2 * small_room.VOXEL_SIZE
+    assert near.mean() > 0.5
+    assert not len(np.intersect1d(dated.static.voxels(0.5)[0].view("f8,f8,f8"), centres.view("f8,f8,f8")))
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_a_single_view_is_shown_at_once_and_forgotten_soon() -> None:
+    everywhere = list(range(10))
+    before, after = views(everywhere * 2, ball=False), views(everywhere, ball=True)
+    most = max(everywhere, key=lambda i: int((before[i][0] != after[i][0]).sum()))
+    m = MRFMap(small_room.VOXEL_SIZE, time=TIME)
+    in_turn(m, [*before, after[most]])
+    m.infer()
+    seen, now = ball_voxels(m), m.now_s
+    assert seen > 10
+    assert ball_voxels(m.at(now + 60.0)) < 0.2 * seen  # type: ignore[arg-type]
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_log_odds_fade_between_scans() -> None:
+    frame = small_room.frames()[0]
+    faded_map, plain = (LogOddsMap(small_room.VOXEL_SIZE, time=time) for time in (TimeConfig(10.0), None))
+    for m in (faded_map, plain):
+        m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera, stamp_s=0.0)
+    other = small_room.frames()[5]
+    nothing = np.zeros_like(other.depth_m)
+    for m in (faded_map, plain):
+        m.add_keyframe(nothing, other.T_world_camera, other.camera, stamp_s=10.0)
+    centres, p = plain.voxels(0.0)
+    # Half of the state is drawn anew in one half-life.
+    np.testing.assert_allclose(faded_map.occupancy(centres), 0.5 + 0.5 * (p - 0.5), atol=1e-4)
