@@ -98,7 +98,7 @@ def test_a_change_in_one_brick_costs_one_brick(monkeypatch: pytest.MonkeyPatch) 
         return whole(pool, channel, slots)
 
     slots = pool.in_use[3:4]
-    pool.write("belief", slots, pool.read("belief", slots) + 1.0)
+    pool.write("total", slots, pool.read("belief", slots) + 1.0)
     monkeypatch.setattr(type(pool), "read", counting)
     update = publisher.changes()
     assert update is not None
@@ -110,10 +110,10 @@ def test_less_than_a_step_of_the_log_odds_is_no_news() -> None:
     m = small_room.build([0])
     pool = m.view.pool
     slots = pool.in_use[:2]
-    pool.write("belief", slots, np.full((2, 512), 1.0 + 1e-5, np.float32))
+    pool.write("total", slots, np.full((2, 512), 1.0 + 1e-5, np.float32))
     publisher = publisher_of(m)
     publisher.changes()
-    pool.write("belief", slots, np.full((2, 512), 1.0 + 2e-5, np.float32))
+    pool.write("total", slots, np.full((2, 512), 1.0 + 2e-5, np.float32))
     assert publisher.changes() is None
 
 

@@ -87,7 +87,7 @@ def row_of_voxels(log_odds: ArrayLike) -> BrickPool:
     bricks = np.stack([np.arange(count), np.zeros(count), np.zeros(count)], axis=1).astype(np.int32)
     pool = BrickPool(PRIOR)
     slots = pool.allocate(bricks)
-    pool.write("belief", slots, np.repeat(values.reshape(count, BRICK), BRICK * BRICK, axis=1))
+    pool.write("total", slots, np.repeat(values.reshape(count, BRICK), BRICK * BRICK, axis=1))
     pool.owners[slots] = 1
     return pool
 
