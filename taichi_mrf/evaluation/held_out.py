@@ -2,14 +2,15 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import FrameError
 from taichi_mrf.evaluation.depth_error import DepthError, pooled_depth_error
-from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.sensor.camera import Camera
 
 
 @dataclass(frozen=True)
@@ -22,8 +23,14 @@ class HeldOutCheck:
     skipped: dict[str, str]
 
 
+class RenderedMap(Protocol):
+    """A map that predicts depth."""
+
+    def render_depth(self, camera: Camera, T_world_camera: ArrayLike) -> NDArray[np.float32]: ...
+
+
 def check_held_out(
-    mapped: OccupancyMap,
+    mapped: RenderedMap,
     dataset: Dataset,
     held_out: Sequence[int],
     on_frame: Callable[[int], None] = lambda number: None,

@@ -48,6 +48,7 @@ EXPERIMENTS = {
     "rays": Entry("rays:run_rays", (0.05, 0.02, 0.01)),
     "endless": Entry("endless:run_endless", (0.1,)),
     "submaps": Entry("submaps.corridor:run_submaps", (0.05,), needs_data=False),
+    "window": Entry("window:run_window", (0.1,), needs_data=False),
 }
 
 

@@ -13,7 +13,8 @@ from taichi_mrf.live.session_core import SessionCore
 from taichi_mrf.live.source import Source, saved_unsettled
 from taichi_mrf.mapping.intake import Intake
 from taichi_mrf.mapping.result import MappingResult
-from taichi_mrf.methods.capabilities import can_freeze
+from taichi_mrf.methods.capabilities import can_freeze, window_of
+from taichi_mrf.runs.files import MAP_FILE
 from taichi_mrf.runs.folder import RunFacts
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system import runtime
@@ -53,8 +54,12 @@ class Run(SessionCore):
         """Drop the map, if there is one, and start the source from its beginning, at the present speed. The
         viewer's numbers of keyframes begin at ``first_id``. If it raises, the old map stays."""
         source = self.source
+        m = source.new_map()
+        window = window_of(m)
+        if window is not None and self.policy.out is not None:
+            window.park_beside(self.policy.out / MAP_FILE)
         intake = Intake(
-            source.new_map(),
+            m,
             source.config,
             tracked=source.tracked,
             hold_out=source.hold_out,

@@ -5,6 +5,7 @@ Whoever wants to watch (a progress bar, a log) is a listener: a function that is
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from taichi_mrf.mapping.intake import (
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.mapping.rounds import AlignmentRounds, PlainMover, RoundStep
 from taichi_mrf.mapping.settling import FullInference
+from taichi_mrf.methods.capabilities import window_of
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.sensor.frame import Frame
@@ -59,6 +61,7 @@ def map_sequence(
     out_of_time: Callable[[], bool] = lambda: False,
     resume_from: OccupancyMap | None = None,
     keep: Callable[[MappingResult], None] = lambda result: None,
+    map_path: Path | None = None,
 ) -> MappingResult:
     """Map the frames 0, ``every``, 2 ``every``, ... of a dataset, ``limit`` of them at most.
 
@@ -69,7 +72,8 @@ def map_sequence(
     are if it has not yet, so that the map is usable; ``out_of_time`` ends that sweep too. ``resume_from`` is
     the map of such a run, of this dataset: its keyframes are kept and the frames after the last of them are
     added, which ends in the map of an undisturbed run. ``keep`` is called after each keyframe, and may save
-    what there is for such a run.
+    what there is for such a run. ``map_path`` is where the map will be saved: what leaves its window is
+    written beside it.
     A frame for which there is not enough memory ends the adding: the map of those before it is inferred.
 
     Raises FrameError for an unreadable frame unless ``skip_bad_frames``, DatasetError if no frame became a
@@ -82,6 +86,9 @@ def map_sequence(
     # Refined poses depend on the map at the time: a resumed run repeats the alignment in a new map.
     goes_on = resume_from is not None and not config.poses.refine
     m = resume_from if resume_from is not None and goes_on else create_map(config, dataset.camera)
+    window = window_of(m)
+    if window is not None and map_path is not None:
+        window.park_beside(map_path)
     intake = Intake(m, config, tracked=dataset.tracked, hold_out=hold_out_of(dataset, config))
     if intake.refiner is not None and resume_from is not None:
         intake.refiner.repeat(resume_from.keyframes.values())

@@ -14,6 +14,7 @@ from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.schedule import InferReport, Progress
 from taichi_mrf.methods.mrf.checkpoint import Checkpoint
+from taichi_mrf.methods.mrf.moving_window import MovingWindow
 from taichi_mrf.methods.protocol import OccupancyMap
 
 
@@ -45,6 +46,9 @@ class MessageMap(OccupancyMap, Protocol):
 class FreezingMap(MessageMap, Protocol):
     """A map that can fold keyframes into itself for good."""
 
+    window: MovingWindow | None
+    """What is kept in memory, if not the whole map (``volume.window_m``)."""
+
     @property
     def frozen(self) -> Mapping[int, str]:
         """Names of the frozen keyframes, by id."""
@@ -75,6 +79,11 @@ def has_messages(m: OccupancyMap) -> TypeGuard[MessageMap]:
 def can_freeze(m: OccupancyMap) -> TypeGuard[FreezingMap]:
     """Whether a map can freeze keyframes."""
     return m.METHOD.can_freeze
+
+
+def window_of(m: OccupancyMap) -> MovingWindow | None:
+    """The window of a map that is not in memory as a whole, None for any other."""
+    return m.window if can_freeze(m) else None
 
 
 def can_refine_poses(m: OccupancyMap) -> TypeGuard[AligningMap]:

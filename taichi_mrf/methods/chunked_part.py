@@ -8,12 +8,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.queries.box import voxels_of_box
 from taichi_mrf.queries.known_bricks import Placed
 from taichi_mrf.queries.points import checked_points
 from taichi_mrf.queries.view import View
+from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.system import runtime
 from taichi_mrf.system.owner import owned_attribute
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS
@@ -70,6 +72,25 @@ class MapPart:
     def _inside(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         bricks = np.floor(points_m / (self.voxel_size * BRICK))
         return np.all((bricks >= self.lowest) & (bricks < self.after), axis=1)
+
+
+@dataclass(frozen=True)
+class ChunkedViews:
+    """Renders a chunked map, whose parts are loaded as they come into view."""
+
+    source: ChunkedMap
+
+    def render_depth(self, camera: Camera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
+        """As OccupancyMap.render_depth; the map may be larger than memory, what is in view may not."""
+        check_camera(camera)
+        T, max_depth = as_pose(T_world_camera), self.source.config.sensor.max_depth
+        ends = camera.rays().reshape(-1, 3).astype(np.float64) * max_depth @ T[:3, :3].T + T[:3, 3]
+        corners = np.concatenate([ends, T[None, :3, 3]])
+        try:
+            part = take_part(self.source, corners.min(axis=0), corners.max(axis=0))
+        except ConfigError:  # there is no surface in view
+            return np.full(camera.shape, np.nan, np.float32)
+        return part.view.render_depth(camera, T, max_depth)
 
 
 def take_part(m: ChunkedMap, lower: ArrayLike | None = None, upper: ArrayLike | None = None) -> MapPart:

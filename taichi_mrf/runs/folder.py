@@ -13,11 +13,14 @@ from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import reposed
 from taichi_mrf.errors import CutShortError, FrameError
-from taichi_mrf.evaluation.held_out import HeldOutCheck, check_held_out
+from taichi_mrf.evaluation.held_out import HeldOutCheck, RenderedMap, check_held_out
 from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
 from taichi_mrf.export.ply import write_voxels
 from taichi_mrf.export.trajectory import write_trajectory
 from taichi_mrf.mapping.result import MappingResult
+from taichi_mrf.methods.capabilities import window_of
+from taichi_mrf.methods.chunked import ChunkedMap
+from taichi_mrf.methods.chunked_part import ChunkedViews
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.runs.files import (
     CONFIG_FILE,
@@ -25,12 +28,18 @@ from taichi_mrf.runs.files import (
     REPORT_FILE,
     TRAJECTORY_FILE,
     VOXEL_FILE,
+    WINDOW_FOLDER,
     remove_files_of_earlier_run,
 )
 from taichi_mrf.runs.report import report_json, rounded, run_report, unfinished_report
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.system.memory import peak_memory_mb
+
+_LARGER_THAN_MEMORY = (
+    "The map is not in memory as a whole (volume.window_m): map_window.zarr holds its {} chunks, voxels.ply "
+    "its voxels; there are no pictures."
+)
 
 PICTURED_FRAMES = 3
 """Held-out frames in the picture of measured and rendered depth, at most."""
@@ -100,17 +109,20 @@ def write_run(
 ) -> tuple[dict[str, Any], list[Path]]:
     """Write all files of a run to a folder that exists: the map first, because the time went into it, the
     report last. With ``check`` the held-out frames are compared with the map, and the poses with the depth;
-    with ``pictures`` it is drawn; both are left out in ``haste``. Pictures of an earlier run are removed.
+    with ``pictures`` it is drawn, if it is in memory as a whole; both are left out in ``haste``. Pictures of
+    an earlier run are removed.
 
     Returns the report and the paths. Raises MapFileError.
     """
     written, occupied = _write_map(folder, result, facts.config, advance)
+    chunked = _in_chunks(result.map)
     posed = facts.dataset
     if posed is not None and result.track is not None:
         posed = reposed(posed, result.track.poses(result.map))
     found = None
     if check and posed is not None:
-        found = _check(result, posed, haste, advance)
+        mapped = result.map if chunked is None else ChunkedViews(chunked)
+        found = _check(mapped, result, posed, haste, advance)
         if not haste.hurried and not result.interrupted:
             with result.timed("checking"):
                 result.check_steps()
@@ -118,7 +130,9 @@ def write_run(
     report = facts.report(result, found)
     if not occupied:
         report["notes"].append(_nothing_occupied(facts.config))
-    if pictures:
+    if chunked is not None:
+        report["notes"].append(_LARGER_THAN_MEMORY.format(len(chunked.chunks)))
+    elif pictures:
         written += _write_pictures(folder, result, posed, haste, advance)
     remove_files_of_earlier_run(folder, written)
     report |= {"seconds": rounded(result.seconds), "peak_memory_mb": peak_memory_mb()}
@@ -133,10 +147,19 @@ def write_report(folder: Path, result: MappingResult, facts: RunFacts) -> None:
 
 
 def write_voxel_file(path: Path, m: OccupancyMap) -> int:
-    """Write the voxels that are more likely occupied than free; returns their number. Raises MapFileError."""
-    centres, probability = m.voxels(min_probability=0.5)
+    """Write the voxels that are more likely occupied than free, of a map with a window as of its last save;
+    returns their number. Raises MapFileError."""
+    centres, probability = (_in_chunks(m) or m).voxels(min_probability=0.5)
     write_voxels(path, centres, probability, m.voxel_size)
     return len(centres)
+
+
+def _in_chunks(m: OccupancyMap) -> ChunkedMap | None:
+    """The folder that holds a map of which parts are not in memory, None for any other."""
+    window = window_of(m)
+    if window is None or window.folder is None or not len(window.parked):
+        return None
+    return ChunkedMap.open(window.folder)
 
 
 def _nothing_occupied(config: Config) -> str:
@@ -156,13 +179,17 @@ def _write_map(
         occupied = write_voxel_file(folder / VOXEL_FILE, result.map)
         advance("Writing", 2, 2)
         written = [folder / MAP_FILE, folder / VOXEL_FILE, folder / CONFIG_FILE]
+        if window_of(result.map) is not None:
+            written.append(folder / WINDOW_FOLDER)
         if result.track is not None:
             write_trajectory(folder / TRAJECTORY_FILE, result.track.trajectory(result.map))
             written.append(folder / TRAJECTORY_FILE)
     return written, occupied
 
 
-def _check(result: MappingResult, dataset: Dataset, haste: Haste, advance: Advance) -> HeldOutCheck | None:
+def _check(
+    mapped: RenderedMap, result: MappingResult, dataset: Dataset, haste: Haste, advance: Advance
+) -> HeldOutCheck | None:
     """None if no frame was held out, or if the run has to end before the check does."""
     if not result.held_out or haste.hurried:
         return None
@@ -174,7 +201,7 @@ def _check(result: MappingResult, dataset: Dataset, haste: Haste, advance: Advan
 
     try:
         with result.timed("checking"):
-            check = check_held_out(result.map, dataset, result.held_out, checked)
+            check = check_held_out(mapped, dataset, result.held_out, checked)
     except CutShortError:
         return None
     result.skipped.update(check.skipped)

@@ -99,6 +99,7 @@ def map_to_folder(
             out_of_time=request.out_of_time,
             resume_from=previous,
             keep=Keeper(task.out, settings, task.keep_every, facts.unfinished),
+            map_path=task.out / MAP_FILE,
         )
         result.seconds = {"opening": opening, **result.seconds}
         return write_run(

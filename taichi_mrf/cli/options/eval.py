@@ -26,7 +26,8 @@ class Eval:
     Zell 2014, exact, which compares MRFMap with the factor graph that it approximates, poses, which disturbs
     poses and takes the error back, rays, which asks how many rays a voxel needs,
     endless, which freezes what has left the view for an hour, submaps, which
-    maps the built-in corridor in parts and compares that with the map of a single machine, or all."""
+    maps the built-in corridor in parts and compares that with the map of a single machine, window, which
+    keeps only what is near the camera in memory, or all."""
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("runs/eval")
     """Folder for the results; created if needed."""

@@ -84,6 +84,10 @@ class MovingWindow:
         temporary folder. An earlier run's is replaced. Raises MapFileError."""
         self.parked.write_to(Path(folder))
 
+    def park_beside(self, path: Path) -> None:
+        """:meth:`park_in` the folder that goes with a map's file, in which the map is saved."""
+        self.park_in(folder_beside(path))
+
     def follow(self, m: WindowedMap, position_m: NDArray[np.float64]) -> None:
         """Move the window to a position (3,): freeze the keyframes outside of it, write and release chunks,
         and bring back those that are in it. Disk errors are warnings: the map in memory is whole."""
