@@ -9,6 +9,7 @@ from taichi_mrf.alignment.oriented_points import oriented_points
 from taichi_mrf.alignment.surfels import Surfels, merged, surfels_of
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.voxels.layout import CHUNK_VOXELS, grid_keys
 
 
 class KeyframeSurfels:
@@ -43,6 +44,29 @@ class KeyframeSurfels:
         _, surfels = self._kept.pop(keyframe.id)
         parts = [surfels] if self._frozen is None else [self._frozen, surfels]
         self._frozen = merged(parts, self.cell_size)
+
+    def frozen_in(self, chunks: NDArray[np.int32]) -> Surfels:
+        """What frozen keyframes have measured in some chunks of 64^3 cells, (n, 3)."""
+        if self._frozen is None:
+            return merged([], self.cell_size)
+        return self._frozen.chosen(self._inside(self._frozen, chunks))
+
+    def release(self, chunks: NDArray[np.int32]) -> None:
+        """Remove what frozen keyframes have measured in some chunks, (n, 3)."""
+        if self._frozen is not None:
+            self._frozen = self._frozen.chosen(~self._inside(self._frozen, chunks))
+            self.revision += 1
+
+    def restore(self, surfels: Surfels) -> None:
+        """Bring back what was released."""
+        if len(surfels.keys):
+            parts = [surfels] if self._frozen is None else [self._frozen, surfels]
+            self._frozen = merged(parts, self.cell_size)
+            self.revision += 1
+
+    @staticmethod
+    def _inside(surfels: Surfels, chunks: NDArray[np.int32]) -> NDArray[np.bool_]:
+        return np.isin(grid_keys(surfels.cells // CHUNK_VOXELS), grid_keys(chunks))
 
     def around(
         self, lower_m: NDArray[np.float64], upper_m: NDArray[np.float64], without: int | None = None

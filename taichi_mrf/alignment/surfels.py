@@ -43,8 +43,11 @@ class Surfels:
         """Those in a box of metres in the world, but for parts of a cell."""
         first, last = np.floor(lower_m / self.cell_size), np.floor(upper_m / self.cell_size)
         cells = self.cells
-        inside = ((cells >= first) & (cells <= last)).all(axis=1)
-        return Surfels(self.keys[inside], self.sums[inside], self.cell_size)
+        return self.chosen(np.asarray(((cells >= first) & (cells <= last)).all(axis=1)))
+
+    def chosen(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "Surfels":
+        """Some of them: a mask (N,), or ascending numbers of rows."""
+        return Surfels(self.keys[rows], self.sums[rows], self.cell_size)
 
     def coarser(self, factor: int) -> "Surfels":
         """The same in cells ``factor`` times as wide."""

@@ -262,6 +262,11 @@ class Config(_Tail, _MethodSections, _Head):
         check_field(freezes, "volume.window_m", needed)
 
 
+def without_window(config: Config) -> Config:
+    """The same parameters for a map that is in memory as a whole."""
+    return dataclasses.replace(config, volume=dataclasses.replace(config.volume, window_m=0.0))
+
+
 def load(path: str | Path) -> Config:
     """Read a YAML file, or the shipped one of that name, such as ``kinect1``. Table paths in it are relative
     to its folder. Raises ConfigError, which names the file and the parameter."""

@@ -166,12 +166,14 @@ class DatedBelief:
     def restore_frozen(
         self, slots: NDArray[np.int32], belief: NDArray[np.float32], stamps_s: NDArray[np.float64]
     ) -> None:
-        """What frozen keyframes say of some bricks, (n, 512) log-odds as of (n) stamps: from a saved map."""
-        self.frozen = Channels.at_prior(self.pool.capacity, self.pool.prior_log_odds)
+        """What frozen keyframes say of some bricks, (n, 512) log-odds as of (n) stamps: from a file."""
+        if self.frozen is None:
+            self.frozen = Channels.at_prior(self.pool.capacity, self.pool.prior_log_odds)
         flat = np.ascontiguousarray(belief, np.float32).reshape(-1)
         for channel in (self.frozen.now, self.frozen.shown):
             write_bricks(channel, slots, flat, strip_length())
         self.frozen.stamp_s[slots] = stamps_s
+        self.outdate(slots)
 
     def read_frozen(self, slots: NDArray[np.int32]) -> tuple[NDArray[np.float32], NDArray[np.float64]] | None:
         """The same, to save it; None if nothing is frozen."""

@@ -1,11 +1,9 @@
 """The baseline: the same keyframes mapped by OctoMap's method, shown next to the map on demand."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from taichi_mrf.config.registry import octomap_method
-from taichi_mrf.config.schema import Config
+from taichi_mrf.config.schema import Config, without_window
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.schedule import Progress
 from taichi_mrf.live.mapper import Mapper
@@ -24,8 +22,7 @@ class BaselineOverlay:
 
     def __init__(self, config: Config, noise: NoiseModel) -> None:
         """An empty map with a configuration's parameters, but for the window, which its method lacks."""
-        whole = replace(config, volume=replace(config.volume, window_m=0.0))
-        self.map: OccupancyMap = octomap_method().load_class().with_noise(whole, noise)
+        self.map: OccupancyMap = octomap_method().load_class().with_noise(without_window(config), noise)
         self._publisher = Publisher(
             "baseline",
             self.map.view.pool,

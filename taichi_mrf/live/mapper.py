@@ -22,7 +22,7 @@ from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.refinement import PoseRefiner
 from taichi_mrf.mapping.selection import surplus
 from taichi_mrf.mapping.settling import FullInference
-from taichi_mrf.methods.capabilities import can_freeze, has_messages
+from taichi_mrf.methods.capabilities import can_freeze, has_messages, window_of
 from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap
 from taichi_mrf.viewer import messages
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
@@ -137,10 +137,17 @@ class Mapper:
             raise KeyframeError(f"keyframe {id} ({entry.name}) is off: switch it on to freeze it")
         crossed = self.crossed(entry)
         self.map.freeze_keyframe(self._map_id(entry))
-        picture, entry.picture = entry.picture, FORGOTTEN
-        entry.map_id, entry.state = None, "frozen"
         self.unsettled, self.edited = True, self.edited or by_hand
-        return self._message(entry, picture, crossed)
+        return self._frozen(entry, crossed)
+
+    def left_behind(self) -> list[messages.KeyframeInfo]:
+        """The last messages about the keyframes that the map has frozen itself since this was last called,
+        because they are outside of its window."""
+        if window_of(self.map) is None:
+            return []
+        on = self.roster.with_state("on")
+        nothing = np.zeros((0, 3), np.int32)
+        return [self._frozen(entry, nothing) for entry in on if entry.map_id not in self.map.keyframes]
 
     def renew(self) -> None:
         """Sweep the keyframes whose cavity has changed most, for at most RENEW_SECONDS."""
@@ -203,6 +210,12 @@ class Mapper:
         entries = self.roster.with_state("on")
         entries.sort(key=lambda entry: float(np.linalg.norm(entry.T_world_camera[:3, 3] - point)))
         return map(self.posed_image, entries)
+
+    def _frozen(self, entry: LiveKeyframe, crossed: NDArray[np.int32]) -> messages.KeyframeInfo:
+        """Note that the map has frozen a keyframe; returns the last message about it."""
+        picture, entry.picture = entry.picture, FORGOTTEN
+        entry.map_id, entry.state = None, "frozen"
+        return self._message(entry, picture, crossed)
 
     def _add(self, entry: LiveKeyframe) -> int:
         """Add a keyframe that was off, and sweep it once. If that fails, the map is unchanged."""

@@ -104,6 +104,8 @@ class Run(SessionCore):
 
     def publish(self) -> None:
         """Send the changes of the map, and measure its size."""
+        for info in self.mapper.left_behind():
+            self.send(info)
         changes = self.mapper.publisher.changes()
         if changes is not None:
             self.send(changes)

@@ -37,6 +37,7 @@ def run_report(
         "did_not_fit": result.full,
         "frames": result.frames,
         "keyframes": len(result.map.keyframes),
+        "frozen": statistics.frozen,
         "rays": sum(keyframe.rays for keyframe in result.map.keyframes.values()),
         "voxel_size": result.map.voxel_size,
         "bricks": statistics.bricks,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config.schema import Config, PoseConfig
+from taichi_mrf.config.schema import Config, PoseConfig, without_window
 from taichi_mrf.evaluation.accuracy import JudgedView, judge_view
 from taichi_mrf.evaluation.depth_error import pooled_depth_error
 from taichi_mrf.mapping.intake import Full, Intake
@@ -88,7 +88,7 @@ def judge(m: OccupancyMap, frame: Frame, pixel_stride: int = 1) -> JudgedView:
 def _build(config: Config, frames: WorkingSet, pixel_stride: int, go_on: GoOn) -> OccupancyMap | None:
     """The map of the training frames, None if it was abandoned. Poses stay as they were recorded, so that the
     scores of two tries compare their parameters only."""
-    m = create_map(config, frames.camera)
+    m = create_map(without_window(config), frames.camera)
     intake = Intake(m, dataclasses.replace(config, poses=PoseConfig()))
     for number, frame in enumerate(frames.training):
         if not go_on(f"adding {frame.name}", number / len(frames.training)):

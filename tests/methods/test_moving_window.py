@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from window_walk import CHUNK_M, VOXEL, WINDOW_M, add, probes, walk, walk_both, windowed
 
 from taichi_mrf.config.schema import VolumeConfig
+from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.methods.chunked import ChunkedMap
@@ -78,6 +79,42 @@ def test_any_walk_ends_in_the_map_without_a_window(
     m.window.follow(m, np.array([1.1 * places[0], 0.0, 0.0]))
     in_memory, _ = m.voxels(0.0)
     np.testing.assert_array_equal(m.occupancy(in_memory), other.occupancy(in_memory))
+
+
+def test_the_surface_that_keyframes_are_aligned_with_comes_back(tmp_path: Path) -> None:
+    m, other = windowed(tmp_path / "far.zarr"), MRFMap(VOXEL, volume=VolumeConfig(dense_bricks=128))
+    for each in (m, other):
+        each.aligner.surface.update(each.keyframes)
+        each.infer(keyframes=[add(each, 0.0)])
+        each.aligner.surface.update(each.keyframes)  # from here on the surface of frozen keyframes is kept
+    walk_both(m, other, OUT[1:])
+    surface = m.aligner.surface
+    everywhere = (np.full(3, -9.0), np.full(3, 9.0))
+    assert len(surface.around(*everywhere).keys) < 0.7 * len(other.aligner.surface.around(*everywhere).keys)
+    walk_both(m, other, [3.0, 0.0])
+    box = (np.array([-1.0, -1.0, 1.0]), np.array([1.0, 1.0, 2.0]))
+    ours, theirs = surface.around(*box), other.aligner.surface.around(*box)
+    np.testing.assert_array_equal(ours.keys, theirs.keys)
+    np.testing.assert_allclose(ours.sums, theirs.sums)
+
+
+def test_dated_evidence_comes_back_with_its_date(tmp_path: Path) -> None:
+    options = {"time": TimeConfig(half_life_s=2.0)}
+    m = windowed(tmp_path / "far.zarr", **options)
+    other = MRFMap(VOXEL, volume=VolumeConfig(dense_bricks=128), **options)
+    walk_both(m, other, OUT)
+    assert m.window is not None
+    assert len(m.window.parked) > 1
+    walk_both(m, other, [4.0, 2.0, 0.0])
+    in_memory, occupancy = m.voxels(0.0)
+    np.testing.assert_allclose(occupancy, other.occupancy(in_memory), atol=1e-4)
+    np.testing.assert_allclose(
+        m.at(10.0).occupancy(in_memory), other.at(10.0).occupancy(in_memory), atol=1e-4
+    )
+    # Time has passed: what was seen on the way out alone is less sure than it was.
+    static = MRFMap(VOXEL, volume=VolumeConfig(dense_bricks=128))
+    walk(static, [*OUT, 4.0, 2.0, 0.0])
+    assert np.abs(static.occupancy(in_memory) - occupancy).max() > 0.05
 
 
 def test_memory_is_bounded_on_a_long_way(tmp_path: Path) -> None:

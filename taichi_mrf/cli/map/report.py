@@ -33,7 +33,7 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     return [
         ("backend", f"{report['backend']} ({report['device']})"),
         ("method", report["method"]),
-        ("frames", f"{report['frames']}, {report['keyframes']} of them keyframes"),
+        ("frames", f"{report['frames']}, {_keyframes_text(report['keyframes'], report['frozen'])}"),
         *([("tracking", _tracking_text(tracking))] if tracking else []),
         ("rays", f"{report['rays']:,}"),
         ("voxels", f"{report['voxels']:,} of {report['voxel_size']} m in {report['bricks']:,} bricks"),
@@ -44,6 +44,12 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         ("seconds", seconds),
         ("accuracy", _accuracy_text(report["accuracy"])),
     ]
+
+
+def _keyframes_text(keyframes: int, frozen: int) -> str:
+    if not frozen:
+        return f"{keyframes} of them keyframes"
+    return f"{keyframes + frozen} of them keyframes, {frozen} frozen outside of the window"
 
 
 def _tracking_text(tracking: dict[str, int]) -> str:

@@ -64,7 +64,7 @@ def print_run(console: Terminal, options: Map, report: dict[str, Any], written: 
         print(report_json(report), end="")
         return
     print_report(console, report, written)
-    look = LOOK_AT_PICTURES if options.pictures else "Open"
+    look = LOOK_AT_PICTURES if any(path.suffix == ".png" for path in written) else "Open"
     live = f"taichi-mrf live {options.out / MAP_FILE} {LIVE_VIEW}"
     console.print(f"{look} {OPEN_VOXELS} {live}")
 

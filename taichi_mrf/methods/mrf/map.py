@@ -96,7 +96,8 @@ class MRFMap(ReadableMRF):
         self._next_id = 0
         self._messages_lost = False  # a loaded map has beliefs, but no messages
         self._settled = True
-        self.window = MovingWindow.of(self.config.volume, self._registry)
+        parked = (self._registry, self._dated, self.aligner.surface)
+        self.window = MovingWindow.of(self.config.volume, *parked)
 
     @property
     def stale(self) -> bool:

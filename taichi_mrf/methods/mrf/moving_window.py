@@ -20,18 +20,20 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.alignment.keyframe_surfels import KeyframeSurfels
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.errors import CapacityError, MapFileError
-from taichi_mrf.export.chunk_blocks import StorableMap, by_chunk, header_of
+from taichi_mrf.export.chunk_blocks import StorableMap, by_chunk, chunk_block, header_of
 from taichi_mrf.export.chunk_store import Chunk
 from taichi_mrf.export.store_header import StoreHeader
+from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.brick_registry import BrickRegistry, Bricks
 from taichi_mrf.methods.mrf.parked_chunk import ParkedChunk
-from taichi_mrf.methods.mrf.parked_chunks import ParkedChunks, folder_beside, voxels_of
+from taichi_mrf.methods.mrf.parked_chunks import ParkedChunks, folder_beside
 from taichi_mrf.queries.known_bricks import bricks_between
 from taichi_mrf.system.libraries import library
-from taichi_mrf.voxels.layout import CHUNK, CHUNK_BRICKS, CHUNK_VOXELS, grid_keys
+from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_BRICKS, CHUNK_VOXELS, VOXELS, grid_keys
 
 LEAVE = 1.25
 """Chunks leave memory at this many times the distance at which they come back, so that a camera that stays
@@ -40,6 +42,9 @@ about one place does not move them to and fro."""
 STEP = 0.1
 """Chunks that may leave are looked for whenever the camera has moved by this share of the window."""
 
+
+_AT_ONCE = 32
+"""Chunks whose voxels are assembled at once, a MB each."""
 
 _NONE = np.zeros(0, np.int64)
 
@@ -58,8 +63,16 @@ class WindowedMap(StorableMap, Protocol):
 class MovingWindow:
     """The window of one map, ``size_m`` metres around the newest keyframe's camera."""
 
-    def __init__(self, registry: BrickRegistry, size_m: float) -> None:
-        self.size_m = size_m
+    def __init__(
+        self,
+        size_m: float,
+        registry: BrickRegistry,
+        dated: DatedBelief | None,
+        surface: KeyframeSurfels,
+    ) -> None:
+        """``dated`` is what follows the messages if evidence has a date, ``surface`` what keyframes are
+        aligned with."""
+        self.size_m, self._dated, self._surface = size_m, dated, surface
         self.parked = ParkedChunks()
         self._registry = registry
         self._position_m: NDArray[np.float64] | None = None  # where chunks were last looked for
@@ -67,12 +80,17 @@ class MovingWindow:
         registry.before_claim = self._fetch_crossed
 
     @staticmethod
-    def of(volume: VolumeConfig, registry: BrickRegistry) -> "MovingWindow | None":
+    def of(
+        volume: VolumeConfig,
+        registry: BrickRegistry,
+        dated: DatedBelief | None,
+        surface: KeyframeSurfels,
+    ) -> "MovingWindow | None":
         """The window that a configuration asks for. Raises TaichiMRFError without zarr."""
         if volume.window_m == 0:
             return None
         library("zarr", "volume.window_m needs", "store")  # fails before the run, not in the middle
-        return MovingWindow(registry, volume.window_m)
+        return MovingWindow(volume.window_m, registry, dated, surface)
 
     @property
     def folder(self) -> Path | None:
@@ -136,12 +154,15 @@ class MovingWindow:
         """Bring chunks (n, 3) back into memory."""
         registry = self._registry
         for x, y, z in chunks.tolist():
-            found = self.parked.read((x, y, z))
+            found = self.parked.read((x, y, z), registry.voxel_size)
             if len(found.bricks):
                 slots = registry.restore(found.bricks, found.owners)
-                registry.pool.write("total", slots, found.belief)
+                registry.pool.write("total", slots, found.total)
                 registry.pool.write("evidence", slots, found.evidence)
+                if self._dated is not None and found.dated is not None:
+                    self._dated.restore_frozen(slots, *found.dated)
             registry.see_for_good(found.crossed)
+            self._surface.restore(found.surfels)
             self.parked.drop((x, y, z))
         if len(chunks):
             self._chunks = self.parked.chunks
@@ -152,51 +173,72 @@ class MovingWindow:
         chunks = self._chunks_in_memory()
         chunks = chunks[self._distances(chunks, position_m) > LEAVE * self.size_m]
         chunks = chunks[~self._seen_by_keyframes(chunks)]
-        if not len(chunks):
-            return
-        pool = self._registry.pool
-        slots = pool.in_order
-        slots = slots[np.isin(grid_keys(pool.bricks[slots] // CHUNK), grid_keys(chunks))]
-        try:
-            self.parked.add(self._contents(chunks, slots), header)
-        except MapFileError as error:
-            warnings.warn(f"what lies outside the window stays in memory: {error}", stacklevel=2)
-            return
-        self._registry.leave(slots, chunks)
-        self._chunks = self.parked.chunks
+        for first in range(0, len(chunks), _AT_ONCE):
+            try:
+                self._release(chunks[first : first + _AT_ONCE], header)
+            except MapFileError as error:
+                warnings.warn(f"what lies outside the window stays in memory: {error}", stacklevel=2)
+                return
 
-    def _resident(
-        self, keyframes: Iterable[Keyframe], header: StoreHeader
-    ) -> Iterator[tuple[Chunk, NDArray[np.float32]]]:
-        """The voxels of all chunks in memory; ``keyframes`` are those that are not frozen."""
-        registry, pool = self._registry, self._registry.pool
-        crossed = [k.footprint.window.bricks_of(k.footprint.crossed) // CHUNK for k in keyframes]
-        chunks = _distinct(np.concatenate([self._chunks_in_memory(), *map(_distinct, crossed)]))
-        slots = pool.in_order
-        rows_of = dict(by_chunk(pool.bricks[slots]))
-        for x, y, z in chunks.tolist():
-            inside = slots[rows_of.get((x, y, z), _NONE)]
-            bricks = _bricks_of(np.array([(x, y, z)], np.int32))
-            seen = bricks[registry.topology.crossings(bricks) > 0]
-            belief = pool.read("belief", inside)
-            yield (x, y, z), voxels_of((x, y, z), pool.bricks[inside], belief, seen, header)
+    def _release(self, chunks: NDArray[np.int32], header: StoreHeader) -> None:
+        """Write chunks (n, 3) that only frozen keyframes have seen, and release them."""
+        slots = self._slots_in(chunks)
+        self.parked.add(self._contents(chunks, slots), self._voxels(chunks, header), header)
+        self._registry.leave(slots, chunks)
+        self._surface.release(chunks)
+        self._chunks = self.parked.chunks
 
     def _contents(self, chunks: NDArray[np.int32], slots: NDArray[np.int32]) -> dict[Chunk, ParkedChunk]:
         """What frozen keyframes have left in some chunks (n, 3), whose bricks are in ``slots``."""
         pool, frozen_crossed = self._registry.pool, self._registry.frozen_crossed
         pool.keep_evidence()
+        surfels = self._surface.frozen_in(chunks)
         slots_of, crossed_of = dict(by_chunk(pool.bricks[slots])), dict(by_chunk(frozen_crossed))
+        surfels_of = dict(by_chunk(surfels.cells // BRICK))
         contents = {}
         for x, y, z in chunks.tolist():
             inside = slots[slots_of.get((x, y, z), _NONE)]
             contents[x, y, z] = ParkedChunk(
                 pool.bricks[inside],
-                pool.read("belief", inside),
+                pool.read("total", inside),
                 pool.read("evidence", inside),
                 pool.owners[inside],
                 frozen_crossed[crossed_of.get((x, y, z), _NONE)],
+                None if self._dated is None else self._dated.read_frozen(inside),
+                surfels.chosen(surfels_of.get((x, y, z), _NONE)),
             )
         return contents
+
+    def _resident(
+        self, keyframes: Iterable[Keyframe], header: StoreHeader
+    ) -> Iterator[dict[Chunk, NDArray[np.float32]]]:
+        """The voxels of all chunks in memory, some at a time; ``keyframes`` are those that are not frozen."""
+        crossed = [k.footprint.window.bricks_of(k.footprint.crossed) // CHUNK for k in keyframes]
+        chunks = _distinct(np.concatenate([self._chunks_in_memory(), *map(_distinct, crossed)]))
+        for first in range(0, len(chunks), _AT_ONCE):
+            yield self._voxels(chunks[first : first + _AT_ONCE], header)
+
+    def _voxels(self, chunks: NDArray[np.int32], header: StoreHeader) -> dict[Chunk, NDArray[np.float32]]:
+        """(64, 64, 64) log-odds of some chunks (n, 3), NaN for unknown."""
+        topology, pool = self._registry.topology, self._registry.pool
+        all_bricks = _bricks_of(chunks)
+        slots = topology.slots(all_bricks)
+        has_voxels, is_free = slots >= 0, (slots < 0) & (topology.crossings(all_bricks) > 0)
+        bricks = np.concatenate([all_bricks[has_voxels], all_bricks[is_free]])
+        empty = np.full((int(is_free.sum()), VOXELS), header.seen_free_log_odds, np.float32)
+        log_odds = np.concatenate([pool.read("belief", slots[has_voxels]), empty])
+        rows_of = dict(by_chunk(bricks))
+        blocks = {}
+        for x, y, z in chunks.tolist():
+            rows = rows_of.get((x, y, z), _NONE)
+            blocks[x, y, z] = chunk_block((x, y, z), bricks[rows], log_odds[rows], header.prior_log_odds)
+        return blocks
+
+    def _slots_in(self, chunks: NDArray[np.int32]) -> NDArray[np.int32]:
+        """The slots of the bricks in some chunks (n, 3), by their coordinates."""
+        pool = self._registry.pool
+        slots = pool.in_order
+        return slots[np.isin(grid_keys(pool.bricks[slots] // CHUNK), grid_keys(chunks))]
 
     def _chunks_in_memory(self) -> NDArray[np.int32]:
         """The chunks (n, 3) with voxels, or that frozen keyframes' rays cross."""

@@ -6,45 +6,60 @@ memory and leaves it again with other evidence has another file.
 
 import hashlib
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.alignment.surfels import Surfels
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.export.chunk_store import Chunk
+from taichi_mrf.methods.mrf.storage import dated_arrays, read_dated
 from taichi_mrf.system.atomic import write_npz
 from taichi_mrf.system.files import exists
 from taichi_mrf.system.npz_file import open_npz
-from taichi_mrf.voxels.layout import CHUNK, VOXELS
+from taichi_mrf.voxels.layout import CHUNK, CHUNK_VOXELS, VOXELS
 
 _NAME = re.compile(r"(-?\d{1,7})_(-?\d{1,7})_(-?\d{1,7})-[0-9a-f]{16}\.npz")
+
+_MEMBERS = ("bricks", "total", "evidence", "owners", "crossed")
 
 
 @dataclass(frozen=True)
 class ParkedChunk:
-    """``belief`` and ``evidence`` are (n, 512) log-odds of the ``bricks`` (n, 3) that have voxels; ``owners``
-    (n,) counts the frozen keyframes that own each; ``crossed`` (m, 3) are the bricks that they crossed."""
+    """``total`` and ``evidence`` are (n, 512) log-odds of the ``bricks`` (n, 3) that have voxels; ``owners``
+    (n,) counts the frozen keyframes that own each; ``crossed`` (m, 3) are the bricks that they crossed.
+    ``dated`` is, in a dated map, what they say of the voxels (n, 512), and as of when (n); ``surfels`` is the
+    surface that they have measured, if keyframes are aligned."""
 
     bricks: NDArray[np.int32]
-    belief: NDArray[np.float32]
+    total: NDArray[np.float32]
     evidence: NDArray[np.float32]
     owners: NDArray[np.int32]
     crossed: NDArray[np.int32]
+    dated: tuple[NDArray[np.float32], NDArray[np.float64]] | None
+    surfels: Surfels
+
+    @cached_property
+    def _arrays(self) -> dict[str, NDArray]:
+        arrays: dict[str, NDArray] = {name: getattr(self, name) for name in _MEMBERS}
+        arrays |= {"surfel_keys": self.surfels.keys, "surfel_sums": self.surfels.sums}
+        return arrays if self.dated is None else arrays | dated_arrays(*self.dated)
 
     def file_name(self, chunk: Chunk) -> str:
         """The name of its file."""
         digest = hashlib.blake2b(digest_size=8)
-        for field in fields(self):
-            digest.update(np.ascontiguousarray(getattr(self, field.name)).tobytes())
+        for array in self._arrays.values():
+            digest.update(np.ascontiguousarray(array).tobytes())
         x, y, z = chunk
         return f"{x}_{y}_{z}-{digest.hexdigest()}.npz"
 
     def write(self, path: Path) -> None:
         """Write the file, under a temporary name first. Raises MapFileError."""
         if not exists(path):
-            write_npz(path, {field.name: getattr(self, field.name) for field in fields(self)}, manifest=True)
+            write_npz(path, self._arrays, manifest=True)
 
 
 def chunk_of(name: str) -> Chunk | None:
@@ -53,25 +68,30 @@ def chunk_of(name: str) -> Chunk | None:
     return None if match is None else (int(match[1]), int(match[2]), int(match[3]))
 
 
-def read_parked(path: Path, chunk: Chunk) -> ParkedChunk:
+def read_parked(path: Path, chunk: Chunk, voxel_size: float) -> ParkedChunk:
     """Read a chunk's file back. Raises MapFileError, which names the file and what is wrong."""
     with open_npz(path, MapFileError, "a readable chunk of a map") as file:
         file.check_manifest()
         bricks = file.array("bricks", "i", (None, 3)).astype(np.int32)
         n = len(bricks)
-        belief, evidence = (
-            file.array(name, "f", (n, VOXELS)).astype(np.float32) for name in ("belief", "evidence")
+        total, evidence = (
+            file.array(name, "f", (n, VOXELS)).astype(np.float32) for name in ("total", "evidence")
         )
+        keys = file.array("surfel_keys", "i", (None,)).astype(np.int64)
         found = ParkedChunk(
             bricks,
-            belief,
+            total,
             evidence,
             file.array("owners", "i", (n,)).astype(np.int32),
             file.array("crossed", "i", (None, 3)).astype(np.int32),
+            read_dated(file, n),
+            Surfels(keys, file.array("surfel_sums", "f", (len(keys), 7)).astype(np.float64), voxel_size),
         )
     for places in (found.bricks, found.crossed):
         if (places // CHUNK != chunk).any() or len(np.unique(places, axis=0)) < len(places):
             raise MapFileError(f"{path}: damaged: it names a brick twice, or one of another chunk")
+    if (np.diff(found.surfels.keys) <= 0).any() or (found.surfels.cells // CHUNK_VOXELS != chunk).any():
+        raise MapFileError(f"{path}: damaged: its surfels are not in order, or of another chunk")
     if (found.owners < 1).any():
         raise MapFileError(f"{path}: damaged: a brick has no owner")
     return found

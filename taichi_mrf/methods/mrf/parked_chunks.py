@@ -9,25 +9,19 @@ import shutil
 import tempfile
 import warnings
 from collections.abc import Iterable, Mapping
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
-from taichi_mrf.export.chunk_blocks import chunk_block
 from taichi_mrf.export.chunk_store import SUFFIX, Chunk, ChunkStore, new_store
 from taichi_mrf.export.growing_store import put_chunks
 from taichi_mrf.export.store_header import StoreHeader
 from taichi_mrf.methods.mrf.parked_chunk import ParkedChunk, chunk_of, read_parked
 from taichi_mrf.system.files import is_file
-from taichi_mrf.voxels.layout import VOXELS, grid_keys
 
 PARKED = "parked"
-
-_AT_ONCE = 32
-"""Chunks whose voxels are assembled at once, a MB each."""
 
 
 def folder_beside(path: Path) -> Path:
@@ -69,24 +63,25 @@ class ParkedChunks:
                 self._copy(folder)
             self.folder = folder
 
-    def add(self, chunks: Mapping[Chunk, ParkedChunk], header: StoreHeader) -> None:
-        """Write chunks that are about to leave memory. Raises MapFileError; none of them counts as written
-        then."""
+    def add(
+        self,
+        chunks: Mapping[Chunk, ParkedChunk],
+        blocks: Mapping[Chunk, NDArray[np.float32]],
+        header: StoreHeader,
+    ) -> None:
+        """Write chunks that are about to leave memory, and their voxels, (64, 64, 64) log-odds each. Raises
+        MapFileError; none of them counts as written then."""
         folder = self._begun(header)
         names = {chunk: parked.file_name(chunk) for chunk, parked in chunks.items()}
         for chunk, parked in chunks.items():
             parked.write(folder / PARKED / names[chunk])
-        blocks = {
-            chunk: voxels_of(chunk, parked.bricks, parked.belief, parked.crossed, header)
-            for chunk, parked in chunks.items()
-        }
         put_chunks(folder, header, blocks)
         self._names |= names
 
-    def read(self, chunk: Chunk) -> ParkedChunk:
+    def read(self, chunk: Chunk, voxel_size: float) -> ParkedChunk:
         """What a chunk's file holds. Raises MapFileError."""
         assert self.folder is not None
-        return read_parked(self.folder / PARKED / self._names[chunk], chunk)
+        return read_parked(self.folder / PARKED / self._names[chunk], chunk, voxel_size)
 
     def drop(self, chunk: Chunk) -> None:
         """The chunk is in memory again. Its file is removed unless a saved map names it."""
@@ -106,7 +101,7 @@ class ParkedChunks:
             self.folder, self._is_begun, self._saved = folder, True, set(self.names)
 
     def complete(
-        self, folder: Path, resident: Iterable[tuple[Chunk, NDArray[np.float32]]], header: StoreHeader
+        self, folder: Path, resident: Iterable[Mapping[Chunk, NDArray[np.float32]]], header: StoreHeader
     ) -> None:
         """Make a folder hold the whole map: all files, and the voxels of the ``resident`` chunks too, (64,
         64, 64) log-odds each. Raises MapFileError."""
@@ -114,8 +109,7 @@ class ParkedChunks:
         self._begun(header)
         if folder != self.folder:
             self._copy(folder)
-        pending = iter(resident)
-        while blocks := dict(islice(pending, _AT_ONCE)):
+        for blocks in resident:
             put_chunks(folder, header, blocks)
 
     def tidy(self, folder: Path) -> None:
@@ -148,18 +142,3 @@ class ParkedChunks:
         assert self.folder is not None
         with new_store(folder) as temporary:
             shutil.copytree(self.folder, temporary)
-
-
-def voxels_of(
-    chunk: Chunk,
-    bricks: NDArray[np.int32],
-    belief: NDArray[np.float32],
-    crossed: NDArray[np.int32],
-    header: StoreHeader,
-) -> NDArray[np.float32]:
-    """(64, 64, 64) log-odds of a chunk, NaN for unknown, from those of its bricks, (n, 3) and (n, 512), and
-    the bricks that rays cross, (m, 3), with voxels or without."""
-    free = crossed[~np.isin(grid_keys(crossed), grid_keys(bricks))]
-    empty = np.full((len(free), VOXELS), header.seen_free_log_odds, np.float32)
-    values = np.concatenate([belief, empty])
-    return chunk_block(chunk, np.concatenate([bricks, free]), values, header.prior_log_odds)

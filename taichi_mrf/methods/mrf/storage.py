@@ -87,8 +87,7 @@ def write_contents(path: Path, contents: MapContents) -> None:
     if contents.parked:
         arrays["parked"] = np.array(contents.parked, np.str_)
     if contents.frozen_dated is not None:
-        belief, stamps = contents.frozen_dated
-        arrays |= {"frozen_belief": belief, "frozen_stamps": np.maximum(stamps, _BEFORE_ALL)}
+        arrays |= dated_arrays(*contents.frozen_dated)
     write_npz(path, arrays, manifest=True)
 
 
@@ -104,7 +103,7 @@ def read_contents(path: Path) -> MapContents:
             bricks,
             belief,
             file.array("evidence", "f", (n, VOXELS)) if "evidence" in file else None,
-            _frozen_dated(file, n) if "frozen_belief" in file else None,
+            read_dated(file, n),
             file.array("frozen_owners", "i", (n,)).astype(np.int32),
             file.array("frozen_crossed", "i", (None, 3)).astype(np.int32),
             dict(zip(frozen_ids, file.array("frozen_names", "U", (len(frozen_ids),)).tolist(), strict=True)),
@@ -115,7 +114,15 @@ def read_contents(path: Path) -> MapContents:
     return contents
 
 
-def _frozen_dated(file: NpzFile, bricks: int) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+def dated_arrays(belief: NDArray[np.float32], stamps: NDArray[np.float64]) -> dict[str, NDArray]:
+    """What frozen keyframes say of the voxels of some bricks, (n, 512), and as of when (n), for a file."""
+    return {"frozen_belief": belief, "frozen_stamps": np.maximum(stamps, _BEFORE_ALL)}
+
+
+def read_dated(file: NpzFile, bricks: int) -> tuple[NDArray[np.float32], NDArray[np.float64]] | None:
+    """The same from a file; None if there is none."""
+    if "frozen_belief" not in file:
+        return None
     belief = file.array("frozen_belief", "f", (bricks, VOXELS))
     stamps = file.array("frozen_stamps", "f", (bricks,)).astype(np.float64)
     return belief.astype(np.float32), np.where(stamps > _BEFORE_ALL, stamps, NEVER)
