@@ -15,7 +15,8 @@ from taichi_mrf.config.method import Method
 from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.geometry.up import Up
-from taichi_mrf.inference.dated import DatedBelief, layer_of
+from taichi_mrf.inference.dated import DatedBelief
+from taichi_mrf.inference.dated_channels import layer_of
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import count_observations
 from taichi_mrf.methods.brick_map import BrickMap

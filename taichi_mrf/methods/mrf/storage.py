@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
-from taichi_mrf.inference.dated import NEVER, DatedBelief
+from taichi_mrf.inference.dated import DatedBelief
+from taichi_mrf.inference.dated_channels import NEVER
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.map_file import MapHeader, open_map_file, read_bricks, read_header
