@@ -1,6 +1,7 @@
 """What ``taichi-mrf export`` does: check the names, load the map, write each file, print the list."""
 
 import json
+import math
 import os
 import tempfile
 import time
@@ -10,11 +11,14 @@ from typing import Any
 
 from taichi_mrf.cli.options.export import Export
 from taichi_mrf.cli.shared.terminal import Terminal
+from taichi_mrf.config.registry import methods_with
 from taichi_mrf.errors import ConfigError, MapFileError, TaichiMRFError
 from taichi_mrf.export.chunk_store import SUFFIX, new_store
 from taichi_mrf.export.formats import ExportedMap, export_map, export_note, writer_of
+from taichi_mrf.methods.capabilities import can_freeze, has_layers
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import take_part
+from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.system import runtime
 from taichi_mrf.system.atomic import atomic_path
@@ -94,12 +98,38 @@ def _move(file: Path, place: Path) -> None:
 
 
 def _opened(options: Export) -> ExportedMap:
-    """The map, or the part of a map in chunks that was asked for."""
+    """The map, the part of a map in chunks, or the layer of a map that was asked for."""
+    layered = options.layer != "both" or options.at is not None
     if options.map.suffix == SUFFIX:
+        if layered:
+            raise ConfigError(f"--layer and --at need the map.npz of a run; {options.map} has no keyframes")
         return take_part(ChunkedMap.open(options.map), options.lower, options.upper)
     if options.lower is not None or options.upper is not None:
         raise ConfigError(f"--lower and --upper need a map in chunks (.zarr); {options.map} is not one")
-    return load_map(options.map)
+    m = load_map(options.map)
+    return _layer(m, options) if layered else m
+
+
+def _layer(m: OccupancyMap, options: Export) -> ExportedMap:
+    """The layer of a map, as of the time that was asked for."""
+    if not has_layers(m):
+        able = methods_with("has_layers")
+        raise ConfigError(f"--layer and --at need a map of {able}; {options.map} is one of {m.METHOD.name}")
+    if m.config.time.is_static:
+        raise ConfigError(
+            f"--layer and --at need a map of a world that may change, mapped with --time.half-life-s; "
+            f"{options.map} is one of a static world"
+        )
+    stamp_s = options.at
+    if stamp_s is not None:
+        first_s = min((keyframe.stamp_s for keyframe in m.keyframes.values()), default=-math.inf)
+        stamp_s += m.now_s if stamp_s < 0 else 0.0
+        if stamp_s < first_s and not (can_freeze(m) and m.frozen):
+            raise ConfigError(
+                f"--at {options.at:g}: {options.map} has no keyframe of that time; "
+                f"they are from {first_s:.10g} to {m.now_s:.10g} s"
+            )
+    return m.layer(options.layer, stamp_s)
 
 
 def _size(path: Path) -> int:

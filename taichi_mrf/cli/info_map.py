@@ -58,6 +58,11 @@ def print_map(console: Terminal, facts: Facts) -> None:
     if "keyframes" in facts:
         names = facts["keyframe_names"]
         table.add_row("keyframes", str(facts["keyframes"]) + (f", {names[0]} to {names[1]}" if names else ""))
+        if facts["stamps_s"] is not None:
+            first, last = facts["stamps_s"]
+            table.add_row("time", f"{last - first:.1f} s, stamps {first:.10g} to {last:.10g}")
+        half_life = facts["half_life_s"]
+        table.add_row("world", f"may change, half-life {half_life:g} s" if half_life else "static")
         table.add_row("inferred", "yes" if facts["inferred"] else "no: it is inferred when it is opened")
     for name, value in facts.get("configuration", {}).items():
         table.add_row(name, str(value))
@@ -72,6 +77,7 @@ def _run_map(path: Path) -> Facts:
         header, bricks = read_header(path, file), file.array("bricks", "i", (None, 3))
         method = method_of(file)
     names = [keyframe.name for keyframe in header.keyframes]
+    stamps = [keyframe.stamp_s for keyframe in header.keyframes]
     return {
         "format": "map of a run (.npz)",
         "method": method,
@@ -81,6 +87,8 @@ def _run_map(path: Path) -> Facts:
         "up": header.up_axis or None,
         "keyframes": len(names),
         "keyframe_names": [names[0], names[-1]] if names else [],
+        "stamps_s": [min(stamps), max(stamps)] if stamps else None,
+        "half_life_s": header.config.time.half_life_s,
         "inferred": header.settled,
         "configuration": _changed(header.config),
     }

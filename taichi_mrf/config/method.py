@@ -49,6 +49,10 @@ class Method:
     can_refine_poses: bool = False
     """Keyframes can be aligned with the map (methods.protocol.AligningMap): pose refinement and tracking."""
 
+    has_layers: bool = False
+    """Its map of a world that may change can be read as of another time and by layers
+    (methods.capabilities.LayeredMap)."""
+
     prior_is_unknown: bool = False
     """A voxel is unknown exactly if it still holds the prior. Otherwise ``volume.min_evidence`` decides."""
 

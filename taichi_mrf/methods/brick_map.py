@@ -21,6 +21,7 @@ from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.geometry.up import Up, up_of
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.sensor_section import describing
+from taichi_mrf.queries.contradiction import ray_scores
 from taichi_mrf.queries.extract import extract_voxels
 from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.queries.points import classify, point_log_odds, probability
@@ -175,6 +176,13 @@ class BrickMap(Owned):
         if max_range is not None:
             real(max_range, "max_range", above=0)
         return self.view.ray_profile(origin, direction, max_range or self.sensor.max_depth)
+
+    def ray_scores(
+        self, depth_m: ArrayLike, T_world_camera: ArrayLike, camera: Camera
+    ) -> NDArray[np.float32]:
+        """How much each pixel of a depth image that is not in the map contradicts it, (H, W) float32 in nats:
+        above 0 something new, below 0 a surface that is gone (queries.contradiction.ray_scores)."""
+        return ray_scores(self, depth_m, T_world_camera, camera)
 
     def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
         topology, pool = self._registry.topology, self._pool

@@ -15,7 +15,9 @@ from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.schedule import InferReport, Progress
 from taichi_mrf.methods.mrf.checkpoint import Checkpoint
 from taichi_mrf.methods.mrf.moving_window import MovingWindow
+from taichi_mrf.methods.mrf.reading import Layer, MapReading
 from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.queries.change import MapChange
 
 
 class MessageMap(OccupancyMap, Protocol):
@@ -71,6 +73,24 @@ class AligningMap(FreezingMap, Protocol):
         ...
 
 
+class LayeredMap(OccupancyMap, Protocol):
+    """A map that can be read as of another time and by layers, if its world may change."""
+
+    @property
+    def now_s(self) -> float:
+        """The time that the map is for, in seconds; NaN without keyframes."""
+        ...
+
+    def layer(self, which: Layer = "both", stamp_s: float | None = None) -> MapReading:
+        """One layer, or both, as believed at a time in seconds, now if None. Raises ConfigError in a map of
+        a static world."""
+        ...
+
+    def changes(self, since_s: float) -> MapChange:
+        """What has changed since a time in seconds."""
+        ...
+
+
 def has_messages(m: OccupancyMap) -> TypeGuard[MessageMap]:
     """Whether a map's keyframes keep messages."""
     return m.METHOD.has_messages
@@ -89,3 +109,8 @@ def window_of(m: OccupancyMap) -> MovingWindow | None:
 def can_refine_poses(m: OccupancyMap) -> TypeGuard[AligningMap]:
     """Whether a map can align keyframes, and so be tracked in."""
     return m.METHOD.can_refine_poses
+
+
+def has_layers(m: OccupancyMap) -> TypeGuard[LayeredMap]:
+    """Whether a map can be read as of another time and by layers. In a map of a static world they raise."""
+    return m.METHOD.has_layers

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, known_bricks, sorted_bricks
-from taichi_mrf.queries.points import UNKNOWN, probability
+from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN, probability
 from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
 
 STATES = ("unknown", "free", "occupied")
@@ -52,6 +52,16 @@ class MapChange:
     def changed(self) -> int:
         """Voxels that are known in both maps and differ in state."""
         return int(self.counts[1, 2] + self.counts[2, 1])
+
+    @property
+    def appeared(self) -> NDArray[np.float64]:
+        """Centres, (k, 3) in metres, of the voxels that are free in a and occupied in b."""
+        return self.points[(self.before == FREE) & (self.after == OCCUPIED)]
+
+    @property
+    def vanished(self) -> NDArray[np.float64]:
+        """Centres, (k, 3) in metres, of the voxels that are occupied in a and free in b."""
+        return self.points[(self.before == OCCUPIED) & (self.after == FREE)]
 
 
 def compare_maps(a: QueriedMap, b: QueriedMap) -> MapChange:

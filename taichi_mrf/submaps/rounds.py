@@ -111,6 +111,8 @@ def _check(config: Config, rounds: int) -> None:
         raise ConfigError("poses.refine does not go with submaps: no task sees all keyframes")
     if config.volume.window_m > 0:
         raise ConfigError("volume.window_m does not go with submaps: each task holds its part as a whole")
+    if not config.time.is_static:
+        raise ConfigError("submaps are of a static world: time.half_life_s must be 0 with them")
     if rounds < 0:
         raise ConfigError(f"--rounds must not be negative, not {rounds}")
 

@@ -134,7 +134,8 @@ def _with_keyframes(job: Job, submap: int) -> tuple[PartialMap, dict[int, int]]:
     id_of = {}
     for index in job.plan.submaps[submap].keyframes:
         frame = dataset.read(index)
-        id_of[index] = m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera, frame.name)
+        parts = (frame.depth_m, frame.T_world_camera, frame.camera, frame.name, frame.stamp)
+        id_of[index] = m.add_keyframe(*parts)
     return m, id_of
 
 

@@ -173,8 +173,8 @@ class BrickPool:
     def snapshot(self, undated: bool = False) -> PoolSnapshot:
         """The bricks and beliefs as they are now, which later changes do not touch. With ``undated``, queries
         that are shown the snapshot read its sums of messages."""
-        total = _copied(self.total)
-        belief = total if undated or self.dated is None else _copied(self.belief)
+        total = copied(self.total)
+        belief = total if undated or self.dated is None else copied(self.belief)
         return PoolSnapshot(total, belief, self.bricks.copy(), self.owners.copy())
 
     def restore(self, snapshot: PoolSnapshot) -> None:
@@ -252,7 +252,8 @@ class BrickPool:
         self.capacity = capacity
 
 
-def _copied(channel: "ti.Ndarray") -> "ti.Ndarray":
+def copied(channel: "ti.Ndarray") -> "ti.Ndarray":
+    """A copy of a channel (capacity * 512)."""
     copy = ti.ndarray(ti.f32, channel.shape)
     copy.copy_from(channel)
     return copy

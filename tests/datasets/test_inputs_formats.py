@@ -192,6 +192,15 @@ def test_a_folder_of_npz_is_one_sequence(tmp_path: Path, content: Content) -> No
     assert "c.npz: has another camera than a.npz" in refused(tmp_path)
 
 
+def test_frames_without_stamps_are_a_second_apart(tmp_path: Path, content: Content) -> None:
+    """Also from one file of a folder to the next."""
+    values = {name: value for name, value in arrays(content).items() if name != "stamp"}
+    for name, part in (("a", slice(0, 2)), ("b", slice(2, 5))):
+        few = {key: values[key][part] for key in ("depth_m", "T_world_camera", "color")}
+        write_npz(tmp_path / f"{name}.npz", {"K": K, **few})
+    assert [frame.stamp for frame in open_dataset(tmp_path)] == [0.0, 1.0, 2.0, 3.0, 4.0]
+
+
 def test_missing_depth_is_zero(tmp_path: Path, content: Content) -> None:
     values = arrays(content)
     values["depth_m"][0, 0, :3] = (np.nan, np.inf, -1)

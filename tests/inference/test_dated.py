@@ -6,14 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import small_room
+from ball_room import BALL, TIME, in_turn, near_ball, views
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from taichi_mrf.config.time import TimeConfig
-from taichi_mrf.datasets.synthetic.analytic_render import render
-from taichi_mrf.datasets.synthetic.analytic_scene import Scene, Solid
-from taichi_mrf.datasets.synthetic.room_furniture import room_scene
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.inference.dated import in_time
 from taichi_mrf.kernels.bundles import kernel
@@ -23,7 +21,6 @@ from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.voxels.layout import VOXELS
 
-TIME = TimeConfig(half_life_s=600.0)
 STEP_S = 4.0
 """Seconds between the frames of the tests."""
 
@@ -227,29 +224,10 @@ def test_a_dated_map_keeps_its_stamps_and_beliefs_in_its_file(tmp_path: Path) ->
     assert_equal_bits(loaded, m)
 
 
-BALL = Solid("sphere", (0.4, -0.36, 0.4), (0.25, 0.25, 0.25))
-
-
-def views(indices: list[int], ball: bool) -> list[tuple[NDArray[np.float32], NDArray[np.float64]]]:
-    """Clean depth images of the room, with or without a ball, from poses of the small room."""
-    scene = Scene(room_scene().solids + ((BALL,) if ball else ()), room_scene().light)
-    frames = small_room.frames()
-    return [
-        (render(scene, frames[i].camera, frames[i].T_world_camera, color=False)[0], frames[i].T_world_camera)
-        for i in indices
-    ]
-
-
 def ball_voxels(m: MRFMap) -> int:
     centres, _ = m.voxels(0.5)
     distance = np.linalg.norm(centres - np.array(BALL.center), axis=1)
     return int((np.abs(distance - 0.25) < 1.5 * small_room.VOXEL_SIZE).sum())
-
-
-def in_turn(m: MRFMap, seen: list[tuple[NDArray[np.float32], NDArray[np.float64]]]) -> None:
-    camera = small_room.frames()[0].camera
-    for depth_m, T_world_camera in seen:
-        m.add_keyframe(depth_m, T_world_camera, camera)
 
 
 @pytest.mark.usefixtures("one_backend")
@@ -268,8 +246,7 @@ def test_a_newcomer_shows_where_many_views_saw_nothing() -> None:
     assert ball_voxels(dated) > 0.5 * ball_voxels(alone)
     layer = dated.dynamic
     centres, _ = layer.voxels(0.5)
-    near = np.linalg.norm(centres - np.array(BALL.center), axis=1) < 0.25 + 2 * small_room.VOXEL_SIZE
-    assert near.mean() > 0.5
+    assert near_ball(centres).mean() > 0.5
     assert not len(np.intersect1d(dated.static.voxels(0.5)[0].view("f8,f8,f8"), centres.view("f8,f8,f8")))
 
 

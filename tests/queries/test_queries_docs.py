@@ -4,9 +4,12 @@ import re
 from pathlib import Path
 
 import pytest
+from ball_room import room_that_changed
 from queried_maps import room_map
 
+import taichi_mrf
 from taichi_mrf.export.formats import extensions
+from taichi_mrf.methods.mrf.reading import LAYERS, Layer
 
 
 @pytest.fixture
@@ -28,6 +31,20 @@ def test_the_examples_run(
         exec(example, names)  # what the page tells people to run
     assert capsys.readouterr().out.count("\n") >= 5
     assert {path.name for path in tmp_path.iterdir()} == {"map.npz", "room.bt", "floor.pgm", "floor.yaml"}
+
+
+@pytest.mark.usefixtures("one_backend")
+@pytest.mark.parametrize("which", LAYERS)
+def test_the_examples_run_on_every_layer(
+    which: Layer, page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    layer = room_that_changed(ball_comes=True).layer(which)
+    monkeypatch.setattr(taichi_mrf, "load_map", lambda path: layer)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    for example in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(example, names)
+    assert (tmp_path / "room.bt").stat().st_size > 0
 
 
 def test_the_table_names_every_format(page: str) -> None:

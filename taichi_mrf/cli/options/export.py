@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -24,6 +24,14 @@ class Export:
 
     to: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE [FILE ...]")]
     """The files to write."""
+
+    layer: Literal["static", "dynamic", "both"] = "both"
+    """What to write of a map whose world may change: what was there all along (static), what is there now
+    although it was free (dynamic), or both."""
+
+    at: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
+    """Write the map as it was believed then: a stamp as ``info`` shows them, or, below 0, seconds before the
+    newest keyframe."""
 
     lower: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
     """Lower corner (metres) of the box to export from a map in chunks; without it, the box starts where the

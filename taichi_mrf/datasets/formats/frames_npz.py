@@ -3,7 +3,7 @@
 ``depth_m`` (N, H, W) float is axial depth in metres, 0 or NaN where there is none, or uint16 with
 ``depth_scale``, its steps per metre; ``T_world_camera`` is (N, 4, 4) or (N, 3, 4); ``K`` (3, 3), or ``fx``,
 ``fy``, ``cx``, ``cy``. ``stamp`` (N,) in seconds and ``color`` (N, H, W, 3) uint8 RGB may be left out, and
-and so may poses with ``ReadOptions.track``. Without the N, a file is one frame.
+so may poses with ``ReadOptions.track``. Without the N, a file is one frame.
 """
 
 import math
@@ -26,7 +26,6 @@ from taichi_mrf.system.files import is_file, is_folder
 from taichi_mrf.system.npz_file import NpzFile, open_npz
 
 DEPTH, POSE, MATRIX, STAMP, COLOR, SCALE = "depth_m", "T_world_camera", "K", "stamp", "color", "depth_scale"
-FRAMES_PER_SECOND = 30.0
 
 
 @dataclass(frozen=True)
@@ -114,7 +113,9 @@ def open_npz_frames(path: Path, options: ReadOptions) -> FramesNpz:
     and the field."""
     paths = sorted(path.glob("*.npz")) if is_folder(path) else [path]
     name = path.name if is_folder(path) else path.stem
-    parts = [_read_part(each, options) for each in paths]
+    parts: list[Part] = []
+    for each in paths:
+        parts.append(_read_part(each, options, first=sum(len(part.poses) for part in parts)))
     camera = options.camera or parts[0].camera
     for part in parts:
         if part.camera != parts[0].camera:
@@ -122,7 +123,9 @@ def open_npz_frames(path: Path, options: ReadOptions) -> FramesNpz:
     return FramesNpz(name, camera, parts=parts, color=options.color)
 
 
-def _read_part(path: Path, options: ReadOptions) -> Part:
+def _read_part(path: Path, options: ReadOptions, first: int) -> Part:
+    """One file, whose first frame is number ``first`` of the sequence. Without stamps, frames are a second
+    apart."""
     with _opened(path) as file:
         shape, dtype = file.header(DEPTH)
         if len(shape) not in (2, 3) or dtype.kind not in "fu":
@@ -136,9 +139,7 @@ def _read_part(path: Path, options: ReadOptions) -> Part:
             (3, 4),
         ):
             raise DatasetError(f"{path}: {POSE} is {poses.shape}; expected ({count}, 4, 4)")
-        stamps = (
-            _numbers(file, path, STAMP).reshape(-1) if STAMP in file else np.arange(count) / FRAMES_PER_SECOND
-        )
+        stamps = _numbers(file, path, STAMP).reshape(-1) if STAMP in file else first + np.arange(count)
         if stamps.shape != (count,):
             raise DatasetError(f"{path}: {STAMP} is {stamps.shape}; expected ({count},)")
         if not np.isfinite(stamps).all():

@@ -35,4 +35,5 @@ METHOD = Method(
     has_messages=True,
     can_freeze=True,
     can_refine_poses=True,
+    has_layers=True,
 )

@@ -5,6 +5,7 @@ import copy
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Literal, get_args
 
 import numpy as np
 import taichi as ti
@@ -21,7 +22,12 @@ from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import count_observations
 from taichi_mrf.methods.brick_map import BrickMap
 from taichi_mrf.methods.protocol import MappedKeyframe
+from taichi_mrf.queries.change import MapChange, compare_maps
 from taichi_mrf.queries.view import View
+from taichi_mrf.voxels.pool import copied
+
+Layer = Literal["static", "dynamic", "both"]
+LAYERS: tuple[Layer, ...] = get_args(Layer)
 
 
 class MapReading(BrickMap):
@@ -57,7 +63,7 @@ class MapReading(BrickMap):
 
     def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
         if self._registry.version != self._version:
-            raise KeyframeError("the map has changed since it was read: call at(), static or dynamic again")
+            raise KeyframeError("the map has changed since it was read: call at() or layer() again")
         return super()._log_odds(points)
 
 
@@ -112,32 +118,53 @@ class ReadableMRF(BrickMap):
         keyframes, also from later ones. Raises ConfigError in a map of a static world
         (``time.half_life_s`` is 0), where keyframes have no order.
         """
-        stamp_s = real(stamp_s, "stamp_s")
-        dated = self._needs_dates("at()")
-        self._restore_messages()
-        return MapReading(self, dated.as_of(stamp_s))
+        return self.layer("both", stamp_s)
 
     @property
     def static(self) -> MapReading:
         """The static layer: the map without what came after its surroundings were mapped. Raises ConfigError
         in a map of a static world."""
-        return self._layer(dynamic=False)
+        return self.layer("static")
 
     @property
     def dynamic(self) -> MapReading:
         """The dynamic layer: what is occupied now, although all keyframes together say free. All else is
         unknown. Raises ConfigError in a map of a static world."""
-        return self._layer(dynamic=True)
+        return self.layer("dynamic")
 
-    def _layer(self, dynamic: bool) -> MapReading:
-        self._needs_dates("a layer")
-        self._restore_messages()
+    def layer(self, which: Layer = "both", stamp_s: float | None = None) -> MapReading:
+        """One layer of the map, "static" or "dynamic", or "both", which is the whole map, to be queried and
+        exported; as it was believed at ``stamp_s`` in seconds, now if None.
+
+        Raises ConfigError for another name, and in a map of a static world, which has "both" only and no
+        other time than now.
+        """
+        if which not in LAYERS:
+            raise ConfigError(f"there is no layer {which!r}; known are {', '.join(LAYERS)}")
+        if which != "both" or stamp_s is not None:
+            what = f"the {which} layer" if which != "both" else "the map of another time"
+            dated = self._needs_dates(what)
+            self._restore_messages()
         pool = self._pool
-        return MapReading(self, layer_of(pool.total, pool.belief, pool.prior_log_odds, dynamic))
+        shown = copied(pool.belief) if stamp_s is None else dated.as_of(real(stamp_s, "stamp_s"))
+        if which == "both":
+            return MapReading(self, shown)
+        dynamic = which == "dynamic"
+        reading = MapReading(self, layer_of(pool.total, shown, pool.prior_log_odds, dynamic))
+        if dynamic:
+            reading.seen_free_log_odds = pool.prior_log_odds  # free space belongs to the static layer
+        return reading
+
+    def changes(self, since_s: float) -> MapChange:
+        """What differs between the map as it was believed at a time in seconds and as it is now: its
+        ``appeared`` and ``vanished`` are voxels that were free and are occupied, and the reverse; ``points``,
+        ``before`` and ``after`` list all voxels whose state has changed, also those that were seen first
+        since then. Raises ConfigError in a map of a static world."""
+        return compare_maps(self.at(since_s), self)
 
     def _needs_dates(self, what: str) -> DatedBelief:
         if self._dated is None:
-            raise ConfigError(f"{what} needs a map whose world may change: set time.half_life_s")
+            raise ConfigError(f"{what} needs a map of a world that may change: set time.half_life_s")
         return self._dated
 
     def _find(self, id: int) -> Keyframe:
