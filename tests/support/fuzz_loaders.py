@@ -7,8 +7,9 @@ told from what was there before.
 import gzip
 import json
 import pickle
+import shutil
 from collections.abc import Callable
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, fields
 from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -41,7 +42,7 @@ from stereo_rig import write as write_stereo_file
 
 from taichi_mrf.calibration.depth_files import DepthFiles
 from taichi_mrf.calibration.image_stamps import read_stamps
-from taichi_mrf.config.schema import Config, load
+from taichi_mrf.config.schema import Config, VolumeConfig, load
 from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.images import read_grey
@@ -56,6 +57,7 @@ from taichi_mrf.export.octomap_reader import read_octomap
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.mrf.parked_chunk import chunk_of, read_parked
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -362,6 +364,26 @@ def _store(folder: Path) -> Path:
     return folder / "map.zarr"
 
 
+def _parked_chunk(folder: Path) -> Path:
+    """A chunk that has left the window of a map."""
+    m = MRFMap(0.2, max_depth=4.0, volume=VolumeConfig(window_m=2.0))
+    assert m.window is not None
+    m.window.park_in(folder / "map_window.zarr")
+    T_world_camera = np.eye(4)
+    for x in (0.0, 90.0):
+        T_world_camera[0, 3] = x
+        m.add_keyframe(np.full(CAMERA.shape, 1.5, np.float32), T_world_camera, CAMERA)
+    file = max((folder / "map_window.zarr" / "parked").iterdir(), key=lambda file: file.stat().st_size)
+    return Path(shutil.copy(file, folder))
+
+
+def _parked(path: Path) -> bytes:
+    chunk = chunk_of(path.name)
+    assert chunk is not None
+    found = read_parked(path, chunk, 0.2)
+    return _arrays_of(*(getattr(found, field.name) for field in fields(found)))
+
+
 def _octree(suffix: str, folder: Path) -> Path:
     path = folder / f"map{suffix}"
     (write_ot if suffix == ".ot" else write_bt)(path, _small_map("log_odds"))
@@ -449,6 +471,7 @@ LOADERS = [
     Loader("map, MRFMap", partial(_saved_map, "mrf"), _map, sealed=True),
     Loader("map, LogOddsMap", partial(_saved_map, "log_odds"), _map, sealed=True),
     *([Loader("map in chunks", _store, _chunks)] if find_spec("zarr") else []),
+    *([Loader("chunk outside the window", _parked_chunk, _parked, sealed=True)] if find_spec("zarr") else []),
     Loader("OctoMap .ot", partial(_octree, ".ot"), _octomap),
     Loader("OctoMap .bt", partial(_octree, ".bt"), _octomap),
     Loader("configuration YAML", _yaml, _config),

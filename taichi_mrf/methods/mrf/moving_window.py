@@ -121,7 +121,7 @@ class MovingWindow:
         moved = self._position_m is None or np.linalg.norm(position_m - self._position_m) > STEP * self.size_m
         if moved or far:
             self._position_m = position_m.copy()
-            self._leave(position_m, header_of(m))
+            self._leave(m, position_m)
         near = self._chunks[self._distances(self._chunks, position_m) <= self.size_m]
         try:
             self._fetch(near)
@@ -167,18 +167,20 @@ class MovingWindow:
         if len(chunks):
             self._chunks = self.parked.chunks
 
-    def _leave(self, position_m: NDArray[np.float64], header: StoreHeader) -> None:
+    def _leave(self, m: WindowedMap, position_m: NDArray[np.float64]) -> None:
         """Write the chunks that are outside of the window, and release them. What cannot be written stays in
         memory."""
         chunks = self._chunks_in_memory()
         chunks = chunks[self._distances(chunks, position_m) > LEAVE * self.size_m]
         chunks = chunks[~self._seen_by_keyframes(chunks)]
-        for first in range(0, len(chunks), _AT_ONCE):
-            try:
+        if not len(chunks):
+            return
+        header = header_of(m)
+        try:
+            for first in range(0, len(chunks), _AT_ONCE):
                 self._release(chunks[first : first + _AT_ONCE], header)
-            except MapFileError as error:
-                warnings.warn(f"what lies outside the window stays in memory: {error}", stacklevel=2)
-                return
+        except MapFileError as error:
+            warnings.warn(f"what lies outside the window stays in memory: {error}", stacklevel=2)
 
     def _release(self, chunks: NDArray[np.int32], header: StoreHeader) -> None:
         """Write chunks (n, 3) that only frozen keyframes have seen, and release them."""
