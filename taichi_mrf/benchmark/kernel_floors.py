@@ -51,7 +51,7 @@ FLOORS: Mapping[str, Mapping[str, Floor]] = {
         "_write_down": lambda w: 4 * w.pixels + 12 * w.rays,  # levels and means in, the list out
         "_mark": lambda w: 8 * w.rays + 4 * w.crossed,  # the list in, marks out
         "read": lambda w: 20 * (w.surface + w.crossed),  # coordinates and the tree in, slots out
-        "_fill_bricks": lambda w: (4 + 4 * VOXELS) * w.created,
+        "fill_bricks": lambda w: (4 + 4 * VOXELS) * w.created,
         "write": lambda w: 20 * w.created,  # coordinates and slots in, the tree out
         "count": lambda w: 20 * w.crossed,  # coordinates in, the tree in and out
     },

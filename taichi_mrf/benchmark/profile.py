@@ -22,11 +22,14 @@ from taichi_mrf import Config, Frame, MRFMap
 from taichi_mrf.benchmark.kernel_floors import FLOORS, Work
 from taichi_mrf.benchmark.keyframe_cost import live_stages, timed, warm_up
 from taichi_mrf.benchmark.launches import count_launches
+from taichi_mrf.kernels import positions
 from taichi_mrf.system import runtime
 
 PACKAGE = str(Path(taichi_mrf.__file__).parent)
 TAICHI = str(Path(ti.__file__).parent)
 WATCH = count_launches.__wrapped__.__code__.co_filename  # type: ignore[attr-defined]
+WITHIN_TAICHI = (WATCH, positions.__file__)
+"""Files of this package that Taichi calls, or that stand for it: their time is Taichi's."""
 IN_TAICHI = "Taichi: launches, arguments, copies"
 RAYS = "send_messages"
 
@@ -154,21 +157,30 @@ def host_seconds(watch: cProfile.Profile) -> dict[str, tuple[int, float]]:
         before = found[function]
         found[function] = before[0] + calls, before[1] + seconds
 
-    for (file, _, name), (_, calls, own, _, callers) in pstats.Stats(watch).stats.items():  # type: ignore[attr-defined]
+    stats = pstats.Stats(watch).stats  # type: ignore[attr-defined]
+    # What comes back from outside: ``next`` of a generator of this package, for instance.
+    returned: dict[Any, float] = defaultdict(float)
+    for (file, _, _), (_, _, _, _, callers) in stats.items():
+        if _is_ours(file):
+            for caller, (_, _, _, cumulative) in callers.items():
+                returned[caller] += cumulative
+    for function, (_, calls, own, total, callers) in stats.items():
+        file, _, name = function
+        abroad = 1.0 - min(1.0, returned[function] / total) if total > 0 else 0.0
         if _is_ours(file):
             note(_title(file, name), calls, own)
             continue
         for (caller_file, _, caller), (_, inner_calls, _, cumulative) in callers.items():
             if _is_ours(caller_file):
-                if file.startswith((TAICHI, WATCH)):
+                if file.startswith((TAICHI, *WITHIN_TAICHI)):
                     note(IN_TAICHI, inner_calls, cumulative)
                 else:
-                    note(_title(caller_file, caller), 0, cumulative)
+                    note(_title(caller_file, caller), 0, cumulative * abroad)
     return dict(found)
 
 
 def _is_ours(file: str) -> bool:
-    return file.startswith(PACKAGE) and file != WATCH
+    return file.startswith(PACKAGE) and file not in WITHIN_TAICHI
 
 
 def _title(file: str, function: str) -> str:

@@ -126,7 +126,7 @@ def test_floors_count_bytes() -> None:
     assert floors["cavity"](work) == 2 * 512 * (4 + 2 + 4 + 8)
     assert floors["finish"](work) == 2 * 512 * 8 + 600 * (2 + 2 + 4 + 4)
     assert floors["send_messages"](work) == 10 * 12 + 600 * 20
-    assert FLOORS["allocate"]["_fill_bricks"](work) == 3 * (4 + 512 * 4)
+    assert FLOORS["allocate"]["fill_bricks"](work) == 3 * (4 + 512 * 4)
 
 
 @pytest.mark.usefixtures("backend")

@@ -2,12 +2,13 @@
 
 import io
 import json
+import logging
 import re
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable
-from contextlib import ExitStack, redirect_stderr, redirect_stdout
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -43,11 +44,24 @@ def taichi_mrf(
         stack.enter_context(warnings.catch_warnings())
         warnings.simplefilter("always", UserWarning)
         warnings.showwarning = _show_warning
+        stack.enter_context(_own_log())
         try:
             status = main([str(argument) for argument in arguments])
         except SystemExit as stop:
             status = stop.code if isinstance(stop.code, int) else 1
     return subprocess.CompletedProcess(list(arguments), status, out.getvalue(), err.getvalue())
+
+
+@contextmanager
+def _own_log() -> Iterator[None]:
+    """What --verbose changes of the library's log ends with the program, as it does in a process."""
+    log = logging.getLogger("taichi_mrf")
+    level, handlers = log.level, list(log.handlers)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
+        log.handlers[:] = handlers
 
 
 def as_process(

@@ -34,7 +34,7 @@ def open_terminal(verbosity: Verbosity, stderr: bool = False) -> Terminal:
         log.removeHandler(handler)
     if verbosity.verbose:
         log.addHandler(_LogLines(Terminal(stderr=True)))
-        log.setLevel(logging.INFO)
+    log.setLevel(logging.INFO if verbosity.verbose else logging.NOTSET)
     return terminal
 
 
