@@ -197,6 +197,30 @@ def test_icl_images_outside_the_trajectory_are_dropped_and_counted(tmp_path: Pat
     np.testing.assert_allclose(dataset.read(0).T_world_camera, content.poses[1], atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("name", "first_s", "step_s"),
+    [
+        ("seven_scenes", 0.0, 10 / 30),
+        ("tum", 1305031102.0, 0.033),
+        ("redwood", 0.0, 1 / 30),
+        ("icl", 1 / 30, 1 / 30),
+        ("house", 180.0, 1.0),  # nobody knows when: frames are a second apart
+    ],
+)
+def test_stamps_are_seconds(tmp_path: Path, name: str, first_s: float, step_s: float) -> None:
+    folder = FORMATS[name][0](tmp_path / "recording", Content(3))
+    stamps = [frame.stamp for frame in open_dataset(folder)]
+    np.testing.assert_allclose(stamps, [first_s + i * step_s for i in range(3)], atol=1e-6)
+
+
+def test_stamps_in_names_of_images_count(tmp_path: Path) -> None:
+    """As in Redwood's own scans."""
+    folder = write_redwood(tmp_path / "recording", Content(3))
+    for i, path in enumerate(sorted((folder / "depth").iterdir())):
+        path.rename(path.with_name(f"{path.stem}-{1000000 + 33000 * i:012d}.png"))
+    assert [frame.stamp for frame in open_dataset(folder)] == [1.0, 1.033, 1.066]
+
+
 @pytest.mark.parametrize(("write", "steps"), [(write_rows, 5000.0), (write_log, 1000.0)])
 @pytest.mark.parametrize("first", [0, 7])
 def test_images_taken_out_of_a_recording_keep_their_poses(

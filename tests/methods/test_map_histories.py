@@ -8,6 +8,7 @@ import small_room
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -15,6 +16,7 @@ from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import PolynomialNoise
+from taichi_mrf.voxels.layout import BRICK
 
 pytestmark = pytest.mark.usefixtures("backend")
 
@@ -68,6 +70,34 @@ def test_any_history_ends_in_the_map_of_the_final_set(
     m.infer()
     names = [frame.name for frame in room]
     assert_same_map(m, small_room.build([names.index(name) for name in kept] + final))
+
+
+QUARTER_TURNS = [((1, 0), (0, 1)), ((0, -1), (1, 0)), ((-1, 0), (0, -1)), ((0, 1), (-1, 0))]
+
+
+@pytest.mark.parametrize("time", [TimeConfig(), TimeConfig(half_life_s=600.0)])
+@settings(max_examples=2)
+@given(bricks=st.tuples(*[st.integers(-40, 40)] * 3), turn=st.sampled_from(QUARTER_TURNS))
+def test_a_map_moves_rigidly_with_its_keyframes(
+    time: TimeConfig, bricks: tuple[int, int, int], turn: tuple[tuple[int, int], tuple[int, int]]
+) -> None:
+    """By quarter turns and whole bricks, which take voxels to voxels."""
+    here, there = (MRFMap(small_room.VOXEL_SIZE, time=time) for _ in range(2))
+    T = np.eye(4)
+    T[:2, :2] = turn
+    T[:3, 3] = np.array(bricks) * BRICK * small_room.VOXEL_SIZE
+    for frame in small_room.frames()[:2]:
+        small_room.add(here, frame)
+        id = small_room.add(there, frame)
+        there.move_keyframe(id, T @ frame.T_world_camera)
+    for m in (here, there):
+        m.infer()
+    centres, p = here.voxels(0.0)
+    moved = np.abs(there.occupancy(centres @ T[:3, :3].T + T[:3, 3]) - p)
+    assert len(there.voxels(0.0)[0]) == len(p)
+    # Rounding takes surfaces on a face between two voxels to either of them.
+    assert (moved <= 0.01).mean() >= 0.98
+    assert moved.max() < 0.2
 
 
 def test_moving_back_and_forth_changes_nothing() -> None:

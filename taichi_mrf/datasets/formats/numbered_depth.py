@@ -146,12 +146,21 @@ def _frame(
     colors = (folder / place / f"{path.stem}{end}" for place in COLOR_FOLDERS for end in (".png", ".jpg"))
     return RecordedFrame(
         name=path.stem,
-        stamp=number / FRAMES_PER_SECOND,
+        stamp=_stamp(path, number, trajectory),
         depth_file=path,
         read_pose=partial(_read_pose, trajectory.path, pose, mirror),
         pose_source=str(trajectory.path) if pose is None else pose.source,
         color_file=next((color for color in colors if color.is_file()), None),
     )
+
+
+def _stamp(path: Path, number: int, trajectory: Trajectory) -> float:
+    """When an image was taken, in seconds: from its name if it tells, else from its number. Files of
+    matrices do not tell how many there are in a second."""
+    named = _IMAGE.fullmatch(path.name)
+    if named is not None and named[2] is not None:
+        return int(named[2][1:]) / 1e6
+    return float(number) if trajectory.layout == "rows" else number / FRAMES_PER_SECOND
 
 
 def _read_pose(path: Path, pose: RecordedPose | None, mirror: bool) -> Pose:

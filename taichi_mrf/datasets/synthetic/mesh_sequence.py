@@ -26,8 +26,6 @@ from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.simulate import KINECT_1, KINECT_1_LATERAL, simulate
 
 NAME = "mesh:"
-FRAMES_PER_SECOND = 30.0
-"""Sets the stamps of poses that were recorded without any."""
 
 SENSORS = {"kinect": KINECT_1, "kinect-lateral": KINECT_1_LATERAL}
 
@@ -118,7 +116,7 @@ class MeshSequence(Dataset):
             sensor = SENSORS[self.options.noise]
             depth_m = simulate(depth_m, self.camera, sensor, seed=(self.options.seed, index))
         stamped = self.trajectory.layout == "stamped"
-        stamp = self.trajectory.poses[index].key if stamped else index / FRAMES_PER_SECOND
+        stamp = self.trajectory.poses[index].key if stamped else float(index)
         return Frame(depth_m, self.pose(index), self.camera, stamp, self.frame_names[index])
 
 
