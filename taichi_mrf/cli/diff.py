@@ -1,6 +1,7 @@
 """What ``taichi-mrf diff`` does: load two maps, compare them, write the changes, print a table."""
 
 import json
+from pathlib import Path
 from typing import Any
 
 from rich.table import Table
@@ -9,6 +10,8 @@ from taichi_mrf.cli.options.diff import Diff
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.changes import write_changes
+from taichi_mrf.methods.chunked_part import MapPart, in_chunks, take_part
+from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.queries.change import STATES, MapChange, compare_maps
 from taichi_mrf.system import runtime
@@ -19,7 +22,7 @@ def run_diff(options: Diff) -> int:
     if options.out is not None and options.out.suffix.lower() != ".ply":
         raise ConfigError(f"{options.out}: changes are written as a .ply")
     runtime.init(options.arch)
-    a, b = load_map(options.a), load_map(options.b)
+    a, b = _whole(options.a), _whole(options.b)
     found = compare_maps(a, b)
     report = diff_report(found, str(options.a), str(options.b), a.voxel_size)
     if options.out is not None:
@@ -32,6 +35,13 @@ def run_diff(options: Diff) -> int:
     else:
         _print(report)
     return 0
+
+
+def _whole(path: Path) -> OccupancyMap | MapPart:
+    """A saved map, with what is outside of its window."""
+    m = load_map(path)
+    chunked = in_chunks(m)
+    return m if chunked is None else take_part(chunked)
 
 
 def diff_report(found: MapChange, a: str, b: str, voxel_size: float) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from taichi_mrf.export.chunk_store import SUFFIX, new_store
 from taichi_mrf.export.formats import ExportedMap, export_map, export_note, writer_of
 from taichi_mrf.methods.capabilities import can_freeze, has_layers
 from taichi_mrf.methods.chunked import ChunkedMap
-from taichi_mrf.methods.chunked_part import take_part
+from taichi_mrf.methods.chunked_part import in_chunks, take_part
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.system import runtime
@@ -104,9 +104,17 @@ def _opened(options: Export) -> ExportedMap:
         if layered:
             raise ConfigError(f"--layer and --at need the map.npz of a run; {options.map} has no keyframes")
         return take_part(ChunkedMap.open(options.map), options.lower, options.upper)
+    m = load_map(options.map)
+    whole = in_chunks(m)
+    if whole is not None:
+        if layered:
+            raise ConfigError(
+                f"--layer and --at need a map in memory; {options.map} was mapped with volume.window_m and "
+                f"has {len(whole.chunks)} chunks in {whole.store.path.name}"
+            )
+        return take_part(whole, options.lower, options.upper)
     if options.lower is not None or options.upper is not None:
         raise ConfigError(f"--lower and --upper need a map in chunks (.zarr); {options.map} is not one")
-    m = load_map(options.map)
     return _layer(m, options) if layered else m
 
 

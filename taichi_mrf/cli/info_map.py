@@ -17,6 +17,7 @@ from taichi_mrf.config.text import differences
 from taichi_mrf.export.octomap_reader import read_octomap
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.map_file import method_of, open_map_file, read_header
+from taichi_mrf.methods.mrf.parked_chunks import folder_beside
 from taichi_mrf.system.files import is_file, is_folder
 from taichi_mrf.voxels.layout import BRICK, CHUNK_VOXELS, VOXELS
 
@@ -64,6 +65,9 @@ def print_map(console: Terminal, facts: Facts) -> None:
         half_life = facts["half_life_s"]
         table.add_row("world", f"may change, half-life {half_life:g} s" if half_life else "static")
         table.add_row("inferred", "yes" if facts["inferred"] else "no: it is inferred when it is opened")
+    if facts.get("chunks_outside_window"):
+        folder = folder_beside(Path(facts["map"])).name
+        table.add_row("outside window", f"{facts['chunks_outside_window']} chunks, in {folder}")
     for name, value in facts.get("configuration", {}).items():
         table.add_row(name, str(value))
     table.add_row("written", facts["written"])
@@ -76,6 +80,7 @@ def _run_map(path: Path) -> Facts:
     with open_map_file(path) as file:
         header, bricks = read_header(path, file), file.array("bricks", "i", (None, 3))
         method = method_of(file)
+        parked = len(file.array("parked", "U", (None,))) if "parked" in file else 0
     names = [keyframe.name for keyframe in header.keyframes]
     stamps = [keyframe.stamp_s for keyframe in header.keyframes]
     return {
@@ -90,6 +95,7 @@ def _run_map(path: Path) -> Facts:
         "stamps_s": [min(stamps), max(stamps)] if stamps else None,
         "half_life_s": header.config.time.half_life_s,
         "inferred": header.settled,
+        "chunks_outside_window": parked,
         "configuration": _changed(header.config),
     }
 

@@ -15,6 +15,7 @@ from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.live.replay import Replay
 from taichi_mrf.mapping.intake import hold_out_of
 from taichi_mrf.methods.map_file import open_map_file, read_header
+from taichi_mrf.methods.mrf.parked_chunks import folder_beside
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map, load_map
 from taichi_mrf.system import runtime
@@ -71,11 +72,15 @@ def open_source(
     path = Path(name)
     if path.suffix == ".npz" and is_file(path) and not frames_npz.FORMAT.recognises(path):
         with open_map_file(path) as file:
-            header = read_header(path, file)
+            header, parked = read_header(path, file), "parked" in file
         parameters = dataclasses.replace(header.config, runtime=config.runtime)
         notes = [f"{path.name} is a saved map: its own parameters are in force."]
         if not header.settled:
             notes.append(saved_unsettled(path.name))
+        if parked:
+            notes.append(
+                f"It shows what is near the last keyframe; {folder_beside(path).name} has all of it."
+            )
         return Source(path.name, parameters, lambda: load_map(path)), notes
     dataset = open_dataset(name, color=False, track=track, **(reading or SourceFlags()).keywords())
     config = with_recorded_noise(config, dataset)

@@ -10,7 +10,9 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.geometry.up import Up
+from taichi_mrf.methods.capabilities import window_of
 from taichi_mrf.methods.chunked import ChunkedMap
+from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.queries.box import voxels_of_box
 from taichi_mrf.queries.known_bricks import Placed
 from taichi_mrf.queries.points import checked_points
@@ -91,6 +93,15 @@ class ChunkedViews:
         except ConfigError:  # there is no surface in view
             return np.full(camera.shape, np.nan, np.float32)
         return part.view.render_depth(camera, T, max_depth)
+
+
+def in_chunks(m: OccupancyMap) -> ChunkedMap | None:
+    """The map in chunks that holds the parts of a map that are outside of its window, as of when they left
+    memory, and the others as of the last save. None for a map that is in memory as a whole."""
+    window = window_of(m)
+    if window is None or window.folder is None or not len(window.parked):
+        return None
+    return ChunkedMap.open(window.folder)
 
 
 def take_part(m: ChunkedMap, lower: ArrayLike | None = None, upper: ArrayLike | None = None) -> MapPart:

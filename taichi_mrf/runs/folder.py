@@ -19,8 +19,7 @@ from taichi_mrf.export.ply import write_voxels
 from taichi_mrf.export.trajectory import write_trajectory
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.methods.capabilities import window_of
-from taichi_mrf.methods.chunked import ChunkedMap
-from taichi_mrf.methods.chunked_part import ChunkedViews
+from taichi_mrf.methods.chunked_part import ChunkedViews, in_chunks
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.runs.files import (
     CONFIG_FILE,
@@ -115,7 +114,7 @@ def write_run(
     Returns the report and the paths. Raises MapFileError.
     """
     written, occupied = _write_map(folder, result, facts.config, advance)
-    chunked = _in_chunks(result.map)
+    chunked = in_chunks(result.map)
     posed = facts.dataset
     if posed is not None and result.track is not None:
         posed = reposed(posed, result.track.poses(result.map))
@@ -149,17 +148,9 @@ def write_report(folder: Path, result: MappingResult, facts: RunFacts) -> None:
 def write_voxel_file(path: Path, m: OccupancyMap) -> int:
     """Write the voxels that are more likely occupied than free, of a map with a window as of its last save;
     returns their number. Raises MapFileError."""
-    centres, probability = (_in_chunks(m) or m).voxels(min_probability=0.5)
+    centres, probability = (in_chunks(m) or m).voxels(min_probability=0.5)
     write_voxels(path, centres, probability, m.voxel_size)
     return len(centres)
-
-
-def _in_chunks(m: OccupancyMap) -> ChunkedMap | None:
-    """The folder that holds a map of which parts are not in memory, None for any other."""
-    window = window_of(m)
-    if window is None or window.folder is None or not len(window.parked):
-        return None
-    return ChunkedMap.open(window.folder)
 
 
 def _nothing_occupied(config: Config) -> str:

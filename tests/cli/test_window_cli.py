@@ -10,6 +10,7 @@ from console import COARSE, taichi_mrf
 from taichi_mrf.config.schema import Config, EvaluationConfig, SensorConfig, VolumeConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.live.source import open_source
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.registry import load_map
@@ -39,6 +40,21 @@ def test_a_run_with_a_window_leaves_the_whole_map_in_chunks(tmp_path: Path) -> N
     centres, _ = whole.voxels(min_probability=0.5)
     assert f"element vertex {len(centres)}" in (tmp_path / "voxels.ply").read_bytes()[:300].decode()
     assert (near.state(centres) == UNKNOWN).mean() > 0.2
+    # What is said and exported of the map's file is of the whole map too.
+    info = taichi_mrf("info", tmp_path / "map.npz").stdout
+    assert f"{len(near.window.parked)} chunks, in map_window.zarr" in info
+    exported = tmp_path / "exported.ply"
+    assert taichi_mrf("export", tmp_path / "map.npz", "--to", exported).returncode == 0
+    assert f"element vertex {len(centres)}" in exported.read_bytes()[:300].decode()
+    box = ("--lower", "0", "-1", "-1", "--upper", "1", "1", "1")
+    assert taichi_mrf("export", tmp_path / "map.npz", "--to", exported, *box).returncode == 0
+    assert f"element vertex {len(centres)}" not in exported.read_bytes()[:300].decode()
+    same = taichi_mrf("diff", tmp_path / "map.npz", tmp_path / "map.npz", "--json")
+    known = json.loads(same.stdout)
+    assert (known["changed_state"], known["known_in_both"]) == (0, known["known_in_both"])
+    assert known["known_in_both"] > 2 * (near.state(near.voxels(0.0)[0]) != UNKNOWN).sum()
+    _, notes = open_source(str(tmp_path / "map.npz"), near.config, every=1, limit=None, speed=0.0, loop=False)
+    assert any("map_window.zarr has all of it" in note for note in notes)
     # A run without a window that takes its place leaves no part of it.
     again = ("map", CORRIDOR, "--out", tmp_path, *COARSE, *NEAR, "--limit", "5", "--no-pictures")
     assert taichi_mrf(*again, "--overwrite").returncode == 0

@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sliding_camera import CAMERA
 from window_walk import CHUNK_M, VOXEL, WINDOW_M, add, probes, walk, walk_both, windowed
 
 from taichi_mrf.config.schema import VolumeConfig
@@ -15,7 +16,7 @@ from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.methods.chunked import ChunkedMap
-from taichi_mrf.methods.chunked_part import take_part
+from taichi_mrf.methods.chunked_part import ChunkedViews, take_part
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.visibility.map import VisibilityMap
@@ -140,6 +141,11 @@ def test_the_folder_answers_queries_and_is_exported(tmp_path: Path) -> None:
     ours, theirs = (trimesh.load(tmp_path / name) for name in ("part.ply", "whole.ply"))
     assert {tuple(p) for p in ours.vertices} == {tuple(p) for p in theirs.vertices}
     assert whole.up == other.up
+    T_world_camera = np.eye(4)
+    for place_m in (0.1, 3.3, 50.0):
+        T_world_camera[0, 3] = place_m
+        rendered = ChunkedViews(whole).render_depth(CAMERA, T_world_camera)
+        np.testing.assert_array_equal(rendered, other.render_depth(CAMERA, T_world_camera))
     # While the run went on, what had left the window could be read as well.
     assert m.window is not None
     parked = ChunkedMap.open(tmp_path / "far.zarr")
@@ -208,6 +214,23 @@ def test_a_missing_chunk_is_named(tmp_path: Path) -> None:
     loaded = MRFMap.load(tmp_path / "map.npz")
     with pytest.raises(MapFileError, match=file.name):
         walk(loaded, OUT[::-1])
+
+
+def test_chunks_that_came_back_before_an_error_are_not_read_again(tmp_path: Path) -> None:
+    m, other = windowed(tmp_path / "far.zarr"), MRFMap(VOXEL, volume=VolumeConfig(dense_bricks=128))
+    walk_both(m, other, [*OUT, 20.0])
+    assert m.window is not None
+    near = [name for name in m.window.parked.names if name.startswith(("0_", "1_"))]
+    last = tmp_path / "far.zarr" / "parked" / near[-1]
+    whole = last.read_bytes()
+    last.write_bytes(b"")
+    with pytest.warns(UserWarning, match="a chunk near the camera stays on disk"):
+        m.window.follow(m, np.array([3.2, 0.0, 0.0]))
+    last.write_bytes(whole)
+    m.window.follow(m, np.array([3.2, 0.0, 0.0]))
+    in_memory, occupancy = m.voxels(0.0)
+    np.testing.assert_array_equal(occupancy, other.occupancy(in_memory))
+    assert not any(name.startswith(("0_", "1_")) for name in m.window.parked.names)
 
 
 def test_what_cannot_be_written_stays_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

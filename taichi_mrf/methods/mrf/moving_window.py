@@ -152,20 +152,25 @@ class MovingWindow:
 
     def _fetch(self, chunks: NDArray[np.int32]) -> None:
         """Bring chunks (n, 3) back into memory."""
+        try:
+            for x, y, z in chunks.tolist():
+                self._restore(self.parked.read((x, y, z), self._registry.voxel_size))
+                self.parked.drop((x, y, z))
+        finally:
+            if len(chunks):
+                self._chunks = self.parked.chunks
+
+    def _restore(self, found: ParkedChunk) -> None:
+        """Put what a chunk's file held back into memory."""
         registry = self._registry
-        for x, y, z in chunks.tolist():
-            found = self.parked.read((x, y, z), registry.voxel_size)
-            if len(found.bricks):
-                slots = registry.restore(found.bricks, found.owners)
-                registry.pool.write("total", slots, found.total)
-                registry.pool.write("evidence", slots, found.evidence)
-                if self._dated is not None and found.dated is not None:
-                    self._dated.restore_frozen(slots, *found.dated)
-            registry.see_for_good(found.crossed)
-            self._surface.restore(found.surfels)
-            self.parked.drop((x, y, z))
-        if len(chunks):
-            self._chunks = self.parked.chunks
+        if len(found.bricks):
+            slots = registry.restore(found.bricks, found.owners)
+            registry.pool.write("total", slots, found.total)
+            registry.pool.write("evidence", slots, found.evidence)
+            if self._dated is not None and found.dated is not None:
+                self._dated.restore_frozen(slots, *found.dated)
+        registry.see_for_good(found.crossed)
+        self._surface.restore(found.surfels)
 
     def _leave(self, m: WindowedMap, position_m: NDArray[np.float64]) -> None:
         """Write the chunks that are outside of the window, and release them. What cannot be written stays in
