@@ -15,6 +15,9 @@ VOXEL = 0.05
 CHUNK_M = CHUNK_VOXELS * VOXEL
 WINDOW_M = 1.0
 
+OUT = [0.5 * step for step in range(13)]
+"""Places on the way out, metres: almost two chunks."""
+
 
 def windowed(folder: Path | None = None, window_m: float = WINDOW_M, **options: Any) -> MRFMap:
     """An empty map with a window, which parks in a folder."""
@@ -23,6 +26,11 @@ def windowed(folder: Path | None = None, window_m: float = WINDOW_M, **options: 
         assert m.window is not None
         m.window.park_in(folder)
     return m
+
+
+def unwindowed(**options: Any) -> MRFMap:
+    """An empty map that is in memory as a whole."""
+    return MRFMap(VOXEL, volume=VolumeConfig(dense_bricks=128), **options)
 
 
 def add(m: MRFMap, place_m: float, number: int = 0) -> int:
