@@ -4,6 +4,7 @@ A wrong type is an ArgumentTypeError (a TypeError), an impossible value an Argum
 are ConfigErrors.
 """
 
+import math
 import numbers
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -27,6 +28,14 @@ def real(value: Any, name: str, least: float | None = None, above: float | None 
         raise ArgumentError(f"{name} must be at least {least:g}, not {number}")
     if above is not None and not number > above:
         raise ArgumentError(f"{name} must be more than {above:g}, not {number}")
+    return number
+
+
+def seconds(value: Any, name: str) -> float:
+    """A time in seconds: any finite number."""
+    number = real(value, name)
+    if not math.isfinite(number):
+        raise ArgumentError(f"{name} must be a finite number of seconds, not {number}")
     return number
 
 

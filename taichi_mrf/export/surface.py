@@ -68,7 +68,7 @@ def voxel_surface(m: QueriedMap, threshold: float) -> Surface:
 def smooth_surface(m: QueriedMap, level: float) -> Surface:
     """Where the marginal is ``level``, by marching cubes (Lewiner et al. 2003) between the centres of voxels.
 
-    What nobody has seen counts as empty. Raises TaichiMRFError without scikit-image.
+    Unknown space counts as empty. Raises TaichiMRFError without scikit-image.
     """
     measure = library("skimage.measure", "meshes need", "mesh")
     vertices, triangles, values = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.float32)]

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.config.arguments import instance, iterable, real, whole
+from taichi_mrf.config.arguments import instance, iterable, real, seconds, whole
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
 from taichi_mrf.config.time import TimeConfig
@@ -143,7 +143,7 @@ class BrickMap(Owned):
 
     def _stamp(self, stamp_s: Any) -> float:
         """A new keyframe's stamp; the number of keyframes added before if it is None."""
-        return float(self._next_id) if stamp_s is None else real(stamp_s, "stamp_s")
+        return float(self._next_id) if stamp_s is None else seconds(stamp_s, "stamp_s")
 
     def _note_up(self, T_world_camera: Pose) -> None:
         """Keep which way is up if this is the first keyframe."""

@@ -33,7 +33,7 @@ OUTLIERS = 0.01
 
 
 class MeasuredMap(Protocol):
-    """A map that knows the sensor it was made with."""
+    """A map, and the sensor that it was made with."""
 
     voxel_size: float
     view: View

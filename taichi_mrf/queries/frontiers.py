@@ -31,7 +31,7 @@ class Frontiers:
 
 
 def find_frontiers(m: QueriedMap, min_voxels: int = 1) -> Frontiers:
-    """All free voxels that share a face with an unknown one; those that touch, be it at a corner, are one
+    """All free voxels that share a face with an unknown one; those that touch, also at a corner, are one
     cluster. Clusters of less than ``min_voxels`` are left out.
 
     The map is looked at chunk by chunk, so that memory is bounded by what is found. Raises ConfigError for

@@ -56,7 +56,7 @@ def pixel_gain(
 ) -> NDArray[np.float32]:
     """Information gain of each pixel's ray up to an axial depth in metres, (H, W) float32 in bits.
 
-    Raises KeyframeError for a pose that is none, ConfigError for a depth that is not positive, CapacityError
+    Raises KeyframeError for an impossible pose, ConfigError for a depth that is not positive, CapacityError
     if the view reaches through more space than fits memory.
     """
     return _gain(RaySpace(m), camera, as_pose(T_world_camera), max_depth)

@@ -1,4 +1,4 @@
-"""The space that rays go through, with what is not known of it: for queries that must not look through it.
+"""The space that rays go through, unknown space included: for queries in which that stops a ray or counts.
 
 The index of a window (voxels/window.py) names the bricks that exist. Here it also names, by the slot behind
 the pool's last, every brick that no ray has crossed, so that a ray meets its voxels as it meets others;

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import taichi_mrf as tm
+from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.errors import CapacityError, ConfigError, TaichiMRFError
 
 CAMERA = tm.PinholeCamera(40, 30, 40.0, 40.0, 19.5, 14.5)
@@ -117,3 +118,16 @@ def test_noise_names_its_coefficients() -> None:
 def test_exports_name_what_is_no_map(tmp_path: Path) -> None:
     with pytest.raises(TypeError, match=r"m must be a map, or a part of one from take_part, not None"):
         tm.export_map(None, tmp_path / "map.ply")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("stamp_s", [float("nan"), float("inf")])
+@pytest.mark.parametrize("kind", MAPS)
+def test_a_stamp_is_a_time(one_backend: str, kind: type, stamp_s: float) -> None:
+    m = kind(0.1)
+    with pytest.raises(ValueError, match="stamp_s must be a finite number of seconds"):
+        m.add_keyframe(DEPTH, np.eye(4), CAMERA, stamp_s=stamp_s)
+    assert not m.keyframes
+    if kind is tm.MRFMap:
+        dated = tm.MRFMap(0.1, time=TimeConfig(half_life_s=600.0))
+        with pytest.raises(ValueError, match="stamp_s must be a finite number of seconds"):
+            dated.at(stamp_s)

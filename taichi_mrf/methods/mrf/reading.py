@@ -11,7 +11,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.config.arguments import real
+from taichi_mrf.config.arguments import seconds
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.errors import ConfigError, KeyframeError
@@ -146,7 +146,7 @@ class ReadableMRF(BrickMap):
             dated = self._needs_dates(what)
             self._restore_messages()
         pool = self._pool
-        shown = copied(pool.belief) if stamp_s is None else dated.as_of(real(stamp_s, "stamp_s"))
+        shown = copied(pool.belief) if stamp_s is None else dated.as_of(seconds(stamp_s, "stamp_s"))
         if which == "both":
             return MapReading(self, shown)
         dynamic = which == "dynamic"
