@@ -19,6 +19,7 @@ from small_room import VOXEL_SIZE, add, frames
 from taichi_mrf.cluster.local import LocalProcesses
 from taichi_mrf.cluster.runner import InProcess
 from taichi_mrf.config.schema import Config, EvaluationConfig, PoseConfig, RuntimeConfig, VolumeConfig
+from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError, DatasetError, MapFileError
 from taichi_mrf.experiments.submaps.costs import MeasuredCost, Place, need
@@ -210,6 +211,7 @@ def test_what_cannot_be_cut_is_refused(tmp_path: Path) -> None:
     for config, problem in (
         (Config(0.1, method="log_odds"), "method mrf"),
         (Config(0.1, poses=PoseConfig(refine=True)), "poses.refine"),
+        (Config(0.1, time=TimeConfig(half_life_s=600.0)), "time.half_life_s must be 0"),
     ):
         with pytest.raises(ConfigError, match=problem):
             map_in_submaps(SEQUENCE, config, 6.4, tmp_path / "s", tmp_path / "m.zarr", InProcess(), rounds=0)
