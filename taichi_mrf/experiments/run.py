@@ -47,6 +47,7 @@ EXPERIMENTS = {
     "poses": Entry("poses:run_poses", (0.05,)),
     "rays": Entry("rays:run_rays", (0.05, 0.02, 0.01)),
     "endless": Entry("endless:run_endless", (0.1,)),
+    "changes": Entry("changes:run_changes", (0.05, 0.02), needs_data=False),
     "submaps": Entry("submaps.corridor:run_submaps", (0.05,), needs_data=False),
     "window": Entry("window:run_window", (0.1,), needs_data=False),
 }
