@@ -20,6 +20,8 @@ sys.path.insert(0, str(REPOSITORY / "tests" / "support"))  # the driver of the b
 from browser import LivePage, chromium  # noqa: E402
 from live_program import LiveProgram  # noqa: E402
 
+from taichi_mrf.viewer.scene.coloring import DYNAMIC_COLOR  # noqa: E402
+
 IMAGES = REPOSITORY / "docs" / "images"
 ROOM = ("synthetic:room", "--voxel-size", "0.05", "--speed", "0.2")
 """At this speed a frame arrives each second, which is enough for the browser to draw it."""
@@ -28,7 +30,8 @@ WIDTH, HEIGHT = 1240, 700
 CLIP_WIDTH = 640
 COLORS = 80
 CAMERA_COLOR = (230, 0, 126)
-"""The colour of the camera and its path, which have too few pixels to enter the palette by themselves."""
+"""The colour of the camera and its path. Like dynamic voxels they have too few pixels to enter the palette by
+themselves."""
 
 FRAME_MS, LAST_MS = 150, 1500
 
@@ -127,14 +130,14 @@ def side_by_side(pictures: list[Image.Image]) -> Image.Image:
     return Image.fromarray(np.concatenate([np.asarray(each) for each in pictures], axis=1))
 
 
-def write_clip(shots: list[Image.Image], path: Path) -> None:
-    """Write a GIF of all pictures with one palette."""
+def write_clip(shots: list[Image.Image], path: Path, frame_ms: int = FRAME_MS) -> None:
+    """Write a GIF of all pictures with one palette, each shown for some milliseconds."""
     size = CLIP_WIDTH, round(CLIP_WIDTH * HEIGHT / WIDTH)
     small = [each.resize(size, Image.Resampling.LANCZOS) for each in shots]
-    rare = Image.new("RGB", (size[0] // 4, size[1]), CAMERA_COLOR)
-    palette = small_colors(side_by_side([*small[:: len(small) // 8], rare]), COLORS)
+    rare = [Image.new("RGB", (size[0] // 4, size[1]), color) for color in (CAMERA_COLOR, DYNAMIC_COLOR)]
+    palette = small_colors(side_by_side([*small[:: len(small) // 8], *rare]), COLORS)
     frames = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in small]
-    durations = [FRAME_MS] * (len(frames) - 1) + [LAST_MS]
+    durations = [frame_ms] * (len(frames) - 1) + [LAST_MS]
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)
 
 

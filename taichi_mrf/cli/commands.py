@@ -12,7 +12,7 @@ import tyro
 
 from taichi_mrf.cli.options.bench import Bench
 from taichi_mrf.cli.options.calibrate import Calibrate
-from taichi_mrf.cli.options.config_file import laser_parameters, mapping_parameters
+from taichi_mrf.cli.options.config_file import laser_parameters, live_parameters, mapping_parameters
 from taichi_mrf.cli.options.diff import Diff
 from taichi_mrf.cli.options.eval import Eval
 from taichi_mrf.cli.options.export import Export
@@ -61,7 +61,7 @@ class Command:
 
 _COMMON = ("out", "voxel-size", "method", "config", "every", "limit")
 _MAP_FLAGS = (*_COMMON, "resume", "overwrite", "jobs", "track-poses")
-_LIVE_FLAGS = (*_COMMON, "overwrite", "speed", "track-poses", "port", "open")
+_LIVE_FLAGS = (*_COMMON, "overwrite", "speed", "track-poses", "time.half-life-s", "port", "open")
 _TUNE_FLAGS = ("out", "voxel-size", "config", "frames", "first", "stride", "auto", "search", "port", "open")
 _BENCH_FLAGS = (
     "voxel-sizes",
@@ -90,7 +90,7 @@ _LASER_FLAGS = (
 
 COMMANDS = {
     "map": Command(Map, "taichi_mrf.cli.map.many:run", mapping_parameters, _MAP_FLAGS),
-    "live": Command(Live, "taichi_mrf.cli.live:run_live", mapping_parameters, _LIVE_FLAGS),
+    "live": Command(Live, "taichi_mrf.cli.live:run_live", live_parameters, _LIVE_FLAGS),
     "tune": Command(Tune, "taichi_mrf.cli.tune:run_tune", mapping_parameters, _TUNE_FLAGS),
     "export": Command(Export, "taichi_mrf.cli.export:run_export"),
     "import": Command(Import, "taichi_mrf.cli.import_map:run_import"),

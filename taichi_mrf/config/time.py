@@ -5,6 +5,9 @@ from dataclasses import dataclass
 
 from taichi_mrf.config.values import check_field
 
+LIVE_HALF_LIFE_S = 600.0
+"""The half-life that a live run has by default: people and chairs move. All else maps a static world."""
+
 
 @dataclass(frozen=True)
 class TimeConfig:

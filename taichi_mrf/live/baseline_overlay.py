@@ -1,9 +1,12 @@
 """The baseline: the same keyframes mapped by OctoMap's method, shown next to the map on demand."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from taichi_mrf.config.registry import octomap_method
 from taichi_mrf.config.schema import Config, without_window
+from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.schedule import Progress
 from taichi_mrf.live.mapper import Mapper
@@ -21,8 +24,10 @@ class BaselineOverlay:
     """A map by OctoMap's method that follows a mapper's keyframes, one piece of work at a time."""
 
     def __init__(self, config: Config, noise: NoiseModel) -> None:
-        """An empty map with a configuration's parameters, but for the window, which its method lacks."""
-        self.map: OccupancyMap = octomap_method().load_class().with_noise(without_window(config), noise)
+        """An empty map with a configuration's parameters, but for the window, which its method lacks, and
+        for time: OctoMap's update forgets nothing."""
+        static = replace(without_window(config), time=TimeConfig())
+        self.map: OccupancyMap = octomap_method().load_class().with_noise(static, noise)
         self._publisher = Publisher(
             "baseline",
             self.map.view.pool,

@@ -6,9 +6,10 @@ import time
 
 from taichi_mrf.inference.schedule import Progress
 from taichi_mrf.live.baseline_overlay import BaselineOverlay
+from taichi_mrf.live.change_list import ChangeList
 from taichi_mrf.live.pictures import view_images
 from taichi_mrf.live.run import Run
-from taichi_mrf.viewer.messages import Notice, Watch
+from taichi_mrf.viewer.messages import Notice, SceneChanges, Watch
 
 NOTHING = Watch(images=False, view=None, baseline=False)
 
@@ -23,6 +24,7 @@ class Extras:
         self._run = run
         self._watch = NOTHING
         self._baseline: BaselineOverlay | None = None
+        self._changes: ChangeList | None = None
         self._shown_version = -1
         self._images_made = float("-inf")
 
@@ -31,22 +33,24 @@ class Extras:
         if wanted != self._watch:
             self._watch, self._shown_version = wanted, -1
 
-    def nothing_wanted(self) -> None:
-        """Show no extras: a new viewer starts without them."""
+    def start_again_for_viewer(self) -> None:
+        """Show no extras, which a new viewer starts without; it is sent the list of changes."""
         self._watch, self._baseline = NOTHING, None
+        if self._changes is not None:
+            self._run.send(self._changes.listed())
 
     def start_over(self) -> None:
         """Start over with a new map; the page shows the same extras."""
-        self._baseline, self._shown_version = None, -1
+        self._baseline, self._changes, self._shown_version = None, None, -1
 
     def work(self, progress: Progress) -> bool:
         """Do one piece of the work that is left; returns whether there was any. ``progress`` can stop it."""
-        publisher = self._run.mapper.publisher
+        publisher = self._run.mapper.shown.publisher
         if publisher.counting != self._watch.counts:
             publisher.count(self._watch.counts)
             self._run.publish()
             return True
-        if self._make_images():
+        if self._run.renew_past() or self._make_images() or self._list_changes():
             return True
         if not self._watch.baseline:
             if self._baseline is not None:
@@ -78,6 +82,17 @@ class Extras:
         if changes is not None:
             self._run.send(changes)
         return True
+
+    def _list_changes(self) -> bool:
+        """Look for what appeared and what left; False if it was nothing."""
+        if self._changes is None:
+            self._changes = ChangeList(self._run.mapper)
+        look = self._changes.look
+        found: list[SceneChanges] = []
+        self._run.guarded(lambda: found.extend(look()))
+        for changes in found:
+            self._run.send(changes)
+        return bool(found)
 
     def _make_images(self) -> bool:
         now = time.monotonic()

@@ -16,8 +16,8 @@ from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.inference.schedule import InferReport, InferSteps
 from taichi_mrf.live.live_keyframes import LiveKeyframe, LiveKeyframes
 from taichi_mrf.live.pictures import thumbnail
-from taichi_mrf.live.publish import Publisher
 from taichi_mrf.live.ray_answers import PosedDepthImage
+from taichi_mrf.live.shown_map import ShownMap
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.refinement import PoseRefiner
 from taichi_mrf.mapping.selection import surplus
@@ -51,9 +51,7 @@ class Mapper:
         self.roster = LiveKeyframes(next_id=first_id)
         for id, keyframe in m.keyframes.items():
             self.roster.add(keyframe, keyframe.rays, thumbnail(keyframe.depth_m), id, keyframe.stamp_s)
-        self.publisher = Publisher(
-            "map", m.view.pool, m.seen_by, prior_is_unknown=m.METHOD.prior_is_unknown, counting=False
-        )
+        self.shown = ShownMap(m)
         # A map from a file has beliefs but no messages; an edit would need full inference first.
         self.lacks_messages = bool(m.keyframes) and has_messages(m)
         self.unsettled, self.edited = self.lacks_messages or self.stale, False

@@ -23,7 +23,9 @@ from taichi_mrf.viewer.messages import (
     Notice,
     Quit,
     RayAnswer,
+    SceneChanges,
     Status,
+    TimeSpan,
     Update,
 )
 from taichi_mrf.voxels.layout import grid_keys
@@ -34,7 +36,7 @@ BRICKS_AT_ONCE = 2048
 MOST = {Notice: 50, File: 4}
 """Most updates of these kinds that wait; the oldest are dropped first."""
 
-LATEST_ONLY = (Status, CurrentCamera, Images, RayAnswer)
+LATEST_ONLY = (Status, CurrentCamera, Images, RayAnswer, TimeSpan, SceneChanges)
 
 MERGE_FACTOR = 2
 """Waiting bricks are merged when their number has grown by this factor since the last merge, so that each is

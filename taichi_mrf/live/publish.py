@@ -16,6 +16,9 @@ from taichi_mrf.voxels.pool import BrickPool
 SeenBy = Callable[[NDArray[np.int32]], NDArray[np.uint8]]
 """Slots (n,) -> how many keyframes see each of their voxels, (n, 512)."""
 
+Beliefs = Callable[[NDArray[np.int32]], NDArray[np.float32]]
+"""Slots (n,) -> the log-odds of their voxels, (n, 512)."""
+
 _AT_ONCE = 4096
 """Bricks that are read from the pool at once."""
 
@@ -32,22 +35,28 @@ class Publisher:
         prior_is_unknown: bool = False,
         least_log_odds: float | None = None,
         counting: bool = True,
+        beliefs: Beliefs | None = None,
     ) -> None:
         """With ``prior_is_unknown`` a voxel that holds exactly the pool's prior is unobserved, as in maps
         that integrate scan by scan: it is sent as just less likely occupied than not, or all of them would
         be shown. With ``least_log_odds`` a brick counts only if it has a known voxel above that.
         ``counting``: send the number of keyframes that see each voxel, which reads every keyframe's messages.
+        ``beliefs``: what to send of the pool's bricks, by default the pool's own beliefs.
         """
         self._layer, self._pool, self._seen_by = layer, pool, seen_by
         self._prior_is_unknown, self._least = prior_is_unknown, least_log_odds
         self.counting = counting
+        self._beliefs = beliefs or (lambda slots: pool.read("belief", slots))
         self._sent = _SentBricks()
         self._identity = pool.identity.copy()
         self._all = True
 
-    def changes(self) -> Bricks | None:
-        """What has changed since the last call, None if nothing has. The first time that is the whole map."""
-        touched = self._pool.take_touched()
+    def changes(self, touched: NDArray[np.int32] | None = None) -> Bricks | None:
+        """What has changed since the last call, None if nothing has. The first time that is the whole map.
+
+        ``touched`` are the slots, ascending, that may have changed; by default the pool is asked.
+        """
+        touched = self._pool.take_touched() if touched is None else touched
         slots, self._all = (self._pool.in_use if self._all else touched), False
         parts = [self._changed(slots[i : i + _AT_ONCE]) for i in range(0, len(slots), _AT_ONCE)]
         hidden = [part[3] for part in parts]
@@ -73,6 +82,10 @@ class Publisher:
             self.counting = on
             self.start_over()
 
+    def look_again(self) -> None:
+        """Compare every brick with what was sent at the next call of :meth:`changes`."""
+        self._all = True
+
     def start_over(self) -> None:
         """Send the whole map with the next changes: the viewer is a new one."""
         self._sent, self._all = _SentBricks(), True
@@ -82,7 +95,7 @@ class Publisher:
     ) -> tuple[NDArray[np.int32], NDArray[np.int16], NDArray[np.uint8], NDArray[np.int32]]:
         """Of some bricks those that differ from what was sent: coordinates, log-odds, seen; and the bricks
         that are hidden now."""
-        bricks, belief = self._pool.bricks[slots], self._pool.read("belief", slots)
+        bricks, belief = self._pool.bricks[slots], self._beliefs(slots)
         log_odds = pack_log_odds(belief)
         seen = self._seen_by(slots) if self.counting else np.zeros(log_odds.shape, np.uint8)
         if self._prior_is_unknown:

@@ -27,6 +27,7 @@ from taichi_mrf.viewer.messages import (
     Request,
     Reset,
     Save,
+    ShowTime,
     Speed,
     Step,
     Switch,
@@ -64,6 +65,7 @@ class Requests:
             RayThrough: self._ray_through,
             PixelRay: self._pixel_ray,
             Watch: extras.watch,
+            ShowTime: lambda request: run.show_time(request.stamp_s),
             Save: self._save,
             Quit: self._quit,
         }
@@ -101,10 +103,12 @@ class Requests:
             change(run.mapper)
         finally:  # even if it fails, the viewer is sent the present state
             run.send(run.describe(request.keyframe))
+            run.show_time(None)
             run.publish()
 
     def _freeze(self, request: Freeze) -> None:
         self._run.send(self._run.mapper.freeze(request.keyframe))
+        self._run.show_time(None)
         self._run.publish()
 
     def _ray_through(self, request: RayThrough) -> None:

@@ -10,6 +10,7 @@ from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.live.progress import Progress
 from taichi_mrf.live.replay import Replay
 from taichi_mrf.live.session_core import SessionCore
+from taichi_mrf.live.shown_map import time_span
 from taichi_mrf.live.source import Source, saved_unsettled
 from taichi_mrf.mapping.intake import Intake
 from taichi_mrf.mapping.result import MappingResult
@@ -18,7 +19,7 @@ from taichi_mrf.runs.files import MAP_FILE
 from taichi_mrf.runs.folder import RunFacts
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system import runtime
-from taichi_mrf.viewer.messages import CurrentCamera, Hello, KeyframeInfo, Notice
+from taichi_mrf.viewer.messages import Bricks, CurrentCamera, Hello, KeyframeInfo, Notice
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,7 @@ class Run(SessionCore):
                 min_evidence=self.mapper.min_evidence,
                 parameters=to_yaml(self.source.config),
                 can_freeze=can_freeze(m),
+                has_dates=self.mapper.shown.has_dates,
             )
         )
         if self.mapper.saved_unsettled and self.mapper.unsettled:
@@ -99,18 +101,25 @@ class Run(SessionCore):
             self.send(self.mapper.describe(entry))
         if self.current is not None:
             self.show_camera(self.current)
-        self.mapper.publisher.start_over()
+        self.mapper.shown.start_over()
         self.publish()
 
     def publish(self) -> None:
         """Send the changes of the map, and measure its size."""
         for info in self.mapper.left_behind():
             self.send(info)
-        changes = self.mapper.publisher.changes()
-        if changes is not None:
-            self.send(changes)
-            self.version += 1
+        self._send_layers(self.mapper.shown.changes())
+        self._send_time()
         self.progress.measure(self.mapper)
+
+    def show_time(self, stamp_s: float | None) -> None:
+        """Show the map as of a time in seconds, None for now, once there is time to read it."""
+        self.mapper.shown.show(stamp_s)
+        self._send_time()
+
+    def renew_past(self) -> bool:
+        """Send what is shown of the past if it is outdated; returns whether there was anything to send."""
+        return self._send_layers(self.mapper.shown.renew())
 
     def show_camera(self, frame: Frame) -> None:
         """Show the viewer the pose of a frame."""
@@ -181,6 +190,17 @@ class Run(SessionCore):
         if self.replay.finished:
             return self.replay.problem or "done: the map is up to date"
         return "waiting: paused" if self.replay.paused else "waiting for the next frame"
+
+    def _send_layers(self, layers: list[Bricks]) -> bool:
+        for bricks in layers:
+            self.send(bricks)
+        self.version += bool(layers)
+        return bool(layers)
+
+    def _send_time(self) -> None:
+        span = time_span(self.mapper.shown, self.mapper.roster.entries.values())
+        if span is not None:
+            self.send(span)
 
     def _show_adding(self, frame: Frame) -> None:
         self.show_camera(frame)

@@ -80,8 +80,8 @@ class Session:
     def reconnect(self, link: Link) -> None:
         """Go on with another viewer, which is sent the whole state."""
         self.state.link = link
-        self._extras.nothing_wanted()
         self.state.send_everything()
+        self._extras.start_again_for_viewer()
 
     def _begin_anew(self) -> None:
         self.state.begin(self.state.mapper.roster.next_id)

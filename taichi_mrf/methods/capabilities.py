@@ -114,3 +114,8 @@ def can_refine_poses(m: OccupancyMap) -> TypeGuard[AligningMap]:
 def has_layers(m: OccupancyMap) -> TypeGuard[LayeredMap]:
     """Whether a map can be read as of another time and by layers. In a map of a static world they raise."""
     return m.METHOD.has_layers
+
+
+def has_dates(m: OccupancyMap) -> TypeGuard[LayeredMap]:
+    """Whether a map's world may change, so that it can be read as of another time and by layers."""
+    return m.view.pool.dated is not None

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, known_bricks, sorted_bricks
+from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, known_bricks, sorted_bricks
 from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN, probability
 from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
 
@@ -64,8 +64,9 @@ class MapChange:
         return self.points[(self.before == OCCUPIED) & (self.after == FREE)]
 
 
-def compare_maps(a: QueriedMap, b: QueriedMap) -> MapChange:
-    """Compare two maps over all that is known in either, also seen-free space without voxels.
+def compare_maps(a: QueriedMap, b: QueriedMap, bricks: Bricks | None = None) -> MapChange:
+    """Compare two maps over all that is known in either, also seen-free space without voxels; or only in
+    ``bricks``, (n, 3) coordinates.
 
     The maps can be of different methods. Raises ConfigError if their voxels are of different sizes.
     """
@@ -77,7 +78,9 @@ def compare_maps(a: QueriedMap, b: QueriedMap) -> MapChange:
     sums = np.zeros(2)
     parts = []
     readers = BrickReader(a), BrickReader(b)
-    bricks = sorted_bricks(np.concatenate([known_bricks(a), known_bricks(b)]))
+    if bricks is None:
+        bricks = np.concatenate([known_bricks(a), known_bricks(b)])
+    bricks = sorted_bricks(bricks)
     for piece, log_odds_a, before in readers[0].batches(bricks):
         log_odds_b = readers[1].log_odds(piece)
         after = readers[1].state(log_odds_b)

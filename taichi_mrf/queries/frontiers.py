@@ -5,15 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.errors import ConfigError
 from taichi_mrf.queries.box import voxel_box
+from taichi_mrf.queries.clusters import find_clusters
 from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, known_bricks, sorted_bricks
 from taichi_mrf.queries.points import FREE, UNKNOWN
-from taichi_mrf.system.libraries import library
-from taichi_mrf.voxels.layout import CHUNK, CHUNK_VOXELS, grid_keys
-
-_HALF_OF_NEIGHBOURS = np.stack(np.unravel_index(np.arange(14, 27), (3, 3, 3)), axis=1) - 1
-"""13 of the 26 neighbours of a voxel; the others are these seen from the other side."""
+from taichi_mrf.voxels.layout import CHUNK, CHUNK_VOXELS
 
 
 @dataclass(frozen=True)
@@ -37,24 +33,11 @@ def find_frontiers(m: QueriedMap, min_voxels: int = 1) -> Frontiers:
     The map is looked at chunk by chunk, so that memory is bounded by what is found. Raises ConfigError for
     min_voxels below 1, TaichiMRFError without SciPy.
     """
-    if min_voxels < 1:
-        raise ConfigError(f"min_voxels must be at least 1, not {min_voxels}")
-    graphs = library("scipy.sparse", "frontiers need", "mesh")
-    csgraph = library("scipy.sparse.csgraph", "frontiers need", "mesh")
     voxels = frontier_voxels(m)
-    pairs = _touching(voxels)
-    graph = graphs.coo_matrix((np.ones(len(pairs), np.int8), pairs.T), (len(voxels), len(voxels)))
-    labels = csgraph.connected_components(graph, directed=False)[1] if len(voxels) else np.zeros(0, np.int32)
-    counts = np.bincount(labels)
-    order = np.argsort(-counts, kind="stable")
-    order = order[counts[order] >= min_voxels]
-    number = np.full(len(counts), -1, np.int32)
-    number[order] = np.arange(len(order))
-    cluster = number[labels]
+    cluster, sizes = find_clusters(voxels, min_voxels, "frontiers need")
     kept = cluster >= 0
-    points, cluster = (voxels[kept] + 0.5) * m.voxel_size, cluster[kept]
-    sizes = counts[order]
-    sums = [np.bincount(cluster, points[:, axis], len(order)) for axis in range(3)]
+    points, cluster = (voxels[kept].astype(np.float64) + 0.5) * m.voxel_size, cluster[kept]
+    sums = [np.bincount(cluster, points[:, axis], len(sizes)) for axis in range(3)]
     return Frontiers(points, cluster, sizes, np.stack(sums, axis=1) / np.maximum(sizes, 1)[:, None])
 
 
@@ -75,17 +58,3 @@ def frontier_voxels(m: QueriedMap) -> NDArray[np.int32]:
         voxels = np.argwhere(beside & (state[1:-1, 1:-1, 1:-1] == FREE))
         found.append((voxels + first).astype(np.int32))
     return np.concatenate(found)
-
-
-def _touching(voxels: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Pairs (p, 2) of rows whose voxels touch."""
-    keys = grid_keys(voxels)
-    order = np.argsort(keys)
-    ascending = keys[order]
-    pairs = [np.zeros((0, 2), np.int64)]
-    for step in _HALF_OF_NEIGHBOURS:
-        wanted = grid_keys(voxels + step.astype(np.int32))
-        places = np.minimum(np.searchsorted(ascending, wanted), max(len(keys) - 1, 0))
-        there = np.flatnonzero(ascending[places] == wanted) if len(keys) else np.zeros(0, np.int64)
-        pairs.append(np.stack([there, order[places[there]]], axis=1))
-    return np.concatenate(pairs)

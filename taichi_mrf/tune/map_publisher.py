@@ -20,12 +20,12 @@ class MapPublisher:
         """Send a map with its keyframes. If grid, prior and keyframes are those of the map before, only
         bricks are sent, so that the picture does not go black in between."""
         before, self._shown = self._shown, Mapper(trial.map)
-        hello, publisher = self._describe(trial), self._shown.publisher
+        hello, publisher = self._describe(trial), self._shown.shown.publisher
         bricks = publisher.changes() or publisher.everything_gone()
         keyframes = [self._shown.describe(entry) for entry in self._shown.roster.entries.values()]
         names = [keyframe.name for keyframe in keyframes]
         if before is not None and self._hello == hello and _names(before) == names:
-            gone = [before.publisher.everything_gone()]
+            gone = [before.shown.publisher.everything_gone()]
         else:
             gone = []
             self._link.send(hello)

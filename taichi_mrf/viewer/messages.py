@@ -18,8 +18,9 @@ LOG_ODDS_STEP = 1 / 512
 """Log-odds are sent as int16 multiples of this. They are rounded down, so that their sign, and with it the
 threshold of one half, is exact; beyond +-64 they are clipped."""
 
-Layer = Literal["map", "baseline"]
-"""The map itself, or the baseline beside it: OctoMap's log-odds update of the same keyframes."""
+Layer = Literal["map", "baseline", "dynamic"]
+"""The map itself; the baseline beside it, OctoMap's log-odds update of the same keyframes; and of the map the
+bricks with dynamic voxels, those whose log-odds are not below 0."""
 
 KeyframeState = Literal["on", "off", "frozen"]
 
@@ -53,6 +54,8 @@ class Hello(Update):
     """The effective configuration as YAML."""
     can_freeze: bool = True
     """Whether the map's method can freeze keyframes."""
+    has_dates: bool = False
+    """Whether the map can be shown as of another time."""
 
 
 @dataclass(frozen=True)
@@ -120,6 +123,35 @@ class Status(Update):
     finished: bool
     pending: bool
     speed: float = 0.0
+
+
+@dataclass(frozen=True)
+class TimeSpan(Update):
+    """The times at which the map can be shown, from ``first_s`` to ``now_s`` in seconds, as stamps have them;
+    and the one that is shown, None for now. ``start_s`` is the stamp from which the page counts."""
+
+    start_s: float
+    first_s: float
+    now_s: float
+    shown_s: float | None
+
+
+@dataclass(frozen=True)
+class SceneChange:
+    """Something that appeared or left, up to ``stamp_s`` (seconds), in a box of ``size_m`` (3) around
+    ``centre_m`` (3), metres, world."""
+
+    stamp_s: float
+    verb: Literal["appeared", "left"]
+    size_m: tuple[float, float, float]
+    centre_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class SceneChanges(Update):
+    """What has appeared and left lately, the latest first."""
+
+    changes: tuple[SceneChange, ...]
 
 
 @dataclass(frozen=True)
@@ -261,6 +293,13 @@ class Watch(Request):
     view: int | None
     baseline: bool
     counts: bool = False
+
+
+@dataclass(frozen=True)
+class ShowTime(Request):
+    """Show the map as it was believed at a time in seconds, None for now."""
+
+    stamp_s: float | None
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,8 @@ from console import complaints
 from live_program import DEADLINE_S
 from new_interpreter import obey_hangups
 
+from taichi_mrf.cli.parser import parse
+
 ROOM = "synthetic:room?frames=6&width=80&height=60"
 FLAGS = ("--voxel-size", "0.1", "--runtime.arch", "cpu", "--port", "0")
 FILES = {"map.npz", "voxels.ply", "config.yaml", "report.json"}
@@ -131,7 +133,7 @@ def read_report(folder: Path) -> dict[str, Any]:
 def ended(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, "subprocess.CompletedProcess[str]"]:
     """A run that ended by itself: its folder, and what it printed."""
     out = tmp_path_factory.mktemp("ended") / "live"
-    return out, live(ROOM, "--exit-when-done", "--out", out, *FLAGS)
+    return out, live(ROOM, "--exit-when-done", "--out", out, "--time.half-life-s", "0", *FLAGS)
 
 
 def test_a_run_that_ends_by_itself_leaves_the_map_that_map_makes(
@@ -244,6 +246,30 @@ def test_the_parameters_of_a_file_hold_unless_a_flag_says_otherwise(tmp_path: Pa
     written = (out / "config.yaml").read_text()
     for line in ("voxel_size: 0.2", "sweeps: 2", "damping: 0.1"):
         assert line in written
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "flags", "expected"),
+    [
+        ("live", None, (), 600.0),
+        ("live", "voxel_size: 0.2", (), 600.0),
+        ("live", "time: {moving_share: 0.01}", (), 600.0),
+        ("live", "time: {half_life_s: 0}", (), 0.0),
+        ("live", "time: {half_life_s: 0}", ("--time.half-life-s", "5"), 5.0),
+        ("live", None, ("--time.half-life-s", "0"), 0.0),
+        ("map", None, (), 0.0),
+        ("map", "voxel_size: 0.2", (), 0.0),
+    ],
+)
+def test_the_world_of_a_live_run_changes_unless_a_file_or_a_flag_says_otherwise(
+    name: str, text: str | None, flags: tuple[str, ...], expected: float, tmp_path: Path
+) -> None:
+    arguments = [name, ROOM, "--out", str(tmp_path), *flags]
+    if text is not None:
+        (tmp_path / "mine.yaml").write_text(text)
+        arguments += ["--config", str(tmp_path / "mine.yaml")]
+    _, options = parse(arguments)
+    assert options.settings.time.half_life_s == expected
 
 
 @pytest.mark.parametrize(

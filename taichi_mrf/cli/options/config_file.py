@@ -4,14 +4,15 @@ Flags change them, so that this file is read before the command line is parsed.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from taichi_mrf.config.files import read_yaml
+from taichi_mrf.config.files import find_config, read_yaml
 from taichi_mrf.config.schema import Config, load
+from taichi_mrf.config.time import LIVE_HALF_LIFE_S, TimeConfig
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.factor_graph.config import LaserConfig
 
@@ -41,6 +42,20 @@ def mapping_parameters(arguments: Sequence[str]) -> Config:
     return Config()
 
 
+def live_parameters(arguments: Sequence[str]) -> Config:
+    """The same for a live run, whose world changes, unless the file sets ``time.half_life_s``. Raises
+    ConfigError."""
+    path, config = _files(arguments).config, mapping_parameters(arguments)
+    if path is not None and "half_life_s" in _section(path, "time"):
+        return config
+    return replace(config, time=replace(config.time, half_life_s=LIVE_HALF_LIFE_S))
+
+
+def live_defaults() -> Config:
+    """The parameters of a live run without any file or flag."""
+    return Config(time=TimeConfig(half_life_s=LIVE_HALF_LIFE_S))
+
+
 def laser_parameters(arguments: Sequence[str]) -> LaserConfig:
     """The parameters of --config, else the defaults. Raises ConfigError."""
     files = _files(arguments)
@@ -50,6 +65,11 @@ def laser_parameters(arguments: Sequence[str]) -> LaserConfig:
 def load_laser_config(path: Path) -> LaserConfig:
     """Read a YAML file of parameters. Raises ConfigError."""
     return from_dict(LaserConfig, read_yaml(path), str(path))
+
+
+def _section(path: Path, name: str) -> dict[str, object]:
+    """What a file that has been read without errors sets in a section."""
+    return (read_yaml(find_config(path)) or {}).get(name) or {}
 
 
 def _files(arguments: Sequence[str]) -> _Files:

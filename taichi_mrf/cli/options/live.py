@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from taichi_mrf.cli.options.checks import check_least, check_port
+from taichi_mrf.cli.options.config_file import live_defaults
 from taichi_mrf.cli.options.pose_flags import PoseFlags
 from taichi_mrf.cli.options.verbosity import Verbosity
 from taichi_mrf.config.schema import Config
@@ -18,8 +19,9 @@ from taichi_mrf.errors import ConfigError
 class Live:
     """Map a sequence or a camera, and show the map in the browser while it grows.
 
-    Keyframes can be switched off and on, moved and frozen there, and rays inspected. Ctrl-C ends the run
-    and, with --out, saves the map (exit status 130). Example: taichi-mrf live recording/ --out
+    Keyframes can be switched off and on, moved and frozen there, and rays inspected. The world may change:
+    --time.half-life-s is 600 here, and 0 (a static world) for map. Ctrl-C ends the run and, with --out,
+    saves the map (exit status 130). Example: taichi-mrf live recording/ --out
     runs/desk --open
     """
 
@@ -74,7 +76,7 @@ class Live:
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
     """How much is printed."""
 
-    settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
+    settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=live_defaults)
     """Parameters."""
 
     def __post_init__(self) -> None:

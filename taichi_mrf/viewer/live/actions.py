@@ -24,6 +24,7 @@ class Action(Enum):
     SET_POSITION = auto()
     SHOW_PIXEL_RAY = auto()
     WATCH_IMAGES = auto()
+    SHOW_TIME = auto()
     SAVE_MAP = auto()
     SAVE_VOXELS = auto()
     SAVE_PICTURE = auto()

@@ -32,6 +32,8 @@ class Page(BasePage[Panel]):
             m.Status: self.panel.show_status,
             m.RayAnswer: self._show_ray,
             m.Images: self.panel.show_images,
+            m.TimeSpan: self.panel.time.show_span,
+            m.SceneChanges: self.panel.time.show_changes,
             Clicked: self._clicked,
             Dragged: self._dragged,
         }
@@ -51,6 +53,7 @@ class Page(BasePage[Panel]):
             Action.SET_POSITION: lambda client: self._edit(self._move_as_typed),
             Action.SHOW_PIXEL_RAY: lambda client: self._edit(self._ray_of_pixel),
             Action.WATCH_IMAGES: lambda client: self._watch_images(),
+            Action.SHOW_TIME: lambda client: ask(m.ShowTime(self.panel.time.chosen_s())),
             Action.SAVE_MAP: lambda client: ask(m.Save("map", client)),
             Action.SAVE_VOXELS: lambda client: ask(m.Save("ply", client)),
             Action.SAVE_PICTURE: self.downloads.picture,

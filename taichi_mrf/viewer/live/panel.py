@@ -7,6 +7,7 @@ import numpy as np
 import viser
 
 from taichi_mrf.viewer.live.actions import Action
+from taichi_mrf.viewer.live.time_folder import TimeFolder
 from taichi_mrf.viewer.messages import Hello, Images, KeyframeInfo, Status
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Tell, rows_html
 from taichi_mrf.viewer.scene.options import ViewOptions
@@ -43,6 +44,7 @@ POSITION_STEP_M = 0.01
 
 _MAP_OPTIONS = ("color_by", "threshold", "size", "shade", "cut_axis", "cut_at", "bricks", "show_baseline")
 _PAGE_OPTIONS = ("follow", "pictures", "dark")
+_TIME_OPTIONS = ("dynamic",)
 
 
 class Panel(BasePanel):
@@ -59,6 +61,9 @@ class Panel(BasePanel):
         self.watch(self.speed, Action.SPEED)
         self.add_legend()
         self.add_counts()
+        self.time = TimeFolder(gui, self)
+        with self.time.folder:
+            self._time_options = OptionWidgets(gui, ViewOptions(), self.options_moved, _TIME_OPTIONS)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Map", viser.Icon.CUBE):
             self._map_options = OptionWidgets(gui, ViewOptions(), self.options_moved, _MAP_OPTIONS)
@@ -79,14 +84,18 @@ class Panel(BasePanel):
 
     def options(self) -> ViewOptions:
         """The view options as the widgets stand."""
-        page, shown = self._page_options.value(), self._map_options.value()
-        values = {name: getattr(page, name) for name in _PAGE_OPTIONS}
-        values |= {name: getattr(shown, name) for name in _MAP_OPTIONS}
+        parts = {
+            _PAGE_OPTIONS: self._page_options,
+            _MAP_OPTIONS: self._map_options,
+            _TIME_OPTIONS: self._time_options,
+        }
+        values = {name: getattr(widgets.value(), name) for names, widgets in parts.items() for name in names}
         return ViewOptions(**values)
 
     def show_hello(self, hello: Hello) -> None:
         """Show the source, the backend and the parameters."""
         self._hello = hello
+        self.time.begin(hello.has_dates)
         self._parameters.content = (
             '<div style="margin:0.5em 0.75em;font-size:0.85em">Parameters'
             f'<pre style="overflow:auto;margin:0.3em 0">{in_html(hello.parameters)}</pre></div>'

@@ -29,7 +29,7 @@ _HEAD_START_S = 0.01
 """Delay that lets the new count reach the browser before the voxel data: a browser that draws by software is
 busy with the voxels for half a second."""
 
-_ONLY_THE_LATEST = (m.Status, m.CurrentCamera, m.Images, OptionsMoved)
+_ONLY_THE_LATEST = (m.Status, m.CurrentCamera, m.Images, m.TimeSpan, m.SceneChanges, OptionsMoved)
 """Of several of these that wait, only the latest is handled."""
 
 
@@ -100,6 +100,7 @@ class BasePage(Generic[P]):
         """Show how many voxels the page shows, or will show in a moment."""
         if self.map is not None:
             shown = {name: layer.voxels_shown for name, layer in self.map.layers.items()}
+            shown["dynamic"] = self.map.layers["map"].dynamic_shown
             self.panel.show_counts(shown, self.downloads.is_recording)
 
     def _announce(self) -> None:

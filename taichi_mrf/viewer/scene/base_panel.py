@@ -72,8 +72,9 @@ class BasePanel:
 
     def show_counts(self, voxels: Mapping[Layer, int], recording: bool) -> None:
         """Show how many voxels of each layer the page shows, and whether the scene is being recorded."""
-        baseline = voxels["baseline"]
-        text = f"{voxels['map']:,} voxels shown" + (f", {baseline:,} of the baseline" if baseline else "")
+        baseline, dynamic = voxels["baseline"], voxels["dynamic"]
+        text = f"{voxels['map']:,} voxels shown" + (f", {dynamic:,} dynamic" if dynamic else "")
+        text += f", {baseline:,} of the baseline" if baseline else ""
         self._shown.content = text + (" · recording" if recording else "")
 
     def show_legend(self, legend_html: str) -> None:

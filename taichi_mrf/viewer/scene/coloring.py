@@ -21,6 +21,9 @@ _MAPS = {
 }
 
 
+DYNAMIC_COLOR = (255, 30, 20)
+"""The colour of dynamic voxels, which no scale has."""
+
 _DARKENED = (0.75, 0.62, 1.0)
 """Brightness of surfaces perpendicular to x, y and z."""
 
@@ -100,6 +103,16 @@ def legend_html(scale: Scale) -> str:
         f'src="data:image/png;base64,{png}">'
         '<div style="display:flex;justify-content:space-between">'
         f"<span>{scale.low:.3g}</span><span>{scale.label}</span><span>{scale.high:.3g}</span></div></div>"
+    )
+
+
+def dynamic_legend_html() -> str:
+    """What the colour of dynamic voxels means, for the page."""
+    red, green, blue = DYNAMIC_COLOR
+    return (
+        '<div style="padding:0 0.75em;font-size:0.85em"><span style="display:inline-block;width:0.8em;'
+        f'height:0.8em;background:rgb({red},{green},{blue});margin-right:0.4em"></span>'
+        "dynamic: occupied now, usually free</div>"
     )
 
 

@@ -73,9 +73,10 @@ class MapScene:
 
     def take(self, bricks: Bricks) -> None:
         """Take in changed bricks; :meth:`flush` draws them."""
-        store = self.layers[bricks.layer].store
+        layer: Layer = "map" if bricks.layer == "dynamic" else bricks.layer
+        store = self.layers[layer].dynamic if bricks.layer == "dynamic" else self.layers[layer].store
         changed = store.put(bricks.bricks, bricks.log_odds, bricks.seen) | store.remove(bricks.removed)
-        self._dirty[bricks.layer] |= changed
+        self._dirty[layer] |= changed
         self._news_at = time.monotonic()
 
     def look_changed(self) -> None:

@@ -46,5 +46,8 @@ class ViewOptions:
     show_baseline: bool = False
     """Also map the same keyframes with OctoMap's log-odds update, and show that map next to this one."""
 
+    dynamic: bool = True
+    """Show in red what is dynamic: occupied now, although all keyframes together say that it is free."""
+
     dark: bool = False
     """Dark colours for the page."""

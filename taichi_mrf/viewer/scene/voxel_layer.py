@@ -6,7 +6,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from taichi_mrf.viewer.scene.coloring import Scale, voxel_colors
+from taichi_mrf.viewer.scene.coloring import DYNAMIC_COLOR, Scale, voxel_colors
 from taichi_mrf.viewer.scene.voxel_store import ChunkKey, Cut, VoxelStore, facing
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
@@ -24,6 +24,8 @@ class Look:
     point_size: float
     """In voxels."""
     shade: bool
+    dynamic: bool
+    """Whether dynamic voxels have a colour of their own."""
     up: tuple[int, int]
     """The axis that points up, and 1 or -1 for its direction."""
 
@@ -35,6 +37,8 @@ class _Sent:
     cells: NDArray[np.uint8]
     colors: NDArray[np.uint8]
     point_size: float
+    dynamic: int
+    """How many of the voxels have the colour of dynamic ones."""
     exact: bool = True
 
     @property
@@ -44,11 +48,15 @@ class _Sent:
 
 
 class VoxelLayer:
-    """Owns the scene nodes under ``prefix``."""
+    """Owns the scene nodes under ``prefix``.
+
+    ``dynamic`` holds the dynamic voxels of the same map. They differ in colour and are no points of their
+    own, which would flicker in the place of others.
+    """
 
     def __init__(self, scene: viser.SceneApi, prefix: str, voxel_size: float) -> None:
         self._scene, self._prefix, self._voxel_size = scene, prefix, voxel_size
-        self.store = VoxelStore()
+        self.store, self.dynamic = VoxelStore(), VoxelStore()
         self.origin_m = np.zeros(3)
         self.bytes_sent = 0
         self._sent: dict[ChunkKey, _Sent] = {}
@@ -58,8 +66,12 @@ class VoxelLayer:
     @property
     def voxels_shown(self) -> int:
         """Number of voxels that clients show once everything prepared has been sent."""
-        ahead: dict[ChunkKey, _Sent | None] = {**self._sent, **self._prepared}
-        return sum(len(each.cells) for each in ahead.values() if each is not None)
+        return sum(len(each.cells) for each in self._ahead())
+
+    @property
+    def dynamic_shown(self) -> int:
+        """How many of them have the colour of dynamic voxels."""
+        return sum(each.dynamic for each in self._ahead())
 
     def place(self, origin_m: NDArray[np.float64]) -> None:
         """Move the whole layer to another origin, (3,) in metres, world."""
@@ -92,10 +104,15 @@ class VoxelLayer:
 
     def clear(self) -> None:
         """Remove everything from the scene and from the store."""
-        self.store = VoxelStore()
+        self.store, self.dynamic = VoxelStore(), VoxelStore()
         self._prepared.clear()
         for key in list(self._sent):
             self._take_out(key)
+
+    def _ahead(self) -> list[_Sent]:
+        """What clients have of each chunk once everything prepared has been sent."""
+        ahead: dict[ChunkKey, _Sent | None] = {**self._sent, **self._prepared}
+        return [each for each in ahead.values() if each is not None]
 
     def points(self) -> NDArray[np.float64]:
         """Centres (n, 3) in metres, in the world, of all voxels that are shown."""
@@ -114,12 +131,16 @@ class VoxelLayer:
         axis, sign = look.up
         heights = sign * (key[axis] * CHUNK_VOXELS + 0.5 + shown.cells[:, axis]) * self._voxel_size
         faces = facing(shown.cells) if look.shade else None
-        now = _Sent(shown.cells, voxel_colors(look.scale, shown, heights, faces), look.point_size)
+        colors = voxel_colors(look.scale, shown, heights, faces)
+        dynamic = self._is_dynamic(key, shown.cells) if look.dynamic else np.zeros(len(colors), np.bool_)
+        colors[dynamic] = DYNAMIC_COLOR
+        now = _Sent(shown.cells, colors, look.point_size, int(dynamic.sum()))
         if before is not None and np.array_equal(before.cells, now.cells):
             moved = np.abs(before.colors.astype(np.int16) - now.colors).max()
             if before.point_size != now.point_size:
                 self._nodes[key].point_size = now.point_size
                 before.point_size = now.point_size
+            before.dynamic = now.dynamic
             if moved == 0:
                 before.exact = True
                 return
@@ -127,6 +148,11 @@ class VoxelLayer:
                 before.exact = False
                 return
         self._prepared[key] = now
+
+    def _is_dynamic(self, key: ChunkKey, cells: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Which of a chunk's voxels (n, 3) are dynamic, (n,)."""
+        across = np.array([CHUNK_VOXELS**2, CHUNK_VOXELS, 1], np.int32)
+        return np.isin(cells @ across, self.dynamic.shown(key, 0.0, None).cells @ across)
 
     def _send(self, key: ChunkKey, now: _Sent) -> None:
         self._nodes[key] = self._scene.add_point_cloud(

@@ -1,0 +1,134 @@
+"""What the page shows of the map: as it is believed now or was believed at another time, with its dynamic
+voxels as a layer of their own.
+
+A reading of the past is renewed only from time to time, because it takes all messages.
+"""
+
+import math
+import time
+from collections.abc import Collection
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.live.live_keyframes import LiveKeyframe
+from taichi_mrf.live.publish import Publisher
+from taichi_mrf.methods.capabilities import has_dates
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Bricks, TimeSpan
+from taichi_mrf.voxels.layout import VOXELS
+
+RENEW_SECONDS = 1.0
+"""Shortest time between two readings of the map as of the same time, in seconds."""
+
+NOT_DYNAMIC = -1.0
+"""The log-odds that are sent of voxels outside the dynamic layer: any below 0 will do."""
+
+
+class ShownMap:
+    """Finds what to send of a map. ``stamp_s`` is the time that is shown, None for now."""
+
+    def __init__(self, m: OccupancyMap) -> None:
+        self.map = m
+        self.stamp_s: float | None = None
+        self._pool = m.view.pool
+        self._past = self._pool  # of the reading that is shown while stamp_s is set
+        self._outdated, self._read_at = False, -math.inf  # whether renew() has something to do
+        self.publisher = Publisher(
+            "map",
+            self._pool,
+            m.seen_by,
+            prior_is_unknown=m.METHOD.prior_is_unknown,
+            counting=False,
+            beliefs=self._beliefs,
+        )
+        self._dynamic: Publisher | None = None
+        if has_dates(m):
+            # Packed log-odds of 0 count as occupied.
+            least = -0.5 * LOG_ODDS_STEP
+            self._dynamic = Publisher(
+                "dynamic",
+                self._pool,
+                m.seen_by,
+                least_log_odds=least,
+                counting=False,
+                beliefs=self._dynamic_beliefs,
+            )
+
+    @property
+    def has_dates(self) -> bool:
+        """Whether the map can be shown as of another time."""
+        return self._dynamic is not None
+
+    def show(self, stamp_s: float | None) -> None:
+        """Show the map as of a time in seconds, None for now; :meth:`renew` does the work."""
+        if self.has_dates and stamp_s != self.stamp_s:
+            self.stamp_s, self._outdated, self._read_at = stamp_s, True, -math.inf
+            if stamp_s is None:
+                self._past = self._pool
+                self._look_again()
+
+    def changes(self) -> list[Bricks]:
+        """What has changed of each layer since the last call. While the past is shown it is nothing, and
+        :meth:`renew` follows."""
+        self._outdated = self.stamp_s is not None
+        if self._outdated:
+            return []
+        return self._changes()
+
+    def renew(self) -> list[Bricks]:
+        """Go to another time, or read the past again if the map has changed and a moment has gone by.
+        Returns what has changed of each layer."""
+        if not self._outdated or time.monotonic() - self._read_at < RENEW_SECONDS:
+            return []
+        if self.stamp_s is not None:
+            assert has_dates(self.map)
+            self._past = self.map.layer(stamp_s=self.stamp_s).view.pool
+            self._look_again()
+            self._read_at = time.monotonic()
+        self._outdated = False
+        return self._changes()
+
+    def start_over(self) -> None:
+        """Send everything with the next changes: the viewer is a new one."""
+        self.show(None)
+        for publisher in self._publishers():
+            publisher.start_over()
+
+    def _changes(self) -> list[Bricks]:
+        touched = self._pool.take_touched()
+        found = (publisher.changes(touched) for publisher in self._publishers())
+        return [bricks for bricks in found if bricks is not None]
+
+    def _publishers(self) -> list[Publisher]:
+        return [self.publisher] if self._dynamic is None else [self.publisher, self._dynamic]
+
+    def _look_again(self) -> None:
+        for publisher in self._publishers():
+            publisher.look_again()
+
+    def _beliefs(self, slots: NDArray[np.int32]) -> NDArray[np.float32]:
+        return self._past.read("belief", slots)
+
+    def _dynamic_beliefs(self, slots: NDArray[np.int32]) -> NDArray[np.float32]:
+        """The dynamic layer of inference/dated.py, of some bricks alone: occupied at the time that is shown,
+        although all evidence together says free."""
+        if not len(slots):
+            return np.zeros((0, VOXELS), np.float32)
+        belief, total = self._beliefs(slots), self._pool.read("total", slots)
+        dynamic = (belief >= 0) & (total < self._pool.prior_log_odds)
+        return np.where(dynamic, belief, np.float32(NOT_DYNAMIC))
+
+
+def time_span(shown: ShownMap, entries: Collection[LiveKeyframe]) -> TimeSpan | None:
+    """The times at which a map can be shown; None for a map without dates or keyframes.
+
+    Frozen keyframes count from the newest of them on, and before that the map would lack them.
+    """
+    on = [entry.stamp_s for entry in entries if entry.state == "on"]
+    frozen = [entry.stamp_s for entry in entries if entry.state == "frozen"]
+    if not shown.has_dates or not on + frozen:
+        return None
+    first = max(frozen) if frozen else min(on)
+    start = min(entry.stamp_s for entry in entries)  # also of those that are off, or all times would shift
+    return TimeSpan(start, first, max(on + frozen), shown.stamp_s)

@@ -1,0 +1,105 @@
+"""The live page of a world that changes, in a real Chromium: a person who walks, and the slider of time."""
+
+import re
+from collections.abc import Iterator
+
+import pytest
+from browser import LivePage, Seen, chromium, missing
+from live_program import LiveProgram
+
+from taichi_mrf import MRFMap
+from taichi_mrf.methods.mrf.reading import MapReading
+from taichi_mrf.system import runtime
+from taichi_mrf.viewer.scene.coloring import DYNAMIC_COLOR
+
+WALKER = "synthetic:room?moving=walker&width=80&height=60"
+FRAMES, BEFORE_S = 25, 14
+"""The person comes in at 16 s; a frame is taken each second."""
+
+RED = """color => Object.entries(window.__viserMutable.nodeRefFromName).reduce((count, [name, node]) => {
+  if (!node || !name.startsWith('/voxels/')) return count;
+  node.traverse(object => {
+    const c = object.isPoints ? object.geometry.attributes.color : {count: 0};
+    for (let i = 0; i < c.count; i++)
+      count += [c.getX(i), c.getY(i), c.getZ(i)].every((value, k) => Math.round(255 * value) === color[k]);
+  });
+  return count;
+}, 0)"""
+
+pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[LivePage]:
+    """The room while a person walks in it; no more frames come."""
+    flags = ("--voxel-size", "0.1", "--runtime.arch", "cpu", "--limit", str(FRAMES))
+    with (
+        LiveProgram(WALKER, *flags) as program,
+        chromium() as browser,
+        LivePage(browser, program.address) as opened,
+    ):
+        opened.until_settled()
+        yield opened
+        assert opened.problems == []
+
+
+@pytest.fixture(scope="module")
+def saved(page: LivePage, tmp_path_factory: pytest.TempPathFactory) -> MRFMap:
+    """The map as the page's button saves it."""
+    path = tmp_path_factory.mktemp("saved") / "map.npz"
+    page.tab("Save")
+    page.download("Map").save_as(path)
+    runtime.init("cpu")
+    return MRFMap.load(path)
+
+
+def voxels_of(m: MRFMap | MapReading) -> int:
+    return len(m.voxels(0.5)[0])
+
+
+def red(page: LivePage) -> int:
+    return int(page.page.evaluate(RED, list(DYNAMIC_COLOR)))
+
+
+def said_dynamic(page: LivePage) -> int:
+    found = re.search(r"([\d,]+) dynamic", page.text())
+    return int(found[1].replace(",", "")) if found else 0
+
+
+def test_dynamic_voxels_are_red_unless_the_box_is_cleared(page: LivePage, saved: MRFMap) -> None:
+    dynamic = voxels_of(saved.dynamic)
+    assert dynamic > 50
+    page.until(lambda seen: seen.agrees and red(page) == said_dynamic(page) == dynamic, "red voxels")
+    page.screenshot("walker_dynamic")
+    page.tick("Dynamic", on=False)
+    page.until(lambda seen: seen.agrees and red(page) == said_dynamic(page) == 0, "no red voxels")
+    page.tick("Dynamic")
+    page.until(lambda seen: seen.agrees and red(page) == said_dynamic(page) == dynamic, "red voxels")
+
+
+def test_the_list_names_what_appeared(page: LivePage) -> None:
+    line = r"\d+\.0 s: something of \d\.\d x \d\.\d x \d\.\d m (appeared|left) at \(.+, .+, .+\)"
+    page.until(lambda seen: re.search(line, page.text()), "a line about the person")
+
+
+def test_the_slider_shows_the_past_and_returns_to_now(page: LivePage, saved: MRFMap) -> None:
+    now, then = voxels_of(saved), voxels_of(saved.at(BEFORE_S))
+    assert now != then
+
+    def showing(voxels: int) -> Seen:
+        return page.until(lambda seen: seen.agrees and seen.voxels == voxels, f"{voxels} voxels")
+
+    showing(now)
+    page.slide("Time (s)", BEFORE_S)
+    showing(then)
+    page.screenshot("walker_before")
+    page.slide("Time (s)", saved.now_s)
+    showing(now)
+    page.slide("Time (s)", BEFORE_S)
+    showing(then)
+    page.tab("Keyframes")
+    page.select("Keyframe", "0: room-0000 (on)")
+    page.press("On/off")
+    page.until(lambda seen: seen.settled and seen.voxels not in (now, then), "the map after an edit")
+    value = page.input("Time (s)").locator("xpath=..").get_by_role("textbox").input_value()
+    assert float(value) == saved.now_s

@@ -1,0 +1,146 @@
+"""The live page's past and present: what is sent of a map whose world may change, and what is listed."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import small_room
+from live_scene import CONFIG, FakeLink, RoomFrames, Shown, finished, map_voxels, session_of, shown
+
+from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.live.shown_map import ShownMap
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.mrf.reading import MapReading
+from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.viewer.messages import SceneChanges, ShowTime, Switch, TimeSpan
+
+pytestmark = pytest.mark.usefixtures("one_backend")
+
+DATED = replace(CONFIG, time=TimeConfig(half_life_s=600.0))
+START_S, EMPTY, FRAMES = 100.0, 4, 7
+
+
+def frame(index: int) -> Frame:
+    """The first frame, a second apart; from EMPTY on something stands halfway between camera and wall."""
+    first = small_room.frames()[0]
+    depth_m = first.depth_m.copy()
+    if index >= EMPTY:
+        depth_m[40:80, 60:100] *= 0.5
+    return replace(first, depth_m=depth_m, stamp=START_S + index, name=f"room {index}")
+
+
+@dataclass
+class VisitedRoom(RoomFrames):
+    """The frames above."""
+
+    count: int = FRAMES
+
+    def read(self, index: int) -> Frame:
+        return frame(index)
+
+
+def visited() -> VisitedRoom:
+    return VisitedRoom("visited room", small_room.frames()[0].camera)
+
+
+def visited_map(time: TimeConfig) -> MRFMap:
+    m = MRFMap(small_room.VOXEL_SIZE, time=time)
+    for i in range(FRAMES):
+        f = frame(i)
+        m.add_keyframe(f.depth_m, f.T_world_camera, f.camera, f.name, f.stamp)
+    m.infer()
+    return m
+
+
+def hear(view: Shown, shown_map: ShownMap, renewed: bool = False) -> Shown:
+    for bricks in shown_map.renew() if renewed else shown_map.changes():
+        view.hear(bricks)
+    return view
+
+
+def voxels(m: MRFMap | MapReading) -> set[tuple[int, int, int]]:
+    return map_voxels(m)
+
+
+def test_the_past_is_sent_and_the_present_comes_back() -> None:
+    m = visited_map(DATED.time)
+    shown_map, before_s = ShownMap(m), START_S + EMPTY - 1
+    view = hear(Shown(), shown_map)
+    now, then = voxels(m), voxels(m.at(before_s))
+    assert len(now - then) > 20
+    assert view.voxels() == now
+    assert view.voxels("dynamic") == voxels(m.dynamic)
+    assert len(view.voxels("dynamic") & (now - then)) > 20
+    shown_map.show(before_s)
+    assert hear(view, shown_map, renewed=True).voxels() == then
+    assert not view.voxels("dynamic") & (now - then)
+    assert shown_map.changes() == []
+    assert shown_map.renew() == []  # a moment has not gone by
+    shown_map.show(None)
+    assert hear(view, shown_map, renewed=True).voxels() == now
+    assert view.voxels("dynamic") == voxels(m.dynamic)
+
+
+def test_the_past_follows_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("taichi_mrf.live.shown_map.RENEW_SECONDS", 0.0)
+    m = visited_map(DATED.time)
+    shown_map, before_s = ShownMap(m), START_S + EMPTY - 1
+    view = hear(Shown(), shown_map)
+    shown_map.show(before_s)
+    hear(view, shown_map, renewed=True)
+    other = small_room.frames()[3]
+    m.add_keyframe(other.depth_m, other.T_world_camera, other.camera, "another view", START_S)
+    m.infer()
+    hear(view, shown_map)
+    assert view.voxels() != voxels(m.at(before_s))
+    assert hear(view, shown_map, renewed=True).voxels() == voxels(m.at(before_s))
+
+
+def test_a_static_map_has_no_past() -> None:
+    m = visited_map(TimeConfig())
+    shown_map = ShownMap(m)
+    view = hear(Shown(), shown_map)
+    shown_map.show(START_S)
+    assert shown_map.stamp_s is None
+    assert shown_map.renew() == []
+    assert view.voxels() == voxels(m)
+    assert "dynamic" not in view.bricks
+
+
+def test_an_edit_returns_to_now() -> None:
+    link = FakeLink()
+    session = session_of(link, visited(), DATED)
+    m = finished(session)
+    spans = link.of_type(TimeSpan)
+    last_s = START_S + FRAMES - 1
+    assert (spans[-1].start_s, spans[-1].first_s, spans[-1].now_s) == (START_S, START_S, last_s)
+    link.ask(ShowTime(START_S + EMPTY - 1))
+    finished(session)
+    session._extras.work(lambda step: True)
+    assert link.of_type(TimeSpan)[-1].shown_s == START_S + EMPTY - 1
+    assert shown(link.sent).voxels() == voxels(m.at(START_S + EMPTY - 1))
+    link.ask(Switch(0, on=False))
+    m = finished(session)
+    assert link.of_type(TimeSpan)[-1].shown_s is None
+    assert shown(link.sent).voxels() == voxels(m)
+
+
+def test_what_appears_is_listed_once_with_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("taichi_mrf.live.change_list.SHARE_OF_TIME", 1.0)
+    link = FakeLink()
+    finished(session_of(link, visited(), DATED))
+    (latest,) = [update.changes for update in link.of_type(SceneChanges)][-1:]
+    appeared = [change for change in latest if change.verb == "appeared"]
+    assert 1 <= len(appeared) <= 2
+    assert START_S + EMPTY <= appeared[-1].stamp_s < START_S + FRAMES
+    f = frame(EMPTY)
+    z = float(f.depth_m[60, 80])
+    at = f.T_world_camera @ [(80 - f.camera.cx) / f.camera.fx * z, (60 - f.camera.cy) / f.camera.fy * z, z, 1]
+    assert np.linalg.norm(np.array(appeared[-1].centre_m) - at[:3]) < 0.4
+
+
+def test_nothing_is_listed_of_a_scene_in_which_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("taichi_mrf.live.change_list.SHARE_OF_TIME", 1.0)
+    link = FakeLink()
+    finished(session_of(link, VisitedRoom("empty", small_room.frames()[0].camera, count=EMPTY), DATED))
+    assert link.of_type(SceneChanges) == []

@@ -1,0 +1,122 @@
+"""The folder "Time" of the live page, without a mapping process: its slider, its list, dynamic voxels."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from taichi_mrf.viewer import messages as m
+from taichi_mrf.viewer.live.actions import Action
+from taichi_mrf.viewer.live.page import Page
+from taichi_mrf.viewer.scene.coloring import DYNAMIC_COLOR
+from taichi_mrf.viewer.scene.options import ViewOptions
+from taichi_mrf.viewer.transport.server import start_server
+
+HELLO = m.Hello("a recording", "cpu", "a device", "mrf", 0.1, -2.0, 0.1, "voxel_size: 0.1", has_dates=True)
+START_S = 1.7e9
+NOTHING = np.zeros((0, 3), np.int32)
+
+
+class TimePage:
+    """A page of a dated map; ``asked`` is what it asked of the mapping process."""
+
+    def __init__(self) -> None:
+        self.server = start_server("127.0.0.1", 0, "Time")
+        self.asked: list[m.Request] = []
+        self.page = Page(self.server, self.asked.append)
+        self.time = self.page.panel.time
+        self.take(HELLO)
+
+    def take(self, *updates: m.Update) -> None:
+        for update in updates:
+            self.page.handlers[type(update)](update)
+
+    def span(self, now_s: float, first_s: float = 0.0, shown_s: float | None = None) -> None:
+        shown = None if shown_s is None else START_S + shown_s
+        self.take(m.TimeSpan(START_S, START_S + first_s, START_S + now_s, shown))
+
+    def move_to(self, seconds: float) -> m.Request:
+        """Move the slider as a user does; returns what is then asked."""
+        self.time.slider.value = seconds
+        self.page.actions[Action.SHOW_TIME](0)
+        return self.asked[-1]
+
+
+@pytest.fixture
+def running() -> Iterator[TimePage]:
+    page = TimePage()
+    yield page
+    page.server.stop()
+
+
+def test_the_right_end_is_now_and_follows(running: TimePage) -> None:
+    slider = running.time.slider
+    running.span(0.0)
+    assert slider.disabled
+    for now_s in (1.0, 7.26):
+        running.span(now_s)
+        assert (slider.min, slider.max, slider.value) == (0.0, round(now_s, 1), round(now_s, 1))
+        assert not slider.disabled
+    assert running.move_to(7.3) == m.ShowTime(None)
+    assert running.move_to(2.5) == m.ShowTime(START_S + 2.5)
+    running.span(9.0, shown_s=2.5)
+    assert (slider.max, slider.value) == (9.0, 2.5)
+    running.span(9.0)
+    assert slider.value == 9.0
+
+
+def test_the_past_begins_at_the_newest_frozen_keyframe(running: TimePage) -> None:
+    running.span(9.0, first_s=4.04)
+    assert (running.time.slider.min, running.time.slider.max) == (4.0, 9.0)
+    assert running.move_to(4.0) == m.ShowTime(START_S + 4.04)
+
+
+def test_the_list_says_what_happened_and_when(running: TimePage) -> None:
+    running.span(20.0)
+    chair = m.SceneChange(START_S + 12.4, "appeared", (0.5, 0.5, 0.52), (1.0, 2.0, 0.4))
+    running.take(m.SceneChanges((chair,)))
+    assert "12.4 s: something of 0.5 x 0.5 x 0.5 m appeared at (1.0, 2.0, 0.4)" in running.time._list.content
+    running.take(HELLO)
+    assert "appeared at" not in running.time._list.content
+
+
+def test_a_static_map_has_no_folder(running: TimePage) -> None:
+    assert running.time.folder.visible
+    running.take(replace(HELLO, has_dates=False))
+    assert not running.time.folder.visible
+
+
+def test_dynamic_voxels_have_their_colour_and_are_counted(running: TimePage) -> None:
+    brick, seen = np.zeros((1, 3), np.int32), np.zeros((1, 512), np.uint8)
+    occupied, dynamic = np.full((1, 512), -900, np.int16), np.full((1, 512), -512, np.int16)
+    occupied[0, :40] = 900
+    dynamic[0, :7] = 900
+    running.take(m.Bricks("map", brick, occupied, seen, NOTHING))
+    assert (len(colors(running)), red(running)) == (40, 0)
+    running.take(m.Bricks("dynamic", brick, dynamic, seen, NOTHING))
+    assert (len(colors(running)), red(running)) == (40, 7)
+    running.page.show_counts()
+    assert running.page.panel._shown.content == "40 voxels shown, 7 dynamic"
+    running.page.options = replace(ViewOptions(), dynamic=False)
+    running.page.map.look_changed()
+    assert (len(colors(running)), red(running)) == (40, 0)
+    running.page.options = ViewOptions()
+    running.page.map.look_changed()
+    assert red(running) == 7
+    running.take(m.Bricks("dynamic", brick[:0], dynamic[:0], seen[:0], brick))
+    assert (len(colors(running)), red(running)) == (40, 0)
+
+
+def colors(running: TimePage) -> np.ndarray:
+    """The colours of the points in the scene, once all has been drawn."""
+    scene = running.page.map
+    assert scene is not None
+    scene._sent_at = 0.0
+    running.page._flush()
+    (node,) = scene.layers["map"]._nodes.values()
+    return np.asarray(node.colors)
+
+
+def red(running: TimePage) -> int:
+    return int((colors(running) == DYNAMIC_COLOR).all(axis=1).sum())
