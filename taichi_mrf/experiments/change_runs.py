@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from taichi_mrf import Frame, LogOddsMap, MRFMap, PolynomialNoise, open_dataset
 from taichi_mrf.config.time import TimeConfig
@@ -17,7 +18,7 @@ from taichi_mrf.datasets.synthetic.moving_scene import distance_to_solids
 from taichi_mrf.datasets.synthetic.room import SyntheticRoom
 from taichi_mrf.datasets.synthetic.room_furniture import ROOM_IN_WORLD
 from taichi_mrf.evaluation.moving_truth import NEAR_M, Mask, MovingTruth, Points, Standing, voxel_keys
-from taichi_mrf.evaluation.robot_paths import Drives, Paths
+from taichi_mrf.evaluation.robot_paths import RADIUS_M, Drives, Paths
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.methods.capabilities import has_messages
 from taichi_mrf.methods.protocol import OccupancyMap
@@ -223,7 +224,8 @@ def run_script(
         layer = m.dynamic.voxels()[0] if contender.layered else occupied[:0]  # type: ignore[attr-defined]
         new.follow(truth, index, occupied, layer)
         if not tuning and index >= FIRST_DRIVE:
-            _drive(m, truth, index, drives)
+            paths, clearance_m = _paths(truth, index)
+            drives.add(paths.trusted(m), clearance_m)
     came, left_ = ([asdict(w) for w in each if w is not None and w.seen] for each in (
         [p.came for p in places], [p.left for p in places],
     ))  # fmt: skip
@@ -237,8 +239,19 @@ def run_script(
     }
 
 
-def _drive(m: OccupancyMap, truth: MovingTruth, index: int, drives: Drives) -> None:
-    """Random paths at a random time before the next keyframe."""
+def perfect_drives(truth: MovingTruth) -> Drives:
+    """What comes of the same paths if they are planned on the true scene at each keyframe's time."""
+    drives = Drives()
+    for index in range(FIRST_DRIVE, len(truth.room)):
+        paths, clearance_m = _paths(truth, index)
+        seen_m = paths.clearance(truth.scene.at(truth.room.stamp_at(index)))
+        drives.add(seen_m > RADIUS_M, clearance_m)
+    return drives
+
+
+def _paths(truth: MovingTruth, index: int) -> tuple[Paths, NDArray[np.float64]]:
+    """Random paths after a keyframe, and how near they come to surfaces at a random time before the next one,
+    (PATHS,) metres."""
     seed = (truth.room.options.seed, index)
     target = np.array(truth.scene.camera.target)
     reach = np.array([PATH_REACH_M, PATH_REACH_M, np.inf])
@@ -246,7 +259,7 @@ def _drive(m: OccupancyMap, truth: MovingTruth, index: int, drives: Drives) -> N
     upper = np.minimum(target + reach, np.add(PATH_UPPER, ROOM_IN_WORLD))
     paths = Paths.random(PATHS, lower, upper, seed)
     stamp_s = truth.room.stamp_at(index) + float(np.random.default_rng(seed).random())
-    drives.add(paths.trusted(m), paths.clearance(truth.scene.at(stamp_s)))
+    return paths, paths.clearance(truth.scene.at(stamp_s))
 
 
 def _walls(truth: MovingTruth, occupied: Points, bare: Points, voxel_size: float) -> dict[str, Any]:

@@ -24,14 +24,13 @@ class KeyframeSelector:
 
     def __init__(self, config: KeyframeConfig) -> None:
         self._config = config
-        self._accepted: list[Pose] = []
+        self._accepted: list[Pose] = []  # those that frames are compared with
 
     def wants(self, T_world_camera: Pose) -> bool:
         """Whether a frame with this pose, (4, 4), should become a keyframe. Does not change the selector."""
         if self._config.rotation == 0 and self._config.translation == 0:
             return True
-        compared = self._accepted if self._config.against == "all" else self._accepted[-1:]
-        return all(self._is_far(T_world_keyframe, T_world_camera) for T_world_keyframe in compared)
+        return all(self._is_far(T_world_keyframe, T_world_camera) for T_world_keyframe in self._accepted)
 
     def objection(self, T_world_camera: Pose, measured: bool) -> str | None:
         """Why a frame with this pose, (4, 4), does not become a keyframe; None if it does. ``measured``: its
@@ -42,6 +41,8 @@ class KeyframeSelector:
 
     def accept(self, T_world_camera: Pose) -> None:
         """Note the pose of a frame that has become a keyframe."""
+        if self._config.against == "last":
+            self._accepted.clear()  # an endless run has no end of poses
         self._accepted.append(T_world_camera)
 
     def _is_far(self, T_world_keyframe: Pose, T_world_camera: Pose) -> bool:

@@ -14,7 +14,13 @@ from small_scenes import experiment
 from taichi_mrf.datasets.synthetic.moving_scene import distance_to_solids
 from taichi_mrf.evaluation.moving_truth import MovingTruth
 from taichi_mrf.experiments import change_runs, changes
-from taichi_mrf.experiments.change_runs import ChangeContender, Watch, moving_truth, run_script
+from taichi_mrf.experiments.change_runs import (
+    ChangeContender,
+    Watch,
+    moving_truth,
+    perfect_drives,
+    run_script,
+)
 from taichi_mrf.experiments.changes import CLAMPED, DECAY, Figures, run_changes
 from taichi_mrf.queries.points import FREE, OCCUPIED
 
@@ -109,6 +115,13 @@ def test_a_map_that_never_sees_what_moves(truths: dict[str, MovingTruth]) -> Non
     assert figures.new_lost > 0.7
     assert np.isnan(figures.precision)
     assert result["drives"]["hit"] > 0.05 * result["drives"]["taken"]
+
+
+def test_who_knows_the_scene_is_hit_by_what_moves_after_the_keyframe(truths: dict[str, MovingTruth]) -> None:
+    things, walker = perfect_drives(truths["things"]), perfect_drives(truths["walker"])
+    assert things.hit == things.refused == 0
+    assert things.taken >= things.free > 0
+    assert 0 < walker.hit < 0.2 * walker.taken
 
 
 def test_a_watch_counts_views_until_the_map_is_right() -> None:

@@ -1,6 +1,7 @@
 """The folder of a map with a window: what it answers, and how it fares with saved maps and failing disks."""
 
 import gc
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from sliding_camera import CAMERA
 from window_walk import CHUNK_M, OUT, VOXEL, WINDOW_M, add, probes, unwindowed, walk, walk_both, windowed
 
 from taichi_mrf.config.schema import VolumeConfig
-from taichi_mrf.errors import ConfigError, MapFileError
+from taichi_mrf.errors import ConfigError, MapFileError, TaichiMRFError
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import ChunkedViews, take_part
@@ -176,6 +177,12 @@ def test_a_map_of_an_earlier_run_is_replaced(tmp_path: Path) -> None:
 def test_methods_that_cannot_freeze_refuse_a_window(method: type) -> None:
     with pytest.raises(ConfigError, match=r"volume.window_m needs the method mrf, not"):
         method(VOXEL, volume=VolumeConfig(window_m=WINDOW_M))
+
+
+def test_without_zarr_the_error_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    with pytest.raises(TaichiMRFError, match=r"volume.window_m needs zarr, which is not installed: pip"):
+        windowed()
 
 
 @pytest.mark.parametrize("size", [-1.0, float("nan"), float("inf")])
