@@ -78,10 +78,17 @@ def live_stages(m: MRFMap, frame: Frame) -> dict[str, Callable[[], object]]:
     both at once.
     """
     added: list[int] = []
+    parts = (frame.depth_m, frame.T_world_camera, frame.camera, frame.name, frame.stamp)
+
+    def renew() -> InferReport:
+        report = m.renew()
+        m.view.pool.belief  # noqa: B018 (a dated map brings it up to date when it is read)
+        return report
+
     return {
-        "allocate": lambda: added.append(m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera)),
+        "allocate": lambda: added.append(m.add_keyframe(*parts)),
         "own_sweep": lambda: m.infer(sweeps=1, keyframes=added),
-        "reinference": m.renew,
+        "reinference": renew,
     }
 
 

@@ -19,7 +19,7 @@ class TimeConfig:
     600 a few views are enough to see what is new, whatever was there before. 0 is a world that never
     changes, for surveys."""
 
-    moving_share: float = 1e-4
+    moving_share: float = 1e-6
     """Share of space that things which come and go fill. The smaller it is, the more views it takes until a
     surface that was seen often counts as gone. Only mrf uses it."""
 

@@ -64,6 +64,7 @@ class DatedBelief:
         self.pool, self.time, self._keyframes = pool, time, keyframes
         self._channels = Channels.at_prior(pool.capacity, pool.prior_log_odds)
         self._outdated = np.zeros(len(self._channels.stamp_s), bool)
+        self._folded: set[int] = set()  # keyframes whose messages are in the beliefs, or are outdated there
         self.frozen: Channels | None = None
 
     @property
@@ -100,20 +101,27 @@ class DatedBelief:
             self._age(channels, seen, np.full(len(seen), stamp_s))
         return channels.shown
 
-    def outdate(self, slots: NDArray[np.int32] | None = None) -> None:
-        """Messages to these bricks have changed; None for all."""
-        self._outdated[slice(None) if slots is None else slots] = True
+    def outdate(self) -> None:
+        """All messages may have changed."""
+        self._outdated[:] = True
+        self._folded = {keyframe.id for keyframe in self._keyframes() if keyframe.messages is not None}
 
-    def note_sweep(self, keyframe: Keyframe, moved: NDArray[np.int32], first: bool) -> None:
-        """A sweep has renewed a keyframe's messages, or has computed the ``first``; ``moved`` (n) counts the
-        marginals that it has moved in each visible brick."""
+    def withdraw(self, keyframe: Keyframe) -> None:
+        """A keyframe goes, or is frozen: its messages no longer count."""
+        self._outdated[keyframe.visible.slots] = True
+        self._folded.discard(keyframe.id)
+
+    def note_sweep(self, keyframe: Keyframe, moved: NDArray[np.int32]) -> None:
+        """A sweep has computed a keyframe's messages; ``moved`` (n) counts the marginals that it has moved in
+        each visible brick."""
         slots = keyframe.visible.slots
-        if not first:
-            self.outdate(slots[moved > FEW_MOVED])
+        if keyframe.id in self._folded:
+            self._outdated[slots[moved > FEW_MOVED]] = True
             return
+        self._folded.add(keyframe.id)
         channels = self._channels
         newest = ~self._outdated[slots] & (channels.stamp_s[slots] <= keyframe.stamp_s)
-        self.outdate(slots[~newest])
+        self._outdated[slots[~newest]] = True
         self._fold(channels, keyframe, np.flatnonzero(newest))
 
     def freeze(self, keyframe: Keyframe) -> None:
@@ -121,7 +129,7 @@ class DatedBelief:
         if self.frozen is None:
             self.frozen = Channels.at_prior(self.pool.capacity, self.pool.prior_log_odds)
         self._fold(self.frozen, keyframe, np.arange(len(keyframe.visible.slots)))
-        self.outdate(keyframe.visible.slots)
+        self.withdraw(keyframe)
 
     def show(self, slots: NDArray[np.int32], belief: NDArray[np.float32], stamp_s: float) -> None:
         """Read these log-odds, (n) -> (n, 512), as of a time until messages change."""
@@ -141,7 +149,7 @@ class DatedBelief:
         for channel in (self.frozen.now, self.frozen.shown):
             write_bricks(channel, slots, flat, strip_length())
         self.frozen.stamp_s[slots] = stamps_s
-        self.outdate(slots)
+        self._outdated[slots] = True
 
     def read_frozen(self, slots: NDArray[np.int32]) -> tuple[NDArray[np.float32], NDArray[np.float64]] | None:
         """The same, to save it; None if nothing is frozen."""
@@ -236,7 +244,7 @@ class DatedBelief:
         lasting = 0.5 ** (seconds / self.time.glimpse_half_life_s)
         lasting[lasting < FORGOTTEN] = 0.0
         share = self.time.moving_share
-        parts = (share * forgotten, (1.0 - share) * forgotten, lasting)
+        parts = (1.0 - forgotten, share * forgotten, (1.0 - share) * forgotten, lasting)
         return Aging(*(part.astype(np.float32) for part in parts))
 
 

@@ -24,6 +24,9 @@ NEVER = -np.inf
 class Aging(Bundle):
     """What time does to some bricks, (n) each."""
 
+    kept: F32Array
+    """Chance that the state is that of then."""
+
     left: F32Array
     """Chance that what is free now was occupied then."""
 
@@ -100,7 +103,7 @@ def fold_bricks(
             message = ti.cast(messages[source + k], ti.f32)
             evidence = now[target + k] - prior
             if evidence != 0.0:
-                evidence = faded(evidence, aging.left[brick], aging.appeared[brick])
+                evidence = faded(evidence, aging.kept[brick], aging.left[brick], aging.appeared[brick])
             glimpse *= aging.lasting[brick]
             if message != 0.0:
                 glimpse = glimpse_of(evidence, message, prior)
@@ -136,7 +139,9 @@ def age_bricks(
             before += ti.cast(glimpse > 0.0, ti.i32)
             glimpse *= aging.lasting[brick]
             after += ti.cast(glimpse > 0.0, ti.i32)
-            evidence = faded(now[target + k] - prior, aging.left[brick], aging.appeared[brick])
+            evidence = faded(
+                now[target + k] - prior, aging.kept[brick], aging.left[brick], aging.appeared[brick]
+            )
             now[target + k] = prior + evidence
             shown[target + k] = now[target + k] + glimpse
         if before != after:

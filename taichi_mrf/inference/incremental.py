@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
 from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
 from taichi_mrf.inference.messages import places_of
-from taichi_mrf.inference.schedule import InferProgress, InferReport, Progress
+from taichi_mrf.inference.schedule import InferProgress, InferReport, NoteSweep, Progress
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import VOXELS
@@ -57,12 +57,11 @@ class IncrementalInference:
         look_again: Callable[[Keyframe], object],
         refresh: Callable[[Keyframe], object],
         usual: float,
-        note_sweep: Callable[[Keyframe, NDArray[np.int32], bool], object] | None = None,
+        note_sweep: NoteSweep | None = None,
     ) -> None:
         """``look_again`` brings the list of a keyframe's bricks up to date, ``refresh`` its messages too;
         ``usual`` is the tolerance above which a keyframe waits even if a call tolerates more. ``note_sweep``
-        is called after each sweep with the keyframe, how many marginals have moved in each of its bricks, and
-        whether it was its first."""
+        is called after each sweep."""
         self.pool, self.sweeper, self.bounds, self.usual = pool, sweeper, bounds, usual
         self.look_again, self.refresh = look_again, refresh
         self._note_sweep = note_sweep
@@ -100,13 +99,12 @@ class IncrementalInference:
                 if seconds is not None and time.perf_counter() - begin >= seconds:
                     break
             keyframe = keyframes[id]
-            is_first = keyframe.messages is None
             self.refresh(keyframe)
             self.pool.touch(keyframe.visible.slots)
             if self.sweeper.sweep(keyframe, self.pool):
                 moved = self.sweeper.take_moved(keyframe, self.pool)
                 if self._note_sweep is not None:
-                    self._note_sweep(keyframe, moved, is_first)
+                    self._note_sweep(keyframe, moved)
             else:
                 keyframe.change_count_at_last_sweep = np.zeros(0, np.int64)  # it sees no brick
             rays, swept = rays + keyframe.rays, swept + 1

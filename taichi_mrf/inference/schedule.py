@@ -11,6 +11,9 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.kernels.resident import on_host
@@ -43,6 +46,9 @@ class InferReport:
 
 
 Progress = Callable[[InferProgress], bool]
+
+NoteSweep = Callable[[Keyframe, NDArray[np.int32]], object]
+"""Called after a sweep over a keyframe with how many marginals have moved in each of its bricks, (n,)."""
 
 InferSteps = Generator[InferProgress, None, InferReport]
 """Inference step by step: it yields after each keyframe. StopRequestedError, thrown in, ends it early."""
@@ -90,6 +96,7 @@ def sweep_steps(
     sweeper: Sweeper,
     sweeps: int,
     tolerance: float,
+    note_sweep: NoteSweep | None = None,
 ) -> InferSteps:
     """Sweep over keyframes in the given order (Gauss-Seidel: each sees what the last has changed).
 
@@ -114,6 +121,8 @@ def sweep_steps(
             # Only now does the host ask, and wait for, what came of it.
             for keyframe in swept:
                 changed = sweeper.take_moved(keyframe, pool)
+                if note_sweep is not None:
+                    note_sweep(keyframe, changed)
                 moved += int(changed.sum())
                 seen += len(changed) * VOXELS
         residual, done = moved / max(seen, 1), sweep

@@ -55,15 +55,16 @@ def clamped_log_odds(occupied: F32, empty: F32, clamp: F32, largest: F32) -> F32
 
 
 @ti.func
-def faded(evidence: F32, left: F32, appeared: F32) -> F32:
+def faded(evidence: F32, kept: F32, left: F32, appeared: F32) -> F32:
     """Evidence of the past, as log-odds, for a state that may have changed since (a binary channel).
 
     ``left`` is the chance that what is free now was occupied then, ``appeared`` the chance that what is
-    occupied now was free then. No evidence stays none, and certainty becomes ``-log(left)`` or
+    occupied now was free then, and ``kept`` the rest of 1. No evidence stays none, and certainty becomes ``-log(left)`` or
     ``log(appeared)``.
     """
     small = ti.exp(-ti.abs(evidence))
-    occupied, free = 1.0 - appeared + appeared * small, left + (1.0 - left) * small
+    # kept + left is 1 - appeared, with all its digits where nearly everything is forgotten.
+    occupied, free = kept + left + appeared * small, left + (kept + appeared) * small
     if evidence < 0.0:
-        occupied, free = (1.0 - appeared) * small + appeared, 1.0 - left + left * small
+        occupied, free = (kept + left) * small + appeared, kept + appeared + left * small
     return ti.log(occupied / free)

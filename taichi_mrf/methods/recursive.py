@@ -285,7 +285,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         self._newest_s = max(self._newest_s, stamp_s)
         slots = self._pool.in_use
         if forgotten > 0 and len(slots):
-            fade_bricks(slots, self._pool.total, forgotten / 2, strip_length())
+            fade_bricks(slots, self._pool.total, forgotten, strip_length())
             self._pool.revision += 1
             self._pool.touch(slots)
 

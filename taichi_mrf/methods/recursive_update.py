@@ -31,10 +31,10 @@ def updated(log_odds: F32, change: F32, lowest: F32, highest: F32) -> F32:
 
 
 @ti.kernel
-def fade_bricks(slots: I32Array, belief: F32Array, flips: F32, strip: Template):
-    """Let time pass in bricks, (n) ``slots`` of ``belief`` (pool * 512), in which a voxel of either state has
-    changed it with the chance ``flips``. Unknown voxels stay unknown."""
+def fade_bricks(slots: I32Array, belief: F32Array, forgotten: F32, strip: Template):
+    """Let time pass in bricks, (n) ``slots`` of ``belief`` (pool * 512): the share ``forgotten`` of each
+    voxel's state is drawn anew, and either is as likely. Unknown voxels stay unknown."""
     for part in range(slots.shape[0] * (VOXELS // strip)):
         _, j = strip_begin(part, slots, strip)
         for k in range(strip):
-            belief[j + k] = faded(belief[j + k], flips, flips)
+            belief[j + k] = faded(belief[j + k], 1.0 - forgotten, 0.5 * forgotten, 0.5 * forgotten)

@@ -36,9 +36,9 @@ def through_time(
 
 
 @kernel
-def fade_all(evidence: F32Array, left: F32, appeared: F32) -> None:
+def fade_all(evidence: F32Array, kept: F32, left: F32, appeared: F32) -> None:
     for i in range(evidence.shape[0]):
-        evidence[i] = faded(evidence[i], left, appeared)
+        evidence[i] = faded(evidence[i], kept, left, appeared)
 
 
 def dated_room(order: list[int], time: TimeConfig | None = TIME) -> MRFMap:
@@ -85,7 +85,7 @@ def test_the_channel_is_that_of_the_oracle() -> None:
         forgotten = TIME.forgotten(seconds)
         left, appeared = TIME.moving_share * forgotten, (1 - TIME.moving_share) * forgotten
         found = evidence.astype(np.float32)
-        fade_all(found, left, appeared)
+        fade_all(found, 1 - forgotten, left, appeared)
         np.testing.assert_allclose(found, through_time(evidence, seconds), atol=2e-4, rtol=1e-5)
 
 

@@ -79,7 +79,7 @@ class KeyframeAllocator:
                 pool.revision += 1
                 pool.touch(slots)
                 if self.dated is not None:
-                    self.dated.outdate(slots)
+                    self.dated.withdraw(keyframe)
         self.registry.disclaim(keyframe.footprint)
         self.bounds.drop(keyframe.id)
         self.budget.give_back(keyframe.id)

@@ -252,11 +252,12 @@ class MRFMap(ReadableMRF):
         as_configured = keyframes is None and (sweeps, tolerance) == (config.sweeps, config.tolerance)
         complete = False
         try:
-            report = yield from sweep_steps(chosen, self._pool, self._sweeper, sweeps, tolerance)
+            note = None if self._dated is None or chosen_ids is None else self._dated.note_sweep
+            report = yield from sweep_steps(chosen, self._pool, self._sweeper, sweeps, tolerance, note)
             complete = report.complete
         finally:
             self._settled = complete and as_configured
-            if self._dated is not None:
+            if self._dated is not None and chosen_ids is None:
                 self._dated.outdate()
         return report
 
