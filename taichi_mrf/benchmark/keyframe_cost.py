@@ -13,6 +13,7 @@ from typing import Any
 import taichi as ti
 
 from taichi_mrf import Frame, MRFMap
+from taichi_mrf.inference.schedule import InferReport
 
 
 @dataclass(frozen=True)

@@ -59,8 +59,8 @@ def faded(evidence: F32, kept: F32, left: F32, appeared: F32) -> F32:
     """Evidence of the past, as log-odds, for a state that may have changed since (a binary channel).
 
     ``left`` is the chance that what is free now was occupied then, ``appeared`` the chance that what is
-    occupied now was free then, and ``kept`` the rest of 1. No evidence stays none, and certainty becomes ``-log(left)`` or
-    ``log(appeared)``.
+    occupied now was free then, and ``kept`` the rest of 1. No evidence stays none, and certainty becomes
+    ``-log(left)`` or ``log(appeared)``.
     """
     small = ti.exp(-ti.abs(evidence))
     # kept + left is 1 - appeared, with all its digits where nearly everything is forgotten.
