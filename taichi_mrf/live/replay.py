@@ -7,6 +7,7 @@ frame that cannot be read, an UnreadableFrame is returned.
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
@@ -45,6 +46,12 @@ class Replay:
         self._ahead: Frame | UnreadableFrame | None = None
         self.held_out: dict[int, None] = {}
         """Dataset indices of the frames that were passed unread, to check the map against."""
+        self._first_s: float | None = None
+        """Stamp of the first frame of this pass, as recorded."""
+        self._last_s, self._step_s = 0.0, 1.0
+        """Stamp of the last frame so far, and the time since the one before, in seconds."""
+        self._later_s = 0.0
+        """How much later than recorded the frames of this pass are."""
         self._begin: tuple[float, float] | None = None
         """A time on the clock, and the stamp of the frame that was due then."""
         self.set_speed(speed)
@@ -107,17 +114,28 @@ class Replay:
         return max(0.0, self._begin[0] + (stamp - self._begin[1]) / self._speed - now)
 
     def take(self) -> Frame | UnreadableFrame | None:
-        """The next frame, due or not; None after the last."""
+        """The next frame, due or not; None after the last. Time goes on when a looped source starts again."""
         if self.finished:
             return None
         frame = self._ahead or self._read()
         self._ahead = None
         self._readable = self._readable or isinstance(frame, Frame)
+        if isinstance(frame, Frame) and math.isfinite(frame.stamp):
+            self._note(frame.stamp)
+            frame = replace(frame, stamp=frame.stamp + self._later_s)
         self.number, self._next = self._next, self._next + 1
         self._find_next()
         if isinstance(frame, UnreadableFrame) and frame.last:
             self.finished, self.problem = True, frame.problem
         return frame
+
+    def _note(self, stamp_s: float) -> None:
+        """Note the stamp of a frame that is taken."""
+        if self._first_s is None:
+            self._first_s = stamp_s
+        elif stamp_s > self._last_s:
+            self._step_s = stamp_s - self._last_s
+        self._last_s = max(stamp_s, self._first_s)
 
     def _read(self) -> Frame | UnreadableFrame:
         index = self._index(self._next)
@@ -146,6 +164,9 @@ class Replay:
                 return
             if over:
                 self._next, self._readable, self._begin = 1, False, None
+                if self._first_s is not None:
+                    self._later_s += self._last_s - self._first_s + self._step_s
+                self._first_s = None
             if not is_held_out(self._next, self._hold_out):
                 return
             self.held_out[self._index(self._next)] = None

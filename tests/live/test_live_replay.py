@@ -201,6 +201,13 @@ def test_a_loop_begins_again_at_the_first_frame_and_its_pace() -> None:
     assert not replay.finished
 
 
+def test_time_goes_on_when_a_loop_begins_again() -> None:
+    replay = Replay(recording(10.0, 10.5, 12.5), loop=True)
+    frames = [replay.take() for _ in range(8)]
+    stamps = [frame.stamp for frame in frames if isinstance(frame, Frame)]
+    assert stamps == [10.0, 10.5, 12.5, 14.5, 15.0, 17.0, 19.0, 19.5]
+
+
 def test_a_loop_over_broken_frames_ends() -> None:
     replay = Replay(recording(0.0, 1.0, broken=[0, 1]), loop=True)
     assert taken(replay) == ["0: broken", "1: broken"]
