@@ -224,7 +224,7 @@ def _change_table(
             f"views alone would show; ghost: views until under 5% are left; both within {WATCHED_S:g} s, and "
             "one view more where they did not suffice.",
             "trail: voxels that someone has walked through and left, but that are occupied, of all in the "
-            "swept volume; mean over the keyframes since he came, and after the last one.",
+            "swept volume; mean over the keyframes since somebody came, and after the last one.",
             f"new: points of what came to its place less than {FRESH_S:g} s ago, as each view shows them, "
             "with an occupied voxel within 5 cm; recall: with one of the dynamic layer. precision: voxels of "
             "the layer near something that was not there at the start.",

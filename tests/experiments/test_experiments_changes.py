@@ -103,7 +103,7 @@ def test_a_map_that_is_always_right(truths: dict[str, MovingTruth]) -> None:
     assert figures.new_lost < 0.1
     things, walker = (result["drives"] for result in results)
     assert things["hit"] == 0
-    assert 0 < walker["hit"] < 0.1 * walker["taken"]  # he walks on after the keyframe
+    assert 0 < walker["hit"] < 0.1 * walker["taken"]  # the person walks on after the keyframe
     assert things["taken"] > 50
     assert things["refused"] < 0.2 * things["free"]
 
