@@ -23,7 +23,7 @@ def build(
     m = contender.make(scene, voxel_size)
     for index in keyframes:
         view = scene.views[index]
-        m.add_keyframe(view.measured_m, view.T_world_camera, scene.camera, view.name)
+        m.add_keyframe(view.measured_m, view.T_world_camera, scene.camera, view.name, view.stamp_s)
     m.infer()
     return m, time.perf_counter() - start
 

@@ -39,13 +39,15 @@ COFFIN_SEED = 100
 @dataclass(frozen=True)
 class SceneView:
     """One view. ``measured_m`` and ``true_m`` are (H, W) axial depth in metres, 0 for none; in a recording
-    what was measured is all that is known of the truth. ``judged`` (H, W): pixels that count."""
+    what was measured is all that is known of the truth. ``judged`` (H, W): pixels that count. ``stamp_s`` is
+    when it was taken, in seconds; None if nothing is known of that."""
 
     name: str
     T_world_camera: Pose
     measured_m: NDArray[np.float32]
     true_m: NDArray[np.float32]
     judged: NDArray[np.bool_]
+    stamp_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ def kitchen_scene(data: Path, limit: int | None = None) -> Scene:
     for index in range(len(dataset))[:limit]:
         frame = dataset.read(index)
         depth = frame.depth_m
-        views.append(SceneView(frame.name, frame.T_world_camera, depth, depth, depth > 0))
+        views.append(SceneView(frame.name, frame.T_world_camera, depth, depth, depth > 0, frame.stamp))
     noise = PolynomialNoise(KINECT_1_LATERAL.sigma, KINECT_1_LATERAL.bias)
     return Scene("seven_scenes_redkitchen", dataset.camera, noise, VolumeConfig(), 10.0, views)
 
