@@ -26,7 +26,7 @@ from taichi_mrf.sensor.simulate import KINECT_1
 
 FRAMES = 60
 SIZE = "&width=160&height=120"
-DATED = TimeConfig(half_life_s=600.0, moving_share=1e-4)
+DATED = TimeConfig(half_life_s=600.0)
 
 WATCHED_S = 15.0
 """For so long after something has come or left a map may take to show it."""
