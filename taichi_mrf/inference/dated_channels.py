@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import faded
-from taichi_mrf.kernels.types import F32, AnyArray, F32Array, I32Array, Template
+from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, I32Array, Template
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import grown
 from taichi_mrf.voxels.strips import strip_begin
@@ -82,6 +82,15 @@ def grown_channels(old: Channels, old_capacity: int, capacity: int) -> Channels:
     return Channels(now, shown, counts, stamps)
 
 
+@ti.func
+def past(now: F32, shown: F32, prior: F32, aging: Template, brick: I32):
+    """What a voxel's past is still worth: evidence, as log-odds over the prior, and a glimpse beyond that."""
+    evidence = now - prior
+    if evidence != 0.0:
+        evidence = faded(evidence, aging.kept[brick], aging.left[brick], aging.appeared[brick])
+    return evidence, (shown - now) * aging.lasting[brick]
+
+
 @kernel
 def fold_bricks(
     places: I32Array, slots: I32Array, now: F32Array, shown: F32Array, glimpsed: I32Array,
@@ -98,18 +107,14 @@ def fold_bricks(
         brick = i // VOXELS
         before = after = 0
         for k in range(strip):
-            glimpse = shown[target + k] - now[target + k]
-            before += ti.cast(glimpse > 0.0, ti.i32)
+            before += ti.cast(shown[target + k] > now[target + k], ti.i32)
             message = ti.cast(messages[source + k], ti.f32)
-            evidence = now[target + k] - prior
-            if evidence != 0.0:
-                evidence = faded(evidence, aging.kept[brick], aging.left[brick], aging.appeared[brick])
-            glimpse *= aging.lasting[brick]
+            evidence, glimpse = past(now[target + k], shown[target + k], prior, aging, brick)
             if message != 0.0:
                 glimpse = glimpse_of(evidence, message, prior)
-            after += ti.cast(glimpse > 0.0, ti.i32)
             now[target + k] = prior + evidence + message
             shown[target + k] = now[target + k] + glimpse
+            after += ti.cast(shown[target + k] > now[target + k], ti.i32)
         if before != after:
             glimpsed[slots[brick]] += after - before
 
@@ -135,15 +140,11 @@ def age_bricks(
         brick = i // VOXELS
         before = after = 0
         for k in range(strip):
-            glimpse = shown[target + k] - now[target + k]
-            before += ti.cast(glimpse > 0.0, ti.i32)
-            glimpse *= aging.lasting[brick]
-            after += ti.cast(glimpse > 0.0, ti.i32)
-            evidence = faded(
-                now[target + k] - prior, aging.kept[brick], aging.left[brick], aging.appeared[brick]
-            )
+            before += ti.cast(shown[target + k] > now[target + k], ti.i32)
+            evidence, glimpse = past(now[target + k], shown[target + k], prior, aging, brick)
             now[target + k] = prior + evidence
             shown[target + k] = now[target + k] + glimpse
+            after += ti.cast(shown[target + k] > now[target + k], ti.i32)
         if before != after:
             glimpsed[slots[brick]] += after - before
 

@@ -276,3 +276,22 @@ def test_log_odds_fade_between_scans() -> None:
     centres, p = plain.voxels(0.0)
     # Half of the state is drawn anew in one half-life.
     np.testing.assert_allclose(faded_map.occupancy(centres), 0.5 + 0.5 * (p - 0.5), atol=1e-4)
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_glimpses_are_counted_and_end() -> None:
+    m = dated_room([0, 1, 2, 3, 4])
+    dated = m._dated
+    assert dated is not None
+    pool = m.view.pool
+    pool.read("belief", pool.in_use)
+    channels = dated._channels
+    differs = (channels.shown.to_numpy() > channels.now.to_numpy()).reshape(-1, VOXELS).sum(axis=1)
+    assert differs.sum() > 0
+    np.testing.assert_array_equal(channels.glimpsed.to_numpy()[: pool.capacity], differs[: pool.capacity])
+    far = np.zeros_like(small_room.frames()[9].depth_m)
+    for later in range(1, 12):  # an image without a measurement lets time pass
+        frame = small_room.frames()[9]
+        m.add_keyframe(far, frame.T_world_camera, frame.camera, stamp_s=m.now_s + 10.0 * later)
+        pool.read("belief", pool.in_use)
+    assert channels.glimpsed.to_numpy().max() == 0
