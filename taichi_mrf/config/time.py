@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from taichi_mrf.config.values import check_field
 
-LIVE_HALF_LIFE_S = 600.0
+LIVE_HALF_LIFE_S = 14400.0
 """The half-life that a live run has by default: people and chairs move. All else maps a static world."""
 
 
@@ -16,8 +16,8 @@ class TimeConfig:
 
     half_life_s: float = 0.0
     """Seconds after which half of what is known of a voxel is out of date: how soon may a chair move? With
-    600 a few views are enough to see what is new, whatever was there before. 0 is a world that never
-    changes, for surveys."""
+    14400 (four hours) a few views are enough to see what is new, whatever was there before. 0 is a world
+    that never changes, for surveys."""
 
     moving_share: float = 1e-6
     """Share of space that things which come and go fill. The smaller it is, the more views it takes until a

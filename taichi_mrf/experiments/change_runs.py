@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf import Frame, LogOddsMap, MRFMap, PolynomialNoise, open_dataset
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.time import LIVE_HALF_LIFE_S, TimeConfig
 from taichi_mrf.datasets.synthetic.moving_scene import distance_to_solids
 from taichi_mrf.datasets.synthetic.room import SyntheticRoom
 from taichi_mrf.datasets.synthetic.room_furniture import ROOM_IN_WORLD
@@ -26,7 +26,7 @@ from taichi_mrf.sensor.simulate import KINECT_1
 
 FRAMES = 60
 SIZE = "&width=160&height=120"
-DATED = TimeConfig(half_life_s=600.0)
+DATED = TimeConfig(half_life_s=LIVE_HALF_LIFE_S)
 
 WATCHED_S = 15.0
 """For so long after something has come or left a map may take to show it."""

@@ -7,7 +7,7 @@ have their recorded stamps; all others count as a second apart.
 from pathlib import Path
 
 from taichi_mrf import MRFMap
-from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.time import LIVE_HALF_LIFE_S, TimeConfig
 from taichi_mrf.evaluation.tables import Entry, Spread, Table, write_table
 from taichi_mrf.experiments.contenders import Contender
 from taichi_mrf.experiments.folds import Experiment, Scored, flatten, fold_key, require_views
@@ -18,7 +18,7 @@ from taichi_mrf.methods.protocol import OccupancyMap
 HELD_OUT = {"coffin_world": 4, "house_livingroom": 10, "seven_scenes_redkitchen": 20}
 """One view in so many of each scene is held out, by its name."""
 
-DATED = {"half-life 10 min": TimeConfig(600.0), "half-life 1 h": TimeConfig(3600.0)}
+DATED = {"half-life 4 h (live)": TimeConfig(LIVE_HALF_LIFE_S), "half-life 10 min": TimeConfig(600.0)}
 STATIC = "static"
 
 FIGURES = ("1.5sigma", "5cm", "sensor")

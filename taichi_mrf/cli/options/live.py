@@ -20,7 +20,7 @@ class Live:
     """Map a sequence or a camera, and show the map in the browser while it grows.
 
     Keyframes can be switched off and on, moved and frozen there, and rays inspected. The world may change:
-    --time.half-life-s is 600 here, and 0 (a static world) for map. Ctrl-C ends the run and, with --out,
+    --time.half-life-s is 14400 here, and 0 (a static world) for map. Ctrl-C ends the run and, with --out,
     saves the map (exit status 130). Example: taichi-mrf live recording/ --out
     runs/desk --open
     """
