@@ -37,6 +37,7 @@ class VoxelMap:
     probability: NDArray[np.float32]
     keyframes: dict[int, Frame]
     voxel_size: float = VOXEL
+    up: None = None
 
     def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         shown = self.probability >= min_probability

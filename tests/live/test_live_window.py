@@ -24,14 +24,14 @@ def test_keyframes_outside_the_window_are_frozen_on_the_page(tmp_path: Path) -> 
         mapper.enter(Added(frame, id, keyframe.rays))
         told.append([info.name for info in mapper.left_behind()])
         mapper.renew()
-        mapper.publisher.changes()
+        mapper.shown.publisher.changes()
     names = [entry.name for entry in mapper.roster.entries.values()]
     assert told == [[], [], names[:2], [], names[2:4]]
     assert mapper.left_behind() == []
     assert [entry.map_id for entry in mapper.roster.with_state("on")] == list(m.keyframes)
     assert [entry.name for entry in mapper.roster.with_state("frozen")] == names[:4]
     # What has left memory is taken off the page.
-    assert len(mapper.publisher._sent.bricks()) == m.statistics().bricks
+    assert len(mapper.shown.publisher._sent.bricks()) == m.statistics().bricks
 
 
 def test_the_baseline_has_no_window(tmp_path: Path) -> None:
