@@ -109,6 +109,7 @@ def test_a_broken_frame_is_told_of_and_mapping_goes_on(browser: "Browser", tmp_p
         page.screenshot("broken_frame_listed")
         page.tab("Map")
         page.press("Reset")
+        page.press("Delete the map and start again")
         notice = page.page.locator(".mantine-Notification-root", has_text="frame-000001")
         notice.first.wait_for(state="visible")
         page.screenshot("broken_frame_notice")
