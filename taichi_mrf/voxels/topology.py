@@ -90,7 +90,7 @@ class _Tree:
     and a process with some ten trees of pointers crashes (Taichi 1.7.4).
     """
 
-    LAYERS, REGIONS, REGION = 64, 64, 16
+    LAYERS, REGIONS, REGION = 256, 64, 16
     HALF_SPAN = REGIONS * REGION * CHUNK // 2
 
     def __init__(self) -> None:
