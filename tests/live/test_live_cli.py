@@ -251,9 +251,9 @@ def test_the_parameters_of_a_file_hold_unless_a_flag_says_otherwise(tmp_path: Pa
 @pytest.mark.parametrize(
     ("name", "text", "flags", "expected"),
     [
-        ("live", None, (), 600.0),
-        ("live", "voxel_size: 0.2", (), 600.0),
-        ("live", "time: {moving_share: 0.01}", (), 600.0),
+        ("live", None, (), 14400.0),
+        ("live", "voxel_size: 0.2", (), 14400.0),
+        ("live", "time: {moving_share: 0.01}", (), 14400.0),
         ("live", "time: {half_life_s: 0}", (), 0.0),
         ("live", "time: {half_life_s: 0}", ("--time.half-life-s", "5"), 5.0),
         ("live", None, ("--time.half-life-s", "0"), 0.0),
