@@ -127,11 +127,11 @@ def _leave_out(*args: Any, **kwargs: Any) -> NoReturn:
 
 def _take_fewer_examples(item: pytest.Item) -> None:
     """A software device takes seconds for what a CPU does at once, and a maker of maps needs a dozen kernels
-    for each example: a third of the CPU's examples shows whether kernels do the same there."""
+    for each example: a sixth of the CPU's examples shows whether kernels do the same there."""
     test = getattr(item, "obj", None)
     chosen: settings | None = getattr(test, SETTINGS_OF_A_TEST, None)
     if chosen is not None:
-        fewer = settings(chosen, max_examples=max(3, chosen.max_examples // 3))
+        fewer = settings(chosen, max_examples=max(3, chosen.max_examples // 6))
         setattr(getattr(test, "__func__", test), SETTINGS_OF_A_TEST, fewer)
 
 

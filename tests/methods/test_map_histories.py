@@ -138,7 +138,7 @@ def resident_mb() -> float:
     )
 
 
-def test_a_hundred_times_adding_and_removing_takes_no_memory() -> None:
+def test_adding_and_removing_again_and_again_takes_no_memory() -> None:
     m = small_room.build([0, 1])
     frame = small_room.frames()[2]
 
@@ -149,15 +149,15 @@ def test_a_hundred_times_adding_and_removing_takes_no_memory() -> None:
         m.remove_keyframe(k)
         return held_mb
 
-    for _ in range(30):
+    for _ in range(20):
         keyframe_mb = once()
     size = m.statistics()
     before_mb = resident_mb()
-    for _ in range(100):
+    for _ in range(60):
         once()
     assert m.statistics() == size
     # What one lost keyframe in ten would hold; had one in five been lost, it would show.
-    assert resident_mb() - before_mb < 10 * keyframe_mb
+    assert resident_mb() - before_mb < 6 * keyframe_mb
 
 
 def test_moving_everything_by_whole_bricks_moves_the_map() -> None:
