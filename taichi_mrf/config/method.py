@@ -53,6 +53,9 @@ class Method:
     """Its map of a world that may change can be read as of another time and by layers
     (methods.capabilities.LayeredMap)."""
 
+    has_colors: bool = False
+    """Keyframes may have colour images, and voxels then have colours (methods.capabilities.ColoredMap)."""
+
     prior_is_unknown: bool = False
     """A voxel is unknown exactly if it still holds the prior. Otherwise ``volume.min_evidence`` decides."""
 

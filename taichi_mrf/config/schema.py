@@ -199,6 +199,10 @@ class _Head:
         },
     )
 
+    color: bool = False
+    """Read the recording's colour images too, and give voxels and surfaces the colours of the pixels that see
+    them (methods whose maps have colours: mrf)."""
+
     sensor: SensorConfig = field(default_factory=SensorConfig)
     """The sensor's noise and range."""
 
@@ -260,6 +264,8 @@ class Config(_Tail, _MethodSections, _Head):
         freezes = self.volume.window_m == 0 or METHODS[self.method].can_freeze
         needed = f"needs the method {methods_with('can_freeze')}, not {self.method}"
         check_field(freezes, "volume.window_m", needed)
+        colored = not self.color or METHODS[self.method].has_colors
+        check_field(colored, "color", f"needs the method {methods_with('has_colors')}, not {self.method}")
 
 
 def without_window(config: Config) -> Config:

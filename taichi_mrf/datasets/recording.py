@@ -7,7 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.color_camera import ColorCamera, without_black
 from taichi_mrf.datasets.depth_scale import PLAUSIBLE_MEDIAN_M, USUAL, Evidence, gather
 from taichi_mrf.datasets.images import read_color, read_depth
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
@@ -37,7 +41,8 @@ class Recording(Dataset):
 
     ``steps_per_metre`` is the scale of the depth images and ``scale_source`` where it comes from; if it is
     ``scale_assumed``, no file says so and :meth:`check_scale` may find another. ``sentinel`` is a value of
-    the images that means no measurement (beside 0).
+    the images that means no measurement (beside 0). ``color_camera`` took the colour images, unless they are
+    registered to depth.
     """
 
     frames: Sequence[RecordedFrame] = ()
@@ -46,6 +51,7 @@ class Recording(Dataset):
     scale_assumed: bool = False
     sentinel: int | None = None
     color: bool = True
+    color_camera: ColorCamera | None = None
     _names: list[str] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -76,10 +82,17 @@ class Recording(Dataset):
         try:
             depth_m = read_depth(recorded.depth_file, self.steps_per_metre, self.sentinel, self.camera)
             if self.color and recorded.color_file is not None:
-                color = read_color(recorded.color_file, self.camera)
+                color = self._read_color(recorded.color_file, depth_m)
         except DatasetError as error:
             raise FrameError(f"frame {recorded.name}: {error}") from error
         return Frame(depth_m, T_world_camera, self.camera, recorded.stamp, recorded.name, color)
+
+    def _read_color(self, path: Path, depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """The colours of the depth image's pixels. Raises DatasetError."""
+        if self.color_camera is None:
+            return without_black(read_color(path, self.camera))
+        color = read_color(path, self.color_camera.camera)
+        return self.color_camera.registered(color, depth_m, self.camera)
 
     def check_scale(self, poses_are_used: bool) -> list[str]:
         """Compare neighbouring frames at the recorded poses, and note which scale is used and why.

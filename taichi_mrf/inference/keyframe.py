@@ -41,6 +41,19 @@ def checked_depth(depth_m: ArrayLike, camera: Camera, min_depth: float) -> NDArr
     return np.where(valid, measured, np.float32(0.0))
 
 
+def checked_color(color: ArrayLike | None, camera: Camera) -> NDArray[np.uint8] | None:
+    """A copy of an (H, W, 3) RGB image, None for None. Raises KeyframeError if it does not have the camera's
+    shape, or is no uint8."""
+    if color is None:
+        return None
+    image = np.asarray(color)
+    if image.shape != (*camera.shape, 3) or image.dtype != np.uint8:
+        raise KeyframeError(
+            f"a colour image must be uint8 of the shape {(*camera.shape, 3)}, not {image.dtype} {image.shape}"
+        )
+    return image.copy()
+
+
 TILE = 32
 """Pixels along each side of the tiles by which depths are summed up, and in whose order rays are listed:
 those of a tile cross the same bricks. A tile is also the largest block of pixels with one ray."""
@@ -52,7 +65,8 @@ class DepthImage:
 
     ``depth`` is (H * W) float32 in metres along each pixel's ray (axial depth for a pinhole), 0 where there
     is no measurement; ``farthest`` the largest in each tile (rows, columns). ``sensor`` is camera and noise
-    as kernels take them, ``rays`` the number of measurements.
+    as kernels take them, ``rays`` the number of measurements. ``color`` is (H, W, 3) RGB in host memory, 0
+    0 0 where a pixel has no colour, or None.
     """
 
     depth: Resident
@@ -61,14 +75,26 @@ class DepthImage:
     noise_table: NoiseTable
     rays: int
     farthest: NDArray[np.float32]
+    color: NDArray[np.uint8] | None = None
 
     @staticmethod
-    def upload(depth_m: NDArray[np.float32], camera: Camera, noise: NoiseModel) -> "DepthImage":
+    def upload(
+        depth_m: NDArray[np.float32],
+        camera: Camera,
+        noise: NoiseModel,
+        color: NDArray[np.uint8] | None = None,
+    ) -> "DepthImage":
         """Put :func:`checked_depth` (H, W), which must not change from now on, where kernels can reach it.
         Raises ConfigError if the noise model does not fit the camera."""
         table = noise.table(camera)
         depth, sensor = resident(depth_m.reshape(-1)), table.sensor(camera)
-        return DepthImage(depth, camera, sensor, table, int(np.count_nonzero(depth_m)), _farthest(depth_m))
+        rays = int(np.count_nonzero(depth_m))
+        return DepthImage(depth, camera, sensor, table, rays, _farthest(depth_m), color)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of depth and colour."""
+        return self.depth.shape[0] * 4 + (0 if self.color is None else self.color.nbytes)
 
     def to_numpy(self) -> NDArray[np.float32]:
         """(H, W) axial depth in metres, 0 where there is no measurement."""
@@ -200,9 +226,14 @@ class Keyframe:
         return self.image.to_numpy()
 
     @property
+    def color(self) -> NDArray[np.uint8] | None:
+        """(H, W, 3) RGB, 0 0 0 where a pixel has no colour; None without a colour image."""
+        return self.image.color
+
+    @property
     def image_bytes(self) -> int:
-        """Bytes of the depth image and of the list of its rays."""
-        return self.image.depth.shape[0] * 4 + self.ray_list.nbytes + self.entry_depths.shape[0] * 4
+        """Bytes of the images and of the list of the rays."""
+        return self.image.nbytes + self.ray_list.nbytes + self.entry_depths.shape[0] * 4
 
     @property
     def voxel_bytes(self) -> int:

@@ -15,7 +15,8 @@ from taichi_mrf.viewer.messages import KeyframeState
 @dataclass
 class LiveKeyframe:
     """One keyframe. ``map_id`` is its number in the map while it is on; ``depth_m`` (H, W) is its depth image
-    in metres, 0 for no measurement, while it is off. A frozen keyframe has neither.
+    in metres, 0 for no measurement, and ``color`` (H, W, 3) its colour image, if it has one, while it is off.
+    A frozen keyframe has none of them.
 
     ``T_recorded`` is the recorded pose and ``T_home`` the one found by alignment, which is the same if poses
     are not refined; ``moved_by_hand``: a user has moved it elsewhere.
@@ -31,6 +32,7 @@ class LiveKeyframe:
     stamp_s: float
     state: KeyframeState = "on"
     depth_m: NDArray[np.float32] | None = None
+    color: NDArray[np.uint8] | None = None
     moved_by_hand: bool = False
 
     def __post_init__(self) -> None:

@@ -97,11 +97,11 @@ class Mapper:
             entry.map_id = self._add(entry)
             if self.refiner is not None:
                 self.refiner.note_recorded(entry.map_id, entry.T_recorded)
-            entry.depth_m, entry.state = None, "on"
+            entry.depth_m, entry.color, entry.state = None, None, "on"
         else:
-            depth_m = self._keyframe(entry).depth_m
+            depth_m, color = self._keyframe(entry).depth_m, self._keyframe(entry).color
             self.map.remove_keyframe(self._map_id(entry))
-            entry.map_id, entry.depth_m, entry.state = None, depth_m, "off"
+            entry.map_id, entry.depth_m, entry.color, entry.state = None, depth_m, color, "off"
         self.unsettled = self.edited = self.cavities_changed = True
         return entry
 
@@ -218,7 +218,7 @@ class Mapper:
     def _add(self, entry: LiveKeyframe) -> int:
         """Add a keyframe that was off, and sweep it once. If that fails, the map is unchanged."""
         assert entry.depth_m is not None
-        parts = (entry.T_world_camera, entry.camera, entry.name, entry.stamp_s)
+        parts = (entry.T_world_camera, entry.camera, entry.name, entry.stamp_s, entry.color)
         map_id = self.map.add_keyframe(entry.depth_m, *parts)
         try:
             self.sweep(map_id)

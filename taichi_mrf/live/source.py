@@ -82,7 +82,8 @@ def open_source(
                 f"It shows what is near the last keyframe; {folder_beside(path).name} has all of it."
             )
         return Source(path.name, parameters, lambda: load_map(path)), notes
-    dataset = open_dataset(name, color=False, track=track, **(reading or SourceFlags()).keywords())
+    keywords = (reading or SourceFlags()).keywords()
+    dataset = open_dataset(name, color=config.color, track=track, **keywords)
     config = with_recorded_noise(config, dataset)
     # Held-out frames of a tracked source are read, so that their poses are known when the map is checked.
     unread = 0 if dataset.tracked else hold_out_of(dataset, config)

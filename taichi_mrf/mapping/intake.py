@@ -171,9 +171,9 @@ class Intake:
     def _added(self, frame: Frame) -> int:
         """Add a frame as a keyframe and align it, or leave nothing of it; returns its number."""
         with self.result.timed("adding"):
-            keyframe = self.map.add_keyframe(
-                frame.depth_m, frame.T_world_camera, frame.camera, frame.name, frame.stamp
-            )
+            color = frame.color if self.map.config.color else None
+            parts = (frame.T_world_camera, frame.camera, frame.name, frame.stamp, color)
+            keyframe = self.map.add_keyframe(frame.depth_m, *parts)
         try:
             if self.refiner is not None:
                 with self.result.timed("refining"):

@@ -39,8 +39,8 @@ _CAMERA_VALUES = 6
 class StoredKeyframe:
     """A keyframe in host memory, as it is saved; recursive maps hold their keyframes in this form.
 
-    ``depth_m`` is (H, W) float32 axial depth in metres, 0 where there is no measurement, and ``stamp_s``
-    when it was taken, in seconds.
+    ``depth_m`` is (H, W) float32 axial depth in metres, 0 where there is no measurement, ``stamp_s`` when it
+    was taken, in seconds, and ``color`` (H, W, 3) uint8 RGB or None.
     """
 
     id: int
@@ -49,6 +49,7 @@ class StoredKeyframe:
     T_world_camera: Pose
     camera: Camera
     stamp_s: float
+    color: NDArray[np.uint8] | None = None
 
     @property
     def rays(self) -> int:
@@ -105,6 +106,8 @@ class MapHeader:
         }
         for number, keyframe in enumerate(keyframes):
             arrays[f"keyframe_depth_{number}"] = keyframe.depth_m
+            if keyframe.color is not None:
+                arrays[f"keyframe_color_{number}"] = keyframe.color
         return arrays
 
 
@@ -174,7 +177,11 @@ def read_header(path: Path, file: NpzFile) -> MapHeader:
     for i, id in enumerate(ids.tolist()):
         camera = _camera(cameras[i])
         depth_m = file.array(f"keyframe_depth_{i}", "f", camera.shape)
-        keyframes.append(StoredKeyframe(id, names[i], depth_m, as_pose(poses[i]), camera, float(stamps[i])))
+        color = None
+        if f"keyframe_color_{i}" in file:
+            color = file.array(f"keyframe_color_{i}", "u", (*camera.shape, 3)).astype(np.uint8)
+        place = as_pose(poses[i]), camera, float(stamps[i])
+        keyframes.append(StoredKeyframe(id, names[i], depth_m, *place, color))
     next_id = file.scalar("next_id", "i")
     if len(set(ids.tolist())) < n or not all(0 <= id < next_id for id in ids.tolist()):
         raise MapFileError(f"{path}: damaged: the ids of its keyframes are not valid")

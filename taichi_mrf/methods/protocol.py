@@ -46,6 +46,11 @@ class MappedKeyframe(PosedDepth, Protocol):
         """When it was taken, in seconds."""
         ...
 
+    @property
+    def color(self) -> NDArray[np.uint8] | None:
+        """(H, W, 3) RGB, 0 0 0 where a pixel has no colour; None without a colour image."""
+        ...
+
 
 class OccupancyMap(Protocol):
     """A probabilistic occupancy map of depth keyframes, whatever its method.
@@ -96,9 +101,11 @@ class OccupancyMap(Protocol):
         camera: Camera,
         name: str = "",
         stamp_s: float | None = None,
+        color: ArrayLike | None = None,
     ) -> int:
         """Add a depth image, (H, W) axial depth in metres, taken at a pose (4, 4) and a time in seconds, by
-        default the number of keyframes added before; returns its id."""
+        default the number of keyframes added before; returns its id. ``color`` (H, W, 3) uint8 RGB is for
+        maps that have colours (``METHOD.has_colors``); others raise ConfigError."""
         ...
 
     def remove_keyframe(self, id: int) -> None:

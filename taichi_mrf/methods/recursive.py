@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import instance
 from taichi_mrf.config.schema import Config
-from taichi_mrf.errors import KeyframeError
+from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.inference.keyframe import DepthImage, Footprint, checked_depth
 from taichi_mrf.inference.schedule import (
@@ -135,14 +135,18 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         camera: Camera,
         name: str = "",
         stamp_s: float | None = None,
+        color: ArrayLike | None = None,
     ) -> int:
         """Add a depth image and integrate it at once; in a stale map the next :meth:`infer` does.
 
         ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
         ``T_world_camera`` is (4, 4); ``stamp_s`` is when it was taken, in seconds, by default the number of
         keyframes added before. Returns the keyframe's id.
-        Raises KeyframeError for a wrong shape or pose, CapacityError if the map would not fit.
+        Raises KeyframeError for a wrong shape or pose, CapacityError if the map would not fit, ConfigError
+        for a ``color`` image: the map has no colours.
         """
+        if color is not None:
+            raise ConfigError(f"a map of the method {self.METHOD.name} has no colours: pass no color")
         T, name = as_pose(T_world_camera), instance(name, str, "name", "a string")
         depth = checked_depth(depth_m, camera, self.sensor.min_depth)
         if not self._keyframes:

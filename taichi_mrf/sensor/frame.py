@@ -14,8 +14,9 @@ class Frame:
     """A depth image, where it was taken, and with what.
 
     ``depth_m`` is axial depth (along the optical axis), (H, W) float32 in metres; 0 means no
-    measurement. ``T_world_camera`` is (4, 4) float64. ``stamp`` is in seconds. ``color`` is
-    (H, W, 3) uint8 RGB or None. ``name`` is what error messages and reports call this frame.
+    measurement. ``T_world_camera`` is (4, 4) float64. ``stamp`` is in seconds. ``color`` is (H, W, 3)
+    uint8 RGB of the same pixels, 0 0 0 where a pixel has none, or None. ``name`` is what error messages
+    and reports call this frame.
     """
 
     depth_m: NDArray[np.float32]

@@ -109,6 +109,8 @@ def _check(config: Config, rounds: int) -> None:
         raise ConfigError(f"submaps need the method {methods_with('has_messages')}, not {config.method}")
     if config.poses.refine:
         raise ConfigError("poses.refine does not go with submaps: no task sees all keyframes")
+    if config.color:
+        raise ConfigError("color does not go with submaps: a map in chunks has no colours")
     if config.volume.window_m > 0:
         raise ConfigError("volume.window_m does not go with submaps: each task holds its part as a whole")
     if not config.time.is_static:

@@ -80,7 +80,9 @@ def map_to_folder(
     start = time.perf_counter()
     settings = task.settings
     runtime.init(settings.runtime.arch, settings.runtime.threads, settings.runtime.debug)
-    dataset = open_dataset(task.source, color=False, track=task.track_poses, **task.reading.keywords())
+    dataset = open_dataset(
+        task.source, color=settings.color, track=task.track_poses, **task.reading.keywords()
+    )
     settings = with_recorded_noise(settings, dataset)
     previous = resumed_map(task.out, settings) if task.resume else None
     skipped = skipped_before(task.out) if task.resume else {}

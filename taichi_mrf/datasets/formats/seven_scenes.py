@@ -1,15 +1,19 @@
 """7-Scenes (Shotton et al., CVPR 2013): frame-NNNNNN.depth.png, .color.png or .jpg, .pose.txt.
 
 Depth is 16-bit millimetres, 0 and 65535 mean none; a pose file holds T_world_camera as a 4 x 4 matrix.
-The depth camera has no published calibration; 585 585 320 240 is what the data set's page gives. Colour
-is not registered to depth there.
+The depth camera has no published calibration; 585 585 320 240 is what the data set's page gives. The colour
+camera has none at all; COLOR was found by turning and shifting it until the edges in depth lie on edges in
+colour. A recording in this format with another camera counts as registered.
 """
 
 import re
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.color_camera import ColorCamera
 from taichi_mrf.datasets.hints import pose_files_hint
 from taichi_mrf.datasets.intrinsics import find_camera
 from taichi_mrf.datasets.options import ReadOptions
@@ -20,6 +24,19 @@ from taichi_mrf.sensor.camera import PinholeCamera
 
 NAME = "7-Scenes"
 CAMERA = PinholeCamera(width=640, height=480, fx=585.0, fy=585.0, cx=320.0, cy=240.0)
+COLOR = ColorCamera(
+    PinholeCamera(width=640, height=480, fx=526.6, fy=526.6, cx=320.0, cy=240.0),
+    np.array(
+        [
+            [1.0, -0.0079, 0.0004, -0.0244],
+            [0.0079, 1.0, -0.0037, 0.0],
+            [-0.0004, 0.0037, 1.0, 0.0],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    ),
+)
+"""Found on 20 frames of the red kitchen: the gradient of the colour image at edges of depth is 2.6 times its
+mean, and without registration 1.4 times. The angles are so small that their sines stand for them."""
 STEPS_PER_METRE = 1000.0
 NO_DEPTH = 65535
 FRAMES_PER_SECOND = 30.0
@@ -56,6 +73,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         scale_source="--depth-scale" if options.depth_scale else NAME,
         sentinel=NO_DEPTH,
         color=options.color,
+        color_camera=COLOR if camera == CAMERA else None,
     )
 
 

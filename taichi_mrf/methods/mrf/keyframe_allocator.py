@@ -46,7 +46,7 @@ class KeyframeAllocator:
         rays, voxel_size = self.bundler.rays_of(image), self.registry.voxel_size
         parts = (voxel_size, self.sensor, self.inference, self.volume)
         footprint = find_footprint(image, rays, T_world_camera, *parts, scouts=SCOUTS)
-        self.budget.check(footprint, 4 * (image.depth.shape[0] + rays.blocks.shape[0]) + rays.nbytes)
+        self.budget.check(footprint, image.nbytes + 4 * rays.blocks.shape[0] + rays.nbytes)
         self.registry.anchor_at(T_world_camera[:3, 3])
         return self._claimed(id, name, image, rays, T_world_camera, stamp_s, footprint)
 

@@ -24,7 +24,7 @@ from taichi_mrf.factor_graph.depth_graph import depth_graph
 from taichi_mrf.factor_graph.graph import FactorGraph
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.inference.incremental import IncrementalInference
-from taichi_mrf.inference.keyframe import DepthImage, Keyframe, checked_depth
+from taichi_mrf.inference.keyframe import DepthImage, Keyframe, checked_color, checked_depth
 from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
 from taichi_mrf.inference.prior import log_odds_without_bricks, prior_probability
 from taichi_mrf.inference.ray_list import RayBundler
@@ -117,23 +117,20 @@ class MRFMap(ReadableMRF):
         camera: Camera,
         name: str = "",
         stamp_s: float | None = None,
+        color: ArrayLike | None = None,
     ) -> int:
         """Add a depth image. It takes part in the next :meth:`infer`.
 
         ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
         ``T_world_camera`` is (4, 4); ``stamp_s`` is when it was taken, in seconds, by default the number of
-        keyframes added before. Returns the keyframe's id.
+        keyframes added before; ``color`` is (H, W, 3) uint8 RGB of the same pixels, 0 0 0 for none, from
+        which :meth:`colors` follow. Returns the keyframe's id.
         Raises KeyframeError for a wrong shape or pose, CapacityError if the map would not fit.
         """
-        T, name, stamp_s = (
-            as_pose(T_world_camera),
-            instance(name, str, "name", "a string"),
-            self._stamp(stamp_s),
-        )
-        image = self._upload(depth_m, camera)
-        keyframe = self._allocator.place(
-            self._next_id, name or f"keyframe {self._next_id}", image, T, stamp_s
-        )
+        T, stamp_s = as_pose(T_world_camera), self._stamp(stamp_s)
+        name = instance(name, str, "name", "a string") or f"keyframe {self._next_id}"
+        image = self._upload(depth_m, camera, color)
+        keyframe = self._allocator.place(self._next_id, name, image, T, stamp_s)
         self._keyframes[keyframe.id] = keyframe
         self._note_up(T)
         self._next_id += 1
@@ -337,7 +334,8 @@ class MRFMap(ReadableMRF):
         """Write the map to one .npz file, under a temporary name first. Raises MapFileError."""
         keyframes = list(self._keyframes.values())
         stored = [
-            StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera, k.stamp_s) for k in keyframes
+            StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera, k.stamp_s, k.color)
+            for k in keyframes
         ]
         header = MapHeader(self.config, self.noise, stored, self._next_id, self._settled, self.up)
         parked = () if self.window is None else self.window.save_beside(Path(path), self)
@@ -360,7 +358,7 @@ class MRFMap(ReadableMRF):
             m._registry.see_for_good(contents.frozen_crossed)
             m._frozen = dict(contents.frozen)
             for k in header.keyframes:
-                image = m._upload(k.depth_m, k.camera)
+                image = m._upload(k.depth_m, k.camera, k.color)
                 parts = (image, k.T_world_camera, k.stamp_s)
                 m._keyframes[k.id] = m._allocator.place(k.id, k.name, *parts)
             if m.window is not None:
@@ -375,8 +373,9 @@ class MRFMap(ReadableMRF):
         m._messages_lost, m._settled = bool(m._keyframes), header.settled
         return m
 
-    def _upload(self, depth_m: ArrayLike, camera: Camera) -> DepthImage:
-        image = DepthImage.upload(checked_depth(depth_m, camera, self.sensor.min_depth), camera, self.noise)
+    def _upload(self, depth_m: ArrayLike, camera: Camera, color: ArrayLike | None) -> DepthImage:
+        depth = checked_depth(depth_m, camera, self.sensor.min_depth)
+        image = DepthImage.upload(depth, camera, self.noise, checked_color(color, camera))
         if not self._keyframes:
             warn_of_bad_sigma(image.noise_table, self.sensor.min_depth, self.sensor.max_depth)
         return image

@@ -36,4 +36,5 @@ METHOD = Method(
     can_freeze=True,
     can_refine_poses=True,
     has_layers=True,
+    has_colors=True,
 )
