@@ -3,9 +3,9 @@ those that use a backend.
 
     python tests/backends.py [options of pytest]
 
-Two processes run the CPU's tests; each takes the next file of tests that is not taken yet. All run side by
-side, because one alone seldom keeps two cores busy. Each one's output is printed in one piece: that of the
-first as it comes, the others' when that is done.
+Some processes run the CPU's tests; each takes the next file of tests that is not taken yet. All run side by
+side, because tests of pages and processes wait more than they compute. Each one's output is printed in one
+piece: that of the first as it comes, the others' when that is done.
 """
 
 import subprocess
@@ -16,7 +16,7 @@ from typing import IO
 
 from taichi_mrf.system import runtime
 
-PROCESSES = 2
+PROCESSES = 3
 
 Run = tuple[str, subprocess.Popen[bytes], IO[bytes]]
 

@@ -1,13 +1,13 @@
 """All keyframes aligned with each other at once, and each with where it was recorded.
 
-Alignment of one keyframe after the other adds up what each is wrong by, and rounds of it take a bend of
-the whole way out only slowly. Here the residuals of every pair's points are functions of both its poses,
+Aligning one keyframe after the other accumulates their errors, and further rounds correct a bend of the whole
+trajectory only slowly. Here the residuals of every pair's points are functions of both its poses,
 and one linear system moves all of them:
 
     sum over pairs (i, k) of |r_ik + J_ik (xi_i - Ad(T_i_k) xi_k)|^2  +  sum over i of |e_i + xi_i|^2
 
-with T_i_k = inv(T_i) T_k, and e_i the way from where keyframe i was recorded, as a twist. How much each of
-the two is worth is in recorded.py.
+with T_i_k = inv(T_i) T_k, and e_i the twist from keyframe i's recorded pose. recorded.py has the weights of
+the two terms.
 """
 
 from collections.abc import Collection, Generator, Mapping, Sequence
@@ -52,7 +52,7 @@ def align_jointly(
 ) -> Generator[None, None, dict[int, Pose]]:
     """The poses, by keyframe, under which all points fit each other and what was recorded; those that are
     ``fixed`` stay, and that with the lowest id. ``T_world_camera`` is where the search begins. A
-    generator: it yields for each pair of keyframes, again and again."""
+    generator: it yields once for each pair of keyframes in each step."""
     ids = sorted(points)
     free = np.repeat([i > 0 and id not in fixed for i, id in enumerate(ids)], 6)
     poses = [T_world_camera[id] for id in ids]

@@ -25,8 +25,8 @@ class KeyframeSurfels:
         self._frozen: Surfels | None = None
 
     def update(self, keyframes: Mapping[int, Keyframe], without: int | None = None) -> None:
-        """Measure what is new or has moved, and forget what is gone. ``without`` is a keyframe that is not
-        asked for now."""
+        """Measure what is new or has moved, and forget what is gone. ``without`` is a keyframe that may
+        stay as it is."""
         gone = [id for id in self._kept if id not in keyframes]
         for id in gone:
             del self._kept[id]
@@ -36,8 +36,8 @@ class KeyframeSurfels:
                 self._measure(keyframe)
 
     def freeze(self, keyframe: Keyframe) -> None:
-        """Keep for good what a keyframe has measured. Before the first :meth:`update` nothing is kept: who
-        never aligns does not pay for it."""
+        """Keep for good what a keyframe has measured. Before the first :meth:`update` nothing is kept, so
+        that maps which are never aligned pay nothing."""
         if not (self._kept or self._frozen is not None):
             return
         self._measure(keyframe)

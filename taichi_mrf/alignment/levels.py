@@ -15,7 +15,7 @@ from taichi_mrf.alignment.surfels import Surfels
 from taichi_mrf.geometry.poses import Pose
 
 COARSEST_M = 0.08
-"""Width in metres that the first level's cells have at least. Further than 1.5 cells nothing is found."""
+"""Least width of the first level's cells, in metres. Surfaces further away than 1.5 cells are not found."""
 
 THINNED = (4, 2, 1)
 """Which of the points each level takes along rows and columns: strides of 8, 4 and 2 pixels."""
@@ -25,7 +25,7 @@ LEAST_POINTS = 50
 
 
 def margin_m(cell_size: float) -> float:
-    """How far around the points the surface is looked up, in metres."""
+    """How far beyond the points the surface is used, in metres."""
     return 2 * max(cell_size, COARSEST_M)
 
 
@@ -56,7 +56,7 @@ def aligned(
     lever_m: float,
     observable: float = OBSERVABLE,
 ) -> Aligned:
-    """The pose that a search ends at which begins at ``T_world_camera``; see levenberg.align."""
+    """The pose at which a search from ``T_world_camera`` ends; see levenberg.align."""
     found = align(levels[0], T_world_camera, recorded, lever_m, observable)
     for level in levels[1:]:
         found = align(level, found.T_world_camera, recorded, lever_m, observable)

@@ -28,8 +28,7 @@ OBSERVABLE = 0.0005
 drifts: with ten times as much a camera at 30 images a second slid 20 cm along a wall of the built-in room."""
 
 AHEAD_M = 1.0
-"""The surface is put in place for so many metres more than the points need, so that it lasts for more images
-than one."""
+"""Metres by which the surface's grids reach beyond the points, so that they serve more than one image."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +49,7 @@ class Located:
 
 
 class Locator:
-    """Locates images in a ``surface``, which is put in place anew when it has changed or the camera has moved
-    on."""
+    """Locates images in a ``surface``. Its grids are rebuilt when it changes or the camera has moved on."""
 
     def __init__(self, surface: KeyframeSurfels) -> None:
         self._surface = surface

@@ -1,4 +1,4 @@
-"""How far points lie from the surface, and what that asks of the camera's pose: residuals and Jacobian.
+"""Distances of points from the surface, and their derivatives by the camera's pose: residuals and Jacobian.
 
 A point p of the camera frame is moved by T exp(xi), xi = (rho, omega), to P = T (p + rho + omega x p). Its
 residual is the mean over the surfels in the 27 cells around P, weighted by how near and how well known they
