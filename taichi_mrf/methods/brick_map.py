@@ -27,12 +27,13 @@ from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.queries.points import classify, point_log_odds, probability
 from taichi_mrf.queries.profile import RayProfile
 from taichi_mrf.queries.view import View
+from taichi_mrf.queries.within import occupied_within, path_collision
 from taichi_mrf.sensor.camera import Camera, PinholeCamera, check_camera
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config
 from taichi_mrf.system import runtime
 from taichi_mrf.system.owner import Owned, owned_attribute
 from taichi_mrf.voxels.pool import BrickPool
-from taichi_mrf.voxels.topology import create_topology, recycle
+from taichi_mrf.voxels.topology import Topology, create_topology, recycle
 
 MapT = TypeVar("MapT", bound="BrickMap")
 SectionT = TypeVar("SectionT")
@@ -184,6 +185,20 @@ class BrickMap(Owned):
         above 0 something new, below 0 a surface that is gone (queries.contradiction.ray_scores)."""
         return ray_scores(self, depth_m, T_world_camera, camera)
 
+    def occupied_within(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
+        """The probability that something lies within ``radius_m`` metres of points (N, 3) in metres, (N,)
+        float32 (queries.within). Raises ConfigError, CapacityError if the points lie too far apart."""
+        return occupied_within(points, radius_m, *self._grid())
+
+    def path_collision(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
+        """The probability that a ball of ``radius_m`` metres hits something on its way from point to point: a
+        path (N, 3) in metres -> (), paths (P, N, 3) -> (P,) (queries.within). Raises as
+        :meth:`occupied_within`, and ConfigError for a path without points."""
+        return path_collision(points, radius_m, *self._grid())
+
     def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
-        topology, pool = self._registry.topology, self._pool
-        return point_log_odds(points, self.voxel_size, topology, pool, self.seen_free_log_odds)
+        return point_log_odds(points, *self._grid())
+
+    def _grid(self) -> tuple[float, Topology, BrickPool, float]:
+        """The voxels as queries at points take them."""
+        return self.voxel_size, self._registry.topology, self._pool, self.seen_free_log_odds

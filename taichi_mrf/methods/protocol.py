@@ -144,6 +144,14 @@ class OccupancyMap(Protocol):
         """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,) int8."""
         ...
 
+    def occupied_within(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
+        """The probability that something lies within ``radius_m`` of points (N, 3), in metres: (N,)."""
+        ...
+
+    def path_collision(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
+        """The probability that a ball hits something on a path (N, 3) -> (), or paths (P, N, 3) -> (P,)."""
+        ...
+
     def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """Voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
         ...

@@ -9,7 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 import taichi as ti
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from taichi_mrf.config.arguments import seconds
 from taichi_mrf.config.method import Method
@@ -24,7 +24,8 @@ from taichi_mrf.methods.brick_map import BrickMap
 from taichi_mrf.methods.protocol import MappedKeyframe
 from taichi_mrf.queries.change import MapChange, compare_maps
 from taichi_mrf.queries.view import View
-from taichi_mrf.voxels.pool import copied
+from taichi_mrf.voxels.pool import BrickPool, copied
+from taichi_mrf.voxels.topology import Topology
 
 Layer = Literal["static", "dynamic", "both"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
@@ -61,10 +62,10 @@ class MapReading(BrickMap):
         """The world axis that is up."""
         return self._source.up
 
-    def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
+    def _grid(self) -> tuple[float, Topology, BrickPool, float]:
         if self._registry.version != self._version:
             raise KeyframeError("the map has changed since it was read: call at() or layer() again")
-        return super()._log_odds(points)
+        return super()._grid()
 
 
 class ReadableMRF(BrickMap):

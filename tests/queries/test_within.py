@@ -1,0 +1,131 @@
+"""What lies in a ball, or in the way of one: against lines cut voxel by voxel in float64, closed forms, and
+the joint distribution of a ray's voxels."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hand_made import PRIOR, VOXEL
+from oracles.inference import Ray, Segment, enumerate_marginals
+from oracles.traversal import segments
+from queried_maps import SEEN_FREE, HandMap, hand_map, map_of
+
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.queries.within import occupied_within, path_collision
+
+UNKNOWN_P = 1 / (1 + math.exp(-PRIOR))
+
+
+@pytest.fixture(scope="module")
+def hand(backend: str) -> HandMap:
+    return hand_map(backend)
+
+
+def grid(hand: HandMap) -> tuple:
+    return hand.voxel_size, hand.hand.topology, hand.hand.pool, SEEN_FREE
+
+
+def ball(hand: HandMap, points: object, radius_m: float) -> np.ndarray:
+    return occupied_within(points, radius_m, *grid(hand))
+
+
+def path(hand: HandMap, points: object, radius_m: float) -> np.ndarray:
+    return path_collision(points, radius_m, *grid(hand))
+
+
+def expected(hand: HandMap, centre_m: np.ndarray, radius_m: float) -> float:
+    """The likeliest line of each axis, and the least of these."""
+    reach = math.floor(radius_m / VOXEL)
+    of_axes = []
+    for axis in range(3):
+        likeliest = 0.0
+        for a in range(-reach, reach + 1):
+            for b in range(-reach, reach + 1):
+                squared = radius_m**2 - (a * a + b * b) * VOXEL**2
+                if squared <= 0:
+                    continue
+                beside = np.roll([0.0, a * VOXEL, b * VOXEL], axis)
+                along = np.eye(3)[axis]
+                start = centre_m + beside - math.sqrt(squared) * along
+                cells, near, far = segments(start, along, 0.0, 2 * math.sqrt(squared), VOXEL)
+                m, length = 1 / (1 + np.exp(-hand.true_log_odds(cells))), (far - near) / VOXEL
+                no_brick = np.isnan(hand.hand.at(cells.astype(np.int64)))
+                likeliest = max(likeliest, 1 - np.prod(np.where(no_brick, (1 - m) ** length, 1 - m * length)))
+        of_axes.append(likeliest)
+    return min(of_axes)
+
+
+@pytest.mark.parametrize("radius_m", [0.03, 0.11, 0.26])
+def test_a_ball_has_the_probability_of_its_likeliest_line(hand: HandMap, radius_m: float) -> None:
+    random = np.random.default_rng(3)
+    low, high = hand.hand.bricks.min(axis=0) * 8 * VOXEL, (hand.hand.bricks.max(axis=0) + 1) * 8 * VOXEL
+    hits = np.argwhere(hand.hand.log_odds > 0)[::40][:8]
+    at_hits = (hand.hand.bricks[hits[:, 0]] * 8 + hits[:, 1:] + random.random((len(hits), 3))) * VOXEL
+    points = np.concatenate([random.uniform(low - 0.4, high + 0.4, (8, 3)), at_hits])
+    truth = [expected(hand, point, radius_m) for point in points]
+    assert np.ptp(truth) > 0.05
+    np.testing.assert_allclose(ball(hand, points, radius_m), truth, atol=2e-5)
+
+
+def test_space_that_nobody_saw_has_the_prior_of_a_line(hand: HandMap) -> None:
+    """And space that was seen free next to nothing."""
+    far = np.array([[40.0, -30.0, 20.0]])
+    diameter = 2 * 0.3 / VOXEL
+    assert ball(hand, far, 0.3)[0] == pytest.approx(1 - (1 - UNKNOWN_P) ** diameter, rel=1e-4)
+
+
+def test_a_wall_is_one_thing_however_many_lines_meet_it(backend: str) -> None:
+    """A wall that may be in any of four layers, and a ball that reaches into two of them: the lines beside
+    each other add nothing, while voxels taken alone would make a collision certain."""
+    log_odds = np.full((16, 16, 16), -12.0)
+    log_odds[6:10] = math.log(0.25 / 0.75)
+    wall = map_of(backend, (0, 0, 0), log_odds)
+    centre = np.array([[6.0 * VOXEL, 8 * VOXEL, 8 * VOXEL]])  # on the face of the first layer
+    found = float(ball(wall, centre, 2 * VOXEL)[0])
+    assert found == pytest.approx(1 - 0.75**2, abs=1e-3)
+    assert 1 - 0.75 ** (np.pi * 4) > 0.95  # the voxels of the half ball, taken alone
+
+
+def test_a_larger_ball_is_never_less_likely_to_hold_something(hand: HandMap) -> None:
+    points = np.random.default_rng(4).uniform([-2, 0, -2], [1, 3, 1], (40, 3))
+    by_radius = [ball(hand, points, radius) for radius in (0.02, 0.07, 0.1, 0.18)]
+    assert (np.diff(by_radius, axis=0) >= -1e-5).all()
+
+
+def test_a_line_is_between_its_likeliest_voxel_and_the_exact_chance_of_all() -> None:
+    """A ray has measured a surface that can only be in one of its voxels: some voxel is occupied. The rule,
+    from the exact marginals, comes closer to that than any single voxel, and never beyond."""
+    cells = [(i, 0, 0) for i in range(7)]
+    densities = [math.exp(-0.5 * ((i - 3) / 1.3) ** 2) for i in range(7)]
+    ray = Ray([Segment(cell, 1.0) for cell in cells], densities, 0.0)
+    marginals = np.array([enumerate_marginals([ray], 0.1, 1e-6)[cell] for cell in cells])
+    rule = 1 - np.prod(1 - marginals)
+    assert marginals.max() + 0.2 < rule < 1.0
+
+
+def test_a_path_is_as_likely_to_collide_as_at_its_likeliest_place(hand: HandMap) -> None:
+    corners = np.array([[[-1.4, 2.0, -0.4], [-0.9, 2.2, 0.0], [-0.9, 2.2, 0.3]], np.zeros((3, 3))])
+    found = path(hand, corners, 0.1)
+    along = np.linspace(0, 1, 200)[:, None]
+    dense = np.concatenate([a + along * (b - a) for a, b in pairwise(corners[0])])
+    everywhere = ball(hand, dense, 0.1)
+    assert everywhere.max() * 0.8 <= found[0] <= everywhere.max() + 1e-5
+    assert found[1] == ball(hand, [[0, 0, 0]], 0.1)[0]
+    assert path(hand, corners[0], 0.1) == found[0]
+    assert path(hand, corners[0], 0.1).shape == ()
+
+
+def test_nonsense_is_refused(hand: HandMap) -> None:
+    for points, radius in (
+        (np.zeros((2, 2)), 0.1),
+        (np.zeros((1, 3)), 0.0),
+        (np.full((1, 3), np.nan), 0.1),
+        ([[0, 0, 0], [1e9, 0, 0]], 0.1),
+    ):
+        with pytest.raises(ConfigError):
+            ball(hand, points, radius)
+    for points in (np.zeros((0, 3)), np.zeros(3), np.full((2, 3), np.inf)):
+        with pytest.raises(ConfigError):
+            path(hand, points, 0.1)
+    assert ball(hand, np.zeros((0, 3)), 0.1).shape == (0,)
