@@ -152,8 +152,9 @@ def one_backend(backend: str) -> str:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def small_pictures() -> Iterator[None]:
-    """Figures are drawn as always, but written with few pixels, which takes a third of the time."""
+def small_pictures() -> Iterator[Any]:
+    """Figures are drawn as always, but written with few pixels, which takes a third of the time. The value is
+    what writes them with all of theirs."""
     from matplotlib.figure import Figure  # late: half of a run's start
 
     save = Figure.savefig
@@ -163,7 +164,15 @@ def small_pictures() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", save_small)
-        yield
+        yield save
+
+
+@pytest.fixture
+def full_pictures(small_pictures: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests that look at the pixels of figures."""
+    from matplotlib.figure import Figure
+
+    monkeypatch.setattr(Figure, "savefig", small_pictures)
 
 
 @pytest.fixture(scope="session")

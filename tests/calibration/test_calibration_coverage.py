@@ -75,6 +75,7 @@ def pixels(path: Path) -> NDArray[np.uint8]:
     return image
 
 
+@pytest.mark.usefixtures("full_pictures")
 @pytest.mark.parametrize(("nearest", "furthest"), [(0.6, 3.5), (1.0, 1.9)])
 def test_pictures_show_what_was_learnt(tmp_path: Path, nearest: float, furthest: float) -> None:
     tables = random_tables(48, 20, np.random.default_rng(0))

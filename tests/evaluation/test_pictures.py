@@ -83,6 +83,7 @@ def _read(path: Path) -> NDArray[np.uint8]:
     return picture
 
 
+@pytest.mark.usefixtures("full_pictures")
 def test_pictures_are_written(room: VoxelMap, tmp_path: Path) -> None:
     paths = write_pictures(tmp_path, room, [_held_out(room, 0.0)])
     assert {path.name for path in paths} == {"top_view.png", "depth.png", "perspective.png"}
