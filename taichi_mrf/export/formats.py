@@ -19,8 +19,9 @@ from taichi_mrf.export.mesh_file import write_mesh
 from taichi_mrf.export.octomap import write_bt, write_ot
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.export.ply import write_voxels
-from taichi_mrf.export.surface import smooth_surface, voxel_surface
+from taichi_mrf.export.surface import photographed, smooth_surface, voxel_surface
 from taichi_mrf.geometry.up import Z_UP, Up, plan_axes, up_from_name, up_name, y_up
+from taichi_mrf.queries.colored import ColoredMap, is_colored, shown_colors
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN
 
 _DEFAULTS = ExportOptions()
@@ -93,7 +94,9 @@ def _plan_note(up: Up) -> str:
 def _points_or_surface(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
     if options.cubes or options.mesh:
         return _surface(m, path, options)
-    write_voxels(path, *m.voxels(options.threshold), m.voxel_size)
+    centres, p = m.voxels(options.threshold)
+    colored = _photo(m, path, options)
+    write_voxels(path, centres, p, m.voxel_size, None if colored is None else shown_colors(colored, centres))
     return [path]
 
 
@@ -102,9 +105,21 @@ def _surface(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
     surface = make(m, options.threshold)
     if not len(surface.triangles):
         raise ConfigError(f"{path}: no voxel has a probability of {options.threshold:g}: there is no surface")
+    colored = _photo(m, path, options)
+    if colored is not None:
+        surface = photographed(colored, surface, options.cubes)
     T_gltf_world = y_up(_up(m, options)) if path.suffix.lower() == ".glb" else None
     write_mesh(path, surface, m.voxel_size, T_gltf_world)
     return [path]
+
+
+def _photo(m: ExportedMap, path: Path, options: ExportOptions) -> ColoredMap | None:
+    """The map, if its colours are to be those that cameras saw. Raises ConfigError if it has none."""
+    if is_colored(m) and options.color_by != "marginal":
+        return m
+    if options.color_by == "photo":
+        raise ConfigError(f"{path}: the map has no colours: map the recording with --color")
+    return None
 
 
 def _octomap_binary(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
@@ -113,7 +128,7 @@ def _octomap_binary(m: ExportedMap, path: Path, options: ExportOptions) -> list[
 
 
 def _octomap(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
-    write_ot(path, m)
+    write_ot(path, m, _photo(m, path, options))
     return [path]
 
 
@@ -138,7 +153,7 @@ def _chunks(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
 def _page(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
     from taichi_mrf.export.page import write_page  # viser takes a second to import
 
-    write_page(path, m, options.threshold, _up(m, options))
+    write_page(path, m, options.threshold, _up(m, options), _photo(m, path, options))
     return [path]
 
 

@@ -9,7 +9,6 @@ from taichi_mrf.export.surface import Surface
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.system.atomic import atomic_path
 from taichi_mrf.system.libraries import library
-from taichi_mrf.voxels.colors import LOWEST
 
 
 def write_mesh(
@@ -23,7 +22,7 @@ def write_mesh(
     """
     suffix = Path(path).suffix.lower()
     if suffix == ".ply":
-        comments = [f"voxel_size {voxel_size:.9g} metres", f"color is viridis from occupancy {LOWEST} to 1"]
+        comments = [f"voxel_size {voxel_size:.9g} metres", surface.colors_note]
         write_surface(path, surface.vertices_m, surface.triangles, surface.colors, comments)
         return
     trimesh = library("trimesh", f"{suffix} files need", "mesh")

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
+from taichi_mrf.queries.colored import ColoredMap
 from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, seen_free_bricks
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN
 from taichi_mrf.system.memory import check_memory
@@ -29,9 +30,12 @@ BRICK_LEVEL = 3
 NO_CHILD, FREE_LEAF, OCCUPIED_LEAF, INNER = 0, 1, 2, 3
 """The kinds of a child, in two bits of OctoMap's binary format."""
 
+WHITE = np.uint32(0xFFFFFF)
+"""The colour that OctoMap takes for none."""
+
 _CHILDREN = 8
 
-_BYTES_PER_NODE = 60
+_BYTES_PER_NODE = 68
 """Peak memory of sorting the nodes: twice their arrays, and their numbers."""
 
 
@@ -41,7 +45,9 @@ class Nodes:
 
     ``code`` (n,) int64 is the number of the first voxel in the node, ``level`` (n,) int8 its level, 0 for a
     voxel; ``value`` (n,) float32 log-odds, for an inner node the largest below it; ``children`` (n,) uint8
-    has a bit for each child, 0 for a leaf; ``kinds`` (n,) uint16 two bits for each, see :data:`NO_CHILD`.
+    has a bit for each child, 0 for a leaf; ``kinds`` (n,) uint16 two bits for each, see :data:`NO_CHILD`;
+    ``color`` (n,) uint32 is red + 256 green + 65536 blue, :data:`WHITE` for none, for an inner node the
+    mean of its children's.
     """
 
     code: NDArray[np.int64]
@@ -49,6 +55,7 @@ class Nodes:
     value: NDArray[np.float32]
     children: NDArray[np.uint8]
     kinds: NDArray[np.uint16]
+    color: NDArray[np.uint32]
 
     def __len__(self) -> int:
         return len(self.code)
@@ -57,12 +64,17 @@ class Nodes:
         return Nodes(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
     @staticmethod
-    def leaves(code: NDArray[np.int64], level: int, value: NDArray[np.float32]) -> "Nodes":
-        """Leaves of one level."""
+    def leaves(
+        code: NDArray[np.int64],
+        level: int,
+        value: NDArray[np.float32],
+        color: NDArray[np.uint32] | None = None,
+    ) -> "Nodes":
+        """Leaves of one level, without a colour if ``color`` is None."""
         n = len(code)
         return Nodes(
             code, np.full(n, level, np.int8), value.astype(np.float32), np.zeros(n, np.uint8),
-            np.zeros(n, np.uint16),
+            np.zeros(n, np.uint16), np.full(n, WHITE) if color is None else color,
         )  # fmt: skip
 
     @staticmethod
@@ -71,12 +83,13 @@ class Nodes:
         return Nodes(*(np.concatenate([getattr(p, n) for p in parts]) for n in Nodes.__dataclass_fields__))
 
 
-def octree_of(m: QueriedMap, *, only_state: bool) -> Nodes:
+def octree_of(m: QueriedMap, *, only_state: bool, colored: ColoredMap | None = None) -> Nodes:
     """The known space of a map in pre-order: no node for unknown space, leaves for free space, with or
     without voxels in the map, and for what is occupied. Eight equal leaves are one.
 
-    With ``only_state`` all free voxels are equal, at -1, and all occupied ones, at +1. Raises CapacityError
-    if the map is larger than an octree of OctoMap's, or if there is not enough memory.
+    With ``only_state`` all free voxels are equal, at -1, and all occupied ones, at +1. Occupied voxels get
+    the colours of ``colored``, the same map. Raises CapacityError if the map is larger than an octree of
+    OctoMap's, or if there is not enough memory.
     """
     reader = BrickReader(m)
     done: list[Nodes] = []
@@ -87,7 +100,12 @@ def octree_of(m: QueriedMap, *, only_state: bool) -> Nodes:
         values = np.where(state == OCCUPIED, np.float32(1), np.float32(-1)) if only_state else log_odds
         row, place = np.nonzero(state[:, _IN_Z_ORDER] != UNKNOWN)
         codes = brick_codes(bricks)[row] + place
-        nodes = Nodes.leaves(codes, 0, values[:, _IN_Z_ORDER][row, place])
+        color = None
+        if colored is not None:
+            seen = colored.colors_in(reader.slots(bricks))[:, _IN_Z_ORDER][row, place]
+            shown = (state[:, _IN_Z_ORDER][row, place] == OCCUPIED) & (seen[:, 3] > 0)
+            color = np.where(shown, _packed(seen), WHITE)
+        nodes = Nodes.leaves(codes, 0, values[:, _IN_Z_ORDER][row, place], color)
         tops.append(_joined_up_to(BRICK_LEVEL, nodes, done))
     free = seen_free_bricks(m)
     if len(free):
@@ -156,6 +174,25 @@ def voxels_in_z_order() -> NDArray[np.int64]:
     return _IN_Z_ORDER
 
 
+def channels(color: NDArray[np.uint32]) -> NDArray[np.uint8]:
+    """Red, green and blue (n, 3) of the colours of nodes (n,)."""
+    return (color[:, None] >> np.array([0, 8, 16], np.uint32)).astype(np.uint8)
+
+
+def _packed(color: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    wide = color.astype(np.uint32)
+    return wide[:, 0] | wide[:, 1] << np.uint32(8) | wide[:, 2] << np.uint32(16)
+
+
+def _mean_colors(color: NDArray[np.uint32], first: NDArray[np.intp]) -> NDArray[np.uint32]:
+    """The mean colour of the children from each of ``first`` on, rounded down as OctoMap does; those without
+    a colour do not count."""
+    has = color != WHITE
+    count = np.add.reduceat(has.astype(np.uint32), first)
+    sums = np.add.reduceat(np.where(has[:, None], channels(color), np.uint8(0)).astype(np.uint32), first)
+    return np.where(count > 0, _packed(sums // np.maximum(count, 1)[:, None]), WHITE)
+
+
 def _joined_up_to(level: int, nodes: Nodes, done: list[Nodes]) -> Nodes:
     """The nodes of ``level`` over some nodes of one level below it, ascending; those below go to ``done``."""
     while len(nodes) and nodes.level[0] < level:
@@ -174,6 +211,10 @@ def _parents(nodes: Nodes, done: list[Nodes]) -> Nodes:
     kind = np.where(leaf, np.where(nodes.value >= 0, OCCUPIED_LEAF, FREE_LEAF), INNER).astype(np.uint16)
     largest = np.maximum.reduceat(nodes.value, first)
     equal = np.minimum.reduceat(nodes.value, first) == largest
+    color = np.full(len(first), WHITE)
+    if (nodes.color != WHITE).any():
+        equal &= np.minimum.reduceat(nodes.color, first) == np.maximum.reduceat(nodes.color, first)
+        color = _mean_colors(nodes.color, first)
     joined = (count == _CHILDREN) & equal & np.logical_and.reduceat(leaf, first)
     done.append(nodes[~np.repeat(joined, count)])
     children = np.bitwise_or.reduceat((1 << child).astype(np.uint8), first)
@@ -184,4 +225,5 @@ def _parents(nodes: Nodes, done: list[Nodes]) -> Nodes:
         largest,
         np.where(joined, np.uint8(0), children),
         np.where(joined, np.uint16(0), kinds),
+        color,
     )

@@ -23,6 +23,10 @@ class ExportOptions:
     mesh: bool = False
     """Write a .ply as a mesh by marching cubes, like .glb, .obj and .stl, not as points."""
 
+    color_by: Literal["auto", "marginal", "photo"] = "auto"
+    """What colours of .ply, .glb, .obj, .ot and .html show: the marginals, or what cameras saw (photo), if
+    the map was made with colour images; auto is photo for such a map. An .ot has no colours of marginals."""
+
     z_min: float | None = None
     """Lower end in metres of the band of heights that a .pgm shows; heights count along up."""
 

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from taichi_mrf.geometry.up import Z_UP, Up
+from taichi_mrf.queries.colored import ColoredMap, shown_colors_in
 from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.viewer.messages import pack_log_odds
 from taichi_mrf.viewer.scene.look import look_of
-from taichi_mrf.viewer.scene.options import ViewOptions
+from taichi_mrf.viewer.scene.options import ColorBy, ViewOptions
 from taichi_mrf.viewer.scene.viewpoint import ViewpointController
 from taichi_mrf.viewer.scene.voxel_layer import VoxelLayer
 from taichi_mrf.viewer.transport.server import start_server
@@ -23,9 +24,17 @@ _NOT_SHOWN = np.float32(-60)
 """Log-odds below any threshold."""
 
 
-def write_page(path: str | Path, m: QueriedMap, threshold: float = 0.5, up: Up | None = None) -> None:
+def write_page(
+    path: str | Path,
+    m: QueriedMap,
+    threshold: float = 0.5,
+    up: Up | None = None,
+    colored: ColoredMap | None = None,
+) -> None:
     """Write a page that shows the voxels of at least this probability, ``up`` pointing up (default: the
-    map's). Raises MapFileError, ViewerError."""
+    map's), by their marginals or in the colours of ``colored``, the same map. Raises MapFileError,
+    ViewerError."""
+    color_by: ColorBy = "marginal" if colored is None else "photo"
     server = start_server("127.0.0.1", 0, Path(path).stem)
     try:
         layer = VoxelLayer(server.scene, "/voxels", m.voxel_size)
@@ -34,11 +43,13 @@ def write_page(path: str | Path, m: QueriedMap, threshold: float = 0.5, up: Up |
             # Some maps give unseen voxels a probability of one half; those must not be shown.
             seen = np.where(log_odds == reader.pool.prior_log_odds, _NOT_SHOWN, log_odds)
             layer.store.put(bricks, pack_log_odds(seen), np.zeros((len(bricks), VOXELS), np.uint8))
+            if colored is not None:
+                layer.store.paint(bricks, shown_colors_in(colored, reader.slots(bricks)))
         eye = ViewpointController(server)
         eye.set_up(up or m.up or Z_UP)
         bounds = layer.store.bounds()
         if bounds is not None:
-            look = look_of(ViewOptions(threshold=threshold), layer.store, eye.up, m.voxel_size)
+            look = look_of(ViewOptions(color_by, threshold), layer.store, eye.up, m.voxel_size)
             layer.prepare(layer.all_chunks(), look, exactly=True)
             layer.send()
             low, high = (end.astype(np.float64) * BRICK * m.voxel_size for end in (bounds[0], bounds[1] + 1))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.system.atomic import atomic_path
-from taichi_mrf.voxels.colors import LOWEST, marginal_colors
+from taichi_mrf.voxels.colors import MARGINAL_NOTE, PHOTO_NOTE, marginal_colors
 
 _PLACE = [(name, "<f4") for name in ("x", "y", "z")]
 _COLOR = [(name, "u1") for name in ("red", "green", "blue")]
@@ -19,20 +19,25 @@ _PLY_TYPES = {"f": "float", "u": "uchar"}
 
 
 def write_voxels(
-    path: str | Path, centres: NDArray[np.floating], probability: NDArray[np.floating], voxel_size: float
+    path: str | Path,
+    centres: NDArray[np.floating],
+    probability: NDArray[np.floating],
+    voxel_size: float,
+    colors: NDArray[np.uint8] | None = None,
 ) -> None:
     """Write voxels as one coloured point each. Raises MapFileError.
 
     ``centres`` (N, 3) and ``voxel_size`` are in metres, world frame. Besides its position a vertex has
-    the property ``occupancy``, its marginal (N,), and the colour that stands for it.
+    the property ``occupancy``, its marginal (N,), and its colour: of ``colors`` (N, 3), which cameras saw, or
+    the one that stands for the marginal.
     """
     comments = [
         f"voxel_size {voxel_size:.9g} metres",
         "occupancy is the marginal probability that the voxel is occupied",
-        f"color is viridis from occupancy {LOWEST} to 1",
+        MARGINAL_NOTE if colors is None else PHOTO_NOTE,
     ]
     extra = {"occupancy": np.asarray(probability, "<f4")}
-    write_points(path, centres, marginal_colors(probability), extra, comments)
+    write_points(path, centres, marginal_colors(probability) if colors is None else colors, extra, comments)
 
 
 def write_points(

@@ -4,16 +4,17 @@ Both go through the map chunk by chunk, so that memory is bounded by the surface
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.queries.box import BoxOfVoxels, voxel_box
+from taichi_mrf.queries.colored import ColoredMap, blended_colors, shown_colors
 from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, sorted_bricks
 from taichi_mrf.system.libraries import library
-from taichi_mrf.voxels.colors import marginal_colors
+from taichi_mrf.voxels.colors import MARGINAL_NOTE, PHOTO_NOTE, marginal_colors
 from taichi_mrf.voxels.layout import CHUNK, CHUNK_VOXELS
 
 _ON_GRID = 2e-5
@@ -36,11 +37,12 @@ _SIDES = (
 @dataclass(frozen=True)
 class Surface:
     """Triangles in the world: ``vertices_m`` (V, 3) float64 in metres, ``triangles`` (T, 3) int64, wound
-    counter-clockwise as seen from free space, ``colors`` (V, 3) uint8 of the marginals."""
+    counter-clockwise as seen from free space, ``colors`` (V, 3) uint8, whose meaning is ``colors_note``."""
 
     vertices_m: NDArray[np.float64]
     triangles: NDArray[np.int64]
     colors: NDArray[np.uint8]
+    colors_note: str = MARGINAL_NOTE
 
 
 def voxel_surface(m: QueriedMap, threshold: float) -> Surface:
@@ -63,6 +65,18 @@ def voxel_surface(m: QueriedMap, threshold: float) -> Surface:
         -1, 3
     )
     return Surface(vertices, triangles, np.concatenate(colors))
+
+
+def photographed(m: ColoredMap, surface: Surface, of_voxels: bool) -> Surface:
+    """The same surface in the colours that cameras saw. ``of_voxels``: it is a :func:`voxel_surface`."""
+    if of_voxels:
+        corners = surface.vertices_m.reshape(-1, 4, 3)
+        outwards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1]) / m.voxel_size**2
+        centres = corners.mean(axis=1) - 0.5 * m.voxel_size * outwards
+        colors = np.repeat(shown_colors(m, centres), 4, axis=0)
+    else:
+        colors = blended_colors(m, surface.vertices_m)
+    return replace(surface, colors=colors, colors_note=PHOTO_NOTE)
 
 
 def smooth_surface(m: QueriedMap, level: float) -> Surface:

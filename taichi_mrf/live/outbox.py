@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.viewer.messages import (
+    BrickColors,
     Bricks,
     CurrentCamera,
     File,
@@ -107,6 +108,8 @@ class Outbox:
             return type(update).__name__
         if isinstance(update, KeyframeInfo):
             return "keyframe", update.id
+        if isinstance(update, BrickColors):
+            return "colors", update.chunk
         if isinstance(update, Hello):
             return Hello.__name__
         return None

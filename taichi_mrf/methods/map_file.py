@@ -20,6 +20,7 @@ from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import CapacityError, MapFileError, TaichiMRFError, said
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.geometry.up import UP_NAMES, Up, up_from_name, up_name, up_of
+from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.sensor_section import describing
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
@@ -50,6 +51,11 @@ class StoredKeyframe:
     camera: Camera
     stamp_s: float
     color: NDArray[np.uint8] | None = None
+
+    @staticmethod
+    def of(k: Keyframe) -> "StoredKeyframe":
+        """A keyframe of an MRFMap."""
+        return StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera, k.stamp_s, k.color)
 
     @property
     def rays(self) -> int:

@@ -56,6 +56,8 @@ class Hello(Update):
     """Whether the map's method can freeze keyframes."""
     has_dates: bool = False
     """Whether the map can be shown as of another time."""
+    has_colors: bool = False
+    """Whether voxels have the colours that cameras saw."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,16 @@ class Bricks(Update):
     log_odds: NDArray[np.int16]
     seen: NDArray[np.uint8]
     removed: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class BrickColors(Update):
+    """The colours that cameras saw, of the voxels of all bricks of a ``chunk``: ``bricks`` (n, 3) int32,
+    ``colors`` (n, 512, 3) uint8 RGB."""
+
+    chunk: tuple[int, int, int]
+    bricks: NDArray[np.int32]
+    colors: NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -286,13 +298,14 @@ class PixelRay(Request):
 @dataclass(frozen=True)
 class Watch(Request):
     """Which extras the page shows and the mapping process must keep up to date: images of ``view`` (a
-    keyframe, or None for the current camera), the baseline beside the map, and the ``counts`` of keyframes
-    that see each voxel (else sent as 0)."""
+    keyframe, or None for the current camera), the baseline beside the map, the ``counts`` of keyframes that
+    see each voxel (else sent as 0), and the ``colors`` of voxels."""
 
     images: bool
     view: int | None
     baseline: bool
     counts: bool = False
+    colors: bool = False
 
 
 @dataclass(frozen=True)

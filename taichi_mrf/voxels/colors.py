@@ -1,4 +1,4 @@
-"""The colours of marginals: one scale for files and pictures."""
+"""The colours of voxels in files and pictures: of marginals on one scale, and where there are none."""
 
 import cv2
 import numpy as np
@@ -6,6 +6,14 @@ from numpy.typing import ArrayLike, NDArray
 
 LOWEST = 0.5
 """The marginal at the dark end of the scale; below it a voxel counts as free and is not shown."""
+
+MARGINAL_NOTE = f"color is viridis from occupancy {LOWEST} to 1"
+
+NO_COLOR = 128
+"""Each of red, green and blue of a voxel whose colour no camera saw, beside others that have one."""
+
+PHOTO_NOTE = f"color is what cameras saw, {NO_COLOR} {NO_COLOR} {NO_COLOR} where none did"
+"""What the colours in a file mean, for its header."""
 
 
 def viridis() -> NDArray[np.uint8]:

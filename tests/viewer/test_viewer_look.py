@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,11 +14,11 @@ from taichi_mrf.viewer.messages import LOG_ODDS_STEP, KeyframeInfo, RayAnswer, p
 from taichi_mrf.viewer.scene.coloring import legend_html, scale_of, voxel_colors
 from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, Placement
 from taichi_mrf.viewer.scene.look import look_of
-from taichi_mrf.viewer.scene.options import ColorBy, ViewOptions
+from taichi_mrf.viewer.scene.options import UNPAINTED, ColorBy, ViewOptions
 from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
 from taichi_mrf.viewer.scene.ray_plot import curves
 from taichi_mrf.viewer.scene.voxel_store import Shown, VoxelStore, facing
-from taichi_mrf.voxels.colors import marginal_colors
+from taichi_mrf.voxels.colors import NO_COLOR, marginal_colors
 
 HEIGHTS = (0.0, 2.0)
 
@@ -73,7 +73,26 @@ def test_heights_run_over_the_map() -> None:
     np.testing.assert_array_equal(colors, scale.colors[[0, 128, 255]])
 
 
-@pytest.mark.parametrize("color_by", get_args(ColorBy))
+def test_a_photo_shows_what_cameras_saw_and_grey_where_none_did() -> None:
+    scale, store = scale_of("photo", 0.5, HEIGHTS), VoxelStore()
+    bricks = np.array([[0, 0, 0], [0, 0, 1], [9, 0, 0]], np.int32)
+    colors = np.random.default_rng(0).integers(0, 255, (3, 512, 3)).astype(np.uint8)
+    store.paint(bricks[:2], colors[:2])  # may come before the voxels, which are hidden until then
+    assert not len(store.shown((0, 0, 0), 0.0, None).cells)
+    assert store.put(bricks, np.full((3, 512), 100, np.int16), np.ones((3, 512), np.uint8))
+    seen = store.shown((0, 0, 0), 0.0, None)
+    np.testing.assert_array_equal(voxel_colors(scale, seen, np.zeros(1024)), colors[:2].reshape(-1, 3))
+    unseen = store.shown((1, 0, 0), 0.0, None)
+    np.testing.assert_array_equal(voxel_colors(scale, unseen, np.zeros(512)), np.full((512, 3), NO_COLOR))
+    dark = voxel_colors(scale, seen, np.zeros(1024), np.full(1024, 3, np.uint8))
+    assert (dark <= colors[:2].reshape(-1, 3)).all()
+    assert "grey where none did" in legend_html(scale)
+    store.remove(bricks[:1])
+    left = store.shown((0, 0, 0), 0.0, None)
+    np.testing.assert_array_equal(voxel_colors(scale, left, np.zeros(512)), colors[1])
+
+
+@pytest.mark.parametrize("color_by", UNPAINTED)
 def test_every_mode_has_a_legend_with_its_ends(color_by: ColorBy) -> None:
     scale = scale_of(color_by, 0.5, HEIGHTS)
     text = legend_html(scale)

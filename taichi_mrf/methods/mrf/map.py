@@ -33,6 +33,7 @@ from taichi_mrf.inference.sweep import Sweeper, unknown_entry_depths
 from taichi_mrf.methods.brick_map import check_inference, own_parameters, own_section
 from taichi_mrf.methods.map_file import MapHeader, StoredKeyframe, naming
 from taichi_mrf.methods.mrf.checkpoint import Checkpoint, go_back, take_checkpoint
+from taichi_mrf.methods.mrf.coloring import MapColors
 from taichi_mrf.methods.mrf.keyframe_allocator import KeyframeAllocator
 from taichi_mrf.methods.mrf.memory_budget import MemoryBudget
 from taichi_mrf.methods.mrf.moving_window import MovingWindow
@@ -96,7 +97,8 @@ class MRFMap(ReadableMRF):
         self._next_id = 0
         self._messages_lost = False  # a loaded map has beliefs, but no messages
         self._settled = True
-        parked = (self._registry, self._dated, self.aligner.surface)
+        self._colors = MapColors(self._registry, self._keyframes, self._sweeper, self._allocator.refresh)
+        parked = (self._registry, self._dated, self.aligner.surface, self._colors)
         self.window = MovingWindow.of(self.config.volume, *parked)
 
     @property
@@ -190,6 +192,7 @@ class MRFMap(ReadableMRF):
             raise KeyframeError(
                 f"keyframe {id} ({keyframe.name}) has no messages to freeze: call infer first"
             )
+        self._colors.freeze(keyframe)
         self._allocator.freeze(keyframe)
         self.aligner.surface.freeze(keyframe)
         self._frozen[id] = keyframe.name
@@ -327,21 +330,17 @@ class MRFMap(ReadableMRF):
             frozen=len(self._frozen),
             rays=sum(k.rays for k in keyframes),
             message_bytes=sum(k.voxel_bytes for k in keyframes),
-            other_bytes=sum(k.image_bytes for k in keyframes) + self._sweeper.nbytes,
+            other_bytes=sum(k.image_bytes for k in keyframes) + self._sweeper.nbytes + self._colors.nbytes,
         )
 
     def save(self, path: str | Path) -> None:
         """Write the map to one .npz file, under a temporary name first. Raises MapFileError."""
         keyframes = list(self._keyframes.values())
-        stored = [
-            StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera, k.stamp_s, k.color)
-            for k in keyframes
-        ]
+        stored = [StoredKeyframe.of(keyframe) for keyframe in keyframes]
         header = MapHeader(self.config, self.noise, stored, self._next_id, self._settled, self.up)
         parked = () if self.window is None else self.window.save_beside(Path(path), self)
-        write_contents(
-            Path(path), contents_of(header, self._registry, keyframes, self._frozen, parked, self._dated)
-        )
+        parts = (self._frozen, parked, self._dated, self._colors)
+        write_contents(Path(path), contents_of(header, self._registry, keyframes, *parts))
         if self.window is not None:
             self.window.saved(Path(path))
 
@@ -356,6 +355,7 @@ class MRFMap(ReadableMRF):
             if len(bricks):
                 slots = m._registry.restore(bricks, contents.frozen_owners)
             m._registry.see_for_good(contents.frozen_crossed)
+            m._colors.restore(contents.frozen_colors)
             m._frozen = dict(contents.frozen)
             for k in header.keyframes:
                 image = m._upload(k.depth_m, k.camera, k.color)
@@ -369,6 +369,7 @@ class MRFMap(ReadableMRF):
             if m._dated is not None and contents.frozen_dated is not None:
                 m._dated.restore_frozen(slots, *contents.frozen_dated)
             m._show(slots, contents.belief)
+            m._colors.show(slots, contents.colors)
         m._next_id, m._up = header.next_id, header.up
         m._messages_lost, m._settled = bool(m._keyframes), header.settled
         return m

@@ -29,6 +29,7 @@ from taichi_mrf.export.store_header import StoreHeader
 from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.brick_registry import BrickRegistry, Bricks
+from taichi_mrf.methods.mrf.coloring import MapColors
 from taichi_mrf.methods.mrf.parked_chunk import ParkedChunk
 from taichi_mrf.methods.mrf.parked_chunks import ParkedChunks, folder_beside
 from taichi_mrf.queries.known_bricks import bricks_between
@@ -69,10 +70,11 @@ class MovingWindow:
         registry: BrickRegistry,
         dated: DatedBelief | None,
         surface: KeyframeSurfels,
+        colors: MapColors,
     ) -> None:
         """``dated`` is what follows the messages if evidence has a date, ``surface`` what keyframes are
         aligned with."""
-        self.size_m, self._dated, self._surface = size_m, dated, surface
+        self.size_m, self._dated, self._surface, self._colors = size_m, dated, surface, colors
         self.parked = ParkedChunks()
         self._registry = registry
         self._position_m: NDArray[np.float64] | None = None  # where chunks were last looked for
@@ -85,12 +87,13 @@ class MovingWindow:
         registry: BrickRegistry,
         dated: DatedBelief | None,
         surface: KeyframeSurfels,
+        colors: MapColors,
     ) -> "MovingWindow | None":
         """The window that a configuration asks for. Raises TaichiMRFError without zarr."""
         if volume.window_m == 0:
             return None
         library("zarr", "volume.window_m needs", "store")  # fails before the run, not in the middle
-        return MovingWindow(volume.window_m, registry, dated, surface)
+        return MovingWindow(volume.window_m, registry, dated, surface, colors)
 
     @property
     def folder(self) -> Path | None:
@@ -171,6 +174,7 @@ class MovingWindow:
                 self._dated.restore_frozen(slots, *found.dated)
         registry.see_for_good(found.crossed)
         self._surface.restore(found.surfels)
+        self._colors.restore(found.colors)
 
     def _leave(self, m: WindowedMap, position_m: NDArray[np.float64]) -> None:
         """Write the chunks that are outside of the window, and release them. What cannot be written stays in
@@ -193,6 +197,7 @@ class MovingWindow:
         self.parked.add(self._contents(chunks, slots), self._voxels(chunks, header), header)
         self._registry.leave(slots, chunks)
         self._surface.release(chunks)
+        self._colors.release(chunks)
         self._chunks = self.parked.chunks
 
     def _contents(self, chunks: NDArray[np.int32], slots: NDArray[np.int32]) -> dict[Chunk, ParkedChunk]:
@@ -202,6 +207,8 @@ class MovingWindow:
         surfels = self._surface.frozen_in(chunks)
         slots_of, crossed_of = dict(by_chunk(pool.bricks[slots])), dict(by_chunk(frozen_crossed))
         surfels_of = dict(by_chunk(surfels.cells // BRICK))
+        colors = self._colors.frozen_in(chunks)
+        colors_of = dict(by_chunk(colors.bricks))
         contents = {}
         for x, y, z in chunks.tolist():
             inside = slots[slots_of.get((x, y, z), _NONE)]
@@ -213,6 +220,7 @@ class MovingWindow:
                 frozen_crossed[crossed_of.get((x, y, z), _NONE)],
                 None if self._dated is None else self._dated.read_frozen(inside),
                 surfels.chosen(surfels_of.get((x, y, z), _NONE)),
+                colors.chosen(colors_of.get((x, y, z), _NONE)),
             )
         return contents
 

@@ -21,6 +21,7 @@ from taichi_mrf.inference.dated_channels import layer_of
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import count_observations
 from taichi_mrf.methods.brick_map import BrickMap
+from taichi_mrf.methods.mrf.coloring import MapColors
 from taichi_mrf.methods.protocol import MappedKeyframe
 from taichi_mrf.queries.change import MapChange, compare_maps
 from taichi_mrf.queries.view import View
@@ -62,6 +63,24 @@ class MapReading(BrickMap):
         """The world axis that is up."""
         return self._source.up
 
+    @property
+    def has_colors(self) -> bool:
+        """Whether any voxel may have a colour."""
+        return self._colored.has_colors
+
+    def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
+        """Colours of the map that is read, whatever the time or the layer."""
+        return self._colored.colors(points)
+
+    def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """The same for the voxels of some bricks of the pool, (n,) slots -> (n, 512, 4)."""
+        return self._colored.colors_in(slots)
+
+    @property
+    def _colored(self) -> "ReadableMRF":
+        assert isinstance(self._source, ReadableMRF)
+        return self._source
+
     def _grid(self) -> tuple[float, Topology, BrickPool, float]:
         if self._registry.version != self._version:
             raise KeyframeError("the map has changed since it was read: call at() or layer() again")
@@ -74,6 +93,7 @@ class ReadableMRF(BrickMap):
     _keyframes: dict[int, Keyframe]
     _frozen: dict[int, str]
     _dated: DatedBelief | None
+    _colors: MapColors
 
     @property
     def keyframes(self) -> Mapping[int, Keyframe]:
@@ -95,6 +115,33 @@ class ReadableMRF(BrickMap):
         frozen ones count as one; 255 means 255 or more."""
         sent = [(k.visible, k.messages) for k in self._keyframes.values() if k.messages is not None]
         return count_observations(slots, sent, self._pool)
+
+    @property
+    def has_colors(self) -> bool:
+        """Whether any voxel may have a colour: a keyframe has been added with a colour image."""
+        return bool(self._colors)
+
+    def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
+        """What cameras saw of the voxels at (N, 3) points in metres, (N, 4) uint8: red, green, blue, and how
+        much of the voxel they have seen, 0 for nothing. Each pixel's colour goes to the voxels on its ray by
+        the probability that they are what it saw, as of the last :meth:`infer`."""
+        self._prepare_colors()
+        return self._colors.at(points)
+
+    def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """The same for the voxels of some bricks of ``view.pool``, (n,) slots -> (n, 512, 4)."""
+        self._prepare_colors()
+        return self._colors.within(slots)
+
+    def recent_colors(self) -> NDArray[np.uint8]:
+        """Colours (slots * 512, 4) while keyframes come, at the price of the new ones: those of others are
+        as they were found before (MapColors.follow)."""
+        self._restore_messages()
+        return self._colors.follow()
+
+    def _prepare_colors(self) -> None:
+        if not self._colors.is_current:
+            self._restore_messages()
 
     def _date(self, time: TimeConfig) -> None:
         """Give evidence a date, unless the world is static."""

@@ -13,14 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
+from taichi_mrf.inference.color_sums import ColorShare
 from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.dated_channels import NEVER
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.map_file import MapHeader, open_map_file, read_bricks, read_header
+from taichi_mrf.methods.mrf.coloring import MapColors
 from taichi_mrf.system.atomic import write_npz
 from taichi_mrf.system.npz_file import NpzFile
-from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.layout import VOXELS, grid_keys
+
+_SHARE = ("bricks", "numbers", "rg", "bw")
 
 _BEFORE_ALL = float(np.finfo(np.float64).min)
 """Stands for no stamp at all: a file holds finite numbers only."""
@@ -32,7 +36,8 @@ class MapContents:
     (n, 3); ``frozen_dated`` is what frozen keyframes say of the voxels of a dated map, and as of when (n);
     ``frozen_owners`` (n,) counts the frozen keyframes that own each brick, ``frozen_crossed`` (m, 3)
     are the bricks that they crossed, and ``frozen`` their names by id. ``parked`` names the files of the
-    chunks that are not in memory (parked_chunks.py)."""
+    chunks that are not in memory (parked_chunks.py). ``colors`` (n, 512, 4) are those of the voxels, or (0,
+    512, 4), ``frozen_colors`` what frozen keyframes gave to them."""
 
     header: MapHeader
     bricks: NDArray[np.int32]
@@ -43,6 +48,8 @@ class MapContents:
     frozen_crossed: NDArray[np.int32]
     frozen: dict[int, str]
     parked: list[str]
+    colors: NDArray[np.uint8]
+    frozen_colors: ColorShare
 
 
 def contents_of(
@@ -52,6 +59,7 @@ def contents_of(
     frozen: dict[int, str],
     parked: Sequence[str] = (),
     dated: DatedBelief | None = None,
+    colors: MapColors | None = None,
 ) -> MapContents:
     """The contents to store; ``keyframes`` are those that are not frozen."""
     pool = registry.pool
@@ -69,6 +77,8 @@ def contents_of(
         registry.frozen_crossed,
         frozen,
         list(parked),
+        np.zeros((0, VOXELS, 4), np.uint8) if colors is None else colors.stored(slots, header.settled),
+        ColorShare.nothing() if colors is None else colors.frozen,
     )
 
 
@@ -89,7 +99,9 @@ def write_contents(path: Path, contents: MapContents) -> None:
         arrays["parked"] = np.array(contents.parked, np.str_)
     if contents.frozen_dated is not None:
         arrays |= dated_arrays(*contents.frozen_dated)
-    write_npz(path, arrays, manifest=True)
+    if len(contents.colors) and contents.colors.any():
+        arrays["colors"] = contents.colors
+    write_npz(path, arrays | color_arrays(contents.frozen_colors), manifest=True)
 
 
 def read_contents(path: Path) -> MapContents:
@@ -109,6 +121,10 @@ def read_contents(path: Path) -> MapContents:
             file.array("frozen_crossed", "i", (None, 3)).astype(np.int32),
             dict(zip(frozen_ids, file.array("frozen_names", "U", (len(frozen_ids),)).tolist(), strict=True)),
             file.array("parked", "U", (None,)).tolist() if "parked" in file else [],
+            file.array("colors", "u", (n, VOXELS, 4)).astype(np.uint8)
+            if "colors" in file
+            else np.zeros((0, VOXELS, 4), np.uint8),
+            read_color_share(path, file, bricks),
         )
     if (contents.frozen_owners < 0).any():
         raise MapFileError(f"{path}: damaged: frozen_owners holds a negative number")
@@ -127,3 +143,27 @@ def read_dated(file: NpzFile, bricks: int) -> tuple[NDArray[np.float32], NDArray
     belief = file.array("frozen_belief", "f", (bricks, VOXELS))
     stamps = file.array("frozen_stamps", "f", (bricks,)).astype(np.float64)
     return belief.astype(np.float32), np.where(stamps > _BEFORE_ALL, stamps, NEVER)
+
+
+def color_arrays(share: ColorShare) -> dict[str, NDArray]:
+    """What frozen keyframes gave to the colours of voxels, for a file; nothing if it is nothing."""
+    arrays: dict[str, NDArray] = {f"frozen_color_{name}": getattr(share, name) for name in _SHARE}
+    return arrays if len(share.numbers) else {}
+
+
+def read_color_share(path: Path, file: NpzFile, bricks: NDArray[np.int32]) -> ColorShare:
+    """The same from a file whose bricks (n, 3) are given. Raises MapFileError if it names others."""
+    if "frozen_color_numbers" not in file:
+        return ColorShare.nothing()
+    numbers = file.array("frozen_color_numbers", "i", (None,)).astype(np.int32)
+    n = len(numbers)
+    share = ColorShare(
+        file.array("frozen_color_bricks", "i", (n, 3)).astype(np.int32),
+        numbers,
+        file.array("frozen_color_rg", "i", (n,)).astype(np.int64),
+        file.array("frozen_color_bw", "i", (n,)).astype(np.int64),
+    )
+    known = np.isin(grid_keys(share.bricks), grid_keys(bricks)).all()
+    if not known or ((numbers < 0) | (numbers >= VOXELS)).any() or (share.bw <= 0).any():
+        raise MapFileError(f"{path}: damaged: the colours of frozen keyframes are not those of its voxels")
+    return share

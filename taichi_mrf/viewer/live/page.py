@@ -27,6 +27,7 @@ class Page(BasePage[Panel]):
         self.handlers |= {
             m.Hello: self._begin,
             m.Bricks: lambda bricks: None if self.map is None else self.map.take(bricks),
+            m.BrickColors: lambda colors: None if self.map is None else self.map.paint(colors),
             m.KeyframeInfo: self._take_keyframe,
             m.CurrentCamera: self._take_camera,
             m.Status: self.panel.show_status,
@@ -182,8 +183,7 @@ class Page(BasePage[Panel]):
     def _ask_for_extras(self) -> None:
         """Tell the mapping process which extras the page shows."""
         view = self.keyframes.chosen if self.panel.view.value == CHOSEN_KEYFRAME else None
-        baseline, counts = _extras(self.options)
-        self.ask(m.Watch(self.panel.images.value, view, baseline, counts))
+        self.ask(m.Watch(self.panel.images.value, view, *_extras(self.options)))
 
     def _clicked(self, click: Clicked) -> None:
         """A click on a keyframe's picture chooses it and asks for the pixel's ray; a click on a voxel asks
@@ -202,6 +202,6 @@ class Page(BasePage[Panel]):
             self.ask(m.RayThrough((point[0], point[1], point[2]), click.origin, chosen))
 
 
-def _extras(options: ViewOptions) -> tuple[bool, bool]:
-    """Whether the options need the baseline's map, and the counts of keyframes."""
-    return options.show_baseline, options.color_by == "keyframes"
+def _extras(options: ViewOptions) -> tuple[bool, bool, bool]:
+    """Whether the options need the baseline's map, the counts of keyframes, and the colours of voxels."""
+    return options.show_baseline, options.color_by == "keyframes", options.color_by == "photo"

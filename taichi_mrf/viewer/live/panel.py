@@ -1,7 +1,7 @@
 """The widgets of the live page. page.py decides what they do."""
 
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import viser
@@ -10,7 +10,7 @@ from taichi_mrf.viewer.live.actions import Action
 from taichi_mrf.viewer.live.time_folder import TimeFolder
 from taichi_mrf.viewer.messages import Hello, Images, KeyframeInfo, Status
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Tell, rows_html
-from taichi_mrf.viewer.scene.options import ViewOptions
+from taichi_mrf.viewer.scene.options import UNPAINTED, ColorBy, ViewOptions
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
 from taichi_mrf.viewer.scene.safe_text import in_html, in_markdown
 from taichi_mrf.viewer.scene.widgets import OptionWidgets
@@ -96,6 +96,7 @@ class Panel(BasePanel):
         """Show the source, the backend and the parameters."""
         self._hello = hello
         self.time.begin(hello.has_dates)
+        self._map_options.offer("color_by", get_args(ColorBy) if hello.has_colors else UNPAINTED)
         self._parameters.content = (
             '<div style="margin:0.5em 0.75em;font-size:0.85em">Parameters'
             f'<pre style="overflow:auto;margin:0.3em 0">{in_html(hello.parameters)}</pre></div>'

@@ -11,15 +11,18 @@ from numpy.typing import NDArray
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 from taichi_mrf.viewer.scene.options import ColorBy
 from taichi_mrf.viewer.scene.voxel_store import Shown
-from taichi_mrf.voxels.colors import LOWEST
+from taichi_mrf.voxels.colors import LOWEST, NO_COLOR
 
 _MAPS = {
     "marginal": cv2.COLORMAP_VIRIDIS,
     "height": cv2.COLORMAP_CIVIDIS,
     "uncertainty": cv2.COLORMAP_MAGMA,
     "keyframes": cv2.COLORMAP_PLASMA,
+    "photo": cv2.COLORMAP_BONE,  # of no voxel
 }
 
+
+PHOTO_LABEL = "what cameras saw; grey where none did"
 
 DYNAMIC_COLOR = (255, 30, 20)
 """The colour of dynamic voxels, which no scale has."""
@@ -70,6 +73,8 @@ def scale_of(
         share = np.log2(np.maximum(np.arange(256), 1)) / doublings
         label = "keyframes that see the voxel"
         return Scale(color_by, colors, 1.0, float(2**doublings), label, _numbers(share))
+    if color_by == "photo":
+        return Scale(color_by, colors, 0.0, 1.0, PHOTO_LABEL)
     p = _probabilities()
     if color_by == "uncertainty":
         return Scale(color_by, colors, 0.0, 1.0, "uncertainty: entropy (bits)", _numbers(_entropy(p)))
@@ -82,6 +87,9 @@ def voxel_colors(
 ) -> NDArray[np.uint8]:
     """Colours (n, 3) of a chunk's voxels with centres at these heights (n,), in metres; darkened by the
     direction of their surface if ``facing`` is given."""
+    if scale.color_by == "photo":
+        seen = np.full((len(heights_m), 3), NO_COLOR, np.uint8) if shown.colors is None else shown.colors
+        return seen if facing is None else (seen * _SHADES[facing][:, None] + 0.5).astype(np.uint8)
     if scale.table is None:
         span = max(scale.high - scale.low, 1e-6)
         numbers = _numbers((heights_m - scale.low) / span)
@@ -95,6 +103,8 @@ def voxel_colors(
 
 def legend_html(scale: Scale) -> str:
     """The scale as a strip with numbers, for the page."""
+    if scale.color_by == "photo":
+        return f'<div style="padding:0 0.75em;font-size:0.85em">{scale.label}</div>'
     strip = np.ascontiguousarray(scale.colors[None, :, ::-1])
     png = base64.b64encode(cv2.imencode(".png", strip)[1].tobytes()).decode("ascii")
     return (

@@ -11,7 +11,7 @@ import viser
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.up import Up
-from taichi_mrf.viewer.messages import Bricks, Hello, Layer
+from taichi_mrf.viewer.messages import BrickColors, Bricks, Hello, Layer
 from taichi_mrf.viewer.scene.brick_lines import BrickLines
 from taichi_mrf.viewer.scene.coloring import Scale
 from taichi_mrf.viewer.scene.cut_plane import CutPlane, cut_picture
@@ -77,6 +77,11 @@ class MapScene:
         store = self.layers[layer].dynamic if bricks.layer == "dynamic" else self.layers[layer].store
         changed = store.put(bricks.bricks, bricks.log_odds, bricks.seen) | store.remove(bricks.removed)
         self._dirty[layer] |= changed
+        self._news_at = time.monotonic()
+
+    def paint(self, colors: BrickColors) -> None:
+        """Take in colours of the map's bricks; :meth:`flush` draws them."""
+        self._dirty["map"] |= self.store.paint(colors.bricks, colors.colors)
         self._news_at = time.monotonic()
 
     def look_changed(self) -> None:

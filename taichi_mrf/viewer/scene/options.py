@@ -2,11 +2,13 @@
 the slider's. No page is needed to import it."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from taichi_mrf.config.sliders import Range
 
-ColorBy = Literal["marginal", "height", "uncertainty", "keyframes"]
+ColorBy = Literal["marginal", "height", "uncertainty", "keyframes", "photo"]
+UNPAINTED: tuple[ColorBy, ...] = tuple(each for each in get_args(ColorBy) if each != "photo")
+"""What the colour can show of a map that no camera has seen in colour."""
 CutAxis = Literal["none", "x", "y", "z"]
 
 
@@ -15,8 +17,8 @@ class ViewOptions:
     """How the map is shown; nothing here changes the map."""
 
     color_by: ColorBy = "marginal"
-    """What the colour shows: the marginal probability, the height, the uncertainty (entropy), or the number
-    of keyframes whose rays pass through the voxel."""
+    """What the colour shows: the marginal probability, the height, the uncertainty (entropy), the number of
+    keyframes whose rays pass through the voxel, or what cameras saw (photo)."""
 
     threshold: Annotated[float, Range(0.02, 0.99, 0.01)] = 0.5
     """Show voxels whose probability of being occupied is at least this."""

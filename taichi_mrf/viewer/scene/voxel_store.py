@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
+from taichi_mrf.voxels.colors import NO_COLOR
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS, offsets_in_brick
 
 ChunkKey = tuple[int, int, int]
 
 _IN_BRICK = offsets_in_brick().astype(np.uint8)
 _NOWHERE = -1
+_HIDDEN = np.int16(-32768)
 _BITS = VOXELS.bit_length() - 1
 
 _CODES = np.stack(np.unravel_index(np.arange(CHUNK**3), (CHUNK,) * 3), axis=1).astype(np.uint8)
@@ -26,11 +28,12 @@ _CELLS = (_CODES[:, None] * BRICK + _IN_BRICK).reshape(-1, 3)
 @dataclass(frozen=True)
 class Shown:
     """Voxels of one chunk: ``cells`` (n, 3) uint8 in 0..63, ``log_odds`` (n,) int16 in LOG_ODDS_STEP,
-    ``seen`` (n,) uint8 keyframes."""
+    ``seen`` (n,) uint8 keyframes, ``colors`` (n, 3) RGB that cameras saw, None if the chunk has none."""
 
     cells: NDArray[np.uint8]
     log_odds: NDArray[np.int16]
     seen: NDArray[np.uint8]
+    colors: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,7 @@ class Chunk:
         self._codes = np.zeros(0, np.int16)
         self.log_odds = np.zeros((0, VOXELS), np.int16)
         self.seen = np.zeros((0, VOXELS), np.uint8)
+        self.colors: NDArray[np.uint8] | None = None  # (n, 512, 3), once some are known
 
     def __len__(self) -> int:
         return len(self._codes)
@@ -84,14 +88,26 @@ class Chunk:
             more = len(new), VOXELS
             self.log_odds = np.concatenate([self.log_odds, np.zeros(more, np.int16)])
             self.seen = np.concatenate([self.seen, np.zeros(more, np.uint8)])
+            if self.colors is not None:
+                self.colors = np.concatenate([self.colors, _uncolored(len(new))])
         rows = self._row[codes]
         self.log_odds[rows], self.seen[rows] = log_odds, seen
+
+    def paint(self, codes: NDArray[np.int16], colors: NDArray[np.uint8]) -> None:
+        """Set the colours of the voxels of some bricks. Those that are not here yet are hidden until
+        :meth:`put` brings their log-odds."""
+        new = codes[self._row[codes] == _NOWHERE]
+        self.put(new, np.full((len(new), VOXELS), _HIDDEN), np.zeros((len(new), VOXELS), np.uint8))
+        if self.colors is None:
+            self.colors = _uncolored(len(self))
+        self.colors[self._row[codes]] = colors
 
     def remove(self, codes: NDArray[np.int16]) -> None:
         """Remove some bricks; numbers of other bricks are ignored."""
         keep = ~np.isin(self._codes, codes)
         self._codes = self._codes[keep]
         self.log_odds, self.seen = self.log_odds[keep], self.seen[keep]
+        self.colors = None if self.colors is None else self.colors[keep]
         self._row[:] = _NOWHERE
         self._row[self._codes] = np.arange(len(self))
 
@@ -103,7 +119,8 @@ class Chunk:
         if hidden_above is not None:
             kept = cells[:, hidden_above[0]] <= hidden_above[1]
             voxels, cells = voxels[kept], cells[kept]
-        return Shown(cells, self.log_odds.reshape(-1)[voxels], self.seen.reshape(-1)[voxels])
+        colors = None if self.colors is None else self.colors.reshape(-1, 3)[voxels]
+        return Shown(cells, self.log_odds.reshape(-1)[voxels], self.seen.reshape(-1)[voxels], colors)
 
     def slab(self, axis: int, cell: int) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
         """The voxels of one layer of the chunk: cells (n, 2) along the other two axes, log-odds (n,)."""
@@ -129,6 +146,16 @@ class VoxelStore:
         changed = set()
         for key, codes, rows in _by_chunk(bricks):
             self.chunks.setdefault(key, Chunk()).put(codes, log_odds[rows], seen[rows])
+            changed.add(key)
+        self._forget_bounds(changed)
+        return changed
+
+    def paint(self, bricks: NDArray[np.int32], colors: NDArray[np.uint8]) -> set[ChunkKey]:
+        """Take in the colours (n, 512, 3) that cameras saw of bricks (n, 3); returns the chunks that have
+        changed."""
+        changed = set()
+        for key, codes, rows in _by_chunk(bricks):
+            self.chunks.setdefault(key, Chunk()).paint(codes, colors[rows])
             changed.add(key)
         self._forget_bounds(changed)
         return changed
@@ -180,6 +207,10 @@ class VoxelStore:
         if cut is not None:
             hidden_above = cut.axis, cut.voxel - key[cut.axis] * CHUNK_VOXELS
         return chunk.at_least(log_odds, hidden_above)
+
+
+def _uncolored(bricks: int) -> NDArray[np.uint8]:
+    return np.full((bricks, VOXELS, 3), NO_COLOR, np.uint8)
 
 
 def _by_chunk(

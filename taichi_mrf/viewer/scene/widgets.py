@@ -2,7 +2,7 @@
 
 import dataclasses
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import viser
@@ -34,6 +34,11 @@ class OptionWidgets(Generic[T]):
             handle = add_widget(gui, label_of(field.name), hints[field.name], value, texts[field.name])
             handle.on_update(lambda event: changed())
             self.handles[field.name] = handle
+
+    def offer(self, name: str, choices: Sequence[str]) -> None:
+        """Let a dropdown offer these choices only."""
+        if tuple(self.handles[name].options) != tuple(choices):
+            self.handles[name].options = tuple(choices)
 
     def value(self) -> T:
         """The options with the values of the widgets."""

@@ -1,0 +1,233 @@
+"""Colours by posterior: against NumPy ray by ray, and what edits and hidden surfaces must not change."""
+
+from pathlib import Path
+
+import colored_scene as scene
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from one_pixel import VOXEL, look_along
+from oracles import inference as reference
+from oracles.forward import Noise
+
+from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.errors import ConfigError, KeyframeError
+from taichi_mrf.inference.color_sums import WEIGHT_STEPS, ColorShare
+from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.methods.log_odds.map import LogOddsMap
+from taichi_mrf.methods.mrf import keyframe_allocator
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.noise import PolynomialNoise
+from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
+
+pytestmark = pytest.mark.usefixtures("backend")
+
+
+def cavities(m: MRFMap, k: Keyframe) -> dict[reference.Voxel, float]:
+    """Log-odds of the voxels that a keyframe sees, without its own messages."""
+    bricks = k.footprint.window.bricks_of(k.visible.cells)
+    voxels = (bricks[:, None] * BRICK + offsets_in_brick()).reshape(-1, 3)
+    belief = m.view.pool.read("belief", k.visible.slots).reshape(-1).astype(np.float64)
+    assert k.messages is not None
+    found = belief - k.messages.to_numpy()[: len(belief)].astype(np.float64)
+    return dict(zip(map(tuple, voxels.tolist()), found.tolist(), strict=True))
+
+
+def spread(ray: reference.Ray, cavity: dict, config: InferenceConfig, prior: float) -> dict:
+    """The posterior of each voxel of a ray that it is what the pixel sees."""
+    lowest = reference.logit(config.free_share * prior)
+    visibility, found = 1.0, {}
+    for segment, density in zip(ray.segments, ray.densities, strict=True):
+        if segment.voxel in cavity:
+            m = reference.logistic(min(config.cavity_clamp, max(lowest, cavity[segment.voxel])))
+            free = (1 - m) ** segment.length
+            found[segment.voxel] = (1 - free) * density * visibility
+            visibility *= free
+    total = sum(found.values()) + visibility * ray.beyond + config.outlier_floor
+    return {voxel: here / total for voxel, here in found.items()}
+
+
+@settings(max_examples=15)
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 3), sigma=st.floats(0.03, 0.15))
+def test_colours_are_those_of_the_posterior(seed: int, count: int, sigma: float) -> None:
+    rng = np.random.default_rng(seed)
+    camera = PinholeCamera(2, 2, 8.0, 8.0, 0.5, 0.5)
+    config = InferenceConfig(message_precision="float32", outlier_floor=1e-3, ray_density=0.0)
+    m = MRFMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=1.5)
+    rays, images = {}, {}
+    middle = rng.uniform(-1, 1, 3)
+    for _ in range(count):
+        direction = rng.normal(size=3)
+        T = look_along(middle - 0.6 * direction / np.linalg.norm(direction), direction, rng)
+        depth = rng.uniform(0.55, 0.65, camera.shape).astype(np.float32)
+        color = rng.integers(1, 256, (2, 2, 3)).astype(np.uint8)
+        color[0, 0] = 0  # a pixel without a colour
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(keyframe_allocator, "SCOUTS", 1)
+            id = m.add_keyframe(depth, T, camera, color=color)
+        rays[id] = reference.cast(depth, T, camera, VOXEL, Noise((sigma,)), config, max_depth=1.5)
+        images[id] = color.reshape(-1, 3).astype(float)
+    assume(all(s.length > 0.01 for cast in rays.values() for ray in cast for s in ray.segments))
+    m.infer()
+    sums: dict[reference.Voxel, np.ndarray] = {}
+    for id, k in m.keyframes.items():
+        mine: dict[reference.Voxel, np.ndarray] = {}
+        cavity = cavities(m, k)
+        for ray, rgb in zip(rays[id], images[id], strict=True):
+            if rgb.any():
+                for voxel, w in spread(ray, cavity, config, m.prior).items():
+                    mine[voxel] = mine.get(voxel, np.zeros(4)) + w * np.append(rgb, 1.0)
+        for voxel, share in mine.items():
+            weight = np.rint(share[3] * WEIGHT_STEPS)
+            mean = np.append(share[:3] / max(share[3], 1e-12), 1.0)
+            sums[voxel] = sums.get(voxel, np.zeros(4)) + weight * mean
+    voxels = [voxel for voxel, total in sums.items() if total[3] > 0]
+    assert voxels
+    got = m.colors((np.array(voxels) + 0.5) * VOXEL).astype(float)
+    expected = np.array([np.append(sums[v][:3] / sums[v][3], sums[v][3]) for v in voxels])
+    # One step of weight may fall the other way, and then the mean of two keyframes shifts.
+    sure = (np.abs(got[:, 3] - expected[:, 3]) < 0.5) | (count == 1)
+    assert sure.mean() > 0.8
+    np.testing.assert_allclose(got[sure, :3], expected[sure, :3], atol=2.5)
+    np.testing.assert_allclose(got[:, 3], expected[:, 3], atol=count)
+
+
+steps = st.lists(
+    st.tuples(st.sampled_from(["add", "remove", "move", "infer", "look"]), st.integers(0, 5)), max_size=8
+)
+
+
+@settings(max_examples=8)
+@given(history=steps, final=st.permutations(range(6)).map(lambda order: order[:3]))
+def test_any_history_ends_in_the_colours_of_the_final_set(
+    history: list[tuple[str, int]], final: list[int]
+) -> None:
+    m = MRFMap(scene.VOXEL, scene.NOISE)
+    for verb, number in history:
+        ids = list(m.keyframes)
+        if verb == "add" and len(ids) < 4:
+            scene.add(m, number)
+        elif verb == "remove" and ids:
+            m.remove_keyframe(ids[number % len(ids)])
+        elif verb == "move" and ids:
+            m.move_keyframe(ids[number % len(ids)], scene.pose(*scene.PLACES[number]))
+        elif verb == "infer":
+            m.infer(sweeps=1)
+        elif verb == "look":
+            m.colors(scene.probes()[:1])
+    for id in list(m.keyframes):
+        m.remove_keyframe(id)
+    for number in final:
+        scene.add(m, number)
+    m.infer()
+    expected = scene.build(sorted(final)).colors(scene.probes())
+    assert (expected[:, 3] > 0).sum() > 500
+    np.testing.assert_array_equal(m.colors(scene.probes()), expected)
+
+
+def test_what_is_removed_takes_its_colours_along_and_what_is_frozen_keeps_them() -> None:
+    m = scene.build([0, 1, 2])
+    before = m.colors(scene.probes())
+    id = scene.add(m, 4)
+    m.infer()
+    with_fourth = m.colors(scene.probes())
+    assert (with_fourth != before).any()
+    m.remove_keyframe(id)
+    m.infer()
+    np.testing.assert_array_equal(m.colors(scene.probes()), before)
+    m.freeze_keyframe(min(m.keyframes))
+    np.testing.assert_array_equal(m.colors(scene.probes()), before)
+    for id in list(m.keyframes):
+        m.freeze_keyframe(id)
+    np.testing.assert_array_equal(m.colors(scene.probes()), before)
+
+
+def test_nothing_smears_onto_what_stands_behind() -> None:
+    """The image of the thing reaches over the wall behind it, whose voxels other views see."""
+    m = scene.build([0, 1, 2, 3, 4, 5])
+    points, _ = m.voxels(0.5)
+    color = m.colors(points).astype(int)
+    seen = color[:, 3] > 0
+    assert seen.mean() > 0.95
+    on_thing = np.abs(points[:, 2] - scene.THING_Z) < 2 * scene.VOXEL
+    on_wall = np.abs(points[:, 2] - scene.WALL_Z) < 2 * scene.VOXEL
+    assert (on_thing | on_wall).all()
+    assert on_thing.sum() > 50
+    behind = on_wall & (np.abs(points[:, :2]) < 1.5 * scene.HALF).all(axis=1)
+    assert (behind & seen).sum() > 20  # hidden to some views and seen by others
+    for rows, own in ((on_wall & seen, scene.BLUE), (on_thing & seen, scene.RED)):
+        off = np.abs(color[rows, :3] - own.astype(int)).max(axis=1)
+        assert np.median(off) == 0
+        assert (off > 60).mean() < 0.02  # pixels on the edge of the thing
+
+
+@pytest.mark.parametrize("depth_m", [0.8, 3.0])
+def test_a_measurement_that_the_map_holds_for_an_outlier_has_no_say(depth_m: float) -> None:
+    """A green image, wrong everywhere: in space that four views saw free, or behind what they saw."""
+    m = scene.build([0, 1, 2, 3])
+    green = np.full((*scene.CAMERA.shape, 3), (0, 255, 0), np.uint8)
+    wrong = np.full(scene.CAMERA.shape, depth_m, np.float32)
+    m.add_keyframe(wrong, scene.pose(0.0), scene.CAMERA, color=green)
+    m.infer()
+    points, _ = m.voxels(0.5)
+    color = m.colors(points[points[:, 2] < 2.2])
+    assert (color[:, 3] > 0).sum() > 300
+    assert color[:, 1].max() <= scene.BLUE[1] + 5
+
+
+def test_files_keep_colours(tmp_path: Path) -> None:
+    m = scene.build([0, 1, 2, 3])
+    m.freeze_keyframe(1)
+    m.infer()
+    expected = m.colors(scene.probes())
+    m.save(tmp_path / "map.npz")
+    loaded = MRFMap.load(tmp_path / "map.npz")
+    assert loaded.has_colors
+    np.testing.assert_array_equal(loaded.colors(scene.probes()), expected)
+    for k in loaded.keyframes.values():
+        np.testing.assert_array_equal(k.color, m.keyframes[k.id].color)
+    loaded.infer()
+    np.testing.assert_array_equal(loaded.colors(scene.probes()), expected)
+
+
+def test_new_keyframes_alone_bring_recent_colours_up_to_date() -> None:
+    m = scene.build([0])
+    first = m.recent_colors()
+    id = scene.add(m, 3)
+    m.infer(keyframes=[id])
+    both = m.recent_colors()
+    assert (both[: len(first)] != first).any()
+    m.remove_keyframe(id)
+    m.infer()
+    np.testing.assert_array_equal(
+        m.recent_colors(), m.colors_in(np.arange(m.view.pool.capacity)).reshape(-1, 4)
+    )
+
+
+def test_without_colour_images_there_are_none_and_wrong_ones_are_refused() -> None:
+    m = MRFMap(scene.VOXEL, scene.NOISE)
+    depth, color = scene.view(0.0)
+    m.add_keyframe(depth, scene.pose(0.0), scene.CAMERA)
+    m.infer()
+    assert not m.has_colors
+    assert not m.colors(scene.probes()[:10]).any()
+    for wrong in (color[1:], color.astype(float), color[..., 0]):
+        with pytest.raises(KeyframeError, match="a colour image must be uint8 of the shape"):
+            m.add_keyframe(depth, scene.pose(0.0), scene.CAMERA, color=wrong)
+    with pytest.raises(ConfigError, match="log_odds has no colours"):
+        LogOddsMap(scene.VOXEL).add_keyframe(depth, scene.pose(0.0), scene.CAMERA, color=color)
+
+
+def test_shares_add_up_voxel_by_voxel() -> None:
+    bricks = np.array([[0, 0, 0], [0, 0, 0], [1, 0, 0]], np.int32)
+    numbers, ones = np.array([3, 7, 3], np.int32), np.ones(3, np.int64)
+    a = ColorShare(bricks, numbers, ones, 2 * ones)
+    b = ColorShare(bricks[1:], numbers[1:], 10 * ones[1:], ones[1:])
+    both = b.plus(a)
+    np.testing.assert_array_equal(both.bricks, bricks)
+    np.testing.assert_array_equal(both.numbers, numbers)
+    np.testing.assert_array_equal(both.rg, [1, 11, 11])
+    np.testing.assert_array_equal(both.bw, [2, 3, 3])
+    assert len(ColorShare.nothing().plus(ColorShare.nothing()).numbers) == 0
