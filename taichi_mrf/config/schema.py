@@ -199,10 +199,6 @@ class _Head:
         },
     )
 
-    color: bool = False
-    """Read the recording's colour images too, and give voxels and surfaces the colours of the pixels that see
-    them (methods whose maps have colours: mrf)."""
-
     sensor: SensorConfig = field(default_factory=SensorConfig)
     """The sensor's noise and range."""
 
@@ -210,6 +206,10 @@ class _Head:
 @dataclass(frozen=True)
 class _Tail:
     """The fields after them."""
+
+    color: bool = False
+    """Read the recording's colour images too, and give voxels and surfaces the colours of the pixels that see
+    them (methods whose maps have colours: mrf)."""
 
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     """Which frames become keyframes."""

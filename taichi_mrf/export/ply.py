@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.queries.colored import is_colored, shown_colors
+from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.system.atomic import atomic_path
 from taichi_mrf.voxels.colors import MARGINAL_NOTE, PHOTO_NOTE, marginal_colors
 
@@ -38,6 +40,12 @@ def write_voxels(
     ]
     extra = {"occupancy": np.asarray(probability, "<f4")}
     write_points(path, centres, marginal_colors(probability) if colors is None else colors, extra, comments)
+
+
+def photo_at(m: QueriedMap, points: NDArray[np.floating]) -> NDArray[np.uint8] | None:
+    """What cameras saw at points (N, 3) in metres, for :func:`write_voxels`; None if the map has no
+    colours."""
+    return shown_colors(m, points) if is_colored(m) else None
 
 
 def write_points(

@@ -15,7 +15,7 @@ from taichi_mrf.datasets.derived import reposed
 from taichi_mrf.errors import CutShortError, FrameError
 from taichi_mrf.evaluation.held_out import HeldOutCheck, RenderedMap, check_held_out
 from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
-from taichi_mrf.export.ply import write_voxels
+from taichi_mrf.export.ply import photo_at, write_voxels
 from taichi_mrf.export.trajectory import write_trajectory
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.methods.capabilities import window_of
@@ -146,10 +146,10 @@ def write_report(folder: Path, result: MappingResult, facts: RunFacts) -> None:
 
 
 def write_voxel_file(path: Path, m: OccupancyMap) -> int:
-    """Write the voxels that are more likely occupied than free, of a map with a window as of its last save;
-    returns their number. Raises MapFileError."""
+    """Write the voxels that are more likely occupied than free, of a map with a window as of its last save,
+    in the colours that cameras saw if the map has them; returns their number. Raises MapFileError."""
     centres, probability = (in_chunks(m) or m).voxels(min_probability=0.5)
-    write_voxels(path, centres, probability, m.voxel_size)
+    write_voxels(path, centres, probability, m.voxel_size, photo_at(m, centres))
     return len(centres)
 
 

@@ -9,7 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 import taichi as ti
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import seconds
 from taichi_mrf.config.method import Method
