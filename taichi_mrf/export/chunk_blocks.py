@@ -1,6 +1,5 @@
 """Assembles bricks to chunks of 64^3 voxels, and writes a map in memory to a store."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Protocol
 
@@ -11,16 +10,7 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.export.chunk_store import Chunk, ChunkStore, StoreHeader, new_store
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, known_bricks
-from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS
-
-
-def by_chunk(bricks: Bricks) -> Iterator[tuple[Chunk, NDArray[np.int64]]]:
-    """The chunks that bricks (n, 3) lie in, each with the rows of its bricks."""
-    chunks, owner = np.unique(bricks // CHUNK, axis=0, return_inverse=True)
-    order = np.argsort(owner.reshape(-1), kind="stable")
-    ends = np.cumsum(np.bincount(owner.reshape(-1), minlength=len(chunks)))
-    for number, (x, y, z) in enumerate(chunks.tolist()):
-        yield (x, y, z), order[ends[number - 1] if number else 0 : ends[number]]
+from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, by_chunk
 
 
 def chunk_block(

@@ -9,7 +9,8 @@ from taichi_mrf.live.baseline_overlay import BaselineOverlay
 from taichi_mrf.live.change_list import ChangeList
 from taichi_mrf.live.pictures import view_images
 from taichi_mrf.live.run import Run
-from taichi_mrf.viewer.messages import Notice, SceneChanges, Watch
+from taichi_mrf.live.shown_colors import ShownColors
+from taichi_mrf.viewer.messages import BrickColors, Notice, SceneChanges, Watch
 
 NOTHING = Watch(images=False, view=None, baseline=False)
 
@@ -25,6 +26,7 @@ class Extras:
         self._watch = NOTHING
         self._baseline: BaselineOverlay | None = None
         self._changes: ChangeList | None = None
+        self._colors: ShownColors | None = None
         self._shown_version = -1
         self._images_made = float("-inf")
 
@@ -35,13 +37,13 @@ class Extras:
 
     def start_again_for_viewer(self) -> None:
         """Show no extras, which a new viewer starts without; it is sent the list of changes."""
-        self._watch, self._baseline = NOTHING, None
+        self._watch, self._baseline, self._colors = NOTHING, None, None
         if self._changes is not None:
             self._run.send(self._changes.listed())
 
     def start_over(self) -> None:
         """Start over with a new map; the page shows the same extras."""
-        self._baseline, self._changes, self._shown_version = None, None, -1
+        self._baseline, self._changes, self._colors, self._shown_version = None, None, None, -1
 
     def work(self, progress: Progress) -> bool:
         """Do one piece of the work that is left; returns whether there was any. ``progress`` can stop it."""
@@ -50,7 +52,7 @@ class Extras:
             publisher.count(self._watch.counts)
             self._run.publish()
             return True
-        if self._run.renew_past() or self._make_images() or self._list_changes():
+        if self._run.renew_past() or self._make_images() or self._list_changes() or self._send_colors():
             return True
         if not self._watch.baseline:
             if self._baseline is not None:
@@ -92,6 +94,19 @@ class Extras:
         self._run.guarded(lambda: found.extend(look()))
         for changes in found:
             self._run.send(changes)
+        return bool(found)
+
+    def _send_colors(self) -> bool:
+        """Send the colours of voxels that have changed; False if there were none."""
+        if not self._watch.colors:
+            return False
+        if self._colors is None:
+            self._colors = ShownColors(self._run.mapper)
+        changes = self._colors.changes
+        found: list[BrickColors] = []
+        self._run.guarded(lambda: found.extend(changes()))
+        for colors in found:
+            self._run.send(colors)
         return bool(found)
 
     def _make_images(self) -> bool:

@@ -7,7 +7,8 @@ entry, and a type checker then knows the verbs.
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Protocol, TypeGuard
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.alignment.refine import Aligner, RefinedPose
 from taichi_mrf.config.schema import PoseConfig
@@ -18,6 +19,7 @@ from taichi_mrf.methods.mrf.moving_window import MovingWindow
 from taichi_mrf.methods.mrf.reading import Layer, MapReading
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.queries.change import MapChange
+from taichi_mrf.queries.colored import ColoredMap
 
 
 class MessageMap(OccupancyMap, Protocol):
@@ -91,6 +93,14 @@ class LayeredMap(OccupancyMap, Protocol):
         ...
 
 
+class PaintedMap(OccupancyMap, ColoredMap, Protocol):
+    """A map whose keyframes may have colour images."""
+
+    def recent_colors(self) -> NDArray[np.uint8]:
+        """Colours (slots * 512, 4) while keyframes come, at the price of the new ones."""
+        ...
+
+
 def has_messages(m: OccupancyMap) -> TypeGuard[MessageMap]:
     """Whether a map's keyframes keep messages."""
     return m.METHOD.has_messages
@@ -119,3 +129,8 @@ def has_layers(m: OccupancyMap) -> TypeGuard[LayeredMap]:
 def has_dates(m: OccupancyMap) -> TypeGuard[LayeredMap]:
     """Whether a map's world may change, so that it can be read as of another time and by layers."""
     return m.view.pool.dated is not None
+
+
+def takes_colors(m: OccupancyMap) -> TypeGuard[PaintedMap]:
+    """Whether keyframes of a map may have colour images."""
+    return m.METHOD.has_colors

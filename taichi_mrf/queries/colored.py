@@ -39,13 +39,16 @@ def is_colored(m: QueriedMap) -> TypeGuard[ColoredMap]:
 
 def shown_colors(m: ColoredMap, points: ArrayLike) -> NDArray[np.uint8]:
     """Colours (N, 3) of the voxels that hold the points (N, 3) in metres; NO_COLOR for those without one."""
-    found = m.colors(points)
-    return np.where(found[:, 3:] > 0, found[:, :3], np.uint8(NO_COLOR))
+    return painted(m.colors(points))
 
 
 def shown_colors_in(m: ColoredMap, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
     """The same for the voxels of some bricks of ``view.pool``, (n,) slots -> (n, 512, 3)."""
-    found = m.colors_in(slots)
+    return painted(m.colors_in(slots))
+
+
+def painted(found: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Colours (..., 4) -> (..., 3); NO_COLOR for those without one."""
     return np.where(found[..., 3:] > 0, found[..., :3], np.uint8(NO_COLOR))
 
 

@@ -15,7 +15,7 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.errors import ConfigError, MapFileError
-from taichi_mrf.export.chunk_blocks import by_chunk, chunk_block
+from taichi_mrf.export.chunk_blocks import chunk_block
 from taichi_mrf.export.chunk_store import ChunkStore, StoreHeader, new_store
 from taichi_mrf.geometry.up import up_from_name, up_name
 from taichi_mrf.inference.prior import log_odds_without_bricks
@@ -25,7 +25,7 @@ from taichi_mrf.submaps.round_files import SubmapReport, read_core, read_places,
 from taichi_mrf.submaps.survey import find_keyframes
 from taichi_mrf.submaps.task import SubmapTask, infer_submap, is_idle
 from taichi_mrf.system.atomic import write_text
-from taichi_mrf.voxels.layout import CHUNK, VOXELS
+from taichi_mrf.voxels.layout import CHUNK, VOXELS, by_chunk
 
 SETTLED = 0.001
 """The rounds end when at most this share of all voxels has changed in the last one."""

@@ -5,6 +5,8 @@ A brick is 8^3 voxels, a chunk is 8^3 bricks. Voxel (i, j, k) of the world cover
 is integer arithmetic with floor division, so negative coordinates need no special case.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,3 +38,12 @@ def grid_keys(cells: NDArray[np.integer] | NDArray[np.floating]) -> NDArray[np.i
     """
     i, j, k = (cells.astype(np.int64) + (1 << 20)).T
     return (i << 42) | (j << 21) | k
+
+
+def by_chunk(bricks: NDArray[np.int32]) -> Iterator[tuple[tuple[int, int, int], NDArray[np.int64]]]:
+    """The chunks that bricks (n, 3) lie in, each with the rows of its bricks."""
+    chunks, owner = np.unique(bricks // CHUNK, axis=0, return_inverse=True)
+    order = np.argsort(owner.reshape(-1), kind="stable")
+    ends = np.cumsum(np.bincount(owner.reshape(-1), minlength=len(chunks)))
+    for number, (x, y, z) in enumerate(chunks.tolist()):
+        yield (x, y, z), order[ends[number - 1] if number else 0 : ends[number]]

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from taichi_mrf.alignment.keyframe_surfels import KeyframeSurfels
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.errors import CapacityError, MapFileError
-from taichi_mrf.export.chunk_blocks import StorableMap, by_chunk, chunk_block, header_of
+from taichi_mrf.export.chunk_blocks import StorableMap, chunk_block, header_of
 from taichi_mrf.export.chunk_store import Chunk
 from taichi_mrf.export.store_header import StoreHeader
 from taichi_mrf.inference.dated import DatedBelief
@@ -34,7 +34,7 @@ from taichi_mrf.methods.mrf.parked_chunk import ParkedChunk
 from taichi_mrf.methods.mrf.parked_chunks import ParkedChunks, folder_beside
 from taichi_mrf.queries.known_bricks import bricks_between
 from taichi_mrf.system.libraries import library
-from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_BRICKS, CHUNK_VOXELS, VOXELS, grid_keys
+from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_BRICKS, CHUNK_VOXELS, VOXELS, by_chunk, grid_keys
 
 LEAVE = 1.25
 """Chunks leave memory at this many times the distance at which they come back, so that a camera that stays
