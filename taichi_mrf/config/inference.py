@@ -64,6 +64,11 @@ class InferenceConfig:
     average: Literal["probability", "log_odds"] = "log_odds"
     """What a keyframe's message averages over its rays through a voxel, weighted by length."""
 
+    ray_correlation: float = 1.0
+    """Correlation of the errors of two rays of one image, 0 to 1. A keyframe's message to a voxel counts as
+    that of n / (1 + ray_correlation (n - 1)) average rays, n being its rays through the voxel: once at 1, as
+    in the paper; up to twice at 0.5."""
+
     min_length: float = 0.02
     """A voxel keeps its old message if a keyframe's rays cross it for less than this length in total, in
     voxel sizes."""
@@ -101,6 +106,7 @@ class InferenceConfig:
         check_field(self.outlier_floor >= 0, "inference.outlier_floor", "must not be negative")
         check_field(self.end_sigmas > 0, "inference.end_sigmas", "must be positive")
         check_field(self.ray_density >= 0, "inference.ray_density", "must not be negative")
+        check_field(0 <= self.ray_correlation <= 1, "inference.ray_correlation", "must lie between 0 and 1")
         check_field(self.min_length >= 0, "inference.min_length", "must not be negative")
         check_field(0 < self.message_clamp <= 30, "inference.message_clamp", "must lie between 0 and 30")
         check_field(0 < self.cavity_clamp <= 60, "inference.cavity_clamp", "must lie between 0 and 60")

@@ -312,14 +312,16 @@ def _add(cast: Template, voxel: I32, length: F32, message: F32):
 @kernel
 def finish(
     slots: I32Array, belief: F32Array, messages: AnyArray, sums: I64Array, scale: F32,
-    clamp: F32, damping: F32, min_length: F32, moved: I32Array, log_average: Template, strip: Template,
+    clamp: F32, damping: F32, min_length: F32, moved: I32Array, log_average: Template,
+    correlation: F32, repeated: Template, strip: Template,
 ) -> None:  # fmt: skip
     """Renew a keyframe's messages with the rays' averages (eq. 7), and the beliefs with them (eq. 8).
 
     ``slots`` (n) are the visible bricks' places in the pool, ``belief`` (pool * 512) and ``messages`` (n *
     512) log-odds, ``sums`` (n * 512) those of the rays. A voxel that rays crossed for ``min_length`` voxel
     sizes or less keeps its message. ``damping`` is the share of the old message that stays. ``moved`` (n)
-    counts, for each brick, the voxels whose marginal changed by more than MOVED.
+    counts, for each brick, the voxels whose marginal changed by more than MOVED. With ``repeated`` an average
+    counts as often as rays whose errors have this ``correlation`` do (:func:`independent_rays`).
     """
     for part in range(slots.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, slots, strip)
@@ -331,6 +333,9 @@ def finish(
                 if not ti.static(log_average):
                     log_odds = ti.log(ti.max(mean, TINY) / ti.max(1.0 - mean, TINY))
                     log_odds = ti.max(-clamp, ti.min(clamp, log_odds))
+                if ti.static(repeated):
+                    log_odds *= independent_rays(length_sum(sums[i + k], scale), correlation)
+                    log_odds = ti.max(-clamp, ti.min(clamp, log_odds))
                 old = ti.cast(messages[i + k], ti.f32)
                 messages[i + k] = old + (1.0 - damping) * (log_odds - old)
                 # The belief takes what was stored, not what was meant, so that it stays the sum of messages.
@@ -340,6 +345,14 @@ def finish(
                 count += _moves(before, change)
         if count > 0:
             moved[i // VOXELS] += count
+
+
+@ti.func
+def independent_rays(rays: F32, correlation: F32) -> F32:
+    """How many independent rays say as much as ``rays`` of one image, of which any two have errors of this
+    correlation: n / (1 + correlation (n - 1)). 1 ray for a correlation of 1, at most 1 / correlation."""
+    n = ti.max(1.0, rays)
+    return n / (1.0 + correlation * (n - 1.0))
 
 
 @ti.func

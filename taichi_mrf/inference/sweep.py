@@ -119,7 +119,8 @@ class Sweeper:
         bricks.moved.fill(0)  # a NumPy array's method or a Taichi array's
         sum_product.finish(
             bricks.slots, pool.total, messages, swept.sums, swept.scale, config.message_clamp,
-            config.damping, config.min_length, bricks.moved, model.log_average, strip,
+            config.damping, config.min_length, bricks.moved, model.log_average,
+            config.ray_correlation, config.ray_correlation < 1, strip,
         )  # fmt: skip
         pool.revision += 1
         keyframe.revision = pool.revision

@@ -98,14 +98,14 @@ def test_two_rays_that_share_one_voxel_equal_enumeration(
 
 
 COMPILED_VARIANTS = [
-    ("auto", "probability", False, "sum-product"),
-    ("segment", "log_odds", True, "sum-product"),
-    ("centre", "probability", True, "max-product"),
-    ("segment", "probability", False, "max-product"),
-    ("centre", "log_odds", False, "sum-product"),
+    ("auto", "probability", False, "sum-product", 1.0),
+    ("segment", "log_odds", True, "sum-product", 0.3),
+    ("centre", "probability", True, "max-product", 1.0),
+    ("segment", "probability", False, "max-product", 0.5),
+    ("centre", "log_odds", False, "sum-product", 1.0),
 ]
-"""Likelihood, average, lengths and method, each of which means a kernel of its own: every pair of values is
-there at least once but for a few."""
+"""Likelihood, average, lengths, method and the correlation of rays (1 or less), each of which means a kernel
+of its own: every pair of values is there at least once but for a few."""
 
 
 @settings(max_examples=30)
@@ -128,12 +128,12 @@ def test_loops_equal_the_numpy_schedule(
     pixels: tuple[int, int],
     count: int,
     sigma: float,
-    compiled: tuple[Likelihood, Average, bool, Method],
+    compiled: tuple[Likelihood, Average, bool, Method, float],
     damping: float,
     sweeps: int,
     free_share: float,
 ) -> None:
-    likelihood, average, lengths, method = compiled
+    likelihood, average, lengths, method, ray_correlation = compiled
     rng = np.random.default_rng(seed)
     camera = PinholeCamera(pixels[0], pixels[1], 8.0, 8.0, (pixels[0] - 1) / 2, (pixels[1] - 1) / 2)
     config = InferenceConfig(
@@ -142,6 +142,7 @@ def test_loops_equal_the_numpy_schedule(
         likelihood=likelihood,
         average=average,
         segment_lengths=lengths,
+        ray_correlation=ray_correlation,
         damping=damping,
         message_precision="float32",
         min_length=0.0,

@@ -189,6 +189,9 @@ def infer(
                 if config.average == "probability":
                     least = logistic(-config.message_clamp)
                     mean = logit(min(1 - least, max(least, mean)))
+                rays_here = max(1.0, weights[voxel])
+                mean *= rays_here / (1 + config.ray_correlation * (rays_here - 1))
+                mean = min(config.message_clamp, max(-config.message_clamp, mean))
                 old = messages.get(voxel, 0.0)
                 messages[voxel] = old + (1 - config.damping) * (mean - old)
                 belief[voxel] += messages[voxel] - old
