@@ -60,7 +60,9 @@ def flags_of(options: type, prefix: str = "", pairs_off: bool = False) -> Iterat
             continue
         word = (prefix + name).replace("_", "-")
         head, dot, tail = word.rpartition(".")
-        off = f"--{head}{dot}no-{tail}" if hint is bool and not alone else None
+        off = f"--{head}{dot}no-{tail}" if hint is bool else None
+        if off and alone:  # the one of the pair that changes the default
+            word, off = (off[2:] if field.default is True else word), None
         yield Flag(f"--{word}", metavar, texts.get(field.name, ""), field.default, off)
 
 

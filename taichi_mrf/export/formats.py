@@ -21,6 +21,7 @@ from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.export.ply import write_voxels
 from taichi_mrf.export.surface import photographed, smooth_surface, voxel_surface
 from taichi_mrf.geometry.up import Z_UP, Up, plan_axes, up_from_name, up_name, y_up
+from taichi_mrf.queries.cells import standing_cells
 from taichi_mrf.queries.colored import ColoredMap, is_colored, shown_colors
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN
 
@@ -95,14 +96,23 @@ def _points_or_surface(m: ExportedMap, path: Path, options: ExportOptions) -> li
     if options.cubes or options.mesh:
         return _surface(m, path, options)
     centres, p = m.voxels(options.threshold)
+    sizes = np.full(len(p), m.voxel_size)
+    if options.cells:
+        cells = standing_cells(m, options.threshold)
+        centres = np.concatenate([centres, *(each.centres(m.voxel_size) for each in cells)])
+        p = np.concatenate([p, *(each.probability for each in cells)])
+        sizes = np.concatenate([sizes, *(np.full(len(each), each.side * m.voxel_size) for each in cells)])
     colored = _photo(m, path, options)
-    write_voxels(path, centres, p, m.voxel_size, None if colored is None else shown_colors(colored, centres))
+    colors = None if colored is None else shown_colors(colored, centres)
+    write_voxels(path, centres, p, m.voxel_size, colors, sizes)
     return [path]
 
 
 def _surface(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
-    make = voxel_surface if options.cubes else smooth_surface
-    surface = make(m, options.threshold)
+    if options.cubes:
+        surface = voxel_surface(m, options.threshold, options.cells)
+    else:
+        surface = smooth_surface(m, options.threshold)
     if not len(surface.triangles):
         raise ConfigError(f"{path}: no voxel has a probability of {options.threshold:g}: there is no surface")
     colored = _photo(m, path, options)
@@ -123,12 +133,12 @@ def _photo(m: ExportedMap, path: Path, options: ExportOptions) -> ColoredMap | N
 
 
 def _octomap_binary(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
-    write_bt(path, m)
+    write_bt(path, m, options.cells)
     return [path]
 
 
 def _octomap(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
-    write_ot(path, m, _photo(m, path, options))
+    write_ot(path, m, _photo(m, path, options), options.cells)
     return [path]
 
 
@@ -153,7 +163,7 @@ def _chunks(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
 def _page(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
     from taichi_mrf.export.page import write_page  # viser takes a second to import
 
-    write_page(path, m, options.threshold, _up(m, options), _photo(m, path, options))
+    write_page(path, m, options.threshold, _up(m, options), _photo(m, path, options), options.cells)
     return [path]
 
 

@@ -25,10 +25,11 @@ COLOR_NODE = np.dtype([("value", "<f4"), ("color", "u1", 3), ("children", "u1")]
 """A node of an ``.ot`` of the kind ColorOcTree."""
 
 
-def write_ot(path: str | Path, m: QueriedMap, colored: ColoredMap | None = None) -> None:
+def write_ot(path: str | Path, m: QueriedMap, colored: ColoredMap | None = None, cells: bool = False) -> None:
     """Write a map with its log-odds, as a ColorOcTree with the colours of ``colored``, the same map; unknown
-    stays unknown. Raises MapFileError, CapacityError."""
-    nodes = octree_of(m, only_state=False, colored=colored)
+    stays unknown. With ``cells``, larger leaves stand in for voxels none of which is likely occupied
+    (octree.octree_of). Raises MapFileError, CapacityError."""
+    nodes = octree_of(m, only_state=False, colored=colored, cells=cells)
     records = np.empty(len(nodes), FULL_NODE if colored is None else COLOR_NODE)
     records["value"], records["children"] = nodes.value, nodes.children
     if colored is not None:
@@ -37,10 +38,10 @@ def write_ot(path: str | Path, m: QueriedMap, colored: ColoredMap | None = None)
     _write(path, FULL_HEADER, nodes, m.voxel_size, records.tobytes(), kind)
 
 
-def write_bt(path: str | Path, m: QueriedMap) -> None:
-    """Write which voxels are free and which occupied, the rest being unknown. Raises MapFileError,
-    CapacityError."""
-    nodes = octree_of(m, only_state=True)
+def write_bt(path: str | Path, m: QueriedMap, cells: bool = False) -> None:
+    """Write which voxels are free and which occupied, the rest being unknown; ``cells`` as in
+    :func:`write_ot`. Raises MapFileError, CapacityError."""
+    nodes = octree_of(m, only_state=True, cells=cells)
     inner = nodes.kinds[nodes.children != 0].astype("<u2")
     _write(path, BINARY_HEADER, nodes, m.voxel_size, inner.tobytes())
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
+from taichi_mrf.queries.cells import SUREST, standing_in
 from taichi_mrf.queries.colored import ColoredMap
 from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, seen_free_bricks
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN
@@ -83,12 +84,16 @@ class Nodes:
         return Nodes(*(np.concatenate([getattr(p, n) for p in parts]) for n in Nodes.__dataclass_fields__))
 
 
-def octree_of(m: QueriedMap, *, only_state: bool, colored: ColoredMap | None = None) -> Nodes:
+def octree_of(
+    m: QueriedMap, *, only_state: bool, colored: ColoredMap | None = None, cells: bool = False
+) -> Nodes:
     """The known space of a map in pre-order: no node for unknown space, leaves for free space, with or
     without voxels in the map, and for what is occupied. Eight equal leaves are one.
 
     With ``only_state`` all free voxels are equal, at -1, and all occupied ones, at +1. Occupied voxels get
-    the colours of ``colored``, the same map. Raises CapacityError if the map is larger than an octree of
+    the colours of ``colored``, the same map. With ``cells``, a cell of 2, 4 or 8 voxels that is more likely
+    occupied than not, although none of its voxels is, is one occupied leaf without a colour
+    (queries.cells.standing_cells). Raises CapacityError if the map is larger than an octree of
     OctoMap's, or if there is not enough memory.
     """
     reader = BrickReader(m)
@@ -98,14 +103,18 @@ def octree_of(m: QueriedMap, *, only_state: bool, colored: ColoredMap | None = N
     tops = []
     for bricks, log_odds, state in reader.batches(with_voxels[order]):
         values = np.where(state == OCCUPIED, np.float32(1), np.float32(-1)) if only_state else log_odds
-        row, place = np.nonzero(state[:, _IN_Z_ORDER] != UNKNOWN)
-        codes = brick_codes(bricks)[row] + place
+        first, shown = brick_codes(bricks), state[:, _IN_Z_ORDER] != UNKNOWN
+        standing = _standing_leaves(reader, first, log_odds, shown, only_state) if cells else []
+        row, place = np.nonzero(shown)
         color = None
         if colored is not None:
             seen = colored.colors_in(reader.slots(bricks))[:, _IN_Z_ORDER][row, place]
-            shown = (state[:, _IN_Z_ORDER][row, place] == OCCUPIED) & (seen[:, 3] > 0)
-            color = np.where(shown, _packed(seen), WHITE)
-        nodes = Nodes.leaves(codes, 0, values[:, _IN_Z_ORDER][row, place], color)
+            painted = (state[:, _IN_Z_ORDER][row, place] == OCCUPIED) & (seen[:, 3] > 0)
+            color = np.where(painted, _packed(seen), WHITE)
+        nodes = Nodes.leaves(first[row] + place, 0, values[:, _IN_Z_ORDER][row, place], color)
+        for leaves in standing:
+            joined = Nodes.concatenate([_joined_up_to(int(leaves.level[0]), nodes, done), leaves])
+            nodes = joined[np.argsort(joined.code)]
         tops.append(_joined_up_to(BRICK_LEVEL, nodes, done))
     free = seen_free_bricks(m)
     if len(free):
@@ -119,6 +128,29 @@ def octree_of(m: QueriedMap, *, only_state: bool, colored: ColoredMap | None = N
     check_memory(_BYTES_PER_NODE * count, f"an octree of {count / 1e6:.3g} million nodes")
     nodes = Nodes.concatenate(done)
     return nodes[np.argsort(nodes.code * 32 + (DEPTH - nodes.level))]
+
+
+def _standing_leaves(
+    reader: BrickReader,
+    first: NDArray[np.int64],
+    log_odds: NDArray[np.float32],
+    shown: NDArray[np.bool_],
+    only_state: bool,
+) -> list[Nodes]:
+    """The cells of some bricks that stand in for voxels, as leaves by level, the lowest first. ``first`` (n,)
+    are the bricks' codes; their voxels, in the order of the curve, are taken out of ``shown`` (n, 512)."""
+    found = []
+    for side, standing, likely in standing_in(reader, log_odds, 0.5):
+        level, across = side.bit_length() - 1, BRICK // side
+        # Rows of cells in the order of the curve, each of which holds 8^level voxels that follow each other.
+        in_z_order = np.argsort(z_order(np.indices((across,) * 3).reshape(3, -1).T.astype(np.int64)))
+        row, cell = np.nonzero(standing[:, in_z_order])
+        if len(row):
+            shown.reshape(len(first), -1, side**3)[row, cell] = False
+            p = np.clip(likely[:, in_z_order][row, cell].astype(np.float64), 0.5, SUREST)
+            value = np.where(only_state, 1.0, np.log(p / (1 - p))).astype(np.float32)
+            found.append(Nodes.leaves(first[row] + (cell.astype(np.int64) << 3 * level), level, value))
+    return found
 
 
 def brick_codes(bricks: Bricks) -> NDArray[np.int64]:

@@ -23,6 +23,10 @@ class ExportOptions:
     mesh: bool = False
     """Write a .ply as a mesh by marching cubes, like .glb, .obj and .stl, not as points."""
 
+    cells: bool = True
+    """Where no voxel is likely enough but a cell of 2, 4 or 8 voxels is, show the cell: in a .ply as a point
+    with the property size, in cubes and .html as all its voxels, in .bt and .ot as a larger leaf."""
+
     color_by: Literal["auto", "marginal", "photo"] = "auto"
     """What colours of .ply, .glb, .obj, .ot and .html show: the marginals, or what cameras saw (photo), if
     the map was made with colour images; auto is photo for such a map. An .ot has no colours of marginals."""

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from taichi_mrf.geometry.up import Z_UP, Up
+from taichi_mrf.queries.cells import CellReader
 from taichi_mrf.queries.colored import ColoredMap, shown_colors_in
 from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap
 from taichi_mrf.system.atomic import write_text
@@ -30,15 +31,16 @@ def write_page(
     threshold: float = 0.5,
     up: Up | None = None,
     colored: ColoredMap | None = None,
+    cells: bool = False,
 ) -> None:
     """Write a page that shows the voxels of at least this probability, ``up`` pointing up (default: the
-    map's), by their marginals or in the colours of ``colored``, the same map. Raises MapFileError,
-    ViewerError."""
+    map's), by their marginals or in the colours of ``colored``, the same map; with ``cells`` also the cells
+    that stand in for voxels (queries/cells.py). Raises MapFileError, ViewerError."""
     color_by: ColorBy = "marginal" if colored is None else "photo"
     server = start_server("127.0.0.1", 0, Path(path).stem)
     try:
         layer = VoxelLayer(server.scene, "/voxels", m.voxel_size)
-        reader = BrickReader(m)
+        reader = CellReader(m, threshold) if cells else BrickReader(m)
         for bricks, log_odds, _ in reader.batches(reader.bricks):
             # Some maps give unseen voxels a probability of one half; those must not be shown.
             seen = np.where(log_odds == reader.pool.prior_log_odds, _NOT_SHOWN, log_odds)

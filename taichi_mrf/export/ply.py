@@ -26,12 +26,14 @@ def write_voxels(
     probability: NDArray[np.floating],
     voxel_size: float,
     colors: NDArray[np.uint8] | None = None,
+    sizes: NDArray[np.floating] | None = None,
 ) -> None:
     """Write voxels as one coloured point each. Raises MapFileError.
 
     ``centres`` (N, 3) and ``voxel_size`` are in metres, world frame. Besides its position a vertex has
     the property ``occupancy``, its marginal (N,), and its colour: of ``colors`` (N, 3), which cameras saw, or
-    the one that stands for the marginal.
+    the one that stands for the marginal. With ``sizes`` (N,), in metres, some are cells of several voxels,
+    and ``size`` is a property too.
     """
     comments = [
         f"voxel_size {voxel_size:.9g} metres",
@@ -39,6 +41,9 @@ def write_voxels(
         MARGINAL_NOTE if colors is None else PHOTO_NOTE,
     ]
     extra = {"occupancy": np.asarray(probability, "<f4")}
+    if sizes is not None:
+        extra["size"] = np.asarray(sizes, "<f4")
+        comments.append("size is the side in metres of the voxel, or of a cell that stands in for several")
     write_points(path, centres, marginal_colors(probability) if colors is None else colors, extra, comments)
 
 

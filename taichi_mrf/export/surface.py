@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.queries.box import BoxOfVoxels, voxel_box
+from taichi_mrf.queries.cells import CellReader
 from taichi_mrf.queries.colored import ColoredMap, blended_colors, shown_colors
 from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, sorted_bricks
 from taichi_mrf.system.libraries import library
@@ -45,10 +46,11 @@ class Surface:
     colors_note: str = MARGINAL_NOTE
 
 
-def voxel_surface(m: QueriedMap, threshold: float) -> Surface:
-    """The outsides of all voxels of at least this probability; each side has its own four vertices."""
+def voxel_surface(m: QueriedMap, threshold: float, cells: bool = False) -> Surface:
+    """The outsides of all voxels of at least this probability, with ``cells`` also of those in cells that
+    stand in for voxels (queries/cells.py); each side has its own four vertices."""
     corners, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
-    for found in _chunks(m, 1, reach_back=False):
+    for found in _chunks(m, 1, False, CellReader(m, threshold) if cells else BrickReader(m)):
         p = _seen_probability(m, found)
         solid = p >= threshold
         inner = (slice(1, -1),) * 3
@@ -87,7 +89,7 @@ def smooth_surface(m: QueriedMap, level: float) -> Surface:
     measure = library("skimage.measure", "meshes need", "mesh")
     vertices, triangles, values = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.float32)]
     count = 0
-    for found in _chunks(m, 0, reach_back=True):
+    for found in _chunks(m, 0, True, BrickReader(m)):
         p = _seen_probability(m, found)
         solid = np.argwhere(p > level)
         if not len(solid):
@@ -113,13 +115,12 @@ def _largest_around(points: NDArray[np.float32], p: NDArray[np.float32]) -> NDAr
     return np.max([p[tuple(corner)] for corner in corners], axis=0)
 
 
-def _chunks(m: QueriedMap, margin: int, reach_back: bool) -> Iterator[BoxOfVoxels]:
+def _chunks(m: QueriedMap, margin: int, reach_back: bool, reader: BrickReader) -> Iterator[BoxOfVoxels]:
     """The chunks that hold voxels, with ``margin`` voxels around them, or with ``reach_back`` one voxel more
     behind them, and with them the chunks before them, whose cells reach into them.
 
     Raises ConfigError for a map without voxels.
     """
-    reader = BrickReader(m)
     if not len(reader.bricks):
         raise ConfigError("the map is empty: it has no surface")
     chunks = sorted_bricks(reader.bricks // CHUNK)

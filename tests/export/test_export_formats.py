@@ -23,6 +23,7 @@ from taichi_mrf.export.level_map import level_map
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.registry import load_map
+from taichi_mrf.queries.cells import shown_voxels, standing_cells
 from taichi_mrf.queries.known_bricks import bricks_between, seen_free_bricks
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK
@@ -88,10 +89,21 @@ def size_of(path: Path) -> int:
 
 def test_points_are_the_voxels(tmp_path: Path) -> None:
     m = room_map("mrf")
-    export_map(m, tmp_path / "map.ply", ExportOptions(threshold=0.8))
+    export_map(m, tmp_path / "map.ply", ExportOptions(threshold=0.8, cells=False))
     cloud = trimesh.load(tmp_path / "map.ply")
     np.testing.assert_array_equal(cloud.vertices, m.voxels(0.8)[0].astype(np.float32))
     assert 0 < len(cloud.vertices) < len(m.voxels(0.5)[0])
+
+
+def test_cells_that_stand_in_for_voxels_are_points_with_their_size(tmp_path: Path) -> None:
+    m = room_map("mrf")
+    export_map(m, tmp_path / "map.ply", ExportOptions(threshold=0.8))
+    with open(tmp_path / "map.ply", "rb") as file:
+        table = trimesh.exchange.ply.load_ply(file)["metadata"]["_ply_raw"]["vertex"]["data"]
+    sides, counts = np.unique(np.rint(np.asarray(table["size"]) / m.voxel_size), return_counts=True)
+    cells = {cells.side: len(cells) for cells in standing_cells(m, 0.8) if len(cells)}
+    assert dict(zip(sides, counts, strict=True)) == {1: len(m.voxels(0.8)[0]), **cells}
+    assert cells
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -196,7 +208,7 @@ def test_a_browser_shows_the_voxels(method: str, tmp_path: Path) -> None:
     export_map(m, tmp_path / "map.html")
     with chromium() as browser, LivePage(browser, (tmp_path / "map.html").as_uri()) as page:
         seen = page.until(lambda seen: seen.voxels, "voxels in the scene")
-        assert seen.voxels == len(m.voxels()[0])
+        assert seen.voxels == len(shown_voxels(m, 0.5)[0])
         assert page.problems == []
 
 

@@ -16,6 +16,7 @@ from taichi_mrf.export.octomap import write_bt, write_ot
 from taichi_mrf.export.octomap_reader import OctomapLeaves, read_octomap
 from taichi_mrf.export.octree import brick_codes, bricks_of_codes, octree_of, z_order
 from taichi_mrf.methods.log_odds.map import LogOddsMap
+from taichi_mrf.queries.cells import standing_cells
 from taichi_mrf.queries.known_bricks import BrickReader, known_bricks
 from taichi_mrf.voxels.layout import BRICK
 
@@ -121,6 +122,40 @@ def test_eight_equal_bricks_are_one_leaf(octomap: ModuleType, backend: str, tmp_
     assert leaves.pop(((-16, 0, -16), 16)) == pytest.approx(-3.0)
     assert leaves[(4, 3, -11), 1] == pytest.approx(2.0)
     assert {side for _, side in leaves} == {1, 2, 4, 8}
+
+
+@pytest.mark.parametrize("name", ["map.ot", "map.bt"])
+def test_a_cell_that_is_likely_as_a_whole_is_one_occupied_node(
+    octomap: ModuleType, hand: HandMap, backend: str, name: str, tmp_path: Path
+) -> None:
+    """An inner node of the tree, without children; all other voxels are as without cells."""
+    log_odds = np.full((16, 16, 16), -4.0)
+    log_odds[2:4, :8, :8] = -0.4  # two layers
+    log_odds[:8, 8:, 8:] = -1.9  # eight
+    log_odds[9, 9, 9] = 2.0
+    write = write_ot if name.endswith("ot") else write_bt
+    for m in (map_of(backend, (0, 0, 0), log_odds), hand):
+        write(tmp_path / name, m, cells=True)
+        tree = read_tree(octomap, tmp_path / name)
+        leaves = leaves_of(tree)
+        assert as_dict(read_octomap(tmp_path / name)) == pytest.approx(leaves, abs=1e-3)
+        standing = {
+            (tuple(cell), cells.side): p
+            for cells in standing_cells(m)
+            for cell, p in zip(cells.lowest.tolist(), cells.probability.tolist(), strict=True)
+        }
+        # Eight equal nodes are one larger node, so that voxels are compared, not nodes.
+        found, inside = voxels_of(leaves), voxels_of(standing)
+        others = {voxel: p for voxel, p in known_voxels(m).items() if voxel not in inside}
+        assert found.keys() == inside.keys() | others.keys()
+        assert all((found[voxel] > 0) == (p > 0.5) for voxel, p in (inside | others).items())
+        if name.endswith("ot"):
+            assert probabilities(found[v] for v in inside) == pytest.approx(list(inside.values()), abs=1e-4)
+        if m is not hand:
+            assert {side for _, side in standing} == {2, 8}
+            node = tree.search([0.12, 0.03, 0.03], 15)  # type: ignore[attr-defined]
+            assert tree.isNodeOccupied(node)  # type: ignore[attr-defined]
+            assert not tree.nodeHasChildren(node)  # type: ignore[attr-defined]
 
 
 def test_an_empty_map_is_an_empty_tree(octomap: ModuleType, backend: str, tmp_path: Path) -> None:

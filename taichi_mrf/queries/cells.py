@@ -1,0 +1,198 @@
+"""Cells of 2, 4 and 8 voxels a side: how likely each holds something, and those that stand in for voxels.
+
+Where a surface's depth is uncertain no voxel is likely to be occupied, but a cell that reaches across the
+uncertainty is. The probability of a cell follows from the marginals of its voxels by the rule of within.py:
+the likeliest line of voxels along an axis, of the axis that gives the least.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf.config.arguments import real
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.kernels.types import F32Array, Template
+from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap
+from taichi_mrf.queries.points import probability
+from taichi_mrf.system import runtime
+from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
+
+SIDES = (2, 4, 8)
+"""Sides of the cells, in voxels."""
+
+_EMPTY = np.float32(-30.0)
+"""Log-odds of a voxel that holds nothing."""
+
+SUREST = 1 - 1e-6
+"""Probability of a cell beyond which its log-odds do not grow."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Cells of one size: ``lowest`` (n, 3) int32 the coordinates of each cell's lowest voxel, ``side`` in
+    voxels, ``probability`` (n,) float32 that something in the cell is occupied."""
+
+    lowest: NDArray[np.int32]
+    side: int
+    probability: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.lowest)
+
+    def centres(self, voxel_size: float) -> NDArray[np.float64]:
+        """The cells' centres, (n, 3) in metres."""
+        return (self.lowest.astype(np.float64) + 0.5 * self.side) * voxel_size
+
+
+def all_cells(m: QueriedMap, side: int) -> Cells:
+    """All cells of 2, 4 or 8 voxels a side in the bricks of a map that have voxels, unknown voxels at the
+    map's prior. Raises ConfigError for another side."""
+    if side not in SIDES:
+        raise ConfigError(f"cells have a side of 2, 4 or 8 voxels, not {side}")
+    reader = BrickReader(m)
+    parts = [_cells(np.zeros((0, 3), np.int32), np.zeros((0, (BRICK // side) ** 3), np.float32), side)]
+    for bricks, log_odds, _ in reader.batches(reader.bricks):
+        parts.append(_cells(bricks, cell_probabilities(log_odds, side), side))
+    return _joined(parts)
+
+
+def standing_cells(m: QueriedMap, threshold: float = 0.5) -> list[Cells]:
+    """The cells that stand in for voxels where none reaches a probability of ``threshold``, by size: a cell
+    reaches it, and no voxel and no smaller cell in it does.
+
+    Only voxels with evidence of a surface count, those likelier than the prior. Maps that integrate scan by
+    scan, whose prior is one half, have no such cells for a threshold up to that. Raises ConfigError for a
+    threshold that is not between 0 and 1.
+    """
+    reader = BrickReader(m)
+    by_side: dict[int, list[Cells]] = {side: [] for side in SIDES}
+    for bricks, log_odds, _ in reader.batches(reader.bricks):
+        for side, standing, likely in standing_in(reader, log_odds, threshold):
+            cells = _cells(bricks, likely, side)
+            kept = np.flatnonzero(standing.reshape(-1))
+            by_side[side].append(Cells(cells.lowest[kept], side, cells.probability[kept]))
+    return [_joined(parts) for parts in by_side.values() if parts]
+
+
+class CellReader(BrickReader):
+    """Reads voxels as those of the cells that stand in for them: their log-odds are the cell's."""
+
+    def __init__(self, m: QueriedMap, threshold: float) -> None:
+        super().__init__(m)
+        self._threshold = threshold
+
+    def log_odds(self, bricks: Bricks) -> NDArray[np.float32]:
+        """(n, 512) log-odds; bricks without voxels as they are."""
+        filled = super().log_odds(bricks)
+        here = np.flatnonzero(self.slots(bricks) >= 0)
+        voxels = filled[here]
+        for side, standing, likely in standing_in(self, voxels.copy(), self._threshold):
+            p = np.minimum(likely[standing].astype(np.float64), SUREST)
+            rows, cells = np.nonzero(standing)
+            voxels[rows[:, None], _voxels_of_cells(side)[cells]] = np.log(p / (1 - p))[:, None]
+        filled[here] = voxels
+        return filled
+
+
+def shown_voxels(m: QueriedMap, threshold: float) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """The voxels of at least a probability of ``threshold`` and those of the cells that stand in for others:
+    centres (N, 3) in metres and the probability of voxel or cell, (N,)."""
+    reader = CellReader(m, threshold)
+    least = np.log(threshold / (1 - threshold))
+    centres, likely = [np.zeros((0, 3))], [np.zeros(0, np.float32)]
+    for bricks, log_odds, _ in reader.batches(reader.bricks):
+        row, number = np.nonzero((log_odds >= least) & (log_odds != reader.pool.prior_log_odds))
+        voxels = bricks[row].astype(np.float64) * BRICK + offsets_in_brick()[number]
+        centres.append((voxels + 0.5) * m.voxel_size)
+        likely.append(probability(log_odds[row, number]))
+    return np.concatenate(centres), np.concatenate(likely)
+
+
+@cache
+def _voxels_of_cells(side: int) -> NDArray[np.int64]:
+    """The numbers in a brick of each cell's voxels, (cells, side^3)."""
+    across = BRICK // side
+    numbers = np.arange(VOXELS).reshape(across, side, across, side, across, side)
+    return numbers.transpose(0, 2, 4, 1, 3, 5).reshape(across**3, side**3)
+
+
+def standing_in(
+    reader: BrickReader, log_odds: NDArray[np.float32], threshold: float
+) -> Iterator[tuple[int, NDArray[np.bool_], NDArray[np.float32]]]:
+    """For some bricks of a map, (n, 512) log-odds, and each side: which cells stand in for voxels, and the
+    probability of all cells, (n, cells) in row-major order each."""
+    if not 0 < real(threshold, "threshold") < 1:
+        raise ConfigError(f"threshold must lie between 0 and 1, not {threshold}")
+    no_evidence = log_odds <= reader.pool.prior_log_odds + reader.map.view.volume.min_evidence
+    known = np.where(no_evidence, _EMPTY, log_odds)
+    reached = probability(known) >= threshold
+    for side in SIDES:
+        likely = cell_probabilities(known, side)
+        reached = _any_of_eight(reached)
+        standing = (likely >= threshold) & ~reached
+        reached |= standing
+        yield side, standing, likely
+
+
+def cell_probabilities(log_odds: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+    """The probability of each cell of some bricks, (n, 512) log-odds -> (n, (8 / side)^3), row-major."""
+    n = len(log_odds)
+    free = 1.0 - probability(log_odds)
+    out = np.zeros(n * (BRICK // side) ** 3, np.float32)
+    if n:
+        _join_voxels(np.ascontiguousarray(free.reshape(-1), np.float32), out, side)
+        runtime.settle()
+    return out.reshape(n, -1)
+
+
+def _any_of_eight(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether any of the eight parts of a cell has a flag: (n, k^3) of the parts -> (n, (k / 2)^3)."""
+    half = round(flags.shape[1] ** (1 / 3)) // 2
+    parts = flags.reshape(-1, half, 2, half, 2, half, 2)
+    return parts.any(axis=(2, 4, 6)).reshape(len(flags), -1)
+
+
+def _cells(bricks: Bricks, likely: NDArray[np.float32], side: int) -> Cells:
+    """The cells of bricks (n, 3) with their probabilities (n, cells)."""
+    across = BRICK // side
+    inside = np.indices((across,) * 3, np.int32).reshape(3, -1).T * side
+    lowest = bricks[:, None].astype(np.int32) * BRICK + inside
+    return Cells(lowest.reshape(-1, 3), side, likely.reshape(-1))
+
+
+def _joined(parts: list[Cells]) -> Cells:
+    return Cells(
+        np.concatenate([part.lowest for part in parts]),
+        parts[0].side,
+        np.concatenate([part.probability for part in parts]),
+    )
+
+
+@ti.kernel
+def _join_voxels(free: F32Array, out: F32Array, side: Template):
+    """The probability of cells of ``side`` voxels, into ``out`` (bricks * cells), from the probability of
+    each voxel to be ``free`` (bricks * 512)."""
+    for i in out:
+        across = ti.static(BRICK // side)
+        brick, cell = i // across**3, i % across**3
+        corner = ti.Vector([cell // across**2, cell // across % across, cell % across]) * side
+        first = brick * VOXELS + (corner[0] * BRICK + corner[1]) * BRICK + corner[2]
+        least = 1.0
+        for axis in ti.static(range(3)):
+            # Strides of the voxels along a line, and of the lines beside each other.
+            along = ti.static(BRICK ** (2 - axis))
+            a_stride = ti.static(BRICK ** (2 - (axis + 1) % 3))
+            b_stride = ti.static(BRICK ** (2 - (axis + 2) % 3))
+            rarest = 1.0
+            for a in range(side):
+                for b in range(side):
+                    line = 1.0
+                    for k in range(side):
+                        line *= free[first + a * a_stride + b * b_stride + k * along]
+                    rarest = ti.min(rarest, line)
+            least = ti.min(least, 1.0 - rarest)
+        out[i] = least
