@@ -8,6 +8,7 @@ side, because tests of pages and processes wait more than they compute. Each one
 piece: that of the first as it comes, the others' when that is done.
 """
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -27,6 +28,9 @@ def main() -> int:
     if not found:
         print("Taichi has no backend here", file=sys.stderr)
         return 1
+    if hasattr(os, "nice"):  # not on Windows
+        # The least priority: `live` and `tune` lower theirs, and would wait for all tests of higher priority.
+        os.nice(19)
     first, *others = found
     with ExitStack() as stack:
         queue = stack.enter_context(tempfile.TemporaryDirectory())

@@ -27,8 +27,8 @@ def octomap() -> ModuleType:
 
 
 @pytest.fixture(scope="module")
-def hand(backend: str) -> HandMap:
-    return hand_map(backend)
+def hand(one_backend: str) -> HandMap:
+    return hand_map(one_backend)
 
 
 def read_tree(octomap: ModuleType, path: Path, voxel_size: float = VOXEL) -> object:

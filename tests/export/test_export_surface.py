@@ -18,16 +18,16 @@ from taichi_mrf.export.surface import smooth_surface, voxel_surface
 from taichi_mrf.geometry.up import y_up
 from taichi_mrf.voxels.colors import marginal_colors
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = pytest.mark.usefixtures("one_backend")
 
 RADIUS = 0.46
 
 
 @pytest.fixture(scope="module")
-def ball(backend: str) -> HandMap:
+def ball(one_backend: str) -> HandMap:
     """Around (0, 0, 0), where eight chunks meet; the marginal is one half at the radius."""
     centres = (np.indices((32, 32, 32)) - 16 + 0.5) * VOXEL
-    return map_of(backend, (-16, -16, -16), 40 * (RADIUS - np.linalg.norm(centres, axis=0)))
+    return map_of(one_backend, (-16, -16, -16), 40 * (RADIUS - np.linalg.norm(centres, axis=0)))
 
 
 def loaded(path: Path) -> trimesh.Trimesh:
