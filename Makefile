@@ -48,6 +48,6 @@ $(VENV)/.installed: $(VENV)/.created pyproject.toml
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[bench]" 2>/dev/null \
-		|| echo "OctoMap (extra: bench) has no wheel for this Python: its comparison is left out."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[octomap]" 2>/dev/null \
+		|| echo "OctoMap (extra: octomap) has no wheel for this Python: its comparison is left out."
 	@touch $@
