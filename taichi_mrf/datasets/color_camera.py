@@ -5,6 +5,7 @@ that camera sees something nearer, or does not look, and where there is no depth
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -24,7 +25,7 @@ _NOWHERE = np.float32(-100.0)
 """The place of a pixel that takes no colour."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ColorCamera:
     """A colour camera beside a depth camera: ``T_color_depth`` (4, 4) takes points of the depth camera to
     it."""
@@ -37,34 +38,38 @@ class ColorCamera:
     ) -> NDArray[np.uint8]:
         """The colours (H, W, 3) of the pixels of a depth image (H, W), 0 0 0 where there is none; ``color``
         is the colour camera's image, uint8 RGB."""
-        measured = depth_m > 0
-        points = depth_camera.rays()[measured] * depth_m[measured][:, None].astype(np.float64)
-        x, y, z = (points @ self.T_color_depth[:3, :3].T + self.T_color_depth[:3, 3]).T
+        turned, shift = _turned_rays(depth_camera, self), self.T_color_depth[:3, 3].astype(np.float32)
+        x, y, z = (turned[axis] * depth_m + shift[axis] for axis in range(3))
         with np.errstate(divide="ignore", invalid="ignore"):
-            u = self.camera.fx * x / z + self.camera.cx
-            v = self.camera.fy * y / z + self.camera.cy
-        inside = (z > 0) & (u >= 0) & (v >= 0) & (u <= self.camera.width - 1) & (v <= self.camera.height - 1)
-        rows, columns = np.nonzero(measured)
-        kept = np.flatnonzero(inside)
-        kept = kept[self._in_front(u[kept], v[kept], z[kept])]
-        u_of, v_of = np.full((2, *depth_m.shape), _NOWHERE, np.float32)
-        u_of[rows[kept], columns[kept]], v_of[rows[kept], columns[kept]] = u[kept], v[kept]
-        picked = without_black(cv2.remap(color, u_of, v_of, cv2.INTER_LINEAR))
-        picked[u_of == _NOWHERE] = 0
+            u = np.float32(self.camera.fx) * x / z + np.float32(self.camera.cx)
+            v = np.float32(self.camera.fy) * y / z + np.float32(self.camera.cy)
+        seen = (depth_m > 0) & (z > 0) & (u >= 0) & (v >= 0)
+        seen &= (u <= self.camera.width - 1) & (v <= self.camera.height - 1)
+        seen[seen] = self._in_front(u[seen], v[seen], z[seen])
+        u[~seen] = _NOWHERE
+        picked = without_black(cv2.remap(color, u, v, cv2.INTER_LINEAR))
+        picked[~seen] = 0
         return picked
 
     def _in_front(
-        self, u: NDArray[np.float64], v: NDArray[np.float64], z: NDArray[np.float64]
+        self, u: NDArray[np.float32], v: NDArray[np.float32], z: NDArray[np.float32]
     ) -> NDArray[np.bool_]:
         """Which points (n,) at pixels (u, v) and depth z have none before them."""
         across = self.camera.width // _CELL + 1
-        cell = (v / _CELL).astype(np.int64) * across + (u / _CELL).astype(np.int64)
-        nearest = np.full(across * (self.camera.height // _CELL + 1), np.inf)
+        cell = (v.astype(np.int32) // _CELL) * np.int32(across) + u.astype(np.int32) // _CELL
+        nearest = np.full(across * (self.camera.height // _CELL + 1), np.float32(np.inf))
         np.minimum.at(nearest, cell, z)
-        return np.asarray(z <= nearest[cell] * (1.0 + _BEHIND))
+        return np.asarray(z <= nearest[cell] * np.float32(1.0 + _BEHIND))
 
 
 def without_black(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """The same colours (..., 3) with 1 1 1 for black: 0 0 0 stands for no colour."""
-    colors[~colors.any(axis=-1)] = 1
+    colors[(colors[..., 0] | colors[..., 1] | colors[..., 2]) == 0] = 1
     return colors
+
+
+@lru_cache(maxsize=8)
+def _turned_rays(depth_camera: PinholeCamera, to: ColorCamera) -> NDArray[np.float32]:
+    """The depth camera's rays in the colour camera's axes, (3, H, W)."""
+    turned: NDArray[np.float64] = np.einsum("ij,hwj->ihw", to.T_color_depth[:3, :3], depth_camera.rays())
+    return turned.astype(np.float32)
