@@ -33,8 +33,7 @@ def read_depth(
 def read_color(path: Path, camera: PinholeCamera | None = None) -> NDArray[np.uint8]:
     """An (H, W, 3) uint8 RGB image. Raises DatasetError, whose text names the file, also for one of another
     size than the camera's."""
-    image = _decode(_image_file(path), str(path), cv2.IMREAD_COLOR, camera)
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return decode_color(_image_file(path), str(path), camera)
 
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
@@ -59,6 +58,12 @@ def decode_16_bit(data: bytes, where: str, camera: PinholeCamera | None = None) 
             f"found {8 * image.dtype.itemsize}-bit with {channels} channel{'s' if channels > 1 else ''}"
         )
     return image
+
+
+def decode_color(data: bytes, where: str, camera: PinholeCamera | None = None) -> NDArray[np.uint8]:
+    """An (H, W, 3) uint8 RGB image from an encoded one. Raises DatasetError, whose text begins with
+    ``where``, if it is damaged, or of another size than the camera's."""
+    return cv2.cvtColor(_decode(data, where, cv2.IMREAD_COLOR, camera), cv2.COLOR_BGR2RGB)
 
 
 def _image_file(path: Path) -> bytes:

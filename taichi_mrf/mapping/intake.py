@@ -4,6 +4,7 @@ Batch runs, live runs and trials of parameters offer their frames here one by on
 follows from it (a progress bar, a notice, the end of the run) is up to them.
 """
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -103,6 +104,7 @@ class Intake:
         self._selector = KeyframeSelector(keyframe_steps(config.keyframes) if tracked else config.keyframes)
         self._hold_out, self._sweep = hold_out, sweep
         self._remembers, self._before_adding = remember_frames, before_adding
+        self._expects_color = True  # until a frame without colour was named
 
     def passes_unread(self, number: int, index: int) -> bool:
         """Whether the ``number``-th frame (from 1) is held out without being read, which the result notes by
@@ -172,6 +174,9 @@ class Intake:
         """Add a frame as a keyframe and align it, or leave nothing of it; returns its number."""
         with self.result.timed("adding"):
             color = frame.color if self.map.config.color else None
+            if self.map.config.color and color is None and self._expects_color:
+                self._expects_color = False
+                warnings.warn(f"frame {frame.name} has no colour image", stacklevel=2)
             parts = (frame.T_world_camera, frame.camera, frame.name, frame.stamp, color)
             keyframe = self.map.add_keyframe(frame.depth_m, *parts)
         try:

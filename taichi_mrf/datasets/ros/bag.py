@@ -15,6 +15,7 @@ from pathlib import Path
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
+from taichi_mrf.datasets.ros.color import BagColors, find_colors
 from taichi_mrf.datasets.ros.poses import BagPoses, PoseChoice, find_poses
 from taichi_mrf.datasets.ros.reader import METADATA, SUFFIXES, Entry, RosReader, is_bag
 from taichi_mrf.datasets.ros.topics import DepthTopic, choose, depth_topics, described
@@ -38,6 +39,9 @@ class BagOptions(PoseChoice):
     info: str = ""
     """The topic of their CameraInfo."""
 
+    color: str = ""
+    """The topic of colour images, by default the only one."""
+
 
 @dataclass
 class RosBag(Dataset):
@@ -49,6 +53,7 @@ class RosBag(Dataset):
     poses: Sequence[Pose] = field(kw_only=True)
     names: Sequence[str] = field(kw_only=True)
     depth_scale: float | None = None
+    colors: BagColors | None = None
 
     @property
     def frame_names(self) -> Sequence[str]:
@@ -77,7 +82,13 @@ class RosBag(Dataset):
                 f"frame {name}: {where}: the image has {depth_m.shape[1]} x {depth_m.shape[0]} pixels, "
                 f"the camera {self.camera.width} x {self.camera.height}"
             )
-        return Frame(depth_m, self.poses[index], self.camera, self.entries[index].stamp, name)
+        color = None
+        if self.colors is not None:
+            try:
+                color = self.colors.read(index, depth_m, self.camera)
+            except DatasetError as error:
+                raise FrameError(f"frame {name}: {error}") from error
+        return Frame(depth_m, self.poses[index], self.camera, self.entries[index].stamp, name, color)
 
 
 def open_bag(path: Path, query: str, options: ReadOptions) -> RosBag:
@@ -126,6 +137,11 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> RosBag
             f"{dropped} of {len(entries)} images of {depth.name} dropped: "
             f"no poses within {gap:g} s on both sides"
         )
+    colors = None
+    if options.color:
+        stamps = [entry.stamp for _, entry, _ in posed]
+        colors, said = find_colors(reader, chosen.color, depth, camera, stamps, options.max_time_gap)
+        notes += said
     return RosBag(
         name=reader.path.stem,
         camera=camera,
@@ -139,6 +155,7 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> RosBag
         names=[f"{i:06d}" for i, _, _ in posed],
         depth_scale=options.depth_scale,
         tracked=chosen.poses == TRACK,
+        colors=colors,
     )
 
 

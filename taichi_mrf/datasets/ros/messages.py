@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.images import PNG_SIGNATURE, decode_16_bit
+from taichi_mrf.datasets.images import PNG_SIGNATURE, decode_16_bit, decode_color
 from taichi_mrf.datasets.options import DISTORTION_COUNTS
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
 from taichi_mrf.errors import ConfigError, DatasetError
@@ -34,6 +34,12 @@ PNG = "png"
 
 ENCODINGS = f"{MILLIMETRES[0]} (millimetres), {METRES} (metres), or compressedDepth of the two as PNG"
 STEPS_PER_METRE = 1000.0
+
+_COLOR_CHANNELS = {"rgb8": [0, 1, 2], "rgba8": [0, 1, 2], "bgr8": [2, 1, 0], "bgra8": [2, 1, 0]}
+"""Where red, green and blue are in the pixels of an encoding."""
+
+_COMPRESSED_COLOR = ("jpeg", "jpg", "png", "rgb8;", "bgr8;")
+"""Beginnings of the formats of CompressedImages in colour."""
 
 _HEADER_BYTES = 12
 _LENS_MODELS = ("plumb_bob", "rational_polynomial", "", "none")
@@ -97,6 +103,31 @@ def _compressed(message: Any) -> tuple[NDArray, float]:
     depth_m = np.zeros(steps.shape, np.float32)
     np.divide(np.float32(scale), inverse, out=depth_m, where=(steps > 0) & (inverse > 0))
     return depth_m, 1.0
+
+
+def is_color(encoding: str) -> bool:
+    """Whether an image of this encoding is a colour image."""
+    compressed = encoding.startswith(_COMPRESSED_COLOR) or "; jpeg compressed" in encoding
+    return encoding in _COLOR_CHANNELS or (compressed and "compressedDepth" not in encoding)
+
+
+def color_image(message: Any) -> NDArray[np.uint8]:
+    """An (H, W, 3) RGB image of an Image or a CompressedImage. Raises DatasetError, which does not name the
+    topic, for data that do not fit its encoding."""
+    if hasattr(message, "format"):
+        return decode_color(bytes(message.data), message.format)
+    if message.encoding not in _COLOR_CHANNELS:
+        raise DatasetError(f"encoding {message.encoding!r} is not colour")
+    order = _COLOR_CHANNELS[message.encoding]
+    pixel_bytes = 4 if "a" in message.encoding else 3
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    data = np.asarray(message.data, np.uint8)
+    if step < width * pixel_bytes or len(data) < height * step:
+        raise DatasetError(
+            f"{len(data)} bytes are too few for {width} x {height} pixels of {message.encoding}"
+        )
+    rows = data[: height * step].reshape(height, step)[:, : width * pixel_bytes]
+    return np.ascontiguousarray(rows.reshape(height, width, pixel_bytes)[..., order])
 
 
 def camera_of(info: Any, rectified: bool) -> tuple[PinholeCamera, tuple[float, ...]]:

@@ -1,0 +1,116 @@
+"""Colour topics of bags: registered to depth, of a camera of their own, and those that cannot be used."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from inputs_bags import CAMERA, COUNT, FRAME, Bag, Kind, plain, stamp, steps, writing
+
+from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets.color_camera import ColorCamera
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.geometry.poses import inverse
+from taichi_mrf.sensor.camera import PinholeCamera
+
+TOPIC, OWN_FRAME = "/camera/color/image_raw", "camera_color_optical_frame"
+OWN = PinholeCamera(24, 18, 21.0, 22.0, 11.5, 8.5)
+T_depth_color = np.eye(4)
+T_depth_color[0, 3] = 0.025
+
+
+def picture(i: int, camera: PinholeCamera = CAMERA) -> np.ndarray:
+    return np.random.default_rng(100 + i).integers(1, 256, (*camera.shape, 3)).astype(np.uint8)
+
+
+def registered(bag: Bag, encoding: str = "rgb8") -> None:
+    for i in range(COUNT):
+        rgb = picture(i)
+        data = {"rgb8": rgb, "bgra8": np.dstack([rgb[..., ::-1], rgb[..., :1]])}[encoding]
+        bag.image(TOPIC, stamp(i) + 0.01, FRAME, np.ascontiguousarray(data), encoding)
+
+
+def compressed(bag: Bag) -> None:
+    for i in range(COUNT):
+        data = cv2.imencode(".png", picture(i)[..., ::-1])[1]
+        bag.send(
+            TOPIC, "sensor_msgs/msg/CompressedImage", stamp(i), header=bag.header(stamp(i), FRAME),
+            format="png", data=data.reshape(-1),
+        )  # fmt: skip
+
+
+def beside(bag: Bag, info: bool = True, tf: bool = True) -> None:
+    if info:
+        bag.camera_info("/camera/color/camera_info", OWN_FRAME, OWN)
+    if tf:
+        bag.tf("/tf_static", 0.0, FRAME, OWN_FRAME, T_depth_color)
+    for i in range(COUNT):
+        bag.image(TOPIC, stamp(i), OWN_FRAME, picture(i, OWN), "rgb8")
+
+
+@pytest.fixture
+def opened(tmp_path: Path) -> Callable[..., Dataset]:
+    """Writes a bag of the parts with depth and poses, and opens it."""
+
+    def write(*parts: Callable[[Bag], None], kind: Kind = "ros1", query: str = "") -> Dataset:
+        path = tmp_path / ("walk.bag" if kind == "ros1" else "walk")
+        with writing(path, kind) as bag:
+            for part in (plain, *parts):
+                part(bag)
+        return open_dataset(f"{path}{query}")
+
+    return write
+
+
+@pytest.mark.parametrize("write", [registered, lambda bag: registered(bag, "bgra8"), compressed])
+def test_registered_colours_come_back(opened: Callable[..., Dataset], write: Callable[[Bag], None]) -> None:
+    dataset = opened(write, kind="mcap")
+    for i in (2, 0, 4):
+        np.testing.assert_array_equal(dataset.read(i).color, picture(i))
+    assert any(note == f"color: {TOPIC}, registered to depth" for note in dataset.notes)
+
+
+def test_a_camera_of_its_own_is_brought_to_the_depth_pixels(opened: Callable[..., Dataset]) -> None:
+    dataset = opened(beside)
+    own = ColorCamera(OWN, inverse(T_depth_color))
+    for i in range(COUNT):
+        frame = dataset.read(i)
+        assert frame.color is not None
+        np.testing.assert_array_equal(frame.color, own.registered(picture(i, OWN), frame.depth_m, CAMERA))
+        assert frame.color.any()
+        assert not frame.color[steps(i) == 0].any()
+
+
+@pytest.mark.parametrize(
+    ("write", "problem"),
+    [
+        (lambda bag: beside(bag, tf=False), "tf has no fixed transform"),
+        (lambda bag: beside(bag, info=False), "its CameraInfo is not known"),
+        (
+            lambda bag: (registered(bag), bag.image("/left", 1.0, FRAME, picture(0), "bgr8")),
+            "choose one with",
+        ),
+    ],
+)
+def test_colours_that_cannot_be_used_are_named(
+    opened: Callable[..., Dataset], write: Callable[[Bag], None], problem: str
+) -> None:
+    dataset = opened(write)
+    assert dataset.read(0).color is None
+    (note,) = [note for note in dataset.notes if note.startswith("color: ")]
+    assert problem in note
+
+
+def test_a_colour_topic_can_be_chosen_and_must_be_one(opened: Callable[..., Dataset]) -> None:
+    def two(bag: Bag) -> None:
+        registered(bag)
+        bag.image("/left", 1.0, FRAME, picture(7), "bgr8")
+
+    dataset = opened(two, query="?color=/left")
+    np.testing.assert_array_equal(dataset.read(0).color, picture(7)[..., ::-1])
+    assert dataset.read(1).color is None
+    assert any("4 of 5 images have none" in note for note in dataset.notes)
+    path = str(dataset.reader.path)  # type: ignore[attr-defined]
+    with pytest.raises(DatasetError, match="is not colour"):
+        open_dataset(f"{path}?color=/camera/depth/image_raw&depth=/camera/depth/image_raw")
