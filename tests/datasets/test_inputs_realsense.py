@@ -31,10 +31,13 @@ class Pipeline:
     starts = 0
     stopped = 0
     lost: tuple[int, ...] = ()
+    colored = False
 
     def start(self, config: SimpleNamespace) -> SimpleNamespace:
         if config.file is not None and not Path(config.file).read_bytes().startswith(b"#ROSBAG"):
             raise RuntimeError("Failed to resolve request.\n Request to enable_device_from_file was invalid")
+        if config.color and not self.colored:
+            raise RuntimeError("Couldn't resolve requests")
         type(self).starts += 1
         self.left = [i for i in range(COUNT) if i not in self.lost]
         if config.playback is not None and config.playback.real_time and self.starts % 2 == 0:
@@ -50,7 +53,7 @@ class Pipeline:
             get_timestamp=lambda: 1000.0 * stamp(i),
             get_frame_number=lambda: 100 + i,
         )
-        return SimpleNamespace(get_depth_frame=lambda: image)
+        return SimpleNamespace(get_depth_frame=lambda: image, number=i)
 
     def stop(self) -> None:
         type(self).stopped += 1
@@ -60,13 +63,14 @@ class Config:
     def __init__(self) -> None:
         self.file: str | None = None
         self.playback: SimpleNamespace | None = None
+        self.color = False
 
     def enable_device_from_file(self, file: str, repeat_playback: bool) -> None:
         assert not repeat_playback
         self.file, self.playback = file, SimpleNamespace(real_time=True)
 
-    def enable_stream(self, *asked: object) -> None:
-        self.asked = asked
+    def enable_stream(self, kind: str, *asked: object) -> None:
+        self.color = self.color or kind == "color"
 
     def resolve(self, wrapped: object) -> SimpleNamespace:
         return self.profile()
@@ -82,6 +86,18 @@ class Config:
         )
 
 
+class Align:
+    """Gives each image a colour of its own."""
+
+    def __init__(self, to: str) -> None:
+        assert to == "depth"
+
+    def process(self, frames: SimpleNamespace) -> SimpleNamespace:
+        image = np.full((*STEPS.shape, 3), 10 + frames.number, np.uint8)
+        color = SimpleNamespace(get_data=lambda: image)
+        return SimpleNamespace(get_depth_frame=frames.get_depth_frame, get_color_frame=lambda: color)
+
+
 @pytest.fixture
 def library(monkeypatch: pytest.MonkeyPatch) -> type[Pipeline]:
     """A pyrealsense2 whose pipelines are this test's."""
@@ -91,7 +107,8 @@ def library(monkeypatch: pytest.MonkeyPatch) -> type[Pipeline]:
 
     module = ModuleType("pyrealsense2")
     names = {"pipeline": TestPipeline, "config": Config, "pipeline_wrapper": lambda pipeline: pipeline}
-    names |= {"stream": SimpleNamespace(depth="depth"), "format": SimpleNamespace(z16="z16")}
+    names |= {"stream": SimpleNamespace(depth="depth", color="color"), "align": Align}
+    names |= {"format": SimpleNamespace(z16="z16", rgb8="rgb8")}
     for name, value in names.items():
         setattr(module, name, value)
     monkeypatch.setitem(sys.modules, "pyrealsense2", module)
@@ -113,6 +130,17 @@ def poses(tmp_path: Path) -> Path:
     lines = (stamped_line(FIRST + t, look_at([t, 0, 0], [9, 0, 0])) for t in times)
     path.write_text("\n".join(lines))
     return path
+
+
+def test_a_recording_with_colour_gives_it_aligned_to_depth(library: type[Pipeline], recording: Path) -> None:
+    assert open_dataset(f"realsense:{recording}").read(0).color is None
+    library.colored = True
+    source = open_dataset(f"realsense:{recording}")
+    for i in (1, 4, 2):
+        frame = source.read(i)
+        assert frame.color is not None
+        assert (frame.color == 10 + i).all()
+        np.testing.assert_allclose(frame.depth_m, (STEPS + 10 * i) * 0.0005, rtol=1e-6)
 
 
 def test_a_recording_is_a_sequence_that_ends(library: type[Pipeline], recording: Path) -> None:

@@ -18,6 +18,7 @@ class Pipeline:
 
     images: tuple[np.ndarray | None, ...] = ()
     problem: str | None = None
+    color: np.ndarray | None = None  # of each image's pixels; None: the camera has no colour sensor
 
     def __init__(self) -> None:
         self.left = list(self.images)
@@ -26,7 +27,9 @@ class Pipeline:
     def start(self, config: SimpleNamespace) -> SimpleNamespace:
         if self.problem:
             raise RuntimeError(self.problem)
-        width, height = config.asked[1:3]
+        if "color" in config.streams and self.color is None:
+            raise RuntimeError("Couldn't resolve requests")
+        width, height = config.streams["depth"][:2]
         intrinsics = SimpleNamespace(width=width, height=height, fx=4.0, fy=5.0, ppx=1.5, ppy=1.0)
         video = SimpleNamespace(get_intrinsics=lambda: intrinsics)
         sensor = SimpleNamespace(get_depth_scale=lambda: 0.0005)
@@ -40,7 +43,7 @@ class Pipeline:
         if steps is None:
             raise RuntimeError(f"Frame didn't arrive within {timeout_ms}")
         image = SimpleNamespace(get_data=lambda: steps, get_timestamp=lambda: 2500.0)
-        return SimpleNamespace(get_depth_frame=lambda: image)
+        return SimpleNamespace(get_depth_frame=lambda: image, raw_color=self.color)
 
     def stop(self) -> None:
         self.stopped = True
@@ -50,16 +53,30 @@ class Pipeline:
 def library(monkeypatch: pytest.MonkeyPatch) -> type[Pipeline]:
     """A pyrealsense2 whose cameras are Pipelines of this test."""
 
-    class Config(SimpleNamespace):
-        def enable_stream(self, *asked: object) -> None:
-            self.asked = asked
+    class Config:
+        def __init__(self) -> None:
+            self.streams: dict[str, tuple[object, ...]] = {}
+
+        def enable_stream(self, kind: str, *asked: object) -> None:
+            self.streams[kind] = asked
+
+    class Align:
+        """Finds the raw colours of the depth image's pixels."""
+
+        def __init__(self, to: str) -> None:
+            assert to == "depth"
+
+        def process(self, frames: SimpleNamespace) -> SimpleNamespace:
+            color = SimpleNamespace(get_data=lambda: frames.raw_color)
+            return SimpleNamespace(get_depth_frame=frames.get_depth_frame, get_color_frame=lambda: color)
 
     class TestPipeline(Pipeline):
         pass
 
     module = ModuleType("pyrealsense2")
-    names = {"pipeline": TestPipeline, "config": Config}
-    names |= {"stream": SimpleNamespace(depth="depth"), "format": SimpleNamespace(z16="z16")}
+    names = {"pipeline": TestPipeline, "config": Config, "align": Align}
+    names |= {"stream": SimpleNamespace(depth="depth", color="color")}
+    names |= {"format": SimpleNamespace(z16="z16", rgb8="rgb8")}
     for name, value in names.items():
         setattr(module, name, value)
     monkeypatch.setitem(sys.modules, "pyrealsense2", module)
@@ -83,6 +100,18 @@ def test_images_come_in_metres_with_the_cameras_own_intrinsics(library: type[Pip
     assert (frame.name, frame.stamp) == ("realsense-000007", 2.5)
     np.testing.assert_allclose(frame.T_world_camera[:3, 2], [1, 0, 0], atol=1e-12)
     assert any("stand still" in note for note in source.notes)
+
+
+def test_colours_come_aligned_to_depth_where_the_camera_has_them(library: type[Pipeline]) -> None:
+    library.images = (STEPS, STEPS)
+    alone = open_dataset("realsense:width=4&height=3")
+    assert alone.read(0).color is None
+    assert any("depth alone: Couldn't resolve requests" in note for note in alone.notes)
+    library.color = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
+    frame = open_dataset("realsense:width=4&height=3").read(0)
+    np.testing.assert_array_equal(frame.color, library.color)
+    np.testing.assert_allclose(frame.depth_m, STEPS * 0.0005, rtol=1e-6)
+    assert open_dataset("realsense:width=4&height=3", color=False).read(0).color is None
 
 
 def test_a_missed_image_is_a_broken_frame_and_many_are_the_end(library: type[Pipeline]) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from taichi_mrf.datasets.base import BuiltIn, Dataset, start_pose
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
-from taichi_mrf.datasets.realsense.recorded import Player, RealSenseRecording
+from taichi_mrf.datasets.realsense.recorded import Player, RealSenseRecording, aligned_images
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
@@ -72,9 +72,11 @@ class _EndlessNames(Sequence[str]):
 
 @dataclass
 class RealSenseCamera(Dataset):
-    """A RealSense camera. ``pipeline`` is pyrealsense2's, started; ``depth_scale`` is metres a step."""
+    """A RealSense camera. ``pipeline`` is pyrealsense2's, started; ``depth_scale`` is metres a step;
+    ``align`` is the library's, which brings colour to the depth camera's pixels, None without colour."""
 
     pipeline: Any = None
+    align: Any = None
     depth_scale: float = 0.001
     trajectory: TimedPoses | None = None
     largest_gap: float = INTERPOLATION_GAP
@@ -96,7 +98,8 @@ class RealSenseCamera(Dataset):
         if that has happened several times in a row."""
         name = self.frame_names[index]
         try:
-            image = self.pipeline.wait_for_frames(TIMEOUT_MS).get_depth_frame()
+            frames = self.pipeline.wait_for_frames(TIMEOUT_MS)
+            image, color = aligned_images(frames, self.align)
             steps = np.asanyarray(image.get_data())
         except RuntimeError as error:
             self.misses += 1
@@ -108,7 +111,7 @@ class RealSenseCamera(Dataset):
             raise FrameError(f"{name}: the image has the shape {steps.shape}, not {self.camera.shape}")
         depth_m = (steps * np.float32(self.depth_scale)).astype(np.float32)
         stamp = image.get_timestamp() / 1000.0
-        return Frame(depth_m, self._pose(name, stamp), self.camera, stamp, name)
+        return Frame(depth_m, self._pose(name, stamp), self.camera, stamp, name, color)
 
     def _pose(self, name: str, stamp: float) -> Pose:
         if self.trajectory is None:
@@ -156,19 +159,26 @@ def _file_and_options(text: str) -> tuple[str, RealSenseOptions]:
 def _open_camera(
     rs: Any, wanted: RealSenseOptions, trajectory: TimedPoses | None, gap: float, options: ReadOptions
 ) -> RealSenseCamera:
-    pipeline, config = rs.pipeline(), rs.config()
-    config.enable_stream(rs.stream.depth, wanted.width, wanted.height, rs.format.z16, wanted.fps)
-    try:
-        profile = pipeline.start(config)
-    except RuntimeError as error:
-        raise DatasetError(f"{NAME} cannot be started: {error}") from error
+    notes, align, started = [ENDLESS], None, None
+    if options.color:
+        started = _started(rs, wanted, color=True)
+        if isinstance(started, str):
+            notes.append(f"color: the camera gives depth alone: {started}")
+        else:
+            align = rs.align(rs.stream.depth)
+    if started is None or isinstance(started, str):
+        started = _started(rs, wanted, color=False)
+    if isinstance(started, str):
+        raise DatasetError(f"{NAME} cannot be started: {started}")
+    pipeline, profile = started
     stream = profile.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
     camera = PinholeCamera(stream.width, stream.height, stream.fx, stream.fy, stream.ppx, stream.ppy)
     source = RealSenseCamera(
         NAME,
         options.camera or camera,
-        notes=[ENDLESS],
+        notes=notes,
         pipeline=pipeline,
+        align=align,
         depth_scale=float(profile.get_device().first_depth_sensor().get_depth_scale()),
         trajectory=trajectory,
         largest_gap=gap,
@@ -177,12 +187,25 @@ def _open_camera(
     return source
 
 
+def _started(rs: Any, wanted: RealSenseOptions, color: bool) -> tuple[Any, Any] | str:
+    """A pipeline that has been started, and its profile; what the library says if it cannot be. The colour
+    stream may have any size."""
+    pipeline, config = rs.pipeline(), rs.config()
+    config.enable_stream(rs.stream.depth, wanted.width, wanted.height, rs.format.z16, wanted.fps)
+    if color:
+        config.enable_stream(rs.stream.color, 0, 0, rs.format.rgb8, wanted.fps)
+    try:
+        return pipeline, pipeline.start(config)
+    except RuntimeError as error:
+        return str(error)
+
+
 def _open_recording(
     rs: Any, path: Path, trajectory: TimedPoses | None, gap: float, options: ReadOptions
 ) -> RealSenseRecording:
     if not is_file(path):
         raise DatasetError(f"{NAME}{path}: no such file")
-    player = Player(rs, path)
+    player = Player(rs, path, options.color)
     images = [listed for listed, _ in player.images()]
     if not images:
         raise DatasetError(f"{path}: contains no depth images")

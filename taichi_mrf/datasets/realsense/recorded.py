@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.errors import DatasetError, FrameError
@@ -30,28 +31,48 @@ class RecordedImage:
     stamp: float
 
 
+def aligned_images(frames: Any, align: Any) -> tuple[Any, NDArray[np.uint8] | None]:
+    """The depth image of the library's ``frames``, and with its ``align`` the colours (H, W, 3) of the depth
+    image's pixels, None if there are none."""
+    if align is None:
+        return frames.get_depth_frame(), None
+    both = align.process(frames)
+    depth, color = both.get_depth_frame(), both.get_color_frame()
+    return depth, np.array(color.get_data(), np.uint8) if color else None
+
+
 class Player:
     """A recording in play. ``camera`` is its depth camera, ``depth_scale`` metres a step of its images."""
 
-    def __init__(self, rs: Any, path: Path) -> None:
-        """Open the file with the library ``rs`` (pyrealsense2). Raises DatasetError, which names the file."""
+    def __init__(self, rs: Any, path: Path, color: bool = False) -> None:
+        """Open the file with the library ``rs`` (pyrealsense2), with ``color`` also its colour images if it
+        has any. Raises DatasetError, which names the file."""
         self._rs, self._path = rs, path
         self._pipeline: Any = None
+        self._align: Any = None
+        if color:
+            try:
+                self._start(color=True)
+                self._align = rs.align(rs.stream.depth)
+                return
+            except DatasetError:
+                pass  # as a recording without colour does
         self._start()
 
-    def images(self) -> Iterator[tuple[RecordedImage, Any]]:
-        """The depth images from here to the end."""
+    def images(self) -> Iterator[tuple[RecordedImage, tuple[Any, NDArray[np.uint8] | None]]]:
+        """The depth images from here to the end, each with the colours (H, W, 3) of its pixels or None."""
         while True:
             try:
-                image = self._pipeline.wait_for_frames(END_MS).get_depth_frame()
+                found = aligned_images(self._pipeline.wait_for_frames(END_MS), self._align)
             except RuntimeError:
                 return
-            yield RecordedImage(image.get_frame_number(), image.get_timestamp() / 1000.0), image
+            number, stamp = found[0].get_frame_number(), found[0].get_timestamp() / 1000.0
+            yield RecordedImage(number, stamp), found
 
     def rewind(self) -> None:
         """Start again from the first image."""
         self.close()
-        self._start()
+        self._start(color=self._align is not None)
 
     def close(self) -> None:
         """Close the file."""
@@ -59,12 +80,14 @@ class Player:
             self._pipeline.stop()
             self._pipeline = None
 
-    def _start(self) -> None:
+    def _start(self, color: bool = False) -> None:
         rs = self._rs
         pipeline, config = rs.pipeline(), rs.config()
         try:
             config.enable_device_from_file(str(self._path), repeat_playback=False)
             config.enable_stream(rs.stream.depth)
+            if color:
+                config.enable_stream(rs.stream.color, rs.format.rgb8)
             # Before the start: in real time images are dropped, often the first one.
             resolved = config.resolve(rs.pipeline_wrapper(pipeline))
             resolved.get_device().as_playback().set_real_time(False)
@@ -107,12 +130,13 @@ class RealSenseRecording(Dataset):
             self.player.rewind()
             self._coming = self.player.images()
         self._last = index
-        image = next((image for found, image in self._coming if found.number == wanted.number), None)
-        if image is None:
+        images = next((images for found, images in self._coming if found.number == wanted.number), None)
+        if images is None:
             self._last = len(self.listed)  # the player is at the end
             raise FrameError(f"frame {name}: {self.name}: the image is missing when the file is played again")
+        image, color = images
         steps = np.asanyarray(image.get_data())
         if steps.shape != self.camera.shape:
             raise FrameError(f"frame {name}: the image has the shape {steps.shape}, not {self.camera.shape}")
         depth_m = (steps * np.float32(self.player.depth_scale)).astype(np.float32)
-        return Frame(depth_m, self.poses[index], self.camera, wanted.stamp, name)
+        return Frame(depth_m, self.poses[index], self.camera, wanted.stamp, name, color)
