@@ -105,7 +105,9 @@ def smooth_surface(m: QueriedMap, level: float) -> Surface:
         triangles.append(faces.astype(np.int64) + count)
         values.append(_largest_around(points, part))
         count += len(points)
-    return _welded(np.concatenate(vertices), np.concatenate(triangles), np.concatenate(values), m.voxel_size)
+    points = np.concatenate(vertices)
+    kept, faces = welded_rows(points, np.concatenate(triangles))
+    return Surface((points[kept] + 0.5) * m.voxel_size, faces, marginal_colors(np.concatenate(values)[kept]))
 
 
 def _largest_around(points: NDArray[np.float32], p: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -137,10 +139,14 @@ def _seen_probability(m: QueriedMap, found: BoxOfVoxels) -> NDArray[np.float32]:
     return np.where(found.log_odds == m.view.pool.prior_log_odds, np.float32(0), found.occupancy)
 
 
-def _welded(
-    points: NDArray[np.float64], triangles: NDArray[np.int64], values: NDArray[np.float32], voxel_size: float
-) -> Surface:
-    """One vertex where those of two chunks are the same: on the same edge between two voxels' centres."""
+def welded_rows(
+    points: NDArray[np.float64], triangles: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """One vertex where those of two chunks are the same: on the same edge between two voxels' centres.
+
+    ``points`` (V, 3) count voxels' centres. Returns the rows of those that stay, and the triangles (T, 3) of
+    them, without those that have no area.
+    """
     nearest = np.rint(points)
     off = np.abs(points - nearest)
     axis = off.argmax(axis=1)
@@ -155,4 +161,4 @@ def _welded(
     _, first, place = np.unique(key, return_index=True, return_inverse=True)
     triangles = place.reshape(-1)[triangles]
     flat = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
-    return Surface((points[first] + 0.5) * voxel_size, triangles[~flat], marginal_colors(values[first]))
+    return first, triangles[~flat]

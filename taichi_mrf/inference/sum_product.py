@@ -76,7 +76,7 @@ class ForwardPass(Struct):
 
 
 @dataclass(frozen=True)
-class _Cast(Bundle):
+class Cast(Bundle):
     """One ray, and all that a step along it needs."""
 
     model: RayModel
@@ -136,7 +136,7 @@ def send_messages(
             if i < rays.number:
                 measured = rays.depth[i]
                 ray, noise, pixels = listed_ray(rays, i, sensor, view)
-                cast = _Cast(
+                cast = Cast(
                     model, swept, sensor, measured, noise, sensor.support(measured, noise),
                     ray.direction.norm(), ti.cast(pixels, ti.f32),
                 )  # fmt: skip
@@ -152,7 +152,7 @@ def send_messages(
                 ahead = ForwardPass(1.0, NEVER if ti.static(model.maximise) else 0.0, end, 0)
                 first_step = worker * trace.longest
                 if ti.static(retrace):
-                    walk_voxels(ray, begin, end, space, _see_voxel, ahead, cast)
+                    walk_voxels(ray, begin, end, space, see_voxel, ahead, cast)
                 else:
                     walk_voxels(ray, begin, end, space, _trace_voxel, ahead, _Traced(cast, trace, first_step))
                 if entry_depths_known == 0:
@@ -193,7 +193,7 @@ def send_messages(
 class _Traced(Bundle):
     """A ray that writes down its steps, from ``first_step`` of the trace on."""
 
-    cast: _Cast
+    cast: Cast
     trace: Trace
     first_step: I32
 
@@ -202,7 +202,7 @@ class _Traced(Bundle):
 class _Retraced(Bundle):
     """A ray that is followed a second time, with all that its voxels explain together."""
 
-    cast: _Cast
+    cast: Cast
     total: F32
     largest: F32
 
@@ -237,7 +237,7 @@ def _explain(ahead: Template, met: Vec3) -> Vec4:
 
 
 @ti.func
-def _see_voxel(ahead: Template, cast: Template, voxel: I32, near: F32, far: F32):
+def see_voxel(ahead: Template, cast: Template, voxel: I32, near: F32, far: F32):
     """One voxel of the forward pass, of which nothing is written down."""
     if ahead.voxels == 0:
         ahead.first = near

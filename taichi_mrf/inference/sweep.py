@@ -92,7 +92,7 @@ class Sweeper:
         )
         self._reserve(n, workers.number * footprint.longest, workers.number)
         window, bricks, strip = footprint.window, visible.on_device(), strip_length()
-        model = self._model()
+        model = self.model()
         retrace = config.return_pass == "retrace" and not model.maximise
         swept = SweptVoxels(self.log_free, self.sums, self._scale(keyframe))
 
@@ -126,7 +126,8 @@ class Sweeper:
         keyframe.revision = pool.revision
         return True
 
-    def _model(self) -> RayModel:
+    def model(self) -> RayModel:
+        """What the rays of all keyframes share."""
         config = self.inference
         return RayModel(
             voxel_size=self.voxel_size,

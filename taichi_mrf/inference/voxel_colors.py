@@ -87,7 +87,7 @@ class ColorPass:
             rays, keyframe.entry_depths, int(keyframe.entry_depths_known),
             image.sensor, window.viewpoint(keyframe.T_world_camera),
             s.index.space(window, s.volume.lower, s.volume.upper),
-            replace(s._model(), maximise=False), swept,
+            replace(s.model(), maximise=False), swept,
             Trace(s.trace_voxel, s.trace, footprint.longest, s.steps),
             workers, _pixels(color), self._bw,
         )  # fmt: skip

@@ -22,6 +22,7 @@ from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import count_observations
 from taichi_mrf.methods.brick_map import BrickMap
 from taichi_mrf.methods.mrf.coloring import MapColors
+from taichi_mrf.methods.mrf.surfacing import WithSurface
 from taichi_mrf.methods.protocol import MappedKeyframe
 from taichi_mrf.queries.change import MapChange, compare_maps
 from taichi_mrf.queries.view import View
@@ -87,7 +88,7 @@ class MapReading(BrickMap):
         return super()._grid()
 
 
-class ReadableMRF(BrickMap):
+class ReadableMRF(WithSurface):
     """The part of an MRFMap that changes nothing."""
 
     _keyframes: dict[int, Keyframe]

@@ -1,0 +1,152 @@
+"""The zero level of a field of signed distances as triangles, with a standard deviation for each vertex.
+
+Where few rays have crossed a voxel, as far away or at small voxels, its mean distance is noise. There the
+field is blended with its surroundings: with g = t / (t + W), a voxel of weight W takes g times the sums of
+the 27 voxels around it (binomial weights) to its own, so a voxel that many rays have crossed stays as it is.
+Triangles are made in cells of whose 8 corners all have weight: where both sides of the surface were seen.
+
+It goes chunk by chunk, so that memory is bounded by the surface, not by the space around it.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.export.surface import welded_rows
+from taichi_mrf.queries.known_bricks import sorted_bricks
+from taichi_mrf.system.libraries import library
+from taichi_mrf.voxels.distance_field import DistanceField
+from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS, grid_keys
+
+BLENDED_BELOW = 0.3
+"""t: the weight at which a voxel's mean distance has a standard deviation of about half a voxel."""
+
+LEAST_WEIGHT = 0.02
+"""A voxel with less has no distance, nor has one that no ray has crossed."""
+
+GRID_STD = 0.05
+"""Standard deviation, in voxels, of what interpolation between voxels adds to a vertex."""
+
+RAY_STD = 1.0
+"""Standard deviation of a vertex as a multiple of what rays with independent errors would have."""
+
+MARGIN = 1
+"""Voxels around a box that blending reads."""
+
+
+@dataclass(frozen=True)
+class FusedSurface:
+    """A surface in the world: ``vertices_m`` (V, 3) float64 in metres, ``triangles`` (T, 3) int64, wound
+    counter-clockwise as seen from free space, ``normals`` (V, 3) unit vectors towards free space, and
+    ``std_m`` (V,) float32, the standard deviation of each vertex along its normal, in metres."""
+
+    vertices_m: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+    normals: NDArray[np.float32]
+    std_m: NDArray[np.float32]
+
+
+def fused_surface(field: DistanceField, voxel_size: float) -> FusedSurface:
+    """The surface of a field. Raises TaichiMRFError without scikit-image."""
+    measure = library("skimage.measure", "surfaces need", "mesh")
+    vertices, triangles, weights = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.float32)]
+    count = 0
+    for lowest, own, weight, distance in _boxes(field):
+        known = (weight > LEAST_WEIGHT) & (own > 0)
+        mean = np.where(known, distance / np.maximum(weight, LEAST_WEIGHT), np.float32(0))
+        # marching_cubes looks at the mask of a cell's highest corner.
+        whole = np.zeros_like(known)
+        whole[1:, 1:, 1:] = _all_corners(known)
+        inside, outside = _all_corners(mean >= 0), _all_corners(mean < 0)
+        whole[1:, 1:, 1:] &= ~(inside | outside)
+        if not whole.any():
+            continue
+        points, faces, _, _ = measure.marching_cubes(mean, 0.0, mask=whole, gradient_direction="descent")
+        vertices.append(points.astype(np.float64) + lowest)
+        triangles.append(faces.astype(np.int64) + count)
+        weights.append(_weight_at(points, weight))
+        count += len(points)
+    points = np.concatenate(vertices)
+    first, triangles_of = welded_rows(points, np.concatenate(triangles))
+    vertices_m = (points[first] + 0.5) * voxel_size
+    ray_variance = 1.0 / (16.0 * np.maximum(np.concatenate(weights)[first], LEAST_WEIGHT))
+    std_m = voxel_size * np.sqrt(GRID_STD**2 + RAY_STD**2 * ray_variance)
+    normals = _normals(vertices_m, triangles_of)
+    return FusedSurface(vertices_m, triangles_of, normals, std_m.astype(np.float32))
+
+
+def _boxes(
+    field: DistanceField,
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]]:
+    """The lowest voxel of each chunk that holds distances; and for its voxels and those behind it, whose
+    cells reach into it, their own weight, and weight and distance times weight after blending."""
+    keys = grid_keys(field.bricks)
+    chunks = sorted_bricks(field.bricks // CHUNK)
+    before = [chunks - np.array(step, np.int32) for step in np.ndindex(2, 2, 2)]
+    side = CHUNK_VOXELS + 1 + 2 * MARGIN
+    around = np.indices((CHUNK + 2,) * 3).reshape(3, -1).T - 1
+    for chunk in sorted_bricks(np.concatenate([np.zeros((0, 3), np.int32), *before])).astype(np.int64):
+        bricks = chunk * CHUNK + around
+        wanted = grid_keys(bricks)
+        rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        here = np.flatnonzero(keys[rows] == wanted)
+        if not len(here):
+            continue
+        boxes = []
+        for sums in (field.weight, field.distance):
+            box = np.zeros(((CHUNK + 2) ** 3, VOXELS), np.float32)
+            box[here] = sums[rows[here]]
+            voxels = box.reshape(*(CHUNK + 2,) * 3, *(BRICK,) * 3).transpose(0, 3, 1, 4, 2, 5)
+            dense = voxels.reshape(((CHUNK + 2) * BRICK,) * 3)
+            boxes.append(dense[(slice(BRICK - MARGIN, BRICK - MARGIN + side),) * 3])
+        yield chunk * CHUNK_VOXELS, boxes[0][(slice(MARGIN, -MARGIN),) * 3], *_blended(*boxes)
+
+
+def _blended(
+    weight: NDArray[np.float32], distance: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Sums of weight, and of distance times weight, blended with their surroundings; the box shrinks by
+    MARGIN on each side."""
+    inner = (slice(MARGIN, -MARGIN),) * 3
+    share = BLENDED_BELOW / (BLENDED_BELOW + weight[inner])
+    around = [_binomial(sums) for sums in (weight, distance)]
+    return weight[inner] + share * around[0], distance[inner] + share * around[1]
+
+
+def _binomial(sums: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Each voxel and its neighbours with the weights 1/2, 1, 1/2 along each axis."""
+    for axis in range(3):
+        sums = np.moveaxis(sums, axis, 0)
+        sums = np.moveaxis(sums[1:-1] + 0.5 * (sums[:-2] + sums[2:]), 0, axis)
+    return sums
+
+
+def _all_corners(true: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether it is true at all 8 corners of each cell; one less along each axis."""
+    for axis in range(3):
+        true = np.moveaxis(true, axis, 0)
+        true = np.moveaxis(true[1:] & true[:-1], 0, axis)
+    return true
+
+
+def _weight_at(points: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The weights at points (n, 3) on edges between voxels, between those of the two ends: (n,)."""
+    first = np.floor(points).astype(np.int64)
+    last = np.ceil(points).astype(np.int64)
+    share = (points - first).max(axis=1)
+    mixed = (1 - share) * weight[tuple(first.T)] + share * weight[tuple(last.T)]
+    return mixed.astype(np.float32)
+
+
+def _normals(vertices_m: NDArray[np.float64], triangles: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Unit normals of vertices: those of the triangles around each, by their areas."""
+    corners = vertices_m[triangles]
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros((len(vertices_m), 3))
+    for axis in range(3):
+        for corner in range(3):
+            normals[:, axis] += np.bincount(triangles[:, corner], areas[:, axis], len(vertices_m))
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return (normals / np.maximum(length, 1e-30)).astype(np.float32)

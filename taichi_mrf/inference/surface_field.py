@@ -1,0 +1,125 @@
+"""The signed distances of all keyframes' rays, voxel by voxel: the host's side of surface_rays.py.
+
+The field is made anew from the keyframes whenever it is asked for, so it follows every edit.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf.config.schema import VolumeConfig
+from taichi_mrf.inference import surface_rays
+from taichi_mrf.inference.footprint import visible_box, window_around
+from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
+from taichi_mrf.inference.ray_model import RayModel, SweptVoxels
+from taichi_mrf.inference.surface_rays import SCALE, Band, DistanceSums
+from taichi_mrf.system import runtime
+from taichi_mrf.system.memory import check_memory
+from taichi_mrf.voxels.distance_field import DistanceField
+from taichi_mrf.voxels.layout import CHUNK, VOXELS, grid_keys
+from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.strips import strip_length
+from taichi_mrf.voxels.window import Window, WindowIndex
+
+BAND_VOXELS = 2.0
+BAND_SIGMAS = 3.0
+
+BRICKS_AT_ONCE = 1 << 15
+"""Bricks whose sums are in memory together: 270 MB."""
+
+Bricks = NDArray[np.int32]
+
+
+class SurfaceRays:
+    """Follows the rays of keyframes; owns the scratch."""
+
+    def __init__(self, pool: BrickPool, model: RayModel, volume: VolumeConfig) -> None:
+        """``model`` is what rays share; its ``floor`` is the density of measurements from anywhere."""
+        self.pool, self.model, self.volume = pool, model, volume
+        self.band = Band(BAND_VOXELS, BAND_SIGMAS, model.max_depth)
+        self._index = WindowIndex()
+        self._log_free = ti.ndarray(ti.f32, max(1, pool.capacity) * VOXELS)
+        surface_rays.free_logs(pool.in_use, pool.belief, self._log_free, strip_length())
+
+    def field(self, keyframes: Sequence[tuple[Keyframe, VisibleBricks]]) -> DistanceField:
+        """The field of some keyframes, each with the bricks of the map that it sees now. Raises
+        CapacityError if there is not enough memory."""
+        bands = [self._bricks_in_band(keyframe) for keyframe, _ in keyframes]
+        bricks = np.concatenate([np.zeros((0, 3), np.int32), *(w.bricks_of(cells) for w, cells in bands)])
+        # In the order of chunks, so that those that are summed up together lie together.
+        _, first = np.unique(grid_keys(bricks), return_index=True)
+        bricks = bricks[first]
+        bricks = bricks[np.argsort(grid_keys(bricks // CHUNK), kind="stable")]
+        check_memory(8.0 * VOXELS * len(bricks), f"the surface in {len(bricks)} bricks")
+        weight, distance = (np.zeros((len(bricks), VOXELS), np.float32) for _ in range(2))
+        for begin in range(0, len(bricks), BRICKS_AT_ONCE):
+            rows = slice(begin, begin + BRICKS_AT_ONCE)
+            weight[rows], distance[rows] = self._sums(bricks[rows], keyframes, bands)
+        order = np.argsort(grid_keys(bricks))
+        return DistanceField(bricks[order], weight[order], distance[order])
+
+    def trust(self, keyframe: Keyframe, visible: VisibleBricks) -> NDArray[np.float32]:
+        """The probability that each ray of a keyframe's list met a surface, (rays,)."""
+        rays, window = keyframe.ray_list, keyframe.footprint.window
+        trust = np.zeros(rays.blocks.shape[0], np.float32)
+        if len(visible.cells):
+            # Only log_free is read: nothing is swept.
+            swept = SweptVoxels(self._log_free, ti.ndarray(ti.i64, 1), 1.0)
+            self._index.fill(window, visible.cells, visible.slots)
+            space = self._index.space(window, self.volume.lower, self.volume.upper)
+            view = window.viewpoint(keyframe.T_world_camera)
+            surface_rays.find_trust(rays, keyframe.image.sensor, view, space, self.model, swept, trust)
+            self._index.clear(window, visible.cells)
+            runtime.settle()
+        return trust
+
+    def _bricks_in_band(self, keyframe: Keyframe) -> tuple[Window, NDArray[np.int32]]:
+        """The window around the bands of a keyframe's rays, and its cells in them."""
+        image, T = keyframe.image, keyframe.T_world_camera
+        beyond_m = 2.0 * self.band.voxels * self.model.voxel_size
+        box = visible_box(image, T, self.model.max_depth, self.band.sigmas, beyond_m)
+        window = window_around(*box, self.model.voxel_size, self.volume)
+        if image.rays == 0 or window is None:
+            return keyframe.footprint.window, np.zeros(0, np.int32)
+        marks = np.zeros(window.cells, np.int32)
+        surface_rays.mark_band(
+            keyframe.ray_list, image.sensor, window.viewpoint(T), window.shape_vector,
+            *window.clip_box(self.volume.lower, self.volume.upper), self.band, marks,
+        )  # fmt: skip
+        runtime.settle()
+        return window, np.flatnonzero(marks).astype(np.int32)
+
+    def _sums(
+        self,
+        bricks: Bricks,
+        keyframes: Sequence[tuple[Keyframe, VisibleBricks]],
+        bands: Sequence[tuple[Window, NDArray[np.int32]]],
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Weights and distances times weight, (n, 512) each, in some bricks."""
+        sums = DistanceSums(
+            ti.ndarray(ti.i64, len(bricks) * VOXELS), ti.ndarray(ti.i64, len(bricks) * VOXELS)
+        )
+        sums.weight.fill(0)
+        sums.distance.fill(0)
+        keys = grid_keys(bricks)
+        order = np.argsort(keys)
+        for (keyframe, visible), (window, cells) in zip(keyframes, bands, strict=True):
+            wanted = grid_keys(window.bricks_of(cells))
+            rows = order[np.minimum(np.searchsorted(keys, wanted, sorter=order), len(keys) - 1)]
+            here = keys[rows] == wanted
+            if not here.any():
+                continue
+            cells, slots = cells[here], rows[here].astype(np.int32)
+            trust = self.trust(keyframe, visible)
+            self._index.fill(window, cells, slots)
+            space = self._index.space(window, self.volume.lower, self.volume.upper)
+            view = window.viewpoint(keyframe.T_world_camera)
+            rays, sensor = keyframe.ray_list, keyframe.image.sensor
+            surface_rays.add_distances(rays, trust, sensor, view, space, self.band, sums)
+            self._index.clear(window, cells)
+            runtime.settle()
+        found = (array.to_numpy().reshape(-1, VOXELS) for array in (sums.weight, sums.distance))
+        weight, distance = ((array / SCALE).astype(np.float32) for array in found)
+        return weight, distance

@@ -1,0 +1,182 @@
+"""What the rays of a keyframe say of the surface in and around each voxel: signed distances.
+
+A ray with the measurement z has its surface at depth s, the measurement without its bias, with the standard
+deviation sigma. A voxel whose centre lies at depth t on the ray gets the distance d = s - t, in metres along
+the ray, with the weight
+
+    w = P l / (sigma^2 + (voxel / 4)^2)
+
+for each of the ray's pixels, where l is the length of its way through the voxel. With the marginals m of the
+map, and o for a measurement from anywhere in the sensor's range,
+
+    P = (E + B) / (E + B + o)        E = sum_i nu_i m_i vis_i, B the same for what lies beyond the map    (4)
+
+is the posterior probability that the ray met a surface at all: a pixel of something that came and went, or an
+outlier, has none. A ray reaches as far as its band, 2 voxels or 3 sigma to either side of s, whichever is
+more. Free space in front of the band gets nothing, so that what lies behind a thin wall is no surface.
+
+The sums are integers, so they do not depend on the order of rays and keyframes.
+"""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from taichi_mrf.inference.keyframe import RayList
+from taichi_mrf.inference.ray_list import listed_ray
+from taichi_mrf.inference.ray_model import RayModel, SweptVoxels
+from taichi_mrf.inference.sum_product import TINY, Cast, ForwardPass, see_voxel
+from taichi_mrf.kernels.bundles import Bundle, kernel
+from taichi_mrf.kernels.log_odds import softplus
+from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, I64Array, IVec3, Template, Vec3
+from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.numbering import flat
+from taichi_mrf.voxels.strips import strip_begin
+from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_bricks, walk_voxels
+
+SCALE = float(1 << 24)
+"""Steps of the sums for a weight of 1."""
+
+SUREST = 30.0
+"""Bound on a marginal's log-odds, beyond which float32 loses its digits."""
+
+
+@dataclass(frozen=True)
+class Band(Bundle):
+    """How far to either side of its surface a ray counts."""
+
+    voxels: F32
+    """At least so many voxels,"""
+
+    sigmas: F32
+    """and at least so many standard deviations."""
+
+    max_depth: F32
+    """Metres of depth that no ray goes beyond."""
+
+
+@dataclass(frozen=True)
+class DistanceSums(Bundle):
+    """Sums over rays for the voxels of some bricks. Arrays (bricks * 512), in units of 1 / SCALE."""
+
+    weight: I64Array
+    """Of w, times (voxel / 4)^2: a pixel with a small sigma has the weight l."""
+
+    distance: I64Array
+    """Of this weight times d in voxels."""
+
+
+@dataclass(frozen=True)
+class _Measured(Bundle):
+    """One ray, and all that a step along its band needs."""
+
+    ray: Template
+    sums: DistanceSums
+    surface: F32  # its depth
+    to_voxels: F32  # length of the ray, in voxels, for one metre of depth
+    weight: F32
+
+
+@dataclass(frozen=True)
+class _Marked(Bundle):
+    """The bricks of a window: its shape, and a mark for each."""
+
+    shape: IVec3
+    marks: I32Array
+
+
+@kernel
+def free_logs(slots: I32Array, belief: F32Array, log_free: F32Array, strip: Template) -> None:
+    """log(1 - m) of the bricks in ``slots`` (n) from their log-odds. ``belief`` and ``log_free`` are (pool *
+    512)."""
+    for part in range(slots.shape[0] * (VOXELS // strip)):
+        _, j = strip_begin(part, slots, strip)
+        for k in range(strip):
+            log_free[j + k] = -softplus(ti.max(-SUREST, ti.min(SUREST, belief[j + k])))
+
+
+@kernel
+def find_trust(
+    rays: RayList, sensor: Sensor, view: Viewpoint, space: Space, model: RayModel, swept: SweptVoxels,
+    trust: F32Array,
+) -> None:  # fmt: skip
+    """P of each ray, (rays). ``space`` and ``swept`` hold the bricks of the map, ``model.floor`` is o."""
+    for i in range(rays.number):
+        measured = rays.depth[i]
+        ray, noise, pixels = listed_ray(rays, i, sensor, view)
+        cast = Cast(
+            model, swept, sensor, measured, noise, sensor.support(measured, noise),
+            ray.direction.norm(), ti.cast(pixels, ti.f32),
+        )  # fmt: skip
+        last = sensor.farthest_depth(measured, noise, model.end_sigmas)
+        begin, end = 0.0, ti.min(last, model.max_depth)
+        clip(ray, begin, end, space.lower, space.upper)
+        ahead = ForwardPass(1.0, 0.0, end, 0)
+        walk_voxels(ray, begin, end, space, see_voxel, ahead, cast)
+        met = ahead.explained + TINY
+        if end < last:
+            met += ahead.visibility * sensor.likelihood_beyond(measured, end, noise)
+        trust[i] = met / (met + model.floor)
+
+
+@kernel
+def mark_band(
+    rays: RayList, sensor: Sensor, view: Viewpoint, shape: IVec3, lower: Vec3, upper: Vec3, band: Band,
+    marks: I32Array,
+) -> None:  # fmt: skip
+    """Mark the bricks that lie in the bands of rays. ``marks`` (bricks of the window) are those of a window
+    of ``shape`` bricks; ``lower`` and ``upper`` bound its mapped part, in voxels."""
+    for i in range(rays.number):
+        ray, noise, _ = listed_ray(rays, i, sensor, view)
+        found = _surface_of(rays.depth[i], noise, sensor, band, ray.direction.norm())
+        begin, end = ti.max(0.0, found[0] - found[2]), ti.min(found[0] + found[2], band.max_depth)
+        clip(ray, begin, end, lower, upper)
+        state = 0
+        walk_bricks(ray, begin, end, shape, marks, False, _mark_brick, state, _Marked(shape, marks))
+
+
+@kernel
+def add_distances(
+    rays: RayList, trust: F32Array, sensor: Sensor, view: Viewpoint, space: Space, band: Band,
+    sums: DistanceSums,
+) -> None:  # fmt: skip
+    """Add the distances of a keyframe's rays, whose P are ``trust`` (rays), to the bricks of ``space``."""
+    for i in range(rays.number):
+        ray, noise, pixels = listed_ray(rays, i, sensor, view)
+        to_voxels = ray.direction.norm()
+        found = _surface_of(rays.depth[i], noise, sensor, band, to_voxels)
+        begin, end = ti.max(0.0, found[0] - found[2]), ti.min(found[0] + found[2], band.max_depth)
+        clip(ray, begin, end, space.lower, space.upper)
+        weight = pixels * trust[i] / (16.0 * found[1] * found[1] + 1.0)
+        state = 0
+        measured = _Measured(ray, sums, found[0], to_voxels, weight)
+        walk_voxels(ray, begin, end, space, _add_distance, state, measured)
+
+
+@ti.func
+def _surface_of(measured: F32, noise: Template, sensor: Template, band: Template, to_voxels: F32) -> Vec3:
+    """The depth of a ray's surface, its standard deviation in voxels, and the depth that its band reaches."""
+    surface = sensor.surface_depth(measured, noise)
+    sigma = noise.sigma(surface) * to_voxels
+    return Vec3(surface, sigma, ti.max(band.voxels, band.sigmas * sigma) / to_voxels)
+
+
+@ti.func
+def _mark_brick(state: Template, marked: Template, ray: Template, brick: IVec3, t: F32, t_leave: F32):
+    """Mark one brick of a band."""
+    marked.marks[flat(brick, marked.shape)] = 1
+    return 1
+
+
+@ti.func
+def _add_distance(state: Template, measured: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of a band."""
+    ray = measured.ray
+    centre = ti.floor(ray.origin + 0.5 * (near + far) * ray.direction) + 0.5
+    along = (centre - ray.origin).dot(ray.direction) / measured.to_voxels
+    distance = measured.surface * measured.to_voxels - along
+    weight = measured.weight * (far - near) * measured.to_voxels
+    ti.atomic_add(measured.sums.weight[voxel], ti.cast(weight * SCALE, ti.i64))
+    ti.atomic_add(measured.sums.distance[voxel], ti.cast(weight * distance * SCALE, ti.i64))
+    return 1

@@ -1,0 +1,46 @@
+"""The surface of an MRFMap below the size of its voxels, from its keyframes and marginals."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.export.fused_surface import FusedSurface, fused_surface
+from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.inference.surface_field import SurfaceRays
+from taichi_mrf.inference.sweep import Sweeper
+from taichi_mrf.methods.brick_map import BrickMap
+from taichi_mrf.voxels.distance_field import DistanceField
+
+OUTLIERS = 0.01
+"""Share of the measurements that may come from anywhere in the sensor's range."""
+
+
+class WithSurface(BrickMap):
+    """The part of an MRFMap that makes its surface."""
+
+    _keyframes: dict[int, Keyframe]
+    _sweeper: Sweeper
+
+    @property
+    def keyframes(self) -> Mapping[int, Keyframe]:
+        """The keyframes that can still be moved and removed, by id."""
+        raise NotImplementedError
+
+    def surface(self) -> FusedSurface:
+        """The surface that the keyframes measured, by marching cubes through the mean of their signed
+        distances: vertices, triangles, normals, and a standard deviation in metres for each vertex.
+
+        It is made from the keyframes' images and the marginals as they are now, so call :meth:`infer` before.
+        Frozen keyframes have no images and no part in it. Raises ConfigError for a map without keyframes,
+        CapacityError if there is not enough memory, TaichiMRFError without scikit-image.
+        """
+        if not self._keyframes:
+            raise ConfigError("the map has no keyframes: there is nothing to make a surface of")
+        return fused_surface(surface_field_of(self), self.voxel_size)
+
+
+def surface_field_of(m: WithSurface) -> DistanceField:
+    """The signed distances that a map's keyframes measured. Raises CapacityError."""
+    model = replace(m._sweeper.model(), maximise=False, floor=OUTLIERS / m.sensor.max_depth)
+    rays = SurfaceRays(m._pool, model, m.config.volume)
+    return rays.field([(k, m._registry.visible(k.footprint)) for k in m._keyframes.values()])

@@ -1,0 +1,58 @@
+"""The surface of a field of signed distances: where it lies, which way it faces, and how sure it is."""
+
+import numpy as np
+import pytest
+
+from taichi_mrf import MRFMap, PinholeCamera, PolynomialNoise
+from taichi_mrf.errors import ConfigError
+
+pytestmark = pytest.mark.usefixtures("backend")
+pytest.importorskip("skimage")
+
+CAMERA = PinholeCamera(80, 60, 80.0, 80.0, 39.5, 29.5)
+VOXEL, SIGMA, BIAS = 0.05, 0.02, 0.04
+NORMAL = np.array([0.2, -0.1, -1.0]) / np.linalg.norm([0.2, -0.1, -1.0])
+
+
+def _depth_of_plane(T_world_camera: np.ndarray, distance_m: float) -> np.ndarray:
+    """Clean axial depth of the plane NORMAL . x = -distance_m."""
+    origin, directions = T_world_camera[:3, 3], CAMERA.rays() @ T_world_camera[:3, :3].T
+    return (-distance_m - origin @ NORMAL) / (directions @ NORMAL)
+
+
+def _map_of_plane(noise_m: float) -> MRFMap:
+    rng = np.random.default_rng(1)
+    m = MRFMap(VOXEL, PolynomialNoise((SIGMA,), (BIAS,)))
+    for x in (-0.3, 0.0, 0.3):
+        T = np.eye(4)
+        T[0, 3] = x
+        depth = _depth_of_plane(T, 1.5) + BIAS + rng.normal(0, noise_m, CAMERA.shape)
+        m.add_keyframe(depth.astype(np.float32), T, CAMERA)
+    m.infer()
+    return m
+
+
+def test_a_plane_lies_where_it_is() -> None:
+    surface = _map_of_plane(0.0).surface()
+    error = surface.vertices_m @ NORMAL + 1.5
+    assert len(surface.triangles) > 500
+    assert np.abs(error).mean() < 0.05 * VOXEL  # neither its slope nor the bias moves it
+    inner = np.abs(surface.vertices_m[:, :2]).max(axis=1) < 0.4  # not where images end
+    assert np.abs(error[inner]).max() < 0.2 * VOXEL
+    assert (surface.normals[inner] @ NORMAL).mean() > 0.99
+    corners = surface.vertices_m[surface.triangles]
+    wound = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) @ NORMAL
+    assert (wound > 0).mean() > 0.99
+
+
+def test_the_standard_deviation_grows_where_rays_are_few() -> None:
+    surface = _map_of_plane(SIGMA).surface()
+    error = np.abs(surface.vertices_m @ NORMAL + 1.5)
+    assert np.mean(error <= 2 * surface.std_m) > 0.9
+    middle = np.abs(surface.vertices_m[:, :2]).max(axis=1) < 0.3
+    assert surface.std_m[middle].mean() < 0.5 * surface.std_m.max()
+
+
+def test_a_map_without_keyframes_has_no_surface() -> None:
+    with pytest.raises(ConfigError, match="no keyframes"):
+        MRFMap(VOXEL).surface()

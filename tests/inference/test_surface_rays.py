@@ -1,0 +1,94 @@
+"""The field of signed distances against float64 NumPy, ray by ray and voxel by voxel."""
+
+import numpy as np
+import pytest
+from one_pixel import random_pose
+from oracles.forward import Noise
+from oracles.traversal import segments
+
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.mrf.surfacing import surface_field_of
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.noise import PolynomialNoise
+from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
+
+pytestmark = pytest.mark.usefixtures("backend")
+
+CAMERA = PinholeCamera(5, 4, 8.0, 8.0, 2.0, 1.5)
+VOXEL = 0.1
+SIGMA, BIAS = (0.02, 0.05), (0.03,)
+
+
+def _map(**parameters: float) -> MRFMap:
+    return MRFMap(VOXEL, PolynomialNoise(SIGMA, BIAS), max_depth=5.0, ray_density=0.0, **parameters)
+
+
+def _field(m: MRFMap) -> dict[tuple[int, int, int], tuple[float, float]]:
+    """Weight and distance times weight of each voxel that has any."""
+    field = surface_field_of(m)
+    found = {}
+    for brick, weight, distance in zip(field.bricks, field.weight, field.distance, strict=True):
+        for number in np.flatnonzero(weight):
+            voxel = tuple((brick * BRICK + offsets_in_brick()[number]).tolist())
+            found[voxel] = float(weight[number]), float(distance[number])
+    return found
+
+
+def test_the_field_equals_numpy() -> None:
+    rng = np.random.default_rng(5)
+    T = random_pose(rng)
+    depth = rng.uniform(0.8, 1.6, CAMERA.shape).astype(np.float32)
+    m = _map()
+    m.add_keyframe(depth, T, CAMERA)
+    expected: dict[tuple[int, int, int], list[float]] = {}
+    noise = Noise(SIGMA, BIAS)
+    for v, u in np.ndindex(*CAMERA.shape):
+        direction = T[:3, :3] @ CAMERA.rays()[v, u]
+        metres = np.linalg.norm(direction)
+        surface = float(noise.depth_of_deviation(float(depth[v, u]), 0.0))
+        sigma = float(noise.sigma_at(surface)) * metres
+        reach = max(2 * VOXEL, 3 * sigma) / metres
+        cells, near, far = segments(T[:3, 3], direction, surface - reach, surface + reach, VOXEL)
+        for cell, begin, end in zip(cells.tolist(), near, far, strict=True):
+            along = ((np.array(cell) + 0.5) * VOXEL - T[:3, 3]) @ direction / metres
+            weight = (end - begin) * metres / VOXEL / (16 * (sigma / VOXEL) ** 2 + 1)
+            sums = expected.setdefault(tuple(cell), [0.0, 0.0])
+            sums[0] += weight
+            sums[1] += weight * (surface * metres - along) / VOXEL
+    found = _field(m)
+    for voxel, (weight, distance) in expected.items():
+        # P is above 0.99: nothing is known but a prior of two surfaces a metre.
+        np.testing.assert_allclose(found.get(voxel, (0.0, 0.0)), (weight, distance), rtol=0.01, atol=2e-3)
+    assert sum(weight for weight, _ in found.values()) == pytest.approx(
+        sum(weight for weight, _ in expected.values()), rel=0.01
+    )
+
+
+def test_a_thing_that_others_looked_through_has_no_say() -> None:
+    wall, thing = np.full(CAMERA.shape, 2.0, np.float32), np.full(CAMERA.shape, 2.0, np.float32)
+    thing[:, :2] = 1.0
+    m = MRFMap(VOXEL, PolynomialNoise((0.02,)), max_depth=5.0, ray_density=0.0)
+    for depth in (wall, wall, wall, thing):
+        m.add_keyframe(depth, np.eye(4), CAMERA)
+    before = max(weight for (_, _, z), (weight, _) in _field(m).items() if z == 9)
+    m.infer()
+    after = max([weight for (_, _, z), (weight, _) in _field(m).items() if z == 9], default=0.0)
+    assert before > 0.1
+    assert after < 0.02 * before
+    assert max(weight for (_, _, z), (weight, _) in _field(m).items() if z == 19) > 1.0
+
+
+def test_a_removed_keyframe_takes_its_share_along() -> None:
+    rng = np.random.default_rng(6)
+    views = [
+        (rng.uniform(0.8, 1.6, CAMERA.shape).astype(np.float32), random_pose(rng, 0.2)) for _ in range(3)
+    ]
+    edited, others = _map(), _map()
+    ids = [edited.add_keyframe(depth, T, CAMERA) for depth, T in views]
+    for depth, T in views[1:]:
+        others.add_keyframe(depth, T, CAMERA)
+    edited.infer()
+    edited.remove_keyframe(ids[0])
+    edited.infer()
+    others.infer()
+    assert _field(edited) == _field(others)
