@@ -56,7 +56,7 @@ def all_cells(m: QueriedMap, side: int) -> Cells:
     reader = BrickReader(m)
     parts = [_cells(np.zeros((0, 3), np.int32), np.zeros((0, (BRICK // side) ** 3), np.float32), side)]
     for bricks, log_odds, _ in reader.batches(reader.bricks):
-        parts.append(_cells(bricks, cell_probabilities(log_odds, side), side))
+        parts.append(_cells(bricks, cell_probabilities(log_odds, reader.pool.prior_log_odds, side), side))
     return _joined(parts)
 
 
@@ -131,20 +131,22 @@ def standing_in(
     known = np.where(no_evidence, _EMPTY, log_odds)
     reached = probability(known) >= threshold
     for side in SIDES:
-        likely = cell_probabilities(known, side)
+        likely = cell_probabilities(known, reader.pool.prior_log_odds, side)
         reached = _any_of_eight(reached)
         standing = (likely >= threshold) & ~reached
         reached |= standing
         yield side, standing, likely
 
 
-def cell_probabilities(log_odds: NDArray[np.float32], side: int) -> NDArray[np.float32]:
+def cell_probabilities(
+    log_odds: NDArray[np.float32], prior_log_odds: float, side: int
+) -> NDArray[np.float32]:
     """The probability of each cell of some bricks, (n, 512) log-odds -> (n, (8 / side)^3), row-major."""
     n = len(log_odds)
-    free = 1.0 - probability(log_odds)
+    marginals = np.where(log_odds > prior_log_odds, 1.0, -1.0) * probability(log_odds)
     out = np.zeros(n * (BRICK // side) ** 3, np.float32)
     if n:
-        _join_voxels(np.ascontiguousarray(free.reshape(-1), np.float32), out, side)
+        _join_voxels(np.ascontiguousarray(marginals.reshape(-1), np.float32), out, side)
         runtime.settle()
     return out.reshape(n, -1)
 
@@ -173,9 +175,9 @@ def _joined(parts: list[Cells]) -> Cells:
 
 
 @ti.kernel
-def _join_voxels(free: F32Array, out: F32Array, side: Template):
-    """The probability of cells of ``side`` voxels, into ``out`` (bricks * cells), from the probability of
-    each voxel to be ``free`` (bricks * 512)."""
+def _join_voxels(marginals: F32Array, out: F32Array, side: Template):
+    """The probability of cells of ``side`` voxels, into ``out`` (bricks * cells), from the ``marginals``
+    (bricks * 512) of voxels likelier than the prior, and of the others with a minus before it."""
     for i in out:
         across = ti.static(BRICK // side)
         brick, cell = i // across**3, i % across**3
@@ -190,9 +192,13 @@ def _join_voxels(free: F32Array, out: F32Array, side: Template):
             rarest = 1.0
             for a in range(side):
                 for b in range(side):
-                    line = 1.0
+                    free, surface = 1.0, 0.0
                     for k in range(side):
-                        line *= free[first + a * a_stride + b * b_stride + k * along]
-                    rarest = ti.min(rarest, line)
+                        marginal = marginals[first + a * a_stride + b * b_stride + k * along]
+                        if marginal > 0.0:
+                            surface += marginal
+                        else:
+                            free *= 1.0 + marginal
+                    rarest = ti.min(rarest, free * ti.max(0.0, 1.0 - surface))
             least = ti.min(least, 1.0 - rarest)
         out[i] = least

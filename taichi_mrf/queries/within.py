@@ -1,15 +1,17 @@
 """How likely something lies in a ball, or in the way of a ball that moves: voxels taken together.
 
-A surface whose depth is uncertain may lie in any of the voxels along a ray, so the chances of the voxels
-along a line add up. Lines side by side mostly see the same surface, with the same error, so theirs do not.
-The probability that something lies in a ball is that of its likeliest line,
+A ray has one first surface. Where its depth is uncertain the voxels along the ray share it, so along a line
+the chances of voxels with evidence of a surface add up; voxels without it are independent. Lines side by side
+mostly see the same surface, with the same error, so theirs do not add up. The probability that something lies
+in a ball is that of its likeliest line,
 
-    P(ball) = min over axes a of  max over lines along a of  1 - prod_i (1 - m_i l_i),
+    P(ball) = min over axes of  max over lines along the axis of
+                  1 - max(0, 1 - sum_{i in S} m_i l_i)  prod_{i not in S} (1 - m_i l_i),
 
-where m_i is the marginal of voxel i and l_i the length of the line in the voxel and in the ball, in voxels.
-Of the three axes, the one along which the surface is uncertain gives the least: the others run along the
-surface and count it again in each voxel. A ball that moves hits something with the probability of its
-likeliest place. docs/decisions.md compares these rules with others.
+where m_i is the marginal of voxel i, l_i the length of the line in the voxel and in the ball, in voxels, and
+S are the voxels likelier than the prior. Of the three axes, the one along which the surface is uncertain
+gives the least: the others run along the surface and count it again in each voxel. A ball that moves hits
+something with the probability of its likeliest place. docs/decisions.md compares these rules with others.
 """
 
 from dataclasses import dataclass
@@ -60,6 +62,9 @@ class _Voxels(Bundle):
     belief: F32Array
     """(pool * 512) log-odds."""
 
+    prior: F32
+    """Log-odds of a voxel of which nothing is known."""
+
     unknown: F32
     """Marginal of voxels in bricks that no ray has crossed."""
 
@@ -96,11 +101,11 @@ def occupied_within(
     cells = np.ascontiguousarray(inside, np.int32)
     slots = topology.slots(cells)
     slots[(slots < 0) & (topology.crossings(cells) > 0)] = _SEEN_FREE
-    marginals = 1.0 / (1.0 + np.exp(-np.array([pool.prior_log_odds, seen_free], np.float64)))
+    prior = float(pool.prior_log_odds)
+    unknown, free = (float(1.0 / (1.0 + np.exp(-x))) for x in (prior, seen_free))
     out = np.zeros(len(points_m), np.float32)
-    voxels = _Voxels(
-        ti.Vector(shape.astype(int).tolist(), ti.i32), slots, pool.belief, *(float(p) for p in marginals)
-    )
+    box = ti.Vector(shape.astype(int).tolist(), ti.i32)
+    voxels = _Voxels(box, slots, pool.belief, prior, unknown, free)
     _look_around((centres - lowest * BRICK).astype(np.float32), radius, voxels, out)
     runtime.settle()
     return out
@@ -174,7 +179,8 @@ def _free_along(axis: Template, centre: Vec3, a: I32, b: I32, half: F32, voxels:
     cell[first] = ti.floor(centre[first] + ti.cast(a, ti.f32), ti.i32)
     cell[second] = ti.floor(centre[second] + ti.cast(b, ti.f32), ti.i32)
     t, end = centre[axis] - half, centre[axis] + half
-    free = 1.0
+    free = 1.0  # of the voxels that are no likelier than the prior
+    surface = 0.0  # in one of the others
     while t < end:
         cell[axis] = ti.floor(t, ti.i32)
         brick = cell // BRICK
@@ -186,11 +192,16 @@ def _free_along(axis: Template, centre: Vec3, a: I32, b: I32, half: F32, voxels:
             stride = ti.static(BRICK ** (2 - axis))
             while t < leave:
                 upper = ti.min(leave, ti.floor(t) + 1.0)
-                free *= 1.0 - (upper - t) * logistic(voxels.belief[index])
+                log_odds = voxels.belief[index]
+                here = (upper - t) * logistic(log_odds)
+                if log_odds > voxels.prior:
+                    surface += here
+                else:
+                    free *= 1.0 - here
                 index += stride
                 t = upper
         else:
-            here = voxels.unknown if slot == _UNKNOWN else voxels.free
-            free *= ti.pow(1.0 - here, leave - t)
+            everywhere = voxels.unknown if slot == _UNKNOWN else voxels.free
+            free *= ti.pow(1.0 - everywhere, leave - t)
             t = leave
-    return free
+    return free * ti.max(0.0, 1.0 - surface)

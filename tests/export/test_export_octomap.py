@@ -130,8 +130,8 @@ def test_a_cell_that_is_likely_as_a_whole_is_one_occupied_node(
 ) -> None:
     """An inner node of the tree, without children; all other voxels are as without cells."""
     log_odds = np.full((16, 16, 16), -4.0)
-    log_odds[2:4, :8, :8] = -0.4  # two layers
-    log_odds[:8, 8:, 8:] = -1.9  # eight
+    log_odds[2:4, :8, :8] = -0.8  # two layers
+    log_odds[:8, 8:, 8:] = -1.99  # eight
     log_odds[9, 9, 9] = 2.0
     write = write_ot if name.endswith("ot") else write_bt
     for m in (map_of(backend, (0, 0, 0), log_odds), hand):

@@ -51,7 +51,9 @@ def expected(hand: HandMap, centre_m: np.ndarray, radius_m: float) -> float:
                 cells, near, far = segments(start, along, 0.0, 2 * math.sqrt(squared), VOXEL)
                 m, length = 1 / (1 + np.exp(-hand.true_log_odds(cells))), (far - near) / VOXEL
                 no_brick = np.isnan(hand.hand.at(cells.astype(np.int64)))
-                likeliest = max(likeliest, 1 - np.prod(np.where(no_brick, (1 - m) ** length, 1 - m * length)))
+                evidence = hand.true_log_odds(cells).astype(np.float32) > np.float32(PRIOR)
+                rest = np.where(no_brick, (1 - m) ** length, 1 - m * length)[~evidence].prod()
+                likeliest = max(likeliest, 1 - max(0.0, 1 - (m * length)[evidence].sum()) * rest)
         of_axes.append(likeliest)
     return min(of_axes)
 
@@ -83,7 +85,7 @@ def test_a_wall_is_one_thing_however_many_lines_meet_it(backend: str) -> None:
     wall = map_of(backend, (0, 0, 0), log_odds)
     centre = np.array([[6.0 * VOXEL, 8 * VOXEL, 8 * VOXEL]])  # on the face of the first layer
     found = float(ball(wall, centre, 2 * VOXEL)[0])
-    assert found == pytest.approx(1 - 0.75**2, abs=1e-3)
+    assert found == pytest.approx(0.5, abs=1e-3)
     assert 1 - 0.75 ** (np.pi * 4) > 0.95  # the voxels of the half ball, taken alone
 
 
@@ -93,15 +95,23 @@ def test_a_larger_ball_is_never_less_likely_to_hold_something(hand: HandMap) -> 
     assert (np.diff(by_radius, axis=0) >= -1e-5).all()
 
 
-def test_a_line_is_between_its_likeliest_voxel_and_the_exact_chance_of_all() -> None:
-    """A ray has measured a surface that can only be in one of its voxels: some voxel is occupied. The rule,
-    from the exact marginals, comes closer to that than any single voxel, and never beyond."""
-    cells = [(i, 0, 0) for i in range(7)]
-    densities = [math.exp(-0.5 * ((i - 3) / 1.3) ** 2) for i in range(7)]
-    ray = Ray([Segment(cell, 1.0) for cell in cells], densities, 0.0)
-    marginals = np.array([enumerate_marginals([ray], 0.1, 1e-6)[cell] for cell in cells])
-    rule = 1 - np.prod(1 - marginals)
-    assert marginals.max() + 0.2 < rule < 1.0
+def test_a_line_is_nearly_as_likely_as_in_the_exact_joint_distribution(backend: str) -> None:
+    """Rays side by side have measured the same surface. In the joint distribution of a ray's voxels one of
+    them is the first surface, those before it are free, and those behind it keep the prior."""
+    cells = [(i, 0, 0) for i in range(8)]
+    densities = np.exp(-0.5 * ((np.arange(8) - 3.5) / 0.9) ** 2)
+    ray = Ray([Segment(cell, 1.0) for cell in cells], densities.tolist(), 0.0)
+    marginals = enumerate_marginals([ray], UNKNOWN_P, 1e-9)
+    along = np.array([math.log(marginals[cell] / (1 - marginals[cell])) for cell in cells])
+    wall = map_of(backend, (0, 0, 0), np.broadcast_to(along[:, None, None], (8, 8, 8)))
+    first = densities * (1 - UNKNOWN_P) ** np.arange(8)
+    first /= first.sum()
+    for radius in (1, 2, 3):
+        exact = 1 - first[: 4 - radius].sum() * (1 - UNKNOWN_P) ** (2 * radius) - first[4 + radius :].sum()
+        found = ball(wall, np.array([[4.0, 4.5, 4.5]]) * VOXEL, radius * VOXEL)[0]
+        alone = 1 - np.prod([1 - marginals[cell] for cell in cells[4 - radius : 4 + radius]])
+        assert found == pytest.approx(exact, abs=0.05)
+        assert exact - alone > 0.1
 
 
 def test_a_path_is_as_likely_to_collide_as_at_its_likeliest_place(hand: HandMap) -> None:
