@@ -40,12 +40,14 @@ MARGIN = 1
 class FusedSurface:
     """A surface in the world: ``vertices_m`` (V, 3) float64 in metres, ``triangles`` (T, 3) int64, wound
     counter-clockwise as seen from free space, ``normals`` (V, 3) unit vectors towards free space, and
-    ``std_m`` (V,) float32, the standard deviation of each vertex along its normal, in metres."""
+    ``std_m`` (V,) float32, the standard deviation of each vertex along its normal, in metres; ``colors`` (V,
+    3) uint8 are what cameras saw, None in a map without colours."""
 
     vertices_m: NDArray[np.float64]
     triangles: NDArray[np.int64]
     normals: NDArray[np.float32]
     std_m: NDArray[np.float32]
+    colors: NDArray[np.uint8] | None = None
 
 
 def fused_surface(field: DistanceField, voxel_size: float) -> FusedSurface:

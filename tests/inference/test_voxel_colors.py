@@ -20,6 +20,7 @@ from taichi_mrf.methods.mrf import keyframe_allocator
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
+from taichi_mrf.voxels.colors import NO_COLOR
 from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -175,6 +176,16 @@ def test_a_measurement_that_the_map_holds_for_an_outlier_has_no_say(depth_m: flo
     color = m.colors(points[points[:, 2] < 2.2])
     assert (color[:, 3] > 0).sum() > 300
     assert color[:, 1].max() <= scene.BLUE[1] + 5
+
+
+def test_the_surface_below_voxels_has_their_colours() -> None:
+    surface = scene.build([0, 1, 2, 3]).surface()
+    assert surface.colors is not None
+    seen = (surface.colors != NO_COLOR).any(axis=1)
+    assert seen.mean() > 0.9
+    near = surface.vertices_m[:, 2] < 1.6
+    for rows, own in ((near & seen, scene.RED), (~near & seen, scene.BLUE)):
+        assert np.median(np.abs(surface.colors[rows].astype(int) - own).max(axis=1)) <= 1
 
 
 def test_files_keep_colours(tmp_path: Path) -> None:

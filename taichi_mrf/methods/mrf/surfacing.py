@@ -9,6 +9,7 @@ from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.surface_field import SurfaceRays
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.methods.brick_map import BrickMap
+from taichi_mrf.queries.colored import blended_colors, is_colored
 from taichi_mrf.voxels.distance_field import DistanceField
 
 OUTLIERS = 0.01
@@ -28,7 +29,8 @@ class WithSurface(BrickMap):
 
     def surface(self) -> FusedSurface:
         """The surface that the keyframes measured, by marching cubes through the mean of their signed
-        distances: vertices, triangles, normals, and a standard deviation in metres for each vertex.
+        distances: vertices, triangles, normals, and for each vertex a standard deviation in metres, and its
+        colour if keyframes have colour images.
 
         It is made from the keyframes' images and the marginals as they are now, so call :meth:`infer` before.
         Frozen keyframes have no images and no part in it. Raises ConfigError for a map without keyframes,
@@ -36,7 +38,9 @@ class WithSurface(BrickMap):
         """
         if not self._keyframes:
             raise ConfigError("the map has no keyframes: there is nothing to make a surface of")
-        return fused_surface(surface_field_of(self), self.voxel_size)
+        found = fused_surface(surface_field_of(self), self.voxel_size)
+        colors = blended_colors(self, found.vertices_m) if is_colored(self) else None
+        return replace(found, colors=colors)
 
 
 def surface_field_of(m: WithSurface) -> DistanceField:
