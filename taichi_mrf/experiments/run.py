@@ -46,6 +46,7 @@ EXPERIMENTS = {
     "exact": Entry("exact:run_exact", (0.05,)),
     "poses": Entry("poses:run_poses", (0.05,)),
     "rays": Entry("rays:run_rays", (0.05, 0.02, 0.01)),
+    "readings": Entry("readings:run_readings", (0.05, 0.02)),
     "price": Entry("price:run_price", (0.05, 0.02)),
     "endless": Entry("endless:run_endless", (0.1,)),
     "changes": Entry("changes:run_changes", (0.05, 0.02), needs_data=False),

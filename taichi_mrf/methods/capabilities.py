@@ -16,7 +16,7 @@ from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.schedule import InferReport, Progress
 from taichi_mrf.methods.mrf.checkpoint import Checkpoint
 from taichi_mrf.methods.mrf.moving_window import MovingWindow
-from taichi_mrf.methods.mrf.reading import Layer, MapReading
+from taichi_mrf.methods.mrf.reading import Layer, MapReading, Reading
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.queries.change import MapChange
 from taichi_mrf.queries.colored import ColoredMap
@@ -86,6 +86,10 @@ class LayeredMap(OccupancyMap, Protocol):
     def layer(self, which: Layer = "both", stamp_s: float | None = None) -> MapReading:
         """One layer, or both, as believed at a time in seconds, now if None. Raises ConfigError in a map of
         a static world."""
+        ...
+
+    def reading(self, which: Reading = "surface") -> MapReading:
+        """The map with another rule for what is occupied."""
         ...
 
     def changes(self, since_s: float) -> MapChange:

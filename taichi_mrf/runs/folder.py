@@ -7,19 +7,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from taichi_mrf.config.registry import METHODS
+from taichi_mrf.config.registry import METHODS, methods_with
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import reposed
-from taichi_mrf.errors import CutShortError, FrameError
+from taichi_mrf.errors import ConfigError, CutShortError, FrameError
 from taichi_mrf.evaluation.held_out import HeldOutCheck, RenderedMap, check_held_out
 from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
 from taichi_mrf.export.ply import photo_at, write_voxels
 from taichi_mrf.export.trajectory import write_trajectory
 from taichi_mrf.mapping.result import MappingResult
-from taichi_mrf.methods.capabilities import window_of
+from taichi_mrf.methods.capabilities import has_layers, window_of
 from taichi_mrf.methods.chunked_part import ChunkedViews, in_chunks
+from taichi_mrf.methods.mrf.reading import MapReading, Reading
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.runs.files import (
     CONFIG_FILE,
@@ -103,17 +104,18 @@ def write_run(
     *,
     check: bool = True,
     pictures: bool = True,
+    reading: Reading = "marginal",
     haste: Haste = NO_HASTE,
     advance: Advance = lambda stage, done, total: None,
 ) -> tuple[dict[str, Any], list[Path]]:
     """Write all files of a run to a folder that exists: the map first, because the time went into it, the
     report last. With ``check`` the held-out frames are compared with the map, and the poses with the depth;
     with ``pictures`` it is drawn, if it is in memory as a whole; both are left out in ``haste``. Pictures of
-    an earlier run are removed.
+    an earlier run are removed. ``reading`` says what is occupied in the voxels' file and the pictures.
 
-    Returns the report and the paths. Raises MapFileError.
+    Returns the report and the paths. Raises MapFileError, ConfigError if the map has no such reading.
     """
-    written, occupied = _write_map(folder, result, facts.config, advance)
+    written, occupied, shown = _write_map(folder, result, facts.config, reading, advance)
     chunked = in_chunks(result.map)
     posed = facts.dataset
     if posed is not None and result.track is not None:
@@ -132,7 +134,7 @@ def write_run(
     if chunked is not None:
         report["notes"].append(_LARGER_THAN_MEMORY.format(len(chunked.chunks)))
     elif pictures:
-        written += _write_pictures(folder, result, posed, haste, advance)
+        written += _write_pictures(folder, result, posed, shown, haste, advance)
     remove_files_of_earlier_run(folder, written)
     report |= {"seconds": rounded(result.seconds), "peak_memory_mb": peak_memory_mb()}
     write_text(folder / REPORT_FILE, report_json(report))
@@ -145,10 +147,11 @@ def write_report(folder: Path, result: MappingResult, facts: RunFacts) -> None:
     write_text(folder / REPORT_FILE, report_json(facts.report(result, None)))
 
 
-def write_voxel_file(path: Path, m: OccupancyMap) -> int:
+def write_voxel_file(path: Path, m: OccupancyMap, shown: MapReading | None = None) -> int:
     """Write the voxels that are more likely occupied than free, of a map with a window as of its last save,
-    in the colours that cameras saw if the map has them; returns their number. Raises MapFileError."""
-    centres, probability = (in_chunks(m) or m).voxels(min_probability=0.5)
+    in the colours that cameras saw if the map has them; returns their number. ``shown`` takes the place of
+    its marginals. Raises MapFileError."""
+    centres, probability = (in_chunks(m) or shown or m).voxels(min_probability=0.5)
     write_voxels(path, centres, probability, m.voxel_size, photo_at(m, centres))
     return len(centres)
 
@@ -158,16 +161,28 @@ def _nothing_occupied(config: Config) -> str:
     return f"The map is empty: no voxel has a probability of 0.5 or more; {advice}."
 
 
+def _read_as(m: OccupancyMap, reading: Reading) -> MapReading | None:
+    """A map by a reading, None for its marginals. Raises ConfigError if it has no other."""
+    if reading == "marginal":
+        return None
+    if not has_layers(m) or in_chunks(m) is not None:
+        raise ConfigError(
+            f"a {reading} reading needs a map of {methods_with('has_layers')}, in memory as a whole"
+        )
+    return m.reading(reading)
+
+
 def _write_map(
-    folder: Path, result: MappingResult, config: Config, advance: Advance
-) -> tuple[list[Path], int]:
-    """Returns the paths and the number of occupied voxels."""
+    folder: Path, result: MappingResult, config: Config, reading: Reading, advance: Advance
+) -> tuple[list[Path], int, MapReading | None]:
+    """Returns the paths, the number of occupied voxels, and the map by a reading other than its marginals."""
     advance("Writing", 0, 2)
     with result.timed("writing"):
         result.map.save(folder / MAP_FILE)
         write_text(folder / CONFIG_FILE, commented_yaml(config))
         advance("Writing", 1, 2)
-        occupied = write_voxel_file(folder / VOXEL_FILE, result.map)
+        shown = _read_as(result.map, reading)
+        occupied = write_voxel_file(folder / VOXEL_FILE, result.map, shown)
         advance("Writing", 2, 2)
         written = [folder / MAP_FILE, folder / VOXEL_FILE, folder / CONFIG_FILE]
         if window_of(result.map) is not None:
@@ -175,7 +190,7 @@ def _write_map(
         if result.track is not None:
             write_trajectory(folder / TRAJECTORY_FILE, result.track.trajectory(result.map))
             written.append(folder / TRAJECTORY_FILE)
-    return written, occupied
+    return written, occupied, shown
 
 
 def _check(
@@ -200,7 +215,12 @@ def _check(
 
 
 def _write_pictures(
-    folder: Path, result: MappingResult, dataset: Dataset | None, haste: Haste, advance: Advance
+    folder: Path,
+    result: MappingResult,
+    dataset: Dataset | None,
+    shown: MapReading | None,
+    haste: Haste,
+    advance: Advance,
 ) -> list[Path]:
     """The pictures; none if the run has to end before they are drawn."""
     advance("Drawing", 0, 1)
@@ -208,7 +228,7 @@ def _write_pictures(
         with result.timed("pictures"), haste.cutting_short():
             held_out = _spread(result.held_out, PICTURED_FRAMES)
             frames = [] if dataset is None else _readable(dataset, held_out)
-            pictures = write_pictures(folder, result.map, frames)
+            pictures = write_pictures(folder, result.map, frames, shown)
     except CutShortError:
         return []
     advance("Drawing", 1, 1)

@@ -105,8 +105,9 @@ def map_to_folder(
         )
         result.seconds = {"opening": opening, **result.seconds}
         return write_run(
-            task.out, result, facts, pictures=task.pictures, haste=request, advance=progress.advance
-        )
+            task.out, result, facts, pictures=task.pictures, reading=task.shown_reading, haste=request,
+            advance=progress.advance,
+        )  # fmt: skip
 
 
 def listener_of(progress: ProgressBar) -> Listener:

@@ -7,6 +7,7 @@ from typing import Any
 from taichi_mrf.cli.options.map import Map
 from taichi_mrf.config.schema import Config, with_absolute_tables
 from taichi_mrf.datasets.source_flags import SourceFlags
+from taichi_mrf.methods.mrf.reading import Reading
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class MapTask:
     track_poses: bool = False
     keep_every: float = Map.keep_every
     overwrite: bool = False
+    shown_reading: Reading = "marginal"
 
     def __str__(self) -> str:
         return self.source
@@ -56,4 +58,5 @@ def map_task(options: Map, source: str, out: Path) -> MapTask:
         options.poses.track_poses,
         options.keep_every,
         options.overwrite,
+        options.shown_reading,
     )

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -76,6 +76,10 @@ class Map:
     pictures: bool = True
     """Draw the map from above, in perspective, and against the measured depth."""
 
+    shown_reading: Annotated[Literal["marginal", "surface"], tyro.conf.arg(name="reading")] = "marginal"
+    """What is occupied in voxels.ply and the pictures: voxels that are more likely so than not, or also those
+    that most rays take for their first surface (surface), which needs mrf and a map in memory."""
+
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the report as JSON, and nothing else, on stdout."""
 
@@ -97,5 +101,11 @@ class Map:
             raise ConfigError("map needs a SOURCE")
         if self.resume and self.overwrite:
             raise ConfigError("--resume and --overwrite do not go together")
+        if self.shown_reading != "marginal":
+            whole = self.submap_size is None and self.settings.volume.window_m == 0
+            if self.settings.method != "mrf" or not whole:
+                raise ConfigError(
+                    f"--reading {self.shown_reading} needs --method mrf and a map in memory as a whole"
+                )
         if not self.keep_every >= 0:
             raise ConfigError(f"--keep-every must be a number of seconds, not {self.keep_every}")

@@ -2,9 +2,10 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from taichi_mrf.evaluation.depth_error import depth_error
 from taichi_mrf.evaluation.pictures.figures import new_figure, notice
@@ -27,13 +28,22 @@ _DIFFERENCE_RANGE_CM = 10.0
 _NO_DEPTH_GREY = "0.88"
 
 
-def write_pictures(out_dir: Path, m: OccupancyMap, held_out: Sequence[Frame]) -> list[Path]:
+class ShownMap(Protocol):
+    """What is drawn of a map."""
+
+    def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]: ...
+
+
+def write_pictures(
+    out_dir: Path, m: OccupancyMap, held_out: Sequence[Frame], shown: ShownMap | None = None
+) -> list[Path]:
     """Write ``top_view.png``, ``depth.png`` and ``perspective.png`` to a folder that exists.
 
     ``held_out`` are frames that the map has not seen, to compare rendered with measured depth; without
-    any a keyframe serves, and its title says so. Returns the paths. Raises MapFileError.
+    any a keyframe serves, and its title says so. ``shown`` has the voxels to draw if they are not the map's
+    marginals. Returns the paths. Raises MapFileError.
     """
-    figures = {"depth.png": depth_comparison(m, held_out), **_room_figures(m)}
+    figures = {"depth.png": depth_comparison(m, held_out), **_room_figures(m, shown or m)}
     for name, figure in figures.items():
         with atomic_path(out_dir / name) as temporary:
             # Level 2 of 9 takes half of the default's time, and the files are a fifth larger.
@@ -41,9 +51,9 @@ def write_pictures(out_dir: Path, m: OccupancyMap, held_out: Sequence[Frame]) ->
     return [out_dir / name for name in figures]
 
 
-def _room_figures(m: OccupancyMap) -> dict[str, "Figure"]:
+def _room_figures(m: OccupancyMap, shown: ShownMap) -> dict[str, "Figure"]:
     """The views of the whole map, by file name."""
-    centres, probability = m.voxels(min_probability=LOWEST)
+    centres, probability = shown.voxels(min_probability=LOWEST)
     if len(centres) == 0:
         nothing = notice(f"The map holds no voxel with a marginal of {LOWEST} or more.")
         return {"top_view.png": nothing, "perspective.png": nothing}

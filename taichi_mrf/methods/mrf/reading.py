@@ -4,6 +4,7 @@ of it."""
 import copy
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Literal, get_args
 
@@ -20,6 +21,8 @@ from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.dated_channels import layer_of
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import count_observations
+from taichi_mrf.inference.surface_votes import surfaces_first
+from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.methods.brick_map import BrickMap
 from taichi_mrf.methods.mrf.coloring import MapColors
 from taichi_mrf.methods.mrf.surfacing import WithSurface
@@ -31,6 +34,11 @@ from taichi_mrf.voxels.topology import Topology
 
 Layer = Literal["static", "dynamic", "both"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
+
+Reading = Literal["marginal", "surface"]
+"""What is called occupied: voxels whose marginal is over 0.5, or also those that most rays take for their
+first surface."""
+READINGS: tuple[Reading, ...] = get_args(Reading)
 
 
 class MapReading(BrickMap):
@@ -84,7 +92,9 @@ class MapReading(BrickMap):
 
     def _grid(self) -> tuple[float, Topology, BrickPool, float]:
         if self._registry.version != self._version:
-            raise KeyframeError("the map has changed since it was read: call at() or layer() again")
+            raise KeyframeError(
+                "the map has changed since it was read: call at(), layer() or reading() again"
+            )
         return super()._grid()
 
 
@@ -93,6 +103,7 @@ class ReadableMRF(WithSurface):
 
     _keyframes: dict[int, Keyframe]
     _frozen: dict[int, str]
+    _sweeper: Sweeper
     _dated: DatedBelief | None
     _colors: MapColors
 
@@ -203,6 +214,24 @@ class ReadableMRF(WithSurface):
         if dynamic:
             reading.seen_free_log_odds = pool.prior_log_odds  # free space belongs to the static layer
         return reading
+
+    def reading(self, which: Reading = "surface") -> MapReading:
+        """The map with another rule for what is occupied, to be queried, cast rays in, drawn and exported.
+
+        A wall that is seen with a sigma of several voxels has no voxel that is more likely occupied than not.
+        "surface" also calls a voxel occupied if it wins the vote of the rays: each measured ray votes for
+        the voxel that most likely is its first surface, and against those in front of it
+        (inference.surface_votes). Its log-odds are raised to just above even odds; all others are the
+        marginals, which are what "marginal" gives. Frozen keyframes have no votes. Raises ConfigError for
+        another name.
+        """
+        if which not in READINGS:
+            raise ConfigError(f"there is no reading {which!r}; known are {', '.join(READINGS)}")
+        if which == "marginal":
+            return MapReading(self, copied(self._pool.belief))
+        seen = [(k, self._registry.visible_again(k.footprint, k.visible)) for k in self._keyframes.values()]
+        model = replace(self._sweeper.model(), maximise=False)
+        return MapReading(self, surfaces_first(seen, self._pool, model, self.view.volume))
 
     def changes(self, since_s: float) -> MapChange:
         """What differs between the map as it was believed at a time in seconds and as it is now: its

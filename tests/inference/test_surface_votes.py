@@ -1,0 +1,127 @@
+"""The vote of the rays for their first surface: against NumPy ray by ray, and what a reading is."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, event, given, settings
+from hypothesis import strategies as st
+from one_pixel import VOXEL, allocated, look_along, marginals
+from oracles import inference as reference
+from oracles.forward import Noise
+from uncertain_wall import WALL_M, uncertain_wall
+
+from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.errors import ConfigError, KeyframeError
+from taichi_mrf.inference.surface_votes import CALLED, GRAZED
+from taichi_mrf.methods.mrf import keyframe_allocator
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.queries.cast import cast_rays
+from taichi_mrf.queries.points import OCCUPIED
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.noise import PolynomialNoise
+
+pytestmark = pytest.mark.usefixtures("backend")
+
+
+def vote(ray: reference.Ray, p: dict, learnt: float, floor: float, votes: dict) -> bool:
+    """Add one ray's votes; False if rounding may decide what they are."""
+    visibility, explained, found = 1.0, 0.0, []
+    for segment, density in zip(ray.segments, ray.densities, strict=True):
+        if segment.voxel in p:
+            free = (1 - p[segment.voxel]) ** segment.length
+            here = (1 - free) * density * visibility
+            explained += here
+            found.append((segment, here if p[segment.voxel] > learnt else 0.0))
+            visibility *= free
+            if segment.length < 0.01 or abs(p[segment.voxel] - learnt) < 1e-4:
+                return False
+    best = sorted((here for _, here in found), reverse=True)[:2]
+    if len(best) < 2 or best[1] > 0.99 * best[0] or abs(explained / floor - 1) < 0.01:
+        return False
+    if explained > floor:
+        front = [here for _, here in found].index(best[0])
+        if any(abs(segment.length - GRAZED) < 0.01 for segment, _ in found[:front]):
+            return False
+        for segment, _ in found[:front]:
+            if segment.length > GRAZED:
+                votes[segment.voxel] = votes.get(segment.voxel, 0) - 1
+        votes[found[front][0].voxel] = votes.get(found[front][0].voxel, 0) + 1
+    return True
+
+
+@settings(max_examples=15)
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 3), sigma=st.floats(0.05, 0.2))
+def test_voxels_are_called_as_the_rays_vote(seed: int, count: int, sigma: float) -> None:
+    rng = np.random.default_rng(seed)
+    camera = PinholeCamera(3, 2, 8.0, 8.0, 1.0, 0.5)
+    config = InferenceConfig(outlier_floor=1e-3, ray_density=0.0)
+    m = MRFMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=1.5)
+    rays = []
+    middle = rng.uniform(-1, 1, 3)
+    for _ in range(count):
+        direction = rng.normal(size=3)
+        T = look_along(middle - 0.6 * direction / np.linalg.norm(direction), direction, rng)
+        depth = rng.uniform(0.5, 0.7, camera.shape).astype(np.float32)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(keyframe_allocator, "SCOUTS", 1)
+            m.add_keyframe(depth, T, camera)
+        rays += reference.cast(depth, T, camera, VOXEL, Noise((sigma,)), config, max_depth=1.5)
+    m.infer()
+    voxels = sorted(allocated(m))
+    before = marginals(m, voxels)
+    p = dict(zip(voxels, before.tolist(), strict=True))
+    learnt = reference.logistic(reference.logit(m.prior) + m.config.volume.min_evidence)
+    votes: dict[reference.Voxel, int] = {}
+    doubtful: set[reference.Voxel] = set()
+    for ray in rays:
+        if not vote(ray, p, learnt, config.outlier_floor, votes):
+            doubtful |= {s.voxel for s in ray.segments}
+    assume(len(doubtful) < len(voxels))
+    called = reference.logistic(CALLED)
+    expected = {v: max(p[v], called) if votes.get(v, 0) > 0 else p[v] for v in voxels if v not in doubtful}
+    got = marginals(m.reading("surface"), list(expected))
+    np.testing.assert_allclose(got, list(expected.values()), atol=1e-5)
+    np.testing.assert_array_equal(marginals(m.reading("marginal"), voxels), before)
+    event(f"{sum(votes.get(v, 0) > 0 for v in expected)} voxels called")
+
+
+def test_a_wall_that_no_voxel_is_sure_of_stops_rays() -> None:
+    m = uncertain_wall()
+    straight = np.linspace(-0.3, 0.5, 9)[:, None] * [1, 0, 0] + [0.003, 0.02, 0]
+    assert not cast_rays(m, straight, (0, 0, 1), 3.0).hit.any()
+    surface = m.reading("surface")
+    found = cast_rays(surface, straight, (0, 0, 1), 3.0)
+    assert found.hit.mean() > 0.8
+    np.testing.assert_allclose(found.range[found.hit] + VOXEL / 2, WALL_M, atol=2.5 * VOXEL)
+    called = found.point[found.hit] + [0, 0, VOXEL / 2]
+    assert (surface.state(called) == OCCUPIED).all()
+    assert len(surface.voxels()[0]) > len(m.voxels()[0])
+
+
+def test_what_marginals_call_occupied_stays_so() -> None:
+    m = uncertain_wall()
+    centres, before = m.voxels(0.0)
+    after = m.reading("surface").occupancy(centres)
+    assert (after >= before).all()
+    raised = after > before
+    assert raised.any()
+    assert (after[raised] < 0.51).all()
+
+
+def test_a_reading_follows_edits() -> None:
+    edited, plain = uncertain_wall(3), uncertain_wall(2)
+    reading = edited.reading("surface")
+    edited.remove_keyframe(2)
+    with pytest.raises(KeyframeError, match="has changed since it was read"):
+        reading.occupancy(np.zeros((1, 3)))
+    edited.infer()
+    centres, _ = plain.voxels(0.0)
+    np.testing.assert_array_equal(
+        edited.reading("surface").occupancy(centres), plain.reading("surface").occupancy(centres)
+    )
+
+
+def test_an_empty_map_can_be_read() -> None:
+    m = MRFMap(VOXEL)
+    assert len(m.reading("surface").voxels()[0]) == 0
+    with pytest.raises(ConfigError, match="there is no reading 'first'"):
+        m.reading("first")  # type: ignore[arg-type]
