@@ -13,6 +13,7 @@ from taichi_mrf.errors import ArgumentTypeError, ConfigError
 from taichi_mrf.export.arrays import write_arrays
 from taichi_mrf.export.chunk_blocks import StorableMap, write_chunks
 from taichi_mrf.export.chunk_store import SUFFIX
+from taichi_mrf.export.fused_surface import SurfacedMap, has_surface, measured_surface
 from taichi_mrf.export.level_map import level_map
 from taichi_mrf.export.map_server import grey_image, write_map_server
 from taichi_mrf.export.mesh_file import write_mesh
@@ -74,8 +75,13 @@ def extensions() -> Sequence[str]:
 
 
 def export_note(m: ExportedMap, path: str | Path, options: ExportOptions = _DEFAULTS) -> str | None:
-    """A note for the user on a written file: how a floor plan lies in the world."""
-    if _WRITERS.get(Path(path).suffix.lower()) is not _level_map:
+    """A note for the user on a written file: what a mesh shows, how a floor plan lies in the world."""
+    writer = _WRITERS.get(Path(path).suffix.lower())
+    if writer is _surface or (writer is _points_or_surface and options.mesh):
+        if options.cubes or _with_rays(m, Path(path), options) is None:
+            return None
+        return f"the surface that the rays of {len(m.keyframes)} keyframes measured"
+    if writer is not _level_map:
         return None
     reason = "--up" if options.up != "auto" else "as in the map's first keyframe"
     if options.up == "auto" and m.up is None:
@@ -111,6 +117,8 @@ def _points_or_surface(m: ExportedMap, path: Path, options: ExportOptions) -> li
 def _surface(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
     if options.cubes:
         surface = voxel_surface(m, options.threshold, options.cells)
+    elif (measured := _with_rays(m, path, options)) is not None:
+        surface = measured_surface(measured)
     else:
         surface = smooth_surface(m, options.threshold)
     if not len(surface.triangles):
@@ -121,6 +129,17 @@ def _surface(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
     T_gltf_world = y_up(_up(m, options)) if path.suffix.lower() == ".glb" else None
     write_mesh(path, surface, m.voxel_size, T_gltf_world)
     return [path]
+
+
+def _with_rays(m: ExportedMap, path: Path, options: ExportOptions) -> SurfacedMap | None:
+    """The map, if its mesh is to be what rays measured. Raises ConfigError if it has none."""
+    if options.surface != "marginal" and has_surface(m):
+        return m
+    if options.surface == "rays":
+        raise ConfigError(
+            f"{path}: the map has no keyframes, or some are frozen; --surface marginal needs none"
+        )
+    return None
 
 
 def _photo(m: ExportedMap, path: Path, options: ExportOptions) -> ColoredMap | None:

@@ -10,13 +10,15 @@ It goes chunk by chunk, so that memory is bounded by the surface, not by the spa
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Protocol, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.export.surface import welded_rows
-from taichi_mrf.queries.known_bricks import sorted_bricks
+from taichi_mrf.export.surface import Surface, welded_rows
+from taichi_mrf.queries.known_bricks import QueriedMap, sorted_bricks
 from taichi_mrf.system.libraries import library
+from taichi_mrf.voxels.colors import marginal_colors
 from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS, grid_keys
 
@@ -48,6 +50,29 @@ class FusedSurface:
     normals: NDArray[np.float32]
     std_m: NDArray[np.float32]
     colors: NDArray[np.uint8] | None = None
+
+
+class SurfacedMap(QueriedMap, Protocol):
+    """A map that makes a surface from its keyframes."""
+
+    def surface(self) -> FusedSurface:
+        """The surface that the keyframes measured."""
+        ...
+
+
+def has_surface(m: QueriedMap) -> TypeGuard[SurfacedMap]:
+    """Whether a map makes a surface from all keyframes that it was made of: none is frozen."""
+    return hasattr(m, "surface") and len(m.keyframes) > 0 and not getattr(m, "frozen", ())
+
+
+def measured_surface(m: SurfacedMap) -> Surface:
+    """The surface of a map, in the colours of the likeliest marginal at or right behind each vertex."""
+    found = m.surface()
+    behind = found.vertices_m - 0.5 * m.voxel_size * found.normals
+    p = np.maximum(m.occupancy(found.vertices_m), m.occupancy(behind))
+    return Surface(
+        found.vertices_m, found.triangles, marginal_colors(p), normals=found.normals, std_m=found.std_m
+    )
 
 
 def fused_surface(field: DistanceField, voxel_size: float) -> FusedSurface:

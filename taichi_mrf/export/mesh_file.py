@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from taichi_mrf.export.ply import write_surface
 from taichi_mrf.export.surface import Surface
@@ -23,12 +24,18 @@ def write_mesh(
     suffix = Path(path).suffix.lower()
     if suffix == ".ply":
         comments = [f"voxel_size {voxel_size:.9g} metres", surface.colors_note]
-        write_surface(path, surface.vertices_m, surface.triangles, surface.colors, comments)
+        extra: dict[str, NDArray] = {}
+        if surface.normals is not None:
+            extra |= dict(zip(("nx", "ny", "nz"), surface.normals.T, strict=True))
+        if surface.std_m is not None:
+            extra["std_m"] = surface.std_m
+        write_surface(path, surface.vertices_m, surface.triangles, surface.colors, extra, comments)
         return
     trimesh = library("trimesh", f"{suffix} files need", "mesh")
     mesh = trimesh.Trimesh(
-        surface.vertices_m, surface.triangles, vertex_colors=surface.colors, process=False, validate=False
-    )
+        surface.vertices_m, surface.triangles, vertex_normals=surface.normals,
+        vertex_colors=surface.colors, process=False, validate=False,
+    )  # fmt: skip
     whole = mesh
     if suffix == ".glb":
         whole = trimesh.Scene()

@@ -23,6 +23,10 @@ class ExportOptions:
     mesh: bool = False
     """Write a .ply as a mesh by marching cubes, like .glb, .obj and .stl, not as points."""
 
+    surface: Literal["auto", "rays", "marginal"] = "auto"
+    """What a mesh shows: rays is the surface that the keyframes' rays measured, below the size of voxels, and
+    marginal where the marginal is the threshold. auto is rays for a map that has keyframes, none frozen."""
+
     cells: bool = True
     """Where no voxel is likely enough but a cell of 2, 4 or 8 voxels is, show the cell: in a .ply as a point
     with the property size, in cubes and .html as all its voxels, in .bt and .ot as a larger leaf."""

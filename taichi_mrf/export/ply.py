@@ -62,11 +62,7 @@ def write_points(
 ) -> None:
     """Write points (N, 3) in metres with colours (N, 3) and further properties (N,) by name, float32 or
     uint8 each. Raises MapFileError."""
-    dtype = np.dtype([*_PLACE, *_COLOR, *((name, values.dtype) for name, values in extra.items())])
-    vertices = _vertices(dtype, points, colors)
-    for name, values in extra.items():
-        vertices[name] = values
-    _write(path, vertices, None, comments)
+    _write(path, _vertices(points, colors, extra), None, comments)
 
 
 def write_surface(
@@ -74,20 +70,25 @@ def write_surface(
     vertices_m: NDArray[np.floating],
     triangles: NDArray[np.integer],
     colors: NDArray[np.uint8],
+    extra: dict[str, NDArray],
     comments: Sequence[str],
 ) -> None:
-    """Write triangles (T, 3) over vertices (V, 3) in metres, with colours (V, 3). Raises MapFileError."""
+    """Write triangles (T, 3) over vertices (V, 3) in metres, with colours (V, 3) and further properties (V,)
+    by name. Raises MapFileError."""
     faces = np.empty(len(triangles), _TRIANGLE)
     faces["count"], faces["corners"] = 3, triangles
-    _write(path, _vertices(np.dtype([*_PLACE, *_COLOR]), vertices_m, colors), faces, comments)
+    _write(path, _vertices(vertices_m, colors, extra), faces, comments)
 
 
-def _vertices(dtype: np.dtype, points: NDArray[np.floating], colors: NDArray[np.uint8]) -> NDArray:
+def _vertices(points: NDArray[np.floating], colors: NDArray[np.uint8], extra: dict[str, NDArray]) -> NDArray:
+    dtype = np.dtype([*_PLACE, *_COLOR, *((name, values.dtype) for name, values in extra.items())])
     vertices = np.empty(len(points), dtype=dtype)
     for axis, name in enumerate("xyz"):
         vertices[name] = points[:, axis]
     for channel, name in enumerate(("red", "green", "blue")):
         vertices[name] = colors[:, channel]
+    for name, values in extra.items():
+        vertices[name] = values
     return vertices
 
 

@@ -38,12 +38,15 @@ _SIDES = (
 @dataclass(frozen=True)
 class Surface:
     """Triangles in the world: ``vertices_m`` (V, 3) float64 in metres, ``triangles`` (T, 3) int64, wound
-    counter-clockwise as seen from free space, ``colors`` (V, 3) uint8, whose meaning is ``colors_note``."""
+    counter-clockwise as seen from free space, ``colors`` (V, 3) uint8, whose meaning is ``colors_note``. What
+    keyframes have measured has ``normals`` (V, 3) and standard deviations ``std_m`` (V,) too."""
 
     vertices_m: NDArray[np.float64]
     triangles: NDArray[np.int64]
     colors: NDArray[np.uint8]
     colors_note: str = MARGINAL_NOTE
+    normals: NDArray[np.float32] | None = None
+    std_m: NDArray[np.float32] | None = None
 
 
 def voxel_surface(m: QueriedMap, threshold: float, cells: bool = False) -> Surface:

@@ -51,7 +51,10 @@ def run_export(*arguments: object) -> int:
     ("second", "error"),
     [
         (["b.pgm"], ConfigError),  # without a band of heights
-        (["b.stl", "--threshold", "0.9999999"], ConfigError),  # no voxel is that sure
+        (
+            ["b.stl", "--surface", "marginal", "--threshold", "0.9999999"],
+            ConfigError,
+        ),  # no voxel is that sure
         (["missing/b.bt"], MapFileError),
         (["a.ply"], ConfigError),  # twice
         (["folder.npz"], MapFileError),

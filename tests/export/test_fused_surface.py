@@ -1,10 +1,14 @@
 """The surface of a field of signed distances: where it lies, which way it faces, and how sure it is."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from taichi_mrf import MRFMap, PinholeCamera, PolynomialNoise
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.export.formats import export_map, export_note
+from taichi_mrf.export.options import ExportOptions
 
 pytestmark = pytest.mark.usefixtures("backend")
 pytest.importorskip("skimage")
@@ -51,6 +55,29 @@ def test_the_standard_deviation_grows_where_rays_are_few() -> None:
     assert np.mean(error <= 2 * surface.std_m) > 0.9
     middle = np.abs(surface.vertices_m[:, :2]).max(axis=1) < 0.3
     assert surface.std_m[middle].mean() < 0.5 * surface.std_m.max()
+
+
+def test_files_hold_it_by_default(tmp_path: Path) -> None:
+    m = _map_of_plane(SIGMA)
+    surface = m.surface()
+    trimesh = pytest.importorskip("trimesh")
+    for name in ("plane.ply", "plane.glb", "plane.obj", "plane.stl"):
+        export_map(m, tmp_path / name, ExportOptions(mesh=True, up="z"))
+        assert "3 keyframes" in str(export_note(m, tmp_path / name, ExportOptions(mesh=True)))
+        loaded = trimesh.load_mesh(tmp_path / name, process=False)
+        assert len(loaded.faces) == len(surface.triangles)
+    header = (tmp_path / "plane.ply").read_bytes()[:1000]
+    assert b"property float std_m" in header
+    assert b"property float nx" in header
+
+
+def test_frozen_keyframes_leave_the_marginals(tmp_path: Path) -> None:
+    m = _map_of_plane(0.0)
+    m.freeze_keyframe(0)
+    with pytest.raises(ConfigError, match="frozen"):
+        export_map(m, tmp_path / "plane.ply", ExportOptions(mesh=True, surface="rays"))
+    export_map(m, tmp_path / "plane.ply", ExportOptions(mesh=True))
+    assert b"std_m" not in (tmp_path / "plane.ply").read_bytes()[:1000]
 
 
 def test_a_map_without_keyframes_has_no_surface() -> None:
