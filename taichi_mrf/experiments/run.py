@@ -47,6 +47,7 @@ EXPERIMENTS = {
     "poses": Entry("poses:run_poses", (0.05,)),
     "rays": Entry("rays:run_rays", (0.05, 0.02, 0.01)),
     "readings": Entry("readings:run_readings", (0.05, 0.02)),
+    "cells": Entry("cells:run_cells", (0.05, 0.02)),
     "price": Entry("price:run_price", (0.05, 0.02)),
     "endless": Entry("endless:run_endless", (0.1,)),
     "changes": Entry("changes:run_changes", (0.05, 0.02), needs_data=False),

@@ -59,3 +59,8 @@ def test_first_scores_come_before_full_ones(repository: Path) -> None:
     script = repository / "benchmarks" / "first_scores.py"
     said = run(script, source, "--voxel-size", "0.2", "--tries", "1")
     assert "4 frames of 64 x 48 mapped at 20 cm, 2 judged" in said
+
+
+def test_the_rates_of_balls_and_paths(repository: Path) -> None:
+    said = run(repository / "benchmarks" / "within_rate.py", "--voxel-size", "0.2", "--queries", "100")
+    assert said.count("a second") == 5

@@ -28,7 +28,8 @@ class Eval:
     endless, which freezes what has left the view for an hour, changes, in which things come and go and a
     person walks through, submaps, which maps the built-in corridor in parts and compares that with the map of
     a single machine, window, which keeps only what is near the camera in memory, surface, which compares the
-    surface of maps with that of Open3D (extra bench), or all."""
+    surface of maps with that of Open3D (extra bench), cells, which judges the probabilities of cells, balls
+    and paths, or all."""
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("runs/eval")
     """Folder for the results; created if needed."""
