@@ -140,10 +140,11 @@ def _add_share(places: I32Array, rg: I64Array, bw: I64Array, all_rg: I64Array, a
 def _pack(rg: I64Array, bw: I64Array, packed: I32Array):
     """Mean colours and weights of the sums (pool * 512): red, green, blue, weight from the lowest byte on."""
     for i in range(packed.shape[0]):
-        weight = low_half(bw[i])
+        weight, color = low_half(bw[i]), ti.i64(0)
         if weight > 0:
             half = weight // 2
             red, green = ((rg[i] >> 32) + half) // weight, (low_half(rg[i]) + half) // weight
             blue = ((bw[i] >> 32) + half) // weight
             alpha = ti.min(weight, 255)
-            packed[i] = ti.cast(red + (green << 8) + (blue << 16) + (alpha << 24), ti.i32)
+            color = red + (green << 8) + (blue << 16) + (alpha << 24)
+        packed[i] = ti.cast(color, ti.i32)

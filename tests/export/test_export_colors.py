@@ -17,7 +17,7 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.queries.colored import blended_colors
 from taichi_mrf.voxels.colors import NO_COLOR, marginal_colors
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = pytest.mark.usefixtures("one_backend")
 
 
 @pytest.fixture(scope="module")
