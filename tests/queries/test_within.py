@@ -9,9 +9,11 @@ import pytest
 from hand_made import PRIOR, VOXEL
 from oracles.inference import Ray, Segment, enumerate_marginals
 from oracles.traversal import segments
-from queried_maps import SEEN_FREE, HandMap, hand_map, map_of
+from queried_maps import SEEN_FREE, HandMap, hand_map, map_of, room, room_map
 
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.queries.points import FREE
 from taichi_mrf.queries.within import occupied_within, path_collision
 
 UNKNOWN_P = 1 / (1 + math.exp(-PRIOR))
@@ -124,6 +126,29 @@ def test_a_path_is_as_likely_to_collide_as_at_its_likeliest_place(hand: HandMap)
     assert found[1] == ball(hand, [[0, 0, 0]], 0.1)[0]
     assert path(hand, corners[0], 0.1) == found[0]
     assert path(hand, corners[0], 0.1).shape == ()
+
+
+def test_answers_follow_edits(backend: str) -> None:
+    """A map from which a keyframe was removed answers as the map of the others does."""
+    edited, others = room(MRFMap, [0, 1, 2]), room(MRFMap, [0, 1])
+    points = np.random.default_rng(5).uniform([-3, -2.5, -1], [3, 2.5, 1], (300, 3))
+    before = edited.occupied_within(points, 0.25)
+    edited.remove_keyframe(2)
+    edited.infer()
+    after = edited.occupied_within(points, 0.25)
+    np.testing.assert_array_equal(after, others.occupied_within(points, 0.25))
+    assert np.abs(after - before).max() > 0.1
+
+
+@pytest.mark.usefixtures("one_backend")
+@pytest.mark.parametrize("method", ["log_odds", "visibility", "mrf"])
+def test_a_path_through_a_wall_collides_in_every_map(method: str) -> None:
+    m = room_map(method)
+    inside = (
+        np.array([0.0, 0.0, 0.0]) if m.state([[0.0, 0.0, 0.0]])[0] == FREE else m.voxels()[0].mean(axis=0)
+    )
+    through, short = m.path_collision([[inside, inside + [6, 0, 0]], [inside, inside + [0.1, 0, 0]]], 0.15)
+    assert short < 0.5 < through
 
 
 def test_nonsense_is_refused(hand: HandMap) -> None:
