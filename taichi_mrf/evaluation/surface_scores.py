@@ -7,6 +7,7 @@ plane of the nearest point, and as far as the foot lies further aside than the p
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from taichi_mrf.system.libraries import library
 JUMP = 0.15
 """Neighbouring depths that differ by more than this share lie on two surfaces: there is no plane."""
 
-SAMPLES_PER_M2 = 10_000
+SAMPLES_PER_M2 = 2500
 """Points on the mesh at which it is judged."""
 
 
@@ -30,6 +31,11 @@ class OrientedPoints:
     points_m: NDArray[np.float64]
     normals: NDArray[np.float64]
     spacing_m: NDArray[np.float64]
+
+    @cached_property
+    def tree(self) -> Any:
+        """Finds the nearest of the points."""
+        return library("scipy.spatial", "surface scores need", "mesh").cKDTree(self.points_m)
 
     @staticmethod
     def joined(parts: Sequence["OrientedPoints"], cell_m: float) -> "OrientedPoints":
@@ -104,14 +110,17 @@ def surface_truth(
     poses: Sequence[Pose],
     camera: PinholeCamera,
     seen: Sequence[int],
-    cell_m: float = 0.01,
+    judged: Sequence[NDArray[np.bool_]] | None = None,
+    cell_m: float = 0.015,
 ) -> SurfaceTruth:
     """The truth from clean axial depth images (H, W), 0 where nothing is; ``seen`` are the numbers of those
-    that the map was made of."""
-    parts = [depth_points(depth, T, camera) for depth, T in zip(depths_m, poses, strict=True)]
-    return SurfaceTruth(
-        OrientedPoints.joined(parts, cell_m), OrientedPoints.joined([parts[i] for i in seen], cell_m)
-    )
+    that the map was made of, ``judged`` (H, W) the pixels whose surface it should hold, by default all."""
+    everything = [depth_points(depth, T, camera) for depth, T in zip(depths_m, poses, strict=True)]
+    parts = [everything[i] for i in seen]
+    if judged is not None:
+        masked = [np.where(judged[i], depths_m[i], np.float32(0)) for i in seen]
+        parts = [depth_points(depth, poses[i], camera) for i, depth in zip(seen, masked, strict=True)]
+    return SurfaceTruth(OrientedPoints.joined(everything, cell_m), OrientedPoints.joined(parts, cell_m))
 
 
 def depth_points(depth_m: NDArray[np.float32], T_world_camera: Pose, camera: PinholeCamera) -> OrientedPoints:
@@ -153,8 +162,7 @@ def plane_distance(
     points_m: NDArray[np.float64], normals: NDArray[np.float64] | None, surface: OrientedPoints
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The distance of points (n, 3) to a surface, and the angle in degrees to its normal there, (n,) each."""
-    spatial = library("scipy.spatial", "surface scores need", "mesh")
-    _, nearest = spatial.cKDTree(surface.points_m).query(points_m, workers=-1)
+    _, nearest = surface.tree.query(points_m, workers=-1)
     apart = points_m - surface.points_m[nearest]
     normal = surface.normals[nearest]
     across = (apart * normal).sum(axis=1)

@@ -84,9 +84,10 @@ class _Case:
     @cached_property
     def truth(self) -> SurfaceTruth:
         views = self.scene.views
-        depths = [np.where(view.judged, view.true_m, np.float32(0)) for view in views]
-        poses = [view.T_world_camera for view in views]
-        return surface_truth(depths, poses, self.scene.camera, _used(self.scene))
+        depths, poses = [view.true_m for view in views], [view.T_world_camera for view in views]
+        return surface_truth(
+            depths, poses, self.scene.camera, _used(self.scene), [view.judged for view in views]
+        )
 
 
 def _cases(experiment: Experiment) -> Sequence[_Case]:

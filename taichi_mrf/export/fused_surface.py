@@ -28,11 +28,12 @@ BLENDED_BELOW = 0.3
 LEAST_WEIGHT = 0.02
 """A voxel with less has no distance, nor has one that no ray has crossed."""
 
-GRID_STD = 0.05
-"""Standard deviation, in voxels, of what interpolation between voxels adds to a vertex."""
+RAY_STD = 0.8
+"""Standard deviation of a vertex as a multiple of what the weight there gives: blending uses more rays."""
 
-RAY_STD = 1.0
-"""Standard deviation of a vertex as a multiple of what rays with independent errors would have."""
+GRID_STD, BENT_STD, BORDER_STD = 0.02, 0.6, 0.3
+"""Standard deviations in voxels of what interpolation between voxels adds: everywhere, where the surface is
+bent most, and where it ends. With RAY_STD they were fitted on four scenes (docs/surfaces.md)."""
 
 MARGIN = 1
 """Voxels around a box that blending reads."""
@@ -99,9 +100,28 @@ def fused_surface(field: DistanceField, voxel_size: float) -> FusedSurface:
     first, triangles_of = welded_rows(points, np.concatenate(triangles))
     vertices_m = (points[first] + 0.5) * voxel_size
     ray_variance = 1.0 / (16.0 * np.maximum(np.concatenate(weights)[first], LEAST_WEIGHT))
-    std_m = voxel_size * np.sqrt(GRID_STD**2 + RAY_STD**2 * ray_variance)
-    normals = _normals(vertices_m, triangles_of)
+    normals, bent = _normals(vertices_m, triangles_of)
+    grid_variance = GRID_STD**2 + BENT_STD**2 * bent
+    grid_variance[_border(triangles_of)] += BORDER_STD**2
+    std_m = voxel_size * np.sqrt(grid_variance + RAY_STD**2 * ray_variance)
     return FusedSurface(vertices_m, triangles_of, normals, std_m.astype(np.float32))
+
+
+def without_free(m: QueriedMap, surface: FusedSurface, least: float) -> FusedSurface:
+    """The surface without what the map takes for free: vertices around which, within 2 voxels or standard
+    deviations along the normal, no voxel has the probability ``least``. Rays with a large sigma leave such
+    vertices in front of a surface and behind it."""
+    step = np.maximum(m.voxel_size, surface.std_m)[:, None] * surface.normals
+    likely = np.zeros(len(step), bool)
+    for number in (0, -1, 1, -2, 2):
+        rows = np.flatnonzero(~likely)
+        likely[rows] = m.occupancy(surface.vertices_m[rows] + number * step[rows]) >= least
+    triangles = surface.triangles[likely[surface.triangles].all(axis=1)]
+    kept = np.zeros(len(likely), bool)
+    kept[triangles] = True
+    place = np.cumsum(kept) - 1
+    rest = surface.vertices_m[kept], place[triangles], surface.normals[kept], surface.std_m[kept]
+    return FusedSurface(*rest)
 
 
 def _boxes(
@@ -167,13 +187,26 @@ def _weight_at(points: NDArray[np.float32], weight: NDArray[np.float32]) -> NDAr
     return mixed.astype(np.float32)
 
 
-def _normals(vertices_m: NDArray[np.float64], triangles: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Unit normals of vertices: those of the triangles around each, by their areas."""
+def _border(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The vertices of edges that have a triangle on one side only."""
+    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    keys, count = np.unique(edges[:, 0] << 32 | edges[:, 1], return_counts=True)
+    alone = keys[count == 1]
+    return np.concatenate([alone >> 32, alone & 0xFFFFFFFF])
+
+
+def _normals(
+    vertices_m: NDArray[np.float64], triangles: NDArray[np.int64]
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Unit normals (V, 3) of vertices: those of the triangles around each, by their areas; and how far these
+    differ from each other (V,), 0 where the surface is flat, at most 1."""
     corners = vertices_m[triangles]
     areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = np.zeros((len(vertices_m), 3))
     for axis in range(3):
         for corner in range(3):
             normals[:, axis] += np.bincount(triangles[:, corner], areas[:, axis], len(vertices_m))
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return (normals / np.maximum(length, 1e-30)).astype(np.float32)
+    length = np.linalg.norm(normals, axis=1)
+    area = np.bincount(triangles.ravel(), np.repeat(np.linalg.norm(areas, axis=1), 3), len(vertices_m))
+    bent = np.maximum(1.0 - length / np.maximum(area, 1e-30), 0.0)
+    return (normals / np.maximum(length, 1e-30)[:, None]).astype(np.float32), bent

@@ -1,19 +1,19 @@
 """What the rays of a keyframe say of the surface in and around each voxel: signed distances.
 
-A ray with the measurement z has its surface at depth s, the measurement without its bias, with the standard
-deviation sigma. A voxel whose centre lies at depth t on the ray gets the distance d = s - t, in metres along
-the ray, with the weight
+A voxel whose centre lies at depth t on a ray with the measurement z gets the distance
 
-    w = P l / (sigma^2 + (voxel / 4)^2)
+    d = z - bias(t) - t        with the weight        w = P l / (sigma(t)^2 + (voxel / 4)^2)
 
-for each of the ray's pixels, where l is the length of its way through the voxel. With the marginals m of the
+for each of the ray's pixels, in metres along the ray, where l is the length of its way through the voxel.
+Noise is that of a surface at the voxel: at the measurement, rays that err towards the camera would look more
+precise than others, and draw the surface nearer. With the marginals m of the
 map, and o for a measurement from anywhere in the sensor's range,
 
     P = (E + B) / (E + B + o)        E = sum_i nu_i m_i vis_i, B the same for what lies beyond the map    (4)
 
 is the posterior probability that the ray met a surface at all: a pixel of something that came and went, or an
-outlier, has none. A ray reaches as far as its band, 2 voxels or 3 sigma to either side of s, whichever is
-more. Free space in front of the band gets nothing, so that what lies behind a thin wall is no surface.
+outlier, has none. A ray reaches as far as its band, the depths that are within 2 voxels or 3 sigma of the
+measurement. Free space in front of the band gets nothing, so that what lies behind a thin wall is no surface.
 
 The sums are integers, so they do not depend on the order of rays and keyframes.
 """
@@ -28,7 +28,7 @@ from taichi_mrf.inference.ray_model import RayModel, SweptVoxels
 from taichi_mrf.inference.sum_product import TINY, Cast, ForwardPass, see_voxel
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import softplus
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, I64Array, IVec3, Template, Vec3
+from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, I64Array, IVec3, Template, Vec2, Vec3
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.numbering import flat
@@ -73,9 +73,10 @@ class _Measured(Bundle):
 
     ray: Template
     sums: DistanceSums
-    surface: F32  # its depth
+    measured: F32
+    noise: Template  # of its pixel
     to_voxels: F32  # length of the ray, in voxels, for one metre of depth
-    weight: F32
+    weight: F32  # pixels times P
 
 
 @dataclass(frozen=True)
@@ -129,8 +130,8 @@ def mark_band(
     of ``shape`` bricks; ``lower`` and ``upper`` bound its mapped part, in voxels."""
     for i in range(rays.number):
         ray, noise, _ = listed_ray(rays, i, sensor, view)
-        found = _surface_of(rays.depth[i], noise, sensor, band, ray.direction.norm())
-        begin, end = ti.max(0.0, found[0] - found[2]), ti.min(found[0] + found[2], band.max_depth)
+        reach = _band_of(rays.depth[i], noise, sensor, band, ray.direction.norm())
+        begin, end = reach[0], reach[1]
         clip(ray, begin, end, lower, upper)
         state = 0
         walk_bricks(ray, begin, end, shape, marks, False, _mark_brick, state, _Marked(shape, marks))
@@ -145,21 +146,21 @@ def add_distances(
     for i in range(rays.number):
         ray, noise, pixels = listed_ray(rays, i, sensor, view)
         to_voxels = ray.direction.norm()
-        found = _surface_of(rays.depth[i], noise, sensor, band, to_voxels)
-        begin, end = ti.max(0.0, found[0] - found[2]), ti.min(found[0] + found[2], band.max_depth)
+        reach = _band_of(rays.depth[i], noise, sensor, band, to_voxels)
+        begin, end = reach[0], reach[1]
         clip(ray, begin, end, space.lower, space.upper)
-        weight = pixels * trust[i] / (16.0 * found[1] * found[1] + 1.0)
         state = 0
-        measured = _Measured(ray, sums, found[0], to_voxels, weight)
+        measured = _Measured(ray, sums, rays.depth[i], noise, to_voxels, pixels * trust[i])
         walk_voxels(ray, begin, end, space, _add_distance, state, measured)
 
 
 @ti.func
-def _surface_of(measured: F32, noise: Template, sensor: Template, band: Template, to_voxels: F32) -> Vec3:
-    """The depth of a ray's surface, its standard deviation in voxels, and the depth that its band reaches."""
-    surface = sensor.surface_depth(measured, noise)
-    sigma = noise.sigma(surface) * to_voxels
-    return Vec3(surface, sigma, ti.max(band.voxels, band.sigmas * sigma) / to_voxels)
+def _band_of(measured: F32, noise: Template, sensor: Template, band: Template, to_voxels: F32) -> Vec2:
+    """The depths between which a ray's band lies."""
+    surface, least = sensor.surface_depth(measured, noise), band.voxels / to_voxels
+    nearest = ti.min(surface - least, sensor.nearest_depth(measured, noise, band.sigmas))
+    farthest = ti.max(surface + least, sensor.farthest_depth(measured, noise, band.sigmas))
+    return Vec2(ti.max(0.0, nearest), ti.min(farthest, band.max_depth))
 
 
 @ti.func
@@ -174,9 +175,10 @@ def _add_distance(state: Template, measured: Template, voxel: I32, near: F32, fa
     """One voxel of a band."""
     ray = measured.ray
     centre = ti.floor(ray.origin + 0.5 * (near + far) * ray.direction) + 0.5
-    along = (centre - ray.origin).dot(ray.direction) / measured.to_voxels
-    distance = measured.surface * measured.to_voxels - along
-    weight = measured.weight * (far - near) * measured.to_voxels
+    depth = (centre - ray.origin).dot(ray.direction) / (measured.to_voxels * measured.to_voxels)
+    distance = (measured.measured - measured.noise.bias(depth) - depth) * measured.to_voxels
+    sigma = measured.noise.sigma(depth) * measured.to_voxels
+    weight = measured.weight * (far - near) * measured.to_voxels / (16.0 * sigma * sigma + 1.0)
     ti.atomic_add(measured.sums.weight[voxel], ti.cast(weight * SCALE, ti.i64))
     ti.atomic_add(measured.sums.distance[voxel], ti.cast(weight * distance * SCALE, ti.i64))
     return 1

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
     class Struct(Any): ...
 
+    class Vec2(Any): ...
+
     class Vec3(Any): ...
 
     class Vec4(Any): ...
@@ -38,6 +40,7 @@ else:
     Struct = object
     F32 = ti.f32
     I32 = ti.i32
+    Vec2 = ti.types.vector(2, ti.f32)
     Vec3 = ti.types.vector(3, ti.f32)
     Vec4 = ti.types.vector(4, ti.f32)
     Vec5 = ti.types.vector(5, ti.f32)

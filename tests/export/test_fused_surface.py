@@ -1,5 +1,6 @@
 """The surface of a field of signed distances: where it lies, which way it faces, and how sure it is."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from taichi_mrf import MRFMap, PinholeCamera, PolynomialNoise
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.formats import export_map, export_note
+from taichi_mrf.export.fused_surface import without_free
 from taichi_mrf.export.options import ExportOptions
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -83,3 +85,13 @@ def test_frozen_keyframes_leave_the_marginals(tmp_path: Path) -> None:
 def test_a_map_without_keyframes_has_no_surface() -> None:
     with pytest.raises(ConfigError, match="no keyframes"):
         MRFMap(VOXEL).surface()
+
+
+def test_no_surface_where_the_marginals_say_free() -> None:
+    m = _map_of_plane(0.0)
+    found = m.surface()
+    stray = dataclasses.replace(found, vertices_m=found.vertices_m - [0, 0, 0.9])
+    left = without_free(m, stray, 0.05)
+    assert np.abs(left.vertices_m[:, :2]).max(axis=1).min() > 0.1  # beside the images all is unknown
+    assert np.abs(stray.vertices_m[:, :2]).max(axis=1).min() < 0.1
+    assert len(without_free(m, found, 0.05).triangles) == len(found.triangles)

@@ -46,15 +46,18 @@ def test_the_field_equals_numpy() -> None:
         direction = T[:3, :3] @ CAMERA.rays()[v, u]
         metres = np.linalg.norm(direction)
         surface = float(noise.depth_of_deviation(float(depth[v, u]), 0.0))
-        sigma = float(noise.sigma_at(surface)) * metres
-        reach = max(2 * VOXEL, 3 * sigma) / metres
-        cells, near, far = segments(T[:3, 3], direction, surface - reach, surface + reach, VOXEL)
+        measured = float(depth[v, u])
+        nearest, farthest = (float(noise.depth_of_deviation(measured, sigmas)) for sigmas in (3.0, -3.0))
+        least = 2 * VOXEL / metres
+        ends = min(nearest, surface - least), max(farthest, surface + least)
+        cells, near, far = segments(T[:3, 3], direction, *ends, VOXEL)
         for cell, begin, end in zip(cells.tolist(), near, far, strict=True):
-            along = ((np.array(cell) + 0.5) * VOXEL - T[:3, 3]) @ direction / metres
+            at = ((np.array(cell) + 0.5) * VOXEL - T[:3, 3]) @ direction / metres**2
+            sigma = float(noise.sigma_at(at)) * metres
             weight = (end - begin) * metres / VOXEL / (16 * (sigma / VOXEL) ** 2 + 1)
             sums = expected.setdefault(tuple(cell), [0.0, 0.0])
             sums[0] += weight
-            sums[1] += weight * (surface * metres - along) / VOXEL
+            sums[1] += weight * (measured - BIAS[0] - at) * metres / VOXEL
     found = _field(m)
     for voxel, (weight, distance) in expected.items():
         # P is above 0.99: nothing is known but a prior of two surfaces a metre.

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.export.fused_surface import FusedSurface, fused_surface
+from taichi_mrf.export.fused_surface import FusedSurface, fused_surface, without_free
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.surface_field import SurfaceRays
 from taichi_mrf.inference.sweep import Sweeper
@@ -16,9 +16,14 @@ OUTLIERS = 0.01
 """Share of the measurements that may come from anywhere in the sensor's range."""
 
 
+LEAST = 0.5
+"""Where no marginal reaches this share of the prior, there is no surface."""
+
+
 class WithSurface(BrickMap):
     """The part of an MRFMap that makes its surface."""
 
+    prior: float
     _keyframes: dict[int, Keyframe]
     _sweeper: Sweeper
 
@@ -39,6 +44,7 @@ class WithSurface(BrickMap):
         if not self._keyframes:
             raise ConfigError("the map has no keyframes: there is nothing to make a surface of")
         found = fused_surface(surface_field_of(self), self.voxel_size)
+        found = without_free(self, found, LEAST * self.prior)
         colors = blended_colors(self, found.vertices_m) if is_colored(self) else None
         return replace(found, colors=colors)
 
