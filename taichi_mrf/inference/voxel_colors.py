@@ -7,6 +7,8 @@ outliers):
     w_ri = nu_i m_i vis_i / (sum_j nu_j m_j vis_j + beyond + o)        colour_i = sum_r w_ri c_r / sum_r w_ri
 
 What stands behind gets nothing of it, and a measurement that the map holds for an outlier gives nothing.
+Where more rays than ENOUGH meet a voxel, one of up to MOST_STRIDE is followed and counts for all of them: a
+mean colour needs fewer rays than a message.
 """
 
 from dataclasses import dataclass, replace
@@ -33,6 +35,16 @@ from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.strips import strip_length
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_voxels
+
+ENOUGH = 2.5
+"""Rays at a voxel that faces the camera, of which all are followed."""
+
+MOST_STRIDE = 4
+"""Of more rays than this one is followed in any case."""
+
+COLOR_SHARE = 1.0 / 512.0
+"""Of the scale of the sums of lengths: colours reach 255, and a ray that counts for several may do so in a
+voxel that those do not meet."""
 
 
 class ColorPass:
@@ -73,7 +85,7 @@ class ColorPass:
             self._bw = ti.ndarray(ti.i64, n * VOXELS)
         self._bw.fill(0)
         window, bricks, strip = footprint.window, visible.on_device(), strip_length()
-        swept = SweptVoxels(s.log_free, s.sums, s._scale(keyframe) / 256.0)
+        swept = SweptVoxels(s.log_free, s.sums, s._scale(keyframe) * COLOR_SHARE)
         # Beliefs that have a date are no sums of messages: there the keyframe's own evidence stays in.
         messages = (
             keyframe.messages if pool.dated is None else new_messages(visible, config.message_precision)
@@ -89,7 +101,8 @@ class ColorPass:
             s.index.space(window, s.volume.lower, s.volume.upper),
             replace(s.model(), maximise=False), swept,
             Trace(s.trace_voxel, s.trace, footprint.longest, s.steps),
-            workers, _pixels(color), self._bw,
+            workers, _pixels(color), self._bw, (s.voxel_size * image.camera.pixels_per_radian) ** 2 / ENOUGH,
+            200.0 * s.voxel_size * s.inference.ray_density / ENOUGH,
         )  # fmt: skip
         s.index.clear(window, bricks.cells)
         weigh(n * VOXELS, swept.sums, self._bw, swept.scale)
@@ -154,11 +167,14 @@ def spread_colors(
     rays: RayList, entry_depths: F32Array, entry_depths_known: I32,
     sensor: Sensor, view: Viewpoint, space: Space,
     model: RayModel, swept: SweptVoxels, trace: Trace, workers: Workers, image: I32Array, bw: I64Array,
+    crowded: F32, most_many: F32,
 ) -> None:  # fmt: skip
     """Follow the rays of a keyframe, and add the colours of their pixels to the voxels that they see.
 
     ``image`` (H * W) are packed colours, 0 for none. Red and green go to ``swept.sums``, blue and weight to
-    ``bw`` (visible bricks * 512), in units of 1 / ``swept.scale``.
+    ``bw`` (visible bricks * 512), in units of 1 / ``swept.scale``. ``crowded`` / (depth^2 * pixels of a ray)
+    is how many times ENOUGH rays meet a voxel if those beside it have as many pixels; beyond ``most_many`` it
+    is a ray of its own, as at edges, and is followed.
     """
     if ti.static(workers.block > 0):
         ti.loop_config(block_dim=workers.block)
@@ -171,34 +187,39 @@ def spread_colors(
             i = workers.ray(worker, turn)
             if i < rays.number:
                 measured = rays.depth[i]
-                ray, noise, _ = listed_ray(rays, i, sensor, view)
-                first_step = worker * trace.longest
-                looking = _Looking(
-                    model, swept, sensor, measured, noise, sensor.support(measured, noise),
-                    ray.direction.norm(), trace, first_step,
-                )  # fmt: skip
-                last = sensor.farthest_depth(measured, noise, model.end_sigmas)
-                begin, end = 0.0, ti.min(last, model.max_depth)
-                if entry_depths_known == 1:
-                    begin = entry_depths[i]
-                clip(ray, begin, end, space.lower, space.upper)
-                ahead = _Ahead(1.0, 0.0, 0)
-                walk_voxels(ray, begin, end, space, _look, ahead, looking)
-                if ahead.voxels > 0:
-                    total = ahead.explained + model.floor + TINY
-                    if end < last:
-                        total += ahead.visibility * sensor.likelihood_beyond(measured, end, noise)
-                    red, green, blue, pixels = _block_color(rays.blocks[i], image, sensor.camera.width)
-                    for step in range(ahead.voxels):
-                        j = first_step + step
-                        unit = trace.step[j][0] / total * swept.scale
-                        voxel = trace.voxel[j]
-                        weight = ti.cast(unit * pixels + 0.5, ti.i64)
-                        if weight > 0:
-                            # As shares of the rounded weight, so that the mean lies between the colours.
-                            share = ti.cast(weight, ti.f32) / pixels
-                            _add_pair(swept.sums, voxel, share * red, share * green)
-                            ti.atomic_add(bw[voxel], (ti.cast(share * blue + 0.5, ti.i64) << 32) + weight)
+                ray, noise, pixels_of_ray = listed_ray(rays, i, sensor, view)
+                many = crowded / (measured * measured * pixels_of_ray)
+                stride = 1
+                if many <= most_many:
+                    stride = ti.max(1, ti.cast(ti.min(many, MOST_STRIDE), ti.i32))
+                if i % stride == 0:
+                    first_step = worker * trace.longest
+                    looking = _Looking(
+                        model, swept, sensor, measured, noise, sensor.support(measured, noise),
+                        ray.direction.norm(), trace, first_step,
+                    )  # fmt: skip
+                    last = sensor.farthest_depth(measured, noise, model.end_sigmas)
+                    begin, end = 0.0, ti.min(last, model.max_depth)
+                    if entry_depths_known == 1:
+                        begin = entry_depths[i]
+                    clip(ray, begin, end, space.lower, space.upper)
+                    ahead = _Ahead(1.0, 0.0, 0)
+                    walk_voxels(ray, begin, end, space, _look, ahead, looking)
+                    if ahead.voxels > 0:
+                        total = ahead.explained + model.floor + TINY
+                        if end < last:
+                            total += ahead.visibility * sensor.likelihood_beyond(measured, end, noise)
+                        red, green, blue, pixels = _block_color(rays.blocks[i], image, sensor.camera.width)
+                        for step in range(ahead.voxels):
+                            j = first_step + step
+                            unit = trace.step[j][0] / total * swept.scale * stride
+                            voxel = trace.voxel[j]
+                            weight = ti.cast(unit * pixels + 0.5, ti.i64)
+                            if weight > 0:
+                                # As shares of the rounded weight, so that the mean lies between the colours.
+                                share = ti.cast(weight, ti.f32) / pixels
+                                _add_pair(swept.sums, voxel, share * red, share * green)
+                                ti.atomic_add(bw[voxel], (ti.cast(share * blue + 0.5, ti.i64) << 32) + weight)
 
 
 @ti.func
