@@ -112,6 +112,17 @@ def shown_voxels(m: QueriedMap, threshold: float) -> tuple[NDArray[np.float64], 
     return np.concatenate(centres), np.concatenate(likely)
 
 
+class FilledMap:
+    """A map's voxels together with those of the cells that stand in for others: what pictures draw."""
+
+    def __init__(self, m: QueriedMap) -> None:
+        self._map = m
+
+    def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+        """Those of at least this probability: :func:`shown_voxels`."""
+        return shown_voxels(self._map, min_probability)
+
+
 @cache
 def _voxels_of_cells(side: int) -> NDArray[np.int64]:
     """The numbers in a brick of each cell's voxels, (cells, side^3)."""

@@ -228,7 +228,7 @@ def _write_pictures(
         with result.timed("pictures"), haste.cutting_short():
             held_out = _spread(result.held_out, PICTURED_FRAMES)
             frames = [] if dataset is None else _readable(dataset, held_out)
-            pictures = write_pictures(folder, result.map, frames, shown)
+            pictures = write_pictures(folder, result.map, frames, shown, cells=True)
     except CutShortError:
         return []
     advance("Drawing", 1, 1)

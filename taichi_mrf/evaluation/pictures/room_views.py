@@ -50,6 +50,9 @@ class DrawnMap:
     T_world_cameras: Sequence[Pose]
     """Where the keyframes were taken, in their order."""
 
+    of_cells: int = 0
+    """How many of the voxels belong to cells that stand in for them (queries/cells.py)."""
+
 
 def top_view(room: DrawnMap) -> "Figure":
     """The voxels seen from above, coloured by height, with the way of the camera.
@@ -118,7 +121,8 @@ def perspective(room: DrawnMap) -> "Figure":
 
 
 def _voxels(room: DrawnMap) -> str:
-    return f"{len(room.centres):,} occupied voxels of {100 * room.voxel_size:.3g} cm"
+    own = f"{len(room.centres) - room.of_cells:,} occupied voxels of {100 * room.voxel_size:.3g} cm"
+    return f"{own}, and cells that stand in for {room.of_cells:,}" if room.of_cells else own
 
 
 def _camera_above(

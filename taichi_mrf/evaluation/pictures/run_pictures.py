@@ -13,6 +13,7 @@ from taichi_mrf.evaluation.pictures.room_views import DrawnMap, perspective, top
 from taichi_mrf.evaluation.pictures.surfaces import seen_surfaces, up_direction
 from taichi_mrf.geometry.up import Z_UP
 from taichi_mrf.methods.protocol import OccupancyMap, PosedDepth
+from taichi_mrf.queries.cells import FilledMap
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.atomic import atomic_path
 from taichi_mrf.voxels.colors import LOWEST
@@ -35,15 +36,23 @@ class ShownMap(Protocol):
 
 
 def write_pictures(
-    out_dir: Path, m: OccupancyMap, held_out: Sequence[Frame], shown: ShownMap | None = None
+    out_dir: Path,
+    m: OccupancyMap,
+    held_out: Sequence[Frame],
+    shown: ShownMap | None = None,
+    cells: bool = False,
 ) -> list[Path]:
     """Write ``top_view.png``, ``depth.png`` and ``perspective.png`` to a folder that exists.
 
     ``held_out`` are frames that the map has not seen, to compare rendered with measured depth; without
     any a keyframe serves, and its title says so. ``shown`` has the voxels to draw if they are not the map's
-    marginals. Returns the paths. Raises MapFileError.
+    marginals; of these, ``cells`` also draws the cells that stand in for voxels (queries/cells.py). Returns
+    the paths. Raises MapFileError.
     """
-    figures = {"depth.png": depth_comparison(m, held_out), **_room_figures(m, shown or m)}
+    figures = {
+        "depth.png": depth_comparison(m, held_out),
+        **_room_figures(m, shown or (FilledMap(m) if cells else m)),
+    }
     for name, figure in figures.items():
         with atomic_path(out_dir / name) as temporary:
             # Level 2 of 9 takes half of the default's time, and the files are a fifth larger.
@@ -66,6 +75,7 @@ def _room_figures(m: OccupancyMap, shown: ShownMap) -> dict[str, "Figure"]:
         voxel_size=m.voxel_size,
         up=up_direction(poses, surfaces.normals, m.up or Z_UP),
         T_world_cameras=poses,
+        of_cells=len(centres) - len(m.voxels(LOWEST)[0]) if isinstance(shown, FilledMap) else 0,
     )
     return {"top_view.png": top_view(room), "perspective.png": perspective(room)}
 
