@@ -34,15 +34,17 @@ def content(m: MRFMap) -> dict[str, np.ndarray]:
 
 def test_what_leaves_comes_back_bit_for_bit(tmp_path: Path) -> None:
     m = windowed(tmp_path / "far.zarr")
-    walk(m, OUT[:3])
+    walk(m, OUT[:3], colored=True)
     for id in list(m.keyframes):
         m.freeze_keyframe(id)
     assert m.window is not None
     before, points = content(m), probes(m)
-    occupancy, state = m.occupancy(points), m.state(points)
+    occupancy, state, colors = m.occupancy(points), m.state(points), m.colors(points)
+    assert colors.any()
     m.window.follow(m, np.array([50.0, 0.0, 0.0]))
     assert m.statistics().bricks == len(m._registry.frozen_crossed) == 0
     assert (m.state(points) == 0).all()
+    assert not m.colors(points).any()
     assert len(m.window.parked) > 1
     m.window.follow(m, np.zeros(3))
     assert len(m.window.parked) == 0
@@ -50,6 +52,7 @@ def test_what_leaves_comes_back_bit_for_bit(tmp_path: Path) -> None:
         np.testing.assert_array_equal(values, before[name], err_msg=name)
     np.testing.assert_array_equal(m.occupancy(points), occupancy)
     np.testing.assert_array_equal(m.state(points), state)
+    np.testing.assert_array_equal(m.colors(points), colors)
 
 
 @settings(max_examples=6)

@@ -33,20 +33,22 @@ def unwindowed(**options: Any) -> MRFMap:
     return MRFMap(VOXEL, volume=VolumeConfig(dense_bricks=128), **options)
 
 
-def add(m: MRFMap, place_m: float, number: int = 0) -> int:
-    """A keyframe ``place_m`` along the wall, with noise that depends on place and ``number``."""
+def add(m: MRFMap, place_m: float, number: int = 0, colored: bool = False) -> int:
+    """A keyframe ``place_m`` along the wall, with noise that depends on place and ``number``, perhaps with a
+    colour image."""
     T_world_camera = np.eye(4)
     T_world_camera[:3, 3] = place_m, 0.013, 0.021
     random = np.random.default_rng((int(place_m * 1000) + 10**6, number))
     depth_m = (WALL_M + random.normal(0.0, 0.004, CAMERA.shape)).astype(np.float32)
-    return m.add_keyframe(depth_m, T_world_camera, CAMERA, f"{place_m:g} m, {number}")
+    color = random.integers(1, 256, (*CAMERA.shape, 3)).astype(np.uint8) if colored else None
+    return m.add_keyframe(depth_m, T_world_camera, CAMERA, f"{place_m:g} m, {number}", color=color)
 
 
-def walk(m: MRFMap, places_m: Iterable[float]) -> list[int]:
+def walk(m: MRFMap, places_m: Iterable[float], colored: bool = False) -> list[int]:
     """Add keyframes and sweep each; returns how many bricks were in memory after each."""
     bricks = []
     for number, place_m in enumerate(places_m):
-        m.renew([add(m, place_m, number)])
+        m.renew([add(m, place_m, number, colored)])
         bricks.append(m.statistics().bricks)
     return bricks
 
