@@ -70,7 +70,12 @@ class SurfaceRays:
             self._index.fill(window, visible.cells, visible.slots)
             space = self._index.space(window, self.volume.lower, self.volume.upper)
             view = window.viewpoint(keyframe.T_world_camera)
-            surface_rays.find_trust(rays, keyframe.image.sensor, view, space, self.model, swept, trust)
+            # They hold for the bricks of the last sweep.
+            known = keyframe.entry_depths_known and keyframe.visible.version == visible.version
+            surface_rays.find_trust(
+                rays, keyframe.entry_depths, int(known), keyframe.image.sensor, view, space,
+                self.model, swept, trust,
+            )  # fmt: skip
             self._index.clear(window, visible.cells)
             runtime.settle()
         return trust

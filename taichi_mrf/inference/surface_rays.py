@@ -38,6 +38,9 @@ from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_bricks, wal
 SCALE = float(1 << 24)
 """Steps of the sums for a weight of 1."""
 
+SURE = 0.999
+"""P of a ray is not followed further than this."""
+
 SUREST = 30.0
 """Bound on a marginal's log-odds, beyond which float32 loses its digits."""
 
@@ -99,10 +102,11 @@ def free_logs(slots: I32Array, belief: F32Array, log_free: F32Array, strip: Temp
 
 @kernel
 def find_trust(
-    rays: RayList, sensor: Sensor, view: Viewpoint, space: Space, model: RayModel, swept: SweptVoxels,
-    trust: F32Array,
+    rays: RayList, entry_depths: F32Array, entry_depths_known: I32,
+    sensor: Sensor, view: Viewpoint, space: Space, model: RayModel, swept: SweptVoxels, trust: F32Array,
 ) -> None:  # fmt: skip
-    """P of each ray, (rays). ``space`` and ``swept`` hold the bricks of the map, ``model.floor`` is o."""
+    """P of each ray, (rays). ``space`` and ``swept`` hold the bricks of the map, ``model.floor`` is o.
+    ``entry_depths`` (rays) are those of a keyframe, if known."""
     for i in range(rays.number):
         measured = rays.depth[i]
         ray, noise, pixels = listed_ray(rays, i, sensor, view)
@@ -112,9 +116,11 @@ def find_trust(
         )  # fmt: skip
         last = sensor.farthest_depth(measured, noise, model.end_sigmas)
         begin, end = 0.0, ti.min(last, model.max_depth)
+        if entry_depths_known == 1:
+            begin = entry_depths[i]
         clip(ray, begin, end, space.lower, space.upper)
         ahead = ForwardPass(1.0, 0.0, end, 0)
-        walk_voxels(ray, begin, end, space, see_voxel, ahead, cast)
+        walk_voxels(ray, begin, end, space, _see_until_sure, ahead, cast)
         met = ahead.explained + TINY
         if end < last:
             met += ahead.visibility * sensor.likelihood_beyond(measured, end, noise)
@@ -152,6 +158,13 @@ def add_distances(
         state = 0
         measured = _Measured(ray, sums, rays.depth[i], noise, to_voxels, pixels * trust[i])
         walk_voxels(ray, begin, end, space, _add_distance, state, measured)
+
+
+@ti.func
+def _see_until_sure(ahead: Template, cast: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of a ray, which ends where P can only be SURE or more."""
+    see_voxel(ahead, cast, voxel, near, far)
+    return ti.cast(ahead.explained * (1.0 - SURE) < cast.model.floor * SURE, ti.i32)
 
 
 @ti.func
