@@ -48,9 +48,10 @@ COLUMNS = ("F 2 cm", "F 5 cm", "error cm", "near truth", "found", "normals deg",
 def run_surface(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     """A row for each scene, voxel size and surface."""
     rows: list[list[Entry]] = []
-    for case in _cases(experiment):
+    cases = _cases(experiment)
+    for number, case in enumerate(cases):
         for size in experiment.voxel_sizes:
-            experiment.report(f"{case.name}, {size * 100:g} cm", len(rows), 0)
+            experiment.report(f"{case.name}, {size * 100:g} cm", number, len(cases))
             key = (
                 f"surface | {case.name} | {experiment.limit} views | noise {experiment.seeds[0]} | {size:g} m"
             )
