@@ -38,7 +38,7 @@ WEIGHTS = (1.0, 2.0, 3.0)
 BLOCK = 16
 """Voxels along each side of Open3D's blocks."""
 
-SURFACE, MARGINAL, OPEN3D = "MRFMap, surface", "MRFMap, marginal 0.5", "Open3D, best of {}"
+SURFACE, MARGINAL = "MRFMap, surface", "MRFMap, marginal 0.5"
 
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float32] | None]
 
