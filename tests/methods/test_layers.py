@@ -206,3 +206,12 @@ def test_unknown_space_is_no_contradiction() -> None:
     scores = m.ray_scores(other.depth_m, other.T_world_camera, other.camera)
     assert unknown.mean() > 0.2
     assert (scores[unknown] <= 0).all()
+
+
+def test_rays_have_no_votes_for_what_is_gone() -> None:
+    m = room_that_changed(ball_comes=False)
+    reading = m.reading("surface")
+    centres = reading.voxels()[0]
+    assert len(centres) > len(m.voxels()[0])
+    assert near_ball(m.at(BEFORE_S).voxels()[0]).any()
+    assert not near_ball(centres).any()
