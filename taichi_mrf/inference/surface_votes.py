@@ -6,8 +6,8 @@ sum_product.py, with the marginals of the whole map as m)
     nu_i m_i vis_i
 
 among the voxels that are likelier occupied than by the prior. The ray votes for it, and against every
-voxel that it crosses before it. A voxel with more votes for than against is a surface for most of the
-rays that come as far as it. Rays whose measurement the map holds for an outlier do not vote.
+voxel that it crosses before it. A voxel wins that more than two fifths of the rays that come as far as it
+take for their surface. Rays whose measurement the map holds for an outlier do not vote.
 """
 
 from collections.abc import Iterable
@@ -28,12 +28,15 @@ from taichi_mrf.voxels.pool import BrickPool, copied
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_voxels
 from taichi_mrf.voxels.window import WindowIndex
 
+FOR, AGAINST = 3, 2
+"""What a vote for a voxel and one against it weigh: a voxel wins if more than two fifths of the rays that
+come as far take it for their surface. With half, walls have holes where voxels are finer than the noise."""
+
 GRAZED = 0.1
 """A ray that is in a voxel for less than this, in voxel sizes, does not vote against it."""
 
-
 CALLED = 0.01
-"""Log-odds above even odds, or above what counts as known, that a voxel with most votes has at least."""
+"""Log-odds above even odds, or above what counts as known, that a voxel that wins has at least."""
 
 
 def surfaces_first(
@@ -125,7 +128,7 @@ def _vote_against(state: Template, voting: Template, voxel: I32, near: F32, far:
     """One voxel in front of the likeliest surface."""
     before = ti.cast(voxel != voting.surface, ti.i32)
     if before == 1 and (far - near) * voting.voxels_per_depth > GRAZED:
-        ti.atomic_sub(voting.votes[voxel], 1)
+        ti.atomic_sub(voting.votes[voxel], AGAINST)
     return before
 
 
@@ -149,14 +152,14 @@ def _vote(
             ahead = _Ahead(1.0, 0.0, 0.0, -1)
             walk_voxels(ray, begin, end, space, _look, ahead, looking)
             if ahead.surface >= 0 and ahead.explained > model.floor:
-                ti.atomic_add(votes[ahead.surface], 1)
+                ti.atomic_add(votes[ahead.surface], FOR)
                 voting = _Voting(votes, ahead.surface, looking.voxels_per_depth)
                 walk_voxels(ray, begin, end, space, _vote_against, ahead, voting)
 
 
 @ti.kernel
 def _call(votes: I32Array, log_odds: F32Array, least: F32):
-    """Raise the ``log_odds`` (n) of voxels with more ``votes`` (n) for them than against to ``least``."""
+    """Raise the ``log_odds`` (n) of voxels that win the ``votes`` (n) to ``least``."""
     for i in range(votes.shape[0]):
         if votes[i] > 0:
             log_odds[i] = ti.max(log_odds[i], least)

@@ -43,8 +43,8 @@ def vote(ray: reference.Ray, p: dict, learnt: float, floor: float, votes: dict) 
             return False
         for segment, _ in found[:front]:
             if segment.length > GRAZED:
-                votes[segment.voxel] = votes.get(segment.voxel, 0) - 1
-        votes[found[front][0].voxel] = votes.get(found[front][0].voxel, 0) + 1
+                votes[segment.voxel] = votes.get(segment.voxel, 0) - 2
+        votes[found[front][0].voxel] = votes.get(found[front][0].voxel, 0) + 3
     return True
 
 

@@ -30,8 +30,8 @@ class Export:
     although it was free (dynamic), or both."""
 
     reading: Literal["marginal", "surface"] = "marginal"
-    """What is occupied: voxels that are more likely so than not (marginal), or also those that most rays take
-    for their first surface (surface), which leaves fewer holes in walls that are seen unsharply."""
+    """What is occupied: voxels that are more likely so than not (marginal), or also those that enough rays
+    take for their first surface (surface), which leaves fewer holes in walls that are seen unsharply."""
 
     at: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
     """Write the map as it was believed then: a stamp as ``info`` shows them, or, below 0, seconds before the

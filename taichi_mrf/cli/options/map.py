@@ -78,7 +78,7 @@ class Map:
 
     shown_reading: Annotated[Literal["marginal", "surface"], tyro.conf.arg(name="reading")] = "marginal"
     """What is occupied in voxels.ply and the pictures: voxels that are more likely so than not, or also those
-    that most rays take for their first surface (surface), which needs mrf and a map in memory."""
+    that enough rays take for their first surface (surface), which needs mrf and a map in memory."""
 
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the report as JSON, and nothing else, on stdout."""

@@ -36,7 +36,7 @@ Layer = Literal["static", "dynamic", "both"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 
 Reading = Literal["marginal", "surface"]
-"""What is called occupied: voxels whose marginal is over 0.5, or also those that most rays take for their
+"""What is called occupied: voxels whose marginal is over 0.5, or also those that enough rays take for their
 first surface."""
 READINGS: tuple[Reading, ...] = get_args(Reading)
 
