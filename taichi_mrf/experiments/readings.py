@@ -8,7 +8,7 @@ reliability on the voxels that measured rays saw, as ``inference.ray_correlation
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import taichi as ti
@@ -108,9 +108,9 @@ def run_readings(experiment: Experiment) -> tuple[list[Table], list[Path]]:
 def _figures(contender: Any, scene: Scene, mesh: TriangleMesh, voxel_size: float) -> Result:
     keyframes = list(range(0, len(scene.views), 2))
     judged = list(range(1, len(scene.views), 8))
-    m, _ = build(contender, scene, voxel_size, keyframes)
-    assert isinstance(m, MRFMap)
-    centres, occupied = _truth(scene, mesh, keyframes, voxel_size, m)
+    built, _ = build(contender, scene, voxel_size, keyframes)
+    m = cast(MRFMap, built)  # which is what contenders.mrf builds
+    centres, occupied = _truth(scene, mesh, keyframes, voxel_size)
     p = m.occupancy(centres).astype(np.float64)
     maps: dict[str, MRFMap | MapReading] = {"marginal": m, "surface": m.reading("surface")}
     readings = {"omega": [*_accuracy(m, scene, judged, m.view), None, None]}
@@ -152,7 +152,7 @@ def _accuracy(m: MRFMap, scene: Scene, judged: list[int], view: View) -> list[fl
 
 
 def _truth(
-    scene: Scene, mesh: TriangleMesh, keyframes: list[int], voxel_size: float, m: MRFMap
+    scene: Scene, mesh: TriangleMesh, keyframes: list[int], voxel_size: float
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Voxels (n, 3) that measured rays of keyframes could see, and whether they are occupied."""
     views = [scene.views[i] for i in keyframes]

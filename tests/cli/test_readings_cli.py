@@ -40,5 +40,5 @@ def test_a_run_shows_the_map_as_the_rays_read_it(tmp_path: Path) -> None:
     called = len(m.reading("surface").voxels()[0])
     assert called > len(m.voxels()[0])
     assert f"element vertex {called}\n".encode() in (tmp_path / "run" / "voxels.ply").read_bytes()
-    with pytest.raises(ConfigError, match="--reading surface needs --method mrf"):
+    with pytest.raises(ConfigError, match="--reading surface needs the method mrf"):
         Map(sources=(room,), out=tmp_path, shown_reading="surface", settings=Config(method="log_odds"))

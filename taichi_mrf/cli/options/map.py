@@ -9,6 +9,7 @@ import tyro
 from taichi_mrf.cli.options.checks import check_least
 from taichi_mrf.cli.options.pose_flags import PoseFlags
 from taichi_mrf.cli.options.verbosity import Verbosity
+from taichi_mrf.config.registry import METHODS, methods_with
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError
@@ -103,9 +104,10 @@ class Map:
             raise ConfigError("--resume and --overwrite do not go together")
         if self.shown_reading != "marginal":
             whole = self.submap_size is None and self.settings.volume.window_m == 0
-            if self.settings.method != "mrf" or not whole:
+            if not METHODS[self.settings.method].has_layers or not whole:
                 raise ConfigError(
-                    f"--reading {self.shown_reading} needs --method mrf and a map in memory as a whole"
+                    f"--reading {self.shown_reading} needs the method {methods_with('has_layers')} "
+                    "and a map in memory as a whole"
                 )
         if not self.keep_every >= 0:
             raise ConfigError(f"--keep-every must be a number of seconds, not {self.keep_every}")
