@@ -106,7 +106,7 @@ def at_rest(page: LivePage) -> Seen:
     """What the page shows once it no longer changes: small changes of colour come late."""
     seen = page.until_settled()
     while True:
-        page.pause(3.0)  # a busy machine takes its time for them
+        page.pause(1.0)
         before, seen = seen, page.until_settled()
         if (seen.voxels, seen.colors) == (before.voxels, before.colors):
             return seen
