@@ -52,6 +52,8 @@ _LOOK = """() => {
     return false;
   };
   const seen = {voxels: 0, baseline: 0, colors: 0, nodes: []};
+  const hash = (start, numbers) =>
+    numbers.reduce((h, number) => Math.imul(31 * h + Math.round(number) | 0, 2654435761) >>> 0, start);
   for (const [name, node] of Object.entries(mutable?.nodeRefFromName ?? {}).sort()) {
     if (!node || !inScene(node)) continue;
     seen.nodes.push(name);
@@ -59,10 +61,15 @@ _LOOK = """() => {
     if (!(root in {voxels: 0, baseline: 0}) || name.split('/').length < 3) continue;
     node.traverse(object => {
       if (!object.isPoints) return;
-      seen[root] += object.geometry.attributes.position?.count ?? 0;
-      const colors = object.geometry.attributes.color?.array ?? [];
-      for (let i = 0; i < colors.length; i++)
-        seen.colors = (31 * seen.colors + Math.round(255 * colors[i])) % 1000000007;
+      const {position, color} = object.geometry.attributes;
+      const cloud = hash(7, [...name].map(letter => letter.codePointAt(0)));
+      seen[root] += position?.count ?? 0;
+      // A sum, since the order of the points depends on how updates were merged on their way.
+      for (let i = 0; i < (color?.count ?? 0); i++) {
+        const cell = [position.getX(i), position.getY(i), position.getZ(i)];
+        const rgb = [color.getX(i), color.getY(i), color.getZ(i)].map(share => 255 * share);
+        seen.colors = (seen.colors + hash(cloud, [...cell, ...rgb])) % 2 ** 32;
+      }
     });
   }
   const paragraphs = [...document.querySelectorAll('p')];
@@ -143,7 +150,8 @@ class Seen:
     """One look at a page: what it says of itself, and what is in its scene.
 
     ``said`` and ``said_baseline`` are the counts that the page gives, ``voxels`` and ``baseline`` the points
-    that it draws; ``colors`` changes with any colour of any point. ``table`` is that of the tab About, empty
+    that it draws; ``colors`` changes with the colour or
+    place of any point, and not with their order. ``table`` is that of the tab About, empty
     while another one is in front.
     """
 
