@@ -14,6 +14,8 @@ from datasets_recordings import (
     arrays,
     column_by_column,
     row_of,
+    text_of,
+    write_image,
     write_log,
     write_npz,
     write_numbered,
@@ -25,6 +27,7 @@ from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import inverse
 from taichi_mrf.live.source import open_source
+from taichi_mrf.sensor.camera import PinholeCamera
 
 
 @pytest.fixture
@@ -79,6 +82,48 @@ def test_scannets_own_camera_is_assumed_without_a_file(tmp_path: Path) -> None:
     dataset = open_dataset(folder)
     assert dataset.camera.fx == pytest.approx(577.87, abs=0.01)
     assert any("assumed the camera of ScanNet" in note for note in dataset.notes)
+
+
+WIDE = PinholeCamera(40, 30, 35.0, 35.0, 19.5, 14.5)
+"""A colour camera 5 cm to the right of the depth camera, in a frame that neither of them is."""
+
+
+def test_scannets_colours_are_registered_to_depth(tmp_path: Path, content: Content) -> None:
+    content.depth = [np.full((12, 16), 2000, np.uint16) for _ in content.depth]
+    folder = write_scannet(tmp_path, content, color=True)
+    T_base_depth, T_depth_color = content.poses[0], np.eye(4)
+    T_depth_color[0, 3] = 0.05
+    K_wide = np.array([[WIDE.fx, 0, WIDE.cx, 0], [0, WIDE.fy, WIDE.cy, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    (folder / "intrinsic/intrinsic_color.txt").write_text(text_of(K_wide))
+    (folder / "intrinsic/extrinsic_depth.txt").write_text(text_of(T_base_depth))
+    (folder / "intrinsic/extrinsic_color.txt").write_text(text_of(T_base_depth @ T_depth_color))
+    across = np.broadcast_to(np.arange(40, dtype=np.uint8), (30, 40))
+    for path in (folder / "color").iterdir():
+        write_image(path, np.stack([5 * across, across, across], axis=2))
+    dataset = open_dataset(folder)
+    assert dataset.notes == []
+    color = dataset.read(0).color
+    assert color is not None
+    # On a wall in 2 m the colour camera sees the depth camera's pixel u at this column.
+    u = (CAMERA.rays()[0, :, 0] * 2.0 - 0.05) / 2.0 * WIDE.fx + WIDE.cx
+    inside = (u >= 0) & (u <= 39)
+    np.testing.assert_allclose(color[6, inside, 0], 5 * u[inside], atol=1)
+    assert not color[6, ~inside].any()
+    assert open_dataset(folder, color=False).read(0).color is None
+
+
+def test_scannets_colours_without_their_camera(tmp_path: Path, content: Content) -> None:
+    folder = write_scannet(tmp_path, content, color=True)
+    (folder / "color/5.png").unlink()
+    assert [frame.color is None for frame in open_dataset(folder)] == [False, True, False, False, False]
+    K_large = np.diag([1170.0, 1170.0, 1.0, 1.0])
+    K_large[:2, 2] = 647.5, 483.5
+    (folder / "intrinsic/intrinsic_color.txt").write_text(text_of(K_large))
+    assert "647.5 483.5 is not that of images of 16 x 12 pixels" in refused(folder)
+    (folder / "intrinsic/intrinsic_color.txt").unlink()
+    dataset = open_dataset(folder)
+    assert dataset.read(0).color is None
+    assert [note for note in dataset.notes if "intrinsic_color.txt" in note]
 
 
 @pytest.mark.parametrize("place", [".", ".."], ids=["beside", "above"])

@@ -127,8 +127,9 @@ CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
 K = np.array([[14.0, 0, 7.5], [0, 15.0, 5.5], [0, 0, 1]])
 
 
-def write_scannet(folder: Path, content: Content) -> Path:
-    """Numbers without leading zeros, of which the tenth comes after the second."""
+def write_scannet(folder: Path, content: Content, color: bool = False) -> Path:
+    """Numbers without leading zeros, of which the tenth comes after the second. With ``color``, images of
+    the depth camera's pixels."""
     for i in range(content.count):
         write_image(folder / f"depth/{5 * i}.png", content.depth[i])
         (folder / "pose").mkdir(exist_ok=True)
@@ -137,6 +138,12 @@ def write_scannet(folder: Path, content: Content) -> Path:
     wide = np.eye(4)
     wide[:3, :3] = K
     (folder / "intrinsic/intrinsic_depth.txt").write_text(text_of(wide))
+    if color:
+        for i in range(content.count):
+            write_image(folder / f"color/{5 * i}.png", content.color[i])
+        (folder / "intrinsic/intrinsic_color.txt").write_text(text_of(wide))
+        for name in ("depth", "color"):
+            (folder / f"intrinsic/extrinsic_{name}.txt").write_text(text_of(np.eye(4)))
     return folder
 
 

@@ -1,19 +1,28 @@
-"""ScanNet (Dai et al., CVPR 2017), extracted from its .sens files: depth/N.png, pose/N.txt, intrinsic/.
+"""ScanNet (Dai et al., CVPR 2017), extracted from its .sens files: depth/, color/, pose/, intrinsic/.
 
 Depth is 16-bit millimetres; ``pose/N.txt`` holds T_world_camera of the depth camera as a 4 x 4 matrix, of
 -inf where tracking was lost: such images are left out and counted. ``intrinsic/intrinsic_depth.txt`` is the
-camera's 4 x 4 matrix. Colour images are of another size than depth, and not read.
+camera's 4 x 4 matrix.
+
+``color/N.jpg`` (or .png) has a camera of its own, ``intrinsic/intrinsic_color.txt``, and is registered to
+depth. ``extrinsic_depth.txt`` and ``extrinsic_color.txt`` take points of the two cameras to a common frame;
+a file that is missing stands for the identity.
 """
 
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.color_camera import ColorCamera
 from taichi_mrf.datasets.intrinsics import find_camera, read_camera
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.recording import RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import read_matrix_file
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, KeyframeError
+from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import read_text
 
@@ -22,6 +31,10 @@ CAMERA = PinholeCamera(width=640, height=480, fx=577.870605, fy=577.870605, cx=3
 """The camera of most scenes."""
 
 INTRINSICS = "intrinsic/intrinsic_depth.txt"
+COLOR_CAMERA = PinholeCamera(width=1296, height=968, fx=1170.187988, fy=1170.187988, cx=647.75, cy=483.75)
+"""The colour camera of most scenes."""
+
+COLOR_INTRINSICS = "intrinsic/intrinsic_color.txt"
 STEPS_PER_METRE = 1000.0
 FRAMES_PER_SECOND = 30.0
 LOST = "inf"
@@ -50,6 +63,10 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         notes: list[str] = []
     else:
         camera, notes = find_camera(folder, options, CAMERA, NAME, iter(tracked))
+    frames = [_frame(folder, path) for path in tracked]
+    color_camera = _color_camera(folder, frames) if options.color else None
+    if color_camera is None and options.color and any(frame.color_file for frame in frames):
+        notes.append(f"colours are not read: there is no {folder / COLOR_INTRINSICS}")
     dropped = len(images) - len(tracked)
     if dropped:
         notes.append(f"{dropped} of {len(images)} images dropped: tracking was lost")
@@ -58,21 +75,53 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         camera=camera,
         notes=notes,
         dropped=dropped,
-        frames=[_frame(folder, path) for path in tracked],
+        frames=frames,
         steps_per_metre=options.depth_scale or STEPS_PER_METRE,
         scale_source="--depth-scale" if options.depth_scale else NAME,
-        color=False,
+        color=color_camera is not None,
+        color_camera=color_camera,
     )
+
+
+def _color_camera(folder: Path, frames: Sequence[RecordedFrame]) -> ColorCamera | None:
+    """The colour camera beside the depth camera; None if there are no colour images, or their intrinsics are
+    not known. Raises DatasetError for files that are not valid, or intrinsics of images of another size."""
+    path = folder / COLOR_INTRINSICS
+    images: Iterator[Path] = (frame.color_file for frame in frames if frame.color_file is not None)
+    first = next(images, None)
+    if first is None or not path.is_file():
+        return None
+    camera = read_camera(path, COLOR_CAMERA, (first, *images))
+    if not (camera.width / 4 < camera.cx < camera.width * 3 / 4):
+        raise DatasetError(
+            f"{path}: the principal point {camera.cx:g} {camera.cy:g} is not that of images of "
+            f"{camera.width} x {camera.height} pixels such as {first}: scale the intrinsics to the images"
+        )
+    T_base_depth, T_base_color = (_extrinsics(folder, name) for name in ("depth", "color"))
+    return ColorCamera(camera, inverse(T_base_color) @ T_base_depth)
+
+
+def _extrinsics(folder: Path, camera: str) -> Pose:
+    """The pose of a camera in the frame of the device."""
+    path = folder / f"intrinsic/extrinsic_{camera}.txt"
+    if not path.is_file():
+        return np.eye(4)
+    try:
+        return read_matrix_file(path)
+    except KeyframeError as error:
+        raise DatasetError(f"{path}: {error}") from error
 
 
 def _frame(folder: Path, path: Path) -> RecordedFrame:
     pose_file = folder / "pose" / f"{path.stem}.txt"
+    colors = (folder / "color" / f"{path.stem}.{suffix}" for suffix in ("jpg", "png"))
     return RecordedFrame(
         name=path.stem,
         stamp=int(path.stem) / FRAMES_PER_SECOND,
         depth_file=path,
         read_pose=partial(read_matrix_file, pose_file),
         pose_source=str(pose_file),
+        color_file=next((color for color in colors if color.is_file()), None),
     )
 
 
