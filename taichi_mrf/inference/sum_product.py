@@ -208,7 +208,7 @@ class _Retraced(Bundle):
 
 
 @ti.func
-def _crossing(cast: Template, voxel: I32, near: F32, far: F32) -> Vec3:
+def crossing(cast: Template, voxel: I32, near: F32, far: F32) -> Vec3:
     """l_i, log(1 - m_i)^l_i and nu_i of a voxel, in which the ray is from depth ``near`` to ``far``."""
     length = (far - near) * cast.voxels_per_depth
     log_free = cast.swept.log_free[voxel]
@@ -241,7 +241,7 @@ def see_voxel(ahead: Template, cast: Template, voxel: I32, near: F32, far: F32):
     """One voxel of the forward pass, of which nothing is written down."""
     if ahead.voxels == 0:
         ahead.first = near
-    _explain(ahead, _crossing(cast, voxel, near, far))
+    _explain(ahead, crossing(cast, voxel, near, far))
     ahead.voxels += 1
     return 1
 
@@ -249,7 +249,7 @@ def see_voxel(ahead: Template, cast: Template, voxel: I32, near: F32, far: F32):
 @ti.func
 def _trace_voxel(ahead: Template, traced: Template, voxel: I32, near: F32, far: F32):
     """One voxel of the forward pass, written down in the trace."""
-    met = _crossing(traced.cast, voxel, near, far)
+    met = crossing(traced.cast, voxel, near, far)
     if ahead.voxels == 0:
         ahead.first = near
     j = traced.first_step + ahead.voxels
@@ -267,7 +267,7 @@ def _trace_voxel(ahead: Template, traced: Template, voxel: I32, near: F32, far: 
 def _tell_voxel(again: Template, retraced: Template, voxel: I32, near: F32, far: F32):
     """One voxel of the second way along a ray."""
     cast = retraced.cast
-    step = _explain(again, _crossing(cast, voxel, near, far))
+    step = _explain(again, crossing(cast, voxel, near, far))
     behind = ti.max(0.0, retraced.total - again.explained)
     message = _message(cast.model, step[3], step[2], behind, step[1], retraced.largest)
     _add(cast, voxel, step[0], message)

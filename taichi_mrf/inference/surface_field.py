@@ -13,14 +13,15 @@ from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.inference import surface_rays
 from taichi_mrf.inference.footprint import visible_box, window_around
 from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
-from taichi_mrf.inference.ray_model import RayModel, SweptVoxels
-from taichi_mrf.inference.surface_rays import SCALE, Band, DistanceSums
+from taichi_mrf.inference.ray_model import RayModel
+from taichi_mrf.inference.ray_posterior import FreeLogs, follow_rays
+from taichi_mrf.inference.surface_rays import SCALE, Band, DistanceSums, FindTrust
+from taichi_mrf.inference.workers import workers_without_trace
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.layout import CHUNK, VOXELS, grid_keys
 from taichi_mrf.voxels.pool import BrickPool
-from taichi_mrf.voxels.strips import strip_length
 from taichi_mrf.voxels.window import Window, WindowIndex
 
 BAND_VOXELS = 2.0
@@ -40,8 +41,7 @@ class SurfaceRays:
         self.pool, self.model, self.volume = pool, model, volume
         self.band = Band(BAND_VOXELS, BAND_SIGMAS, model.max_depth)
         self._index = WindowIndex()
-        self._log_free = ti.ndarray(ti.f32, max(1, pool.capacity) * VOXELS)
-        surface_rays.free_logs(pool.in_use, pool.belief, self._log_free, strip_length())
+        self._free_logs = FreeLogs.of(pool)
 
     def field(self, keyframes: Sequence[tuple[Keyframe, VisibleBricks]]) -> DistanceField:
         """The field of some keyframes, each with the bricks of the map that it sees now. Raises
@@ -65,16 +65,14 @@ class SurfaceRays:
         rays, window = keyframe.ray_list, keyframe.footprint.window
         trust = np.zeros(rays.blocks.shape[0], np.float32)
         if len(visible.cells):
-            # Only log_free is read: nothing is swept.
-            swept = SweptVoxels(self._log_free, ti.ndarray(ti.i64, 1), 1.0)
             self._index.fill(window, visible.cells, visible.slots)
-            space = self._index.space(window, self.volume.lower, self.volume.upper)
-            view = window.viewpoint(keyframe.T_world_camera)
             # They hold for the bricks of the last sweep.
             known = keyframe.entry_depths_known and keyframe.visible.version == visible.version
-            surface_rays.find_trust(
-                rays, keyframe.entry_depths, int(known), keyframe.image.sensor, view, space,
-                self.model, swept, trust,
+            follow_rays(
+                rays, keyframe.entry_depths, int(known),
+                keyframe.image.sensor, window.viewpoint(keyframe.T_world_camera),
+                self._index.space(window, self.volume.lower, self.volume.upper),
+                self.model, self._free_logs, workers_without_trace(), FindTrust(self.model.floor, trust),
             )  # fmt: skip
             self._index.clear(window, visible.cells)
             runtime.settle()

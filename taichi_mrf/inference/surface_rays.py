@@ -24,15 +24,12 @@ import taichi as ti
 
 from taichi_mrf.inference.keyframe import RayList
 from taichi_mrf.inference.ray_list import listed_ray
-from taichi_mrf.inference.ray_model import RayModel, SweptVoxels
-from taichi_mrf.inference.sum_product import TINY, Cast, ForwardPass, see_voxel
+from taichi_mrf.inference.ray_posterior import RayVisitor
+from taichi_mrf.inference.sum_product import TINY
 from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.log_odds import softplus
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, I64Array, IVec3, Template, Vec2, Vec3
 from taichi_mrf.sensor.model import Sensor
-from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.numbering import flat
-from taichi_mrf.voxels.strips import strip_begin
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_bricks, walk_voxels
 
 SCALE = float(1 << 24)
@@ -40,9 +37,6 @@ SCALE = float(1 << 24)
 
 SURE = 0.999
 """P of a ray is not followed further than this."""
-
-SUREST = 30.0
-"""Bound on a marginal's log-odds, beyond which float32 loses its digits."""
 
 
 @dataclass(frozen=True)
@@ -90,41 +84,24 @@ class _Marked(Bundle):
     marks: I32Array
 
 
-@kernel
-def free_logs(slots: I32Array, belief: F32Array, log_free: F32Array, strip: Template) -> None:
-    """log(1 - m) of the bricks in ``slots`` (n) from their log-odds. ``belief`` and ``log_free`` are (pool *
-    512)."""
-    for part in range(slots.shape[0] * (VOXELS // strip)):
-        _, j = strip_begin(part, slots, strip)
-        for k in range(strip):
-            log_free[j + k] = -softplus(ti.max(-SUREST, ti.min(SUREST, belief[j + k])))
+@dataclass(frozen=True)
+class FindTrust(RayVisitor):
+    """Finds P of each ray, which ends where P can only be SURE or more."""
 
+    outliers: F32
+    """o."""
 
-@kernel
-def find_trust(
-    rays: RayList, entry_depths: F32Array, entry_depths_known: I32,
-    sensor: Sensor, view: Viewpoint, space: Space, model: RayModel, swept: SweptVoxels, trust: F32Array,
-) -> None:  # fmt: skip
-    """P of each ray, (rays). ``space`` and ``swept`` hold the bricks of the map, ``model.floor`` is o.
-    ``entry_depths`` (rays) are those of a keyframe, if known."""
-    for i in range(rays.number):
-        measured = rays.depth[i]
-        ray, noise, pixels = listed_ray(rays, i, sensor, view)
-        cast = Cast(
-            model, swept, sensor, measured, noise, sensor.support(measured, noise),
-            ray.direction.norm(), ti.cast(pixels, ti.f32),
-        )  # fmt: skip
-        last = sensor.farthest_depth(measured, noise, model.end_sigmas)
-        begin, end = 0.0, ti.min(last, model.max_depth)
-        if entry_depths_known == 1:
-            begin = entry_depths[i]
-        clip(ray, begin, end, space.lower, space.upper)
-        ahead = ForwardPass(1.0, 0.0, end, 0)
-        walk_voxels(ray, begin, end, space, _see_until_sure, ahead, cast)
-        met = ahead.explained + TINY
-        if end < last:
-            met += ahead.visibility * sensor.likelihood_beyond(measured, end, noise)
-        trust[i] = met / (met + model.floor)
+    trust: F32Array
+    """(rays): receives P."""
+
+    @ti.func
+    def meet(self, ahead: Template, sight: Template, voxel: I32, here: F32):
+        return ti.cast(ahead.explained * (1.0 - SURE) < self.outliers * SURE, ti.i32)
+
+    @ti.func
+    def end(self, ahead: Template, sight: Template, beyond: F32):
+        met = ahead.explained + TINY + beyond
+        self.trust[sight.number] = met / (met + self.outliers)
 
 
 @kernel
@@ -158,13 +135,6 @@ def add_distances(
         state = 0
         measured = _Measured(ray, sums, rays.depth[i], noise, to_voxels, pixels * trust[i])
         walk_voxels(ray, begin, end, space, _add_distance, state, measured)
-
-
-@ti.func
-def _see_until_sure(ahead: Template, cast: Template, voxel: I32, near: F32, far: F32):
-    """One voxel of a ray, which ends where P can only be SURE or more."""
-    see_voxel(ahead, cast, voxel, near, far)
-    return ti.cast(ahead.explained * (1.0 - SURE) < cast.model.floor * SURE, ti.i32)
 
 
 @ti.func

@@ -16,16 +16,15 @@ from dataclasses import dataclass
 import taichi as ti
 
 from taichi_mrf.config.schema import VolumeConfig
-from taichi_mrf.inference.keyframe import Keyframe, RayList, VisibleBricks
-from taichi_mrf.inference.ray_list import listed_ray
+from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
 from taichi_mrf.inference.ray_model import RayModel
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.log_odds import exp_of_negative, softplus
+from taichi_mrf.inference.ray_posterior import FreeLogs, RayVisitor, follow_rays
+from taichi_mrf.inference.workers import workers_without_trace
+from taichi_mrf.kernels.bundles import Bundle
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template
-from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.pool import BrickPool, copied
-from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_voxels
+from taichi_mrf.voxels.traversal import walk_voxels
 from taichi_mrf.voxels.window import WindowIndex
 
 FOR, AGAINST = 3, 2
@@ -54,13 +53,16 @@ def surfaces_first(
     belief, index = pool.belief, WindowIndex()
     votes = ti.ndarray(ti.i32, belief.shape)
     votes.fill(0)
+    free_logs, vote = FreeLogs.of(pool), _Vote(belief, learnt, votes)
     for keyframe, visible in keyframes:
         if len(visible.slots) > 0:
             window = keyframe.footprint.window
             index.fill(window, visible.cells, visible.slots)
-            _vote(
-                keyframe.ray_list, keyframe.image.sensor, window.viewpoint(keyframe.T_world_camera),
-                index.space(window, volume.lower, volume.upper), model, learnt, belief, votes,
+            follow_rays(
+                keyframe.ray_list, keyframe.entry_depths, 0,
+                keyframe.image.sensor, window.viewpoint(keyframe.T_world_camera),
+                index.space(window, volume.lower, volume.upper),
+                model, free_logs, workers_without_trace(), vote,
             )  # fmt: skip
             index.clear(window, visible.cells)
     log_odds = copied(belief)
@@ -80,38 +82,31 @@ class _Ahead(Struct):
 
 
 @dataclass(frozen=True)
-class _Looking(Bundle):
-    """One ray, and all that a step along it needs."""
+class _Vote(RayVisitor):
+    """Adds the votes of rays to ``votes`` (pool * 512); ``belief`` (pool * 512) are log-odds, of which those
+    above ``learnt`` are likelier than by the prior."""
 
-    model: RayModel
     belief: F32Array
     learnt: F32
-    sensor: Sensor
-    measured: F32
-    noise: Template
-    support: F32
-    voxels_per_depth: F32
+    votes: I32Array
 
+    @ti.func
+    def begin(self, sight: Template):
+        return _Ahead(1.0, 0.0, 0.0, -1)
 
-@ti.func
-def _look(ahead: Template, looking: Template, voxel: I32, near: F32, far: F32):
-    """One voxel on the way to the likeliest surface."""
-    log_odds = looking.belief[voxel]
-    log_free = -softplus(log_odds)
-    if ti.static(looking.model.segment_lengths):
-        log_free *= (far - near) * looking.voxels_per_depth
-    free = exp_of_negative(log_free)
-    if far > looking.support:
-        density = looking.sensor.likelihood(
-            looking.measured, near, far, looking.noise, looking.model.voxel_size, looking.model.likelihood
-        )
-        here = (1.0 - free) * density * ahead.visibility
-        ahead.explained += here
-        if here > ahead.largest and log_odds > looking.learnt:
+    @ti.func
+    def meet(self, ahead: Template, sight: Template, voxel: I32, here: F32):
+        if here > ahead.largest and self.belief[voxel] > self.learnt:
             ahead.largest = here
             ahead.surface = voxel
-    ahead.visibility *= free
-    return 1
+        return 1
+
+    @ti.func
+    def end(self, ahead: Template, sight: Template, beyond: F32):
+        if ahead.surface >= 0 and ahead.explained > sight.model.floor:
+            ti.atomic_add(self.votes[ahead.surface], FOR)
+            voting = _Voting(self.votes, ahead.surface, sight.voxels_per_depth)
+            walk_voxels(sight.ray, sight.begin, sight.end, sight.space, _vote_against, ahead, voting)
 
 
 @dataclass(frozen=True)
@@ -130,31 +125,6 @@ def _vote_against(state: Template, voting: Template, voxel: I32, near: F32, far:
     if before == 1 and (far - near) * voting.voxels_per_depth > GRAZED:
         ti.atomic_sub(voting.votes[voxel], AGAINST)
     return before
-
-
-@kernel
-def _vote(
-    rays: RayList, sensor: Sensor, view: Viewpoint, space: Space, model: RayModel, learnt: F32,
-    belief: F32Array, votes: I32Array,
-) -> None:  # fmt: skip
-    """Add the votes of a keyframe's rays to ``votes`` (pool * 512); ``belief`` (pool * 512) are log-odds."""
-    for i in range(rays.blocks.shape[0]):
-        if i < rays.number:
-            measured = rays.depth[i]
-            ray, noise, _ = listed_ray(rays, i, sensor, view)
-            looking = _Looking(
-                model, belief, learnt, sensor, measured, noise, sensor.support(measured, noise),
-                ray.direction.norm(),
-            )  # fmt: skip
-            begin = 0.0
-            end = ti.min(sensor.farthest_depth(measured, noise, model.end_sigmas), model.max_depth)
-            clip(ray, begin, end, space.lower, space.upper)
-            ahead = _Ahead(1.0, 0.0, 0.0, -1)
-            walk_voxels(ray, begin, end, space, _look, ahead, looking)
-            if ahead.surface >= 0 and ahead.explained > model.floor:
-                ti.atomic_add(votes[ahead.surface], FOR)
-                voting = _Voting(votes, ahead.surface, looking.voxels_per_depth)
-                walk_voxels(ray, begin, end, space, _vote_against, ahead, voting)
 
 
 @ti.kernel

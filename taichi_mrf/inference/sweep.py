@@ -1,6 +1,9 @@
 """One sweep over one keyframe: the host's side of sum_product.py, with the scratch that it needs."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
@@ -12,14 +15,14 @@ from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.accumulators import finest_scale
 from taichi_mrf.inference.keyframe import Keyframe, RayList
 from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
-from taichi_mrf.inference.workers import workers_for
+from taichi_mrf.inference.workers import Workers, workers_for
 from taichi_mrf.kernels.resident import on_host, vec4_array
 from taichi_mrf.sensor.forward import AUTO, CENTRE, SEGMENT
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.strips import strip_length
-from taichi_mrf.voxels.traversal import FAR
+from taichi_mrf.voxels.traversal import FAR, Space, Viewpoint
 from taichi_mrf.voxels.window import WindowIndex
 
 LIKELIHOODS = {"auto": AUTO, "segment": SEGMENT, "centre": CENTRE}
@@ -42,6 +45,17 @@ def unknown_entry_depths(rays: RayList) -> "ti.Ndarray":
     entry_depths = ti.ndarray(ti.f32, rays.blocks.shape[0])
     entry_depths.fill(FAR)
     return entry_depths
+
+
+@dataclass(frozen=True)
+class CastRays:
+    """What the rays of one keyframe read and write (Sweeper.casting), as kernels take it."""
+
+    view: Viewpoint
+    space: Space
+    swept: SweptVoxels
+    trace: Trace
+    workers: Workers
 
 
 class Sweeper:
@@ -81,50 +95,61 @@ class Sweeper:
         False if it sees no brick. The host does not wait for the device: call :meth:`take_moved` before the
         next sweep over the same keyframe.
         """
-        config, image, rays = self.inference, keyframe.image, keyframe.ray_list
-        visible, footprint = keyframe.visible, keyframe.footprint
-        n = len(visible.slots)
-        if n == 0:
+        config, visible = self.inference, keyframe.visible
+        if len(visible.slots) == 0:
             return False
-        messages = keyframe.messages
-        workers = workers_for(
-            runtime.active() or "cpu", runtime.is_software(), footprint.longest, TRACE_BYTES
-        )
-        self._reserve(n, workers.number * footprint.longest, workers.number)
-        window, bricks, strip = footprint.window, visible.on_device(), strip_length()
-        model = self.model()
-        retrace = config.return_pass == "retrace" and not model.maximise
-        swept = SweptVoxels(self.log_free, self.sums, self._scale(keyframe))
+        messages, bricks, model = keyframe.messages, visible.on_device(), self.model()
 
         # Eq. 6: the belief of each voxel without this keyframe's message.
-        sum_product.cavity(
-            bricks.slots, pool.total, messages,
-            least_log_odds(config, pool.prior_log_odds), config.cavity_clamp,
-            swept.log_free, swept.sums, strip,
-        )  # fmt: skip
-
-        # Eqs. 4, 11, 13 and 14: the rays' messages.
-        self.index.fill(window, bricks.cells, self.order)
-        sum_product.send_messages(
-            rays, keyframe.entry_depths, int(keyframe.entry_depths_known),
-            image.sensor, window.viewpoint(keyframe.T_world_camera),
-            self.index.space(window, self.volume.lower, self.volume.upper),
-            model, swept, Trace(self.trace_voxel, self.trace, footprint.longest, self.steps),
-            workers, retrace,
-        )  # fmt: skip
-        keyframe.entry_depths_known = True
-        self.index.clear(window, bricks.cells)
+        with self.casting(keyframe, pool.total, messages, pool.prior_log_odds) as cast:
+            # Eqs. 4, 11, 13 and 14: the rays' messages.
+            sum_product.send_messages(
+                keyframe.ray_list, keyframe.entry_depths, int(keyframe.entry_depths_known),
+                keyframe.image.sensor, cast.view, cast.space, model, cast.swept, cast.trace, cast.workers,
+                config.return_pass == "retrace" and not model.maximise,
+            )  # fmt: skip
+            keyframe.entry_depths_known = True
 
         # Eqs. 7 and 8: the average over rays is the keyframe's new message, and changes the beliefs.
         bricks.moved.fill(0)  # a NumPy array's method or a Taichi array's
         sum_product.finish(
-            bricks.slots, pool.total, messages, swept.sums, swept.scale, config.message_clamp,
+            bricks.slots, pool.total, messages, cast.swept.sums, cast.swept.scale, config.message_clamp,
             config.damping, config.min_length, bricks.moved, model.log_average,
-            config.ray_correlation, config.ray_correlation < 1, strip,
+            config.ray_correlation, config.ray_correlation < 1, strip_length(),
         )  # fmt: skip
         pool.revision += 1
         keyframe.revision = pool.revision
         return True
+
+    @contextmanager
+    def casting(
+        self, keyframe: Keyframe, belief: "ti.Ndarray", messages: "ti.Ndarray", prior_log_odds: float
+    ) -> Iterator[CastRays]:
+        """The scratch made ready for a keyframe's rays; it must see a brick. It holds the cavity of
+        ``belief`` (pool * 512) without ``messages`` (eq. 6), and sums of zero, to which rays add."""
+        visible, footprint, n = keyframe.visible, keyframe.footprint, len(keyframe.visible.slots)
+        workers = workers_for(
+            runtime.active() or "cpu", runtime.is_software(), footprint.longest, TRACE_BYTES
+        )
+        self._reserve(n, workers.number * footprint.longest, workers.number)
+        window, bricks = footprint.window, visible.on_device()
+        swept = SweptVoxels(self.log_free, self.sums, self._scale(keyframe))
+        sum_product.cavity(
+            bricks.slots, belief, messages,
+            least_log_odds(self.inference, prior_log_odds), self.inference.cavity_clamp,
+            swept.log_free, swept.sums, strip_length(),
+        )  # fmt: skip
+        self.index.fill(window, bricks.cells, self.order)
+        try:
+            yield CastRays(
+                window.viewpoint(keyframe.T_world_camera),
+                self.index.space(window, self.volume.lower, self.volume.upper),
+                swept,
+                Trace(self.trace_voxel, self.trace, footprint.longest, self.steps),
+                workers,
+            )
+        finally:
+            self.index.clear(window, bricks.cells)
 
     def model(self) -> RayModel:
         """What the rays of all keyframes share."""

@@ -17,24 +17,18 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.color_sums import ColorShare, ColorSums, weigh
-from taichi_mrf.inference.keyframe import Keyframe, RayList
+from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import new_messages
-from taichi_mrf.inference.ray_list import block_of, listed_ray
-from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
+from taichi_mrf.inference.ray_list import block_of
+from taichi_mrf.inference.ray_model import Trace
+from taichi_mrf.inference.ray_posterior import FreeLogs, RayVisitor, follow_rays
 from taichi_mrf.inference.sum_product import TINY
-from taichi_mrf.inference.sweep import TRACE_BYTES, Sweeper, least_log_odds
-from taichi_mrf.inference.workers import Workers, workers_for
-from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.log_odds import exp_of_negative
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, I64Array, Struct, Template, Vec4
-from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.inference.sweep import Sweeper
+from taichi_mrf.kernels.types import F32, I32, I32Array, I64Array, Struct, Template, Vec4
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
-from taichi_mrf.voxels.strips import strip_length
-from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_voxels
 
 ENOUGH = 2.5
 """Rays at a voxel that faces the camera, of which all are followed."""
@@ -71,41 +65,32 @@ class ColorPass:
 
     def _spread(self, keyframe: Keyframe, pool: BrickPool) -> bool:
         """Leave a keyframe's mean colours times weight in the scratch; False if it has none to give."""
-        color, visible, footprint = keyframe.color, keyframe.visible, keyframe.footprint
+        color, visible = keyframe.color, keyframe.visible
         if color is None or keyframe.messages is None or len(visible.slots) == 0:
             return False
-        s, image, rays = self._sweeper, keyframe.image, keyframe.ray_list
-        n, config = len(visible.slots), s.inference
-        workers = workers_for(
-            runtime.active() or "cpu", runtime.is_software(), footprint.longest, TRACE_BYTES
-        )
-        s._reserve(n, workers.number * footprint.longest, workers.number)
+        s, image = self._sweeper, keyframe.image
+        n = len(visible.slots)
         if n * VOXELS > self._bw.shape[0]:
             runtime.settle()
             self._bw = ti.ndarray(ti.i64, n * VOXELS)
         self._bw.fill(0)
-        window, bricks, strip = footprint.window, visible.on_device(), strip_length()
-        swept = SweptVoxels(s.log_free, s.sums, s._scale(keyframe) * COLOR_SHARE)
         # Beliefs that have a date are no sums of messages: there the keyframe's own evidence stays in.
         messages = (
-            keyframe.messages if pool.dated is None else new_messages(visible, config.message_precision)
+            keyframe.messages if pool.dated is None else new_messages(visible, s.inference.message_precision)
         )
-        sum_product.cavity(
-            bricks.slots, pool.belief, messages, least_log_odds(config, pool.prior_log_odds),
-            config.cavity_clamp, swept.log_free, swept.sums, strip,
-        )  # fmt: skip
-        s.index.fill(window, bricks.cells, s.order)
-        spread_colors(
-            rays, keyframe.entry_depths, int(keyframe.entry_depths_known),
-            image.sensor, window.viewpoint(keyframe.T_world_camera),
-            s.index.space(window, s.volume.lower, s.volume.upper),
-            replace(s.model(), maximise=False), swept,
-            Trace(s.trace_voxel, s.trace, footprint.longest, s.steps),
-            workers, _pixels(color), self._bw, (s.voxel_size * image.camera.pixels_per_radian) ** 2 / ENOUGH,
-            200.0 * s.voxel_size * s.inference.ray_density / ENOUGH,
-        )  # fmt: skip
-        s.index.clear(window, bricks.cells)
-        weigh(n * VOXELS, swept.sums, self._bw, swept.scale)
+        with s.casting(keyframe, pool.belief, messages, pool.prior_log_odds) as cast:
+            scale = cast.swept.scale * COLOR_SHARE
+            spread = _Spread(
+                _pixels(color), image.camera.width, cast.swept.sums, self._bw, scale, cast.trace,
+                (s.voxel_size * image.camera.pixels_per_radian) ** 2 / ENOUGH,
+                200.0 * s.voxel_size * s.inference.ray_density / ENOUGH,
+            )  # fmt: skip
+            follow_rays(
+                keyframe.ray_list, keyframe.entry_depths, int(keyframe.entry_depths_known),
+                image.sensor, cast.view, cast.space,
+                replace(s.model(), maximise=False), FreeLogs(cast.swept.log_free), cast.workers, spread,
+            )  # fmt: skip
+        weigh(n * VOXELS, cast.swept.sums, self._bw, scale)
         runtime.settle()
         return True
 
@@ -126,100 +111,67 @@ class _Ahead(Struct):
 
 
 @dataclass(frozen=True)
-class _Looking(Bundle):
-    """One ray, and all that a step along it needs."""
+class _Spread(RayVisitor):
+    """Adds the colours of rays' pixels to the voxels that they see.
 
-    model: RayModel
-    swept: SweptVoxels
-    sensor: Sensor
-    measured: F32
-    noise: Template
-    support: F32
-    voxels_per_depth: F32
-    trace: Trace
-    first_step: I32
-
-
-@ti.func
-def _look(ahead: Template, looking: Template, voxel: I32, near: F32, far: F32):
-    """One voxel of a ray: note it if it can have made the measurement."""
-    log_free = looking.swept.log_free[voxel]
-    if ti.static(looking.model.segment_lengths):
-        log_free *= (far - near) * looking.voxels_per_depth
-    free = exp_of_negative(log_free)
-    if far > looking.support:
-        density = looking.sensor.likelihood(
-            looking.measured, near, far, looking.noise, looking.model.voxel_size, looking.model.likelihood
-        )
-        here = (1.0 - free) * density * ahead.visibility
-        if here > 0.0:
-            j = looking.first_step + ahead.voxels
-            looking.trace.voxel[j] = voxel
-            looking.trace.step[j] = Vec4(here, 0.0, 0.0, 0.0)
-            ahead.explained += here
-            ahead.voxels += 1
-    ahead.visibility *= free
-    return 1
-
-
-@kernel
-def spread_colors(
-    rays: RayList, entry_depths: F32Array, entry_depths_known: I32,
-    sensor: Sensor, view: Viewpoint, space: Space,
-    model: RayModel, swept: SweptVoxels, trace: Trace, workers: Workers, image: I32Array, bw: I64Array,
-    crowded: F32, most_many: F32,
-) -> None:  # fmt: skip
-    """Follow the rays of a keyframe, and add the colours of their pixels to the voxels that they see.
-
-    ``image`` (H * W) are packed colours, 0 for none. Red and green go to ``swept.sums``, blue and weight to
-    ``bw`` (visible bricks * 512), in units of 1 / ``swept.scale``. ``crowded`` / (depth^2 * pixels of a ray)
-    is how many times ENOUGH rays meet a voxel if those beside it have as many pixels; beyond ``most_many`` it
-    is a ray of its own, as at edges, and is followed.
+    ``image`` (H * W) are packed colours, 0 for none. Red and green go to ``rg``, blue and weight to ``bw``
+    (visible bricks * 512), in units of 1 / ``scale``. ``crowded`` / (depth^2 * pixels of a ray) is how many
+    times ENOUGH rays meet a voxel if those beside it have as many pixels; beyond ``most_many`` it is a ray of
+    its own, as at edges, and is followed.
     """
-    if ti.static(workers.block > 0):
-        ti.loop_config(block_dim=workers.block)
-    for iteration in range(workers.number * workers.spread):
-        worker = iteration // workers.spread
-        turns = 0
-        if iteration % workers.spread == 0:
-            turns = workers.turns(rays.number)
-        for turn in range(turns):
-            i = workers.ray(worker, turn)
-            if i < rays.number:
-                measured = rays.depth[i]
-                ray, noise, pixels_of_ray = listed_ray(rays, i, sensor, view)
-                many = crowded / (measured * measured * pixels_of_ray)
-                stride = 1
-                if many <= most_many:
-                    stride = ti.max(1, ti.cast(ti.min(many, MOST_STRIDE), ti.i32))
-                if i % stride == 0:
-                    first_step = worker * trace.longest
-                    looking = _Looking(
-                        model, swept, sensor, measured, noise, sensor.support(measured, noise),
-                        ray.direction.norm(), trace, first_step,
-                    )  # fmt: skip
-                    last = sensor.farthest_depth(measured, noise, model.end_sigmas)
-                    begin, end = 0.0, ti.min(last, model.max_depth)
-                    if entry_depths_known == 1:
-                        begin = entry_depths[i]
-                    clip(ray, begin, end, space.lower, space.upper)
-                    ahead = _Ahead(1.0, 0.0, 0)
-                    walk_voxels(ray, begin, end, space, _look, ahead, looking)
-                    if ahead.voxels > 0:
-                        total = ahead.explained + model.floor + TINY
-                        if end < last:
-                            total += ahead.visibility * sensor.likelihood_beyond(measured, end, noise)
-                        red, green, blue, pixels = _block_color(rays.blocks[i], image, sensor.camera.width)
-                        for step in range(ahead.voxels):
-                            j = first_step + step
-                            unit = trace.step[j][0] / total * swept.scale * stride
-                            voxel = trace.voxel[j]
-                            weight = ti.cast(unit * pixels + 0.5, ti.i64)
-                            if weight > 0:
-                                # As shares of the rounded weight, so that the mean lies between the colours.
-                                share = ti.cast(weight, ti.f32) / pixels
-                                _add_pair(swept.sums, voxel, share * red, share * green)
-                                ti.atomic_add(bw[voxel], (ti.cast(share * blue + 0.5, ti.i64) << 32) + weight)
+
+    image: I32Array
+    width: I32
+    rg: I64Array
+    bw: I64Array
+    scale: F32
+    trace: Trace
+    crowded: F32
+    most_many: F32
+
+    @ti.func
+    def stride(self, measured: F32, pixels: I32):
+        """One of so many rays like this is followed, and counts for all of them."""
+        many = self.crowded / (measured * measured * pixels)
+        stride = 1
+        if many <= self.most_many:
+            stride = ti.max(1, ti.cast(ti.min(many, MOST_STRIDE), ti.i32))
+        return stride
+
+    @ti.func
+    def wants(self, rays: Template, number: I32):
+        _, _, wide, high = block_of(rays.blocks[number], self.width)
+        return ti.cast(number % self.stride(rays.depth[number], wide * high) == 0, ti.i32)
+
+    @ti.func
+    def begin(self, sight: Template):
+        return _Ahead(1.0, 0.0, 0)
+
+    @ti.func
+    def meet(self, ahead: Template, sight: Template, voxel: I32, here: F32):
+        if here > 0.0:
+            j = sight.worker * self.trace.longest + ahead.voxels
+            self.trace.voxel[j] = voxel
+            self.trace.step[j] = Vec4(here, 0.0, 0.0, 0.0)
+            ahead.voxels += 1
+        return 1
+
+    @ti.func
+    def end(self, ahead: Template, sight: Template, beyond: F32):
+        if ahead.voxels > 0:
+            total = ahead.explained + sight.model.floor + TINY + beyond
+            stride = self.stride(sight.measured, sight.pixels)
+            red, green, blue, pixels = _block_color(sight.block, self.image, self.width)
+            for step in range(ahead.voxels):
+                j = sight.worker * self.trace.longest + step
+                unit = self.trace.step[j][0] / total * self.scale * stride
+                voxel = self.trace.voxel[j]
+                weight = ti.cast(unit * pixels + 0.5, ti.i64)
+                if weight > 0:
+                    # As shares of the rounded weight, so that the mean lies between the colours.
+                    share = ti.cast(weight, ti.f32) / pixels
+                    _add_pair(self.rg, voxel, share * red, share * green)
+                    ti.atomic_add(self.bw[voxel], (ti.cast(share * blue + 0.5, ti.i64) << 32) + weight)
 
 
 @ti.func

@@ -50,3 +50,8 @@ def workers_for(arch: str, software: bool, longest: int, trace_bytes: int) -> Wo
         return Workers(1024, 1, 1, runtime.SOFTWARE_BLOCK)
     most = (512 << 20) // (trace_bytes * longest)
     return Workers(max(256, min(65536, most)), 1, 1, 128)
+
+
+def workers_without_trace() -> Workers:
+    """Workers of the backend that runs, for rays that leave no trace."""
+    return workers_for(runtime.active() or "cpu", runtime.is_software(), 1, 1)

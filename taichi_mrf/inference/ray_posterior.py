@@ -1,0 +1,181 @@
+"""The posterior of a ray's first surface: one pass over a keyframe's rays for all who ask what they saw.
+
+With the marginals m of the voxels 1 .. N of a ray, ordered from the camera, and the symbols of
+sum_product.py,
+
+    here_i = nu_i m_i vis_i        here_i / (sum_j here_j + beyond + o)                                (4)
+
+is the probability that voxel i made the measurement: the ray reached it, it is occupied, and it explains the
+measurement. ``beyond`` is what lies past the end of the map, o the density of a measurement that no surface
+made.
+
+What is done with a ray's posterior is up to a :class:`RayVisitor`. There are three: the surface counts rays
+by the chance that they met one (surface_rays.py), colours go to the voxels that pixels saw (voxel_colors.py),
+and rays vote for their likeliest voxel (surface_votes.py).
+"""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from taichi_mrf.inference.keyframe import RayList
+from taichi_mrf.inference.ray_list import listed_ray
+from taichi_mrf.inference.ray_model import RayModel
+from taichi_mrf.inference.sum_product import crossing
+from taichi_mrf.inference.workers import Workers
+from taichi_mrf.kernels.bundles import Bundle, kernel
+from taichi_mrf.kernels.log_odds import exp_of_negative, softplus
+from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template
+from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.strips import strip_begin, strip_length
+from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_voxels
+
+
+@ti.dataclass
+class Ahead(Struct):
+    """A ray on its way from the camera, in front of voxel i. A visitor may use a struct with more members."""
+
+    visibility: F32  # vis_i
+    explained: F32  # sum_{j<i} here_j
+
+
+@dataclass(frozen=True)
+class FreeLogs(Bundle):
+    """The voxels that rays cross."""
+
+    log_free: F32Array
+    """log(1 - m) of each, at most 0; (bricks * 512)."""
+
+    @staticmethod
+    def of(pool: BrickPool) -> "FreeLogs":
+        """Those of the marginals of a whole map, in the pool's order."""
+        log_free = ti.ndarray(ti.f32, max(1, pool.capacity) * VOXELS)
+        _find_free_logs(pool.in_use, pool.belief, log_free, strip_length())
+        return FreeLogs(log_free)
+
+
+@dataclass(frozen=True)
+class Sight(Bundle):
+    """One ray of a keyframe, from depth ``begin`` to depth ``end``, and all that a step along it needs."""
+
+    model: RayModel
+    swept: FreeLogs
+    sensor: Sensor
+    measured: F32  # its measurement, metres
+    noise: Template  # of its pixel
+    support: F32  # depth before which no surface can have made the measurement
+    voxels_per_depth: F32  # length of the ray, in voxels, for one metre of depth
+    pixels: I32  # for how many pixels it stands
+    number: I32  # in the list of rays
+    block: I32  # of pixels, for ray_list.block_of
+    worker: I32  # that follows it
+    ray: Template
+    begin: F32
+    end: F32
+    space: Space
+
+
+@dataclass(frozen=True)
+class RayVisitor(Bundle):
+    """What is done with the rays of a keyframe. Subclasses have the fields that they need; all their methods
+    are ``ti.func``."""
+
+    @ti.func
+    def wants(self, rays: Template, number: I32):
+        """Whether ray ``number`` of a list (keyframe.RayList) is followed."""
+        return 1
+
+    @ti.func
+    def begin(self, sight: Template):
+        """The state of a ray at the camera: an :class:`Ahead`, or a struct with its members and more."""
+        return Ahead(1.0, 0.0)
+
+    @ti.func
+    def meet(self, ahead: Template, sight: Template, voxel: I32, here: F32):
+        """One voxel that may have made the measurement; ``ahead.explained`` has its ``here``. The ray is
+        followed no further if this returns 0."""
+        return 1
+
+    @ti.func
+    def end(self, ahead: Template, sight: Template, beyond: F32):
+        """The ray's end. ``beyond`` is the density of the measurement if it met its surface past the map."""
+
+
+@kernel
+def follow_rays(
+    rays: RayList, entry_depths: F32Array, entry_depths_known: I32,
+    sensor: Sensor, view: Viewpoint, space: Space,
+    model: RayModel, swept: FreeLogs, workers: Workers, visitor: RayVisitor,
+) -> None:  # fmt: skip
+    """Follow the rays of a keyframe for a visitor. ``space`` and ``swept`` hold the bricks that they meet.
+
+    ``entry_depths`` (rays) are the depths up to which rays cross none of them, if known. A worker follows one
+    ray after the other.
+    """
+    if ti.static(workers.block > 0):
+        ti.loop_config(block_dim=workers.block)
+    for iteration in range(workers.number * workers.spread):
+        worker = iteration // workers.spread
+        turns = 0
+        if iteration % workers.spread == 0:
+            turns = workers.turns(rays.number)
+        for turn in range(turns):
+            i = workers.ray(worker, turn)
+            wanted = 0
+            if i < rays.number:
+                wanted = visitor.wants(rays, i)
+            if wanted == 1:
+                measured = rays.depth[i]
+                ray, noise, pixels = listed_ray(rays, i, sensor, view)
+
+                # The ray ends where its measurement carries no more evidence, or where the map ends.
+                last = sensor.farthest_depth(measured, noise, model.end_sigmas)
+                begin, end = 0.0, ti.min(last, model.max_depth)
+                if entry_depths_known == 1:
+                    begin = entry_depths[i]
+                clip(ray, begin, end, space.lower, space.upper)
+
+                sight = Sight(
+                    model, swept, sensor, measured, noise, sensor.support(measured, noise),
+                    ray.direction.norm(), pixels, i, rays.blocks[i], worker, ray, begin, end, space,
+                )  # fmt: skip
+                ahead = visitor.begin(sight)
+                walk_voxels(ray, begin, end, space, _see, ahead, _Visited(sight, visitor))
+                beyond = 0.0
+                if end < last:
+                    beyond = ahead.visibility * sensor.likelihood_beyond(measured, end, noise)
+                visitor.end(ahead, sight, beyond)
+
+
+@dataclass(frozen=True)
+class _Visited(Bundle):
+    """A ray and who looks at it."""
+
+    sight: Sight
+    visitor: RayVisitor
+
+
+@ti.func
+def _see(ahead: Template, visited: Template, voxel: I32, near: F32, far: F32):
+    """One voxel of a ray, which is in it from depth ``near`` to ``far``."""
+    met = crossing(visited.sight, voxel, near, far)
+    free = exp_of_negative(met[1])
+    go = 1
+    if met[2] > 0.0:
+        here = (1.0 - free) * met[2] * ahead.visibility
+        ahead.explained += here
+        go = visited.visitor.meet(ahead, visited.sight, voxel, here)
+    ahead.visibility *= free
+    return go
+
+
+@kernel
+def _find_free_logs(slots: I32Array, belief: F32Array, log_free: F32Array, strip: Template) -> None:
+    """log(1 - m) of the bricks in ``slots`` (n) from their log-odds. ``belief`` and ``log_free`` are (pool *
+    512)."""
+    for part in range(slots.shape[0] * (VOXELS // strip)):
+        _, j = strip_begin(part, slots, strip)
+        for k in range(strip):
+            log_free[j + k] = -softplus(belief[j + k])

@@ -1,0 +1,107 @@
+"""The posterior of rays against float64 NumPy, ray by ray and voxel by voxel."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import taichi as ti
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from one_pixel import VOXEL, allocated, look_along, marginals, well_cut
+from oracles import inference as reference
+from oracles.forward import Noise
+
+from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.inference.ray_posterior import FreeLogs, RayVisitor, follow_rays
+from taichi_mrf.inference.workers import workers_without_trace
+from taichi_mrf.kernels.types import F32, I32, F32Array, Template
+from taichi_mrf.methods.mrf import keyframe_allocator
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.noise import PolynomialNoise
+from taichi_mrf.system import runtime
+from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.window import WindowIndex
+
+pytestmark = pytest.mark.usefixtures("backend")
+
+CAMERA = PinholeCamera(3, 2, 8.0, 8.0, 1.0, 0.5)
+MAX_DEPTH = 0.7
+
+
+@dataclass(frozen=True)
+class _Record(RayVisitor):
+    """Writes down what rays find; rays of odd numbers are left out, and none goes beyond ``enough``."""
+
+    here: F32Array
+    found: F32Array
+    enough: F32
+
+    @ti.func
+    def wants(self, rays: Template, number: I32) -> I32:
+        return 1 - number % 2
+
+    @ti.func
+    def meet(self, ahead: Template, sight: Template, voxel: I32, here: F32) -> I32:
+        ti.atomic_add(self.here[voxel], here)
+        return ti.cast(ahead.explained < self.enough, ti.i32)
+
+    @ti.func
+    def end(self, ahead: Template, sight: Template, beyond: F32):  # noqa: ANN202 (Taichi takes no None)
+        self.found[3 * sight.number] = ahead.explained
+        self.found[3 * sight.number + 1] = ahead.visibility
+        self.found[3 * sight.number + 2] = beyond
+
+
+def _followed(m: MRFMap, enough: float) -> tuple[np.ndarray, np.ndarray]:
+    """What the visitor has written down of the map's only keyframe, by voxels of the pool and by rays."""
+    (k,) = m.keyframes.values()
+    pool, window, index = m.view.pool, k.footprint.window, WindowIndex()
+    index.fill(window, k.visible.cells, k.visible.slots)
+    here = np.zeros(pool.capacity * VOXELS, np.float32)
+    found = np.zeros((k.ray_list.number, 3), np.float32)
+    follow_rays(
+        k.ray_list, k.entry_depths, int(k.entry_depths_known), k.image.sensor,
+        window.viewpoint(k.T_world_camera), index.space(window), m._sweeper.model(), FreeLogs.of(pool),
+        workers_without_trace(), _Record(here, found.reshape(-1), enough),
+    )  # fmt: skip
+    runtime.settle()
+    return here, found
+
+
+@settings(max_examples=12)
+@given(seed=st.integers(0, 2**32 - 1), sigma=st.floats(0.04, 0.2), enough=st.sampled_from([0.2, 1e9]))
+def test_rays_find_what_numpy_finds(seed: int, sigma: float, enough: float) -> None:
+    rng = np.random.default_rng(seed)
+    config = InferenceConfig(ray_density=0.0)
+    m = MRFMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=MAX_DEPTH)
+    T = look_along(rng.uniform(-1, 1, 3), rng.normal(size=3), rng)
+    depth = rng.uniform(0.5, 0.8, CAMERA.shape).astype(np.float32)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(keyframe_allocator, "SCOUTS", 1)
+        m.add_keyframe(depth, T, CAMERA)
+    m.infer()
+    rays = reference.cast(depth, T, CAMERA, VOXEL, Noise((sigma,)), config, max_depth=MAX_DEPTH)
+    assume(well_cut(rays, 99))
+    voxels = sorted(allocated(m))
+    p = dict(zip(voxels, marginals(m, voxels).tolist(), strict=True))
+    here, found = _followed(m, enough)
+    expected: dict[reference.Voxel, float] = {}
+    for number, ray in enumerate(rays):
+        visibility, explained = 1.0, 0.0
+        for segment, density in zip(ray.segments, ray.densities, strict=True):
+            if segment.voxel in p and number % 2 == 0 and explained < enough:
+                assume(abs(explained - enough) > 1e-3)
+                free = (1 - p[segment.voxel]) ** segment.length
+                one = (1 - free) * density * visibility
+                expected[segment.voxel] = expected.get(segment.voxel, 0.0) + one
+                explained += one
+                visibility *= free
+        wanted = [explained, visibility, visibility * ray.beyond] if number % 2 == 0 else [0.0] * 3
+        np.testing.assert_allclose(found[number], wanted, rtol=2e-3, atol=1e-5)
+    assert here.sum() == pytest.approx(sum(expected.values()), rel=2e-3)
+    slots = m.view.pool.in_order
+    by_voxel = here.reshape(-1, VOXELS)[slots].ravel()
+    assert sorted(by_voxel[by_voxel > 1e-4]) == pytest.approx(
+        sorted(v for v in expected.values() if v > 1e-4), rel=5e-3, abs=1e-4
+    )
