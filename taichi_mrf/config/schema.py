@@ -211,6 +211,10 @@ class _Tail:
     """Read the recording's colour images too, and give voxels and surfaces the colours of the pixels that see
     them (methods whose maps have colours: mrf)."""
 
+    keep_surface: bool = False
+    """Keep for each voxel what keyframes measured of the surface where their images are dropped: in maps in
+    submaps (methods that freeze keyframes: mrf). Maps that hold their keyframes' images need it not."""
+
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     """Which frames become keyframes."""
 
@@ -266,6 +270,8 @@ class Config(_Tail, _MethodSections, _Head):
         check_field(freezes, "volume.window_m", needed)
         colored = not self.color or METHODS[self.method].has_colors
         check_field(colored, "color", f"needs the method {methods_with('has_colors')}, not {self.method}")
+        kept = not self.keep_surface or METHODS[self.method].can_freeze
+        check_field(kept, "keep_surface", needed)
 
 
 def without_window(config: Config) -> Config:

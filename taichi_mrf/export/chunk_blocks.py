@@ -8,8 +8,11 @@ from numpy.typing import NDArray
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.export.chunk_store import Chunk, ChunkStore, StoreHeader, new_store
+from taichi_mrf.export.store_header import COLORS, SURFACE
 from taichi_mrf.geometry.up import Up
+from taichi_mrf.queries.colored import ColoredMap
 from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, known_bricks
+from taichi_mrf.voxels.distance_field import DistanceSource
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, by_chunk
 
 
@@ -19,10 +22,20 @@ def chunk_block(
     """(64, 64, 64) log-odds of a chunk from those of its bricks, (n, 512). NaN for unknown voxels: outside
     the bricks, and where the log-odds equal the prior's."""
     log_odds = np.where(log_odds == np.float32(prior_log_odds), np.float32(np.nan), log_odds)
-    block = np.full((CHUNK, BRICK, CHUNK, BRICK, CHUNK, BRICK), np.nan, np.float32)
+    return _assembled(chunk, bricks, log_odds[..., None], np.nan)[..., 0]
+
+
+def extra_block(chunk: Chunk, bricks: Bricks, values: NDArray) -> NDArray:
+    """(64, 64, 64, k) values of a chunk from those of its bricks, (n, 512, k); 0 outside the bricks."""
+    return _assembled(chunk, bricks, values, 0)
+
+
+def _assembled(chunk: Chunk, bricks: Bricks, values: NDArray, missing: float) -> NDArray:
+    each = values.shape[2]
+    block = np.full((CHUNK, BRICK, CHUNK, BRICK, CHUNK, BRICK, each), missing, values.dtype)
     x, y, z = (bricks - np.array(chunk) * CHUNK).T
-    block[x, :, y, :, z, :] = log_odds.reshape(-1, BRICK, BRICK, BRICK)
-    return block.reshape((CHUNK_VOXELS,) * 3)
+    block[x, :, y, :, z, :] = values.reshape(-1, BRICK, BRICK, BRICK, each)
+    return block.reshape((*(CHUNK_VOXELS,) * 3, each))
 
 
 class StorableMap(QueriedMap, Protocol):
@@ -43,14 +56,31 @@ def header_of(m: StorableMap, up: Up | None = None) -> StoreHeader:
     return StoreHeader.of(m.config, prior, m.seen_free_log_odds, volume.min_evidence, up or m.up)
 
 
-def write_chunks(path: str | Path, m: StorableMap, up: Up | None = None) -> None:
-    """Write a map in memory to a store, chunk by chunk; ``up`` (default: the map's) is kept in it. Raises
-    MapFileError, TaichiMRFError without zarr."""
+def write_chunks(
+    path: str | Path,
+    m: StorableMap,
+    up: Up | None = None,
+    colored: ColoredMap | None = None,
+    surface: DistanceSource | None = None,
+) -> None:
+    """Write a map in memory to a store, chunk by chunk; ``up`` (default: the map's) is kept in it, the
+    colours of ``colored`` (the same map), and the signed distances of ``surface``. Raises MapFileError,
+    TaichiMRFError without zarr."""
     reader = BrickReader(m)
     bricks = known_bricks(m)
+    measured = np.zeros((0, 3), np.int32) if surface is None else surface.chunks
+    extras = [name for name, kept in ((COLORS, colored), (SURFACE, surface)) if kept is not None]
     with new_store(path) as folder:
         header = header_of(m, up)
-        store = ChunkStore.create(folder, header, np.unique(bricks // CHUNK, axis=0))
+        chunks = np.unique(np.concatenate([bricks // CHUNK, measured]), axis=0)
+        store = ChunkStore.create(folder, header, chunks, extras=extras)
         for chunk, rows in by_chunk(bricks):
             log_odds = reader.log_odds(bricks[rows])
             store.write(chunk, chunk_block(chunk, bricks[rows], log_odds, header.prior_log_odds))
+            if colored is not None:
+                colors = colored.colors_in(reader.slots(bricks[rows]))
+                store.write_extra(COLORS, chunk, extra_block(chunk, bricks[rows], colors))
+        for x, y, z in measured.tolist():
+            assert surface is not None
+            sums = surface.box(np.array((x, y, z), np.int64) * CHUNK_VOXELS, CHUNK_VOXELS)
+            store.write_extra(SURFACE, (x, y, z), np.stack(sums, axis=-1))

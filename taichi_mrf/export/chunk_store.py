@@ -3,6 +3,8 @@
 The folder is a zarr group. Its array ``log_odds`` (x, y, z) float32 has a zarr chunk for each chunk of 64^3
 voxels; unknown voxels are NaN, and chunks without a known voxel are not stored. ``chunks`` (n, 3)
 int32 lists the stored chunks in the world's coordinates: chunk c covers the voxels 64 c to 64 (c + 1) - 1.
+If the map has them, ``colors`` (x, y, z, 4) uint8 are red, green, blue and how much was seen, and ``surface``
+(x, y, z, 2) float32 the weight and the distance times weight of DistanceField; both are 0 for nothing.
 The attributes hold the rest: see :class:`StoreHeader`, and ``origin_m``, the outer
 corner of the array's first voxel.
 """
@@ -21,6 +23,7 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import MapFileError, said
 from taichi_mrf.export.store_header import (
     CHUNKS,
+    EXTRAS,
     FORMAT,
     FORMAT_KEY,
     LOG_ODDS,
@@ -56,14 +59,20 @@ class ChunkStore:
     def __init__(self, path: Path, group: Any, layout: StoreLayout) -> None:
         """As :meth:`create` and :meth:`open` make it."""
         self.path, self.header, self._layout, self._group = path, layout.header, layout, group
-        self._array = group[LOG_ODDS]
+        self._array, self.extras = group[LOG_ODDS], layout.extras
 
     @classmethod
     def create(
-        cls, path: str | Path, header: StoreHeader, chunks: NDArray[np.int32], grows: bool = False
+        cls,
+        path: str | Path,
+        header: StoreHeader,
+        chunks: NDArray[np.int32],
+        grows: bool = False,
+        extras: Sequence[str] = (),
     ) -> "ChunkStore":
         """An empty store for some chunks, (n, 3), which the caller then writes. Its array covers their
-        bounding box; if it ``grows`` (growing_store.py), all chunks within ``FARTHEST``.
+        bounding box; if it ``grows`` (growing_store.py), all chunks within ``FARTHEST``. ``extras`` of
+        EXTRAS get arrays too.
 
         Raises MapFileError if it cannot be written, TaichiMRFError without zarr.
         """
@@ -85,6 +94,12 @@ class ChunkStore:
                 LOG_ODDS, shape=tuple(shape.tolist()), chunks=(CHUNK_VOXELS,) * 3, dtype="float32",
                 fill_value=float("nan"), dimension_names=("x", "y", "z"),
             )  # fmt: skip
+            for name in extras:
+                data_type, values = EXTRAS[name]
+                group.create_array(
+                    name, shape=(*shape.tolist(), values), chunks=(*(CHUNK_VOXELS,) * 3, values),
+                    dtype=data_type, fill_value=0, dimension_names=("x", "y", "z", "value"),
+                )  # fmt: skip
             listed = np.ascontiguousarray(chunks, np.int32).reshape(-1, 3)
             in_one_file = (LISTED_TOGETHER if grows else max(1, len(listed)), 3)
             group.create_array(CHUNKS, shape=listed.shape, chunks=in_one_file, dtype="int32", fill_value=0)[
@@ -135,9 +150,10 @@ class ChunkStore:
         """Whether chunks can be added to it (growing_store.py)."""
         return self._layout.lowest_chunk == (-FARTHEST,) * 3
 
-    def file_of(self, chunk: Sequence[int]) -> Path:
-        """Where a chunk's voxels are, from the store's folder."""
-        return Path(LOG_ODDS, "c", *map(str, self._place(chunk)))
+    def file_of(self, chunk: Sequence[int], name: str = LOG_ODDS) -> Path:
+        """Where a chunk's log-odds, or one of its extras, are, from the store's folder."""
+        last = () if name == LOG_ODDS else ("0",)
+        return Path(name, "c", *map(str, self._place(chunk)), *last)
 
     def write(self, chunk: Sequence[int], log_odds: NDArray[np.float32]) -> None:
         """Write one chunk, (64, 64, 64) log-odds, NaN for unknown. Raises MapFileError."""
@@ -156,6 +172,28 @@ class ChunkStore:
             raise MapFileError(f"{self.path}: chunk {tuple(chunk)} cannot be read: {said(error)}") from error
         if found.shape != (CHUNK_VOXELS,) * 3 or np.isinf(found).any():
             raise MapFileError(f"{self.path}: damaged: chunk {tuple(chunk)} holds a value that is not finite")
+        return found
+
+    def write_extra(self, name: str, chunk: Sequence[int], values: NDArray) -> None:
+        """Write one of :attr:`extras` for a chunk, (64, 64, 64, values). Raises MapFileError."""
+        try:
+            self._group[name].blocks[(*self._place(chunk), 0)] = values
+        except OSError as error:
+            raise MapFileError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+
+    def read_extra(self, name: str, chunk: Sequence[int]) -> NDArray:
+        """One of :attr:`extras` of one of :attr:`chunks`, (64, 64, 64, values). Raises MapFileError."""
+        data_type, values = EXTRAS[name]
+        size = CHUNK_VOXELS**3 * values * np.dtype(data_type).itemsize
+        check_packed(self.path / self.file_of(chunk, name), size)
+        try:
+            found = np.asarray(self._group[name].blocks[(*self._place(chunk), 0)], data_type)
+        except Exception as error:  # as above
+            raise MapFileError(
+                f"{self.path}: {name} of chunk {tuple(chunk)} cannot be read: {said(error)}"
+            ) from error
+        if found.shape != (*(CHUNK_VOXELS,) * 3, values) or not np.isfinite(found).all():
+            raise MapFileError(f"{self.path}: damaged: {name} of chunk {tuple(chunk)} are not finite numbers")
         return found
 
     def _place(self, chunk: Sequence[int]) -> Chunk:

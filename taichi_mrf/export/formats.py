@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.config.arguments import shown
+from taichi_mrf.config.registry import METHODS
 from taichi_mrf.errors import ArgumentTypeError, ConfigError
 from taichi_mrf.export.arrays import write_arrays
 from taichi_mrf.export.chunk_blocks import StorableMap, write_chunks
@@ -27,6 +28,12 @@ from taichi_mrf.queries.colored import ColoredMap, is_colored, shown_colors
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN
 
 _DEFAULTS = ExportOptions()
+
+NO_SURFACE = (
+    "the images of keyframes that measured the surface are not in the map, or not of all: map the recording "
+    "anew with --keep-surface, or export from the map.npz of a run"
+)
+"""What is missing for a measured surface, and what to do."""
 
 
 class ExportedMap(StorableMap, Protocol):
@@ -78,9 +85,14 @@ def export_note(m: ExportedMap, path: str | Path, options: ExportOptions = _DEFA
     """A note for the user on a written file: what a mesh shows, how a floor plan lies in the world."""
     writer = _WRITERS.get(Path(path).suffix.lower())
     if writer is _surface or (writer is _points_or_surface and options.mesh):
-        if options.cubes or _with_rays(m, Path(path), options) is None:
+        if options.cubes:
             return None
-        return f"the surface that the rays of {len(m.keyframes)} keyframes measured"
+        if _with_rays(m, Path(path), options) is None:
+            no_images = options.surface == "auto" and METHODS[m.config.method].can_freeze
+            remedy = f"; {NO_SURFACE}" if no_images else ""
+            return f"the surface where the marginal is {options.threshold:g}{remedy}"
+        who = f"{len(m.keyframes)} keyframes" if len(m.keyframes) else "keyframes"
+        return f"the surface that the rays of {who} measured"
     if writer is not _level_map:
         return None
     reason = "--up" if options.up != "auto" else "as in the map's first keyframe"
@@ -136,9 +148,7 @@ def _with_rays(m: ExportedMap, path: Path, options: ExportOptions) -> SurfacedMa
     if options.surface != "marginal" and has_surface(m):
         return m
     if options.surface == "rays":
-        raise ConfigError(
-            f"{path}: the map has no keyframes, or some are frozen; --surface marginal needs none"
-        )
+        raise ConfigError(f"{path}: {NO_SURFACE}; --surface marginal needs none")
     return None
 
 
@@ -175,7 +185,11 @@ def _arrays(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
 
 
 def _chunks(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
-    write_chunks(path, m, _up(m, options) if options.up != "auto" else None)
+    kept = options.surface == "rays" or (options.surface == "auto" and m.config.keep_surface)
+    measured = _with_rays(m, path, options) if kept else None
+    surface = None if measured is None else measured.surface_field()
+    up = _up(m, options) if options.up != "auto" else None
+    write_chunks(path, m, up, _photo(m, path, options), surface)
     return [path]
 
 

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 from typing import Protocol, TypeGuard
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.export.surface import Surface, welded_rows
 from taichi_mrf.queries.known_bricks import QueriedMap, sorted_bricks
 from taichi_mrf.system.libraries import library
 from taichi_mrf.voxels.colors import marginal_colors
-from taichi_mrf.voxels.distance_field import DistanceField
-from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS, grid_keys
+from taichi_mrf.voxels.distance_field import DistanceSource
+from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
 BLENDED_BELOW = 0.3
 """t: the weight at which a voxel's mean distance has a standard deviation of about half a voxel."""
@@ -54,16 +54,25 @@ class FusedSurface:
 
 
 class SurfacedMap(QueriedMap, Protocol):
-    """A map that makes a surface from its keyframes."""
+    """A map that holds what its keyframes measured of the surface."""
+
+    @property
+    def has_surface(self) -> bool:
+        """Whether it holds that of all keyframes that it was made of."""
+        ...
 
     def surface(self) -> FusedSurface:
         """The surface that the keyframes measured."""
         ...
 
+    def surface_field(self) -> DistanceSource:
+        """The signed distances that they measured."""
+        ...
+
 
 def has_surface(m: QueriedMap) -> TypeGuard[SurfacedMap]:
-    """Whether a map makes a surface from all keyframes that it was made of: none is frozen."""
-    return hasattr(m, "surface") and len(m.keyframes) > 0 and not getattr(m, "frozen", ())
+    """Whether a map holds what all keyframes that it was made of measured of the surface."""
+    return bool(getattr(m, "has_surface", False))
 
 
 def measured_surface(m: SurfacedMap) -> Surface:
@@ -76,7 +85,7 @@ def measured_surface(m: SurfacedMap) -> Surface:
     )
 
 
-def fused_surface(field: DistanceField, voxel_size: float) -> FusedSurface:
+def fused_surface(field: DistanceSource, voxel_size: float) -> FusedSurface:
     """The surface of a field. Raises TaichiMRFError without scikit-image."""
     measure = library("skimage.measure", "surfaces need", "mesh")
     vertices, triangles, weights = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.float32)]
@@ -107,7 +116,13 @@ def fused_surface(field: DistanceField, voxel_size: float) -> FusedSurface:
     return FusedSurface(vertices_m, triangles_of, normals, std_m.astype(np.float32))
 
 
-def without_free(m: QueriedMap, surface: FusedSurface, least: float) -> FusedSurface:
+class _Believing(Protocol):
+    voxel_size: float
+
+    def occupancy(self, points: ArrayLike) -> NDArray[np.float32]: ...
+
+
+def without_free(m: _Believing, surface: FusedSurface, least: float) -> FusedSurface:
     """The surface without what the map takes for free: vertices around which, within 2 voxels or standard
     deviations along the normal, no voxel has the probability ``least``. Rays with a large sigma leave such
     vertices in front of a surface and behind it."""
@@ -116,39 +131,43 @@ def without_free(m: QueriedMap, surface: FusedSurface, least: float) -> FusedSur
     for number in (0, -1, 1, -2, 2):
         rows = np.flatnonzero(~likely)
         likely[rows] = m.occupancy(surface.vertices_m[rows] + number * step[rows]) >= least
-    triangles = surface.triangles[likely[surface.triangles].all(axis=1)]
-    kept = np.zeros(len(likely), bool)
+    return _of_triangles(surface, np.asarray(likely[surface.triangles].all(axis=1)))
+
+
+def within_voxels(
+    surface: FusedSurface, voxel_size: float, first: NDArray[np.int64], after: NDArray[np.int64]
+) -> FusedSurface:
+    """The triangles of the cells of some voxels, from ``first`` up to, but without, ``after``, (3,) each; a
+    cell lies between the centres of a voxel and the next ones. Surfaces of adjoining boxes meet: they have
+    the same vertices there, and no triangle in common."""
+    middle = surface.vertices_m[surface.triangles].mean(axis=1) / voxel_size - 0.5
+    inside = np.asarray(((middle >= first) & (middle < after)).all(axis=1))
+    return _of_triangles(surface, inside)
+
+
+def _of_triangles(surface: FusedSurface, chosen: NDArray[np.bool_]) -> FusedSurface:
+    """Some of a surface's triangles, (T,), and their vertices."""
+    triangles = surface.triangles[chosen]
+    kept = np.zeros(len(surface.vertices_m), bool)
     kept[triangles] = True
     place = np.cumsum(kept) - 1
-    rest = surface.vertices_m[kept], place[triangles], surface.normals[kept], surface.std_m[kept]
-    return FusedSurface(*rest)
+    return FusedSurface(
+        surface.vertices_m[kept], place[triangles], surface.normals[kept], surface.std_m[kept]
+    )
 
 
 def _boxes(
-    field: DistanceField,
+    field: DistanceSource,
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]]:
     """The lowest voxel of each chunk that holds distances; and for its voxels and those behind it, whose
     cells reach into it, their own weight, and weight and distance times weight after blending."""
-    keys = grid_keys(field.bricks)
-    chunks = sorted_bricks(field.bricks // CHUNK)
-    before = [chunks - np.array(step, np.int32) for step in np.ndindex(2, 2, 2)]
+    before = [field.chunks - np.array(step, np.int32) for step in np.ndindex(2, 2, 2)]
     side = CHUNK_VOXELS + 1 + 2 * MARGIN
-    around = np.indices((CHUNK + 2,) * 3).reshape(3, -1).T - 1
     for chunk in sorted_bricks(np.concatenate([np.zeros((0, 3), np.int32), *before])).astype(np.int64):
-        bricks = chunk * CHUNK + around
-        wanted = grid_keys(bricks)
-        rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-        here = np.flatnonzero(keys[rows] == wanted)
-        if not len(here):
-            continue
-        boxes = []
-        for sums in (field.weight, field.distance):
-            box = np.zeros(((CHUNK + 2) ** 3, VOXELS), np.float32)
-            box[here] = sums[rows[here]]
-            voxels = box.reshape(*(CHUNK + 2,) * 3, *(BRICK,) * 3).transpose(0, 3, 1, 4, 2, 5)
-            dense = voxels.reshape(((CHUNK + 2) * BRICK,) * 3)
-            boxes.append(dense[(slice(BRICK - MARGIN, BRICK - MARGIN + side),) * 3])
-        yield chunk * CHUNK_VOXELS, boxes[0][(slice(MARGIN, -MARGIN),) * 3], *_blended(*boxes)
+        weight, distance = field.box(chunk * CHUNK_VOXELS - MARGIN, side)
+        if weight.any():
+            own = weight[(slice(MARGIN, -MARGIN),) * 3]
+            yield chunk * CHUNK_VOXELS, own, *_blended(weight, distance)
 
 
 def _blended(

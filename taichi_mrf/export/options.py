@@ -25,15 +25,17 @@ class ExportOptions:
 
     surface: Literal["auto", "rays", "marginal"] = "auto"
     """What a mesh shows: rays is the surface that the keyframes' rays measured, below the size of voxels, and
-    marginal where the marginal is the threshold. auto is rays for a map that has keyframes, none frozen."""
+    marginal where the marginal is the threshold. auto is rays for a map that has keyframes, none frozen, and
+    for a .zarr that holds it. rays also puts it into a .zarr, as auto does after --keep-surface."""
 
     cells: bool = True
     """Where no voxel is likely enough but a cell of 2, 4 or 8 voxels is, show the cell: in a .ply as a point
     with the property size, in cubes and .html as all its voxels, in .bt and .ot as a larger leaf."""
 
     color_by: Literal["auto", "marginal", "photo"] = "auto"
-    """What colours of .ply, .glb, .obj, .ot and .html show: the marginals, or what cameras saw (photo), if
-    the map was made with colour images; auto is photo for such a map. An .ot has no colours of marginals."""
+    """What colours of .ply, .glb, .obj, .ot, .html and .zarr show: the marginals, or what cameras saw
+    (photo), if the map was made with colour images; auto is photo for such a map. .ot and .zarr have no
+    colours of marginals."""
 
     z_min: float | None = None
     """Lower end in metres of the band of heights that a .pgm shows; heights count along up."""

@@ -20,6 +20,10 @@ from taichi_mrf.voxels.layout import CHUNK_VOXELS
 FORMAT = 1
 FORMAT_KEY = "taichi_mrf_map"
 LOG_ODDS, CHUNKS = "log_odds", "chunks"
+COLORS, SURFACE = "colors", "surface"
+
+EXTRAS = {COLORS: ("uint8", 4), SURFACE: ("float32", 2)}
+"""What a store may hold of each voxel beside its log-odds, 0 for nothing: the type and number of values."""
 
 _MOST_BYTES = 1_000_000
 _LARGEST_VOXEL_M = 1000.0
@@ -66,13 +70,14 @@ class StoreHeader:
 @dataclass(frozen=True)
 class StoreLayout:
     """The header, the first of the chunks that there is room for, (3,), how many there are along each axis,
-    how many of them are listed, and how many together in one file of the list."""
+    how many of them are listed, how many together in one file of the list, and the ``extras`` there are."""
 
     header: StoreHeader
     lowest_chunk: tuple[int, int, int]
     chunks_across: tuple[int, int, int]
     listed: int
     listed_together: int
+    extras: tuple[str, ...] = ()
 
 
 def read_layout(folder: Path) -> StoreLayout:
@@ -92,7 +97,12 @@ def read_layout(folder: Path) -> StoreLayout:
     (listed, three), together = _array(folder, CHUNKS, "int32", 0, 2)
     if (three, together[1]) != (3, 3) or listed > math.prod(across):
         raise _damaged(folder, f"{CHUNKS} has the shape ({listed}, {three})")
-    return StoreLayout(header, lowest, across, listed, together[0])
+    extras = tuple(name for name in EXTRAS if exists(folder / name))
+    for name in extras:
+        data_type, values = EXTRAS[name]
+        if _array(folder, name, data_type, 0, 4) != ((*shape, values), (*chunk_shape, values)):
+            raise _damaged(folder, f"{name} is not made of the chunks of {LOG_ODDS}")
+    return StoreLayout(header, lowest, across, listed, together[0], extras)
 
 
 def check_packed(path: Path, size: int) -> None:

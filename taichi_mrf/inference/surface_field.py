@@ -46,7 +46,7 @@ class SurfaceRays:
     def field(self, keyframes: Sequence[tuple[Keyframe, VisibleBricks]]) -> DistanceField:
         """The field of some keyframes, each with the bricks of the map that it sees now. Raises
         CapacityError if there is not enough memory."""
-        bands = [self._bricks_in_band(keyframe) for keyframe, _ in keyframes]
+        bands = [self.bricks_in_band(keyframe) for keyframe, _ in keyframes]
         bricks = np.concatenate([np.zeros((0, 3), np.int32), *(w.bricks_of(cells) for w, cells in bands)])
         # In the order of chunks, so that those that are summed up together lie together.
         _, first = np.unique(grid_keys(bricks), return_index=True)
@@ -78,7 +78,7 @@ class SurfaceRays:
             runtime.settle()
         return trust
 
-    def _bricks_in_band(self, keyframe: Keyframe) -> tuple[Window, NDArray[np.int32]]:
+    def bricks_in_band(self, keyframe: Keyframe) -> tuple[Window, NDArray[np.int32]]:
         """The window around the bands of a keyframe's rays, and its cells in them."""
         image, T = keyframe.image, keyframe.T_world_camera
         beyond_m = 2.0 * self.band.voxels * self.model.voxel_size

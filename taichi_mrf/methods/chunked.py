@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import ConfigError, MapFileError, said
 from taichi_mrf.export.chunk_store import CHUNK_BYTES, Chunk, ChunkStore
+from taichi_mrf.export.store_header import COLORS, SURFACE
 from taichi_mrf.geometry.up import Up, up_from_name
 from taichi_mrf.methods.map_file import check_registered
 from taichi_mrf.queries.box import BoxOfVoxels, voxels_of_box
@@ -44,6 +46,11 @@ def _config_of(store: ChunkStore) -> Config:
     return config
 
 
+def _voxels_of(points: ArrayLike, voxel_size: float) -> NDArray[np.int64]:
+    """The voxels that hold points (N, 3) in metres. Raises ConfigError."""
+    return np.clip(np.floor(checked_points(points) / voxel_size), -(2**30), 2**30).astype(np.int64)
+
+
 class ChunkedMap:
     """Answers queries from a :class:`ChunkStore` on disk. It caches the chunks used last, up to ``cache_mb``
     MB (10^6 bytes); beyond that, memory grows only with the answers."""
@@ -60,6 +67,7 @@ class ChunkedMap:
         self._most = int(cache_mb * 1e6) // CHUNK_BYTES
         self._known = set(map(tuple, self.chunks.tolist()))
         self._cache: OrderedDict[Chunk, NDArray[np.float32]] = OrderedDict()
+        self._colors = lru_cache(self._most)(lambda chunk: store.read_extra(COLORS, chunk))
 
     @classmethod
     def open(cls, path: str | Path, cache_mb: float = 256.0) -> "ChunkedMap":
@@ -70,6 +78,16 @@ class ChunkedMap:
     def up(self) -> Up | None:
         """The world axis that is up, None if the store does not hold it."""
         return up_from_name(self.header.up) if self.header.up else None
+
+    @property
+    def has_colors(self) -> bool:
+        """Whether the store holds the colours that cameras saw."""
+        return COLORS in self.store.extras
+
+    @property
+    def has_surface(self) -> bool:
+        """Whether the store holds what keyframes measured of the surface."""
+        return SURFACE in self.store.extras
 
     @property
     def extent(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -84,14 +102,20 @@ class ChunkedMap:
 
         Raises ConfigError for points of another shape or that are not finite.
         """
-        voxels = np.clip(np.floor(checked_points(points) / self.voxel_size), -(2**30), 2**30).astype(np.int64)
+        voxels = _voxels_of(points, self.voxel_size)
         out = np.full(len(voxels), self.header.prior_log_odds, np.float32)
-        chunks, owner = np.unique(voxels // CHUNK_VOXELS, axis=0, return_inverse=True)
-        for number, (x, y, z) in enumerate(chunks.tolist()):
-            if (x, y, z) in self._known:
-                rows = np.flatnonzero(owner.reshape(-1) == number)
-                found = self._block((x, y, z))[tuple((voxels[rows] % CHUNK_VOXELS).T)]
-                out[rows] = np.where(np.isnan(found), self.header.prior_log_odds, found)
+        for chunk, rows in self._by_chunk(voxels):
+            found = self._block(chunk)[tuple((voxels[rows] % CHUNK_VOXELS).T)]
+            out[rows] = np.where(np.isnan(found), self.header.prior_log_odds, found)
+        return out
+
+    def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
+        """Colours of the voxels that hold points (N, 3) in metres, (N, 4) uint8: red, green, blue, and how
+        much was seen; 0 for none. Raises ConfigError for points of another shape or that are not finite."""
+        voxels = _voxels_of(points, self.voxel_size)
+        out = np.zeros((len(voxels), 4), np.uint8)
+        for chunk, rows in self._by_chunk(voxels) if self.has_colors else ():
+            out[rows] = self._colors(chunk)[tuple((voxels[rows] % CHUNK_VOXELS).T)]
         return out
 
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
@@ -155,6 +179,13 @@ class ChunkedMap:
 
     def _state(self, log_odds: NDArray[np.float32]) -> NDArray[np.int8]:
         return classify(log_odds, self.header.prior_log_odds, self.header.min_evidence)
+
+    def _by_chunk(self, voxels: NDArray[np.int64]) -> Iterator[tuple[Chunk, NDArray[np.int64]]]:
+        """The known chunks that hold some of the voxels (n, 3), each with the rows of these."""
+        chunks, owner = np.unique(voxels // CHUNK_VOXELS, axis=0, return_inverse=True)
+        for number, (x, y, z) in enumerate(chunks.tolist()):
+            if (x, y, z) in self._known:
+                yield (x, y, z), np.flatnonzero(owner.reshape(-1) == number)
 
     def _chunks_between(self, first: NDArray[np.int64], after: NDArray[np.int64]) -> list[Chunk]:
         inside = (self.chunks >= first // CHUNK_VOXELS) & (self.chunks <= (after - 1) // CHUNK_VOXELS)

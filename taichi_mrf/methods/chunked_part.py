@@ -8,13 +8,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.export.fused_surface import FusedSurface
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.methods.capabilities import window_of
 from taichi_mrf.methods.chunked import ChunkedMap
+from taichi_mrf.methods.chunked_surface import StoredDistances, stored_surface
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.queries.box import voxels_of_box
-from taichi_mrf.queries.known_bricks import Placed
+from taichi_mrf.queries.known_bricks import BRICKS_AT_ONCE, Placed
 from taichi_mrf.queries.points import checked_points
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.camera import Camera, check_camera
@@ -70,6 +72,44 @@ class MapPart:
         """All observed voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
         brick_m = BRICK * self.voxel_size
         return self.source.voxels(self.lowest * brick_m, self.after * brick_m, min_probability)
+
+    @property
+    def has_colors(self) -> bool:
+        """Whether the map holds the colours that cameras saw."""
+        return self.source.has_colors
+
+    def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
+        """Colours of the voxels that hold points (N, 3) in metres, (N, 4), as of ChunkedMap, outside of the
+        box too: the colours of a mesh at its border are blended with those beyond."""
+        return self.source.colors(points)
+
+    def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """The same for the voxels of some bricks of ``view.pool``, (n,) slots -> (n, 512, 4); none where a
+        slot is -1."""
+        out = np.zeros((len(slots), VOXELS, 4), np.uint8)
+        here = np.flatnonzero(slots >= 0)
+        voxels = np.indices((BRICK,) * 3).reshape(3, -1).T + 0.5
+        for begin in range(0, len(here), BRICKS_AT_ONCE):
+            rows = here[begin : begin + BRICKS_AT_ONCE]
+            corners = self.view.pool.bricks[slots[rows]].astype(np.float64) * BRICK
+            points_m = (corners[:, None] + voxels).reshape(-1, 3) * self.voxel_size
+            out[rows] = self.source.colors(points_m).reshape(-1, VOXELS, 4)
+        return out
+
+    @property
+    def has_surface(self) -> bool:
+        """Whether the map holds what keyframes measured of the surface."""
+        return self.source.has_surface
+
+    def surface(self) -> FusedSurface:
+        """The surface that the keyframes measured, as MRFMap.surface: that of the cells whose first voxel is
+        in the box, so that the surfaces of adjoining parts meet. Raises ConfigError if the map holds none."""
+        corners = self.lowest * BRICK, self.after * BRICK
+        return stored_surface(self.source, *corners, self if self.has_colors else None)
+
+    def surface_field(self) -> StoredDistances:
+        """The signed distances in the box."""
+        return StoredDistances(self.source, self.lowest * BRICK, self.after * BRICK)
 
     def _inside(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         bricks = np.floor(points_m / (self.voxel_size * BRICK))

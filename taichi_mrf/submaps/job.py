@@ -30,9 +30,9 @@ class Sequence:
     every: int = 1
     limit: int | None = None
 
-    def open(self) -> Dataset:
-        """The recording. Raises DatasetError."""
-        return open_dataset(self.source, color=False, **self.reading)
+    def open(self, color: bool = False) -> Dataset:
+        """The recording, with its colour images or without. Raises DatasetError."""
+        return open_dataset(self.source, color=color, **self.reading)
 
 
 @dataclass(frozen=True)

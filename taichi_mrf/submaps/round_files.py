@@ -13,6 +13,7 @@ from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.system.atomic import write_npz
 from taichi_mrf.system.npz_file import NpzFile, open_npz
+from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.layout import VOXELS
 
 Bricks = NDArray[np.int32]
@@ -24,7 +25,8 @@ Halo = tuple[Bricks, LogOdds]
 @dataclass(frozen=True)
 class SubmapReport:
     """How a task went. ``core_bricks`` belong to the submap; ``free_bricks`` do too, but have no voxels;
-    ``halo_bricks`` are those of other submaps whose evidence it was given. ``moved`` is the share of the
+    ``halo_bricks`` are those of other submaps whose evidence it was given; ``surface_bricks`` are those that
+    it owns in which keyframes have a say in the surface, if that is wanted. ``moved`` is the share of the
     core's voxels whose probability has changed by more than 0.01 since the round before, and ``halo_moved``
     the same for the evidence sent to others; None in the first round."""
 
@@ -41,18 +43,27 @@ class SubmapReport:
     peak_memory_mb: float | None
     moved: float | None = None
     halo_moved: float | None = None
+    surface_bricks: int = 0
+
+    @property
+    def has_nothing(self) -> bool:
+        """Whether rays only pass through: there is nothing to infer."""
+        return not self.core_bricks and not self.surface_bricks
 
 
 @dataclass(frozen=True)
 class RoundResult:
     """The result of a submap: the beliefs in the bricks that it owns, the bricks that it owns in which rays
-    met no surface, and the evidence for each neighbour."""
+    met no surface, and the evidence for each neighbour; if they are wanted, the ``colors`` (n, 512, 4) of the
+    former, and the ``surface`` in whatever of its space keyframes measured it."""
 
     bricks: Bricks
     belief: LogOdds
     free_bricks: Bricks
     halos: Mapping[int, Halo]
     report: SubmapReport
+    colors: NDArray[np.uint8] | None = None
+    surface: DistanceField | None = None
 
 
 def round_path(folder: Path, round: int, submap: int) -> Path:
@@ -68,6 +79,12 @@ def write_round(path: Path, result: RoundResult) -> None:
         "free_bricks": result.free_bricks,
         "report": np.asarray(json.dumps(asdict(result.report))),
     }
+    if result.colors is not None:
+        arrays["colors"] = result.colors
+    if result.surface is not None:
+        arrays["surface_bricks"] = result.surface.bricks
+        arrays["surface_weight"] = result.surface.weight
+        arrays["surface_distance"] = result.surface.distance
     for other, (bricks, evidence) in result.halos.items():
         arrays[f"halo_{other}_bricks"], arrays[f"halo_{other}_evidence"] = bricks, evidence
     try:
@@ -110,10 +127,27 @@ def read_halo(path: Path, listener: int) -> Halo | None:
         return _halo(file, f"halo_{listener}_bricks", f"halo_{listener}_evidence")
 
 
-def read_places(path: Path) -> tuple[Bricks, Bricks]:
-    """Only where the core is: its bricks, and those without voxels."""
+def read_places(path: Path) -> list[Bricks]:
+    """Only where the core is: its bricks, those without voxels, and those in which the surface was measured,
+    if that is wanted."""
     with _opened(path) as file:
-        return _bricks(file, "bricks"), _bricks(file, "free_bricks")
+        names = ("bricks", "free_bricks", "surface_bricks")
+        return [_bricks(file, name) for name in names if name in file]
+
+
+def read_colors(path: Path) -> NDArray[np.uint8] | None:
+    """The colours of the core's bricks, (n, 512, 4); None if they were not made."""
+    with _opened(path) as file:
+        return file.array("colors", "u", (None, VOXELS, 4)).astype(np.uint8) if "colors" in file else None
+
+
+def read_surface(path: Path) -> DistanceField | None:
+    """The signed distances in the core; None if they were not made."""
+    with _opened(path) as file:
+        if "surface_bricks" not in file:
+            return None
+        bricks, weight = _halo(file, "surface_bricks", "surface_weight")
+        return DistanceField(bricks, weight, file.array("surface_distance", "f", weight.shape))
 
 
 def read_core(path: Path) -> tuple[Bricks, LogOdds, Bricks]:

@@ -15,13 +15,22 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.errors import ConfigError, MapFileError
-from taichi_mrf.export.chunk_blocks import chunk_block
-from taichi_mrf.export.chunk_store import ChunkStore, StoreHeader, new_store
+from taichi_mrf.export.chunk_blocks import chunk_block, extra_block
+from taichi_mrf.export.chunk_store import ChunkStore, new_store
+from taichi_mrf.export.store_header import COLORS, SURFACE, StoreHeader
 from taichi_mrf.geometry.up import up_from_name, up_name
 from taichi_mrf.inference.prior import log_odds_without_bricks
 from taichi_mrf.submaps.job import PLAN_FILE, Job, Sequence
 from taichi_mrf.submaps.plan import plan_submaps
-from taichi_mrf.submaps.round_files import SubmapReport, read_core, read_places, round_path
+from taichi_mrf.submaps.round_files import (
+    SubmapReport,
+    read_colors,
+    read_core,
+    read_places,
+    read_report,
+    read_surface,
+    round_path,
+)
 from taichi_mrf.submaps.survey import find_keyframes
 from taichi_mrf.submaps.task import SubmapTask, infer_submap, is_idle
 from taichi_mrf.system.atomic import write_text
@@ -85,7 +94,7 @@ def map_in_submaps(
     )
     result.seconds["planning"] = time.perf_counter() - begin
     for round in range(rounds + 1):
-        report = _round(result.job, folder, round, runner, infer, progress)
+        report = _round(result.job, folder, round, round > 0 or rounds == 0, runner, infer, progress)
         result.rounds.append(report)
         # A round needs no more than the one before it.
         shutil.rmtree(folder / f"round-{round - 2:03d}", ignore_errors=True)
@@ -109,8 +118,6 @@ def _check(config: Config, rounds: int) -> None:
         raise ConfigError(f"submaps need the method {methods_with('has_messages')}, not {config.method}")
     if config.poses.refine:
         raise ConfigError("poses.refine does not go with submaps: no task sees all keyframes")
-    if config.color:
-        raise ConfigError("color does not go with submaps: a map in chunks has no colours")
     if config.volume.window_m > 0:
         raise ConfigError("volume.window_m does not go with submaps: each task holds its part as a whole")
     if not config.time.is_static:
@@ -174,6 +181,7 @@ def _round(
     job: Job,
     folder: Path,
     round: int,
+    may_be_last: bool,
     runner: TaskRunner,
     infer: Callable[[SubmapTask], SubmapReport],
     progress: Progress,
@@ -193,7 +201,7 @@ def _round(
         done.append(number)
         progress(what, len(done), len(order))
 
-    tasks = [SubmapTask(str(folder.resolve()), number, round) for number in order]
+    tasks = [SubmapTask(str(folder.resolve()), number, round, may_be_last) for number in order]
     idle = {task for task in tasks if is_idle(task)}
     reports = [infer_submap(task) for task in tasks if task in idle]
     for number, report in enumerate(reports):
@@ -234,11 +242,34 @@ def _merge(folder: Path, job: Job, round: int, path: Path) -> None:
     header = StoreHeader.of(config, *log_odds, config.volume.min_evidence, up)
     chunks = [np.unique(np.concatenate(read_places(file)) // CHUNK, axis=0) for file in files]
     with new_store(path) as place:
-        store = ChunkStore.create(place, header, np.unique(np.concatenate(chunks), axis=0))
+        extras = [name for name, kept in ((COLORS, config.color), (SURFACE, config.keep_surface)) if kept]
+        store = ChunkStore.create(place, header, np.unique(np.concatenate(chunks), axis=0), extras=extras)
         for file in files:
+            _merge_extras(store, file)
             bricks, belief, free = read_core(file)
             empty = np.full((len(free), VOXELS), header.seen_free_log_odds, np.float32)
             bricks, belief = np.concatenate([bricks, free]), np.concatenate([belief, empty])
             for chunk, rows in by_chunk(bricks):
                 block = chunk_block(chunk, bricks[rows], belief[rows], header.prior_log_odds)
                 store.write(chunk, block)
+
+
+def _merge_extras(store: ChunkStore, file: Path) -> None:
+    """Write the colours and the surface of a submap's core. Raises MapFileError if its file has none."""
+    bricks, report = read_places(file)[0], read_report(file)
+    if report.has_nothing:
+        return
+    colors, surface = read_colors(file), read_surface(file)
+    for name, found in ((COLORS, colors), (SURFACE, surface)):
+        if name in store.extras and found is None:
+            raise MapFileError(
+                f"{file}: holds no {name}: its round was not meant to be the last; --resume "
+                "with more --rounds makes them"
+            )
+    if colors is not None:
+        for chunk, rows in by_chunk(bricks):
+            store.write_extra(COLORS, chunk, extra_block(chunk, bricks[rows], colors[rows]))
+    if surface is not None:
+        sums = np.stack([surface.weight, surface.distance], axis=-1)
+        for chunk, rows in by_chunk(surface.bricks):
+            store.write_extra(SURFACE, chunk, extra_block(chunk, surface.bricks[rows], sums[rows]))

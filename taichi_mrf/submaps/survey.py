@@ -65,7 +65,10 @@ def survey_frames(task: SurveyTask) -> list[SurveyedFrame]:
         measured = bool((frame.depth_m > 0).any())
         if measured:
             id = m.add_keyframe(frame.depth_m, T_world_camera, frame.camera, name, frame.stamp)
-            chunks = np.unique(m.all_crossed_bricks() // CHUNK, axis=0)
+            bricks = m.all_crossed_bricks()
+            if config.keep_surface:
+                bricks = np.concatenate([bricks, m.measured_bricks()])
+            chunks = np.unique(bricks // CHUNK, axis=0)
             m.remove_keyframe(id)
         found.append(SurveyedFrame(index, name, T_world_camera, chunks, measured))
     return found

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.mapping.settling import FullInference
@@ -30,6 +31,7 @@ from taichi_mrf.submaps.round_files import (
 )
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import peak_memory_mb, reset_peak_memory
+from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.layout import grid_keys
 
 MOVED = 0.01
@@ -38,11 +40,13 @@ MOVED = 0.01
 
 @dataclass(frozen=True)
 class SubmapTask:
-    """Infer a submap of the plan in ``folder`` in a round, 0 being the one before any exchange."""
+    """Infer a submap of the plan in ``folder`` in a round, 0 being the one before any exchange. In a round
+    that ``may_be_last`` colours and surface are made too, if the parameters ask for them."""
 
     folder: str
     submap: int
     round: int
+    may_be_last: bool = True
 
     def __str__(self) -> str:
         return f"submap {self.submap} in round {self.round}"
@@ -83,7 +87,7 @@ def is_idle(task: SubmapTask) -> bool:
     """Whether the result is that of the round before: rays only pass through this column, and they are the
     same in every round."""
     before = round_path(Path(task.folder), task.round - 1, task.submap)
-    return task.round > 0 and not read_report(before).core_bricks
+    return task.round > 0 and read_report(before).has_nothing
 
 
 def _inferred(task: SubmapTask, job: Job, on_step: Callable[[InferProgress], None]) -> RoundResult:
@@ -95,9 +99,12 @@ def _inferred(task: SubmapTask, job: Job, on_step: Callable[[InferProgress], Non
     core = _core(job, task.submap, m.bricks())
     crossed = _core(job, task.submap, m.all_crossed_bricks())
     free = crossed[~np.isin(grid_keys(crossed), grid_keys(core))]
+    measured = 0
+    if job.config.keep_surface:
+        measured = len(_core(job, task.submap, m.measured_bricks()))
     heard, inferring = 0, 0.0
     halos: dict[int, Halo] = {}
-    if len(core):
+    if len(core) or measured:
         neighbours = job.plan.neighbours(task.submap)
         heard = _listen(m, task, neighbours)
         with FullInference(m) as inference:
@@ -106,6 +113,7 @@ def _inferred(task: SubmapTask, job: Job, on_step: Callable[[InferProgress], Non
         assert inference.outcome is not None
         inferring = inference.outcome.seconds
         halos = _spoken(m, job, task.submap, {n: [id_of[i] for i in c] for n, c in neighbours.items()})
+    seen = _seen(m, job, task, core)
     belief, size = m.beliefs(core), m.statistics()
     report = SubmapReport(
         submap=task.submap,
@@ -119,8 +127,23 @@ def _inferred(task: SubmapTask, job: Job, on_step: Callable[[InferProgress], Non
         inferring_seconds=round(inferring, 3),
         map_mb=round(size.memory_mb, 3),
         peak_memory_mb=peak_memory_mb(),
+        surface_bricks=measured,
     )
-    return RoundResult(core, belief, free, halos, report)
+    return RoundResult(core, belief, free, halos, report, *seen)
+
+
+def _seen(
+    m: PartialMap, job: Job, task: SubmapTask, core: Bricks
+) -> tuple[NDArray[np.uint8] | None, DistanceField | None]:
+    """The colours of the core's bricks and the surface in the core; None for what is not wanted."""
+    colors, surface = None, None
+    if job.config.color and task.may_be_last:
+        colors = m.colors_in(m.slots(core))
+    if job.config.keep_surface and task.may_be_last:
+        field = m.surface_field()
+        rows = job.plan.is_core(task.submap, field.bricks) & field.weight.any(axis=1)
+        surface = DistanceField(field.bricks[rows], field.weight[rows], field.distance[rows])
+    return colors, surface
 
 
 def _core(job: Job, submap: int, bricks: Bricks) -> Bricks:
@@ -129,13 +152,13 @@ def _core(job: Job, submap: int, bricks: Bricks) -> Bricks:
 
 def _with_keyframes(job: Job, submap: int) -> tuple[PartialMap, dict[int, int]]:
     """The submap's map, not yet inferred, and each keyframe's id in it by its index in the dataset."""
-    dataset = job.sequence.open()
+    dataset = job.sequence.open(job.config.color)
     m = PartialMap.from_config(job.config, dataset.camera)
     id_of = {}
     for index in job.plan.submaps[submap].keyframes:
         frame = dataset.read(index)
         parts = (frame.depth_m, frame.T_world_camera, frame.camera, frame.name, frame.stamp)
-        id_of[index] = m.add_keyframe(*parts)
+        id_of[index] = m.add_keyframe(*parts, color=frame.color)
     return m, id_of
 
 

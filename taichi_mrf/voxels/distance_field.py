@@ -1,9 +1,29 @@
 """Signed distances from a surface for the voxels of some bricks, as sums over measurements."""
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, grid_keys
+
+Sums = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""Weights, and distances times weight."""
+
+
+class DistanceSource(Protocol):
+    """Where signed distances are read from, a box at a time: memory, or a map in chunks."""
+
+    @property
+    def chunks(self) -> NDArray[np.int32]:
+        """The chunks (n, 3) that hold distances."""
+        ...
+
+    def box(self, first: NDArray[np.int64], side: int) -> Sums:
+        """The sums, (side, side, side) each, of the voxels from ``first`` (3,) on; 0 where there are none."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -15,3 +35,30 @@ class DistanceField:
     bricks: NDArray[np.int32]
     weight: NDArray[np.float32]
     distance: NDArray[np.float32]
+
+    @property
+    def chunks(self) -> NDArray[np.int32]:
+        """The chunks (n, 3) that hold distances."""
+        chunks = self.bricks // CHUNK
+        return chunks[np.unique(grid_keys(chunks), return_index=True)[1]]
+
+    def box(self, first: NDArray[np.int64], side: int) -> Sums:
+        """The sums, (side, side, side) each, of the voxels from ``first`` (3,) on; 0 where there are none."""
+        lowest = first // BRICK
+        shape = (first + side - 1) // BRICK - lowest + 1
+        bricks = np.indices(tuple(shape.tolist())).reshape(3, -1).T + lowest
+        wanted = grid_keys(bricks)
+        rows = np.minimum(np.searchsorted(self._keys, wanted), len(self._keys) - 1)
+        here = np.flatnonzero(self._keys[rows] == wanted) if len(self._keys) else np.zeros(0, np.int64)
+        cut = tuple(slice(a, a + side) for a in (first - lowest * BRICK).tolist())
+        boxes = []
+        for sums in (self.weight, self.distance):
+            box = np.zeros((len(bricks), VOXELS), np.float32)
+            box[here] = sums[rows[here]]
+            dense = box.reshape(*shape, *(BRICK,) * 3).transpose(0, 3, 1, 4, 2, 5)
+            boxes.append(np.ascontiguousarray(dense.reshape(shape * BRICK)[cut]))
+        return boxes[0], boxes[1]
+
+    @cached_property
+    def _keys(self) -> NDArray[np.int64]:
+        return grid_keys(self.bricks)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial import KDTree
 from small_room import VOXEL_SIZE, add, frames
 
 from taichi_mrf.cluster.local import LocalProcesses
@@ -24,8 +25,10 @@ from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError, DatasetError, MapFileError
 from taichi_mrf.experiments.submaps.costs import MeasuredCost, Place, need
 from taichi_mrf.experiments.submaps.equality import KilledOnce, compare, infer_or_be_killed
+from taichi_mrf.export.fused_surface import FusedSurface
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.chunked import ChunkedMap
+from taichi_mrf.methods.chunked_part import take_part
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.submaps.job import Job, Sequence
 from taichi_mrf.submaps.partial_map import PartialMap
@@ -39,8 +42,8 @@ zarr = pytest.importorskip("zarr", reason="maps in chunks need the extra store")
 
 SOURCE = "synthetic:corridor?rooms=2&frames=24&width=80&height=60"
 SEQUENCE = Sequence(SOURCE, SourceFlags().keywords())
-CONFIG = Config(0.1, evaluation=EvaluationConfig(hold_out=0))
-SUBMAP_M = 12.8
+CONFIG = Config(0.1, evaluation=EvaluationConfig(hold_out=0), color=True, keep_surface=True)
+VOXEL_M, SUBMAP_M = 0.1, 12.8
 
 chunk = st.tuples(*[st.integers(-9, 9)] * 3)
 seen = st.lists(st.sets(chunk, min_size=1, max_size=6), min_size=1, max_size=8)
@@ -117,7 +120,7 @@ def test_what_is_told_leaves_out_what_the_listener_knows(one_backend: str) -> No
 
 @cache
 def single_map() -> MRFMap:
-    m = map_sequence(SEQUENCE.open(), CONFIG).map
+    m = map_sequence(SEQUENCE.open(color=True), CONFIG).map
     assert isinstance(m, MRFMap)
     return m
 
@@ -153,6 +156,34 @@ def test_the_merged_map_is_that_of_a_single_machine(exchanged: Path) -> None:
     assert second.same_state >= 0.995
     assert second.within > first.within or first.largest > second.largest  # what is exchanged matters
     assert second.largest < first.largest
+
+
+def test_colours_and_surface_are_those_of_a_single_machine(exchanged: Path) -> None:
+    pytest.importorskip("skimage")
+    part, m = take_part(ChunkedMap.open(exchanged / "map.zarr")), single_map()
+    centres = m.voxels(0.5)[0]
+    ours, theirs = part.colors(centres).astype(int), m.colors(centres).astype(int)
+    seen = theirs[:, 3] > 0
+    assert seen.mean() > 0.8
+    assert (np.abs(ours - theirs)[seen].max(axis=1) <= 3).mean() > 0.99
+    surface, whole = part.surface(), m.surface()
+    distance_m, nearest = KDTree(whole.vertices_m).query(surface.vertices_m)
+    assert abs(len(surface.vertices_m) - len(whole.vertices_m)) < 0.005 * len(whole.vertices_m)
+    assert (distance_m < 0.01 * VOXEL_M).mean() > 0.99
+    np.testing.assert_allclose(surface.std_m, whole.std_m[nearest], rtol=0.05, atol=0.1 * VOXEL_M)
+    # The surface goes on across the borders of columns: no more open edges are there than in the single map.
+    assert abs(_open_edges_at_borders(surface) - _open_edges_at_borders(whole)) <= 4
+    vertices = {tuple(v) for v in surface.vertices_m}
+    assert len(vertices) == len(surface.vertices_m)
+
+
+def _open_edges_at_borders(surface: FusedSurface) -> int:
+    """Edges with a triangle on one side only within two voxels of a border between columns."""
+    edges = np.sort(surface.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    alone, count = np.unique(edges, axis=0, return_counts=True)
+    middle = surface.vertices_m[alone[count == 1]].mean(axis=1)[:, :2]
+    offset = np.abs(middle - np.rint(middle / SUBMAP_M) * SUBMAP_M)
+    return int((offset < 2 * VOXEL_M).any(axis=1).sum())
 
 
 def test_nothing_is_done_twice(exchanged: Path) -> None:
@@ -284,7 +315,8 @@ def test_a_killed_worker_changes_nothing(exchanged: Path, tmp_path: Path) -> Non
 def test_the_command(exchanged: Path, tmp_path: Path) -> None:
     """On what is there already: the command resumes, merges, draws and reports."""
     shutil.copytree(exchanged / "submaps", tmp_path / "submaps")
-    flags = ["--voxel-size", "0.1", "--evaluation.hold-out", "0", "--submap-size", "12.8", "--rounds", "1"]
+    flags = ["--voxel-size", "0.1", "--evaluation.hold-out", "0", "--color", "--keep-surface"]
+    flags += ["--submap-size", "12.8", "--rounds", "1"]
     command = [
         sys.executable,
         "-m",

@@ -3,6 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.fused_surface import FusedSurface, fused_surface, without_free
 from taichi_mrf.inference.keyframe import Keyframe
@@ -25,12 +28,23 @@ class WithSurface(BrickMap):
 
     prior: float
     _keyframes: dict[int, Keyframe]
+    _frozen: dict[int, str]
     _sweeper: Sweeper
 
     @property
     def keyframes(self) -> Mapping[int, Keyframe]:
         """The keyframes that can still be moved and removed, by id."""
         raise NotImplementedError
+
+    @property
+    def has_surface(self) -> bool:
+        """Whether there is a surface of all keyframes that the map was made of: none is frozen."""
+        return bool(self._keyframes) and not self._frozen
+
+    def surface_field(self) -> DistanceField:
+        """The signed distances that the keyframes measured, as of the last :meth:`infer`. Raises
+        CapacityError if there is not enough memory."""
+        return surface_field_of(self)
 
     def surface(self) -> FusedSurface:
         """The surface that the keyframes measured, by marching cubes through the mean of their signed
@@ -47,6 +61,13 @@ class WithSurface(BrickMap):
         found = without_free(self, found, LEAST * self.prior)
         colors = blended_colors(self, found.vertices_m) if is_colored(self) else None
         return replace(found, colors=colors)
+
+
+def surface_bricks_of(m: WithSurface) -> NDArray[np.int32]:
+    """The bricks (n, 3) in which a map's keyframes have a say in the surface, some of them several times."""
+    rays = SurfaceRays(m._pool, m._sweeper.model(), m.config.volume)
+    found = [window.bricks_of(cells) for window, cells in map(rays.bricks_in_band, m._keyframes.values())]
+    return np.concatenate([np.zeros((0, 3), np.int32), *found])
 
 
 def surface_field_of(m: WithSurface) -> DistanceField:

@@ -1,0 +1,111 @@
+"""Colours and the measured surface of maps in chunks: those of the map that they were made from, in one piece
+or part by part."""
+
+from pathlib import Path
+
+import colored_scene as scene
+import numpy as np
+import pytest
+import trimesh
+from queried_maps import room_map
+
+from taichi_mrf.errors import ConfigError, MapFileError
+from taichi_mrf.export.formats import export_map, export_note
+from taichi_mrf.export.options import ExportOptions
+from taichi_mrf.methods.chunked import ChunkedMap
+from taichi_mrf.methods.chunked_part import take_part
+from taichi_mrf.methods.mrf.map import MRFMap
+
+pytest.importorskip("zarr", reason="maps in chunks need the extra store")
+pytest.importorskip("skimage")
+pytestmark = pytest.mark.usefixtures("one_backend")
+
+RAYS = ExportOptions(surface="rays", mesh=True)
+
+
+@pytest.fixture(scope="module")
+def m(one_backend: str) -> MRFMap:
+    """The scene, which lies around the corner of several chunks: they end at 0 and at 3.2 m."""
+    return scene.build([0, 1, 2, 3])
+
+
+@pytest.fixture(scope="module")
+def store(m: MRFMap, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("store") / "map.zarr"
+    export_map(m, path, RAYS)
+    return path
+
+
+def test_surface_and_colours_come_back_exactly(m: MRFMap, store: Path, tmp_path: Path) -> None:
+    part = take_part(ChunkedMap.open(store, cache_mb=2))
+    ours, theirs = part.surface(), m.surface()
+    assert len(theirs.triangles) > 500
+    for name in ("vertices_m", "triangles", "normals", "std_m", "colors"):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+    np.testing.assert_array_equal(part.colors(scene.probes()), m.colors(scene.probes()))
+    export_map(part, tmp_path / "again.zarr", RAYS)
+    again = take_part(ChunkedMap.open(tmp_path / "again.zarr")).surface()
+    np.testing.assert_array_equal(again.vertices_m, theirs.vertices_m)
+    for name in ("mesh.glb", "mesh.ply", "map.ot"):
+        export_map(part, tmp_path / name, ExportOptions(mesh=name == "mesh.ply"))
+        export_map(m, tmp_path / f"of_{name}", ExportOptions(mesh=name == "mesh.ply"))
+        assert (tmp_path / name).read_bytes() == (tmp_path / f"of_{name}").read_bytes()
+
+
+def test_surfaces_of_parts_meet_without_seams(m: MRFMap, store: Path) -> None:
+    chunked = ChunkedMap.open(store)
+    low, high = chunked.extent
+    cut = 0.4  # metres, a border of bricks; the chunks' own border is at 0
+    halves = [
+        take_part(chunked, low, (cut - 0.01, *high[1:])),
+        take_part(chunked, (cut + 0.01, *low[1:]), high),
+    ]
+    whole = m.surface()
+    surfaces = [half.surface() for half in halves]
+    assert sum(len(each.triangles) for each in surfaces) == len(whole.triangles)
+    count = len(surfaces[0].vertices_m)
+    vertices = np.concatenate([each.vertices_m for each in surfaces])
+    common = {tuple(v) for v in surfaces[0].vertices_m} & {tuple(v) for v in surfaces[1].vertices_m}
+    assert len(common) > 20
+    assert len({tuple(v) for v in vertices}) == len(whole.vertices_m)
+    joined = trimesh.Trimesh(vertices, np.concatenate([surfaces[0].triangles, surfaces[1].triangles + count]))
+    joined.merge_vertices(digits_vertex=12)
+    single = trimesh.Trimesh(whole.vertices_m, whole.triangles, process=False)
+    assert len(joined.vertices) == len(single.vertices)
+    uses = [sorted(np.bincount(mesh.edges_unique_inverse)) for mesh in (joined, single)]
+    assert uses[0] == uses[1]
+    normals = {tuple(v): n for v, n in zip(whole.vertices_m, whole.normals, strict=True)}
+    for each in surfaces:
+        for vertex, normal in zip(each.vertices_m, each.normals, strict=True):
+            np.testing.assert_allclose(normal, normals[tuple(vertex)], atol=1e-5)
+
+
+def test_a_map_without_them_says_what_to_do(m: MRFMap, tmp_path: Path) -> None:
+    export_map(m, tmp_path / "bare.zarr", ExportOptions(color_by="marginal"))
+    part = take_part(ChunkedMap.open(tmp_path / "bare.zarr"))
+    assert not part.has_colors
+    assert not part.colors(scene.probes()).any()
+    for problem in (part.surface, lambda: export_map(part, tmp_path / "mesh.ply", RAYS)):
+        with pytest.raises(ConfigError, match=r"map the recording anew with --keep-surface, or export from"):
+            problem()
+    with pytest.raises(ConfigError, match="map the recording with --color"):
+        export_map(part, tmp_path / "mesh.ply", ExportOptions(color_by="photo"))
+    export_map(part, tmp_path / "mesh.ply", ExportOptions(mesh=True))
+    note = export_note(part, tmp_path / "mesh.ply", ExportOptions(mesh=True))
+    assert "where the marginal is 0.5; the images" in str(note)
+    assert "--keep-surface" not in str(export_note(room_map("log_odds"), Path("mesh.glb")))
+
+
+def test_damaged_extras_are_named(store: Path, tmp_path: Path) -> None:
+    import shutil
+
+    path = Path(shutil.copytree(store, tmp_path / "map.zarr"))
+    for name, read in (("colors", lambda p: p.colors(scene.probes())), ("surface", lambda p: p.surface())):
+        victim = max((path / name / "c").rglob("0"), key=lambda file: file.stat().st_size * file.is_file())
+        victim.write_bytes(victim.read_bytes()[:40])
+        with pytest.raises(MapFileError, match=name):
+            read(take_part(ChunkedMap.open(path)))
+    document = path / "surface" / "zarr.json"
+    document.write_text(document.read_text().replace("float32", "float64"))
+    with pytest.raises(MapFileError, match="surface is not stored as float32"):
+        ChunkedMap.open(path)
