@@ -164,7 +164,7 @@ def _judge_cells(m: Any, truth: OccupancyTruth, side: int) -> dict[str, Any]:
 
 
 def _cells_of(log_odds: NDArray[np.float32], prior: float, side: int) -> NDArray[np.float32]:
-    return probability(log_odds) if side == 1 else cell_probabilities(log_odds, prior, side)
+    return probability(log_odds) if side == 1 else cell_probabilities(log_odds, prior)[side]
 
 
 def _scores(likely: NDArray[np.float32], state: NDArray[np.int8]) -> dict[str, Any]:

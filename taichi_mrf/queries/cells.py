@@ -1,34 +1,21 @@
 """Cells of 2, 4 and 8 voxels a side: how likely each holds something, and those that stand in for voxels.
 
-Where a surface's depth is uncertain no voxel is likely to be occupied, but a cell that reaches across the
-uncertainty is. The probability of a cell follows from the marginals of its voxels by the rule of within.py:
-the likeliest line of voxels along an axis, of the axis that gives the least.
+The rule is in voxels/cells.py; here it is applied to maps.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.config.arguments import real
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.kernels.types import F32Array, Template
 from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap
 from taichi_mrf.queries.points import probability
-from taichi_mrf.system import runtime
-from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
-
-SIDES = (2, 4, 8)
-"""Sides of the cells, in voxels."""
-
-_EMPTY = np.float32(-30.0)
-"""Log-odds of a voxel that holds nothing."""
-
-SUREST = 1 - 1e-6
-"""Probability of a cell beyond which its log-odds do not grow."""
+from taichi_mrf.voxels import cells as rule
+from taichi_mrf.voxels.cells import SIDES, SUREST, lowest_voxels, voxels_of_cells
+from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
 
 
 @dataclass(frozen=True)
@@ -56,7 +43,7 @@ def all_cells(m: QueriedMap, side: int) -> Cells:
     reader = BrickReader(m)
     parts = [_cells(np.zeros((0, 3), np.int32), np.zeros((0, (BRICK // side) ** 3), np.float32), side)]
     for bricks, log_odds, _ in reader.batches(reader.bricks):
-        parts.append(_cells(bricks, cell_probabilities(log_odds, reader.pool.prior_log_odds, side), side))
+        parts.append(_cells(bricks, cell_probabilities(log_odds, reader.pool.prior_log_odds)[side], side))
     return _joined(parts)
 
 
@@ -90,10 +77,10 @@ class CellReader(BrickReader):
         filled = super().log_odds(bricks)
         here = np.flatnonzero(self.slots(bricks) >= 0)
         voxels = filled[here]
-        for side, standing, likely in standing_in(self, voxels.copy(), self._threshold):
+        for side, standing, likely in standing_in(self, voxels, self._threshold):
             p = np.minimum(likely[standing].astype(np.float64), SUREST)
             rows, cells = np.nonzero(standing)
-            voxels[rows[:, None], _voxels_of_cells(side)[cells]] = np.log(p / (1 - p))[:, None]
+            voxels[rows[:, None], voxels_of_cells(side)[cells]] = np.log(p / (1 - p))[:, None]
         filled[here] = voxels
         return filled
 
@@ -123,14 +110,6 @@ class FilledMap:
         return shown_voxels(self._map, min_probability)
 
 
-@cache
-def _voxels_of_cells(side: int) -> NDArray[np.int64]:
-    """The numbers in a brick of each cell's voxels, (cells, side^3)."""
-    across = BRICK // side
-    numbers = np.arange(VOXELS).reshape(across, side, across, side, across, side)
-    return numbers.transpose(0, 2, 4, 1, 3, 5).reshape(across**3, side**3)
-
-
 def standing_in(
     reader: BrickReader, log_odds: NDArray[np.float32], threshold: float
 ) -> Iterator[tuple[int, NDArray[np.bool_], NDArray[np.float32]]]:
@@ -138,42 +117,21 @@ def standing_in(
     probability of all cells, (n, cells) in row-major order each."""
     if not 0 < real(threshold, "threshold") < 1:
         raise ConfigError(f"threshold must lie between 0 and 1, not {threshold}")
-    no_evidence = log_odds <= reader.pool.prior_log_odds + reader.map.view.volume.min_evidence
-    known = np.where(no_evidence, _EMPTY, log_odds)
-    reached = probability(known) >= threshold
-    for side in SIDES:
-        likely = cell_probabilities(known, reader.pool.prior_log_odds, side)
-        reached = _any_of_eight(reached)
-        standing = (likely >= threshold) & ~reached
-        reached |= standing
-        yield side, standing, likely
+    evidence = log_odds > reader.pool.prior_log_odds + reader.map.view.volume.min_evidence
+    return rule.standing_in(probability(log_odds), evidence, threshold)
 
 
 def cell_probabilities(
-    log_odds: NDArray[np.float32], prior_log_odds: float, side: int
-) -> NDArray[np.float32]:
-    """The probability of each cell of some bricks, (n, 512) log-odds -> (n, (8 / side)^3), row-major."""
-    n = len(log_odds)
-    marginals = np.where(log_odds > prior_log_odds, 1.0, -1.0) * probability(log_odds)
-    out = np.zeros(n * (BRICK // side) ** 3, np.float32)
-    if n:
-        _join_voxels(np.ascontiguousarray(marginals.reshape(-1), np.float32), out, side)
-        runtime.settle()
-    return out.reshape(n, -1)
-
-
-def _any_of_eight(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Whether any of the eight parts of a cell has a flag: (n, k^3) of the parts -> (n, (k / 2)^3)."""
-    half = round(flags.shape[1] ** (1 / 3)) // 2
-    parts = flags.reshape(-1, half, 2, half, 2, half, 2)
-    return parts.any(axis=(2, 4, 6)).reshape(len(flags), -1)
+    log_odds: NDArray[np.float32], prior_log_odds: float
+) -> dict[int, NDArray[np.float32]]:
+    """The probability of each cell of some bricks by side, (n, 512) log-odds -> (n, (8 / side)^3),
+    row-major."""
+    return rule.cell_probabilities(probability(log_odds), log_odds > prior_log_odds)
 
 
 def _cells(bricks: Bricks, likely: NDArray[np.float32], side: int) -> Cells:
     """The cells of bricks (n, 3) with their probabilities (n, cells)."""
-    across = BRICK // side
-    inside = np.indices((across,) * 3, np.int32).reshape(3, -1).T * side
-    lowest = bricks[:, None].astype(np.int32) * BRICK + inside
+    lowest = bricks[:, None].astype(np.int32) * BRICK + lowest_voxels(side)
     return Cells(lowest.reshape(-1, 3), side, likely.reshape(-1))
 
 
@@ -183,33 +141,3 @@ def _joined(parts: list[Cells]) -> Cells:
         parts[0].side,
         np.concatenate([part.probability for part in parts]),
     )
-
-
-@ti.kernel
-def _join_voxels(marginals: F32Array, out: F32Array, side: Template):
-    """The probability of cells of ``side`` voxels, into ``out`` (bricks * cells), from the ``marginals``
-    (bricks * 512) of voxels likelier than the prior, and of the others with a minus before it."""
-    for i in out:
-        across = ti.static(BRICK // side)
-        brick, cell = i // across**3, i % across**3
-        corner = ti.Vector([cell // across**2, cell // across % across, cell % across]) * side
-        first = brick * VOXELS + (corner[0] * BRICK + corner[1]) * BRICK + corner[2]
-        least = 1.0
-        for axis in ti.static(range(3)):
-            # Strides of the voxels along a line, and of the lines beside each other.
-            along = ti.static(BRICK ** (2 - axis))
-            a_stride = ti.static(BRICK ** (2 - (axis + 1) % 3))
-            b_stride = ti.static(BRICK ** (2 - (axis + 2) % 3))
-            rarest = 1.0
-            for a in range(side):
-                for b in range(side):
-                    free, surface = 1.0, 0.0
-                    for k in range(side):
-                        marginal = marginals[first + a * a_stride + b * b_stride + k * along]
-                        if marginal > 0.0:
-                            surface += marginal
-                        else:
-                            free *= 1.0 + marginal
-                    rarest = ti.min(rarest, free * ti.max(0.0, 1.0 - surface))
-            least = ti.min(least, 1.0 - rarest)
-        out[i] = least

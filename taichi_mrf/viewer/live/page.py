@@ -192,8 +192,7 @@ class Page(BasePage[Panel]):
             return
         shown = [k for k in self.keyframes.keyframes.values() if k.state != "frozen"]
         pixel = first_pixel(click.origin, click.direction, shown)
-        points = self.map.layers["map"].points()
-        voxel = first_voxel(click.origin, click.direction, points, self._voxel_size)
+        voxel = first_voxel(click.origin, click.direction, *self.map.boxes())
         if pixel is not None and (voxel is None or pixel.range_m < voxel[1]):
             self._choose(pixel.keyframe)
             self.ask(m.PixelRay(pixel.keyframe, pixel.u, pixel.v))

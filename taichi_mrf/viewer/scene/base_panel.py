@@ -70,10 +70,12 @@ class BasePanel:
         self._progress.value = 100.0 * min(max(share, 0.0), 1.0)
         self._progress.animated = moving
 
-    def show_counts(self, voxels: Mapping[Layer, int], recording: bool) -> None:
-        """Show how many voxels of each layer the page shows, and whether the scene is being recorded."""
+    def show_counts(self, voxels: Mapping[Layer, int], cells: int, recording: bool) -> None:
+        """Show how many voxels of each layer and how many cells the page shows, and whether the scene is
+        being recorded."""
         baseline, dynamic = voxels["baseline"], voxels["dynamic"]
-        text = f"{voxels['map']:,} voxels shown" + (f", {dynamic:,} dynamic" if dynamic else "")
+        text = f"{voxels['map']:,} voxels shown" + (f", {cells:,} cells" if cells else "")
+        text += f", {dynamic:,} dynamic" if dynamic else ""
         text += f", {baseline:,} of the baseline" if baseline else ""
         self._shown.content = text + (" · recording" if recording else "")
 

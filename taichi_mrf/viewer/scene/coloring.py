@@ -75,7 +75,7 @@ def scale_of(
         return Scale(color_by, colors, 1.0, float(2**doublings), label, _numbers(share))
     if color_by == "photo":
         return Scale(color_by, colors, 0.0, 1.0, PHOTO_LABEL)
-    p = _probabilities()
+    p = probabilities()
     if color_by == "uncertainty":
         return Scale(color_by, colors, 0.0, 1.0, "uncertainty: entropy (bits)", _numbers(_entropy(p)))
     low = LOWEST if threshold >= LOWEST else 0.0
@@ -131,7 +131,7 @@ def _numbers(share: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.rint(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
 
 
-def _probabilities() -> NDArray[np.float64]:
+def probabilities() -> NDArray[np.float64]:
     """The probability of each int16 of log-odds, viewed as uint16."""
     return 0.5 * (1.0 + np.tanh(0.5 * np.arange(65536, dtype=np.uint16).view(np.int16) * LOG_ODDS_STEP))
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.viewer.messages import BrickColors, Bricks, Hello, Layer
 from taichi_mrf.viewer.scene.brick_lines import BrickLines
+from taichi_mrf.viewer.scene.cell_layer import CellLayer
 from taichi_mrf.viewer.scene.coloring import Scale
 from taichi_mrf.viewer.scene.cut_plane import CutPlane, cut_picture
 from taichi_mrf.viewer.scene.look import Look, look_of
@@ -33,7 +34,7 @@ _NAMES: dict[Layer, str] = {"map": "this map", "baseline": "baseline (OctoMap)"}
 
 
 class MapScene:
-    """Owns the scene nodes /voxels, /baseline, /cut, /bricks and /names."""
+    """Owns the scene nodes /voxels, /cells, /baseline, /cut, /bricks and /names."""
 
     def __init__(self, server: viser.ViserServer, hello: Hello) -> None:
         self._server, self._hello = server, hello
@@ -41,6 +42,9 @@ class MapScene:
             "map": VoxelLayer(server.scene, "/voxels", hello.voxel_size),
             "baseline": VoxelLayer(server.scene, "/baseline", hello.voxel_size),
         }
+        self.cells = CellLayer(
+            server.scene, "/cells", hello.voxel_size, hello.prior_log_odds, hello.min_evidence
+        )
         self._cut_plane = CutPlane(server.scene, hello.voxel_size)
         self._brick_lines = BrickLines(server.scene, hello.voxel_size)
         self._dirty: dict[Layer, set[ChunkKey]] = {"map": set(), "baseline": set()}
@@ -71,6 +75,13 @@ class MapScene:
         every = np.concatenate(corners)
         return every.min(axis=0), every.max(axis=0)
 
+    def boxes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Centres (n, 3) and sides (n,) of all voxels and cells of the map that are shown, in metres,
+        world."""
+        voxels, (cells, sides) = self.layers["map"].points(), self.cells.boxes()
+        alike = np.full(len(voxels), self._hello.voxel_size)
+        return np.concatenate([voxels, cells]), np.concatenate([alike, sides])
+
     def take(self, bricks: Bricks) -> None:
         """Take in changed bricks; :meth:`flush` draws them."""
         layer: Layer = "map" if bricks.layer == "dynamic" else bricks.layer
@@ -93,6 +104,7 @@ class MapScene:
         """Remove everything from the scene."""
         for layer in self.layers.values():
             layer.clear()
+        self.cells.clear()
         self._cut_plane.hide()
         self._brick_lines.hide()
         for name in _NAMES:
@@ -104,9 +116,11 @@ class MapScene:
         now = time.monotonic()
         if self._all_dirty or any(self._dirty.values()):
             return max(0.0, self._sent_at + 1 / UPDATES_PER_SECOND - now)
+        at_rest = self._news_at + REST_S
+        times = [self.cells.due(at_rest)]
         if any(layer.inexact() for layer in self.layers.values()):
-            return max(0.0, self._news_at + REST_S - now)
-        return None
+            times.append(at_rest)
+        return min((max(0.0, each - now) for each in times if each is not None), default=None)
 
     def flush(
         self,
@@ -133,10 +147,16 @@ class MapScene:
             chunks = layer.all_chunks() if everything else self._dirty[name]
             layer.prepare(chunks | (layer.inexact() if rested else set()), look, exactly=rested)
             self._dirty[name] = set()
+            if name == "map":
+                self.cells.outdate(chunks)
+        due = self.cells.due(self._news_at + REST_S)
+        if due is not None and time.monotonic() >= due:
+            self.cells.prepare(self.store, look)
         announce()
         with self._server.atomic():
             for layer in self.layers.values():
                 layer.send()
+            self.cells.send()
             if map_changed:
                 self._draw_cut(look, crossed)
                 self._brick_lines.show(self.store.bricks() if options.bricks else None)

@@ -29,6 +29,9 @@ class ViewOptions:
     shade: bool = True
     """Darken voxels a little by the direction that their surface faces: shapes are easier to see."""
 
+    cells: bool = True
+    """Where no voxel reaches the threshold but a cell of 2, 4 or 8 voxels does, show the cell."""
+
     cut_axis: CutAxis = "none"
     """Cut the map open across this axis. The cut shows free space (blue), occupied (yellow) and unknown
     (nothing)."""

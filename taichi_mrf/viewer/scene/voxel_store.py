@@ -35,6 +35,11 @@ class Shown:
     seen: NDArray[np.uint8]
     colors: NDArray[np.uint8] | None = None
 
+    def kept(self, which: NDArray[np.bool_]) -> "Shown":
+        """Some of them, ``which`` (n,)."""
+        colors = None if self.colors is None else self.colors[which]
+        return Shown(self.cells[which], self.log_odds[which], self.seen[which], colors)
+
 
 @dataclass(frozen=True)
 class Cut:
@@ -44,11 +49,11 @@ class Cut:
     voxel: int
 
 
-def facing(cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def facing(cells: NDArray[np.uint8], across: int = CHUNK_VOXELS) -> NDArray[np.uint8]:
     """The direction of the surface at each shown voxel (n, 3) of a chunk, from its missing neighbours:
     (a * 3 + b) * 3 + c, (n,), where a, b, c = 0..2 neighbours are missing along x, y, z. Neighbours in other
-    chunks count as present."""
-    side = CHUNK_VOXELS + 2
+    chunks count as present. A chunk is ``across`` voxels wide, or cells, if it is they that are shown."""
+    side = across + 2
     grid = np.ones((side,) * 3, np.uint8)
     grid[1:-1, 1:-1, 1:-1] = 0
     here = (cells + 1).astype(np.int32) @ np.array([side * side, side, 1], np.int32)
