@@ -78,9 +78,7 @@ def voxels_of_cells(side: int) -> NDArray[np.int64]:
     return numbers.transpose(0, 2, 4, 1, 3, 5).reshape(across**3, side**3)
 
 
-def _halves(
-    values: NDArray[np.float32], axis: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _halves(values: NDArray[np.float32], axis: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The even and the odd places along an axis."""
     before = (slice(None),) * axis
     return values[(*before, slice(0, None, 2))], values[(*before, slice(1, None, 2))]

@@ -23,7 +23,7 @@ from taichi_mrf.export.level_map import level_map
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.registry import load_map
-from taichi_mrf.queries.cells import shown_voxels, standing_cells
+from taichi_mrf.queries.cells import standing_cells
 from taichi_mrf.queries.known_bricks import bricks_between, seen_free_bricks
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK
@@ -211,7 +211,10 @@ def test_a_browser_shows_the_voxels(method: str, tmp_path: Path) -> None:
     export_map(m, tmp_path / "map.html")
     with chromium() as browser, LivePage(browser, (tmp_path / "map.html").as_uri()) as page:
         seen = page.until(lambda seen: seen.voxels, "voxels in the scene")
-        assert seen.voxels == len(shown_voxels(m, 0.5)[0])
+        assert seen.voxels == len(m.voxels(0.5)[0])
+        expected = sum(len(cells) for cells in standing_cells(m))
+        assert (expected > 0) == (method == "mrf")
+        assert seen.cells == pytest.approx(expected, rel=0.02)  # the page's log-odds are rounded
         assert page.problems == []
 
 

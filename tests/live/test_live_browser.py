@@ -12,6 +12,7 @@ from live_program import LiveProgram, wait_for
 
 from taichi_mrf import MRFMap
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.queries.cells import standing_cells
 from taichi_mrf.system import runtime
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 
@@ -165,6 +166,18 @@ def test_the_cut_hides_voxels_and_shows_a_picture(page: LivePage) -> None:
     page.select("Cut axis", "none")
     after = page.until(lambda seen: seen.agrees and seen.voxels == before.voxels, "all voxels")
     assert "/cut" not in after.nodes
+
+
+def test_cells_stand_in_where_no_voxel_is_likely(page: LivePage, saved: MRFMap) -> None:
+    expected = sum(len(cells) for cells in standing_cells(saved))
+    seen = page.until(lambda seen: seen.agrees and seen.cells, "cells")
+    assert expected > 100
+    assert seen.cells == pytest.approx(expected, rel=0.02)  # the page's copy has rounded log-odds
+    page.screenshot("live_cells")
+    page.tick("Cells", on=False)
+    page.until(lambda seen: seen.agrees and not seen.cells, "no cells")
+    page.tick("Cells")
+    page.until(lambda again: again.agrees and again.cells == seen.cells, "the cells again")
 
 
 def test_the_outlines_of_bricks_come_and_go(page: LivePage) -> None:

@@ -257,7 +257,10 @@ def test_the_standalone_page_shows_the_map(page: LivePage, browser: "Browser", t
     page.tab("Save")
     page.download("Page").save_as(tmp_path / "map.html")
     with LivePage(browser, (tmp_path / "map.html").as_uri()) as standalone:
-        standalone.until(lambda seen: seen.voxels == page.look().voxels, "the map without a server")
+        shown = page.look()
+        assert shown.cells
+        drawn = (shown.voxels, shown.cells)
+        standalone.until(lambda seen: (seen.voxels, seen.cells) == drawn, "the map without a server")
         standalone.pause(1.0)
         standalone.screenshot("standalone")
         assert standalone.problems == []

@@ -51,19 +51,20 @@ _LOOK = """() => {
     }
     return false;
   };
-  const seen = {voxels: 0, baseline: 0, colors: 0, nodes: []};
+  const seen = {voxels: 0, cells: 0, baseline: 0, colors: 0, nodes: []};
   const hash = (start, numbers) =>
     numbers.reduce((h, number) => Math.imul(31 * h + Math.round(number) | 0, 2654435761) >>> 0, start);
   for (const [name, node] of Object.entries(mutable?.nodeRefFromName ?? {}).sort()) {
     if (!node || !inScene(node)) continue;
     seen.nodes.push(name);
     const root = name.split('/')[1];
-    if (!(root in {voxels: 0, baseline: 0}) || name.split('/').length < 3) continue;
+    if (!(root in {voxels: 0, cells: 0, baseline: 0}) || name.split('/').length < 3) continue;
     node.traverse(object => {
       if (!object.isPoints) return;
       const {position, color} = object.geometry.attributes;
       const cloud = hash(7, [...name].map(letter => letter.codePointAt(0)));
       seen[root] += position?.count ?? 0;
+      if (root === 'cells') return;
       // A sum, since the order of the points depends on how updates were merged on their way.
       for (let i = 0; i < (color?.count ?? 0); i++) {
         const cell = [position.getX(i), position.getY(i), position.getZ(i)];
@@ -149,15 +150,17 @@ def _chromium() -> str | None:
 class Seen:
     """One look at a page: what it says of itself, and what is in its scene.
 
-    ``said`` and ``said_baseline`` are the counts that the page gives, ``voxels`` and ``baseline`` the points
-    that it draws; ``colors`` changes with the colour or
-    place of any point, and not with their order. ``table`` is that of the tab About, empty
-    while another one is in front.
+    ``said``, ``said_cells`` and ``said_baseline`` are the counts that the page gives, ``voxels``, ``cells``
+    and ``baseline`` the points that it draws; ``colors`` changes with the colour or place of any voxel's
+    point, and not with their order. ``table`` is that of the tab About, empty while another one is in
+    front.
     """
 
     said: int
+    said_cells: int
     said_baseline: int
     voxels: int
+    cells: int
     baseline: int
     colors: int
     nodes: tuple[str, ...]
@@ -171,8 +174,9 @@ class Seen:
 
     @property
     def agrees(self) -> bool:
-        """Whether the scene holds as many voxels as the page says."""
-        return (self.said, self.said_baseline) == (self.voxels, self.baseline)
+        """Whether the scene holds as many voxels and cells as the page says."""
+        said = self.said, self.said_cells, self.said_baseline
+        return said == (self.voxels, self.cells, self.baseline)
 
     @property
     def settled(self) -> bool:
@@ -198,7 +202,9 @@ class LivePage:
         words = found.pop("counts").replace(",", "").split()
         said = int(words[0]) if words else 0
         said_baseline = int(words[words.index("baseline") - 3]) if "baseline" in words else 0
-        return Seen(said=said, said_baseline=said_baseline, nodes=tuple(found.pop("nodes")), **found)
+        said_cells = int(words[words.index("cells") - 1]) if "cells" in words else 0
+        counts = {"said": said, "said_cells": said_cells, "said_baseline": said_baseline}
+        return Seen(**counts, nodes=tuple(found.pop("nodes")), **found)
 
     def until(self, condition: Callable[[Seen], object], what: str) -> Seen:
         """Look until a condition holds; returns what was then to be seen."""

@@ -37,10 +37,11 @@ class DrawnPage:
         self.take(m.Bricks("map", BRICK, packed, np.full((1, 512), seen, np.uint8), NOTHING))
 
     def boxes(self, **options: object) -> dict[tuple[float, ...], tuple[int, ...]]:
-        """Of the cells that are drawn, the side in voxels and the lowest voxel in the brick: their colours."""
+        """The cells that are drawn, by side in voxels and lowest voxel in the brick, and their colours."""
         self.page.options = replace(ViewOptions(shade=False), **options)  # type: ignore[arg-type]
         assert self.page.map is not None
         self.page.map.look_changed()
+        self.page.map._news_at = 0.0  # long at rest
         self.page._flush()
         found = {}
         for name, node in self.server.scene._handle_from_node_name.items():
@@ -89,7 +90,8 @@ def test_a_cell_is_as_large_as_the_surface_is_uncertain(drawn: DrawnPage) -> Non
 def test_a_cell_has_the_colour_of_its_own_probability(drawn: DrawnPage) -> None:
     drawn.put(wall(2, -0.5))
     (color,) = set(drawn.boxes().values())
-    assert drawn.page.map is not None and drawn.page.map.scale is not None
+    assert drawn.page.map is not None
+    assert drawn.page.map.scale is not None
     p = 2 / (1 + np.exp(0.5))
     expected = drawn.page.map.scale.colors[round(255 * (p - 0.5) / 0.5)]
     assert np.abs(np.array(color, int) - expected).max() <= 3

@@ -89,7 +89,7 @@ def test_a_static_map_has_no_folder(running: TimePage) -> None:
 
 def test_dynamic_voxels_have_their_colour_and_are_counted(running: TimePage) -> None:
     brick, seen = np.zeros((1, 3), np.int32), np.zeros((1, 512), np.uint8)
-    occupied, dynamic = np.full((1, 512), -900, np.int16), np.full((1, 512), -512, np.int16)
+    occupied, dynamic = np.full((1, 512), -2000, np.int16), np.full((1, 512), -512, np.int16)
     occupied[0, :40] = 900
     dynamic[0, :7] = 900
     running.take(m.Bricks("map", brick, occupied, seen, NOTHING))

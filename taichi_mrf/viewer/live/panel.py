@@ -42,7 +42,17 @@ CURRENT_CAMERA, CHOSEN_KEYFRAME = "current camera", "chosen keyframe"
 NO_KEYFRAME = "none yet"
 POSITION_STEP_M = 0.01
 
-_MAP_OPTIONS = ("color_by", "threshold", "size", "shade", "cells", "cut_axis", "cut_at", "bricks", "show_baseline")
+_MAP_OPTIONS = (
+    "color_by",
+    "threshold",
+    "size",
+    "shade",
+    "cells",
+    "cut_axis",
+    "cut_at",
+    "bricks",
+    "show_baseline",
+)
 _PAGE_OPTIONS = ("follow", "pictures", "dark")
 _TIME_OPTIONS = ("dynamic",)
 

@@ -1,5 +1,5 @@
-"""The cells that stand in for voxels, in the scene: points of 2, 4 or 8 times a voxel's size, one cloud for each
-side in each chunk.
+"""The cells that stand in for voxels, in the scene: points of 2, 4 or 8 times a voxel's size, a cloud for
+each side in each chunk.
 
 They follow from the page's copy of the map, so the mapping process has no part in them. While the map
 changes, computing them takes a small share of the time; once it is at rest, all are brought up to date.
@@ -54,7 +54,12 @@ class CellLayer:
     """Owns the scene nodes under ``prefix``."""
 
     def __init__(
-        self, scene: viser.SceneApi, prefix: str, voxel_size: float, prior_log_odds: float, min_evidence: float
+        self,
+        scene: viser.SceneApi,
+        prefix: str,
+        voxel_size: float,
+        prior_log_odds: float,
+        min_evidence: float,
     ) -> None:
         """``min_evidence`` in log-odds: voxels that are not so much likelier than the prior do not count."""
         self._scene, self._prefix, self._voxel_size = scene, prefix, voxel_size
