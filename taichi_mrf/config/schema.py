@@ -212,8 +212,8 @@ class _Tail:
     them (methods whose maps have colours: mrf)."""
 
     keep_surface: bool = False
-    """Keep for each voxel what keyframes measured of the surface where their images are dropped: in maps in
-    submaps (methods that freeze keyframes: mrf). Maps that hold their keyframes' images need it not."""
+    """Keep for each voxel what keyframes measured of the surface where their images are dropped: those of
+    frozen keyframes, and those of maps in submaps (methods that freeze keyframes: mrf)."""
 
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     """Which frames become keyframes."""

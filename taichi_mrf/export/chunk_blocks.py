@@ -30,6 +30,15 @@ def extra_block(chunk: Chunk, bricks: Bricks, values: NDArray) -> NDArray:
     return _assembled(chunk, bricks, values, 0)
 
 
+def voxel_block(chunk: Chunk, bricks: Bricks, numbers: NDArray[np.int32], values: NDArray) -> NDArray:
+    """(64, 64, 64, k) values of a chunk from those of some voxels, (n, k), which are given by their bricks
+    (n, 3) and their ``numbers`` in these; 0 elsewhere."""
+    block = np.zeros((*(CHUNK_VOXELS,) * 3, values.shape[1]), values.dtype)
+    local = np.stack(np.unravel_index(numbers, (BRICK,) * 3), axis=1)
+    block[tuple(((bricks - np.array(chunk) * CHUNK) * BRICK + local).T)] = values
+    return block
+
+
 def _assembled(chunk: Chunk, bricks: Bricks, values: NDArray, missing: float) -> NDArray:
     each = values.shape[2]
     block = np.full((CHUNK, BRICK, CHUNK, BRICK, CHUNK, BRICK, each), missing, values.dtype)

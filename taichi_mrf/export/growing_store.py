@@ -22,10 +22,18 @@ from taichi_mrf.system.files import exists
 _DOCUMENT = "zarr.json"
 
 
-def put_chunks(path: Path, header: StoreHeader, blocks: Mapping[Chunk, NDArray[np.float32]]) -> None:
+Extras = Mapping[str, Mapping[Chunk, NDArray]]
+"""By the names of EXTRAS and by chunks: (64, 64, 64, values) each."""
+
+
+def put_chunks(
+    path: Path, header: StoreHeader, blocks: Mapping[Chunk, NDArray[np.float32]], extras: Extras | None = None
+) -> None:
     """Write some chunks, (64, 64, 64) log-odds each, NaN for unknown, into the store ``path``, which is made
-    if it does not exist; chunks that are there already are replaced. Raises MapFileError, also for a store
-    that was not made here, and TaichiMRFError without zarr."""
+    if it does not exist; chunks that are there already are replaced, as are those of their ``extras`` that
+    are named. Raises MapFileError, also for a store that was not made here, and TaichiMRFError without zarr.
+    """
+    extras = extras or {}
     new = np.array(list(blocks), np.int32).reshape(-1, 3)
     if len(new) and max(-int(new.min()), int(new.max()) + 1) > FARTHEST:
         raise MapFileError(f"{path}: a chunk further than {FARTHEST} chunks from the origin has no place")
@@ -36,12 +44,19 @@ def put_chunks(path: Path, header: StoreHeader, blocks: Mapping[Chunk, NDArray[n
     chunks = np.concatenate([listed, np.array(added, np.int32).reshape(-1, 3)])
     staging = temporary_name(path)
     try:
-        stage = ChunkStore.create(staging, header, chunks, grows=True)
+        stage = ChunkStore.create(staging, header, chunks, grows=True, extras=tuple(extras))
         for chunk, block in blocks.items():
             stage.write(chunk, block)
+        for name, found in extras.items():
+            for chunk, values in found.items():
+                stage.write_extra(name, chunk, values)
         if not grown:
             os.replace(staging, path)
             return
+        for name in extras:
+            _move(staging, path, Path(name, _DOCUMENT))
+            for chunk in blocks:
+                _move(staging, path, stage.file_of(chunk, name))
         for chunk in blocks:
             _move(staging, path, stage.file_of(chunk))
         if added:

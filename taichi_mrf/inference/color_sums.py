@@ -84,6 +84,13 @@ class ColorShare:
         """Those of some voxels: a mask (n,), or numbers of rows."""
         return ColorShare(self.bricks[rows], self.numbers[rows], self.rg[rows], self.bw[rows])
 
+    def colors(self) -> NDArray[np.uint8]:
+        """The voxels' mean colours, (n, 4): red, green, blue, and the weight, at most 255."""
+        weight = self.bw & 0xFFFFFFFF
+        sums = (self.rg >> 32, self.rg & 0xFFFFFFFF, self.bw >> 32)
+        means = [(each + weight // 2) // weight for each in sums]
+        return np.stack([*means, np.minimum(weight, 255)], axis=1).astype(np.uint8)
+
     def plus(self, other: "ColorShare") -> "ColorShare":
         """Both together."""
         bricks = np.concatenate([self.bricks, other.bricks])

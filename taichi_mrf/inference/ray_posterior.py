@@ -28,7 +28,7 @@ from taichi_mrf.kernels.log_odds import exp_of_negative, softplus
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.voxels.layout import VOXELS
-from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.pool import BrickPool, PoolPart
 from taichi_mrf.voxels.strips import strip_begin, strip_length
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_voxels
 
@@ -49,7 +49,7 @@ class FreeLogs(Bundle):
     """log(1 - m) of each, at most 0; (bricks * 512)."""
 
     @staticmethod
-    def of(pool: BrickPool) -> "FreeLogs":
+    def of(pool: BrickPool | PoolPart) -> "FreeLogs":
         """Those of the marginals of a whole map, in the pool's order."""
         log_free = ti.ndarray(ti.f32, max(1, pool.capacity) * VOXELS)
         _find_free_logs(pool.in_use, pool.belief, log_free, strip_length())

@@ -21,7 +21,7 @@ from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.layout import CHUNK, VOXELS, grid_keys
-from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.pool import BrickPool, PoolPart
 from taichi_mrf.voxels.window import Window, WindowIndex
 
 BAND_VOXELS = 2.0
@@ -36,7 +36,7 @@ Bricks = NDArray[np.int32]
 class SurfaceRays:
     """Follows the rays of keyframes; owns the scratch."""
 
-    def __init__(self, pool: BrickPool, model: RayModel, volume: VolumeConfig) -> None:
+    def __init__(self, pool: BrickPool | PoolPart, model: RayModel, volume: VolumeConfig) -> None:
         """``model`` is what rays share; its ``floor`` is the density of measurements from anywhere."""
         self.pool, self.model, self.volume = pool, model, volume
         self.band = Band(BAND_VOXELS, BAND_SIGMAS, model.max_depth)

@@ -13,7 +13,9 @@ take for their surface. Rays whose measurement the map holds for an outlier do n
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import numpy as np
 import taichi as ti
+from numpy.typing import NDArray
 
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
@@ -23,7 +25,8 @@ from taichi_mrf.inference.workers import workers_without_trace
 from taichi_mrf.kernels.bundles import Bundle
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template
 from taichi_mrf.system import runtime
-from taichi_mrf.voxels.pool import BrickPool, copied
+from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.pool import BrickPool, PoolPart, copied
 from taichi_mrf.voxels.traversal import walk_voxels
 from taichi_mrf.voxels.window import WindowIndex
 
@@ -43,17 +46,36 @@ def surfaces_first(
     pool: BrickPool,
     model: RayModel,
     volume: VolumeConfig,
+    kept: tuple[NDArray[np.int32], NDArray[np.int32]] | None = None,
 ) -> "ti.Ndarray":
     """The log-odds of a map's voxels, (capacity * 512), in which each voxel that wins the vote of the rays is
     occupied; all others keep their marginals.
 
-    ``keyframes`` come with their lists of visible bricks, ``model`` are the parameters of their rays.
+    ``keyframes`` come with their lists of visible bricks, ``model`` are the parameters of their rays, and
+    ``kept`` are votes of other keyframes: bricks, (n,) slots, and their votes (n, 512).
     """
     learnt = pool.prior_log_odds + volume.min_evidence
-    belief, index = pool.belief, WindowIndex()
-    votes = ti.ndarray(ti.i32, belief.shape)
+    votes = count_votes(keyframes, pool, model, volume)
+    if kept is not None:
+        _add_votes(kept[0], kept[1].reshape(-1), votes)
+    log_odds = copied(pool.belief)
+    _call(votes, log_odds, max(0.0, learnt) + CALLED)
+    runtime.settle()
+    return log_odds
+
+
+def count_votes(
+    keyframes: Iterable[tuple[Keyframe, VisibleBricks]],
+    pool: BrickPool | PoolPart,
+    model: RayModel,
+    volume: VolumeConfig,
+) -> "ti.Ndarray":
+    """The votes for and against each voxel, (capacity * 512) int32; parameters as above."""
+    learnt = pool.prior_log_odds + volume.min_evidence
+    index = WindowIndex()
+    votes = ti.ndarray(ti.i32, pool.belief.shape)
     votes.fill(0)
-    free_logs, vote = FreeLogs.of(pool), _Vote(belief, learnt, votes)
+    free_logs, vote = FreeLogs.of(pool), _Vote(pool.belief, learnt, votes)
     for keyframe, visible in keyframes:
         if len(visible.slots) > 0:
             window = keyframe.footprint.window
@@ -65,10 +87,8 @@ def surfaces_first(
                 model, free_logs, workers_without_trace(), vote,
             )  # fmt: skip
             index.clear(window, visible.cells)
-    log_odds = copied(belief)
-    _call(votes, log_odds, max(0.0, learnt) + CALLED)
     runtime.settle()
-    return log_odds
+    return votes
 
 
 @ti.dataclass
@@ -125,6 +145,13 @@ def _vote_against(state: Template, voting: Template, voxel: I32, near: F32, far:
     if before == 1 and (far - near) * voting.voxels_per_depth > GRAZED:
         ti.atomic_sub(voting.votes[voxel], AGAINST)
     return before
+
+
+@ti.kernel
+def _add_votes(slots: I32Array, more: I32Array, votes: I32Array):
+    """Add votes ``more`` (n * 512) in the bricks in ``slots`` (n)."""
+    for i in range(more.shape[0]):
+        votes[slots[i // VOXELS] * VOXELS + i % VOXELS] += more[i]
 
 
 @ti.kernel

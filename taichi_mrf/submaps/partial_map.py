@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from taichi_mrf.inference.messages import withdraw_messages
 from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.methods.mrf.surfacing import surface_bricks_of
 from taichi_mrf.queries.known_bricks import sorted_bricks
 from taichi_mrf.system import runtime
 
@@ -58,10 +57,6 @@ class PartialMap(MRFMap):
             k.footprint.window.bricks_of(k.visible.cells) for k in map(self._keyframes.get, keyframes) if k
         ]
         return sorted_bricks(np.concatenate([np.zeros((0, 3), np.int32), *found]))
-
-    def measured_bricks(self) -> Bricks:
-        """The bricks in which a keyframe has a say in the surface, whether they exist or not; ascending."""
-        return sorted_bricks(surface_bricks_of(self))
 
     def all_crossed_bricks(self) -> Bricks:
         """The bricks that any ray crosses, whether they exist or not; ascending."""

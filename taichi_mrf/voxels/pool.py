@@ -58,6 +58,17 @@ class Dated(Protocol):
     def bytes_per_voxel(self) -> int: ...
 
 
+@dataclass(frozen=True)
+class PoolPart:
+    """Some bricks of a pool by themselves, as if there were no others: ``in_use`` are their slots here, in
+    the order in which they were asked for, and ``belief`` (capacity * 512) their log-odds."""
+
+    capacity: int
+    in_use: NDArray[np.int32]
+    belief: "ti.Ndarray"
+    prior_log_odds: float
+
+
 class BrickPool:
     """The map's bricks with their beliefs.
 
@@ -207,6 +218,13 @@ class BrickPool:
         if len(slots):
             read_bricks(getattr(self, channel), slots, out, strip_length())
         return out.reshape(-1, VOXELS)
+
+    def part(self, slots: NDArray[np.int32]) -> PoolPart:
+        """Some bricks, (n,) slots, by themselves, as they are now."""
+        belief = ti.ndarray(ti.f32, max(1, len(slots)) * VOXELS)
+        if len(slots):
+            read_bricks(self.belief, slots, belief, strip_length())
+        return PoolPart(len(slots), np.arange(len(slots), dtype=np.int32), belief, self.prior_log_odds)
 
     def write(self, channel: str, slots: NDArray[np.int32], values: NDArray[np.float32]) -> None:
         """Set the voxels of some bricks, (n, 512), of the channel "total" or "evidence"."""

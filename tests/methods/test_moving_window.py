@@ -10,7 +10,9 @@ from window_walk import CHUNK_M, OUT, WINDOW_M, add, probes, unwindowed, walk, w
 
 from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.methods.chunked import ChunkedMap
+from taichi_mrf.methods.chunked_part import take_part
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
 pytest.importorskip("zarr", reason="a window needs the extra store")
 pytestmark = pytest.mark.usefixtures("backend")
@@ -33,10 +35,12 @@ def content(m: MRFMap) -> dict[str, np.ndarray]:
 
 
 def test_what_leaves_comes_back_bit_for_bit(tmp_path: Path) -> None:
-    m = windowed(tmp_path / "far.zarr")
+    m = windowed(tmp_path / "far.zarr", keep_surface=True)
     walk(m, OUT[:3], colored=True)
     for id in list(m.keyframes):
         m.freeze_keyframe(id)
+    field = m.surface_field()
+    assert field.weight.any()
     assert m.window is not None
     before, points = content(m), probes(m)
     occupancy, state, colors = m.occupancy(points), m.state(points), m.colors(points)
@@ -45,6 +49,12 @@ def test_what_leaves_comes_back_bit_for_bit(tmp_path: Path) -> None:
     assert m.statistics().bricks == len(m._registry.frozen_crossed) == 0
     assert (m.state(points) == 0).all()
     assert not m.colors(points).any()
+    assert not len(m.surface_field().bricks)
+    gone = ChunkedMap.open(tmp_path / "far.zarr")
+    np.testing.assert_array_equal(gone.colors(points), colors)
+    stored = take_part(gone).surface_field()
+    for place in field.chunks.astype(np.int64) * CHUNK_VOXELS:
+        np.testing.assert_array_equal(stored.box(place, CHUNK_VOXELS), field.box(place, CHUNK_VOXELS))
     assert len(m.window.parked) > 1
     m.window.follow(m, np.zeros(3))
     assert len(m.window.parked) == 0
@@ -53,6 +63,11 @@ def test_what_leaves_comes_back_bit_for_bit(tmp_path: Path) -> None:
     np.testing.assert_array_equal(m.occupancy(points), occupancy)
     np.testing.assert_array_equal(m.state(points), state)
     np.testing.assert_array_equal(m.colors(points), colors)
+    for ours, theirs in (
+        (m.surface_field().bricks, field.bricks),
+        (m.surface_field().distance, field.distance),
+    ):
+        np.testing.assert_array_equal(ours, theirs)
 
 
 @settings(max_examples=6)
@@ -71,6 +86,25 @@ def test_any_walk_ends_in_the_map_without_a_window(
     m.window.follow(m, np.array([1.1 * places[0], 0.0, 0.0]))
     in_memory, _ = m.voxels(0.0)
     np.testing.assert_array_equal(m.occupancy(in_memory), other.occupancy(in_memory))
+
+
+def test_the_folder_holds_surface_and_colours_of_the_whole_map(tmp_path: Path) -> None:
+    m, other = windowed(tmp_path / "far.zarr", keep_surface=True), unwindowed(keep_surface=True)
+    walk_both(m, other, OUT, colored=True)
+    assert m.window is not None
+    assert len(m.window.parked) > 1
+    for each in (m, other):
+        each.infer()
+    m.save(tmp_path / "map.npz")
+    part, points = take_part(ChunkedMap.open(tmp_path / "map_window.zarr")), probes(other)
+    np.testing.assert_array_equal(part.colors(points), other.colors(points))
+    field, stored = other.surface_field(), part.surface_field()
+    for place in field.chunks.astype(np.int64) * CHUNK_VOXELS:
+        np.testing.assert_allclose(
+            stored.box(place, CHUNK_VOXELS), field.box(place, CHUNK_VOXELS), rtol=1e-5, atol=1e-5
+        )
+    again = MRFMap.load(tmp_path / "map.npz")
+    np.testing.assert_array_equal(again.surface_field().weight, m.surface_field().weight)
 
 
 def test_the_surface_that_keyframes_are_aligned_with_comes_back(tmp_path: Path) -> None:

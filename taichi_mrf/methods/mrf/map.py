@@ -34,6 +34,7 @@ from taichi_mrf.methods.brick_map import check_inference, own_parameters, own_se
 from taichi_mrf.methods.map_file import MapHeader, StoredKeyframe, naming
 from taichi_mrf.methods.mrf.checkpoint import Checkpoint, go_back, take_checkpoint
 from taichi_mrf.methods.mrf.coloring import MapColors
+from taichi_mrf.methods.mrf.kept_rays import KeptRays
 from taichi_mrf.methods.mrf.keyframe_allocator import KeyframeAllocator
 from taichi_mrf.methods.mrf.memory_budget import MemoryBudget
 from taichi_mrf.methods.mrf.moving_window import MovingWindow
@@ -66,15 +67,17 @@ class MRFMap(ReadableMRF):
         time: TimeConfig | None = None,
         min_depth: float = SensorConfig.min_depth,
         max_depth: float = SensorConfig.max_depth,
+        keep_surface: bool = False,
         **parameters: Any,
     ) -> None:
         """``parameters`` are fields of InferenceConfig, such as ``surface_density=2.1`` or ``prior=0.1``.
 
-        ``noise`` defaults to a Kinect 1. Raises ConfigError for an unknown or impossible parameter.
+        ``noise`` defaults to a Kinect 1; for ``keep_surface`` see :meth:`surface`. Raises ConfigError for an
+        unknown or impossible parameter.
         """
         section = own_section(inference, InferenceConfig, parameters, "inference", "MRFMap")
         shared = own_parameters(voxel_size, volume, min_depth, max_depth, time)
-        self._set_up(Config(**shared, inference=section), noise)
+        self._set_up(Config(**shared, inference=section, keep_surface=keep_surface), noise)
 
     def _set_up(self, config: Config, noise: NoiseModel | None) -> None:
         inference = config.inference
@@ -98,7 +101,8 @@ class MRFMap(ReadableMRF):
         self._messages_lost = False  # a loaded map has beliefs, but no messages
         self._settled = True
         self._colors = MapColors(self._registry, self._keyframes, self._sweeper, self._allocator.refresh)
-        parked = (self._registry, self._dated, self.aligner.surface, self._colors)
+        self._kept = KeptRays(config.keep_surface)
+        parked = (self._registry, self._dated, self.aligner.surface, self._colors, self._kept)
         self.window = MovingWindow.of(self.config.volume, *parked)
 
     @property
@@ -192,7 +196,7 @@ class MRFMap(ReadableMRF):
             raise KeyframeError(
                 f"keyframe {id} ({keyframe.name}) has no messages to freeze: call infer first"
             )
-        self._colors.freeze(keyframe)
+        self._keep_share(keyframe)
         self._allocator.freeze(keyframe)
         self.aligner.surface.freeze(keyframe)
         self._frozen[id] = keyframe.name
@@ -330,7 +334,7 @@ class MRFMap(ReadableMRF):
             frozen=len(self._frozen),
             rays=sum(k.rays for k in keyframes),
             message_bytes=sum(k.voxel_bytes for k in keyframes),
-            other_bytes=sum(k.image_bytes for k in keyframes) + self._sweeper.nbytes + self._colors.nbytes,
+            other_bytes=sum(k.image_bytes for k in keyframes) + self._sweeper.nbytes + self._left_bytes,
         )
 
     def save(self, path: str | Path) -> None:
@@ -339,7 +343,7 @@ class MRFMap(ReadableMRF):
         stored = [StoredKeyframe.of(keyframe) for keyframe in keyframes]
         header = MapHeader(self.config, self.noise, stored, self._next_id, self._settled, self.up)
         parked = () if self.window is None else self.window.save_beside(Path(path), self)
-        parts = (self._frozen, parked, self._dated, self._colors)
+        parts = (self._frozen, parked, self._dated, self._colors, self._kept)
         write_contents(Path(path), contents_of(header, self._registry, keyframes, *parts))
         if self.window is not None:
             self.window.saved(Path(path))
@@ -355,7 +359,7 @@ class MRFMap(ReadableMRF):
             if len(bricks):
                 slots = m._registry.restore(bricks, contents.frozen_owners)
             m._registry.see_for_good(contents.frozen_crossed)
-            m._colors.restore(contents.frozen_colors)
+            m._restore_shares(contents.frozen_colors, contents.kept)
             m._frozen = dict(contents.frozen)
             for k in header.keyframes:
                 image = m._upload(k.depth_m, k.camera, k.color)

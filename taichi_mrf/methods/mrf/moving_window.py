@@ -23,17 +23,20 @@ from numpy.typing import NDArray
 from taichi_mrf.alignment.keyframe_surfels import KeyframeSurfels
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.errors import CapacityError, MapFileError
-from taichi_mrf.export.chunk_blocks import StorableMap, chunk_block, header_of
+from taichi_mrf.export.chunk_blocks import StorableMap, chunk_block, extra_block, header_of, voxel_block
 from taichi_mrf.export.chunk_store import Chunk
-from taichi_mrf.export.store_header import StoreHeader
+from taichi_mrf.export.growing_store import Extras
+from taichi_mrf.export.store_header import COLORS, SURFACE, StoreHeader
 from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.brick_registry import BrickRegistry, Bricks
 from taichi_mrf.methods.mrf.coloring import MapColors
+from taichi_mrf.methods.mrf.kept_rays import KeptRays
 from taichi_mrf.methods.mrf.parked_chunk import ParkedChunk
 from taichi_mrf.methods.mrf.parked_chunks import ParkedChunks, folder_beside
 from taichi_mrf.queries.known_bricks import bricks_between
 from taichi_mrf.system.libraries import library
+from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_BRICKS, CHUNK_VOXELS, VOXELS, by_chunk, grid_keys
 
 LEAVE = 1.25
@@ -58,7 +61,14 @@ class WindowedMap(StorableMap, Protocol):
 
     def infer(self, *, keyframes: Iterable[int] | None) -> object: ...
 
+    @property
+    def settled(self) -> bool: ...
+
     def freeze_keyframe(self, id: int) -> None: ...
+
+    def measured_bricks(self) -> NDArray[np.int32]: ...
+
+    def surface_field(self) -> DistanceField: ...
 
 
 class MovingWindow:
@@ -71,10 +81,12 @@ class MovingWindow:
         dated: DatedBelief | None,
         surface: KeyframeSurfels,
         colors: MapColors,
+        kept: KeptRays,
     ) -> None:
         """``dated`` is what follows the messages if evidence has a date, ``surface`` what keyframes are
-        aligned with."""
-        self.size_m, self._dated, self._surface, self._colors = size_m, dated, surface, colors
+        aligned with, ``kept`` what frozen ones measured."""
+        self.size_m, self._dated, self._surface = size_m, dated, surface
+        self._colors, self._kept = colors, kept
         self.parked = ParkedChunks()
         self._registry = registry
         self._position_m: NDArray[np.float64] | None = None  # where chunks were last looked for
@@ -88,12 +100,13 @@ class MovingWindow:
         dated: DatedBelief | None,
         surface: KeyframeSurfels,
         colors: MapColors,
+        kept: KeptRays,
     ) -> "MovingWindow | None":
         """The window that a configuration asks for. Raises TaichiMRFError without zarr."""
         if volume.window_m == 0:
             return None
         library("zarr", "volume.window_m needs", "store")  # fails before the run, not in the middle
-        return MovingWindow(volume.window_m, registry, dated, surface, colors)
+        return MovingWindow(volume.window_m, registry, dated, surface, colors, kept)
 
     @property
     def folder(self) -> Path | None:
@@ -135,7 +148,12 @@ class MovingWindow:
         """Make the folder beside a map's file hold the whole map; returns the names of the files of the
         chunks that are not in memory. Raises MapFileError."""
         header = header_of(m)
-        self.parked.complete(folder_beside(path), self._resident(m.keyframes.values(), header), header)
+        surface = None
+        if self._kept.wanted:
+            self._fetch_crossed(m.measured_bricks())
+            surface = m.surface_field() if m.settled else self._kept.share.field
+        resident = self._resident(m, header, surface)
+        self.parked.complete(folder_beside(path), resident, header)
         return self.parked.names
 
     def saved(self, path: Path) -> None:
@@ -175,6 +193,7 @@ class MovingWindow:
         registry.see_for_good(found.crossed)
         self._surface.restore(found.surfels)
         self._colors.restore(found.colors)
+        self._kept.restore(found.rays)
 
     def _leave(self, m: WindowedMap, position_m: NDArray[np.float64]) -> None:
         """Write the chunks that are outside of the window, and release them. What cannot be written stays in
@@ -194,10 +213,22 @@ class MovingWindow:
     def _release(self, chunks: NDArray[np.int32], header: StoreHeader) -> None:
         """Write chunks (n, 3) that only frozen keyframes have seen, and release them."""
         slots = self._slots_in(chunks)
-        self.parked.add(self._contents(chunks, slots), self._voxels(chunks, header), header)
+        contents = self._contents(chunks, slots)
+        extras: dict[str, dict[Chunk, NDArray]] = {}
+        if self._colors:
+            extras[COLORS] = {
+                chunk: voxel_block(chunk, found.colors.bricks, found.colors.numbers, found.colors.colors())
+                for chunk, found in contents.items()
+            }
+        if self._kept.wanted:
+            extras[SURFACE] = {
+                chunk: _distances(chunk, found.rays.field) for chunk, found in contents.items()
+            }
+        self.parked.add(contents, self._voxels(chunks, header), extras, header)
         self._registry.leave(slots, chunks)
         self._surface.release(chunks)
         self._colors.release(chunks)
+        self._kept.release(chunks)
         self._chunks = self.parked.chunks
 
     def _contents(self, chunks: NDArray[np.int32], slots: NDArray[np.int32]) -> dict[Chunk, ParkedChunk]:
@@ -209,6 +240,7 @@ class MovingWindow:
         surfels_of = dict(by_chunk(surfels.cells // BRICK))
         colors = self._colors.frozen_in(chunks)
         colors_of = dict(by_chunk(colors.bricks))
+        rays = self._kept.share.in_chunks(chunks)
         contents = {}
         for x, y, z in chunks.tolist():
             inside = slots[slots_of.get((x, y, z), _NONE)]
@@ -221,17 +253,33 @@ class MovingWindow:
                 None if self._dated is None else self._dated.read_frozen(inside),
                 surfels.chosen(surfels_of.get((x, y, z), _NONE)),
                 colors.chosen(colors_of.get((x, y, z), _NONE)),
+                rays.in_chunks(np.array([[x, y, z]], np.int32)),
             )
         return contents
 
     def _resident(
-        self, keyframes: Iterable[Keyframe], header: StoreHeader
-    ) -> Iterator[dict[Chunk, NDArray[np.float32]]]:
-        """The voxels of all chunks in memory, some at a time; ``keyframes`` are those that are not frozen."""
-        crossed = [k.footprint.window.bricks_of(k.footprint.crossed) // CHUNK for k in keyframes]
-        chunks = _distinct(np.concatenate([self._chunks_in_memory(), *map(_distinct, crossed)]))
+        self, m: WindowedMap, header: StoreHeader, surface: DistanceField | None
+    ) -> Iterator[tuple[dict[Chunk, NDArray[np.float32]], Extras]]:
+        """The voxels of all chunks in memory, some at a time, with their colours if these are known, and with
+        the distances of ``surface``."""
+        measured = np.zeros((0, 3), np.int32) if surface is None else surface.chunks
+        footprints = [k.footprint for k in m.keyframes.values()]
+        crossed = [_distinct(each.window.bricks_of(each.crossed) // CHUNK) for each in footprints]
+        chunks = _distinct(np.concatenate([self._chunks_in_memory(), measured, *crossed]))
         for first in range(0, len(chunks), _AT_ONCE):
-            yield self._voxels(chunks[first : first + _AT_ONCE], header)
+            some = chunks[first : first + _AT_ONCE]
+            extras: dict[str, dict[Chunk, NDArray]] = {}
+            slots = self._slots_in(some)
+            colors = self._colors.stored(slots, m.settled)
+            if len(colors):
+                rows_of = dict(by_chunk(self._registry.pool.bricks[slots]))
+                extras[COLORS] = {
+                    chunk: extra_block(chunk, self._registry.pool.bricks[slots[rows]], colors[rows])
+                    for chunk, rows in rows_of.items()
+                }
+            if surface is not None:
+                extras[SURFACE] = {(x, y, z): _distances((x, y, z), surface) for x, y, z in some.tolist()}
+            yield self._voxels(some, header), extras
 
     def _voxels(self, chunks: NDArray[np.int32], header: StoreHeader) -> dict[Chunk, NDArray[np.float32]]:
         """(64, 64, 64) log-odds of some chunks (n, 3), NaN for unknown."""
@@ -256,10 +304,12 @@ class MovingWindow:
         return slots[np.isin(grid_keys(pool.bricks[slots] // CHUNK), grid_keys(chunks))]
 
     def _chunks_in_memory(self) -> NDArray[np.int32]:
-        """The chunks (n, 3) with voxels, or that frozen keyframes' rays cross."""
+        """The chunks (n, 3) with voxels, or that frozen keyframes' rays cross or have measured."""
         pool, registry = self._registry.pool, self._registry
-        chunks = np.concatenate([pool.bricks[pool.in_use], registry.frozen_crossed]) // CHUNK
-        return _distinct(chunks)
+        measured = self._kept.share.distances.bricks
+        return _distinct(
+            np.concatenate([pool.bricks[pool.in_use], registry.frozen_crossed, measured]) // CHUNK
+        )
 
     def _seen_by_keyframes(self, chunks: NDArray[np.int32]) -> NDArray[np.bool_]:
         """Which of some chunks (n, 3) are crossed by keyframes that are not frozen, (n,)."""
@@ -275,6 +325,11 @@ class MovingWindow:
         beside = np.maximum(np.maximum(lower - position_m, position_m - (lower + side_m)), 0.0)
         distances: NDArray[np.float64] = np.linalg.norm(beside, axis=1)
         return distances
+
+
+def _distances(chunk: Chunk, surface: DistanceField) -> NDArray[np.float32]:
+    """(64, 64, 64, 2) weights and distances of a chunk."""
+    return np.stack(surface.box(np.array(chunk, np.int64) * CHUNK_VOXELS, CHUNK_VOXELS), axis=-1)
 
 
 def _distinct(chunks: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -17,7 +17,15 @@ from taichi_mrf.alignment.surfels import Surfels
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.export.chunk_store import Chunk
 from taichi_mrf.inference.color_sums import ColorShare
-from taichi_mrf.methods.mrf.storage import color_arrays, dated_arrays, read_color_share, read_dated
+from taichi_mrf.methods.mrf.kept_rays import RayShare
+from taichi_mrf.methods.mrf.storage import (
+    color_arrays,
+    dated_arrays,
+    ray_arrays,
+    read_color_share,
+    read_dated,
+    read_rays,
+)
 from taichi_mrf.system.atomic import write_npz
 from taichi_mrf.system.files import exists
 from taichi_mrf.system.npz_file import open_npz
@@ -33,7 +41,8 @@ class ParkedChunk:
     """``total`` and ``evidence`` are (n, 512) log-odds of the ``bricks`` (n, 3) that have voxels; ``owners``
     (n,) counts the frozen keyframes that own each; ``crossed`` (m, 3) are the bricks that they crossed.
     ``dated`` is, in a dated map, what they say of the voxels (n, 512), and as of when (n); ``surfels`` is the
-    surface that they have measured, if keyframes are aligned; ``colors`` is what they gave to the colours."""
+    surface that they have measured, if keyframes are aligned; ``colors`` is what they gave to the colours,
+    and ``rays`` what they measured, if that is kept."""
 
     bricks: NDArray[np.int32]
     total: NDArray[np.float32]
@@ -43,12 +52,13 @@ class ParkedChunk:
     dated: tuple[NDArray[np.float32], NDArray[np.float64]] | None
     surfels: Surfels
     colors: ColorShare
+    rays: RayShare
 
     @cached_property
     def _arrays(self) -> dict[str, NDArray]:
         arrays: dict[str, NDArray] = {name: getattr(self, name) for name in _MEMBERS}
         arrays |= {"surfel_keys": self.surfels.keys, "surfel_sums": self.surfels.sums}
-        arrays |= color_arrays(self.colors)
+        arrays |= color_arrays(self.colors) | ray_arrays(self.rays)
         return arrays if self.dated is None else arrays | dated_arrays(*self.dated)
 
     def file_name(self, chunk: Chunk) -> str:
@@ -90,8 +100,9 @@ def read_parked(path: Path, chunk: Chunk, voxel_size: float) -> ParkedChunk:
             read_dated(file, n),
             Surfels(keys, file.array("surfel_sums", "f", (len(keys), 7)).astype(np.float64), voxel_size),
             read_color_share(path, file, bricks),
+            read_rays(path, file),
         )
-    for places in (found.bricks, found.crossed):
+    for places in (found.bricks, found.crossed, found.rays.distances.bricks, found.rays.votes.bricks):
         if (places // CHUNK != chunk).any() or len(np.unique(places, axis=0)) < len(places):
             raise MapFileError(f"{path}: damaged: it names a brick twice, or one of another chunk")
     if (np.diff(found.surfels.keys) <= 0).any() or (found.surfels.cells // CHUNK_VOXELS != chunk).any():

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.export.chunk_store import SUFFIX, Chunk, ChunkStore, new_store
-from taichi_mrf.export.growing_store import put_chunks
+from taichi_mrf.export.growing_store import Extras, put_chunks
 from taichi_mrf.export.store_header import StoreHeader
 from taichi_mrf.methods.mrf.parked_chunk import ParkedChunk, chunk_of, read_parked
 from taichi_mrf.system.files import is_file
@@ -67,15 +67,16 @@ class ParkedChunks:
         self,
         chunks: Mapping[Chunk, ParkedChunk],
         blocks: Mapping[Chunk, NDArray[np.float32]],
+        extras: Extras,
         header: StoreHeader,
     ) -> None:
-        """Write chunks that are about to leave memory, and their voxels, (64, 64, 64) log-odds each. Raises
-        MapFileError; none of them counts as written then."""
+        """Write chunks that are about to leave memory, and their voxels, (64, 64, 64) log-odds each, and
+        ``extras`` of these. Raises MapFileError; none of them counts as written then."""
         folder = self._begun(header)
         names = {chunk: parked.file_name(chunk) for chunk, parked in chunks.items()}
         for chunk, parked in chunks.items():
             parked.write(folder / PARKED / names[chunk])
-        put_chunks(folder, header, blocks)
+        put_chunks(folder, header, blocks, extras)
         self._names |= names
 
     def read(self, chunk: Chunk, voxel_size: float) -> ParkedChunk:
@@ -101,16 +102,19 @@ class ParkedChunks:
             self.folder, self._is_begun, self._saved = folder, True, set(self.names)
 
     def complete(
-        self, folder: Path, resident: Iterable[Mapping[Chunk, NDArray[np.float32]]], header: StoreHeader
+        self,
+        folder: Path,
+        resident: Iterable[tuple[Mapping[Chunk, NDArray[np.float32]], Extras]],
+        header: StoreHeader,
     ) -> None:
         """Make a folder hold the whole map: all files, and the voxels of the ``resident`` chunks too, (64,
-        64, 64) log-odds each. Raises MapFileError."""
+        64, 64) log-odds each, with their extras. Raises MapFileError."""
         self.folder = self.folder or folder
         self._begun(header)
         if folder != self.folder:
             self._copy(folder)
-        for blocks in resident:
-            put_chunks(folder, header, blocks)
+        for blocks, extras in resident:
+            put_chunks(folder, header, blocks, extras)
 
     def tidy(self, folder: Path) -> None:
         """A map that names exactly these chunks was saved beside a folder: remove all other files."""

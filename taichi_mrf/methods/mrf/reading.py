@@ -17,6 +17,7 @@ from taichi_mrf.config.method import Method
 from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.geometry.up import Up
+from taichi_mrf.inference.color_sums import ColorShare
 from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.dated_channels import layer_of
 from taichi_mrf.inference.keyframe import Keyframe
@@ -25,6 +26,7 @@ from taichi_mrf.inference.surface_votes import surfaces_first
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.methods.brick_map import BrickMap
 from taichi_mrf.methods.mrf.coloring import MapColors
+from taichi_mrf.methods.mrf.kept_rays import RayShare
 from taichi_mrf.methods.mrf.surfacing import WithSurface
 from taichi_mrf.methods.protocol import MappedKeyframe
 from taichi_mrf.queries.change import MapChange, compare_maps
@@ -151,6 +153,21 @@ class ReadableMRF(WithSurface):
         self._restore_messages()
         return self._colors.follow()
 
+    def _keep_share(self, keyframe: Keyframe) -> None:
+        """Keep what a keyframe gives to colours, and to surface and reading; it is about to be frozen."""
+        self._colors.freeze(keyframe)
+        self._keep_rays(keyframe)
+
+    def _restore_shares(self, colors: ColorShare, rays: RayShare) -> None:
+        """Add what frozen keyframes of a saved map have left."""
+        self._colors.restore(colors)
+        self._kept.restore(rays)
+
+    @property
+    def _left_bytes(self) -> int:
+        """Bytes of the colours, and of what frozen keyframes measured."""
+        return self._colors.nbytes + self._kept.share.nbytes
+
     def _prepare_colors(self) -> None:
         if not self._colors.is_current:
             self._restore_messages()
@@ -222,8 +239,8 @@ class ReadableMRF(WithSurface):
         "surface" also calls a voxel occupied if it wins the vote of the rays: each measured ray votes for
         the voxel that most likely is its first surface, and against those in front of it
         (inference.surface_votes). Its log-odds are raised to just above even odds; all others are the
-        marginals, which are what "marginal" gives. Frozen keyframes have no votes. Raises ConfigError for
-        another name.
+        marginals, which are what "marginal" gives. The votes of frozen keyframes are kept with
+        ``keep_surface``, else they have none. Raises ConfigError for another name.
         """
         if which not in READINGS:
             raise ConfigError(f"there is no reading {which!r}; known are {', '.join(READINGS)}")
@@ -231,7 +248,10 @@ class ReadableMRF(WithSurface):
             return MapReading(self, copied(self._pool.belief))
         seen = [(k, self._registry.visible_again(k.footprint, k.visible)) for k in self._keyframes.values()]
         model = replace(self._sweeper.model(), maximise=False)
-        return MapReading(self, surfaces_first(seen, self._pool, model, self.view.volume))
+        votes = self._kept.share.votes
+        slots = self._registry.topology.slots(votes.bricks) if len(votes.bricks) else np.zeros(0, np.int32)
+        kept = (slots[slots >= 0], votes.sums[slots >= 0]) if len(slots) else None
+        return MapReading(self, surfaces_first(seen, self._pool, model, self.view.volume, kept))
 
     def changes(self, since_s: float) -> MapChange:
         """What differs between the map as it was believed at a time in seconds and as it is now: its

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
+from taichi_mrf.inference.brick_sums import LARGEST, BrickSums
 from taichi_mrf.inference.color_sums import ColorShare
 from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.dated_channels import NEVER
@@ -20,6 +21,7 @@ from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.map_file import MapHeader, open_map_file, read_bricks, read_header
 from taichi_mrf.methods.mrf.coloring import MapColors
+from taichi_mrf.methods.mrf.kept_rays import KeptRays, RayShare
 from taichi_mrf.system.atomic import write_npz
 from taichi_mrf.system.npz_file import NpzFile
 from taichi_mrf.voxels.layout import VOXELS, grid_keys
@@ -37,7 +39,7 @@ class MapContents:
     ``frozen_owners`` (n,) counts the frozen keyframes that own each brick, ``frozen_crossed`` (m, 3)
     are the bricks that they crossed, and ``frozen`` their names by id. ``parked`` names the files of the
     chunks that are not in memory (parked_chunks.py). ``colors`` (n, 512, 4) are those of the voxels, or (0,
-    512, 4), ``frozen_colors`` what frozen keyframes gave to them."""
+    512, 4), ``frozen_colors`` what frozen keyframes gave to them, and ``kept`` what they measured."""
 
     header: MapHeader
     bricks: NDArray[np.int32]
@@ -50,6 +52,7 @@ class MapContents:
     parked: list[str]
     colors: NDArray[np.uint8]
     frozen_colors: ColorShare
+    kept: RayShare
 
 
 def contents_of(
@@ -60,6 +63,7 @@ def contents_of(
     parked: Sequence[str] = (),
     dated: DatedBelief | None = None,
     colors: MapColors | None = None,
+    kept: KeptRays | None = None,
 ) -> MapContents:
     """The contents to store; ``keyframes`` are those that are not frozen."""
     pool = registry.pool
@@ -79,6 +83,7 @@ def contents_of(
         list(parked),
         np.zeros((0, VOXELS, 4), np.uint8) if colors is None else colors.stored(slots, header.settled),
         ColorShare.nothing() if colors is None else colors.frozen,
+        RayShare.nothing() if kept is None else kept.share,
     )
 
 
@@ -101,7 +106,8 @@ def write_contents(path: Path, contents: MapContents) -> None:
         arrays |= dated_arrays(*contents.frozen_dated)
     if len(contents.colors) and contents.colors.any():
         arrays["colors"] = contents.colors
-    write_npz(path, arrays | color_arrays(contents.frozen_colors), manifest=True)
+    arrays |= color_arrays(contents.frozen_colors) | ray_arrays(contents.kept)
+    write_npz(path, arrays, manifest=True)
 
 
 def read_contents(path: Path) -> MapContents:
@@ -125,6 +131,7 @@ def read_contents(path: Path) -> MapContents:
             if "colors" in file
             else np.zeros((0, VOXELS, 4), np.uint8),
             read_color_share(path, file, bricks),
+            read_rays(path, file),
         )
     if (contents.frozen_owners < 0).any():
         raise MapFileError(f"{path}: damaged: frozen_owners holds a negative number")
@@ -167,3 +174,28 @@ def read_color_share(path: Path, file: NpzFile, bricks: NDArray[np.int32]) -> Co
     if not known or ((numbers < 0) | (numbers >= VOXELS)).any() or (share.bw <= 0).any():
         raise MapFileError(f"{path}: damaged: the colours of frozen keyframes are not those of its voxels")
     return share
+
+
+def ray_arrays(share: RayShare) -> dict[str, NDArray]:
+    """What frozen keyframes measured, for a file; nothing if it is nothing."""
+    arrays: dict[str, NDArray] = {}
+    for name, found in (("distance", share.distances), ("vote", share.votes)):
+        if len(found.bricks):
+            arrays |= {f"frozen_{name}_bricks": found.bricks, f"frozen_{name}_sums": found.sums}
+    return arrays
+
+
+def read_rays(path: Path, file: NpzFile) -> RayShare:
+    """The same from a file. Raises MapFileError for sums that no keyframes have left."""
+    return RayShare(_read_sums(path, file, "distance", 2), _read_sums(path, file, "vote", 1))
+
+
+def _read_sums(path: Path, file: NpzFile, name: str, values: int) -> BrickSums:
+    if f"frozen_{name}_bricks" not in file:
+        return BrickSums.nothing(values)
+    bricks = file.array(f"frozen_{name}_bricks", "i", (None, 3)).astype(np.int32)
+    sums = file.array(f"frozen_{name}_sums", "i", (len(bricks), VOXELS, values))
+    beyond = (np.abs(sums.astype(np.int64)) > LARGEST).any() or (values == 2 and (sums[..., 0] < 0).any())
+    if beyond or (np.diff(grid_keys(bricks)) <= 0).any():
+        raise MapFileError(f"{path}: damaged: what frozen keyframes measured is not in order")
+    return BrickSums(bricks, sums.astype(np.int32))

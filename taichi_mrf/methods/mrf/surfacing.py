@@ -9,10 +9,13 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.fused_surface import FusedSurface, fused_surface, without_free
 from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.inference.ray_model import RayModel
 from taichi_mrf.inference.surface_field import SurfaceRays
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.methods.brick_map import BrickMap
+from taichi_mrf.methods.mrf.kept_rays import KeptRays
 from taichi_mrf.queries.colored import blended_colors, is_colored
+from taichi_mrf.queries.known_bricks import sorted_bricks
 from taichi_mrf.voxels.distance_field import DistanceField
 
 OUTLIERS = 0.01
@@ -30,6 +33,7 @@ class WithSurface(BrickMap):
     _keyframes: dict[int, Keyframe]
     _frozen: dict[int, str]
     _sweeper: Sweeper
+    _kept: KeptRays
 
     @property
     def keyframes(self) -> Mapping[int, Keyframe]:
@@ -38,8 +42,16 @@ class WithSurface(BrickMap):
 
     @property
     def has_surface(self) -> bool:
-        """Whether there is a surface of all keyframes that the map was made of: none is frozen."""
-        return bool(self._keyframes) and not self._frozen
+        """Whether there is a surface of all keyframes that the map was made of: none is frozen, or what
+        frozen ones measured is kept (``keep_surface``)."""
+        return bool(self._keyframes or self._frozen) and (self._kept.wanted or not self._frozen)
+
+    def measured_bricks(self) -> NDArray[np.int32]:
+        """The bricks (n, 3) in which keyframes that are not frozen have a say in the surface; ascending."""
+        rays = SurfaceRays(self._pool, self._sweeper.model(), self.config.volume)
+        bands = map(rays.bricks_in_band, self._keyframes.values())
+        found = [window.bricks_of(cells) for window, cells in bands]
+        return sorted_bricks(np.concatenate([np.zeros((0, 3), np.int32), *found]))
 
     def surface_field(self) -> DistanceField:
         """The signed distances that the keyframes measured, as of the last :meth:`infer`. Raises
@@ -52,26 +64,34 @@ class WithSurface(BrickMap):
         colour if keyframes have colour images.
 
         It is made from the keyframes' images and the marginals as they are now, so call :meth:`infer` before.
-        Frozen keyframes have no images and no part in it. Raises ConfigError for a map without keyframes,
-        CapacityError if there is not enough memory, TaichiMRFError without scikit-image.
+        Frozen keyframes have no images: their part is kept with ``keep_surface``, else they have none.
+        Raises ConfigError for a map without keyframes, CapacityError if there is not enough memory,
+        TaichiMRFError without scikit-image.
         """
-        if not self._keyframes:
+        if not self._keyframes and not self.has_surface:
             raise ConfigError("the map has no keyframes: there is nothing to make a surface of")
         found = fused_surface(surface_field_of(self), self.voxel_size)
         found = without_free(self, found, LEAST * self.prior)
         colors = blended_colors(self, found.vertices_m) if is_colored(self) else None
         return replace(found, colors=colors)
 
-
-def surface_bricks_of(m: WithSurface) -> NDArray[np.int32]:
-    """The bricks (n, 3) in which a map's keyframes have a say in the surface, some of them several times."""
-    rays = SurfaceRays(m._pool, m._sweeper.model(), m.config.volume)
-    found = [window.bricks_of(cells) for window, cells in map(rays.bricks_in_band, m._keyframes.values())]
-    return np.concatenate([np.zeros((0, 3), np.int32), *found])
+    def _keep_rays(self, keyframe: Keyframe) -> None:
+        """Keep what a keyframe's rays say of the surface, if that is wanted; it is about to be frozen."""
+        if self._kept.wanted:
+            visible = self._registry.visible(keyframe.footprint)
+            models = _model_of(self), replace(self._sweeper.model(), maximise=False)
+            share = self._kept.freeze(keyframe, visible, self._pool, models, self.config.volume)
+            if self._registry.before_claim is not None:  # what is outside of the window comes back
+                self._registry.before_claim(share.distances.bricks)
+            self._kept.restore(share)
 
 
 def surface_field_of(m: WithSurface) -> DistanceField:
     """The signed distances that a map's keyframes measured. Raises CapacityError."""
-    model = replace(m._sweeper.model(), maximise=False, floor=OUTLIERS / m.sensor.max_depth)
-    rays = SurfaceRays(m._pool, model, m.config.volume)
-    return rays.field([(k, m._registry.visible(k.footprint)) for k in m._keyframes.values()])
+    rays = SurfaceRays(m._pool, _model_of(m), m.config.volume)
+    found = rays.field([(k, m._registry.visible(k.footprint)) for k in m._keyframes.values()])
+    return m._kept.added_to(found)
+
+
+def _model_of(m: WithSurface) -> RayModel:
+    return replace(m._sweeper.model(), maximise=False, floor=OUTLIERS / m.sensor.max_depth)

@@ -1,0 +1,110 @@
+"""What the rays of frozen keyframes have measured, kept for the surface and for the reading of the map.
+
+A keyframe's weights and distances (inference/surface_rays.py) and its votes (inference/surface_votes.py) are
+taken with the marginals as they are when it is frozen, and rounded to integers. So what is kept is a sum over
+keyframes: their order does not matter.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.config.schema import VolumeConfig
+from taichi_mrf.inference.brick_sums import BrickSums
+from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
+from taichi_mrf.inference.ray_model import RayModel
+from taichi_mrf.inference.surface_field import SurfaceRays
+from taichi_mrf.inference.surface_votes import count_votes
+from taichi_mrf.voxels.distance_field import DistanceField
+from taichi_mrf.voxels.layout import VOXELS, grid_keys
+from taichi_mrf.voxels.pool import BrickPool
+
+STEPS = 1024.0
+"""Steps of the kept sums for a weight of 1: a voxel with the least weight that counts has 20."""
+
+
+@dataclass(frozen=True)
+class RayShare:
+    """``distances``: weight, and distance in voxels times weight, in 1 / STEPS; ``votes``: one a voxel."""
+
+    distances: BrickSums
+    votes: BrickSums
+
+    @staticmethod
+    def nothing() -> "RayShare":
+        """That of no keyframe."""
+        return RayShare(BrickSums.nothing(2), BrickSums.nothing(1))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in memory."""
+        return self.distances.nbytes + self.votes.nbytes
+
+    def plus(self, other: "RayShare") -> "RayShare":
+        """Both together."""
+        return RayShare(self.distances.plus(other.distances), self.votes.plus(other.votes))
+
+    def in_chunks(self, chunks: NDArray[np.int32], inside: bool = True) -> "RayShare":
+        """What lies in some chunks (n, 3), or what does not."""
+        both = (self.distances, self.votes)
+        return RayShare(*(sums.chosen(sums.inside(chunks) == inside) for sums in both))
+
+    @property
+    def field(self) -> DistanceField:
+        """The distances as signed distances."""
+        sums = self.distances.sums.astype(np.float32) / np.float32(STEPS)
+        return DistanceField(self.distances.bricks, sums[..., 0], sums[..., 1])
+
+
+class KeptRays:
+    """What the frozen keyframes of one map have left."""
+
+    def __init__(self, wanted: bool) -> None:
+        """Unless it is ``wanted``, nothing is kept."""
+        self.wanted, self.share = wanted, RayShare.nothing()
+
+    def freeze(
+        self,
+        keyframe: Keyframe,
+        visible: VisibleBricks,
+        pool: BrickPool,
+        models: tuple[RayModel, RayModel],
+        volume: VolumeConfig,
+    ) -> RayShare:
+        """What a keyframe, which is about to be frozen, leaves, with the bricks that it sees now; ``models``
+        are those of its rays for the surface and for the reading."""
+        # Only the keyframe's own bricks are looked at, however large the map is.
+        part = pool.part(visible.slots)
+        seen = [(keyframe, replace(visible, slots=part.in_use, arrays=None))]
+        field = SurfaceRays(part, models[0], volume).field(seen)
+        sums = np.rint(np.stack([field.weight, field.distance], axis=-1) * STEPS).astype(np.int32)
+        votes = count_votes(seen, part, models[1], volume).to_numpy()[: len(visible.slots) * VOXELS]
+        bricks = pool.bricks[visible.slots]
+        return RayShare(BrickSums.of(field.bricks, sums), BrickSums.of(bricks, votes.reshape(-1, VOXELS, 1)))
+
+    def restore(self, share: RayShare) -> None:
+        """Add what keyframes left."""
+        self.share = self.share.plus(share)
+
+    def release(self, chunks: NDArray[np.int32]) -> None:
+        """Remove what lies in some chunks, (n, 3)."""
+        self.share = self.share.in_chunks(chunks, inside=False)
+
+    def added_to(self, field: DistanceField) -> DistanceField:
+        """The signed distances of other keyframes, and what is kept."""
+        return _sum_of((field, self.share.field)) if len(self.share.distances.bricks) else field
+
+
+def _sum_of(fields: Iterable[DistanceField]) -> DistanceField:
+    fields = list(fields)
+    bricks = np.concatenate([field.bricks for field in fields])
+    _, first = np.unique(grid_keys(bricks), return_index=True)
+    keys = grid_keys(bricks[first])
+    weight, distance = (np.zeros((len(first), VOXELS), np.float32) for _ in range(2))
+    for field in fields:
+        rows = np.searchsorted(keys, grid_keys(field.bricks))
+        weight[rows] += field.weight
+        distance[rows] += field.distance
+    return DistanceField(bricks[first], weight, distance)
