@@ -59,7 +59,7 @@ def changed(section: Any, method: str, prefix: str = "") -> Any:
             values[field.name] = method
         elif name == "volume.window_m" and not METHODS[method].can_freeze:
             values[field.name] = 0.0
-        elif name == "color" and not METHODS[method].has_colors:
+        elif name in ("color", "keep_surface") and not METHODS[method].has_colors:
             values[field.name] = False
         elif name in OTHER:
             values[field.name] = OTHER[name]
@@ -74,7 +74,7 @@ def changed(section: Any, method: str, prefix: str = "") -> Any:
 def test_every_field_of_the_configuration_is_saved(method: str, tmp_path: Path) -> None:
     config = changed(Config(), method)
     unchanged = {"sensor.sigma_table", "sensor.bias_table"}
-    unchanged |= {"method"} if METHODS[method].can_freeze else {"volume.window_m", "color"}
+    unchanged |= {"method"} if METHODS[method].can_freeze else {"volume.window_m", "color", "keep_surface"}
     all_names = differences(Config(), config)
     assert len(all_names) + len(unchanged) == sum(1 for _ in leaves(Config()))
     m = create_map(config, CAMERA)
