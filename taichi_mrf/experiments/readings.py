@@ -117,7 +117,7 @@ def _figures(contender: Any, scene: Scene, mesh: TriangleMesh, voxel_size: float
     for name, shown in maps.items():
         called = shown.occupancy(centres) > 0.5
         found = float((called & occupied).sum())
-        right = _accuracy(m, scene, judged, _solid(shown))
+        right = _accuracy(m, scene, judged, _solid(m, shown))
         readings[name] = [*right, found / max(1, called.sum()), found / occupied.sum()]
     # Voxels that no measured ray has told anything of have the prior; they are not judged.
     seen = np.abs(p - m.prior) > 1e-6
@@ -129,9 +129,9 @@ def _figures(contender: Any, scene: Scene, mesh: TriangleMesh, voxel_size: float
     return {"readings": readings, "marginals": [None if np.isnan(x) else float(x) for x in marginals]}
 
 
-def _solid(m: MRFMap | MapReading) -> View:
-    """The map with voxels that stop every ray or none, by whether they are called occupied."""
-    pool = m.view.pool
+def _solid(m: MRFMap, shown: MRFMap | MapReading) -> View:
+    """The map with voxels that stop every ray or none, by whether they are occupied as it is ``shown``."""
+    pool = shown.view.pool
     solid = ti.ndarray(ti.f32, pool.belief.shape)
     solid.from_numpy(np.where(pool.belief.to_numpy() > 0, OCCUPIED, -OCCUPIED).astype(np.float32))
     return MapReading(m, solid).view.with_occlusion(empty_below=0.0)

@@ -101,6 +101,14 @@ class DatedBelief:
             self._age(channels, seen, np.full(len(seen), stamp_s))
         return channels.shown
 
+    @property
+    def frozen_s(self) -> float:
+        """The stamp of the newest frozen keyframe, in seconds, as far as its bricks are in memory; -inf
+        without one."""
+        if self.frozen is None:
+            return float("-inf")
+        return float(self.frozen.stamp_s[self.pool.in_use].max(initial=-np.inf))
+
     def outdate(self) -> None:
         """All messages may have changed."""
         self._outdated[:] = True

@@ -5,6 +5,7 @@ are Taichi ndarrays, which kernels take as arguments, and not fields, for which 
 anew whenever the pool grows. What only the host needs (coordinates, owners, identities) is NumPy.
 """
 
+import copy
 import heapq
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -218,6 +219,12 @@ class BrickPool:
         if len(slots):
             read_bricks(getattr(self, channel), slots, out, strip_length())
         return out.reshape(-1, VOXELS)
+
+    def showing_others(self, log_odds: "ti.Ndarray") -> "BrickPool":
+        """The same bricks, whose beliefs are other log-odds (capacity * 512)."""
+        other = copy.copy(self)
+        other._shown = log_odds
+        return other
 
     def part(self, slots: NDArray[np.int32]) -> PoolPart:
         """Some bricks, (n,) slots, by themselves, as they are now."""

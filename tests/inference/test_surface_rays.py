@@ -7,7 +7,6 @@ from oracles.forward import Noise
 from oracles.traversal import segments
 
 from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.methods.mrf.surfacing import surface_field_of
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
 from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
@@ -25,7 +24,7 @@ def _map(**parameters: float) -> MRFMap:
 
 def _field(m: MRFMap) -> dict[tuple[int, int, int], tuple[float, float]]:
     """Weight and distance times weight of each voxel that has any."""
-    field = surface_field_of(m)
+    field = m.surface_field()
     found = {}
     for brick, weight, distance in zip(field.bricks, field.weight, field.distance, strict=True):
         for number in np.flatnonzero(weight):

@@ -16,6 +16,7 @@ from taichi_mrf.inference.voxel_colors import ColorPass
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.queries.points import checked_points
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, grid_keys
+from taichi_mrf.voxels.pool import BrickPool
 
 
 class MapColors:
@@ -27,16 +28,25 @@ class MapColors:
         keyframes: Mapping[int, Keyframe],
         sweeper: Sweeper,
         refresh: Callable[[Keyframe], object],
+        pool: BrickPool | None = None,
     ) -> None:
         """``keyframes`` are those of the map, now and later; ``refresh`` brings one's bricks and messages up
-        to date."""
+        to date. ``pool`` (default: the registry's) has the beliefs."""
+        self._beliefs = pool
         self._registry, self._keyframes, self._refresh = registry, keyframes, refresh
-        self._pass = ColorPass(sweeper)
+        self._sweeper, self._pass = sweeper, ColorPass(sweeper)
         self.frozen = ColorShare.nothing()
         self._colors = np.zeros((0, 4), np.uint8)
         self._found_at: tuple[int, int] | None = None
         self._sums: ColorSums | None = None  # kept with follow()
         self._counted: dict[int, Keyframe] = {}
+
+    def of_some(self, keyframes: Mapping[int, Keyframe], pool: BrickPool, with_frozen: bool) -> "MapColors":
+        """The colours that some keyframes gave, and perhaps frozen ones, by the beliefs of ``pool``."""
+        parts = (self._registry, keyframes, self._sweeper, self._refresh, pool)
+        some = MapColors(*parts)
+        some.frozen = self.frozen if with_frozen else some.frozen
+        return some
 
     def __bool__(self) -> bool:
         """Whether any voxel may have a colour."""
@@ -131,7 +141,7 @@ class MapColors:
     def _found(self) -> NDArray[np.uint8]:
         """Colours (capacity * 512, 4) by slot, computed if the map has changed."""
         if not self.is_current:
-            sums, pool = self._of_frozen(), self._registry.pool
+            sums, pool = self._of_frozen(), self._beliefs or self._registry.pool
             for keyframe in self._keyframes.values():
                 if keyframe.color is not None and keyframe.messages is not None:
                     self._refresh(keyframe)

@@ -1,7 +1,6 @@
 """What can be read of an MRFMap: its keyframes, and the map as it was believed at another time, or one layer
 of it."""
 
-import copy
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -9,14 +8,11 @@ from types import MappingProxyType
 from typing import Literal, get_args
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import seconds
-from taichi_mrf.config.method import Method
 from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.errors import ConfigError, KeyframeError
-from taichi_mrf.geometry.up import Up
 from taichi_mrf.inference.color_sums import ColorShare
 from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.dated_channels import layer_of
@@ -24,15 +20,11 @@ from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import count_observations
 from taichi_mrf.inference.surface_votes import surfaces_first
 from taichi_mrf.inference.sweep import Sweeper
-from taichi_mrf.methods.brick_map import BrickMap
-from taichi_mrf.methods.mrf.coloring import MapColors
 from taichi_mrf.methods.mrf.kept_rays import RayShare
-from taichi_mrf.methods.mrf.surfacing import WithSurface
-from taichi_mrf.methods.protocol import MappedKeyframe
+from taichi_mrf.methods.mrf.map_reading import MapReading, RaysThen
+from taichi_mrf.methods.mrf.surfacing import LEAST, WithSurface
 from taichi_mrf.queries.change import MapChange, compare_maps
-from taichi_mrf.queries.view import View
-from taichi_mrf.voxels.pool import BrickPool, copied
-from taichi_mrf.voxels.topology import Topology
+from taichi_mrf.voxels.pool import copied
 
 Layer = Literal["static", "dynamic", "both"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
@@ -43,63 +35,6 @@ first surface."""
 READINGS: tuple[Reading, ...] = get_args(Reading)
 
 
-class MapReading(BrickMap):
-    """Other beliefs over the bricks of a map: a map that can be queried and exported, but not changed.
-
-    It is good for as long as no keyframe of the map is added, removed, moved or frozen.
-    """
-
-    def __init__(self, source: BrickMap, belief: "ti.Ndarray") -> None:
-        """``belief`` (capacity * 512) are log-odds of the voxels of the source's pool."""
-        self.METHOD: Method = source.METHOD  # type: ignore[misc]
-        self.config, self.sensor, self.noise = source.config, source.sensor, source.noise
-        self.voxel_size = source.voxel_size
-        self._source, self._version = source, source._registry.version
-        self._registry, self._up = source._registry, source._up
-        self.seen_free_log_odds = source.seen_free_log_odds
-        self._pool = copy.copy(source._pool)
-        self._pool.dated, self._pool.total = None, belief
-        self._pool.bricks, self._pool.owners = source._pool.bricks.copy(), source._pool.owners.copy()
-        shown = source.view
-        self.view = View(self._pool, self.voxel_size, shown.volume, shown.occlusion)
-
-    @property
-    def keyframes(self) -> Mapping[int, MappedKeyframe]:
-        """The keyframes of the map that is read."""
-        keyframes: Mapping[int, MappedKeyframe] = self._source.keyframes  # type: ignore[attr-defined]
-        return keyframes
-
-    @property
-    def up(self) -> Up | None:
-        """The world axis that is up."""
-        return self._source.up
-
-    @property
-    def has_colors(self) -> bool:
-        """Whether any voxel may have a colour."""
-        return self._colored.has_colors
-
-    def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
-        """Colours of the map that is read, whatever the time or the layer."""
-        return self._colored.colors(points)
-
-    def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """The same for the voxels of some bricks of the pool, (n,) slots -> (n, 512, 4)."""
-        return self._colored.colors_in(slots)
-
-    @property
-    def _colored(self) -> "ReadableMRF":
-        assert isinstance(self._source, ReadableMRF)
-        return self._source
-
-    def _grid(self) -> tuple[float, Topology, BrickPool, float]:
-        if self._registry.version != self._version:
-            raise KeyframeError(
-                "the map has changed since it was read: call at(), layer() or reading() again"
-            )
-        return super()._grid()
-
-
 class ReadableMRF(WithSurface):
     """The part of an MRFMap that changes nothing."""
 
@@ -107,7 +42,6 @@ class ReadableMRF(WithSurface):
     _frozen: dict[int, str]
     _sweeper: Sweeper
     _dated: DatedBelief | None
-    _colors: MapColors
 
     @property
     def keyframes(self) -> Mapping[int, Keyframe]:
@@ -118,11 +52,6 @@ class ReadableMRF(WithSurface):
         """The bricks that a keyframe's rays cross, (n, 3), whether they are allocated or not."""
         footprint = self._find(id).footprint
         return footprint.window.bricks_of(footprint.crossed)
-
-    @property
-    def frozen(self) -> Mapping[int, str]:
-        """Names of the keyframes that have been frozen, by id."""
-        return MappingProxyType(self._frozen)
 
     def seen_by(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
         """How many keyframes observe each voxel of some bricks of the pool, (n,) slots -> (n, 512). All
@@ -224,10 +153,15 @@ class ReadableMRF(WithSurface):
             self._restore_messages()
         pool = self._pool
         shown = copied(pool.belief) if stamp_s is None else dated.as_of(seconds(stamp_s, "stamp_s"))
+        with_frozen = stamp_s is None or self._dated is None or stamp_s >= self._dated.frozen_s
         if which == "both":
-            return MapReading(self, shown)
+            rays = None if stamp_s is None else RaysThen(shown, stamp_s, LEAST * self.prior, with_frozen)
+            return MapReading(self, shown, rays)
         dynamic = which == "dynamic"
-        reading = MapReading(self, layer_of(pool.total, shown, pool.prior_log_odds, dynamic))
+        belief = layer_of(pool.total, shown, pool.prior_log_odds, dynamic)
+        # All that is dynamic is occupied; what the layer does not know is at the prior.
+        least, judging = (0.5, shown) if dynamic else (LEAST * self.prior, belief)
+        reading = MapReading(self, belief, RaysThen(judging, stamp_s, least, with_frozen))
         if dynamic:
             reading.seen_free_log_odds = pool.prior_log_odds  # free space belongs to the static layer
         return reading

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +14,12 @@ from taichi_mrf.inference.ray_model import RayModel
 from taichi_mrf.inference.surface_field import SurfaceRays
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.methods.brick_map import BrickMap
+from taichi_mrf.methods.mrf.coloring import MapColors
 from taichi_mrf.methods.mrf.kept_rays import KeptRays
 from taichi_mrf.queries.colored import blended_colors, is_colored
 from taichi_mrf.queries.known_bricks import sorted_bricks
 from taichi_mrf.voxels.distance_field import DistanceField
+from taichi_mrf.voxels.pool import BrickPool
 
 OUTLIERS = 0.01
 """Share of the measurements that may come from anywhere in the sensor's range."""
@@ -34,6 +37,7 @@ class WithSurface(BrickMap):
     _frozen: dict[int, str]
     _sweeper: Sweeper
     _kept: KeptRays
+    _colors: MapColors
 
     @property
     def keyframes(self) -> Mapping[int, Keyframe]:
@@ -41,10 +45,20 @@ class WithSurface(BrickMap):
         raise NotImplementedError
 
     @property
+    def frozen(self) -> Mapping[int, str]:
+        """Names of the keyframes that have been frozen, by id."""
+        return MappingProxyType(self._frozen)
+
+    @property
+    def keeps_surface(self) -> bool:
+        """Whether frozen keyframes leave what they measured of the surface."""
+        return self._kept.wanted
+
+    @property
     def has_surface(self) -> bool:
         """Whether there is a surface of all keyframes that the map was made of: none is frozen, or what
         frozen ones measured is kept (``keep_surface``)."""
-        return bool(self._keyframes or self._frozen) and (self._kept.wanted or not self._frozen)
+        return bool(self._keyframes or self._frozen) and (self.keeps_surface or not self._frozen)
 
     def measured_bricks(self) -> NDArray[np.int32]:
         """The bricks (n, 3) in which keyframes that are not frozen have a say in the surface; ascending."""
@@ -56,7 +70,7 @@ class WithSurface(BrickMap):
     def surface_field(self) -> DistanceField:
         """The signed distances that the keyframes measured, as of the last :meth:`infer`. Raises
         CapacityError if there is not enough memory."""
-        return surface_field_of(self)
+        return surface_field_of(self, self._pool, self._keyframes)
 
     def surface(self) -> FusedSurface:
         """The surface that the keyframes measured, by marching cubes through the mean of their signed
@@ -70,10 +84,13 @@ class WithSurface(BrickMap):
         """
         if not self._keyframes and not self.has_surface:
             raise ConfigError("the map has no keyframes: there is nothing to make a surface of")
-        found = fused_surface(surface_field_of(self), self.voxel_size)
+        found = fused_surface(self.surface_field(), self.voxel_size)
         found = without_free(self, found, LEAST * self.prior)
         colors = blended_colors(self, found.vertices_m) if is_colored(self) else None
         return replace(found, colors=colors)
+
+    def _prepare_colors(self) -> None:
+        raise NotImplementedError
 
     def _keep_rays(self, keyframe: Keyframe) -> None:
         """Keep what a keyframe's rays say of the surface, if that is wanted; it is about to be frozen."""
@@ -86,11 +103,14 @@ class WithSurface(BrickMap):
             self._kept.restore(share)
 
 
-def surface_field_of(m: WithSurface) -> DistanceField:
-    """The signed distances that a map's keyframes measured. Raises CapacityError."""
-    rays = SurfaceRays(m._pool, _model_of(m), m.config.volume)
-    found = rays.field([(k, m._registry.visible(k.footprint)) for k in m._keyframes.values()])
-    return m._kept.added_to(found)
+def surface_field_of(
+    m: WithSurface, pool: BrickPool, keyframes: Mapping[int, Keyframe], with_frozen: bool = True
+) -> DistanceField:
+    """The signed distances that some of a map's keyframes measured, with the marginals of ``pool``, and
+    perhaps those of frozen ones. Raises CapacityError."""
+    rays = SurfaceRays(pool, _model_of(m), m.config.volume)
+    found = rays.field([(k, m._registry.visible(k.footprint)) for k in keyframes.values()])
+    return m._kept.added_to(found) if with_frozen else found
 
 
 def _model_of(m: WithSurface) -> RayModel:

@@ -1,0 +1,141 @@
+"""A map to be queried and exported, but not changed: other beliefs over the bricks of an MRFMap."""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import taichi as ti
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf.config.method import Method
+from taichi_mrf.errors import ConfigError, KeyframeError
+from taichi_mrf.export.fused_surface import FusedSurface, fused_surface, without_free
+from taichi_mrf.geometry.up import Up
+from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.methods.brick_map import BrickMap
+from taichi_mrf.methods.mrf.coloring import MapColors
+from taichi_mrf.methods.mrf.surfacing import WithSurface, surface_field_of
+from taichi_mrf.methods.protocol import MappedKeyframe
+from taichi_mrf.queries.colored import blended_colors
+from taichi_mrf.queries.view import View
+from taichi_mrf.voxels.distance_field import DistanceField
+from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.voxels.topology import Topology
+
+
+@dataclass(frozen=True)
+class RaysThen:
+    """Which rays surface and colours of a reading are made of: those of the keyframes up to ``stamp_s`` (all
+    if None), judged by the log-odds ``belief`` (capacity * 512). Where the reading has no voxel of the
+    probability ``least``, there is no surface; ``with_frozen`` tells whether frozen keyframes count."""
+
+    belief: "ti.Ndarray"
+    stamp_s: float | None
+    least: float
+    with_frozen: bool
+
+
+class MapReading(BrickMap):
+    """Other beliefs over the bricks of a map: a map that can be queried and exported, but not changed.
+
+    It is good for as long as no keyframe of the map is added, removed, moved or frozen.
+    """
+
+    def __init__(self, source: WithSurface, belief: "ti.Ndarray", rays: RaysThen | None = None) -> None:
+        """``belief`` (capacity * 512) are log-odds of the voxels of the source's pool; without ``rays``,
+        surface and colours are those of the source."""
+        self.METHOD: Method = source.METHOD  # type: ignore[misc]
+        self.config, self.sensor, self.noise = source.config, source.sensor, source.noise
+        self.voxel_size = source.voxel_size
+        self._source, self._version, self._rays = source, source._registry.version, rays
+        self._registry, self._up = source._registry, source._up
+        self.seen_free_log_odds = source.seen_free_log_odds
+        self._pool = copy.copy(source._pool)
+        self._pool.dated, self._pool.total = None, belief
+        self._pool.bricks, self._pool.owners = source._pool.bricks.copy(), source._pool.owners.copy()
+        shown = source.view
+        self.view = View(self._pool, self.voxel_size, shown.volume, shown.occlusion)
+
+    @property
+    def keyframes(self) -> Mapping[int, MappedKeyframe]:
+        """The keyframes of the map that is read."""
+        return self._source.keyframes
+
+    @property
+    def up(self) -> Up | None:
+        """The world axis that is up."""
+        return self._source.up
+
+    @property
+    def has_colors(self) -> bool:
+        """Whether any voxel may have a colour."""
+        return bool(self._colors)
+
+    def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
+        """What cameras saw of the voxels at (N, 3) points in metres by the time that is read, (N, 4)."""
+        self._check()
+        return self._colors.at(points)
+
+    def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
+        """The same for the voxels of some bricks of the pool, (n,) slots -> (n, 512, 4)."""
+        self._check()
+        return self._colors.within(slots)
+
+    @property
+    def has_surface(self) -> bool:
+        """Whether there is a surface of all keyframes that the reading was made of."""
+        if self._rays is None:
+            return self._source.has_surface
+        frozen = self._rays.with_frozen and bool(self._source.frozen)
+        return bool(self._seen or frozen) and (self._source.keeps_surface or not frozen)
+
+    def surface_field(self) -> DistanceField:
+        """The signed distances that the keyframes of the reading measured. Raises CapacityError."""
+        self._check()
+        if self._rays is None:
+            return self._source.surface_field()
+        return surface_field_of(self._source, self._judging, self._seen, self._rays.with_frozen)
+
+    def surface(self) -> FusedSurface:
+        """The surface as of the time that is read, or that of the layer, as MRFMap.surface. Raises
+        ConfigError if no keyframe was there yet."""
+        if self._rays is None:
+            self._check()
+            return self._source.surface()
+        if not self.has_surface:
+            raise ConfigError("there is no keyframe up to this time: there is nothing to make a surface of")
+        found = without_free(self, fused_surface(self.surface_field(), self.voxel_size), self._rays.least)
+        return replace(found, colors=blended_colors(self, found.vertices_m) if self.has_colors else None)
+
+    @cached_property
+    def _seen(self) -> dict[int, Keyframe]:
+        """The keyframes whose rays count."""
+        assert self._rays is not None
+        until_s = np.inf if self._rays.stamp_s is None else self._rays.stamp_s
+        return {id: k for id, k in self._source.keyframes.items() if k.stamp_s <= until_s}
+
+    @cached_property
+    def _judging(self) -> BrickPool:
+        """The bricks with the log-odds that rays are judged by."""
+        assert self._rays is not None
+        return self._source._pool.showing_others(self._rays.belief)
+
+    @cached_property
+    def _colors(self) -> MapColors:
+        self._source._prepare_colors()
+        colors = self._source._colors
+        if self._rays is None:
+            return colors
+        return colors.of_some(self._seen, self._judging, self._rays.with_frozen)
+
+    def _check(self) -> None:
+        if self._registry.version != self._version:
+            raise KeyframeError(
+                "the map has changed since it was read: call at(), layer() or reading() again"
+            )
+
+    def _grid(self) -> tuple[float, Topology, BrickPool, float]:
+        self._check()
+        return super()._grid()
