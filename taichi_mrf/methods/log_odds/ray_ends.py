@@ -92,7 +92,8 @@ def _find_ends(
             if ti.static(correct_bias):
                 surface = sensor.surface_depth(surface, sensor.noise_at(u, v))
             kind = HIT if surface <= max_depth else FREE_END
-        end = view.centre + view.to_voxels @ sensor.direction(u, v) * ti.min(surface, max_depth)
+        direction = sensor.direction(u, v)  # with a name, as in traversal.pixel_ray
+        end = view.centre + view.to_voxels @ direction * ti.min(surface, max_depth)
         put_end(ends, pixel, end, kind)
 
 
