@@ -48,6 +48,7 @@ OF_A_MAP: dict[str, Draw] = {
 
 OF_THE_LIVE_PAGE: dict[str, Draw] = {
     "live_cut.jpg": page_pictures.live_cut,
+    "live_surface.jpg": page_pictures.live_surface,
     "live_keyframes.jpg": page_pictures.live_keyframes,
     "live_images.jpg": page_pictures.live_images,
     "live_baseline.jpg": page_pictures.live_baseline,

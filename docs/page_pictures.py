@@ -46,6 +46,19 @@ def live_cut(page: LivePage) -> Image.Image:
     return picture
 
 
+def live_surface(page: LivePage) -> Image.Image:
+    """The measured surface by height, without the widgets."""
+    page.tab("Map")
+    page.select("Color by", "height")
+    page.select("Show", "surface")
+    page.until(lambda seen: seen.settled and seen.triangles, "the surface")
+    picture = shot(page).crop((0, 150, 940, 770)).resize((480, 317), Image.Resampling.LANCZOS)
+    page.select("Show", "voxels")
+    page.select("Color by", "marginal")
+    page.until_settled()
+    return picture
+
+
 def live_keyframes(page: LivePage) -> Image.Image:
     """A keyframe with the gizmo that moves it, the map coloured by the number of keyframes."""
     page.tab("Map")

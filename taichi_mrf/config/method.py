@@ -56,6 +56,9 @@ class Method:
     has_colors: bool = False
     """Keyframes may have colour images, and voxels then have colours (methods.capabilities.ColoredMap)."""
 
+    measures_surface: bool = False
+    """Makes the surface that its keyframes measured (methods.capabilities.MeasuringMap)."""
+
     prior_is_unknown: bool = False
     """A voxel is unknown exactly if it still holds the prior. Otherwise ``volume.min_evidence`` decides."""
 

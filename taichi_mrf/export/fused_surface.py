@@ -8,7 +8,7 @@ Triangles are made in cells of whose 8 corners all have weight: where both sides
 It goes chunk by chunk, so that memory is bounded by the surface, not by the space around it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol, TypeGuard
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.export.surface import Surface, welded_rows
+from taichi_mrf.queries.colored import marginals_behind
 from taichi_mrf.queries.known_bricks import QueriedMap, sorted_bricks
 from taichi_mrf.system.libraries import library
 from taichi_mrf.voxels.colors import marginal_colors
@@ -78,19 +79,22 @@ def has_surface(m: QueriedMap) -> TypeGuard[SurfacedMap]:
 def measured_surface(m: SurfacedMap) -> Surface:
     """The surface of a map, in the colours of the likeliest marginal at or right behind each vertex."""
     found = m.surface()
-    behind = found.vertices_m - 0.5 * m.voxel_size * found.normals
-    p = np.maximum(m.occupancy(found.vertices_m), m.occupancy(behind))
+    p = marginals_behind(m, found.vertices_m, found.normals)
     return Surface(
         found.vertices_m, found.triangles, marginal_colors(p), normals=found.normals, std_m=found.std_m
     )
 
 
-def fused_surface(field: DistanceSource, voxel_size: float) -> FusedSurface:
-    """The surface of a field. Raises TaichiMRFError without scikit-image."""
+def fused_surface(
+    field: DistanceSource, voxel_size: float, between: Callable[[], object] = lambda: None
+) -> FusedSurface:
+    """The surface of a field. ``between`` is called after each chunk. Raises TaichiMRFError without
+    scikit-image."""
     measure = library("skimage.measure", "surfaces need", "mesh")
     vertices, triangles, weights = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.float32)]
     count = 0
     for lowest, own, weight, distance in _boxes(field):
+        between()
         known = (weight > LEAST_WEIGHT) & (own > 0)
         mean = np.where(known, distance / np.maximum(weight, LEAST_WEIGHT), np.float32(0))
         # marching_cubes looks at the mask of a cell's highest corner.

@@ -54,7 +54,7 @@ def write_page(
         eye.set_up(up or m.up or Z_UP)
         bounds = layer.store.bounds()
         if bounds is not None:
-            options = ViewOptions(color_by, threshold, cells=cells)
+            options = ViewOptions(color_by=color_by, threshold=threshold, cells=cells)
             look = look_of(options, layer.store, eye.up, m.voxel_size)
             layer.prepare(layer.all_chunks(), look, exactly=True)
             layer.send()

@@ -3,7 +3,7 @@
 The field is made anew from the keyframes whenever it is asked for, so it follows every edit.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import taichi as ti
@@ -43,9 +43,13 @@ class SurfaceRays:
         self._index = WindowIndex()
         self._free_logs = FreeLogs.of(pool)
 
-    def field(self, keyframes: Sequence[tuple[Keyframe, VisibleBricks]]) -> DistanceField:
-        """The field of some keyframes, each with the bricks of the map that it sees now. Raises
-        CapacityError if there is not enough memory."""
+    def field(
+        self,
+        keyframes: Sequence[tuple[Keyframe, VisibleBricks]],
+        between: Callable[[], object] = lambda: None,
+    ) -> DistanceField:
+        """The field of some keyframes, each with the bricks of the map that it sees now. ``between`` is
+        called after each keyframe. Raises CapacityError if there is not enough memory."""
         bands = [self.bricks_in_band(keyframe) for keyframe, _ in keyframes]
         bricks = np.concatenate([np.zeros((0, 3), np.int32), *(w.bricks_of(cells) for w, cells in bands)])
         # In the order of chunks, so that those that are summed up together lie together.
@@ -56,7 +60,7 @@ class SurfaceRays:
         weight, distance = (np.zeros((len(bricks), VOXELS), np.float32) for _ in range(2))
         for begin in range(0, len(bricks), BRICKS_AT_ONCE):
             rows = slice(begin, begin + BRICKS_AT_ONCE)
-            weight[rows], distance[rows] = self._sums(bricks[rows], keyframes, bands)
+            weight[rows], distance[rows] = self._sums(bricks[rows], keyframes, bands, between)
         order = np.argsort(grid_keys(bricks))
         return DistanceField(bricks[order], weight[order], distance[order])
 
@@ -99,6 +103,7 @@ class SurfaceRays:
         bricks: Bricks,
         keyframes: Sequence[tuple[Keyframe, VisibleBricks]],
         bands: Sequence[tuple[Window, NDArray[np.int32]]],
+        between: Callable[[], object],
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Weights and distances times weight, (n, 512) each, in some bricks."""
         sums = DistanceSums(
@@ -123,6 +128,7 @@ class SurfaceRays:
             surface_rays.add_distances(rays, trust, sensor, view, space, self.band, sums)
             self._index.clear(window, cells)
             runtime.settle()
+            between()
         found = (array.to_numpy().reshape(-1, VOXELS) for array in (sums.weight, sums.distance))
         weight, distance = ((array / SCALE).astype(np.float32) for array in found)
         return weight, distance

@@ -1,21 +1,34 @@
-"""What the page shows beside the map on request: images of a view, and the same keyframes mapped by
-OctoMap's method."""
+"""What the page shows beside the map on request: images of a view, the measured surface, and the same
+keyframes mapped by OctoMap's method."""
 
 import dataclasses
 import time
+from typing import Protocol
 
-from taichi_mrf.inference.schedule import Progress
+from taichi_mrf.inference.schedule import InferProgress, StopRequestedError
 from taichi_mrf.live.baseline_overlay import BaselineOverlay
 from taichi_mrf.live.change_list import ChangeList
 from taichi_mrf.live.pictures import view_images
 from taichi_mrf.live.run import Run
 from taichi_mrf.live.shown_colors import ShownColors
+from taichi_mrf.live.shown_surface import ShownSurface
+from taichi_mrf.methods.capabilities import measures_surface
 from taichi_mrf.viewer.messages import BrickColors, Notice, SceneChanges, Watch
 
 NOTHING = Watch(images=False, view=None, baseline=False)
 
 IMAGE_SECONDS = 1.0
 """Shortest time between two sets of images, in seconds."""
+
+
+ASK_SECONDS = 0.05
+"""Shortest time between two looks at requests while the surface is made, in seconds."""
+
+
+class GoOn(Protocol):
+    """Called between two steps of long work: carries out requests, and returns whether to go on."""
+
+    def __call__(self, step: InferProgress | None = None) -> bool: ...
 
 
 class Extras:
@@ -27,6 +40,7 @@ class Extras:
         self._baseline: BaselineOverlay | None = None
         self._changes: ChangeList | None = None
         self._colors: ShownColors | None = None
+        self._surface: ShownSurface | None = None
         self._shown_version = -1
         self._images_made = float("-inf")
 
@@ -37,16 +51,17 @@ class Extras:
 
     def start_again_for_viewer(self) -> None:
         """Show no extras, which a new viewer starts without; it is sent the list of changes."""
-        self._watch, self._baseline, self._colors = NOTHING, None, None
+        self._watch, self._baseline, self._colors, self._surface = NOTHING, None, None, None
         if self._changes is not None:
             self._run.send(self._changes.listed())
 
     def start_over(self) -> None:
         """Start over with a new map; the page shows the same extras."""
-        self._baseline, self._changes, self._colors, self._shown_version = None, None, None, -1
+        self._baseline, self._changes, self._colors, self._surface = None, None, None, None
+        self._shown_version = -1
 
-    def work(self, progress: Progress) -> bool:
-        """Do one piece of the work that is left; returns whether there was any. ``progress`` can stop it."""
+    def work(self, go_on: GoOn) -> bool:
+        """Do one piece of the work that is left; returns whether there was any. ``go_on`` can stop it."""
         publisher = self._run.mapper.shown.publisher
         if publisher.counting != self._watch.counts:
             publisher.count(self._watch.counts)
@@ -54,13 +69,15 @@ class Extras:
             return True
         if self._run.renew_past() or self._make_images() or self._list_changes() or self._send_colors():
             return True
+        if self._send_surface(go_on):
+            return True
         if not self._watch.baseline:
             if self._baseline is not None:
                 self._run.send(self._baseline.everything_gone())
                 self._baseline = None
             return False
         try:
-            return self._catch_up(progress)
+            return self._catch_up(go_on)
         except Exception as error:  # mapping continues without the baseline
             self._run.send(Notice(f"baseline: {error}", "error"))
             self._watch = dataclasses.replace(self._watch, baseline=False)
@@ -70,7 +87,7 @@ class Extras:
         """During inference: make images of a newly chosen view, from the map before inference."""
         self._make_images()
 
-    def _catch_up(self, progress: Progress) -> bool:
+    def _catch_up(self, go_on: GoOn) -> bool:
         mapper = self._run.mapper
         if self._baseline is None:
             self._baseline = BaselineOverlay(self._run.source.config, mapper.map.noise)
@@ -78,7 +95,7 @@ class Extras:
             if frozen:
                 text = f"the baseline lacks {frozen} frozen keyframes: their images are no longer in memory"
                 self._run.send(Notice(text, "warning"))
-        if not self._baseline.catch_up(mapper, progress):
+        if not self._baseline.catch_up(mapper, go_on):
             return False
         changes = self._baseline.changes()
         if changes is not None:
@@ -108,6 +125,45 @@ class Extras:
         for colors in found:
             self._run.send(colors)
         return bool(found)
+
+    def _send_surface(self, go_on: GoOn) -> bool:
+        """Make the surface if it is shown, no frames are read, and the map has changed; False if there was
+        nothing to do."""
+        run = self._run
+        if not self._watch.surface or run.is_replaying:
+            return False
+        if self._surface is None:
+            self._surface = ShownSurface(run.mapper)
+        if self._surface.is_current:
+            return False
+        asked = time.monotonic()
+
+        def between() -> None:
+            nonlocal asked
+            if time.monotonic() - asked < ASK_SECONDS:
+                return
+            run.show_activity("making the surface", 0.0)
+            if not go_on() or not self._watch.surface:
+                raise StopRequestedError
+            asked = time.monotonic()
+
+        try:
+            patches = self._surface.patches(between)
+        except StopRequestedError:
+            return True
+        except Exception as error:  # mapping continues without the surface
+            self._surface.give_up()
+            run.send(Notice(f"no surface: {error}", "error"))
+            return True
+        frozen = len(run.mapper.roster.with_state("frozen"))
+        m = run.mapper.map
+        if frozen and patches and measures_surface(m) and not m.has_surface:
+            text = f"the surface lacks {frozen} frozen keyframes, whose images are no longer in memory; "
+            text += "--keep-surface keeps their part"
+            run.send(Notice(text, "warning"))
+        for patch in patches:
+            run.send(patch)
+        return True
 
     def _make_images(self) -> bool:
         now = time.monotonic()

@@ -26,6 +26,7 @@ from taichi_mrf.viewer.messages import (
     RayAnswer,
     SceneChanges,
     Status,
+    SurfacePatch,
     TimeSpan,
     Update,
 )
@@ -110,6 +111,8 @@ class Outbox:
             return "keyframe", update.id
         if isinstance(update, BrickColors):
             return "colors", update.chunk
+        if isinstance(update, SurfacePatch):
+            return "surface", update.chunk
         if isinstance(update, Hello):
             return Hello.__name__
         return None

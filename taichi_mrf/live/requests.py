@@ -12,8 +12,8 @@ from taichi_mrf.live.live_keyframes import LiveKeyframe
 from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.live.ray_answers import pixel_answer, point_answer
 from taichi_mrf.live.run import Run
-from taichi_mrf.runs.files import MAP_FILE, VOXEL_FILE
-from taichi_mrf.runs.folder import write_report, write_voxel_file
+from taichi_mrf.runs.files import MAP_FILE, MESH_FILE, VOXEL_FILE
+from taichi_mrf.runs.folder import write_mesh_file, write_report, write_voxel_file
 from taichi_mrf.viewer.messages import (
     File,
     Freeze,
@@ -33,6 +33,8 @@ from taichi_mrf.viewer.messages import (
     Switch,
     Watch,
 )
+
+_FILES = {"map": MAP_FILE, "ply": VOXEL_FILE, "mesh": MESH_FILE}
 
 
 def resumes_replay(request: Request) -> bool:
@@ -129,11 +131,13 @@ class Requests:
         the report and the parameters."""
         run, m, out = self._run, self._run.mapper.map, self._run.policy.out
         with tempfile.TemporaryDirectory() as temporary:
-            path = (out or Path(temporary)) / (MAP_FILE if request.kind == "map" else VOXEL_FILE)
+            path = (out or Path(temporary)) / _FILES[request.kind]
             if request.kind == "map":
                 m.save(path)
-            else:
+            elif request.kind == "ply":
                 write_voxel_file(path, m)
+            else:
+                run.send(Notice(f"{path.name} shows {write_mesh_file(path, m)}"))
             if out is not None:
                 write_report(out, run.result(), run.facts)
             run.send(File(path.name, path.read_bytes(), request.client))

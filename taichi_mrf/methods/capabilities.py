@@ -4,7 +4,7 @@ The rest of the program asks these questions instead of naming a class: the answ
 entry, and a type checker then knows the verbs.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Protocol, TypeGuard
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.alignment.refine import Aligner, RefinedPose
 from taichi_mrf.config.schema import PoseConfig
+from taichi_mrf.export.fused_surface import FusedSurface
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.schedule import InferReport, Progress
 from taichi_mrf.methods.mrf.checkpoint import Checkpoint
@@ -105,6 +106,19 @@ class PaintedMap(OccupancyMap, ColoredMap, Protocol):
         ...
 
 
+class MeasuringMap(OccupancyMap, Protocol):
+    """A map that can make the surface that its keyframes measured."""
+
+    @property
+    def has_surface(self) -> bool:
+        """Whether no keyframe is missing in it."""
+        ...
+
+    def surface(self, between: Callable[[], object] = ...) -> FusedSurface:
+        """The surface; ``between`` is called between its steps."""
+        ...
+
+
 def has_messages(m: OccupancyMap) -> TypeGuard[MessageMap]:
     """Whether a map's keyframes keep messages."""
     return m.METHOD.has_messages
@@ -138,3 +152,8 @@ def has_dates(m: OccupancyMap) -> TypeGuard[LayeredMap]:
 def takes_colors(m: OccupancyMap) -> TypeGuard[PaintedMap]:
     """Whether keyframes of a map may have colour images."""
     return m.METHOD.has_colors
+
+
+def measures_surface(m: OccupancyMap) -> TypeGuard[MeasuringMap]:
+    """Whether a map can make the surface that its keyframes measured."""
+    return m.METHOD.measures_surface

@@ -99,6 +99,13 @@ def blended_colors(m: ColoredMap, points: ArrayLike) -> NDArray[np.uint8]:
     return np.concatenate([np.zeros((0, 3), np.uint8), *(_blended(m, part) for part in parts)])
 
 
+def marginals_behind(m: QueriedMap, points: ArrayLike, normals: ArrayLike) -> NDArray[np.float32]:
+    """The likeliest marginal at or half a voxel behind points (N, 3) of a surface, in metres: (N,)."""
+    places = np.asarray(points, np.float64)
+    behind = places - 0.5 * m.voxel_size * np.asarray(normals)
+    return np.maximum(m.occupancy(places), m.occupancy(behind))
+
+
 def _blended(m: ColoredMap, points: NDArray[np.float64]) -> NDArray[np.uint8]:
     place = points / m.voxel_size - 0.5
     first = np.floor(place)

@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 MAP_FILE, VOXEL_FILE, CONFIG_FILE = "map.npz", "voxels.ply", "config.yaml"
+MESH_FILE = "mesh.ply"
 REPORT_FILE, TRAJECTORY_FILE = "report.json", "trajectory.txt"
 WINDOW_FOLDER = "map_window.zarr"
 """The map in chunks of a run with a window (methods.mrf.parked_chunks.folder_beside)."""

@@ -15,6 +15,8 @@ from taichi_mrf.datasets.derived import reposed
 from taichi_mrf.errors import ConfigError, CutShortError, FrameError
 from taichi_mrf.evaluation.held_out import HeldOutCheck, RenderedMap, check_held_out
 from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
+from taichi_mrf.export.formats import export_map, export_note
+from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.export.ply import photo_at, write_voxels
 from taichi_mrf.export.trajectory import write_trajectory
 from taichi_mrf.mapping.result import MappingResult
@@ -154,6 +156,13 @@ def write_voxel_file(path: Path, m: OccupancyMap, shown: MapReading | None = Non
     centres, probability = (in_chunks(m) or shown or m).voxels(min_probability=0.5)
     write_voxels(path, centres, probability, m.voxel_size, photo_at(m, centres))
     return len(centres)
+
+
+def write_mesh_file(path: Path, m: OccupancyMap) -> str:
+    """Write the mesh that ``export --mesh`` writes; returns in words what it shows. Raises TaichiMRFError."""
+    options = ExportOptions(mesh=True)
+    export_map(m, path, options)
+    return export_note(m, path, options) or ""
 
 
 def _nothing_occupied(config: Config) -> str:

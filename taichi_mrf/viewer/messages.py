@@ -87,6 +87,26 @@ class BrickColors(Update):
 
 
 @dataclass(frozen=True)
+class SurfacePatch(Update):
+    """The part of the measured surface in a ``chunk``, which takes the place of an earlier one; without
+    ``triangles`` there is none any more.
+
+    ``vertices_m`` (n, 3) float32 in metres, world; ``triangles`` (m, 3) int32, counter-clockwise as seen from
+    free space; ``normals`` (n, 3) int8, 127 is one; ``std_m`` (n,) float32, the standard deviation along the
+    normal; ``log_odds`` (n,) int16 of the likeliest voxel there, see :data:`LOG_ODDS_STEP`; ``colors`` (n, 3)
+    uint8 RGB that cameras saw, None if the map has none.
+    """
+
+    chunk: tuple[int, int, int]
+    vertices_m: NDArray[np.float32]
+    triangles: NDArray[np.int32]
+    normals: NDArray[np.int8]
+    std_m: NDArray[np.float32]
+    log_odds: NDArray[np.int16]
+    colors: NDArray[np.uint8] | None
+
+
+@dataclass(frozen=True)
 class KeyframeInfo(Update):
     """A keyframe that is new or has changed.
 
@@ -299,13 +319,14 @@ class PixelRay(Request):
 class Watch(Request):
     """Which extras the page shows and the mapping process must keep up to date: images of ``view`` (a
     keyframe, or None for the current camera), the baseline beside the map, the ``counts`` of keyframes that
-    see each voxel (else sent as 0), and the ``colors`` of voxels."""
+    see each voxel (else sent as 0), the ``colors`` of voxels, and the measured ``surface``."""
 
     images: bool
     view: int | None
     baseline: bool
     counts: bool = False
     colors: bool = False
+    surface: bool = False
 
 
 @dataclass(frozen=True)
@@ -319,7 +340,7 @@ class ShowTime(Request):
 class Save(Request):
     """Send a file to a client, and write it to the run's folder if there is one."""
 
-    kind: Literal["map", "ply"]
+    kind: Literal["map", "ply", "mesh"]
     client: int
 
 

@@ -180,6 +180,23 @@ def test_cells_stand_in_where_no_voxel_is_likely(page: LivePage, saved: MRFMap) 
     page.until(lambda again: again.agrees and again.cells == seen.cells, "the cells again")
 
 
+def test_the_surface_takes_the_place_of_voxels(page: LivePage, saved: MRFMap) -> None:
+    page.select("Color by", "height")
+    page.select("Show", "surface")
+    expected = len(saved.surface().triangles)
+    seen = page.until(lambda seen: seen.agrees and seen.triangles == expected, "the surface")
+    assert seen.voxels == seen.cells == 0
+    page.pause(1.0)
+    page.screenshot("live_surface")
+    corner = sorted(page.places("/surface/", "vertices"), key=lambda place: place[2])
+    x, y, _ = page.free_places(corner[:20])[0]
+    page.click(x, y)
+    page.until(lambda seen: "/ray" in seen.nodes, "the ray in the scene")
+    page.select("Color by", "marginal")
+    page.select("Show", "voxels")
+    page.until(lambda seen: seen.agrees and seen.voxels == voxels_of(saved, 0.5), "voxels again")
+
+
 def test_the_outlines_of_bricks_come_and_go(page: LivePage) -> None:
     page.tick("Bricks")
     page.until(lambda seen: "/bricks" in seen.nodes, "the outlines")

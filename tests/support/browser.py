@@ -51,15 +51,16 @@ _LOOK = """() => {
     }
     return false;
   };
-  const seen = {voxels: 0, cells: 0, baseline: 0, colors: 0, nodes: []};
+  const seen = {voxels: 0, cells: 0, baseline: 0, triangles: 0, colors: 0, nodes: []};
   const hash = (start, numbers) =>
     numbers.reduce((h, number) => Math.imul(31 * h + Math.round(number) | 0, 2654435761) >>> 0, start);
   for (const [name, node] of Object.entries(mutable?.nodeRefFromName ?? {}).sort()) {
     if (!node || !inScene(node)) continue;
     seen.nodes.push(name);
     const root = name.split('/')[1];
-    if (!(root in {voxels: 0, cells: 0, baseline: 0}) || name.split('/').length < 3) continue;
+    if (!(root in {voxels: 0, cells: 0, baseline: 0, surface: 0}) || name.split('/').length < 3) continue;
     node.traverse(object => {
+      if (object.isMesh) seen.triangles += object.geometry.index.count / 3;
       if (!object.isPoints) return;
       const {position, color} = object.geometry.attributes;
       const cloud = hash(7, [...name].map(letter => letter.codePointAt(0)));
@@ -109,6 +110,10 @@ _PROJECT = """([prefix, kind, local]) => {
         const p = object.geometry.attributes.position;
         for (let i = 0; i < p.count; i++) put(object, [p.getX(i), p.getY(i), p.getZ(i)]);
       }
+      if (kind === 'vertices' && object.isMesh) {
+        const p = object.geometry.attributes.position;
+        for (let i = 0; i < p.count; i += 97) put(object, [p.getX(i), p.getY(i), p.getZ(i)]);
+      }
       if (kind === 'picture' && object.isMesh && object.material.map) put(object, [0, 0, 0]);
     });
   }
@@ -150,18 +155,20 @@ def _chromium() -> str | None:
 class Seen:
     """One look at a page: what it says of itself, and what is in its scene.
 
-    ``said``, ``said_cells`` and ``said_baseline`` are the counts that the page gives, ``voxels``, ``cells``
-    and ``baseline`` the points that it draws; ``colors`` changes with the colour or place of any voxel's
-    point, and not with their order. ``table`` is that of the tab About, empty while another one is in
-    front.
+    ``said``, ``said_cells``, ``said_baseline`` and ``said_triangles`` are the counts that the page gives,
+    ``voxels``, ``cells`` and ``baseline`` the points that it draws, ``triangles`` those of the surface;
+    ``colors`` changes with the colour or place of any voxel's point, and not with their order. ``table`` is
+    that of the tab About, empty while another one is in front.
     """
 
     said: int
     said_cells: int
     said_baseline: int
+    said_triangles: int
     voxels: int
     cells: int
     baseline: int
+    triangles: int
     colors: int
     nodes: tuple[str, ...]
     activity: str
@@ -174,9 +181,9 @@ class Seen:
 
     @property
     def agrees(self) -> bool:
-        """Whether the scene holds as many voxels and cells as the page says."""
-        said = self.said, self.said_cells, self.said_baseline
-        return said == (self.voxels, self.cells, self.baseline)
+        """Whether the scene holds as many voxels, cells and triangles as the page says."""
+        said = self.said, self.said_cells, self.said_baseline, self.said_triangles
+        return said == (self.voxels, self.cells, self.baseline, self.triangles)
 
     @property
     def settled(self) -> bool:
@@ -202,8 +209,9 @@ class LivePage:
         words = found.pop("counts").replace(",", "").split()
         said = int(words[0]) if words else 0
         said_baseline = int(words[words.index("baseline") - 3]) if "baseline" in words else 0
-        said_cells = int(words[words.index("cells") - 1]) if "cells" in words else 0
-        counts = {"said": said, "said_cells": said_cells, "said_baseline": said_baseline}
+        counts = {"said": said, "said_baseline": said_baseline}
+        for name in ("cells", "triangles"):
+            counts[f"said_{name}"] = int(words[words.index(name) - 1]) if name in words else 0
         return Seen(**counts, nodes=tuple(found.pop("nodes")), **found)
 
     def until(self, condition: Callable[[Seen], object], what: str) -> Seen:
@@ -274,7 +282,8 @@ class LivePage:
         self, prefix: str, kind: str, local: tuple[float, float, float] = (0, 0, 0)
     ) -> list[list[float]]:
         """Where nodes are on the page, each as x, y in pixels and metres from the eye: the ``points`` of
-        clouds, the middle of a frustum's ``picture``, or a point of the node itself (``origin``)."""
+        clouds, some ``vertices`` of meshes, the middle of a frustum's ``picture``, or a point of the node
+        itself (``origin``)."""
         return self.page.evaluate(_PROJECT, [prefix, kind, local])
 
     def free_places(self, places: list[list[float]]) -> list[list[float]]:

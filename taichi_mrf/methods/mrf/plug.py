@@ -37,4 +37,5 @@ METHOD = Method(
     can_refine_poses=True,
     has_layers=True,
     has_colors=True,
+    measures_surface=True,
 )

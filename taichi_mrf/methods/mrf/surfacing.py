@@ -1,6 +1,6 @@
 """The surface of an MRFMap below the size of its voxels, from its keyframes and marginals."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -67,24 +67,25 @@ class WithSurface(BrickMap):
         found = [window.bricks_of(cells) for window, cells in bands]
         return sorted_bricks(np.concatenate([np.zeros((0, 3), np.int32), *found]))
 
-    def surface_field(self) -> DistanceField:
-        """The signed distances that the keyframes measured, as of the last :meth:`infer`. Raises
-        CapacityError if there is not enough memory."""
-        return surface_field_of(self, self._pool, self._keyframes)
+    def surface_field(self, between: Callable[[], object] = lambda: None) -> DistanceField:
+        """The signed distances that the keyframes measured, as of the last :meth:`infer`. ``between`` is
+        called after each keyframe. Raises CapacityError if there is not enough memory."""
+        return surface_field_of(self, self._pool, self._keyframes, between=between)
 
-    def surface(self) -> FusedSurface:
+    def surface(self, between: Callable[[], object] = lambda: None) -> FusedSurface:
         """The surface that the keyframes measured, by marching cubes through the mean of their signed
         distances: vertices, triangles, normals, and for each vertex a standard deviation in metres, and its
         colour if keyframes have colour images.
 
         It is made from the keyframes' images and the marginals as they are now, so call :meth:`infer` before.
         Frozen keyframes have no images: their part is kept with ``keep_surface``, else they have none.
-        Raises ConfigError for a map without keyframes, CapacityError if there is not enough memory,
-        TaichiMRFError without scikit-image.
+        ``between`` is called many times in a second; what it raises ends the work. Raises ConfigError for a
+        map without keyframes, CapacityError if there is not enough memory, TaichiMRFError without
+        scikit-image.
         """
         if not self._keyframes and not self.has_surface:
             raise ConfigError("the map has no keyframes: there is nothing to make a surface of")
-        found = fused_surface(self.surface_field(), self.voxel_size)
+        found = fused_surface(self.surface_field(between), self.voxel_size, between)
         found = without_free(self, found, LEAST * self.prior)
         colors = blended_colors(self, found.vertices_m) if is_colored(self) else None
         return replace(found, colors=colors)
@@ -104,12 +105,16 @@ class WithSurface(BrickMap):
 
 
 def surface_field_of(
-    m: WithSurface, pool: BrickPool, keyframes: Mapping[int, Keyframe], with_frozen: bool = True
+    m: WithSurface,
+    pool: BrickPool,
+    keyframes: Mapping[int, Keyframe],
+    with_frozen: bool = True,
+    between: Callable[[], object] = lambda: None,
 ) -> DistanceField:
     """The signed distances that some of a map's keyframes measured, with the marginals of ``pool``, and
     perhaps those of frozen ones. Raises CapacityError."""
     rays = SurfaceRays(pool, _model_of(m), m.config.volume)
-    found = rays.field([(k, m._registry.visible(k.footprint)) for k in keyframes.values()])
+    found = rays.field([(k, m._registry.visible(k.footprint)) for k in keyframes.values()], between)
     return m._kept.added_to(found) if with_frozen else found
 
 

@@ -27,6 +27,7 @@ class Action(Enum):
     SHOW_TIME = auto()
     SAVE_MAP = auto()
     SAVE_VOXELS = auto()
+    SAVE_MESH = auto()
     SAVE_PICTURE = auto()
     SAVE_PAGE = auto()
     RECORD = auto()

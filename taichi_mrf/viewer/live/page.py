@@ -28,6 +28,7 @@ class Page(BasePage[Panel]):
             m.Hello: self._begin,
             m.Bricks: lambda bricks: None if self.map is None else self.map.take(bricks),
             m.BrickColors: lambda colors: None if self.map is None else self.map.paint(colors),
+            m.SurfacePatch: lambda patch: None if self.map is None else self.map.surface.take(patch),
             m.KeyframeInfo: self._take_keyframe,
             m.CurrentCamera: self._take_camera,
             m.Status: self.panel.show_status,
@@ -57,6 +58,7 @@ class Page(BasePage[Panel]):
             Action.SHOW_TIME: lambda client: ask(m.ShowTime(self.panel.time.chosen_s())),
             Action.SAVE_MAP: lambda client: ask(m.Save("map", client)),
             Action.SAVE_VOXELS: lambda client: ask(m.Save("ply", client)),
+            Action.SAVE_MESH: lambda client: ask(m.Save("mesh", client)),
             Action.SAVE_PICTURE: self.downloads.picture,
             Action.SAVE_PAGE: lambda client: self.downloads.page(client, self.options.dark),
             Action.RECORD: self._record,
@@ -201,6 +203,8 @@ class Page(BasePage[Panel]):
             self.ask(m.RayThrough((point[0], point[1], point[2]), click.origin, chosen))
 
 
-def _extras(options: ViewOptions) -> tuple[bool, bool, bool]:
-    """Whether the options need the baseline's map, the counts of keyframes, and the colours of voxels."""
-    return options.show_baseline, options.color_by == "keyframes", options.color_by == "photo"
+def _extras(options: ViewOptions) -> tuple[bool, bool, bool, bool]:
+    """Whether the options need the baseline's map, the counts of keyframes, the colours of voxels, and the
+    measured surface."""
+    by = options.color_by
+    return options.show_baseline, by == "keyframes", by == "photo", options.show == "surface"

@@ -33,6 +33,10 @@ SAVE_BUTTONS = {
         Action.SAVE_VOXELS,
         "The voxels with probability 0.5 or more: a .ply file for MeshLab, CloudCompare or Blender.",
     ),
+    "Mesh": (
+        Action.SAVE_MESH,
+        "The surface that the keyframes measured, as `taichi-mrf export --mesh` writes it: a .ply file.",
+    ),
     "Picture": (Action.SAVE_PICTURE, "What this browser shows, as a .png file."),
     "Page": (Action.SAVE_PAGE, "The scene as one .html file that any browser opens, without a server."),
     "Recording": (Action.RECORD, "Start recording the scene; press again to get it as a .viser file."),
@@ -43,6 +47,7 @@ NO_KEYFRAME = "none yet"
 POSITION_STEP_M = 0.01
 
 _MAP_OPTIONS = (
+    "show",
     "color_by",
     "threshold",
     "size",

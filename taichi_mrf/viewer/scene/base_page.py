@@ -97,11 +97,9 @@ class BasePage(Generic[P]):
         pop_up(self.server, notice)
 
     def show_counts(self) -> None:
-        """Show how many voxels and cells the page shows, or will show in a moment."""
+        """Show how much of what the page shows, or will show in a moment."""
         if self.map is not None:
-            shown = {name: layer.voxels_shown for name, layer in self.map.layers.items()}
-            shown["dynamic"] = self.map.layers["map"].dynamic_shown
-            self.panel.show_counts(shown, self.map.cells.shown, self.downloads.is_recording)
+            self.panel.show_counts(self.map.counts(), self.downloads.is_recording)
 
     def _announce(self) -> None:
         self.show_counts()

@@ -7,7 +7,7 @@ from typing import Any
 
 import viser
 
-from taichi_mrf.viewer.messages import Layer, Notice
+from taichi_mrf.viewer.messages import Notice
 from taichi_mrf.viewer.scene.notices import notices_html
 from taichi_mrf.viewer.scene.options import ViewOptions
 from taichi_mrf.viewer.scene.safe_text import in_html, in_markdown
@@ -16,6 +16,14 @@ from taichi_mrf.viewer.transport.inbox import Event, OptionsMoved, Used
 Tell = Callable[[Event], None]
 
 _MOST_NOTICES = 8
+
+_COUNTED = {
+    "cells": "cells",
+    "triangles": "triangles of the surface",
+    "dynamic": "dynamic",
+    "baseline": "of the baseline",
+}
+"""What is counted beside voxels, and its words."""
 
 
 class BasePanel:
@@ -70,13 +78,11 @@ class BasePanel:
         self._progress.value = 100.0 * min(max(share, 0.0), 1.0)
         self._progress.animated = moving
 
-    def show_counts(self, voxels: Mapping[Layer, int], cells: int, recording: bool) -> None:
-        """Show how many voxels of each layer and how many cells the page shows, and whether the scene is
-        being recorded."""
-        baseline, dynamic = voxels["baseline"], voxels["dynamic"]
-        text = f"{voxels['map']:,} voxels shown" + (f", {cells:,} cells" if cells else "")
-        text += f", {dynamic:,} dynamic" if dynamic else ""
-        text += f", {baseline:,} of the baseline" if baseline else ""
+    def show_counts(self, counts: Mapping[str, int], recording: bool) -> None:
+        """Show how much the page shows, by the names that MapScene.counts has, and whether the scene is being
+        recorded."""
+        text = f"{counts['map']:,} voxels shown"
+        text += "".join(f", {counts[name]:,} {words}" for name, words in _COUNTED.items() if counts[name])
         self._shown.content = text + (" · recording" if recording else "")
 
     def show_legend(self, legend_html: str) -> None:

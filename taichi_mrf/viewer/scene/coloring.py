@@ -82,6 +82,19 @@ def scale_of(
     return Scale(color_by, colors, low, 1.0, "marginal probability", _numbers((p - low) / (1.0 - low)))
 
 
+def std_scale(std_m: NDArray[np.floating]) -> Scale:
+    """The scale of standard deviations of the surface, in centimetres, on which nearly all of these (n,), in
+    metres, lie."""
+    colors = scale_of("uncertainty", LOWEST, (0.0, 1.0)).colors
+    most_mm = np.ceil(1000.0 * np.quantile(std_m, 0.95)) if len(std_m) else 1.0
+    return Scale("uncertainty", colors, 0.0, float(max(most_mm, 1.0)) / 10.0, "standard deviation (cm)")
+
+
+def std_colors(scale: Scale, std_m: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Colours (n, 3) of standard deviations (n,) in metres."""
+    return scale.colors[_numbers(100.0 * std_m / scale.high)]
+
+
 def voxel_colors(
     scale: Scale, shown: Shown, heights_m: NDArray[np.floating], facing: NDArray[np.uint8] | None = None
 ) -> NDArray[np.uint8]:

@@ -18,6 +18,7 @@ from taichi_mrf.viewer.scene.coloring import Scale
 from taichi_mrf.viewer.scene.cut_plane import CutPlane, cut_picture
 from taichi_mrf.viewer.scene.look import Look, look_of
 from taichi_mrf.viewer.scene.options import ViewOptions
+from taichi_mrf.viewer.scene.surface_layer import SurfaceLayer
 from taichi_mrf.viewer.scene.voxel_layer import VoxelLayer
 from taichi_mrf.viewer.scene.voxel_store import ChunkKey, VoxelStore
 from taichi_mrf.voxels.layout import BRICK
@@ -34,7 +35,7 @@ _NAMES: dict[Layer, str] = {"map": "this map", "baseline": "baseline (OctoMap)"}
 
 
 class MapScene:
-    """Owns the scene nodes /voxels, /cells, /baseline, /cut, /bricks and /names."""
+    """Owns the scene nodes /voxels, /cells, /surface, /baseline, /cut, /bricks and /names."""
 
     def __init__(self, server: viser.ViserServer, hello: Hello) -> None:
         self._server, self._hello = server, hello
@@ -45,6 +46,9 @@ class MapScene:
         self.cells = CellLayer(
             server.scene, "/cells", hello.voxel_size, hello.prior_log_odds, hello.min_evidence
         )
+        self.surface = SurfaceLayer(server.scene, "/surface", hello.voxel_size)
+        self._voxel_nodes = [server.scene.add_frame(name, show_axes=False) for name in ("/voxels", "/cells")]
+        self._surface_wanted = False
         self._cut_plane = CutPlane(server.scene, hello.voxel_size)
         self._brick_lines = BrickLines(server.scene, hello.voxel_size)
         self._dirty: dict[Layer, set[ChunkKey]] = {"map": set(), "baseline": set()}
@@ -60,7 +64,14 @@ class MapScene:
     @property
     def scale(self) -> Scale | None:
         """The colour scale in use; None before anything was drawn."""
-        return None if self._look is None else self._look.scale
+        if self._look is None:
+            return None
+        return self.surface.scale(self._look) if self.shows_surface else self._look.scale
+
+    @property
+    def shows_surface(self) -> bool:
+        """Whether the measured surface is shown in the place of voxels and cells."""
+        return self._surface_wanted and bool(self.surface.patches)
 
     def box_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Lowest and highest corner of all maps that are shown, in metres, world; None if there is none."""
@@ -75,9 +86,21 @@ class MapScene:
         every = np.concatenate(corners)
         return every.min(axis=0), every.max(axis=0)
 
+    def counts(self) -> dict[str, int]:
+        """How many of what is shown, or will be once everything has been sent, by name."""
+        counts: dict[str, int] = {name: layer.voxels_shown for name, layer in self.layers.items()}
+        counts |= {"cells": self.cells.shown, "dynamic": self.layers["map"].dynamic_shown, "triangles": 0}
+        if self.shows_surface:
+            hidden = dict.fromkeys(("map", "cells", "dynamic"), 0)
+            counts |= {**hidden, "triangles": self.surface.triangles_shown}
+        return counts
+
     def boxes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Centres (n, 3) and sides (n,) of all voxels and cells of the map that are shown, in metres,
-        world."""
+        world; of the surface its vertices."""
+        if self.shows_surface:
+            vertices = self.surface.points()
+            return vertices, np.full(len(vertices), self._hello.voxel_size)
         voxels, (cells, sides) = self.layers["map"].points(), self.cells.boxes()
         alike = np.full(len(voxels), self._hello.voxel_size)
         return np.concatenate([voxels, cells]), np.concatenate([alike, sides])
@@ -105,6 +128,7 @@ class MapScene:
         for layer in self.layers.values():
             layer.clear()
         self.cells.clear()
+        self.surface.clear()
         self._cut_plane.hide()
         self._brick_lines.hide()
         for name in _NAMES:
@@ -114,7 +138,7 @@ class MapScene:
         """Seconds until :meth:`flush` has something to do if no update comes; None if it has nothing to
         do."""
         now = time.monotonic()
-        if self._all_dirty or any(self._dirty.values()):
+        if self._all_dirty or any(self._dirty.values()) or (self.shows_surface and self.surface.is_stale):
             return max(0.0, self._sent_at + 1 / UPDATES_PER_SECOND - now)
         at_rest = self._news_at + REST_S
         times = [self.cells.due(at_rest)]
@@ -141,6 +165,7 @@ class MapScene:
         look = look_of(options, self.store, up, self._hello.voxel_size)
         # A scale of heights or a cut that moves with the map's size changes every chunk.
         everything = self._all_dirty or (self._look is not None and look != self._look)
+        self._surface_wanted = options.show == "surface"
         map_changed = everything or bool(self._dirty["map"])
         any_changed = map_changed or bool(self._dirty["baseline"])
         for name, layer in self.layers.items():
@@ -152,11 +177,16 @@ class MapScene:
         due = self.cells.due(self._news_at + REST_S)
         if due is not None and time.monotonic() >= due:
             self.cells.prepare(self.store, look)
+        if everything:
+            self.surface.outdate()
+        if self.shows_surface:
+            self.surface.prepare(look, self.store)
         announce()
         with self._server.atomic():
             for layer in self.layers.values():
                 layer.send()
             self.cells.send()
+            self._show_surface(self.shows_surface)
             if map_changed:
                 self._draw_cut(look, crossed)
                 self._brick_lines.show(self.store.bricks() if options.bricks else None)
@@ -165,6 +195,13 @@ class MapScene:
                 self._draw_names(up)
         self._look, self._all_dirty, self._sent_at = look, False, time.monotonic()
         return True
+
+    def _show_surface(self, visible: bool) -> None:
+        """Show the surface in the place of voxels and cells, or these."""
+        self.surface.send(visible)
+        for node in self._voxel_nodes:
+            if node.visible == visible:
+                node.visible = not visible
 
     def _draw_cut(self, look: Look, crossed: Iterable[NDArray[np.int32]]) -> None:
         if look.cut is None:

@@ -9,6 +9,7 @@ from taichi_mrf.config.sliders import Range
 ColorBy = Literal["marginal", "height", "uncertainty", "keyframes", "photo"]
 UNPAINTED: tuple[ColorBy, ...] = tuple(each for each in get_args(ColorBy) if each != "photo")
 """What the colour can show of a map that no camera has seen in colour."""
+Show = Literal["voxels", "surface"]
 CutAxis = Literal["none", "x", "y", "z"]
 
 
@@ -16,9 +17,14 @@ CutAxis = Literal["none", "x", "y", "z"]
 class ViewOptions:
     """How the map is shown; nothing here changes the map."""
 
+    show: Show = "voxels"
+    """Show the voxels of the map, or the surface that its keyframes measured, below the size of voxels. The
+    surface is made when no frames are read: at the end, or while paused."""
+
     color_by: ColorBy = "marginal"
-    """What the colour shows: the marginal probability, the height, the uncertainty (entropy), the number of
-    keyframes whose rays pass through the voxel, or what cameras saw (photo)."""
+    """What the colour shows: the marginal probability, the height, the uncertainty (of a voxel its entropy,
+    of the surface its standard deviation), the number of keyframes whose rays pass through the voxel, or what
+    cameras saw (photo)."""
 
     threshold: Annotated[float, Range(0.02, 0.99, 0.01)] = 0.5
     """Show voxels whose probability of being occupied is at least this."""

@@ -127,6 +127,13 @@ class Chunk:
         colors = None if self.colors is None else self.colors.reshape(-1, 3)[voxels]
         return Shown(cells, self.log_odds.reshape(-1)[voxels], self.seen.reshape(-1)[voxels], colors)
 
+    def seen_at(self, cells: NDArray[np.integer]) -> NDArray[np.uint8]:
+        """By how many keyframes' rays the voxels with coordinates (n, 3), 0 to 63, were crossed, (n,)."""
+        brick, local = cells // BRICK, cells % BRICK
+        rows = self._row[(brick[:, 0] * CHUNK + brick[:, 1]) * CHUNK + brick[:, 2]]
+        numbers = (local[:, 0] * BRICK + local[:, 1]) * BRICK + local[:, 2]
+        return np.where(rows == _NOWHERE, 0, self.seen[rows, numbers]).astype(np.uint8)
+
     def slab(self, axis: int, cell: int) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
         """The voxels of one layer of the chunk: cells (n, 2) along the other two axes, log-odds (n,)."""
         rows = np.flatnonzero(self.bricks[:, axis] == cell // BRICK)

@@ -1,0 +1,157 @@
+"""The measured surface in the scene: triangles, one mesh for each chunk."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from taichi_mrf.viewer.messages import SurfacePatch
+from taichi_mrf.viewer.scene.coloring import Scale, std_colors, std_scale, voxel_colors
+from taichi_mrf.viewer.scene.unlit_mesh import unlit_glb
+from taichi_mrf.viewer.scene.voxel_layer import Look
+from taichi_mrf.viewer.scene.voxel_store import ChunkKey, Cut, Shown, VoxelStore
+from taichi_mrf.voxels.layout import CHUNK_VOXELS
+
+_LIGHT = (0.4, 0.25, 0.88)
+"""From where the light comes: along the two level axes, and up."""
+
+_DARKEST = 0.5
+"""Brightness of what the light does not reach."""
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """The mesh of a chunk: the vertices of its triangles (m, 3)."""
+
+    glb: bytes
+    triangles: NDArray[np.int32]
+
+
+class SurfaceLayer:
+    """Owns the scene nodes under ``prefix``."""
+
+    def __init__(self, scene: viser.SceneApi, prefix: str, voxel_size: float) -> None:
+        self._scene, self._prefix, self._voxel_size = scene, prefix, voxel_size
+        self._root = scene.add_frame(prefix, show_axes=False, visible=False)
+        self.patches: dict[ChunkKey, SurfacePatch] = {}
+        self._stale: set[ChunkKey] = set()
+        self._scale: Scale | None = None
+        self._prepared: dict[ChunkKey, _Drawn | None] = {}
+        self._nodes: dict[ChunkKey, tuple[_Drawn, viser.GlbHandle]] = {}
+
+    @property
+    def is_stale(self) -> bool:
+        """Whether :meth:`prepare` has something to do."""
+        return bool(self._stale)
+
+    @property
+    def triangles_shown(self) -> int:
+        """Number of triangles that clients show once everything prepared has been sent."""
+        ahead: dict[ChunkKey, _Drawn | None] = {key: drawn for key, (drawn, _) in self._nodes.items()}
+        ahead |= self._prepared
+        return sum(len(each.triangles) for each in ahead.values() if each is not None)
+
+    def take(self, patch: SurfacePatch) -> None:
+        """Take in a changed patch."""
+        if len(patch.triangles):
+            self.patches[patch.chunk] = patch
+        else:
+            self.patches.pop(patch.chunk, None)
+        self._stale.add(patch.chunk)
+
+    def outdate(self) -> None:
+        """Draw everything again with the next :meth:`prepare`."""
+        self._stale |= self.patches.keys()
+
+    def scale(self, look: Look) -> Scale:
+        """The scale of its colours."""
+        if look.scale.color_by != "uncertainty":
+            return look.scale
+        every = [np.zeros(0, np.float32), *(patch.std_m for patch in self.patches.values())]
+        return std_scale(np.concatenate(every))
+
+    def prepare(self, look: Look, store: VoxelStore) -> None:
+        """Make the meshes of the patches that have changed; :meth:`send` sends them."""
+        scale = self.scale(look)
+        if scale != self._scale:  # that of uncertainty depends on all patches
+            self._scale = scale
+            self.outdate()
+        for key in sorted(self._stale):
+            patch = self.patches.get(key)
+            self._prepared[key] = None if patch is None else self._drawn(patch, look, scale, store)
+        self._stale.clear()
+
+    def send(self, visible: bool) -> None:
+        """Send what was prepared, and show or hide it all."""
+        for key, drawn in self._prepared.items():
+            if drawn is not None:
+                name = f"{self._prefix}/{key[0]}_{key[1]}_{key[2]}"
+                self._nodes[key] = (
+                    drawn,
+                    self._scene.add_glb(
+                        name, drawn.glb, position=self._corner_m(key), cast_shadow=False, receive_shadow=False
+                    ),
+                )
+            elif key in self._nodes:
+                self._nodes.pop(key)[1].remove()
+        self._prepared.clear()
+        if self._root.visible != visible:
+            self._root.visible = visible
+
+    def clear(self) -> None:
+        """Remove everything from the scene."""
+        self.patches.clear()
+        self._stale.clear()
+        self._prepared = dict.fromkeys(self._nodes)
+        self.send(visible=False)
+
+    def points(self) -> NDArray[np.float64]:
+        """The vertices (n, 3) that are shown, in metres, world."""
+        shown = [
+            self.patches[key].vertices_m[np.unique(drawn.triangles)]
+            for key, (drawn, _) in self._nodes.items()
+            if key in self.patches
+        ]
+        return np.concatenate([np.zeros((0, 3)), *shown])
+
+    def _drawn(self, patch: SurfacePatch, look: Look, scale: Scale, store: VoxelStore) -> _Drawn | None:
+        triangles = self._uncut(patch, look.cut)
+        if not len(triangles):
+            return None
+        vertices = (patch.vertices_m - self._corner_m(patch.chunk)).astype(np.float32)
+        return _Drawn(unlit_glb(vertices, triangles, self._colors(patch, look, scale, store)), triangles)
+
+    def _uncut(self, patch: SurfacePatch, cut: Cut | None) -> NDArray[np.int32]:
+        """The triangles that are not cut away."""
+        if cut is None:
+            return patch.triangles
+        before = patch.vertices_m[:, cut.axis] <= (cut.voxel + 1) * self._voxel_size
+        return patch.triangles[before[patch.triangles].all(axis=1)]
+
+    def _colors(self, patch: SurfacePatch, look: Look, scale: Scale, store: VoxelStore) -> NDArray[np.uint8]:
+        axis, sign = look.up
+        if scale.color_by == "uncertainty":
+            colors = std_colors(scale, patch.std_m)
+        else:
+            seen = self._seen(patch, store) if scale.color_by == "keyframes" else np.zeros(0, np.uint8)
+            shown = Shown(np.zeros((0, 3), np.uint8), patch.log_odds, seen, patch.colors)
+            colors = voxel_colors(scale, shown, sign * patch.vertices_m[:, axis])
+        if not look.shade or scale.color_by == "photo":
+            return colors
+        towards = np.zeros(3)
+        towards[axis] = sign * _LIGHT[2]
+        towards[[other for other in range(3) if other != axis]] = _LIGHT[:2]
+        lit = 0.5 + 0.5 * (patch.normals / 127.0) @ towards
+        return (colors * (_DARKEST + (1 - _DARKEST) * lit)[:, None] + 0.5).astype(np.uint8)
+
+    def _seen(self, patch: SurfacePatch, store: VoxelStore) -> NDArray[np.uint8]:
+        """By how many keyframes' rays the voxel of each vertex was crossed, (n,)."""
+        chunk = store.chunks.get(patch.chunk)
+        if chunk is None:
+            return np.zeros(len(patch.vertices_m), np.uint8)
+        local = np.floor((patch.vertices_m - self._corner_m(patch.chunk)) / self._voxel_size)
+        return chunk.seen_at(np.clip(local, 0, CHUNK_VOXELS - 1).astype(np.int64))
+
+    def _corner_m(self, key: ChunkKey) -> NDArray[np.float64]:
+        return np.array(key) * (CHUNK_VOXELS * self._voxel_size)

@@ -1,0 +1,107 @@
+"""The measured surface that the live page gets: none until it is shown, then that of the map."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live_scene import CONFIG, FakeLink, finished, never, session_of
+
+from taichi_mrf.export.formats import export_map
+from taichi_mrf.export.options import ExportOptions
+from taichi_mrf.live import extras
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.viewer.messages import (
+    File,
+    Freeze,
+    Notice,
+    Request,
+    Save,
+    Status,
+    SurfacePatch,
+    Switch,
+    Update,
+    Watch,
+)
+
+pytestmark = pytest.mark.usefixtures("one_backend")
+
+SHOW = Watch(images=False, view=None, baseline=False, surface=True)
+
+Triangle = tuple[tuple[float, ...], ...]
+
+
+def of_page(link: FakeLink) -> set[Triangle]:
+    """The triangles that the page has, each by its corners."""
+    patches = {patch.chunk: patch for patch in link.of_type(SurfacePatch)}
+    corners = [patch.vertices_m[patch.triangles] for patch in patches.values()]
+    return as_set(np.concatenate(corners))
+
+
+def of_map(m: MRFMap) -> set[Triangle]:
+    surface = m.surface()
+    return as_set(surface.vertices_m[surface.triangles].astype(np.float32))
+
+
+def as_set(corners: np.ndarray) -> set[Triangle]:
+    return {tuple(map(tuple, triangle)) for triangle in corners.tolist()}
+
+
+def test_the_page_gets_the_surface_of_the_map_when_it_shows_it() -> None:
+    link = FakeLink()
+    session = session_of(link)
+    finished(session)
+    assert not link.of_type(SurfacePatch)
+    link.ask(SHOW)
+    m = finished(session)
+    assert of_page(link) == of_map(m)
+    whole = len(link.of_type(SurfacePatch))
+    finished(session)
+    assert len(link.of_type(SurfacePatch)) == whole  # nothing has changed
+    link.ask(Switch(1, on=False))
+    m = finished(session)
+    assert of_page(link) == of_map(m)
+    link.ask(Freeze(0))
+    m = finished(session)
+    assert of_page(link) == of_map(m)
+    assert link.of_type(Notice)[-1].text.startswith("the surface lacks 1 frozen keyframes, whose images")
+    assert link.errors() == []
+
+
+def test_an_edit_ends_the_making_of_a_surface(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(extras, "ASK_SECONDS", 0.0)
+    edits: list[Request] = [Switch(2, on=False)]
+
+    def at_the_surface(update: Update) -> list[Request]:
+        making = isinstance(update, Status) and update.activity == "making the surface"
+        return [edits.pop()] if making and edits else []
+
+    link = FakeLink(at_the_surface)
+    link.ask(SHOW)
+    m = finished(session_of(link))
+    assert not edits
+    assert len(m.keyframes) == 3
+    assert of_page(link) == of_map(m)
+
+
+def test_a_map_without_a_surface_says_why() -> None:
+    link = FakeLink()
+    session = session_of(link, config=replace(CONFIG, method="log_odds"))
+    link.ask(SHOW)
+    session.run(never)
+    (error,) = link.errors()
+    assert error == "no surface: a map of the method log_odds has none"
+    assert not link.of_type(SurfacePatch)
+
+
+def test_the_button_saves_the_mesh_that_export_writes(tmp_path: Path) -> None:
+    link = FakeLink()
+    session = session_of(link)
+    m = finished(session)
+    link.ask(Save("mesh", 7))
+    finished(session)
+    (file,) = link.of_type(File)
+    export_map(m, tmp_path / "mesh.ply", ExportOptions(mesh=True))
+    assert file.name == "mesh.ply"
+    assert file.content == (tmp_path / "mesh.ply").read_bytes()
+    assert link.of_type(Notice)[-1].text == "mesh.ply shows the surface that the rays of 4 keyframes measured"

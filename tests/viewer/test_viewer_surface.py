@@ -1,0 +1,164 @@
+"""The measured surface on the page: meshes in the colours of the scale, in the place of voxels."""
+
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from taichi_mrf.viewer import messages as m
+from taichi_mrf.viewer.live.actions import Clicked
+from taichi_mrf.viewer.live.page import Page
+from taichi_mrf.viewer.scene.options import ViewOptions
+from taichi_mrf.viewer.scene.unlit_mesh import before_tone_mapping, unlit_glb
+from taichi_mrf.viewer.transport.server import start_server
+
+VOXEL = 0.1
+HELLO = m.Hello("a recording", "cpu", "a device", "mrf", VOXEL, -2.2, 0.1, "voxel_size: 0.1", has_colors=True)
+CHUNK = (0, -1, 0)
+
+
+def patch(colors: np.ndarray | None = None, empty: bool = False) -> m.SurfacePatch:
+    """Two triangles across x at y = -3 m, which face -y."""
+    vertices = np.array([[1, -3, 1], [3, -3, 1], [3, -3, 2], [5, -3, 1]], np.float32)
+    triangles = np.array([[0, 1, 2], [1, 3, 2]], np.int32)
+    return m.SurfacePatch(
+        CHUNK,
+        vertices,
+        triangles[:0] if empty else triangles,
+        np.tile(np.array([0, -127, 0], np.int8), (4, 1)),
+        np.array([0.001, 0.002, 0.003, 0.010], np.float32),
+        np.full(4, 1000, np.int16),
+        colors,
+    )
+
+
+class SurfacePage:
+    """A page without a mapping process; ``asked`` is what it asked of it."""
+
+    def __init__(self) -> None:
+        self.server = start_server("127.0.0.1", 0, "Surface")
+        self.asked: list[m.Request] = []
+        self.page = Page(self.server, self.asked.append)
+        self.take(HELLO)
+        brick, packed = np.zeros((1, 3), np.int32), np.full((1, 512), 900, np.int16)
+        self.take(m.Bricks("map", brick, packed, np.ones((1, 512), np.uint8), brick[:0]))
+
+    def take(self, update: m.Update | Clicked) -> None:
+        self.page.handlers[type(update)](update)
+
+    def draw(self, **options: object) -> str:
+        """Draw with these options; the line of counts."""
+        before, self.page.options = self.page.options, replace(ViewOptions(), **options)  # type: ignore[arg-type]
+        self.page.options_changed(before)
+        assert self.page.map is not None
+        self.page.map.look_changed()
+        self.page._flush()
+        return self.page.panel._shown.content
+
+    def is_visible(self, name: str) -> bool:
+        return self.server.scene._handle_from_node_name[name].visible
+
+    def mesh(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Vertices in metres, triangles and colours of the only chunk, as a browser reads them."""
+        node = self.server.scene._handle_from_node_name["/surface/0_-1_0"]
+        vertices, triangles, light = parts_of(node.glb_data)  # type: ignore[attr-defined]
+        return vertices + np.array(node.position), triangles, tone_mapped(light)
+
+
+def parts_of(glb: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    length, kind = struct.unpack("<I4s", glb[12:20])
+    scene, data = json.loads(glb[20 : 20 + length]), glb[28 + length :]
+    assert (glb[:4], kind, len(glb)) == (b"glTF", b"JSON", struct.unpack("<I", glb[8:12])[0])
+    types = {5126: np.float32, 5123: np.uint16, 5125: np.uint32}
+    found = []
+    for accessor, view in zip(scene["accessors"], scene["bufferViews"], strict=True):
+        part = data[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+        found.append(np.frombuffer(part, types[accessor["componentType"]]).reshape(-1, 3))
+    return found[0], found[2], found[1]
+
+
+def tone_mapped(light: np.ndarray) -> np.ndarray:
+    """What three.js makes of linear light with ACESFilmicToneMapping, as sRGB (n, 3) uint8."""
+    into = [[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]]
+    back = [[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605], [-0.00327, -0.07276, 1.07602]]
+    v = (light.astype(np.float64) / 0.6) @ np.array(into).T
+    film = (v * (v + 0.0245786) - 0.000090537) / (v * (0.983729 * v + 0.4329510) + 0.238081)
+    share = np.clip(film @ np.array(back).T, 0.0, 1.0)
+    srgb = np.where(share <= 0.0031308, 12.92 * share, 1.055 * share ** (1 / 2.4) - 0.055)
+    return np.rint(255 * srgb).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def drawn() -> Iterator[SurfacePage]:
+    running = SurfacePage()
+    yield running
+    running.server.stop()
+
+
+def test_colours_survive_the_tone_mapping() -> None:
+    colors = np.random.default_rng(0).integers(0, 256, (5000, 3)).astype(np.uint8)
+    colors[:3] = [[0, 0, 0], [255, 255, 255], [0, 255, 0]]
+    shown = tone_mapped(before_tone_mapping(colors))
+    assert np.abs(shown.astype(int) - colors).max() <= 1
+
+
+def test_a_large_mesh_has_large_indices() -> None:
+    vertices = np.random.default_rng(1).random((70000, 3)).astype(np.float32)
+    triangles = np.array([[0, 1, 69999]])
+    found = parts_of(unlit_glb(vertices, triangles, np.zeros((70000, 3), np.uint8)))
+    np.testing.assert_array_equal(found[0], vertices)
+    np.testing.assert_array_equal(found[1], triangles)
+
+
+def test_the_surface_takes_the_place_of_voxels_once_it_is_there(drawn: SurfacePage) -> None:
+    assert drawn.draw() == "512 voxels shown"
+    assert drawn.draw(show="surface") == "512 voxels shown"
+    assert drawn.asked[-1] == m.Watch(False, None, False, surface=True)
+    drawn.take(patch())
+    assert drawn.draw(show="surface") == "0 voxels shown, 2 triangles of the surface"
+    assert (drawn.is_visible("/voxels"), drawn.is_visible("/surface")) == (False, True)
+    vertices, triangles, _ = drawn.mesh()
+    np.testing.assert_allclose(vertices[triangles], patch().vertices_m[patch().triangles], atol=1e-6)
+    assert drawn.draw() == "512 voxels shown"
+    assert (drawn.is_visible("/voxels"), drawn.is_visible("/surface")) == (True, False)
+    drawn.take(patch(empty=True))
+    assert drawn.draw(show="surface") == "512 voxels shown"
+
+
+def test_a_cut_takes_the_triangles_beyond_it_away(drawn: SurfacePage) -> None:
+    drawn.take(m.Bricks("map", np.array([[7, -7, 2]], np.int32), np.full((1, 512), -900, np.int16),
+                        np.ones((1, 512), np.uint8), np.zeros((0, 3), np.int32)))  # fmt: skip
+    drawn.take(patch())
+    assert "2 triangles" in drawn.draw(show="surface", cut_axis="x", cut_at=1.0)
+    assert "1 triangles" in drawn.draw(show="surface", cut_axis="x", cut_at=0.6)
+
+
+def test_the_colours_are_those_of_the_scale(drawn: SurfacePage) -> None:
+    photo = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [90, 90, 90]], np.uint8)
+    drawn.take(patch(photo))
+    drawn.draw(show="surface", color_by="photo")
+    assert np.abs(drawn.mesh()[2].astype(int) - photo).max() <= 1
+    drawn.draw(show="surface", color_by="uncertainty", shade=False)
+    scale = drawn.page.map.scale if drawn.page.map else None
+    assert scale is not None
+    assert (scale.high, scale.label) == (0.9, "standard deviation (cm)")  # nearly all lie below
+    expected = scale.colors[np.rint(255 * np.array([1, 2, 3, 9]) / 9).astype(int)]
+    assert np.abs(drawn.mesh()[2].astype(int) - expected).max() <= 1
+    drawn.draw(show="surface", shade=False)
+    assert len(np.unique(drawn.mesh()[2], axis=0)) == 1  # they are equally likely
+    lit = drawn.mesh()[2].astype(int)
+    drawn.draw(show="surface")
+    assert (drawn.mesh()[2] <= lit).all()
+    assert (drawn.mesh()[2] < lit).any()
+
+
+def test_a_click_on_the_surface_asks_for_the_ray_to_it(drawn: SurfacePage) -> None:
+    drawn.take(patch())
+    drawn.draw(show="surface")
+    drawn.take(Clicked((3.03, -9.0, 2.01), (0.0, 1.0, 0.0)))
+    asked = drawn.asked[-1]
+    assert isinstance(asked, m.RayThrough)
+    assert asked.point == pytest.approx((3.0, -3.0, 2.0))
