@@ -127,9 +127,7 @@ def path_collision(
     given = array(points, "points")
     if given.ndim not in (2, 3) or given.shape[-1] != 3 or given.shape[-2] == 0:
         raise ConfigError(f"a path needs points of shape (N, 3) or (P, N, 3), not {given.shape}")
-    paths = given.reshape(-1, *given.shape[-2:])
-    if not np.isfinite(paths).all():
-        raise ConfigError("points hold a value that is not finite")
+    paths = checked_points(given.reshape(-1, 3)).reshape(-1, *given.shape[-2:])
     step = _PLACES_APART * real(radius_m, "radius_m", above=0)
     places, path_of = _places(paths, step)
     there = occupied_within(places, radius_m, voxel_size, topology, pool, seen_free)
