@@ -34,6 +34,11 @@ def true_cells(truth: OccupancyTruth, bricks: NDArray[np.int32], side: int) -> N
     return np.where(occupied, OCCUPIED, np.where(free, FREE, NOT_JUDGED)).astype(np.int8)
 
 
+def hidden_voxels(truth: OccupancyTruth, bricks: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Which voxels of bricks (n, 3) are hidden, (n, 512)."""
+    return _bits(truth.hidden_marks, truth.window.cells_of(bricks))
+
+
 def _bits(marks: Marks, cells: NDArray[np.int32]) -> NDArray[np.bool_]:
     """The marks of the voxels of a window's cells, (n,) -> (n, 512); none for a cell of -1."""
     words = np.where(cells[:, None] >= 0, marks.reshape(-1, WORDS)[cells], 0).astype("<i4")

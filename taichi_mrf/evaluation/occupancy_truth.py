@@ -3,7 +3,9 @@
 A voxel is *occupied* if a surface passes through it and a clean ray ends there. It is *free* if a clean ray
 crosses it and no surface touches it. All other voxels are not judged: no view shows what lies inside solids
 or is hidden, and for a surface in the plane between two voxels rounding alone decides which of them holds it.
-Voxels are those of the map's grid: voxel i covers [i, i + 1) times the voxel size along each axis.
+A voxel is *hidden* if no clean ray reaches it and no surface touches it: a map that is occupied there has
+walls that are too thick. Voxels are those of the map's grid: voxel i covers [i, i + 1) times the voxel size
+along each axis.
 """
 
 from collections.abc import Iterator, Sequence
@@ -29,6 +31,7 @@ class OccupancyTruth:
     window: Window
     occupied_marks: Marks
     free_marks: Marks
+    hidden_marks: Marks
 
     @property
     def counts(self) -> tuple[int, int]:
@@ -68,7 +71,8 @@ def occupancy_truth(
     seen = seen_voxels(clean_depths_m, poses, camera, voxel_size)
     surface = _surface_marks(mesh, seen.window, 0.0)
     touched = _surface_marks(mesh, seen.window, SLACK)
-    return OccupancyTruth(seen.window, surface & seen.ended, seen.crossed & ~touched)
+    hidden = ~(seen.crossed | seen.ended | touched)
+    return OccupancyTruth(seen.window, surface & seen.ended, seen.crossed & ~touched, hidden)
 
 
 def surface_voxels(mesh: TriangleMesh, voxel_size: float) -> NDArray[np.int32]:

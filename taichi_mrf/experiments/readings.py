@@ -1,12 +1,14 @@
-"""What a map calls occupied, by marginal and by the rays' vote, against what its omega answers.
+"""What a map calls occupied, by marginal, by the rays' vote and calibrated, against what its omega answers.
 
 Every pixel of held-out views follows its ray to the first voxel that is called occupied, and is judged as
-omega's answer is (evaluation/accuracy.py). Beside that, how far the marginals can be trusted: their
-reliability on the voxels that measured rays saw, as ``inference.ray_correlation`` varies.
+omega's answer is (evaluation/accuracy.py). Beside that, how far the probabilities can be trusted: their
+reliability on the voxels that measured rays saw, without and with those behind the surface, for the
+calibrated reading and for marginals as ``inference.ray_correlation`` varies.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,8 +21,9 @@ from taichi_mrf.datasets.synthetic.analytic_mesh import scene_mesh
 from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh, load_mesh
 from taichi_mrf.datasets.synthetic.room_furniture import room_scene as furnished_room
 from taichi_mrf.evaluation.accuracy import judge_view
+from taichi_mrf.evaluation.cell_truth import hidden_voxels
 from taichi_mrf.evaluation.occupancy_scores import reliability_bins
-from taichi_mrf.evaluation.occupancy_truth import occupancy_truth
+from taichi_mrf.evaluation.occupancy_truth import OccupancyTruth, occupancy_truth
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.contenders import mrf
 from taichi_mrf.experiments.exact import room_scene
@@ -28,9 +31,12 @@ from taichi_mrf.experiments.folds import Experiment, fold_key, require_views
 from taichi_mrf.experiments.judging import build
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene, coffin_scene, house_scene
+from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.methods.mrf.reading import MapReading
+from taichi_mrf.queries.known_bricks import BrickReader
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.simulate import simulate_model
+from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
 
 CORRELATIONS = (1.0, 0.5, 0.3)
 """Values of ``inference.ray_correlation``."""
@@ -56,6 +62,12 @@ OCCUPIED = 10.0
 
 BINS, LEAST_IN_BIN = 10, 100
 
+TURN = look_at(OFF_THE_GRID_M, OFF_THE_GRID_M + np.array([1.0, 0.4, -0.2]), (0.1, 0.0, 1.0))
+"""Moves scenes so that surfaces cut voxels in all ways. Walls in planes of the grid, as those of the house,
+are a voxel off as a whole or not at all, and shares of voxels mean little there."""
+
+_TURNED = ", turned"
+
 Judged = tuple[Scene, TriangleMesh]
 
 
@@ -66,23 +78,27 @@ def run_readings(experiment: Experiment) -> tuple[list[Table], list[Path]]:
         lambda: _house(experiment, "D435"),
         lambda: _coffin(experiment),
         lambda: _room(experiment),
+        lambda: _turned(*_house(experiment, "Kinect")),
+        lambda: _turned(*_coffin(experiment)),
+        lambda: _turned(*_room(experiment)),
     )
     readings: list[list[Entry]] = []
-    marginals: list[list[Entry]] = []
+    trust: list[list[Entry]] = []
     for make in makers:
         scene, mesh = make()
         require_views(scene, 4)
+        correlations = CORRELATIONS[:1] if scene.name.endswith(_TURNED) else CORRELATIONS
         for voxel_size in experiment.voxel_sizes:
-            for number, correlation in enumerate(CORRELATIONS):
+            for number, correlation in enumerate(correlations):
                 contender = mrf(f"rho {correlation:g}", ray_density=2.5, ray_correlation=correlation)
-                experiment.report(f"{scene.name}, {contender.name}", number, len(CORRELATIONS))
+                experiment.report(f"{scene.name}, {contender.name}", number, len(correlations))
                 figures = experiment.ledger.result(
-                    fold_key(scene, 0, contender, voxel_size, f"{len(scene.views)} views, readings"),
+                    fold_key(scene, 0, contender, voxel_size, f"{len(scene.views)} views, three readings"),
                     lambda c=contender, s=scene, t=mesh, size=voxel_size: _figures(c, s, t, size),  # type: ignore[misc]
                 )
                 head: list[Entry] = [f"{voxel_size * 100:g} cm", scene.name, correlation]
-                readings += [[*head, name, *values] for name, values in figures["readings"].items()]
-                marginals.append([*head, *figures["marginals"]])
+                readings += [[*head, *row] for row in figures["readings"]]
+                trust += [[*head, *row] for row in figures["trust"]]
     tables = [
         Table(
             "readings",
@@ -93,13 +109,15 @@ def run_readings(experiment: Experiment) -> tuple[list[Table], list[Path]]:
             ["Precision and recall are of the voxels called occupied, as in Table II."],
         ),
         Table(
-            "marginals",
-            "How far marginals can be trusted",
-            ["voxels", "scene", "ray correlation", "precision", "recall", "log-likelihood", "largest gap",
-             *(f"{i / BINS:g}" for i in range(BINS))],
-            marginals,
-            ["The last columns: observed share minus mean marginal in each bin of at least "
-             f"{LEAST_IN_BIN} seen voxels; their largest size; the mean log-likelihood of a seen voxel."],
+            "trust",
+            "How far probabilities can be trusted",
+            ["voxels", "scene", "ray correlation", "reading", "judged", "precision", "recall",
+             "log-likelihood", "largest gap", *(f"{i / BINS:g}" for i in range(BINS))],
+            trust,
+            ["The last columns: observed share minus mean probability in each bin of at least "
+             f"{LEAST_IN_BIN} voxels that measured rays told the map of; their largest size; the mean "
+             "log-likelihood of a voxel. Seen: voxels that clean rays cross or end in. All: also those that "
+             "are hidden behind surfaces, which count as free."],
         ),
     ]  # fmt: skip
     return tables, [path for table in tables for path in write_table(experiment.out, table)]
@@ -110,23 +128,40 @@ def _figures(contender: Any, scene: Scene, mesh: TriangleMesh, voxel_size: float
     judged = list(range(1, len(scene.views), 8))
     built, _ = build(contender, scene, voxel_size, keyframes)
     m = cast(MRFMap, built)  # which is what contenders.mrf builds
-    centres, occupied = _truth(scene, mesh, keyframes, voxel_size)
-    p = m.occupancy(centres).astype(np.float64)
-    maps: dict[str, MRFMap | MapReading] = {"marginal": m, "surface": m.reading("surface")}
-    readings = {"omega": [*_accuracy(m, scene, judged, m.view), None, None]}
+    truth = _truth(scene, mesh, keyframes, voxel_size)
+    centres, occupied = _seen(truth, scene)
+    behind = _hidden(truth, m)
+    maps: dict[str, MRFMap | MapReading] = {"marginal": m}
+    if contender.name == "rho 1":
+        maps |= {name: m.reading(name) for name in ("surface", "calibrated")}
+    readings: list[list[Entry]] = [["omega", *_accuracy(m, scene, judged, m.view), None, None]]
+    trust: list[list[Entry]] = []
     for name, shown in maps.items():
-        called = shown.occupancy(centres) > 0.5
+        p = shown.occupancy(centres).astype(np.float64)
+        called = p > 0.5
         found = float((called & occupied).sum())
-        right = _accuracy(m, scene, judged, _solid(m, shown))
-        readings[name] = [*right, found / max(1, called.sum()), found / occupied.sum()]
-    # Voxels that no measured ray has told anything of have the prior; they are not judged.
-    seen = np.abs(p - m.prior) > 1e-6
-    bins = reliability_bins(p[seen], occupied[seen], BINS)
+        precision, recall = found / max(1, called.sum()), found / occupied.sum()
+        readings.append([name, *_accuracy(m, scene, judged, _solid(m, shown)), precision, recall])
+        if name != "surface":
+            trust.append([name, "seen", *_trust(p, occupied, m.prior)])
+            p = np.concatenate([p, shown.occupancy(behind)])
+            trust.append([name, "all", *_trust(p, np.append(occupied, np.zeros(len(behind), bool)), m.prior)])
+    return {"readings": readings, "trust": trust}
+
+
+def _trust(p: NDArray[np.float64], occupied: NDArray[np.bool_], prior: float) -> list[Entry]:
+    """Precision, recall, log-likelihood, and the gaps of the bins; a voxel that no ray told anything of has
+    the prior, and is in no bin."""
+    called = p > 0.5
+    found = float((called & occupied).sum())
+    scores = [found / max(1, called.sum()), found / occupied.sum()]
+    told = np.abs(p - prior) > 1e-6
+    p, occupied = p[told], occupied[told]
+    bins = reliability_bins(p, occupied, BINS)
     gaps = np.where(bins.count >= LEAST_IN_BIN, bins.observed - bins.predicted, np.nan)
-    likelihood = np.log(np.where(occupied, p, 1 - p)[seen].clip(1e-4)).mean()
-    _, _, _, precision, recall = readings["marginal"]
-    marginals = [precision, recall, likelihood, np.nanmax(np.abs(gaps)), *gaps]
-    return {"readings": readings, "marginals": [None if np.isnan(x) else float(x) for x in marginals]}
+    likelihood = np.log(np.where(occupied, p, 1 - p).clip(1e-4)).mean()
+    row = [*scores, likelihood, np.nanmax(np.abs(gaps)), *gaps]
+    return [None if np.isnan(x) else float(x) for x in row]
 
 
 def _solid(m: MRFMap, shown: MRFMap | MapReading) -> View:
@@ -151,18 +186,20 @@ def _accuracy(m: MRFMap, scene: Scene, judged: list[int], view: View) -> list[fl
     return [float(x) for x in np.mean(found, axis=0)]
 
 
-def _truth(
-    scene: Scene, mesh: TriangleMesh, keyframes: list[int], voxel_size: float
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Voxels (n, 3) that measured rays of keyframes could see, and whether they are occupied."""
+def _truth(scene: Scene, mesh: TriangleMesh, keyframes: list[int], voxel_size: float) -> OccupancyTruth:
+    """What measured rays of keyframes could see."""
     views = [scene.views[i] for i in keyframes]
-    truth = occupancy_truth(
+    return occupancy_truth(
         mesh,
         [np.where(view.measured_m > 0, view.true_m, 0) for view in views],
         [view.T_world_camera for view in views],
         scene.camera,
         voxel_size,
     )
+
+
+def _seen(truth: OccupancyTruth, scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Centres (n, 3) of the voxels that were seen, and whether they are occupied."""
     parts = list(truth.blocks())
     centres = np.concatenate([c for c, _ in parts])
     occupied = np.concatenate([o for _, o in parts])
@@ -171,6 +208,29 @@ def _truth(
         inside = ((centres > lower) & (centres < upper)).all(axis=1)
         centres, occupied = centres[inside], occupied[inside]
     return centres, occupied
+
+
+def _hidden(truth: OccupancyTruth, m: MRFMap) -> NDArray[np.float64]:
+    """Centres (n, 3) of the voxels of the map's bricks that are hidden."""
+    bricks = BrickReader(m).bricks
+    row, number = np.nonzero(hidden_voxels(truth, bricks))
+    return (bricks[row].astype(np.float64) * BRICK + offsets_in_brick()[number] + 0.5) * m.voxel_size
+
+
+def _turned(scene: Scene, mesh: TriangleMesh) -> Judged:
+    """The scene moved by TURN; its volume is the box around the moved one."""
+    views = [replace(view, T_world_camera=TURN @ view.T_world_camera) for view in scene.views]
+    volume = scene.volume
+    if volume.lower is not None and volume.upper is not None:
+        corners = np.array(list(product(*zip(volume.lower, volume.upper, strict=True))))
+        moved = corners @ TURN[:3, :3].T + TURN[:3, 3]
+        x, y, z = moved.min(axis=0).tolist()
+        volume = replace(volume, lower=(x, y, z))
+        x, y, z = moved.max(axis=0).tolist()
+        volume = replace(volume, upper=(x, y, z))
+    vertices = mesh.vertices @ TURN[:3, :3].T + TURN[:3, 3]
+    moved_mesh = TriangleMesh(vertices, mesh.triangles)
+    return replace(scene, name=scene.name + _TURNED, views=views, volume=volume), moved_mesh
 
 
 def _house(experiment: Experiment, noise: str) -> Judged:

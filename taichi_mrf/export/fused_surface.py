@@ -171,10 +171,10 @@ def _boxes(
         weight, distance = field.box(chunk * CHUNK_VOXELS - MARGIN, side)
         if weight.any():
             own = weight[(slice(MARGIN, -MARGIN),) * 3]
-            yield chunk * CHUNK_VOXELS, own, *_blended(weight, distance)
+            yield chunk * CHUNK_VOXELS, own, *blended_sums(weight, distance)
 
 
-def _blended(
+def blended_sums(
     weight: NDArray[np.float32], distance: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Sums of weight, and of distance times weight, blended with their surroundings; the box shrinks by

@@ -1,4 +1,5 @@
-"""The readings' experiment on small scenes: the rays' vote answers more rays rightly than marginals."""
+"""The readings' experiment on small scenes: the rays' vote answers more rays rightly than marginals, and
+a calibrated map has more of the surface."""
 
 from pathlib import Path
 
@@ -15,12 +16,19 @@ def test_readings_are_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     data = make_data(tmp_path)
     monkeypatch.setattr(readings, "CORRELATIONS", (1.0,))
     monkeypatch.setattr(readings, "LEAST_IN_BIN", 5)
-    [table, marginals], paths = run_experiment("readings", data, tmp_path, (0.1,), (0,), 4, lambda *_: None)
+    [table, trust], paths = run_experiment("readings", data, tmp_path, (0.1,), (0,), 4, lambda *_: None)
     assert all(path.is_file() for path in paths)
-    assert len(marginals.rows) == 4  # two houses, the coffin scene, the room
     rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
-    for omega, marginal, surface in zip(rows[::3], rows[1::3], rows[2::3], strict=True):
-        assert [each["reading"] for each in (omega, marginal, surface)] == ["omega", "marginal", "surface"]
+    assert len(rows) == 4 * 7  # two houses, the coffin scene, the room, and three of them turned
+    names = ["omega", "marginal", "surface", "calibrated"]
+    for omega, marginal, surface, calibrated in zip(*(rows[i::4] for i in range(4)), strict=True):
+        assert [each["reading"] for each in (omega, marginal, surface, calibrated)] == names
         assert surface["recall"] >= marginal["recall"]
         assert surface["unanswered"] <= marginal["unanswered"]
         assert surface["1.5sigma"] >= marginal["1.5sigma"]
+    rows = [dict(zip(trust.columns, row, strict=True)) for row in trust.rows]
+    for seen, all_, calibrated in zip(rows[::4], rows[1::4], rows[2::4], strict=True):
+        assert (seen["judged"], all_["judged"], calibrated["reading"]) == ("seen", "all", "calibrated")
+        assert all_["recall"] == seen["recall"]
+        assert all_["precision"] <= seen["precision"]
+        assert calibrated["recall"] > seen["recall"]

@@ -77,9 +77,12 @@ class Map:
     pictures: bool = True
     """Draw the map from above, in perspective, and against the measured depth."""
 
-    shown_reading: Annotated[Literal["marginal", "surface"], tyro.conf.arg(name="reading")] = "marginal"
-    """What is occupied in voxels.ply and the pictures: voxels that are more likely so than not, or also those
-    that enough rays take for their first surface (surface), which needs mrf and a map in memory."""
+    shown_reading: Annotated[Literal["marginal", "surface", "calibrated"], tyro.conf.arg(name="reading")] = (
+        "marginal"
+    )
+    """What is occupied in voxels.ply and the pictures: voxels that are more likely so than not (marginal),
+    also those that enough rays take for their first surface (surface), or those that the measured surface
+    passes through more likely than not (calibrated); the last two need mrf and a map in memory."""
 
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the report as JSON, and nothing else, on stdout."""

@@ -20,6 +20,7 @@ from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import count_observations
 from taichi_mrf.inference.surface_votes import surfaces_first
 from taichi_mrf.inference.sweep import Sweeper
+from taichi_mrf.methods.mrf.calibrated import calibrated_log_odds
 from taichi_mrf.methods.mrf.kept_rays import RayShare
 from taichi_mrf.methods.mrf.map_reading import MapReading, RaysThen
 from taichi_mrf.methods.mrf.surfacing import LEAST, WithSurface
@@ -29,9 +30,9 @@ from taichi_mrf.voxels.pool import copied
 Layer = Literal["static", "dynamic", "both"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
 
-Reading = Literal["marginal", "surface"]
+Reading = Literal["marginal", "surface", "calibrated"]
 """What is called occupied: voxels whose marginal is over 0.5, or also those that enough rays take for their
-first surface."""
+first surface, or those through which the measured surface passes more likely than not."""
 READINGS: tuple[Reading, ...] = get_args(Reading)
 
 
@@ -173,13 +174,19 @@ class ReadableMRF(WithSurface):
         "surface" also calls a voxel occupied if it wins the vote of the rays: each measured ray votes for
         the voxel that most likely is its first surface, and against those in front of it
         (inference.surface_votes). Its log-odds are raised to just above even odds; all others are the
-        marginals, which are what "marginal" gives. The votes of frozen keyframes are kept with
-        ``keep_surface``, else they have none. Raises ConfigError for another name.
+        marginals, which are what "marginal" gives. "calibrated" gives each voxel the probability that it
+        holds a surface, from the distances of all rays (methods.mrf.calibrated). Votes and distances of
+        frozen keyframes are kept with ``keep_surface``, else they have none. Raises ConfigError for another
+        name, CapacityError if there is not enough memory.
         """
         if which not in READINGS:
             raise ConfigError(f"there is no reading {which!r}; known are {', '.join(READINGS)}")
         if which == "marginal":
             return MapReading(self, copied(self._pool.belief))
+        if which == "calibrated":
+            log_odds = copied(self._pool.belief)
+            log_odds.from_numpy(calibrated_log_odds(self.surface_field(), self._pool).reshape(-1))
+            return MapReading(self, log_odds)
         seen = [(k, self._registry.visible_again(k.footprint, k.visible)) for k in self._keyframes.values()]
         model = replace(self._sweeper.model(), maximise=False)
         votes = self._kept.share.votes
