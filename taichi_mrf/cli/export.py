@@ -125,10 +125,13 @@ def _read_by_rays(options: Export, layered: bool) -> ExportedMap:
     if layered:
         raise ConfigError(f"--reading {options.reading} goes together with neither --layer nor --at")
     m = None if options.map.suffix == SUFFIX else load_map(options.map)
-    if m is None or not has_layers(m) or in_chunks(m) is not None:
+    whole = ChunkedMap.open(options.map) if m is None else in_chunks(m)
+    if whole is not None:
+        return take_part(whole.reading(options.reading), options.lower, options.upper)
+    if m is None or not has_layers(m):
         raise ConfigError(
-            f"--reading {options.reading} needs the keyframes of a map in memory (map.npz, "
-            f"{methods_with('has_layers')}); {options.map} has none"
+            f"--reading {options.reading} needs the rays of a map of {methods_with('has_layers')}; "
+            f"{options.map} has none"
         )
     return m.reading(options.reading)
 

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.export.chunk_store import Chunk, ChunkStore, StoreHeader, new_store
-from taichi_mrf.export.store_header import COLORS, SURFACE
+from taichi_mrf.export.fused_surface import SurfacedMap
+from taichi_mrf.export.store_header import COLORS, FIRST, SURFACE
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.queries.colored import ColoredMap
 from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, known_bricks
-from taichi_mrf.voxels.distance_field import DistanceSource
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, by_chunk
 
 
@@ -28,6 +28,11 @@ def chunk_block(
 def extra_block(chunk: Chunk, bricks: Bricks, values: NDArray) -> NDArray:
     """(64, 64, 64, k) values of a chunk from those of its bricks, (n, 512, k); 0 outside the bricks."""
     return _assembled(chunk, bricks, values, 0)
+
+
+def first_block(chunk: Chunk, bricks: Bricks, first: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """(64, 64, 64, 1) of a chunk: 1 where the rays take a voxel of its bricks, (n, 512), for a surface."""
+    return extra_block(chunk, bricks, first.astype(np.uint8)[..., None])
 
 
 def voxel_block(chunk: Chunk, bricks: Bricks, numbers: NDArray[np.int32], values: NDArray) -> NDArray:
@@ -70,18 +75,22 @@ def write_chunks(
     m: StorableMap,
     up: Up | None = None,
     colored: ColoredMap | None = None,
-    surface: DistanceSource | None = None,
+    measured: SurfacedMap | None = None,
 ) -> None:
     """Write a map in memory to a store, chunk by chunk; ``up`` (default: the map's) is kept in it, the
-    colours of ``colored`` (the same map), and the signed distances of ``surface``. Raises MapFileError,
-    TaichiMRFError without zarr."""
+    colours of ``colored``, and what the rays of ``measured`` say of the surface (both the same map or None).
+    Raises MapFileError, TaichiMRFError without zarr."""
     reader = BrickReader(m)
     bricks = known_bricks(m)
-    measured = np.zeros((0, 3), np.int32) if surface is None else surface.chunks
-    extras = [name for name, kept in ((COLORS, colored), (SURFACE, surface)) if kept is not None]
+    places, surface, first = np.zeros((0, 3), np.int32), None, None
+    if measured is not None:
+        surface, first = measured.surface_field(), measured.first_surfaces()
+        places = surface.chunks
+    kept = ((COLORS, colored), (SURFACE, surface), (FIRST, first))
+    extras = [name for name, each in kept if each is not None]
     with new_store(path) as folder:
         header = header_of(m, up)
-        chunks = np.unique(np.concatenate([bricks // CHUNK, measured]), axis=0)
+        chunks = np.unique(np.concatenate([bricks // CHUNK, places]), axis=0)
         store = ChunkStore.create(folder, header, chunks, extras=extras)
         for chunk, rows in by_chunk(bricks):
             log_odds = reader.log_odds(bricks[rows])
@@ -89,7 +98,11 @@ def write_chunks(
             if colored is not None:
                 colors = colored.colors_in(reader.slots(bricks[rows]))
                 store.write_extra(COLORS, chunk, extra_block(chunk, bricks[rows], colors))
-        for x, y, z in measured.tolist():
+            if first is not None:
+                slots = reader.slots(bricks[rows])
+                found = first[slots] & (slots >= 0)[:, None]
+                store.write_extra(FIRST, chunk, first_block(chunk, bricks[rows], found))
+        for x, y, z in places.tolist():
             assert surface is not None
             sums = surface.box(np.array((x, y, z), np.int64) * CHUNK_VOXELS, CHUNK_VOXELS)
             store.write_extra(SURFACE, (x, y, z), np.stack(sums, axis=-1))

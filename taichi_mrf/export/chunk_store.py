@@ -5,6 +5,7 @@ voxels; unknown voxels are NaN, and chunks without a known voxel are not stored.
 int32 lists the stored chunks in the world's coordinates: chunk c covers the voxels 64 c to 64 (c + 1) - 1.
 If the map has them, ``colors`` (x, y, z, 4) uint8 are red, green, blue and how much was seen, and ``surface``
 (x, y, z, 2) float32 the weight and the distance times weight of DistanceField; both are 0 for nothing.
+``first_surface`` (x, y, z, 1) uint8 is 1 where the rays take a voxel for their first surface.
 The attributes hold the rest: see :class:`StoreHeader`, and ``origin_m``, the outer
 corner of the array's first voxel.
 """

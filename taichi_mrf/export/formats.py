@@ -187,9 +187,8 @@ def _arrays(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
 def _chunks(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
     kept = options.surface == "rays" or (options.surface == "auto" and m.config.keep_surface)
     measured = _with_rays(m, path, options) if kept else None
-    surface = None if measured is None else measured.surface_field()
     up = _up(m, options) if options.up != "auto" else None
-    write_chunks(path, m, up, _photo(m, path, options), surface)
+    write_chunks(path, m, up, _photo(m, path, options), measured)
     return [path]
 
 

@@ -70,6 +70,10 @@ class SurfacedMap(QueriedMap, Protocol):
         """The signed distances that they measured."""
         ...
 
+    def first_surfaces(self) -> NDArray[np.bool_]:
+        """Which voxels of ``view.pool`` their rays take for their first surface, (slots, 512)."""
+        ...
+
 
 def has_surface(m: QueriedMap) -> TypeGuard[SurfacedMap]:
     """Whether a map holds what all keyframes that it was made of measured of the surface."""

@@ -20,9 +20,9 @@ from taichi_mrf.voxels.layout import CHUNK_VOXELS
 FORMAT = 1
 FORMAT_KEY = "taichi_mrf_map"
 LOG_ODDS, CHUNKS = "log_odds", "chunks"
-COLORS, SURFACE = "colors", "surface"
+COLORS, SURFACE, FIRST = "colors", "surface", "first_surface"
 
-EXTRAS = {COLORS: ("uint8", 4), SURFACE: ("float32", 2)}
+EXTRAS = {COLORS: ("uint8", 4), SURFACE: ("float32", 2), FIRST: ("uint8", 1)}
 """What a store may hold of each voxel beside its log-odds, 0 for nothing: the type and number of values."""
 
 _MOST_BYTES = 1_000_000

@@ -41,6 +41,16 @@ CALLED = 0.01
 """Log-odds above even odds, or above what counts as known, that a voxel that wins has at least."""
 
 
+Voting = tuple[
+    Iterable[tuple[Keyframe, VisibleBricks]],
+    BrickPool,
+    RayModel,
+    VolumeConfig,
+    tuple[NDArray[np.int32], NDArray[np.int32]] | None,
+]
+"""The parameters of :func:`surfaces_first`."""
+
+
 def surfaces_first(
     keyframes: Iterable[tuple[Keyframe, VisibleBricks]],
     pool: BrickPool,
@@ -54,14 +64,31 @@ def surfaces_first(
     ``keyframes`` come with their lists of visible bricks, ``model`` are the parameters of their rays, and
     ``kept`` are votes of other keyframes: bricks, (n,) slots, and their votes (n, 512).
     """
-    learnt = pool.prior_log_odds + volume.min_evidence
+    votes = all_votes(keyframes, pool, model, volume, kept)
+    log_odds = copied(pool.belief)
+    _call(votes, log_odds, called(pool.prior_log_odds, volume.min_evidence))
+    runtime.settle()
+    return log_odds
+
+
+def called(prior_log_odds: float, min_evidence: float) -> float:
+    """The least log-odds of a voxel that wins the vote."""
+    return max(0.0, prior_log_odds + min_evidence) + CALLED
+
+
+def all_votes(
+    keyframes: Iterable[tuple[Keyframe, VisibleBricks]],
+    pool: BrickPool,
+    model: RayModel,
+    volume: VolumeConfig,
+    kept: tuple[NDArray[np.int32], NDArray[np.int32]] | None = None,
+) -> "ti.Ndarray":
+    """The votes of keyframes, and those that are ``kept``; parameters as above."""
     votes = count_votes(keyframes, pool, model, volume)
     if kept is not None:
         _add_votes(kept[0], kept[1].reshape(-1), votes)
-    log_odds = copied(pool.belief)
-    _call(votes, log_odds, max(0.0, learnt) + CALLED)
-    runtime.settle()
-    return log_odds
+        runtime.settle()
+    return votes
 
 
 def count_votes(

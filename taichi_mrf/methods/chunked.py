@@ -4,6 +4,7 @@ from collections import OrderedDict
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,8 +15,9 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import ConfigError, MapFileError, said
 from taichi_mrf.export.chunk_store import CHUNK_BYTES, Chunk, ChunkStore
-from taichi_mrf.export.store_header import COLORS, SURFACE
+from taichi_mrf.export.store_header import COLORS, FIRST, SURFACE
 from taichi_mrf.geometry.up import Up, up_from_name
+from taichi_mrf.inference.surface_votes import called
 from taichi_mrf.methods.map_file import check_registered
 from taichi_mrf.queries.box import BoxOfVoxels, voxels_of_box
 from taichi_mrf.queries.points import checked_points, classify, probability
@@ -55,8 +57,17 @@ class ChunkedMap:
     """Answers queries from a :class:`ChunkStore` on disk. It caches the chunks used last, up to ``cache_mb``
     MB (10^6 bytes); beyond that, memory grows only with the answers."""
 
-    def __init__(self, store: ChunkStore, cache_mb: float = 256.0) -> None:
-        """Raises ConfigError for a cache smaller than one chunk."""
+    def __init__(
+        self, store: ChunkStore, cache_mb: float = 256.0, reading: Literal["marginal", "surface"] = "marginal"
+    ) -> None:
+        """``reading``: see :meth:`reading`. Raises ConfigError for a cache smaller than one chunk, and for a
+        reading that the store does not hold."""
+        if reading == "surface" and FIRST not in store.extras:
+            raise ConfigError(
+                f"{store.path}: holds no votes of rays: map the recording anew with --keep-surface, or "
+                "export from the map.npz of a run"
+            )
+        self._reading = reading
         if not real(cache_mb, "cache_mb") * 1e6 >= CHUNK_BYTES:
             raise ConfigError(f"cache_mb must be at least {CHUNK_BYTES / 1e6:.3g}, not {cache_mb}")
         self.store, self.header = store, store.header
@@ -73,6 +84,13 @@ class ChunkedMap:
     def open(cls, path: str | Path, cache_mb: float = 256.0) -> "ChunkedMap":
         """The map in a folder such as map.zarr. Raises MapFileError, TaichiMRFError without zarr."""
         return cls(ChunkStore.open(path), cache_mb)
+
+    def reading(self, which: Literal["marginal", "surface"] = "surface") -> "ChunkedMap":
+        """The map with another rule for what is occupied, as MRFMap.reading. Raises ConfigError for another
+        name, or if the store does not hold the votes of rays."""
+        if which not in ("marginal", "surface"):
+            raise ConfigError(f"there is no reading {which!r}; known are marginal, surface")
+        return ChunkedMap(self.store, self._most * CHUNK_BYTES / 1e6, which)
 
     @property
     def up(self) -> Up | None:
@@ -203,7 +221,13 @@ class ChunkedMap:
 
     def _block(self, chunk: Chunk) -> NDArray[np.float32]:
         if chunk not in self._cache:
-            self._cache[chunk] = self.store.read(chunk)
+            block = self.store.read(chunk)
+            if self._reading == "surface":
+                first = self.store.read_extra(FIRST, chunk)[..., 0] > 0
+                block[first] = np.maximum(
+                    block[first], called(self.header.prior_log_odds, self.header.min_evidence)
+                )
+            self._cache[chunk] = block
             while len(self._cache) > self._most:
                 self._cache.popitem(last=False)
         self._cache.move_to_end(chunk)

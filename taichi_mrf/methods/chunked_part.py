@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.fused_surface import FusedSurface
+from taichi_mrf.export.store_header import FIRST
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.methods.capabilities import window_of
@@ -16,25 +17,28 @@ from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_surface import StoredDistances, stored_surface
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.queries.box import voxels_of_box
-from taichi_mrf.queries.known_bricks import BRICKS_AT_ONCE, Placed
+from taichi_mrf.queries.known_bricks import BRICKS_AT_ONCE, BrickReader, Placed
 from taichi_mrf.queries.points import checked_points
 from taichi_mrf.queries.view import View
+from taichi_mrf.queries.within import occupied_within, path_collision
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.system import runtime
 from taichi_mrf.system.owner import owned_attribute
-from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS
+from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, by_chunk, grid_keys
 from taichi_mrf.voxels.pool import BrickPool
 
 
 @dataclass
 class MapPart:
     """The bricks of a chunked map from ``lowest`` up to, but without, ``after``, (3,) each; everything
-    outside is unknown. It has the queries of a map, but no keyframes and no inference."""
+    outside is unknown. ``free_bricks`` (n, 3) were seen to be free and have no voxels. It has the queries of
+    a map, but no keyframes and no inference."""
 
     source: ChunkedMap
     lowest: NDArray[np.int64]
     after: NDArray[np.int64]
     view: View = owned_attribute()  # noqa: RUF009, a descriptor and no default
+    free_bricks: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 3), np.int32))
     keyframes: Mapping[int, Placed] = field(default_factory=dict)
     voxel_size: float = field(init=False)
 
@@ -107,6 +111,31 @@ class MapPart:
         corners = self.lowest * BRICK, self.after * BRICK
         return stored_surface(self.source, *corners, self if self.has_colors else None)
 
+    def first_surfaces(self) -> NDArray[np.bool_]:
+        """Which voxels of ``view.pool`` the rays take for their first surface, (slots, 512)."""
+        out = np.zeros((self.view.pool.capacity, VOXELS), bool)
+        slots = self.view.pool.in_use
+        rows_of = by_chunk(self.view.pool.bricks[slots]) if FIRST in self.source.store.extras else ()
+        for chunk, rows in rows_of:
+            block = self.source.store.read_extra(FIRST, chunk)[..., 0] > 0
+            x, y, z = (self.view.pool.bricks[slots[rows]] - np.array(chunk) * CHUNK).T
+            out[slots[rows]] = block.reshape((CHUNK, BRICK) * 3)[x, :, y, :, z, :].reshape(-1, VOXELS)
+        return out
+
+    def occupied_within(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
+        """The probability that something lies within ``radius_m`` of points (N, 3) in metres, (N,), as
+        OccupancyMap.occupied_within."""
+        return occupied_within(points, radius_m, *self._grid())
+
+    def path_collision(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
+        """The probability that a ball hits something on its way along paths (..., N, 3), as
+        OccupancyMap.path_collision."""
+        return path_collision(points, radius_m, *self._grid())
+
+    def _grid(self) -> tuple[float, "_PartIndex", BrickPool, float]:
+        index = _PartIndex(BrickReader(self), self.free_bricks)
+        return self.voxel_size, index, self.view.pool, self.seen_free_log_odds
+
     def surface_field(self) -> StoredDistances:
         """The signed distances in the box."""
         return StoredDistances(self.source, self.lowest * BRICK, self.after * BRICK)
@@ -114,6 +143,17 @@ class MapPart:
     def _inside(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         bricks = np.floor(points_m / (self.voxel_size * BRICK))
         return np.all((bricks >= self.lowest) & (bricks < self.after), axis=1)
+
+
+class _PartIndex:
+    """Where the bricks of a part are in its pool, and which have been crossed, for queries."""
+
+    def __init__(self, reader: BrickReader, free_bricks: NDArray[np.int32]) -> None:
+        self.slots, self._free = reader.slots, np.sort(grid_keys(free_bricks))
+
+    def crossings(self, bricks: NDArray[np.int32]) -> NDArray[np.int32]:
+        """1 for bricks (n, 3) that were seen to be free, (n,)."""
+        return np.isin(grid_keys(bricks), self._free).astype(np.int32)
 
 
 @dataclass(frozen=True)
@@ -154,6 +194,7 @@ def take_part(m: ChunkedMap, lower: ArrayLike | None = None, upper: ArrayLike | 
     first, after = voxels_of_box(low, high, m.voxel_size)
     lowest, after = first // BRICK, -(-after // BRICK)
     pool = BrickPool(m.header.prior_log_odds, m.config.volume.memory_limit_gb)
+    free = [np.zeros((0, 3), np.int32)]
     for chunk, block in m.blocks(low, high):
         values = block.reshape((CHUNK, BRICK) * 3).transpose(0, 2, 4, 1, 3, 5).reshape(-1, VOXELS)
         bricks = np.indices((CHUNK,) * 3).reshape(3, -1).T + np.array(chunk) * CHUNK
@@ -161,6 +202,7 @@ def take_part(m: ChunkedMap, lower: ArrayLike | None = None, upper: ArrayLike | 
         # Free and unknown space away from surfaces needs no voxels: occupancy() and state() read the chunks.
         known = ~np.isnan(values)
         near = (known & (values != np.float32(m.header.seen_free_log_odds))).any(axis=1)
+        free.append(bricks[inside & ~near & known.any(axis=1)].astype(np.int32))
         taken = np.flatnonzero(inside & near)
         if len(taken):
             slots = pool.allocate(bricks[taken].astype(np.int32))
@@ -169,4 +211,4 @@ def take_part(m: ChunkedMap, lower: ArrayLike | None = None, upper: ArrayLike | 
     if not len(pool.in_use):
         raise ConfigError("there is no surface in this box of the map")
     volume = replace(m.config.volume, min_evidence=m.header.min_evidence)
-    return MapPart(m, lowest, after, View(pool, m.voxel_size, volume))
+    return MapPart(m, lowest, after, View(pool, m.voxel_size, volume), np.concatenate(free))

@@ -15,6 +15,7 @@ something with the probability of its likeliest place. docs/decisions.md compare
 """
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import taichi as ti
@@ -31,7 +32,6 @@ from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat, voxel_number
 from taichi_mrf.voxels.pool import BrickPool
-from taichi_mrf.voxels.topology import Topology
 
 _UNKNOWN, _SEEN_FREE = -1, -2
 """In place of a slot: bricks without voxels."""
@@ -72,11 +72,19 @@ class _Voxels(Bundle):
     """Marginal of voxels in bricks that rays have crossed, and that have no voxels."""
 
 
+class BrickIndex(Protocol):
+    """Where bricks are, and which rays have crossed; part of a Topology."""
+
+    def slots(self, bricks: NDArray[np.int32]) -> NDArray[np.int32]: ...
+
+    def crossings(self, bricks: NDArray[np.int32]) -> NDArray[np.int32]: ...
+
+
 def occupied_within(
     points: ArrayLike,
     radius_m: float,
     voxel_size: float,
-    topology: Topology,
+    topology: BrickIndex,
     pool: BrickPool,
     seen_free: float,
 ) -> NDArray[np.float32]:
@@ -115,7 +123,7 @@ def path_collision(
     points: ArrayLike,
     radius_m: float,
     voxel_size: float,
-    topology: Topology,
+    topology: BrickIndex,
     pool: BrickPool,
     seen_free: float,
 ) -> NDArray[np.float32]:

@@ -55,7 +55,8 @@ class SubmapReport:
 class RoundResult:
     """The result of a submap: the beliefs in the bricks that it owns, the bricks that it owns in which rays
     met no surface, and the evidence for each neighbour; if they are wanted, the ``colors`` (n, 512, 4) of the
-    former, and the ``surface`` in whatever of its space keyframes measured it."""
+    former, the ``surface`` in whatever of its space keyframes measured it, and the voxels (n, 512) that rays
+    take for their ``first`` surface."""
 
     bricks: Bricks
     belief: LogOdds
@@ -64,6 +65,7 @@ class RoundResult:
     report: SubmapReport
     colors: NDArray[np.uint8] | None = None
     surface: DistanceField | None = None
+    first: NDArray[np.bool_] | None = None
 
 
 def round_path(folder: Path, round: int, submap: int) -> Path:
@@ -85,6 +87,8 @@ def write_round(path: Path, result: RoundResult) -> None:
         arrays["surface_bricks"] = result.surface.bricks
         arrays["surface_weight"] = result.surface.weight
         arrays["surface_distance"] = result.surface.distance
+    if result.first is not None:
+        arrays["first"] = result.first.astype(np.uint8)
     for other, (bricks, evidence) in result.halos.items():
         arrays[f"halo_{other}_bricks"], arrays[f"halo_{other}_evidence"] = bricks, evidence
     try:
@@ -139,6 +143,12 @@ def read_colors(path: Path) -> NDArray[np.uint8] | None:
     """The colours of the core's bricks, (n, 512, 4); None if they were not made."""
     with _opened(path) as file:
         return file.array("colors", "u", (None, VOXELS, 4)).astype(np.uint8) if "colors" in file else None
+
+
+def read_first(path: Path) -> NDArray[np.bool_] | None:
+    """The voxels of the core's bricks that rays take for a surface, (n, 512); None if they were not made."""
+    with _opened(path) as file:
+        return file.array("first", "u", (None, VOXELS)) > 0 if "first" in file else None
 
 
 def read_surface(path: Path) -> DistanceField | None:

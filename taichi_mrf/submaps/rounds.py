@@ -15,9 +15,9 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.errors import ConfigError, MapFileError
-from taichi_mrf.export.chunk_blocks import chunk_block, extra_block
+from taichi_mrf.export.chunk_blocks import chunk_block, extra_block, first_block
 from taichi_mrf.export.chunk_store import ChunkStore, new_store
-from taichi_mrf.export.store_header import COLORS, SURFACE, StoreHeader
+from taichi_mrf.export.store_header import COLORS, FIRST, SURFACE, StoreHeader
 from taichi_mrf.geometry.up import up_from_name, up_name
 from taichi_mrf.inference.prior import log_odds_without_bricks
 from taichi_mrf.submaps.job import PLAN_FILE, Job, Sequence
@@ -26,6 +26,7 @@ from taichi_mrf.submaps.round_files import (
     SubmapReport,
     read_colors,
     read_core,
+    read_first,
     read_places,
     read_report,
     read_surface,
@@ -242,7 +243,7 @@ def _merge(folder: Path, job: Job, round: int, path: Path) -> None:
     header = StoreHeader.of(config, *log_odds, config.volume.min_evidence, up)
     chunks = [np.unique(np.concatenate(read_places(file)) // CHUNK, axis=0) for file in files]
     with new_store(path) as place:
-        extras = [name for name, kept in ((COLORS, config.color), (SURFACE, config.keep_surface)) if kept]
+        extras = [name for name, kept in _wanted(config) if kept]
         store = ChunkStore.create(place, header, np.unique(np.concatenate(chunks), axis=0), extras=extras)
         for file in files:
             _merge_extras(store, file)
@@ -254,13 +255,18 @@ def _merge(folder: Path, job: Job, round: int, path: Path) -> None:
                 store.write(chunk, block)
 
 
+def _wanted(config: Config) -> tuple[tuple[str, bool], ...]:
+    """What a store may hold beside log-odds, and whether it does."""
+    return (COLORS, config.color), (SURFACE, config.keep_surface), (FIRST, config.keep_surface)
+
+
 def _merge_extras(store: ChunkStore, file: Path) -> None:
     """Write the colours and the surface of a submap's core. Raises MapFileError if its file has none."""
     bricks, report = read_places(file)[0], read_report(file)
     if report.has_nothing:
         return
-    colors, surface = read_colors(file), read_surface(file)
-    for name, found in ((COLORS, colors), (SURFACE, surface)):
+    colors, surface, first = read_colors(file), read_surface(file), read_first(file)
+    for name, found in ((COLORS, colors), (SURFACE, surface), (FIRST, first)):
         if name in store.extras and found is None:
             raise MapFileError(
                 f"{file}: holds no {name}: its round was not meant to be the last; --resume "
@@ -269,6 +275,9 @@ def _merge_extras(store: ChunkStore, file: Path) -> None:
     if colors is not None:
         for chunk, rows in by_chunk(bricks):
             store.write_extra(COLORS, chunk, extra_block(chunk, bricks[rows], colors[rows]))
+    if first is not None:
+        for chunk, rows in by_chunk(bricks):
+            store.write_extra(FIRST, chunk, first_block(chunk, bricks[rows], first[rows]))
     if surface is not None:
         sums = np.stack([surface.weight, surface.distance], axis=-1)
         for chunk, rows in by_chunk(surface.bricks):

@@ -134,16 +134,18 @@ def _inferred(task: SubmapTask, job: Job, on_step: Callable[[InferProgress], Non
 
 def _seen(
     m: PartialMap, job: Job, task: SubmapTask, core: Bricks
-) -> tuple[NDArray[np.uint8] | None, DistanceField | None]:
-    """The colours of the core's bricks and the surface in the core; None for what is not wanted."""
-    colors, surface = None, None
+) -> tuple[NDArray[np.uint8] | None, DistanceField | None, NDArray[np.bool_] | None]:
+    """The colours of the core's bricks, the surface in the core, and the voxels that rays take for it; None
+    for what is not wanted."""
+    colors, surface, first = None, None, None
     if job.config.color and task.may_be_last:
         colors = m.colors_in(m.slots(core))
     if job.config.keep_surface and task.may_be_last:
         field = m.surface_field()
         rows = job.plan.is_core(task.submap, field.bricks) & field.weight.any(axis=1)
         surface = DistanceField(field.bricks[rows], field.weight[rows], field.distance[rows])
-    return colors, surface
+        first = m.first_surfaces()[m.slots(core)]
+    return colors, surface, first
 
 
 def _core(job: Job, submap: int, bricks: Bricks) -> Bricks:

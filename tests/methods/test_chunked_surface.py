@@ -7,6 +7,7 @@ import colored_scene as scene
 import numpy as np
 import pytest
 import trimesh
+from console import carry_out
 from queried_maps import room_map
 
 from taichi_mrf.errors import ConfigError, MapFileError
@@ -15,6 +16,8 @@ from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import take_part
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.queries.cast import cast_rays
+from taichi_mrf.system import runtime
 
 pytest.importorskip("zarr", reason="maps in chunks need the extra store")
 pytest.importorskip("skimage")
@@ -80,6 +83,33 @@ def test_surfaces_of_parts_meet_without_seams(m: MRFMap, store: Path) -> None:
             np.testing.assert_allclose(normal, normals[tuple(vertex)], atol=1e-5)
 
 
+def test_readings_and_balls_are_those_of_the_map(m: MRFMap, store: Path, tmp_path: Path) -> None:
+    chunked, points = ChunkedMap.open(store), scene.probes()
+    marginal, ours, theirs = (
+        chunked.occupancy(points),
+        chunked.reading().occupancy(points),
+        m.reading("surface"),
+    )
+    assert ((ours > 0.5) & (marginal <= 0.5)).sum() > 20
+    np.testing.assert_allclose(ours, theirs.occupancy(points), atol=1e-6)
+    np.testing.assert_array_equal(chunked.reading("marginal").occupancy(points), marginal)
+    part = take_part(chunked.reading())
+    assert {tuple(c) for c in part.voxels()[0].round(6)} == {tuple(c) for c in theirs.voxels()[0].round(6)}
+    rays = scene.CAMERA.rays()[::6, ::6].reshape(-1, 3)
+    hits = [cast_rays(each, np.zeros(3), rays, 4.0).range for each in (part, theirs)]
+    np.testing.assert_allclose(hits[0], hits[1], atol=1e-5)
+    whole, some = take_part(chunked), points[::997]
+    np.testing.assert_allclose(whole.occupied_within(some, 0.12), m.occupied_within(some, 0.12), atol=1e-5)
+    way = np.array([[0.0, 0.0, 0.3], [0.0, 0.0, 1.0], [0.4, 0.0, 1.9]])
+    assert whole.path_collision(way, 0.1) == pytest.approx(m.path_collision(way, 0.1), abs=1e-5)
+    out = tmp_path / "voxels.ply"
+    assert (
+        carry_out("export", store, "--to", out, "--reading", "surface", "--arch", runtime.active() or "cpu")
+        == 0
+    )
+    assert len(trimesh.load(out).vertices) >= len(theirs.voxels()[0])
+
+
 def test_a_map_without_them_says_what_to_do(m: MRFMap, tmp_path: Path) -> None:
     export_map(m, tmp_path / "bare.zarr", ExportOptions(color_by="marginal"))
     part = take_part(ChunkedMap.open(tmp_path / "bare.zarr"))
@@ -88,6 +118,10 @@ def test_a_map_without_them_says_what_to_do(m: MRFMap, tmp_path: Path) -> None:
     for problem in (part.surface, lambda: export_map(part, tmp_path / "mesh.ply", RAYS)):
         with pytest.raises(ConfigError, match=r"map the recording anew with --keep-surface, or export from"):
             problem()
+    with pytest.raises(ConfigError, match="no votes of rays: map the recording anew with --keep-surface"):
+        part.source.reading("surface")
+    with pytest.raises(ConfigError, match="no reading 'sharp'"):
+        part.source.reading("sharp")  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="map the recording with --color"):
         export_map(part, tmp_path / "mesh.ply", ExportOptions(color_by="photo"))
     export_map(part, tmp_path / "mesh.ply", ExportOptions(mesh=True))

@@ -21,6 +21,7 @@ from taichi_mrf.methods.protocol import MappedKeyframe
 from taichi_mrf.queries.colored import blended_colors
 from taichi_mrf.queries.view import View
 from taichi_mrf.voxels.distance_field import DistanceField
+from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology
 
@@ -97,6 +98,15 @@ class MapReading(BrickMap):
         if self._rays is None:
             return self._source.surface_field()
         return surface_field_of(self._source, self._judging, self._seen, self._rays.with_frozen)
+
+    def first_surfaces(self) -> NDArray[np.bool_]:
+        """Those of the map that is read. There is no vote of another time or a layer: of these, the voxels
+        that are occupied."""
+        self._check()
+        if self._rays is None:
+            return self._source.first_surfaces()
+        log_odds = self._pool.belief.to_numpy()[: self._pool.capacity * VOXELS]
+        return np.asarray(log_odds.reshape(-1, VOXELS) > 0)
 
     def surface(self) -> FusedSurface:
         """The surface as of the time that is read, or that of the layer, as MRFMap.surface. Raises

@@ -23,10 +23,17 @@ from numpy.typing import NDArray
 from taichi_mrf.alignment.keyframe_surfels import KeyframeSurfels
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.errors import CapacityError, MapFileError
-from taichi_mrf.export.chunk_blocks import StorableMap, chunk_block, extra_block, header_of, voxel_block
+from taichi_mrf.export.chunk_blocks import (
+    StorableMap,
+    chunk_block,
+    extra_block,
+    first_block,
+    header_of,
+    voxel_block,
+)
 from taichi_mrf.export.chunk_store import Chunk
 from taichi_mrf.export.growing_store import Extras
-from taichi_mrf.export.store_header import COLORS, SURFACE, StoreHeader
+from taichi_mrf.export.store_header import COLORS, FIRST, SURFACE, StoreHeader
 from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.brick_registry import BrickRegistry, Bricks
@@ -69,6 +76,8 @@ class WindowedMap(StorableMap, Protocol):
     def measured_bricks(self) -> NDArray[np.int32]: ...
 
     def surface_field(self) -> DistanceField: ...
+
+    def first_surfaces(self) -> NDArray[np.bool_]: ...
 
 
 class MovingWindow:
@@ -152,7 +161,8 @@ class MovingWindow:
         if self._kept.wanted:
             self._fetch_crossed(m.measured_bricks())
             surface = m.surface_field() if m.settled else self._kept.share.field
-        resident = self._resident(m, header, surface)
+        first = m.first_surfaces() if self._kept.wanted and m.settled else None
+        resident = self._resident(m, header, surface, first)
         self.parked.complete(folder_beside(path), resident, header)
         return self.parked.names
 
@@ -224,6 +234,8 @@ class MovingWindow:
             extras[SURFACE] = {
                 chunk: _distances(chunk, found.rays.field) for chunk, found in contents.items()
             }
+            votes = {chunk: found.rays.votes for chunk, found in contents.items()}
+            extras[FIRST] = {c: first_block(c, v.bricks, v.sums[..., 0] > 0) for c, v in votes.items()}
         self.parked.add(contents, self._voxels(chunks, header), extras, header)
         self._registry.leave(slots, chunks)
         self._surface.release(chunks)
@@ -258,25 +270,32 @@ class MovingWindow:
         return contents
 
     def _resident(
-        self, m: WindowedMap, header: StoreHeader, surface: DistanceField | None
+        self,
+        m: WindowedMap,
+        header: StoreHeader,
+        surface: DistanceField | None,
+        first: NDArray[np.bool_] | None,
     ) -> Iterator[tuple[dict[Chunk, NDArray[np.float32]], Extras]]:
-        """The voxels of all chunks in memory, some at a time, with their colours if these are known, and with
-        the distances of ``surface``."""
+        """The voxels of all chunks in memory, some at a time, with their colours if these are known, with the
+        distances of ``surface``, and with the voxels (slots, 512) that rays take for their ``first`` surface.
+        """
         measured = np.zeros((0, 3), np.int32) if surface is None else surface.chunks
         footprints = [k.footprint for k in m.keyframes.values()]
         crossed = [_distinct(each.window.bricks_of(each.crossed) // CHUNK) for each in footprints]
         chunks = _distinct(np.concatenate([self._chunks_in_memory(), measured, *crossed]))
-        for first in range(0, len(chunks), _AT_ONCE):
-            some = chunks[first : first + _AT_ONCE]
+        for begin in range(0, len(chunks), _AT_ONCE):
+            some = chunks[begin : begin + _AT_ONCE]
             extras: dict[str, dict[Chunk, NDArray]] = {}
             slots = self._slots_in(some)
-            colors = self._colors.stored(slots, m.settled)
+            colors, bricks = self._colors.stored(slots, m.settled), self._registry.pool.bricks[slots]
+            rows_of = dict(by_chunk(bricks))
             if len(colors):
-                rows_of = dict(by_chunk(self._registry.pool.bricks[slots]))
                 extras[COLORS] = {
-                    chunk: extra_block(chunk, self._registry.pool.bricks[slots[rows]], colors[rows])
-                    for chunk, rows in rows_of.items()
+                    c: extra_block(c, bricks[rows], colors[rows]) for c, rows in rows_of.items()
                 }
+            if first is not None:
+                here = first[slots]
+                extras[FIRST] = {c: first_block(c, bricks[rows], here[rows]) for c, rows in rows_of.items()}
             if surface is not None:
                 extras[SURFACE] = {(x, y, z): _distances((x, y, z), surface) for x, y, z in some.tolist()}
             yield self._voxels(some, header), extras

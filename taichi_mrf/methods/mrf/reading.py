@@ -18,13 +18,14 @@ from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.dated_channels import layer_of
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import count_observations
-from taichi_mrf.inference.surface_votes import surfaces_first
+from taichi_mrf.inference.surface_votes import Voting, all_votes, surfaces_first
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.methods.mrf.calibrated import calibrated_log_odds
 from taichi_mrf.methods.mrf.kept_rays import RayShare
 from taichi_mrf.methods.mrf.map_reading import MapReading, RaysThen
 from taichi_mrf.methods.mrf.surfacing import LEAST, WithSurface
 from taichi_mrf.queries.change import MapChange, compare_maps
+from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import copied
 
 Layer = Literal["static", "dynamic", "both"]
@@ -187,12 +188,21 @@ class ReadableMRF(WithSurface):
             log_odds = copied(self._pool.belief)
             log_odds.from_numpy(calibrated_log_odds(self.surface_field(), self._pool).reshape(-1))
             return MapReading(self, log_odds)
+        return MapReading(self, surfaces_first(*self._voting()))
+
+    def first_surfaces(self) -> NDArray[np.bool_]:
+        """Which voxels of ``view.pool`` win the vote of the rays for their first surface, (slots, 512)."""
+        votes = all_votes(*self._voting()).to_numpy()[: self._pool.capacity * VOXELS]
+        return np.asarray(votes.reshape(-1, VOXELS) > 0)
+
+    def _voting(self) -> Voting:
+        """Who votes: keyframes with what they see, bricks, rays, volume, and the votes of frozen ones."""
         seen = [(k, self._registry.visible_again(k.footprint, k.visible)) for k in self._keyframes.values()]
         model = replace(self._sweeper.model(), maximise=False)
         votes = self._kept.share.votes
         slots = self._registry.topology.slots(votes.bricks) if len(votes.bricks) else np.zeros(0, np.int32)
         kept = (slots[slots >= 0], votes.sums[slots >= 0]) if len(slots) else None
-        return MapReading(self, surfaces_first(seen, self._pool, model, self.view.volume, kept))
+        return seen, self._pool, model, self.view.volume, kept
 
     def changes(self, since_s: float) -> MapChange:
         """What differs between the map as it was believed at a time in seconds and as it is now: its

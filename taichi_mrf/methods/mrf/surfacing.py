@@ -90,6 +90,10 @@ class WithSurface(BrickMap):
         colors = blended_colors(self, found.vertices_m) if is_colored(self) else None
         return replace(found, colors=colors)
 
+    def first_surfaces(self) -> NDArray[np.bool_]:
+        """Which voxels of ``view.pool`` win the vote of the rays for their first surface, (slots, 512)."""
+        raise NotImplementedError
+
     def _prepare_colors(self) -> None:
         raise NotImplementedError
 
