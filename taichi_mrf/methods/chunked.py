@@ -4,7 +4,6 @@ from collections import OrderedDict
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,13 +18,19 @@ from taichi_mrf.export.store_header import COLORS, FIRST, SURFACE
 from taichi_mrf.geometry.up import Up, up_from_name
 from taichi_mrf.inference.surface_votes import called
 from taichi_mrf.methods.map_file import check_registered
+from taichi_mrf.methods.mrf.calibrated import calibrated_block
+from taichi_mrf.methods.mrf.reading import READINGS, Reading
+from taichi_mrf.methods.stored_distances import StoredDistances
 from taichi_mrf.queries.box import BoxOfVoxels, voxels_of_box
 from taichi_mrf.queries.points import checked_points, classify, probability
 from taichi_mrf.system.memory import check_memory
-from taichi_mrf.voxels.layout import CHUNK_VOXELS
+from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS
 
 _BYTES_PER_VOXEL = 9
 """Log-odds, states, and temporary arrays."""
+
+_SAME_LOG_ODDS = 1e-3
+"""Free space without voxels is stored by its probability, which is float32."""
 
 
 def _config_of(store: ChunkStore) -> Config:
@@ -57,15 +62,14 @@ class ChunkedMap:
     """Answers queries from a :class:`ChunkStore` on disk. It caches the chunks used last, up to ``cache_mb``
     MB (10^6 bytes); beyond that, memory grows only with the answers."""
 
-    def __init__(
-        self, store: ChunkStore, cache_mb: float = 256.0, reading: Literal["marginal", "surface"] = "marginal"
-    ) -> None:
+    def __init__(self, store: ChunkStore, cache_mb: float = 256.0, reading: Reading = "marginal") -> None:
         """``reading``: see :meth:`reading`. Raises ConfigError for a cache smaller than one chunk, and for a
         reading that the store does not hold."""
-        if reading == "surface" and FIRST not in store.extras:
+        needed = {"surface": FIRST, "calibrated": SURFACE}.get(reading)
+        if needed is not None and needed not in store.extras:
             raise ConfigError(
-                f"{store.path}: holds no votes of rays: map the recording anew with --keep-surface, or "
-                "export from the map.npz of a run"
+                f"{store.path}: holds nothing of what rays measured: map the recording anew with "
+                "--keep-surface, or export from the map.npz of a run"
             )
         self._reading = reading
         if not real(cache_mb, "cache_mb") * 1e6 >= CHUNK_BYTES:
@@ -85,11 +89,11 @@ class ChunkedMap:
         """The map in a folder such as map.zarr. Raises MapFileError, TaichiMRFError without zarr."""
         return cls(ChunkStore.open(path), cache_mb)
 
-    def reading(self, which: Literal["marginal", "surface"] = "surface") -> "ChunkedMap":
+    def reading(self, which: Reading = "surface") -> "ChunkedMap":
         """The map with another rule for what is occupied, as MRFMap.reading. Raises ConfigError for another
-        name, or if the store does not hold the votes of rays."""
-        if which not in ("marginal", "surface"):
-            raise ConfigError(f"there is no reading {which!r}; known are marginal, surface")
+        name, or if the store does not hold what rays measured."""
+        if which not in READINGS:
+            raise ConfigError(f"there is no reading {which!r}; known are {', '.join(READINGS)}")
         return ChunkedMap(self.store, self._most * CHUNK_BYTES / 1e6, which)
 
     @property
@@ -114,6 +118,11 @@ class ChunkedMap:
             raise ConfigError("the map is empty: no voxel was observed")
         side = CHUNK_VOXELS * self.voxel_size
         return self.chunks.min(axis=0) * side, (self.chunks.max(axis=0) + 1) * side
+
+    def distances(self, first: NDArray[np.int64], after: NDArray[np.int64]) -> StoredDistances:
+        """The signed distances that keyframes measured, from the voxel ``first`` up to, but without,
+        ``after``, (3,) each."""
+        return StoredDistances(self.store, self.chunks, first, after)
 
     def log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
         """Log-odds of occupied at (N, 3) points in metres, (N,); the prior where nothing was observed.
@@ -221,14 +230,28 @@ class ChunkedMap:
 
     def _block(self, chunk: Chunk) -> NDArray[np.float32]:
         if chunk not in self._cache:
-            block = self.store.read(chunk)
-            if self._reading == "surface":
-                first = self.store.read_extra(FIRST, chunk)[..., 0] > 0
-                block[first] = np.maximum(
-                    block[first], called(self.header.prior_log_odds, self.header.min_evidence)
-                )
+            block = self._read_by_rays(chunk, self.store.read(chunk))
             self._cache[chunk] = block
             while len(self._cache) > self._most:
                 self._cache.popitem(last=False)
         self._cache.move_to_end(chunk)
         return self._cache[chunk]
+
+    def _read_by_rays(self, chunk: Chunk, block: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Log-odds of a chunk by the map's reading, from the marginals'."""
+        prior = self.header.prior_log_odds
+        if self._reading == "surface":
+            first = self.store.read_extra(FIRST, chunk)[..., 0] > 0
+            block[first] = np.maximum(block[first], called(prior, self.header.min_evidence))
+        elif self._reading == "calibrated":
+            unknown = np.isnan(block)
+            bricks = np.where(unknown, np.float32(prior), block).reshape((CHUNK, BRICK) * 3)
+            # Free space away from surfaces has no voxels, and stays as it is, as does what is unknown.
+            away = np.abs(bricks - self.header.seen_free_log_odds) < _SAME_LOG_ODDS
+            near = ~(away | unknown.reshape(bricks.shape)).all(axis=(1, 3, 5), keepdims=True)
+            place = np.array(chunk, np.int64) * CHUNK_VOXELS
+            field = self.distances(place - BRICK, place + CHUNK_VOXELS + BRICK)
+            found = calibrated_block(field, place // CHUNK_VOXELS, bricks.reshape(block.shape), prior)
+            changed = np.where(near, found.reshape(bricks.shape), bricks).reshape(block.shape)
+            block = np.where(unknown & (changed == np.float32(prior)), np.float32(np.nan), changed)
+        return block

@@ -14,8 +14,9 @@ from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.methods.capabilities import window_of
 from taichi_mrf.methods.chunked import ChunkedMap
-from taichi_mrf.methods.chunked_surface import StoredDistances, stored_surface
+from taichi_mrf.methods.chunked_surface import stored_surface
 from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.methods.stored_distances import StoredDistances
 from taichi_mrf.queries.box import voxels_of_box
 from taichi_mrf.queries.known_bricks import BRICKS_AT_ONCE, BrickReader, Placed
 from taichi_mrf.queries.points import checked_points
@@ -138,7 +139,7 @@ class MapPart:
 
     def surface_field(self) -> StoredDistances:
         """The signed distances in the box."""
-        return StoredDistances(self.source, self.lowest * BRICK, self.after * BRICK)
+        return self.source.distances(self.lowest * BRICK, self.after * BRICK)
 
     def _inside(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         bricks = np.floor(points_m / (self.voxel_size * BRICK))

@@ -93,6 +93,9 @@ def test_readings_and_balls_are_those_of_the_map(m: MRFMap, store: Path, tmp_pat
     assert ((ours > 0.5) & (marginal <= 0.5)).sum() > 20
     np.testing.assert_allclose(ours, theirs.occupancy(points), atol=1e-6)
     np.testing.assert_array_equal(chunked.reading("marginal").occupancy(points), marginal)
+    calibrated = chunked.reading("calibrated").occupancy(points)
+    np.testing.assert_allclose(calibrated, m.reading("calibrated").occupancy(points), atol=1e-5)
+    assert np.abs(calibrated - marginal).max() > 0.1
     part = take_part(chunked.reading())
     assert {tuple(c) for c in part.voxels()[0].round(6)} == {tuple(c) for c in theirs.voxels()[0].round(6)}
     rays = scene.CAMERA.rays()[::6, ::6].reshape(-1, 3)
@@ -118,7 +121,7 @@ def test_a_map_without_them_says_what_to_do(m: MRFMap, tmp_path: Path) -> None:
     for problem in (part.surface, lambda: export_map(part, tmp_path / "mesh.ply", RAYS)):
         with pytest.raises(ConfigError, match=r"map the recording anew with --keep-surface, or export from"):
             problem()
-    with pytest.raises(ConfigError, match="no votes of rays: map the recording anew with --keep-surface"):
+    with pytest.raises(ConfigError, match="nothing of what rays measured: map the recording anew with"):
         part.source.reading("surface")
     with pytest.raises(ConfigError, match="no reading 'sharp'"):
         part.source.reading("sharp")  # type: ignore[arg-type]

@@ -58,11 +58,26 @@ def calibrated_log_odds(field: DistanceSource, pool: BrickPool) -> NDArray[np.fl
         x, y, z = (bricks[rows] - chunk * CHUNK).T
         evidence, behind = _of_bricks(evidence)[x, y, z], _of_bricks(behind)[x, y, z]
         slots = pool.in_use[rows]
-        marginal = log_odds[slots]
-        likely = evidence - DOUBT + PRIOR * prior + MARGINAL * np.clip(marginal - prior, -SUREST, SUREST)
-        likely = np.where(behind, np.maximum(likely, prior), likely)
-        log_odds[slots] = np.where(np.isnan(evidence), marginal, likely)
+        log_odds[slots] = _combined(evidence, behind, log_odds[slots], prior)
     return log_odds
+
+
+def calibrated_block(
+    field: DistanceSource, chunk: NDArray[np.int64], marginal: NDArray[np.float32], prior: float
+) -> NDArray[np.float32]:
+    """The same for the voxels of a chunk (3,), whose marginals' log-odds are (64, 64, 64)."""
+    first = chunk * CHUNK_VOXELS - 1 - MARGIN
+    sums = blended_sums(*field.box(first, CHUNK_VOXELS + 2 + 2 * MARGIN))
+    return _combined(*surface_evidence(*sums), marginal, prior)
+
+
+def _combined(
+    evidence: NDArray[np.float32], behind: NDArray[np.bool_], marginal: NDArray[np.float32], prior: float
+) -> NDArray[np.float32]:
+    """Log-odds of voxels from what surface_evidence says of them and their marginals, of one shape."""
+    likely = evidence - DOUBT + PRIOR * prior + MARGINAL * np.clip(marginal - prior, -SUREST, SUREST)
+    likely = np.where(behind, np.maximum(likely, prior), likely)
+    return np.where(np.isnan(evidence), marginal, likely)
 
 
 def surface_evidence(

@@ -1,0 +1,62 @@
+"""The signed distances in the store of a map in chunks, read chunk by chunk."""
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.export.chunk_store import Chunk, ChunkStore
+from taichi_mrf.export.store_header import SURFACE
+from taichi_mrf.voxels.distance_field import Sums
+from taichi_mrf.voxels.layout import CHUNK_VOXELS
+
+_HELD = 64
+"""Chunks whose distances are in memory together, 2 MB each."""
+
+
+class StoredDistances:
+    """The signed distances in a store with these ``chunks`` (n, 3) from the voxel ``first`` up to, but
+    without, ``after``, (3,) each: 0 outside."""
+
+    def __init__(
+        self,
+        store: ChunkStore,
+        chunks: NDArray[np.int32],
+        first: NDArray[np.int64],
+        after: NDArray[np.int64],
+    ) -> None:
+        self.first, self.after = first, after
+        inside = (chunks >= first // CHUNK_VOXELS) & (chunks <= (after - 1) // CHUNK_VOXELS)
+        self._chunks = chunks[inside.all(axis=1)]
+        self._known = set(map(tuple, self._chunks.tolist()))
+        self._read = lru_cache(_HELD)(lambda chunk: store.read_extra(SURFACE, chunk))
+
+    @property
+    def chunks(self) -> NDArray[np.int32]:
+        """The chunks (n, 3) that may hold distances."""
+        return self._chunks
+
+    def box(self, first: NDArray[np.int64], side: int) -> Sums:
+        """The sums, (side, side, side) each, of the voxels from ``first`` (3,) on; 0 where there are none."""
+        sums = np.zeros((side, side, side, 2), np.float32)
+        begin, end = np.maximum(first, self.first), np.minimum(first + side, self.after)
+        if (begin < end).all():
+            lowest, highest = begin // CHUNK_VOXELS, (end - 1) // CHUNK_VOXELS
+            for step in np.ndindex(*(highest - lowest + 1).tolist()):
+                chunk = lowest + step
+                if tuple(chunk.tolist()) in self._known:
+                    corner = chunk * CHUNK_VOXELS
+                    low, high = np.maximum(begin, corner), np.minimum(end, corner + CHUNK_VOXELS)
+                    sums[_between(low - first, high - first)] = self._read(_key(chunk))[
+                        _between(low - corner, high - corner)
+                    ]
+        return np.ascontiguousarray(sums[..., 0]), np.ascontiguousarray(sums[..., 1])
+
+
+def _between(low: NDArray[np.int64], high: NDArray[np.int64]) -> tuple[slice, ...]:
+    return tuple(slice(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))
+
+
+def _key(chunk: NDArray[np.int64]) -> Chunk:
+    x, y, z = chunk.tolist()
+    return x, y, z
