@@ -1,8 +1,8 @@
 """`taichi-mrf eval cells`: how far the probabilities of cells, balls and paths can be trusted.
 
-Maps of half of the house's views and of views of the built-in room are asked for cells of 1, 2, 4 and 8
-voxels, and for balls that stand still or move for a metre, at random places in free space. The truth is that
-of evaluation/cell_truth.py.
+Maps of half of the house's views and of views of the built-in room, as they stand and turned, are asked for
+cells of 1, 2, 4 and 8 voxels, and for balls that stand still or move for a metre, at random places in free
+space, by their marginals and calibrated. The truth is that of evaluation/cell_truth.py.
 """
 
 from dataclasses import dataclass
@@ -23,12 +23,13 @@ from taichi_mrf.evaluation.pictures.reliability import reliability_figure
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.contenders import Contender, mrf
 from taichi_mrf.experiments.folds import Experiment, fold_key, require_views
-from taichi_mrf.experiments.scenes import Scene, SceneView, house_scene
+from taichi_mrf.experiments.scenes import Scene, SceneView, house_scene, turned
 from taichi_mrf.queries.cells import cell_probabilities
 from taichi_mrf.queries.known_bricks import BrickReader, sorted_bricks
 from taichi_mrf.queries.points import probability
 from taichi_mrf.system.atomic import atomic_path
 
+READINGS = ("marginal", "calibrated")
 SIDES = (1, 2, 4, 8)
 RADII_M = (0.1, 0.2)
 PATHS, LENGTH_M = 6000, 1.0
@@ -56,21 +57,25 @@ def run_cells(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     cells: list[list[Entry]] = []
     moves: list[list[Entry]] = []
     paths: list[Path] = []
-    for place in (_house(experiment), _room(experiment)):
+    places = [_house(experiment), _room(experiment)]
+    for place in places + [_Place(*turned(place.scene, place.mesh)) for place in places]:
         require_views(place.scene, 2)
         for size in experiment.voxel_sizes:
             found = _result(experiment, place, size)
             where = [place.scene.name, f"{size * 100:g} cm"]
-            scores = {name: OccupancyScores.from_json(each["scores"]) for name, each in found.items()}
-            for name, each in found.items():
-                row = _row(scores[name], each)
-                (cells if each["kind"] == "cell" else moves).append([*where, name, *row])
-            path = experiment.out / f"cells_{place.scene.name}_{size * 1000:g}mm.png"
-            with atomic_path(path) as temporary:
-                reliability_figure(scores).savefig(temporary, dpi=130)
-            paths.append(path)
-    columns = ["scene", "voxels", "what", "judged", "occupied", "recall at 90% precision", "precision",
-               "recall", "calibration error", "largest gap of a decile", "error of the product"]  # fmt: skip
+            for reading, answers in found.items():
+                scores = {name: OccupancyScores.from_json(each["scores"]) for name, each in answers.items()}
+                for name, each in answers.items():
+                    row = _row(scores[name], each)
+                    (cells if each["kind"] == "cell" else moves).append([*where, reading, name, *row])
+                name = place.scene.name.replace(", ", "_")
+                path = experiment.out / f"cells_{name}_{size * 1000:g}mm_{reading}.png"
+                with atomic_path(path) as temporary:
+                    reliability_figure(scores).savefig(temporary, dpi=130)
+                paths.append(path)
+    columns = ["scene", "voxels", "reading", "what", "judged", "occupied", "recall at 90% precision",
+               "precision", "recall", "calibration error", "largest gap of a decile",
+               "error of the product"]  # fmt: skip
     notes = [
         "Precision and recall at a probability of 0.5. The largest gap is that between the mean probability "
         f"and the share that is occupied, of tenths of the scale with at least {LEAST_IN_BIN} answers; the "
@@ -108,7 +113,7 @@ def _room(experiment: Experiment) -> _Place:
 def _result(experiment: Experiment, place: _Place, voxel_size: float) -> dict[str, Any]:
     scene, contender = place.scene, mrf(ray_density=InferenceConfig.ray_density)
     experiment.report(f"{scene.name}, {voxel_size * 100:g} cm", 0, 1)
-    what = f"{len(scene.views)} views, cells and {PATHS} paths"
+    what = f"{len(scene.views)} views, cells and {PATHS} paths, two readings"
     return experiment.ledger.result(
         fold_key(scene, experiment.seeds[0], contender, voxel_size, what),
         lambda: _judge(contender, place, voxel_size, experiment.seeds[0]),
@@ -125,8 +130,12 @@ def _judge(contender: Contender, place: _Place, voxel_size: float, seed: int) ->
     clean = [np.where(view.true_m < scene.max_depth, view.true_m, np.float32(0)) for view in scene.views]
     poses = [view.T_world_camera for view in scene.views]
     truth = occupancy_truth(place.mesh, clean, poses, scene.camera, voxel_size)
-    found = {_cell_name(side): _judge_cells(m, truth, side) for side in SIDES}
     space = SeenSpace(truth, clean, poses, scene.camera)
+    return {reading: _answers(m.reading(reading), truth, space, seed) for reading in READINGS}
+
+
+def _answers(m: Any, truth: OccupancyTruth, space: SeenSpace, seed: int) -> dict[str, Any]:
+    found = {_cell_name(side): _judge_cells(m, truth, side) for side in SIDES}
     for radius in RADII_M:
         draw = np.random.default_rng([seed, round(1000 * radius)])
         start = space.free_points(PATHS, draw)

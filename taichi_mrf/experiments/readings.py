@@ -8,7 +8,6 @@ calibrated reading and for marginals as ``inference.ray_correlation`` varies.
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 from typing import Any, cast
 
@@ -30,8 +29,14 @@ from taichi_mrf.experiments.exact import room_scene
 from taichi_mrf.experiments.folds import Experiment, fold_key, require_views
 from taichi_mrf.experiments.judging import build
 from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.scenes import Scene, coffin_scene, house_scene
-from taichi_mrf.geometry.poses import look_at
+from taichi_mrf.experiments.scenes import (
+    OFF_THE_GRID_M,
+    TURNED,
+    Scene,
+    coffin_scene,
+    house_scene,
+    turned,
+)
 from taichi_mrf.methods.mrf.reading import MapReading
 from taichi_mrf.queries.known_bricks import BrickReader
 from taichi_mrf.queries.view import View
@@ -43,10 +48,6 @@ CORRELATIONS = (1.0, 0.5, 0.3)
 
 VIEWS = 40
 """Of each scene, at most: every second one is a keyframe, every fourth of the others is judged."""
-
-OFF_THE_GRID_M = np.array([0.0137, 0.0221, 0.0183])
-"""By this the coffin scene is moved: its walls stand in planes of the grid, where rounding decides which
-voxel holds them."""
 
 D435_RANGE_M = 6.0
 """Beyond this the learnt noise of the D435 means nothing."""
@@ -62,12 +63,6 @@ OCCUPIED = 10.0
 
 BINS, LEAST_IN_BIN = 10, 100
 
-TURN = look_at(OFF_THE_GRID_M, OFF_THE_GRID_M + np.array([1.0, 0.4, -0.2]), (0.1, 0.0, 1.0))
-"""Moves scenes so that surfaces cut voxels in all ways. Walls in planes of the grid, as those of the house,
-are a voxel off as a whole or not at all, and shares of voxels mean little there."""
-
-_TURNED = ", turned"
-
 Judged = tuple[Scene, TriangleMesh]
 
 
@@ -78,16 +73,16 @@ def run_readings(experiment: Experiment) -> tuple[list[Table], list[Path]]:
         lambda: _house(experiment, "D435"),
         lambda: _coffin(experiment),
         lambda: _room(experiment),
-        lambda: _turned(*_house(experiment, "Kinect")),
-        lambda: _turned(*_coffin(experiment)),
-        lambda: _turned(*_room(experiment)),
+        lambda: turned(*_house(experiment, "Kinect")),
+        lambda: turned(*_coffin(experiment)),
+        lambda: turned(*_room(experiment)),
     )
     readings: list[list[Entry]] = []
     trust: list[list[Entry]] = []
     for make in makers:
         scene, mesh = make()
         require_views(scene, 4)
-        correlations = CORRELATIONS[:1] if scene.name.endswith(_TURNED) else CORRELATIONS
+        correlations = CORRELATIONS[:1] if scene.name.endswith(TURNED) else CORRELATIONS
         for voxel_size in experiment.voxel_sizes:
             for number, correlation in enumerate(correlations):
                 contender = mrf(f"rho {correlation:g}", ray_density=2.5, ray_correlation=correlation)
@@ -215,22 +210,6 @@ def _hidden(truth: OccupancyTruth, m: MRFMap) -> NDArray[np.float64]:
     bricks = BrickReader(m).bricks
     row, number = np.nonzero(hidden_voxels(truth, bricks))
     return (bricks[row].astype(np.float64) * BRICK + offsets_in_brick()[number] + 0.5) * m.voxel_size
-
-
-def _turned(scene: Scene, mesh: TriangleMesh) -> Judged:
-    """The scene moved by TURN; its volume is the box around the moved one."""
-    views = [replace(view, T_world_camera=TURN @ view.T_world_camera) for view in scene.views]
-    volume = scene.volume
-    if volume.lower is not None and volume.upper is not None:
-        corners = np.array(list(product(*zip(volume.lower, volume.upper, strict=True))))
-        moved = corners @ TURN[:3, :3].T + TURN[:3, 3]
-        x, y, z = moved.min(axis=0).tolist()
-        volume = replace(volume, lower=(x, y, z))
-        x, y, z = moved.max(axis=0).tolist()
-        volume = replace(volume, upper=(x, y, z))
-    vertices = mesh.vertices @ TURN[:3, :3].T + TURN[:3, 3]
-    moved_mesh = TriangleMesh(vertices, mesh.triangles)
-    return replace(scene, name=scene.name + _TURNED, views=views, volume=volume), moved_mesh
 
 
 def _house(experiment: Experiment, noise: str) -> Judged:

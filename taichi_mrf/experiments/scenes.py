@@ -6,7 +6,8 @@ the truth stays known. data/README.md describes the layout of the folders.
 
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,9 @@ from numpy.typing import NDArray
 
 from taichi_mrf import PatchNoise, PinholeCamera, PolynomialNoise, TaichiMRFError, open_dataset
 from taichi_mrf.config.schema import KeyframeConfig, VolumeConfig
+from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh
 from taichi_mrf.errors import DatasetError
-from taichi_mrf.geometry.poses import Pose, as_pose
+from taichi_mrf.geometry.poses import Pose, as_pose, look_at
 from taichi_mrf.mapping.selection import KeyframeSelector
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.simulate import KINECT_1_LATERAL, simulate, simulate_model
@@ -28,6 +30,16 @@ COFFIN_MARGIN = 0.4
 
 EDGE = 0.01
 """A surface counts as in the volume up to this far outside (metres): walls stand on its faces."""
+
+OFF_THE_GRID_M = np.array([0.0137, 0.0221, 0.0183])
+"""By this the coffin scene is moved where single voxels count: its walls stand in planes of the grid, where
+rounding decides which voxel holds them."""
+
+TURN = look_at(OFF_THE_GRID_M, OFF_THE_GRID_M + np.array([1.0, 0.4, -0.2]), (0.1, 0.0, 1.0))
+"""Moves scenes so that surfaces cut voxels in all ways. Walls in planes of the grid, as those of the house,
+are a voxel off as a whole or not at all, and shares of voxels mean little there."""
+
+TURNED = ", turned"
 
 _UNREADABLE = (OSError, ValueError, EOFError, zipfile.BadZipFile)
 """What NumPy raises for a file that is missing or damaged."""
@@ -104,6 +116,22 @@ def kitchen_scene(data: Path, limit: int | None = None) -> Scene:
         views.append(SceneView(frame.name, frame.T_world_camera, depth, depth, depth > 0, frame.stamp))
     noise = PolynomialNoise(KINECT_1_LATERAL.sigma, KINECT_1_LATERAL.bias)
     return Scene("seven_scenes_redkitchen", dataset.camera, noise, VolumeConfig(), 10.0, views)
+
+
+def turned(scene: Scene, mesh: TriangleMesh) -> tuple[Scene, TriangleMesh]:
+    """A scene and its mesh moved by TURN; its volume is the box around the moved one."""
+    views = [replace(view, T_world_camera=TURN @ view.T_world_camera) for view in scene.views]
+    volume = scene.volume
+    if volume.lower is not None and volume.upper is not None:
+        corners = np.array(list(product(*zip(volume.lower, volume.upper, strict=True))))
+        moved = corners @ TURN[:3, :3].T + TURN[:3, 3]
+        x, y, z = moved.min(axis=0).tolist()
+        volume = replace(volume, lower=(x, y, z))
+        x, y, z = moved.max(axis=0).tolist()
+        volume = replace(volume, upper=(x, y, z))
+    vertices = mesh.vertices @ TURN[:3, :3].T + TURN[:3, 3]
+    there = replace(scene, name=scene.name + TURNED, views=views, volume=volume)
+    return there, TriangleMesh(vertices, mesh.triangles)
 
 
 def keyframes_of(scene: Scene, rotation: float, translation: float) -> list[int]:

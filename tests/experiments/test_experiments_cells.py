@@ -76,14 +76,17 @@ def test_cells_are_found_more_often_than_voxels(tmp_path: Path, monkeypatch: pyt
     pytest.importorskip("scipy")
     data = make_data(tmp_path)
     monkeypatch.setattr(cells, "PATHS", 200)
+    monkeypatch.setattr(cells, "SIDES", (1, 8))
+    monkeypatch.setattr(cells, "RADII_M", (0.2,))
     monkeypatch.setattr(cells, "_ROOM", "synthetic:room?width=80&height=60&frames=3")
     tables, paths = run_experiment("cells", data, tmp_path, (0.1,), (0,), None, lambda *_: None)
     of_cells, of_paths = (table.rows for table in tables)
-    assert len(of_cells) == 8
-    assert len(of_paths) == 8
+    assert len(of_cells) == len(of_paths) == 4 * 2 * 2  # scenes as they stand and turned, two readings
     assert all(path.is_file() for path in paths)
-    for scene in (of_cells[:4], of_cells[4:]):
-        recall = [float(row[7]) for row in scene]
+    for first in range(0, len(of_cells), 2):
+        recall = [float(row[8]) for row in of_cells[first : first + 2]]
         assert recall == sorted(recall)
         assert recall[0] < recall[-1]
-    assert all(float(row[6]) > 0.8 for row in of_cells)
+    assert all(float(row[7]) > 0.8 for row in of_cells if row[2] == "marginal")
+    errors = [[float(row[9]) for row in of_cells[first::4]] for first in (1, 3)]  # of cells of 8 voxels
+    assert np.mean(errors[1]) < np.mean(errors[0])
