@@ -1,8 +1,9 @@
-"""What the page shows beside the map on request: images of a view, the measured surface, and the same
-keyframes mapped by OctoMap's method."""
+"""What the page shows beside the map on request: images of a view, the measured surface, another reading
+than marginals, and the same keyframes mapped by OctoMap's method."""
 
 import dataclasses
 import time
+from collections.abc import Callable
 from typing import Protocol
 
 from taichi_mrf.inference.schedule import InferProgress, StopRequestedError
@@ -22,7 +23,7 @@ IMAGE_SECONDS = 1.0
 
 
 ASK_SECONDS = 0.05
-"""Shortest time between two looks at requests while the surface is made, in seconds."""
+"""Shortest time between two looks at requests during long work, in seconds."""
 
 
 class GoOn(Protocol):
@@ -62,14 +63,18 @@ class Extras:
 
     def work(self, go_on: GoOn) -> bool:
         """Do one piece of the work that is left; returns whether there was any. ``go_on`` can stop it."""
-        publisher = self._run.mapper.shown.publisher
+        shown, publisher = self._run.mapper.shown, self._run.mapper.shown.publisher
         if publisher.counting != self._watch.counts:
             publisher.count(self._watch.counts)
             self._run.publish()
             return True
+        if shown.reading != self._watch.reading:
+            shown.read_as(self._watch.reading)
+            self._run.publish()
+            return True
         if self._run.renew_past() or self._make_images() or self._list_changes() or self._send_colors():
             return True
-        if self._send_surface(go_on):
+        if self._send_surface(go_on) or self._find_reading(go_on):
             return True
         if not self._watch.baseline:
             if self._baseline is not None:
@@ -136,19 +141,10 @@ class Extras:
             self._surface = ShownSurface(run.mapper)
         if self._surface.is_current:
             return False
-        asked = time.monotonic()
-
-        def between() -> None:
-            nonlocal asked
-            if time.monotonic() - asked < ASK_SECONDS:
-                return
-            run.show_activity("making the surface", 0.0)
-            if not go_on() or not self._watch.surface:
-                raise StopRequestedError
-            asked = time.monotonic()
-
         try:
-            patches = self._surface.patches(between)
+            patches = self._surface.patches(
+                self._between(go_on, "making the surface", lambda: self._watch.surface)
+            )
         except StopRequestedError:
             return True
         except Exception as error:  # mapping continues without the surface
@@ -164,6 +160,38 @@ class Extras:
         for patch in patches:
             run.send(patch)
         return True
+
+    def _find_reading(self, go_on: GoOn) -> bool:
+        """Read the map by another rule than its marginals if that is shown, no frames are read, and the map
+        has changed; False if there was nothing to do."""
+        run, shown = self._run, self._run.mapper.shown
+        if run.is_replaying or not shown.lacks_reading:
+            return False
+        doing = f"finding the {shown.reading} reading"
+        try:
+            run.find_reading(self._between(go_on, doing, lambda: self._watch.reading == shown.reading))
+        except StopRequestedError:
+            pass
+        except Exception as error:  # marginals are shown instead
+            run.send(Notice(f"no {shown.reading} reading: {error}", "error"))
+            self._watch = dataclasses.replace(self._watch, reading="marginal")
+        return True
+
+    def _between(self, go_on: GoOn, doing: str, wanted: Callable[[], bool]) -> Callable[[], None]:
+        """What is called between steps of long work: now and then it carries out requests, and it raises
+        StopRequestedError if the work is to end."""
+        asked = time.monotonic()
+
+        def between() -> None:
+            nonlocal asked
+            if time.monotonic() - asked < ASK_SECONDS:
+                return
+            self._run.show_activity(doing, 0.0)
+            if not go_on() or not wanted():
+                raise StopRequestedError
+            asked = time.monotonic()
+
+        return between
 
     def _make_images(self) -> bool:
         now = time.monotonic()

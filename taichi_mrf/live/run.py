@@ -1,5 +1,6 @@
 """The state of a live run: its source, its map, and the connection to its page."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -122,6 +123,10 @@ class Run(SessionCore):
     def renew_past(self) -> bool:
         """Send what is shown of the past if it is outdated; returns whether there was anything to send."""
         return self._send_layers(self.mapper.shown.renew())
+
+    def find_reading(self, between: Callable[[], object]) -> None:
+        """Show the map by the reading that is wanted; ``between`` is called after each keyframe."""
+        self._send_layers(self.mapper.shown.find_reading(between))
 
     def show_camera(self, frame: Frame) -> None:
         """Show the viewer the pose of a frame."""

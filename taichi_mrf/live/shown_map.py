@@ -1,21 +1,23 @@
 """What the page shows of the map: as it is believed now or was believed at another time, with its dynamic
-voxels as a layer of their own.
+voxels as a layer of their own; or the map as it is now by another reading than its marginals.
 
-A reading of the past is renewed only from time to time, because it takes all messages.
+The past is read again only from time to time, because that takes all messages. A reading takes a pass over
+all keyframes: it is made when there is time, and until then marginals are shown.
 """
 
 import math
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.errors import ConfigError
 from taichi_mrf.live.live_keyframes import LiveKeyframe
 from taichi_mrf.live.publish import Publisher
-from taichi_mrf.methods.capabilities import has_dates
+from taichi_mrf.methods.capabilities import has_dates, has_layers
 from taichi_mrf.methods.protocol import OccupancyMap
-from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Bricks, TimeSpan
+from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Bricks, Reading, TimeSpan
 from taichi_mrf.voxels.layout import VOXELS
 
 RENEW_SECONDS = 1.0
@@ -34,6 +36,8 @@ class ShownMap:
         self._pool = m.view.pool
         self._past = self._pool  # of the reading that is shown while stamp_s is set
         self._outdated, self._read_at = False, -math.inf  # whether renew() has something to do
+        self.reading: Reading = "marginal"
+        self._read_of: int | None = None  # the revision of the pool of which a reading is shown
         self.publisher = Publisher(
             "map",
             self._pool,
@@ -64,16 +68,41 @@ class ShownMap:
         """Show the map as of a time in seconds, None for now; :meth:`renew` does the work."""
         if self.has_dates and stamp_s != self.stamp_s:
             self.stamp_s, self._outdated, self._read_at = stamp_s, True, -math.inf
+            self._read_of = None
             if stamp_s is None:
                 self._past = self._pool
                 self._look_again()
 
     def changes(self) -> list[Bricks]:
         """What has changed of each layer since the last call. While the past is shown it is nothing, and
-        :meth:`renew` follows."""
+        :meth:`renew` follows. A reading is one of an earlier map, and marginals take its place."""
         self._outdated = self.stamp_s is not None
         if self._outdated:
             return []
+        if self._read_of not in (None, self._pool.revision):
+            self._show_marginals()
+        return self._changes()
+
+    def read_as(self, reading: Reading) -> None:
+        """Show the map by a reading; :meth:`find_reading` does the work."""
+        self.reading = reading
+        if self._read_of is not None:
+            self._show_marginals()
+
+    @property
+    def lacks_reading(self) -> bool:
+        """Whether :meth:`find_reading` has something to do."""
+        wanted = self.reading != "marginal" and self.stamp_s is None
+        return wanted and self._read_of != self._pool.revision
+
+    def find_reading(self, between: Callable[[], object]) -> list[Bricks]:
+        """Show the map by the reading that is wanted; returns what has changed of each layer. ``between`` is
+        called after each keyframe; what it raises ends the work. Raises ConfigError for a map that has
+        marginals only."""
+        if not has_layers(self.map):
+            raise ConfigError(f"a map of the method {self.map.config.method} has marginals only")
+        self._past, self._read_of = self.map.reading(self.reading, between).view.pool, self._pool.revision
+        self._look_again()
         return self._changes()
 
     def renew(self) -> list[Bricks]:
@@ -103,6 +132,10 @@ class ShownMap:
     def _publishers(self) -> list[Publisher]:
         return [self.publisher] if self._dynamic is None else [self.publisher, self._dynamic]
 
+    def _show_marginals(self) -> None:
+        self._past, self._read_of = self._pool, None
+        self._look_again()
+
     def _look_again(self) -> None:
         for publisher in self._publishers():
             publisher.look_again()
@@ -115,7 +148,8 @@ class ShownMap:
         although all evidence together says free."""
         if not len(slots):
             return np.zeros((0, VOXELS), np.float32)
-        belief, total = self._beliefs(slots), self._pool.read("total", slots)
+        source = self._pool if self.stamp_s is None else self._past
+        belief, total = source.read("belief", slots), self._pool.read("total", slots)
         dynamic = (belief >= 0) & (total < self._pool.prior_log_odds)
         return np.where(dynamic, belief, np.float32(NOT_DYNAMIC))
 

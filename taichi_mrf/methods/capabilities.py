@@ -89,8 +89,8 @@ class LayeredMap(OccupancyMap, Protocol):
         a static world."""
         ...
 
-    def reading(self, which: Reading = "surface") -> MapReading:
-        """The map with another rule for what is occupied."""
+    def reading(self, which: Reading = "surface", between: Callable[[], object] = ...) -> MapReading:
+        """The map with another rule for what is occupied; ``between`` is called between its steps."""
         ...
 
     def changes(self, since_s: float) -> MapChange:

@@ -197,6 +197,15 @@ def test_the_surface_takes_the_place_of_voxels(page: LivePage, saved: MRFMap) ->
     page.until(lambda seen: seen.agrees and seen.voxels == voxels_of(saved, 0.5), "voxels again")
 
 
+def test_a_reading_says_what_is_occupied(page: LivePage, saved: MRFMap) -> None:
+    expected = len(saved.reading("surface").voxels(0.5)[0])
+    page.select("Reading", "surface")
+    page.until(lambda seen: seen.settled and seen.voxels == expected, "the first surfaces of rays")
+    page.screenshot("live_reading")
+    page.select("Reading", "marginal")
+    page.until(lambda seen: seen.settled and seen.voxels == voxels_of(saved, 0.5), "marginals")
+
+
 def test_the_outlines_of_bricks_come_and_go(page: LivePage) -> None:
     page.tick("Bricks")
     page.until(lambda seen: "/bricks" in seen.nodes, "the outlines")

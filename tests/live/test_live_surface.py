@@ -1,12 +1,13 @@
-"""The measured surface that the live page gets: none until it is shown, then that of the map."""
+"""What the live page gets once it is shown: the measured surface, and readings of the map."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from live_scene import CONFIG, FakeLink, finished, never, session_of
+from live_scene import CONFIG, FakeLink, finished, map_voxels, never, session_of, shown
 
+from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.live import extras
@@ -17,6 +18,7 @@ from taichi_mrf.viewer.messages import (
     Notice,
     Request,
     Save,
+    ShowTime,
     Status,
     SurfacePatch,
     Switch,
@@ -27,6 +29,7 @@ from taichi_mrf.viewer.messages import (
 pytestmark = pytest.mark.usefixtures("one_backend")
 
 SHOW = Watch(images=False, view=None, baseline=False, surface=True)
+FIRST = Watch(images=False, view=None, baseline=False, reading="surface")
 
 Triangle = tuple[tuple[float, ...], ...]
 
@@ -92,6 +95,56 @@ def test_a_map_without_a_surface_says_why() -> None:
     (error,) = link.errors()
     assert error == "no surface: a map of the method log_odds has none"
     assert not link.of_type(SurfacePatch)
+
+
+def test_voxels_are_those_of_the_reading_that_is_asked_for() -> None:
+    link = FakeLink()
+    session = session_of(link)
+    by_marginal = map_voxels(finished(session))
+    link.ask(FIRST)
+    m = finished(session)
+    by_rays = shown(link.sent).voxels()
+    assert by_rays == map_voxels(m.reading("surface"))
+    assert by_rays > by_marginal
+    link.ask(replace(FIRST, reading="calibrated"))
+    m = finished(session)
+    assert shown(link.sent).voxels() == map_voxels(m.reading("calibrated"))
+    link.ask(FIRST)
+    link.ask(Switch(1, on=False))
+    m = finished(session)
+    assert shown(link.sent).voxels() == map_voxels(m.reading("surface"))
+    link.ask(replace(FIRST, reading="marginal"))
+    m = finished(session)
+    assert shown(link.sent).voxels() == map_voxels(m)
+    link.ask(FIRST)
+    finished(session)
+    session.reconnect(other := FakeLink())
+    finished(session)
+    assert shown(other.sent).voxels() == map_voxels(m)  # a new page shows marginals
+    assert link.errors() == []
+
+
+def test_the_past_is_that_of_marginals_and_now_returns_to_the_reading() -> None:
+    link = FakeLink()
+    session = session_of(link, config=replace(CONFIG, time=TimeConfig(half_life_s=600.0)))
+    link.ask(FIRST)
+    m = finished(session)
+    now, then = map_voxels(m.reading("surface")), m.keyframes[0].stamp_s
+    assert shown(link.sent).voxels() == now
+    link.ask(ShowTime(then))
+    finished(session)
+    assert shown(link.sent).voxels() == map_voxels(m.at(then))
+    link.ask(ShowTime(None))
+    finished(session)
+    assert shown(link.sent).voxels() == now
+
+
+def test_a_map_without_readings_says_why() -> None:
+    link = FakeLink()
+    session = session_of(link, config=replace(CONFIG, method="log_odds"))
+    link.ask(FIRST)
+    session.run(never)
+    assert link.errors() == ["no surface reading: a map of the method log_odds has marginals only"]
 
 
 def test_the_button_saves_the_mesh_that_export_writes(tmp_path: Path) -> None:

@@ -120,9 +120,11 @@ _PROJECT = """([prefix, kind, local]) => {
   return found;
 }"""
 
-_POSITION = """name => {
-  const mutable = window.__viserMutable;
-  const node = name ? mutable.nodeRefFromName[name] : mutable.camera, root = mutable.nodeRefFromName[''];
+_POSITION = """async name => {
+  const mutable = window.__viserMutable, root = mutable.nodeRefFromName[''];
+  const find = () => name ? mutable.nodeRefFromName[name] : mutable.camera;
+  while (!find()) await new Promise(requestAnimationFrame);  // a node that changes is away for a moment
+  const node = find();
   node.updateWorldMatrix(true, false);
   const [x, y, z] = node.matrixWorld.elements.slice(12), m = root.matrixWorld.clone().invert().elements;
   return [0, 1, 2].map(i => m[i] * x + m[i + 4] * y + m[i + 8] * z + m[i + 12]);

@@ -2,10 +2,10 @@
 of it."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +27,8 @@ from taichi_mrf.methods.mrf.surfacing import LEAST, WithSurface
 from taichi_mrf.queries.change import MapChange, compare_maps
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import copied
+
+ItemT = TypeVar("ItemT")
 
 Layer = Literal["static", "dynamic", "both"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
@@ -168,7 +170,7 @@ class ReadableMRF(WithSurface):
             reading.seen_free_log_odds = pool.prior_log_odds  # free space belongs to the static layer
         return reading
 
-    def reading(self, which: Reading = "surface") -> MapReading:
+    def reading(self, which: Reading = "surface", between: Callable[[], object] = lambda: None) -> MapReading:
         """The map with another rule for what is occupied, to be queried, cast rays in, drawn and exported.
 
         A wall that is seen with a sigma of several voxels has no voxel that is more likely occupied than not.
@@ -177,8 +179,9 @@ class ReadableMRF(WithSurface):
         (inference.surface_votes). Its log-odds are raised to just above even odds; all others are the
         marginals, which are what "marginal" gives. "calibrated" gives each voxel the probability that it
         holds a surface, from the distances of all rays (methods.mrf.calibrated). Votes and distances of
-        frozen keyframes are kept with ``keep_surface``, else they have none. Raises ConfigError for another
-        name, CapacityError if there is not enough memory.
+        frozen keyframes are kept with ``keep_surface``, else they have none. ``between`` is called after each
+        keyframe; what it raises ends the work. Raises ConfigError for another name, CapacityError if there is
+        not enough memory.
         """
         if which not in READINGS:
             raise ConfigError(f"there is no reading {which!r}; known are {', '.join(READINGS)}")
@@ -186,9 +189,10 @@ class ReadableMRF(WithSurface):
             return MapReading(self, copied(self._pool.belief))
         if which == "calibrated":
             log_odds = copied(self._pool.belief)
-            log_odds.from_numpy(calibrated_log_odds(self.surface_field(), self._pool).reshape(-1))
+            log_odds.from_numpy(calibrated_log_odds(self.surface_field(between), self._pool).reshape(-1))
             return MapReading(self, log_odds)
-        return MapReading(self, surfaces_first(*self._voting()))
+        seen, pool, model, volume, kept = self._voting()
+        return MapReading(self, surfaces_first(_calling(between, seen), pool, model, volume, kept))
 
     def first_surfaces(self) -> NDArray[np.bool_]:
         """Which voxels of ``view.pool`` win the vote of the rays for their first surface, (slots, 512)."""
@@ -231,3 +235,10 @@ class ReadableMRF(WithSurface):
 
     def _restore_messages(self) -> None:
         raise NotImplementedError
+
+
+def _calling(between: Callable[[], object], items: Iterable[ItemT]) -> Iterator[ItemT]:
+    """The items, with a call after each."""
+    for item in items:
+        yield item
+        between()

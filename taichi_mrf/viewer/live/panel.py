@@ -48,6 +48,7 @@ POSITION_STEP_M = 0.01
 
 _MAP_OPTIONS = (
     "show",
+    "reading",
     "color_by",
     "threshold",
     "size",
