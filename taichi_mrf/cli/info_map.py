@@ -65,6 +65,9 @@ def print_map(console: Terminal, facts: Facts) -> None:
         half_life = facts["half_life_s"]
         table.add_row("world", f"may change, half-life {half_life:g} s" if half_life else "static")
         table.add_row("inferred", "yes" if facts["inferred"] else "no: it is inferred when it is opened")
+    if "surface" in facts:
+        held = [name for name in ("colors", "surface") if facts[name]]
+        table.add_row("also holds", " and ".join(held) or "neither colors nor surface")
     if facts.get("chunks_outside_window"):
         folder = folder_beside(Path(facts["map"])).name
         table.add_row("outside window", f"{facts['chunks_outside_window']} chunks, in {folder}")
@@ -109,6 +112,8 @@ def _chunked_map(path: Path) -> Facts:
         "voxels": len(m.chunks) * CHUNK_VOXELS**3,
         "extent": [corner.tolist() for corner in m.extent] if len(m.chunks) else None,
         "up": m.header.up or None,
+        "colors": m.has_colors,
+        "surface": m.has_surface,
         "configuration": _changed(m.config),
     }
 

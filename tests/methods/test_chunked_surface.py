@@ -10,6 +10,7 @@ import trimesh
 from console import carry_out
 from queried_maps import room_map
 
+from taichi_mrf.cli.info_map import map_facts
 from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.export.formats import export_map, export_note
 from taichi_mrf.export.options import ExportOptions
@@ -81,6 +82,13 @@ def test_surfaces_of_parts_meet_without_seams(m: MRFMap, store: Path) -> None:
     for each in surfaces:
         for vertex, normal in zip(each.vertices_m, each.normals, strict=True):
             np.testing.assert_allclose(normal, normals[tuple(vertex)], atol=1e-5)
+
+
+def test_info_tells_what_a_store_holds(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    facts = map_facts(str(store))
+    assert (facts["colors"], facts["surface"]) == (True, True)
+    assert carry_out("info", store) == 0
+    assert "colors and surface" in capsys.readouterr().out
 
 
 def test_readings_and_balls_are_those_of_the_map(m: MRFMap, store: Path, tmp_path: Path) -> None:
