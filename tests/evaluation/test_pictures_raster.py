@@ -65,9 +65,11 @@ def test_hidden_voxels_and_small_pieces(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(voxel_raster, "_VOXELS_AT_ONCE", 64)
     monkeypatch.setattr(voxel_raster, "_PAIRS_AT_ONCE", 100)
     tested = []
-    pairs = voxel_raster._pairs
+    pairs = voxel_raster.pixels_of_rectangles
     monkeypatch.setattr(
-        voxel_raster, "_pairs", lambda voxels, *rest: (tested.append(voxels), pairs(voxels, *rest))[1]
+        voxel_raster,
+        "pixels_of_rectangles",
+        lambda voxels, *rest: (tested.append(voxels), pairs(voxels, *rest))[1],
     )
     cells = np.array([(i, j, 4 * k) for k in range(4) for i in range(-12, 13) for j in range(-12, 13)])
     centres = (cells + 0.5) * 0.1

@@ -32,6 +32,7 @@ class MapTask:
     keep_every: float = Map.keep_every
     overwrite: bool = False
     shown_reading: Reading = "marginal"
+    surface_picture: bool = False
 
     def __str__(self) -> str:
         return self.source
@@ -59,4 +60,5 @@ def map_task(options: Map, source: str, out: Path) -> MapTask:
         options.keep_every,
         options.overwrite,
         options.shown_reading,
+        options.surface_picture,
     )

@@ -1,4 +1,4 @@
-"""The whole map in one picture: a plan from above, and a doll's-house view in perspective."""
+"""The whole map in one picture: a plan from above, and doll's-house views of its voxels and its surface."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.evaluation.pictures.figures import color_bar, draw_way, new_figure
-from taichi_mrf.evaluation.pictures.shading import shaded
+from taichi_mrf.evaluation.pictures.shading import shaded, shaded_triangles
 from taichi_mrf.evaluation.pictures.surfaces import level_rotation
+from taichi_mrf.evaluation.pictures.triangle_raster import cast_triangles
 from taichi_mrf.evaluation.pictures.viewpoint import faces_viewer, overview_pose
 from taichi_mrf.evaluation.pictures.voxel_raster import cast_voxels
 from taichi_mrf.geometry.poses import Pose, inverse
@@ -117,6 +118,44 @@ def perspective(room: DrawnMap) -> "Figure":
     axes.set_title(f"{_voxels(room)}, surfaces that face away from the viewer left out")
     axes.axis("off")
     color_bar(axes, ListedColormap(viridis() / 255.0), LOWEST, 1.0, "marginal occupancy")
+    return figure
+
+
+@dataclass(frozen=True)
+class DrawnSurface:
+    """A surface to draw, world frame, metres: ``vertices_m`` (V, 3), ``triangles`` (T, 3), at least one,
+    ``normals`` (V, 3) and ``colors`` (V, 3) RGB, None to colour it by height."""
+
+    vertices_m: NDArray[np.floating]
+    triangles: NDArray[np.integer]
+    normals: NDArray[np.floating]
+    colors: NDArray[np.uint8] | None
+
+
+def surface_view(surface: DrawnSurface, voxel_size: float, up: NDArray[np.float64]) -> "Figure":
+    """The surface in the colours that cameras saw, or by height and under a light, from outside; what faces
+    away from the viewer is not seen."""
+    from matplotlib import colormaps
+
+    vertices, triangles, normals = surface.vertices_m, surface.triangles, surface.normals
+    pose = overview_pose(vertices, normals, up, _PERSPECTIVE, voxel_size)
+    image = cast_triangles(vertices, triangles, _PERSPECTIVE.scaled(_OVERSAMPLING), pose)
+    height = vertices @ up
+    floor, top = np.quantile(height, [0.005, 0.995])
+    height_range = max(float(top - floor), voxel_size)
+    colors = surface.colors
+    if colors is None:
+        colors = colormaps["Spectral_r"]((height - floor) / height_range, bytes=True)[:, :3]
+    light = pose[:3, :3] @ [-0.45, -0.6, -0.66]  # from behind the viewer's left shoulder
+    picture = shaded_triangles(image, triangles, colors, normals if surface.colors is None else None, light)
+    picture = cv2.resize(picture, (_PERSPECTIVE.width, _PERSPECTIVE.height), interpolation=cv2.INTER_AREA)
+    figure = new_figure(13.0, 8.2)
+    axes = figure.add_subplot()
+    axes.imshow(picture, interpolation="antialiased")
+    axes.set_title(f"the measured surface, {len(triangles):,} triangles; those that face away are not seen")
+    axes.axis("off")
+    if surface.colors is None:
+        color_bar(axes, "Spectral_r", 0.0, height_range, "height above the lowest surface (m)")
     return figure
 
 

@@ -7,11 +7,19 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.depth_error import depth_error
 from taichi_mrf.evaluation.pictures.figures import new_figure, notice
-from taichi_mrf.evaluation.pictures.room_views import DrawnMap, perspective, top_view
+from taichi_mrf.evaluation.pictures.room_views import (
+    DrawnMap,
+    DrawnSurface,
+    perspective,
+    surface_view,
+    top_view,
+)
 from taichi_mrf.evaluation.pictures.surfaces import seen_surfaces, up_direction
 from taichi_mrf.geometry.up import Z_UP
+from taichi_mrf.methods.capabilities import measures_surface
 from taichi_mrf.methods.protocol import OccupancyMap, PosedDepth
 from taichi_mrf.queries.cells import FilledMap
 from taichi_mrf.sensor.frame import Frame
@@ -41,18 +49,22 @@ def write_pictures(
     held_out: Sequence[Frame],
     shown: ShownMap | None = None,
     cells: bool = False,
+    surface: bool = False,
 ) -> list[Path]:
-    """Write ``top_view.png``, ``depth.png`` and ``perspective.png`` to a folder that exists.
+    """Write ``top_view.png``, ``depth.png`` and ``perspective.png`` to a folder that exists, and
+    ``surface.png`` if the ``surface`` is to be drawn that the keyframes measured.
 
     ``held_out`` are frames that the map has not seen, to compare rendered with measured depth; without
     any a keyframe serves, and its title says so. ``shown`` has the voxels to draw if they are not the map's
     marginals; of these, ``cells`` also draws the cells that stand in for voxels (queries/cells.py). Returns
-    the paths. Raises MapFileError.
+    the paths. Raises MapFileError, ConfigError if there is no such surface.
     """
     figures = {
         "depth.png": depth_comparison(m, held_out),
         **_room_figures(m, shown or (FilledMap(m) if cells else m)),
     }
+    if surface:
+        figures["surface.png"] = _surface_figure(m)
     for name, figure in figures.items():
         with atomic_path(out_dir / name) as temporary:
             # Level 2 of 9 takes half of the default's time, and the files are a fifth larger.
@@ -78,6 +90,18 @@ def _room_figures(m: OccupancyMap, shown: ShownMap) -> dict[str, "Figure"]:
         of_cells=len(centres) - len(m.voxels(LOWEST)[0]) if isinstance(shown, FilledMap) else 0,
     )
     return {"top_view.png": top_view(room), "perspective.png": perspective(room)}
+
+
+def _surface_figure(m: OccupancyMap) -> "Figure":
+    if not measures_surface(m):
+        raise ConfigError(f"a map of the method {m.config.method} has no measured surface")
+    found = m.surface()
+    if not len(found.triangles):
+        return notice("The keyframes have measured no surface.")
+    poses = [keyframe.T_world_camera for keyframe in m.keyframes.values()]
+    up = up_direction(poses, found.normals, m.up or Z_UP)
+    drawn = DrawnSurface(found.vertices_m, found.triangles, found.normals, found.colors)
+    return surface_view(drawn, m.voxel_size, up)
 
 
 def depth_comparison(m: OccupancyMap, held_out: Sequence[Frame]) -> "Figure":

@@ -1,9 +1,11 @@
-"""Light on a picture of voxels, so that its shape is legible and its colours still mean something."""
+"""Light on a picture of voxels or triangles, so that its shape is legible and its colours still mean
+something."""
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.evaluation.pictures.triangle_raster import TriangleImage
 from taichi_mrf.evaluation.pictures.voxel_raster import VoxelImage
 
 _AMBIENT = 0.62
@@ -38,6 +40,28 @@ def shaded(
     light *= 1.0 - _OCCLUSION * _hollowness(image.depth_m)[hit]
     picture = np.full((*hit.shape, 3), BACKGROUND, np.uint8)
     picture[hit] = np.rint(colors[voxel] * light[:, None])
+    return picture
+
+
+def shaded_triangles(
+    image: TriangleImage,
+    triangles: NDArray[np.integer],
+    colors: NDArray[np.uint8],
+    normals: NDArray[np.floating] | None,
+    towards_light: NDArray[np.floating],
+) -> NDArray[np.uint8]:
+    """Colours of vertices (V, 3) on their triangles (T, 3), as an (H, W, 3) RGB picture on white; under a far
+    light if the vertices' ``normals`` (V, 3) are given, else as they are."""
+    hit = image.index >= 0
+    picture = np.full((*hit.shape, 3), BACKGROUND, np.uint8)
+    corners, shares = triangles[image.index[hit]], image.shares[hit]
+    mixed = np.einsum("nk,nkc->nc", shares, colors[corners].astype(np.float64))
+    if normals is not None and len(mixed):
+        normal = np.einsum("nk,nkc->nc", shares, normals[corners])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
+        light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(normal @ towards_light, 0.0, 1.0)
+        mixed *= (light * (1.0 - _OCCLUSION * _hollowness(image.depth_m)[hit]))[:, None]
+    picture[hit] = np.rint(mixed)
     return picture
 
 

@@ -71,7 +71,7 @@ def cast_voxels(
     for start in range(0, order.size, _VOXELS_AT_ONCE):
         voxels = order[start : start + _VOXELS_AT_ONCE]
         voxels = voxels[~_hidden(pixel_box[voxels], nearest[voxels], _depth(words), camera)]
-        for voxel, pixel in _pairs(voxels, pixel_box, camera.width):
+        for voxel, pixel in pixels_of_rectangles(voxels, pixel_box, camera.width):
             enter = np.full(voxel.size, near_m, np.float32)
             leave = np.full(voxel.size, np.inf, np.float32)
             for axis in range(3):
@@ -135,10 +135,11 @@ def _hidden(
     return small & (nearest > np.maximum.reduce(corners))
 
 
-def _pairs(
+def pixels_of_rectangles(
     voxels: NDArray[np.intp], box: NDArray[np.int32], width: int
 ) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    """All (voxel, pixel) pairs of the voxels' rectangles, (P,) each, some at a time."""
+    """All (voxel, pixel) pairs of the rectangles of some voxels, (P,) each, some at a time; ``box`` (N, 4)
+    has the first and last column and row of each."""
     u0, u1, v0, v1 = box[voxels].T.astype(np.intp)
     widths = u1 - u0 + 1
     counts = widths * (v1 - v0 + 1)
