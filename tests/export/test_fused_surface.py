@@ -51,6 +51,24 @@ def test_a_plane_lies_where_it_is() -> None:
     assert (wound > 0).mean() > 0.99
 
 
+def test_depth_of_a_wall_on_voxels_faces_is_rendered_where_it_is() -> None:
+    pytest.importorskip("embreex")
+    m = MRFMap(VOXEL, PolynomialNoise((SIGMA,), (0.0,)))
+    for x in (-0.3, 0.0, 0.3):
+        T = np.eye(4)
+        T[0, 3] = x
+        m.add_keyframe(np.full(CAMERA.shape, 30 * VOXEL, np.float32), T, CAMERA)
+    m.infer()
+    T[:3, 3] = 0.1, 0.05, 0.2
+    depth_m = m.surface().render_depth(CAMERA, T)
+    inner = (slice(15, 45), slice(20, 60))
+    np.testing.assert_allclose(depth_m[inner], 30 * VOXEL - 0.2, atol=0.04 * VOXEL)
+    # The middle of a voxel, in front of the wall or behind it, is half a voxel away.
+    assert np.abs(m.render_depth(CAMERA, T)[inner] - (30 * VOXEL - 0.2)).mean() > 0.4 * VOXEL
+    T[:3, :3] = np.diag([-1.0, 1.0, -1.0])  # the other way, where nothing is
+    assert np.isnan(m.surface().render_depth(CAMERA, T)).all()
+
+
 def test_the_standard_deviation_grows_where_rays_are_few() -> None:
     surface = _map_of_plane(SIGMA).surface()
     error = np.abs(surface.vertices_m @ NORMAL + 1.5)
