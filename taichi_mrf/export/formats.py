@@ -91,7 +91,8 @@ def export_note(m: ExportedMap, path: str | Path, options: ExportOptions = _DEFA
             no_images = options.surface == "auto" and METHODS[m.config.method].can_freeze
             remedy = f"; {NO_SURFACE}" if no_images else ""
             return f"the surface where the marginal is {options.threshold:g}{remedy}"
-        who = f"{len(m.keyframes)} keyframes" if len(m.keyframes) else "keyframes"
+        number = len(m.keyframes) + len(getattr(m, "frozen", ()))
+        who = f"{number} keyframes" if number else "keyframes"
         return f"the surface that the rays of {who} measured"
     if writer is not _level_map:
         return None

@@ -59,8 +59,8 @@ class FusedSurface:
 
     def render_depth(self, camera: PinholeCamera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
         """Axial depth of the surface as a camera at a pose (4, 4) sees it, (H, W) float32 metres, NaN where
-        it sees none. It is more exact than OccupancyMap.render_depth, which ends rays in the middle of a voxel,
-        and has more holes. Raises DatasetError without embreex."""
+        it sees none. It is more exact than OccupancyMap.render_depth, which ends rays in the middle of a
+        voxel, and has more holes. Raises DatasetError without embreex."""
         T = as_pose(T_world_camera)
         if not len(self.triangles):
             return np.full(camera.shape, np.nan, np.float32)

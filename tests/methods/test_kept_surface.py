@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from taichi_mrf.errors import ConfigError, MapFileError
-from taichi_mrf.export.formats import export_map
+from taichi_mrf.export.formats import export_map, export_note
 from taichi_mrf.export.fused_surface import FusedSurface
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.inference.brick_sums import LARGEST, BrickSums
@@ -44,6 +44,7 @@ def test_a_frozen_keyframe_keeps_its_part() -> None:
     for id in (1, 2):
         m.freeze_keyframe(id)
     assert m.has_surface
+    assert "of 4 keyframes" in str(export_note(m, Path("mesh.glb")))
     assert_same(m.surface(), before)
     np.testing.assert_array_equal(m.reading("surface").occupancy(scene.probes()), occupancy)
     np.testing.assert_array_equal(m.colors(scene.probes()), colors)
