@@ -4,7 +4,7 @@ The folder is a zarr group. Its array ``log_odds`` (x, y, z) float32 has a zarr 
 voxels; unknown voxels are NaN, and chunks without a known voxel are not stored. ``chunks`` (n, 3)
 int32 lists the stored chunks in the world's coordinates: chunk c covers the voxels 64 c to 64 (c + 1) - 1.
 If the map has them, ``colors`` (x, y, z, 4) uint8 are red, green, blue and how much was seen, and ``surface``
-(x, y, z, 2) float32 the weight and the distance times weight of DistanceField; both are 0 for nothing.
+(x, y, z, 3) float32 the weight, and distance and excess times weight, of DistanceField; 0 for nothing.
 ``first_surface`` (x, y, z, 1) uint8 is 1 where the rays take a voxel for their first surface.
 The attributes hold the rest: see :class:`StoreHeader`, and ``origin_m``, the outer
 corner of the array's first voxel.

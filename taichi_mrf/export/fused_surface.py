@@ -33,12 +33,18 @@ BLENDED_BELOW = 0.3
 LEAST_WEIGHT = 0.02
 """A voxel with less has no distance, nor has one that no ray has crossed."""
 
-RAY_STD = 0.8
+RAY_STD = 0.55
 """Standard deviation of a vertex as a multiple of what the weight there gives: blending uses more rays."""
 
-GRID_STD, BENT_STD, BORDER_STD = 0.02, 0.6, 0.3
+MIXED_STD = 0.2
+"""And as a multiple of how far distances differ beyond their noise: rays that met different surfaces."""
+
+GRID_STD, BENT_STD, BORDER_STD = 0.02, 0.5, 0.3
 """Standard deviations in voxels of what interpolation between voxels adds: everywhere, where the surface is
-bent most, and where it ends. With RAY_STD they were fitted on four scenes (docs/surfaces.md)."""
+bent most, and where it ends. All were fitted together on the scenes of docs/surfaces.md."""
+
+BLENDED_VARIANCE = 0.5
+"""Variance in voxels^2 of the distances of 27 voxels with binomial weights, whatever was measured."""
 
 MARGIN = 1
 """Voxels around a box that blending reads."""
@@ -113,9 +119,9 @@ def fused_surface(
     """The surface of a field. ``between`` is called after each chunk. Raises TaichiMRFError without
     scikit-image."""
     measure = library("skimage.measure", "surfaces need", "mesh")
-    vertices, triangles, weights = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.float32)]
+    vertices, triangles, variances = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0)]
     count = 0
-    for lowest, own, weight, distance in _boxes(field):
+    for lowest, own, weight, distance, excess in _boxes(field):
         between()
         known = (weight > LEAST_WEIGHT) & (own > 0)
         mean = np.where(known, distance / np.maximum(weight, LEAST_WEIGHT), np.float32(0))
@@ -129,16 +135,15 @@ def fused_surface(
         points, faces, _, _ = measure.marching_cubes(mean, 0.0, mask=whole, gradient_direction="descent")
         vertices.append(points.astype(np.float64) + lowest)
         triangles.append(faces.astype(np.int64) + count)
-        weights.append(_weight_at(points, weight))
+        variances.append(_ray_variance(points, own, weight, mean, excess))
         count += len(points)
     points = np.concatenate(vertices)
     first, triangles_of = welded_rows(points, np.concatenate(triangles))
     vertices_m = (points[first] + 0.5) * voxel_size
-    ray_variance = 1.0 / (16.0 * np.maximum(np.concatenate(weights)[first], LEAST_WEIGHT))
     normals, bent = _normals(vertices_m, triangles_of)
     grid_variance = GRID_STD**2 + BENT_STD**2 * bent
     grid_variance[_border(triangles_of)] += BORDER_STD**2
-    std_m = voxel_size * np.sqrt(grid_variance + RAY_STD**2 * ray_variance)
+    std_m = voxel_size * np.sqrt(grid_variance + np.concatenate(variances)[first])
     return FusedSurface(vertices_m, triangles_of, normals, std_m.astype(np.float32))
 
 
@@ -182,29 +187,27 @@ def _of_triangles(surface: FusedSurface, chosen: NDArray[np.bool_]) -> FusedSurf
     )
 
 
-def _boxes(
-    field: DistanceSource,
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]]:
+Box = NDArray[np.float32]
+
+
+def _boxes(field: DistanceSource) -> Iterator[tuple[NDArray[np.int64], Box, Box, Box, Box]]:
     """The lowest voxel of each chunk that holds distances; and for its voxels and those behind it, whose
-    cells reach into it, their own weight, and weight and distance times weight after blending."""
+    cells reach into it, their own weight, and weight, distance and excess times weight after blending."""
     before = [field.chunks - np.array(step, np.int32) for step in np.ndindex(2, 2, 2)]
     side = CHUNK_VOXELS + 1 + 2 * MARGIN
     for chunk in sorted_bricks(np.concatenate([np.zeros((0, 3), np.int32), *before])).astype(np.int64):
-        weight, distance = field.box(chunk * CHUNK_VOXELS - MARGIN, side)
-        if weight.any():
-            own = weight[(slice(MARGIN, -MARGIN),) * 3]
-            yield chunk * CHUNK_VOXELS, own, *blended_sums(weight, distance)
+        sums = field.box(chunk * CHUNK_VOXELS - MARGIN, side)
+        if sums[0].any():
+            own = sums[0][(slice(MARGIN, -MARGIN),) * 3]
+            weight, distance, excess = blended_sums(*sums)
+            yield chunk * CHUNK_VOXELS, own, weight, distance, excess
 
 
-def blended_sums(
-    weight: NDArray[np.float32], distance: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Sums of weight, and of distance times weight, blended with their surroundings; the box shrinks by
-    MARGIN on each side."""
+def blended_sums(weight: Box, *sums: Box) -> list[Box]:
+    """Sums of weight, and others, blended with their surroundings; the box shrinks by MARGIN on each side."""
     inner = (slice(MARGIN, -MARGIN),) * 3
     share = BLENDED_BELOW / (BLENDED_BELOW + weight[inner])
-    around = [_binomial(sums) for sums in (weight, distance)]
-    return weight[inner] + share * around[0], distance[inner] + share * around[1]
+    return [each[inner] + share * _binomial(each) for each in (weight, *sums)]
 
 
 def _binomial(sums: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -223,13 +226,21 @@ def _all_corners(true: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return true
 
 
-def _weight_at(points: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The weights at points (n, 3) on edges between voxels, between those of the two ends: (n,)."""
+def _ray_variance(
+    points: NDArray[np.float64], own: Box, weight: Box, mean: Box, excess: Box
+) -> NDArray[np.float64]:
+    """The variance in voxels^2 that measurements leave at points (n, 3) on edges between voxels, (n,), from
+    the weight there and from how far distances differ beyond noise and blending."""
     first = np.floor(points).astype(np.int64)
     last = np.ceil(points).astype(np.int64)
     share = (points - first).max(axis=1)
-    mixed = (1 - share) * weight[tuple(first.T)] + share * weight[tuple(last.T)]
-    return mixed.astype(np.float32)
+    total, mixed = np.zeros(len(points)), np.zeros(len(points))
+    for end, part in ((tuple(first.T), 1 - share), (tuple(last.T), share)):
+        gathered = np.maximum(weight[end], LEAST_WEIGHT)
+        differ = excess[end] / gathered - mean[end] ** 2 - BLENDED_VARIANCE * (1.0 - own[end] / gathered)
+        total += part * gathered
+        mixed += part * differ
+    return RAY_STD**2 / (16.0 * total) + MIXED_STD**2 * np.maximum(mixed, 0.0)
 
 
 def _border(triangles: NDArray[np.int64]) -> NDArray[np.int64]:

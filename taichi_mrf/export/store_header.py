@@ -15,6 +15,7 @@ from taichi_mrf.config.schema import Config, to_yaml
 from taichi_mrf.errors import MapFileError, said
 from taichi_mrf.geometry.up import UP_NAMES, Up, up_name
 from taichi_mrf.system.files import check_regular, exists, open_regular, read_text
+from taichi_mrf.voxels.distance_field import VALUES
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
 FORMAT = 1
@@ -22,7 +23,7 @@ FORMAT_KEY = "taichi_mrf_map"
 LOG_ODDS, CHUNKS = "log_odds", "chunks"
 COLORS, SURFACE, FIRST = "colors", "surface", "first_surface"
 
-EXTRAS = {COLORS: ("uint8", 4), SURFACE: ("float32", 2), FIRST: ("uint8", 1)}
+EXTRAS = {COLORS: ("uint8", 4), SURFACE: ("float32", VALUES), FIRST: ("uint8", 1)}
 """What a store may hold of each voxel beside its log-odds, 0 for nothing: the type and number of values."""
 
 _MOST_BYTES = 1_000_000

@@ -14,6 +14,7 @@ by the chance that they met one (surface_rays.py), colours go to the voxels that
 and rays vote for their likeliest voxel (surface_votes.py).
 """
 
+import math
 from dataclasses import dataclass
 
 import taichi as ti
@@ -25,12 +26,13 @@ from taichi_mrf.inference.sum_product import crossing
 from taichi_mrf.inference.workers import Workers
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import exp_of_negative, softplus
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template
+from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Struct, Template, Vec4
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.pool import BrickPool, PoolPart
 from taichi_mrf.voxels.strips import strip_begin, strip_length
-from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_voxels
+from taichi_mrf.voxels.traversal import InBricks, Space, Viewpoint, clip, cross_brick, walk_bricks
 
 
 @ti.dataclass
@@ -48,12 +50,24 @@ class FreeLogs(Bundle):
     log_free: F32Array
     """log(1 - m) of each, at most 0; (bricks * 512)."""
 
+    closed: I32Array
+    """Whether any voxel of a brick is likelier occupied than by the prior; (bricks). In front of the depths
+    that can have made its measurement, a ray passes through others as through empty space."""
+
     @staticmethod
     def of(pool: BrickPool | PoolPart) -> "FreeLogs":
         """Those of the marginals of a whole map, in the pool's order."""
         log_free = ti.ndarray(ti.f32, max(1, pool.capacity) * VOXELS)
         _find_free_logs(pool.in_use, pool.belief, log_free, strip_length())
-        return FreeLogs(log_free)
+        return FreeLogs.with_bricks(log_free, pool.capacity, pool.prior_log_odds)
+
+    @staticmethod
+    def with_bricks(log_free: "ti.Ndarray", bricks: int, prior_log_odds: float) -> "FreeLogs":
+        """With the first ``bricks`` of an array."""
+        closed = ti.ndarray(ti.i32, max(1, bricks))
+        # A little more than the prior, which voxels that nothing is known of have but for rounding.
+        _find_closed(bricks, log_free, -1.01 * math.log1p(math.exp(prior_log_odds)), closed)
+        return FreeLogs(log_free, closed)
 
 
 @dataclass(frozen=True)
@@ -74,6 +88,7 @@ class Sight(Bundle):
     ray: Template
     begin: F32
     end: F32
+    reach: Template  # RayVisitor.reach
     space: Space
 
 
@@ -86,6 +101,14 @@ class RayVisitor(Bundle):
     def wants(self, rays: Template, number: I32):
         """Whether ray ``number`` of a list (keyframe.RayList) is followed."""
         return 1
+
+    @ti.func
+    def reach(self, sensor: Template, model: Template, measured: F32, noise: Template, to_voxels: F32):
+        """The depth before which no surface can have made a measurement, and the depth at which its ray
+        ends, because the measurement carries no more evidence; then two numbers for the visitor itself.
+        ``to_voxels`` is the ray's length, in voxels, for one metre of depth."""
+        last = sensor.farthest_depth(measured, noise, model.end_sigmas)
+        return Vec4(sensor.support(measured, noise), last, 0.0, 0.0)
 
     @ti.func
     def begin(self, sight: Template):
@@ -131,18 +154,23 @@ def follow_rays(
                 ray, noise, pixels = listed_ray(rays, i, sensor, view)
 
                 # The ray ends where its measurement carries no more evidence, or where the map ends.
-                last = sensor.farthest_depth(measured, noise, model.end_sigmas)
+                to_voxels = ray.direction.norm()
+                reach = visitor.reach(sensor, model, measured, noise, to_voxels)
+                support, last = reach[0], reach[1]
                 begin, end = 0.0, ti.min(last, model.max_depth)
                 if entry_depths_known == 1:
                     begin = entry_depths[i]
                 clip(ray, begin, end, space.lower, space.upper)
 
                 sight = Sight(
-                    model, swept, sensor, measured, noise, sensor.support(measured, noise),
-                    ray.direction.norm(), pixels, i, rays.blocks[i], worker, ray, begin, end, space,
+                    model, swept, sensor, measured, noise, support,
+                    to_voxels, pixels, i, rays.blocks[i], worker, ray, begin, end, reach, space,
                 )  # fmt: skip
                 ahead = visitor.begin(sight)
-                walk_voxels(ray, begin, end, space, _see, ahead, _Visited(sight, visitor))
+                walk_bricks(
+                    ray, begin, end, space.shape, space.chunks, True, _see_brick, ahead,
+                    InBricks(space, _see, _Visited(sight, visitor)),
+                )  # fmt: skip
                 beyond = 0.0
                 if end < last:
                     beyond = ahead.visibility * sensor.likelihood_beyond(measured, end, noise)
@@ -155,6 +183,17 @@ class _Visited(Bundle):
 
     sight: Sight
     visitor: RayVisitor
+
+
+@ti.func
+def _see_brick(ahead: Template, inside: Template, ray: Template, brick: IVec3, near: F32, far: F32):
+    """One brick of a ray."""
+    slot, go = inside.space.bricks[flat(brick, inside.space.shape)], 1
+    if slot >= 0:
+        sight = inside.context.sight
+        if far > sight.support or sight.swept.closed[slot] == 1:
+            go = cross_brick(ahead, inside, ray, brick, near, far)
+    return go
 
 
 @ti.func
@@ -179,3 +218,13 @@ def _find_free_logs(slots: I32Array, belief: F32Array, log_free: F32Array, strip
         _, j = strip_begin(part, slots, strip)
         for k in range(strip):
             log_free[j + k] = -softplus(belief[j + k])
+
+
+@ti.kernel
+def _find_closed(bricks: I32, log_free: F32Array, prior: F32, closed: I32Array):
+    """FreeLogs.closed: whether a brick has a ``log_free`` below that of the ``prior``."""
+    for brick in range(bricks):
+        least = 0.0
+        for k in range(VOXELS):
+            least = ti.min(least, log_free[brick * VOXELS + k])
+        closed[brick] = ti.cast(least < prior, ti.i32)

@@ -4,6 +4,7 @@ The field is made anew from the keyframes whenever it is asked for, so it follow
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import taichi as ti
@@ -15,7 +16,7 @@ from taichi_mrf.inference.footprint import visible_box, window_around
 from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
 from taichi_mrf.inference.ray_model import RayModel
 from taichi_mrf.inference.ray_posterior import FreeLogs, follow_rays
-from taichi_mrf.inference.surface_rays import SCALE, Band, DistanceSums, FindTrust
+from taichi_mrf.inference.surface_rays import SCALE, AddDistances, Band, DistanceSums
 from taichi_mrf.inference.workers import workers_without_trace
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import check_memory
@@ -27,8 +28,11 @@ from taichi_mrf.voxels.window import Window, WindowIndex
 BAND_VOXELS = 2.0
 BAND_SIGMAS = 3.0
 
+SCOUTS = 4
+"""One of so many rays marks the bricks in its band, because each brick is met by many."""
+
 BRICKS_AT_ONCE = 1 << 15
-"""Bricks whose sums are in memory together: 270 MB."""
+"""Bricks whose sums are in memory together: 400 MB."""
 
 Bricks = NDArray[np.int32]
 
@@ -38,9 +42,9 @@ class SurfaceRays:
 
     def __init__(self, pool: BrickPool | PoolPart, model: RayModel, volume: VolumeConfig) -> None:
         """``model`` is what rays share; its ``floor`` is the density of measurements from anywhere."""
-        self.pool, self.model, self.volume = pool, model, volume
+        self.pool, self.model, self.volume = pool, replace(model, end_sigmas=BAND_SIGMAS), volume
         self.band = Band(BAND_VOXELS, BAND_SIGMAS, model.max_depth)
-        self._index = WindowIndex()
+        self._index, self._field_index = WindowIndex(), WindowIndex()
         self._free_logs = FreeLogs.of(pool)
 
     def field(
@@ -56,31 +60,13 @@ class SurfaceRays:
         _, first = np.unique(grid_keys(bricks), return_index=True)
         bricks = bricks[first]
         bricks = bricks[np.argsort(grid_keys(bricks // CHUNK), kind="stable")]
-        check_memory(8.0 * VOXELS * len(bricks), f"the surface in {len(bricks)} bricks")
-        weight, distance = (np.zeros((len(bricks), VOXELS), np.float32) for _ in range(2))
+        check_memory(12.0 * VOXELS * len(bricks), f"the surface in {len(bricks)} bricks")
+        sums = np.zeros((3, len(bricks), VOXELS), np.float32)
         for begin in range(0, len(bricks), BRICKS_AT_ONCE):
             rows = slice(begin, begin + BRICKS_AT_ONCE)
-            weight[rows], distance[rows] = self._sums(bricks[rows], keyframes, bands, between)
+            sums[:, rows] = self._sums(bricks[rows], keyframes, bands, between)
         order = np.argsort(grid_keys(bricks))
-        return DistanceField(bricks[order], weight[order], distance[order])
-
-    def trust(self, keyframe: Keyframe, visible: VisibleBricks) -> NDArray[np.float32]:
-        """The probability that each ray of a keyframe's list met a surface, (rays,)."""
-        rays, window = keyframe.ray_list, keyframe.footprint.window
-        trust = np.zeros(rays.blocks.shape[0], np.float32)
-        if len(visible.cells):
-            self._index.fill(window, visible.cells, visible.slots)
-            # They hold for the bricks of the last sweep.
-            known = keyframe.entry_depths_known and keyframe.visible.version == visible.version
-            follow_rays(
-                rays, keyframe.entry_depths, int(known),
-                keyframe.image.sensor, window.viewpoint(keyframe.T_world_camera),
-                self._index.space(window, self.volume.lower, self.volume.upper),
-                self.model, self._free_logs, workers_without_trace(), FindTrust(self.model.floor, trust),
-            )  # fmt: skip
-            self._index.clear(window, visible.cells)
-            runtime.settle()
-        return trust
+        return DistanceField(bricks[order], *(each[order] for each in sums))
 
     def bricks_in_band(self, keyframe: Keyframe) -> tuple[Window, NDArray[np.int32]]:
         """The window around the bands of a keyframe's rays, and its cells in them."""
@@ -92,7 +78,7 @@ class SurfaceRays:
             return keyframe.footprint.window, np.zeros(0, np.int32)
         marks = np.zeros(window.cells, np.int32)
         surface_rays.mark_band(
-            keyframe.ray_list, image.sensor, window.viewpoint(T), window.shape_vector,
+            keyframe.ray_list, SCOUTS, image.sensor, window.viewpoint(T), window.shape_vector,
             *window.clip_box(self.volume.lower, self.volume.upper), self.band, marks,
         )  # fmt: skip
         runtime.settle()
@@ -104,13 +90,12 @@ class SurfaceRays:
         keyframes: Sequence[tuple[Keyframe, VisibleBricks]],
         bands: Sequence[tuple[Window, NDArray[np.int32]]],
         between: Callable[[], object],
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Weights and distances times weight, (n, 512) each, in some bricks."""
-        sums = DistanceSums(
-            ti.ndarray(ti.i64, len(bricks) * VOXELS), ti.ndarray(ti.i64, len(bricks) * VOXELS)
-        )
-        sums.weight.fill(0)
-        sums.distance.fill(0)
+    ) -> NDArray[np.float32]:
+        """Weight, distance and excess, both times weight, in some bricks: (3, n, 512)."""
+        arrays = [ti.ndarray(ti.i64, len(bricks) * VOXELS) for _ in range(3)]
+        for array in arrays:
+            array.fill(0)
+        sums = DistanceSums(*arrays)
         keys = grid_keys(bricks)
         order = np.argsort(keys)
         for (keyframe, visible), (window, cells) in zip(keyframes, bands, strict=True):
@@ -120,15 +105,32 @@ class SurfaceRays:
             if not here.any():
                 continue
             cells, slots = cells[here], rows[here].astype(np.int32)
-            trust = self.trust(keyframe, visible)
-            self._index.fill(window, cells, slots)
-            space = self._index.space(window, self.volume.lower, self.volume.upper)
-            view = window.viewpoint(keyframe.T_world_camera)
-            rays, sensor = keyframe.ray_list, keyframe.image.sensor
-            surface_rays.add_distances(rays, trust, sensor, view, space, self.band, sums)
-            self._index.clear(window, cells)
-            runtime.settle()
+            self._add(keyframe, visible, window, cells, slots, sums)
             between()
-        found = (array.to_numpy().reshape(-1, VOXELS) for array in (sums.weight, sums.distance))
-        weight, distance = ((array / SCALE).astype(np.float32) for array in found)
-        return weight, distance
+        found = [array.to_numpy().reshape(-1, VOXELS) * np.float32(1.0 / SCALE) for array in arrays]
+        return np.stack([each.astype(np.float32) for each in found])
+
+    def _add(
+        self, keyframe: Keyframe, visible: VisibleBricks, window: Window,
+        cells: NDArray[np.int32], slots: NDArray[np.int32], sums: DistanceSums,
+    ) -> None:  # fmt: skip
+        """Add a keyframe's distances to ``sums``, whose bricks are cells (n) of the window at slots (n)."""
+        # The map's bricks in the window of the band.
+        crossed = window.cells_of(keyframe.footprint.window.bricks_of(visible.cells))
+        inside = crossed >= 0
+        if not inside.any():
+            return
+        self._index.fill(window, crossed[inside], visible.slots[inside])
+        self._field_index.fill(window, cells, slots)
+        lower, upper = self.volume.lower, self.volume.upper
+        # They hold for the bricks of the last sweep.
+        known = keyframe.entry_depths_known and keyframe.visible.version == visible.version
+        follow_rays(
+            keyframe.ray_list, keyframe.entry_depths, int(known),
+            keyframe.image.sensor, window.viewpoint(keyframe.T_world_camera),
+            self._index.space(window, lower, upper), self.model, self._free_logs, workers_without_trace(),
+            AddDistances(self.model.floor, self.band, self._field_index.space(window, lower, upper), sums),
+        )  # fmt: skip
+        self._index.clear(window, crossed[inside])
+        self._field_index.clear(window, cells)
+        runtime.settle()

@@ -15,6 +15,9 @@ is the posterior probability that the ray met a surface at all: a pixel of somet
 outlier, has none. A ray reaches as far as its band, the depths that are within 2 voxels or 3 sigma of the
 measurement. Free space in front of the band gets nothing, so that what lies behind a thin wall is no surface.
 
+The third sum, of w (d^2 - sigma^2 - (voxel / 4)^2), is the square by which distances differ more than noise
+lets them: where the bands of rays that met other surfaces reach the voxel too.
+
 The sums are integers, so they do not depend on the order of rays and keyframes.
 """
 
@@ -27,7 +30,8 @@ from taichi_mrf.inference.ray_list import listed_ray
 from taichi_mrf.inference.ray_posterior import RayVisitor
 from taichi_mrf.inference.sum_product import TINY
 from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, I64Array, IVec3, Template, Vec2, Vec3
+from taichi_mrf.kernels.types import F32, I32, I32Array, I64Array, IVec3, Template, Vec3, Vec4
+from taichi_mrf.sensor.forward import SUPPORT
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_bricks, walk_voxels
@@ -35,7 +39,7 @@ from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_bricks, wal
 SCALE = float(1 << 24)
 """Steps of the sums for a weight of 1."""
 
-SURE = 0.999
+SURE = 0.99
 """P of a ray is not followed further than this."""
 
 
@@ -63,17 +67,9 @@ class DistanceSums(Bundle):
     distance: I64Array
     """Of this weight times d in voxels."""
 
-
-@dataclass(frozen=True)
-class _Measured(Bundle):
-    """One ray, and all that a step along its band needs."""
-
-    ray: Template
-    sums: DistanceSums
-    measured: F32
-    noise: Template  # of its pixel
-    to_voxels: F32  # length of the ray, in voxels, for one metre of depth
-    weight: F32  # pixels times P
+    excess: I64Array
+    """Of this weight times (d^2 - sigma^2 - (voxel / 4)^2), in voxels^2: about 0 if all rays measured one
+    surface that passes through the voxel."""
 
 
 @dataclass(frozen=True)
@@ -85,14 +81,20 @@ class _Marked(Bundle):
 
 
 @dataclass(frozen=True)
-class FindTrust(RayVisitor):
-    """Finds P of each ray, which ends where P can only be SURE or more."""
+class AddDistances(RayVisitor):
+    """Adds the distances of rays to the bricks of ``space``, in the same window as those of the map. A ray is
+    followed from the camera until P can only be SURE or more, and then along its band."""
 
     outliers: F32
     """o."""
 
-    trust: F32Array
-    """(rays): receives P."""
+    band: Band
+    space: Space
+    sums: DistanceSums
+
+    @ti.func
+    def reach(self, sensor: Template, model: Template, measured: F32, noise: Template, to_voxels: F32):
+        return _reach_of(sensor, measured, noise, self.band, to_voxels)
 
     @ti.func
     def meet(self, ahead: Template, sight: Template, voxel: I32, here: F32):
@@ -101,49 +103,51 @@ class FindTrust(RayVisitor):
     @ti.func
     def end(self, ahead: Template, sight: Template, beyond: F32):
         met = ahead.explained + TINY + beyond
-        self.trust[sight.number] = met / (met + self.outliers)
+        weight = sight.pixels * met / (met + self.outliers)
+        begin, end = sight.reach[2], sight.reach[3]
+        clip(sight.ray, begin, end, self.space.lower, self.space.upper)
+        walk_voxels(
+            sight.ray, begin, end, self.space, _add_distance, ahead, _Measured(sight, self.sums, weight)
+        )
+
+
+@dataclass(frozen=True)
+class _Measured(Bundle):
+    """One ray, and all that a step along its band needs."""
+
+    sight: Template
+    sums: DistanceSums
+    weight: F32  # pixels times P
 
 
 @kernel
 def mark_band(
-    rays: RayList, sensor: Sensor, view: Viewpoint, shape: IVec3, lower: Vec3, upper: Vec3, band: Band,
-    marks: I32Array,
+    rays: RayList, scouts: I32, sensor: Sensor, view: Viewpoint, shape: IVec3, lower: Vec3, upper: Vec3,
+    band: Band, marks: I32Array,
 ) -> None:  # fmt: skip
-    """Mark the bricks that lie in the bands of rays. ``marks`` (bricks of the window) are those of a window
-    of ``shape`` bricks; ``lower`` and ``upper`` bound its mapped part, in voxels."""
-    for i in range(rays.number):
+    """Mark the bricks that lie in the bands of every ``scouts``-th ray. ``marks`` (bricks of the window) are
+    those of a window of ``shape`` bricks; ``lower`` and ``upper`` bound its mapped part, in voxels."""
+    for scout in range((rays.number + scouts - 1) // scouts):
+        i = scout * scouts
         ray, noise, _ = listed_ray(rays, i, sensor, view)
-        reach = _band_of(rays.depth[i], noise, sensor, band, ray.direction.norm())
-        begin, end = reach[0], reach[1]
+        reach = _reach_of(sensor, rays.depth[i], noise, band, ray.direction.norm())
+        begin, end = reach[2], reach[3]
         clip(ray, begin, end, lower, upper)
         state = 0
         walk_bricks(ray, begin, end, shape, marks, False, _mark_brick, state, _Marked(shape, marks))
 
 
-@kernel
-def add_distances(
-    rays: RayList, trust: F32Array, sensor: Sensor, view: Viewpoint, space: Space, band: Band,
-    sums: DistanceSums,
-) -> None:  # fmt: skip
-    """Add the distances of a keyframe's rays, whose P are ``trust`` (rays), to the bricks of ``space``."""
-    for i in range(rays.number):
-        ray, noise, pixels = listed_ray(rays, i, sensor, view)
-        to_voxels = ray.direction.norm()
-        reach = _band_of(rays.depth[i], noise, sensor, band, to_voxels)
-        begin, end = reach[0], reach[1]
-        clip(ray, begin, end, space.lower, space.upper)
-        state = 0
-        measured = _Measured(ray, sums, rays.depth[i], noise, to_voxels, pixels * trust[i])
-        walk_voxels(ray, begin, end, space, _add_distance, state, measured)
-
-
 @ti.func
-def _band_of(measured: F32, noise: Template, sensor: Template, band: Template, to_voxels: F32) -> Vec2:
-    """The depths between which a ray's band lies."""
+def _reach_of(sensor: Template, measured: F32, noise: Template, band: Template, to_voxels: F32) -> Vec4:
+    """Depths of a ray: before which no surface can have made its measurement, where it ends, and between
+    which its band lies. ``to_voxels`` is its length, in voxels, for one metre of depth."""
     surface, least = sensor.surface_depth(measured, noise), band.voxels / to_voxels
-    nearest = ti.min(surface - least, sensor.nearest_depth(measured, noise, band.sigmas))
-    farthest = ti.max(surface + least, sensor.farthest_depth(measured, noise, band.sigmas))
-    return Vec2(ti.max(0.0, nearest), ti.min(farthest, band.max_depth))
+    nearest = sensor.nearest_depth(measured, noise, band.sigmas)
+    farthest = sensor.farthest_depth(measured, noise, band.sigmas)
+    # In front sigma is smaller: this is further in front than the exact depth.
+    support = surface - (surface - nearest) * (SUPPORT / band.sigmas)
+    begin, end = ti.max(0.0, ti.min(nearest, surface - least)), ti.max(farthest, surface + least)
+    return Vec4(support, farthest, begin, ti.min(end, band.max_depth))
 
 
 @ti.func
@@ -156,12 +160,15 @@ def _mark_brick(state: Template, marked: Template, ray: Template, brick: IVec3, 
 @ti.func
 def _add_distance(state: Template, measured: Template, voxel: I32, near: F32, far: F32):
     """One voxel of a band."""
-    ray = measured.ray
+    ray, noise, to_voxels = measured.sight.ray, measured.sight.noise, measured.sight.voxels_per_depth
     centre = ti.floor(ray.origin + 0.5 * (near + far) * ray.direction) + 0.5
-    depth = (centre - ray.origin).dot(ray.direction) / (measured.to_voxels * measured.to_voxels)
-    distance = (measured.measured - measured.noise.bias(depth) - depth) * measured.to_voxels
-    sigma = measured.noise.sigma(depth) * measured.to_voxels
-    weight = measured.weight * (far - near) * measured.to_voxels / (16.0 * sigma * sigma + 1.0)
+    depth = (centre - ray.origin).dot(ray.direction) / (to_voxels * to_voxels)
+    distance = (measured.sight.measured - noise.bias(depth) - depth) * to_voxels
+    sigma = noise.sigma(depth) * to_voxels
+    variance = sigma * sigma + 1.0 / 16.0
+    weight = measured.weight * (far - near) * to_voxels / (16.0 * variance)
+    excess = distance * distance - variance
     ti.atomic_add(measured.sums.weight[voxel], ti.cast(weight * SCALE, ti.i64))
     ti.atomic_add(measured.sums.distance[voxel], ti.cast(weight * distance * SCALE, ti.i64))
+    ti.atomic_add(measured.sums.excess[voxel], ti.cast(weight * excess * SCALE, ti.i64))
     return 1

@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from taichi_mrf.export.chunk_store import Chunk, ChunkStore
 from taichi_mrf.export.store_header import SURFACE
-from taichi_mrf.voxels.distance_field import Sums
+from taichi_mrf.voxels.distance_field import VALUES, Sums
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
 _HELD = 64
-"""Chunks whose distances are in memory together, 2 MB each."""
+"""Chunks whose distances are in memory together, 3 MB each."""
 
 
 class StoredDistances:
@@ -38,7 +38,7 @@ class StoredDistances:
 
     def box(self, first: NDArray[np.int64], side: int) -> Sums:
         """The sums, (side, side, side) each, of the voxels from ``first`` (3,) on; 0 where there are none."""
-        sums = np.zeros((side, side, side, 2), np.float32)
+        sums = np.zeros((side, side, side, VALUES), np.float32)
         begin, end = np.maximum(first, self.first), np.minimum(first + side, self.after)
         if (begin < end).all():
             lowest, highest = begin // CHUNK_VOXELS, (end - 1) // CHUNK_VOXELS
@@ -50,7 +50,8 @@ class StoredDistances:
                     sums[_between(low - first, high - first)] = self._read(_key(chunk))[
                         _between(low - corner, high - corner)
                     ]
-        return np.ascontiguousarray(sums[..., 0]), np.ascontiguousarray(sums[..., 1])
+        weight, distance, excess = (np.ascontiguousarray(sums[..., i]) for i in range(VALUES))
+        return weight, distance, excess
 
 
 def _between(low: NDArray[np.int64], high: NDArray[np.int64]) -> tuple[slice, ...]:

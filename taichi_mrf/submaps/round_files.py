@@ -13,7 +13,7 @@ from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.system.atomic import write_npz
 from taichi_mrf.system.npz_file import NpzFile, open_npz
-from taichi_mrf.voxels.distance_field import DistanceField
+from taichi_mrf.voxels.distance_field import VALUES, DistanceField
 from taichi_mrf.voxels.layout import VOXELS
 
 Bricks = NDArray[np.int32]
@@ -85,8 +85,7 @@ def write_round(path: Path, result: RoundResult) -> None:
         arrays["colors"] = result.colors
     if result.surface is not None:
         arrays["surface_bricks"] = result.surface.bricks
-        arrays["surface_weight"] = result.surface.weight
-        arrays["surface_distance"] = result.surface.distance
+        arrays["surface_sums"] = result.surface.sums
     if result.first is not None:
         arrays["first"] = result.first.astype(np.uint8)
     for other, (bricks, evidence) in result.halos.items():
@@ -156,8 +155,8 @@ def read_surface(path: Path) -> DistanceField | None:
     with _opened(path) as file:
         if "surface_bricks" not in file:
             return None
-        bricks, weight = _halo(file, "surface_bricks", "surface_weight")
-        return DistanceField(bricks, weight, file.array("surface_distance", "f", weight.shape))
+        bricks = _bricks(file, "surface_bricks")
+        return DistanceField.of(bricks, file.array("surface_sums", "f", (len(bricks), VOXELS, VALUES)))
 
 
 def read_core(path: Path) -> tuple[Bricks, LogOdds, Bricks]:

@@ -279,6 +279,6 @@ def _merge_extras(store: ChunkStore, file: Path) -> None:
         for chunk, rows in by_chunk(bricks):
             store.write_extra(FIRST, chunk, first_block(chunk, bricks[rows], first[rows]))
     if surface is not None:
-        sums = np.stack([surface.weight, surface.distance], axis=-1)
+        sums = surface.sums
         for chunk, rows in by_chunk(surface.bricks):
             store.write_extra(SURFACE, chunk, extra_block(chunk, surface.bricks[rows], sums[rows]))

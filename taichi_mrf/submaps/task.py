@@ -143,7 +143,7 @@ def _seen(
     if job.config.keep_surface and task.may_be_last:
         field = m.surface_field()
         rows = job.plan.is_core(task.submap, field.bricks) & field.weight.any(axis=1)
-        surface = DistanceField(field.bricks[rows], field.weight[rows], field.distance[rows])
+        surface = DistanceField.of(field.bricks[rows], field.sums[rows])
         first = m.first_surfaces()[m.slots(core)]
     return colors, surface, first
 

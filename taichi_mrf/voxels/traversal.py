@@ -194,7 +194,7 @@ def walk_bricks(
 
 
 @dataclass(frozen=True)
-class _InBricks(Bundle):
+class InBricks(Bundle):
     """What :func:`walk_voxels` takes along through the bricks."""
 
     space: Space
@@ -213,13 +213,13 @@ def walk_voxels(
     The walk ends where ``visit`` returns 0.
     """
     walk_bricks(
-        ray, t_begin, t_end, space.shape, space.chunks, True, _cross_brick, state,
-        _InBricks(space, visit, context),
+        ray, t_begin, t_end, space.shape, space.chunks, True, cross_brick, state,
+        InBricks(space, visit, context),
     )  # fmt: skip
 
 
 @ti.func
-def _cross_brick(state: Template, inside: Template, ray: Ray, brick: IVec3, t_enter: F32, t_leave: F32):
+def cross_brick(state: Template, inside: Template, ray: Ray, brick: IVec3, t_enter: F32, t_leave: F32):
     """Visit the voxels of one brick."""
     go = 1
     slot = inside.space.bricks[flat(brick, inside.space.shape)]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import taichi as ti
-from hypothesis import assume, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from one_pixel import VOXEL, allocated, look_along, marginals, well_cut
 from oracles import inference as reference
@@ -25,7 +25,7 @@ from taichi_mrf.voxels.window import WindowIndex
 
 pytestmark = pytest.mark.usefixtures("backend")
 
-CAMERA = PinholeCamera(3, 2, 8.0, 8.0, 1.0, 0.5)
+CAMERA = PinholeCamera(3, 1, 8.0, 8.0, 1.0, 0.0)
 MAX_DEPTH = 0.7
 
 
@@ -69,7 +69,7 @@ def _followed(m: MRFMap, enough: float) -> tuple[np.ndarray, np.ndarray]:
     return here, found
 
 
-@settings(max_examples=12)
+@settings(max_examples=10, suppress_health_check=[HealthCheck.filter_too_much])
 @given(seed=st.integers(0, 2**32 - 1), sigma=st.floats(0.04, 0.2), enough=st.sampled_from([0.2, 1e9]))
 def test_rays_find_what_numpy_finds(seed: int, sigma: float, enough: float) -> None:
     rng = np.random.default_rng(seed)
@@ -82,7 +82,7 @@ def test_rays_find_what_numpy_finds(seed: int, sigma: float, enough: float) -> N
         m.add_keyframe(depth, T, CAMERA)
     m.infer()
     rays = reference.cast(depth, T, CAMERA, VOXEL, Noise((sigma,)), config, max_depth=MAX_DEPTH)
-    assume(well_cut(rays, 99))
+    assume(well_cut(rays[::2], 99))
     voxels = sorted(allocated(m))
     p = dict(zip(voxels, marginals(m, voxels).tolist(), strict=True))
     here, found = _followed(m, enough)

@@ -71,7 +71,7 @@ def test_evidence_and_marginals_are_joined() -> None:
     prior, marginals = pool.prior_log_odds, pool.belief.to_numpy().reshape(found.shape)
     for slot in pool.in_use:  # each brick by itself: a chunk ends nowhere
         first = pool.bricks[slot].astype(np.int64) * BRICK - 1 - MARGIN
-        evidence, behind = surface_evidence(*blended_sums(*field.box(first, BRICK + 2 + 2 * MARGIN)))
+        evidence, behind = surface_evidence(*blended_sums(*field.box(first, BRICK + 2 + 2 * MARGIN)[:2]))
         evidence, behind = evidence.reshape(-1), behind.reshape(-1)
         expected = evidence - DOUBT + PRIOR * prior + MARGINAL * np.clip(marginals[slot] - prior, -10, 10)
         expected[behind] = np.maximum(expected[behind], prior)

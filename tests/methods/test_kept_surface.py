@@ -34,7 +34,10 @@ def assert_same(ours: FusedSurface, theirs: FusedSurface) -> None:
     assert (distance_m < 0.01 * scene.VOXEL).mean() > 0.99
     assert abs(len(ours.triangles) - len(theirs.triangles)) < 0.005 * len(theirs.triangles)
     near = distance_m < 0.01 * scene.VOXEL
-    np.testing.assert_allclose(ours.std_m[near], theirs.std_m[nearest[near]], rtol=0.1)
+    # How far distances differ is the root of a small difference of rounded sums.
+    np.testing.assert_allclose(
+        ours.std_m[near], theirs.std_m[nearest[near]], rtol=0.1, atol=0.02 * scene.VOXEL
+    )
 
 
 def test_a_frozen_keyframe_keeps_its_part() -> None:
@@ -52,7 +55,7 @@ def test_a_frozen_keyframe_keeps_its_part() -> None:
         m.freeze_keyframe(id)
     assert_same(m.surface(), before)
     np.testing.assert_array_equal(m.reading("surface").occupancy(scene.probes()), occupancy)
-    # What is kept is part of the map's size: 8 bytes a voxel for distances, 4 for votes.
+    # What is kept is part of the map's size: 12 bytes a voxel for distances, 4 for votes.
     assert m._kept.share.nbytes < 14 * 512 * (len(m._kept.share.distances.bricks) + m.statistics().bricks)
 
 

@@ -54,7 +54,7 @@ def calibrated_log_odds(field: DistanceSource, pool: BrickPool) -> NDArray[np.fl
         if not len(rows):
             continue
         first = chunk * CHUNK_VOXELS - 1 - MARGIN
-        evidence, behind = surface_evidence(*blended_sums(*field.box(first, CHUNK_VOXELS + 2 + 2 * MARGIN)))
+        evidence, behind = surface_evidence(*_around(field, first))
         x, y, z = (bricks[rows] - chunk * CHUNK).T
         evidence, behind = _of_bricks(evidence)[x, y, z], _of_bricks(behind)[x, y, z]
         slots = pool.in_use[rows]
@@ -67,8 +67,13 @@ def calibrated_block(
 ) -> NDArray[np.float32]:
     """The same for the voxels of a chunk (3,), whose marginals' log-odds are (64, 64, 64)."""
     first = chunk * CHUNK_VOXELS - 1 - MARGIN
-    sums = blended_sums(*field.box(first, CHUNK_VOXELS + 2 + 2 * MARGIN))
-    return _combined(*surface_evidence(*sums), marginal, prior)
+    return _combined(*surface_evidence(*_around(field, first)), marginal, prior)
+
+
+def _around(field: DistanceSource, first: NDArray[np.int64]) -> list[NDArray[np.float32]]:
+    """Blended weights, and distances times weight, of a chunk and the voxels next to it."""
+    weight, distance, _ = field.box(first, CHUNK_VOXELS + 2 + 2 * MARGIN)
+    return blended_sums(weight, distance)
 
 
 def _combined(

@@ -17,7 +17,7 @@ from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
 from taichi_mrf.inference.ray_model import RayModel
 from taichi_mrf.inference.surface_field import SurfaceRays
 from taichi_mrf.inference.surface_votes import count_votes
-from taichi_mrf.voxels.distance_field import DistanceField
+from taichi_mrf.voxels.distance_field import VALUES, DistanceField
 from taichi_mrf.voxels.layout import VOXELS, grid_keys
 from taichi_mrf.voxels.pool import BrickPool
 
@@ -27,7 +27,7 @@ STEPS = 1024.0
 
 @dataclass(frozen=True)
 class RayShare:
-    """``distances``: weight, and distance in voxels times weight, in 1 / STEPS; ``votes``: one a voxel."""
+    """``distances``: the sums of DistanceField in 1 / STEPS; ``votes``: one a voxel."""
 
     distances: BrickSums
     votes: BrickSums
@@ -35,7 +35,7 @@ class RayShare:
     @staticmethod
     def nothing() -> "RayShare":
         """That of no keyframe."""
-        return RayShare(BrickSums.nothing(2), BrickSums.nothing(1))
+        return RayShare(BrickSums.nothing(VALUES), BrickSums.nothing(1))
 
     @property
     def nbytes(self) -> int:
@@ -55,7 +55,7 @@ class RayShare:
     def field(self) -> DistanceField:
         """The distances as signed distances."""
         sums = self.distances.sums.astype(np.float32) / np.float32(STEPS)
-        return DistanceField(self.distances.bricks, sums[..., 0], sums[..., 1])
+        return DistanceField.of(self.distances.bricks, sums)
 
 
 class KeptRays:
@@ -79,7 +79,7 @@ class KeptRays:
         part = pool.part(visible.slots)
         seen = [(keyframe, replace(visible, slots=part.in_use, arrays=None))]
         field = SurfaceRays(part, models[0], volume).field(seen)
-        sums = np.rint(np.stack([field.weight, field.distance], axis=-1) * STEPS).astype(np.int32)
+        sums = np.rint(field.sums * STEPS).astype(np.int32)
         votes = count_votes(seen, part, models[1], volume).to_numpy()[: len(visible.slots) * VOXELS]
         bricks = pool.bricks[visible.slots]
         return RayShare(BrickSums.of(field.bricks, sums), BrickSums.of(bricks, votes.reshape(-1, VOXELS, 1)))
@@ -102,9 +102,8 @@ def _sum_of(fields: Iterable[DistanceField]) -> DistanceField:
     bricks = np.concatenate([field.bricks for field in fields])
     _, first = np.unique(grid_keys(bricks), return_index=True)
     keys = grid_keys(bricks[first])
-    weight, distance = (np.zeros((len(first), VOXELS), np.float32) for _ in range(2))
+    sums = np.zeros((len(first), VOXELS, VALUES), np.float32)
     for field in fields:
         rows = np.searchsorted(keys, grid_keys(field.bricks))
-        weight[rows] += field.weight
-        distance[rows] += field.distance
-    return DistanceField(bricks[first], weight, distance)
+        sums[rows] += field.sums
+    return DistanceField.of(bricks[first], sums)

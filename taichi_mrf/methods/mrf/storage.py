@@ -24,6 +24,7 @@ from taichi_mrf.methods.mrf.coloring import MapColors
 from taichi_mrf.methods.mrf.kept_rays import KeptRays, RayShare
 from taichi_mrf.system.atomic import write_npz
 from taichi_mrf.system.npz_file import NpzFile
+from taichi_mrf.voxels.distance_field import VALUES
 from taichi_mrf.voxels.layout import VOXELS, grid_keys
 
 _SHARE = ("bricks", "numbers", "rg", "bw")
@@ -187,7 +188,7 @@ def ray_arrays(share: RayShare) -> dict[str, NDArray]:
 
 def read_rays(path: Path, file: NpzFile) -> RayShare:
     """The same from a file. Raises MapFileError for sums that no keyframes have left."""
-    return RayShare(_read_sums(path, file, "distance", 2), _read_sums(path, file, "vote", 1))
+    return RayShare(_read_sums(path, file, "distance", VALUES), _read_sums(path, file, "vote", 1))
 
 
 def _read_sums(path: Path, file: NpzFile, name: str, values: int) -> BrickSums:
@@ -195,7 +196,9 @@ def _read_sums(path: Path, file: NpzFile, name: str, values: int) -> BrickSums:
         return BrickSums.nothing(values)
     bricks = file.array(f"frozen_{name}_bricks", "i", (None, 3)).astype(np.int32)
     sums = file.array(f"frozen_{name}_sums", "i", (len(bricks), VOXELS, values))
-    beyond = (np.abs(sums.astype(np.int64)) > LARGEST).any() or (values == 2 and (sums[..., 0] < 0).any())
+    beyond = (np.abs(sums.astype(np.int64)) > LARGEST).any() or (
+        values == VALUES and (sums[..., 0] < 0).any()
+    )
     if beyond or (np.diff(grid_keys(bricks)) <= 0).any():
         raise MapFileError(f"{path}: damaged: what frozen keyframes measured is not in order")
     return BrickSums(bricks, sums.astype(np.int32))
