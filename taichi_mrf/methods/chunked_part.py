@@ -8,16 +8,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.export.fused_surface import FusedSurface
+from taichi_mrf.export.fused_surface import FusedSurface, fused_surface, within_voxels, without_free
 from taichi_mrf.export.store_header import FIRST
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.methods.capabilities import window_of
 from taichi_mrf.methods.chunked import ChunkedMap
-from taichi_mrf.methods.chunked_surface import stored_surface
+from taichi_mrf.methods.mrf.surfacing import LEAST
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.stored_distances import StoredDistances
 from taichi_mrf.queries.box import voxels_of_box
+from taichi_mrf.queries.colored import blended_colors
 from taichi_mrf.queries.known_bricks import BRICKS_AT_ONCE, BrickReader, Placed
 from taichi_mrf.queries.points import checked_points
 from taichi_mrf.queries.view import View
@@ -27,6 +28,10 @@ from taichi_mrf.system import runtime
 from taichi_mrf.system.owner import owned_attribute
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, by_chunk, grid_keys
 from taichi_mrf.voxels.pool import BrickPool
+
+_MARGIN = BRICK
+"""Voxels around a part from which its surface is made too, before it is cut: more than any vertex's position,
+normal and standard deviation depend on."""
 
 
 @dataclass
@@ -109,8 +114,17 @@ class MapPart:
     def surface(self) -> FusedSurface:
         """The surface that the keyframes measured, as MRFMap.surface: that of the cells whose first voxel is
         in the box, so that the surfaces of adjoining parts meet. Raises ConfigError if the map holds none."""
-        corners = self.lowest * BRICK, self.after * BRICK
-        return stored_surface(self.source, *corners, self if self.has_colors else None)
+        if not self.has_surface:
+            raise ConfigError(
+                f"{self.source.store.path}: holds no measured surface: map the recording anew with "
+                "--keep-surface, or export from the map.npz of a run"
+            )
+        first, after = self.lowest * BRICK, self.after * BRICK
+        distances = self.source.distances(first - _MARGIN, after + _MARGIN)
+        found = fused_surface(distances, self.voxel_size)
+        found = without_free(self.source, found, LEAST * self.source.prior)
+        found = within_voxels(found, self.voxel_size, first, after)
+        return replace(found, colors=blended_colors(self, found.vertices_m) if self.has_colors else None)
 
     def first_surfaces(self) -> NDArray[np.bool_]:
         """Which voxels of ``view.pool`` the rays take for their first surface, (slots, 512)."""
