@@ -74,7 +74,7 @@ def test_evidence_and_marginals_are_joined() -> None:
         evidence, behind = surface_evidence(*blended_sums(*field.box(first, BRICK + 2 + 2 * MARGIN)[:2]))
         evidence, behind = evidence.reshape(-1), behind.reshape(-1)
         expected = evidence - DOUBT + PRIOR * prior + MARGINAL * np.clip(marginals[slot] - prior, -10, 10)
-        expected[behind] = np.maximum(expected[behind], prior)
+        expected[behind] = np.maximum(expected[behind], np.minimum(marginals[slot], prior)[behind])
         none = np.isnan(evidence)
         expected[none] = marginals[slot][none]
         np.testing.assert_allclose(found[slot], expected, atol=1e-5)

@@ -12,8 +12,9 @@ extends e = (|n_x| + |n_y| + |n_z|) / 2 to either side. With S(x) = 1 / (1 + exp
 
 where prior and marginal are log-odds, too.
 
-A voxel behind the surface has at least the prior: it has not been seen. Where no ray measured a distance, the
-marginal stays. docs/evaluation.md says how far these probabilities can be trusted.
+A voxel behind the surface has at least the prior, since it has not been seen, unless its marginal is lower.
+Where no ray measured a distance, the marginal stays. docs/evaluation.md says how far these probabilities can
+be trusted.
 """
 
 from typing import Any
@@ -46,19 +47,17 @@ SUREST = 10.0
 def calibrated_log_odds(field: DistanceSource, pool: BrickPool) -> NDArray[np.float32]:
     """Log-odds of the voxels of a map, (capacity, 512), by the distances of its rays and the marginals."""
     log_odds: NDArray[np.float32] = pool.belief.to_numpy().reshape(-1, VOXELS)
-    bricks = pool.bricks[pool.in_use]
+    in_use = pool.in_use
+    bricks = pool.bricks[in_use]
     chunk_of = grid_keys(bricks // CHUNK)
-    prior = pool.prior_log_odds
     for chunk in field.chunks.astype(np.int64):
         rows = np.flatnonzero(chunk_of == grid_keys(chunk[None].astype(np.int32)))
-        if not len(rows):
-            continue
-        first = chunk * CHUNK_VOXELS - 1 - MARGIN
-        evidence, behind = surface_evidence(*_around(field, first))
-        x, y, z = (bricks[rows] - chunk * CHUNK).T
-        evidence, behind = _of_bricks(evidence)[x, y, z], _of_bricks(behind)[x, y, z]
-        slots = pool.in_use[rows]
-        log_odds[slots] = _combined(evidence, behind, log_odds[slots], prior)
+        if len(rows):
+            evidence, behind = _around(field, chunk)
+            x, y, z = (bricks[rows] - chunk * CHUNK).T
+            found = _of_bricks(evidence)[x, y, z], _of_bricks(behind)[x, y, z]
+            slots = in_use[rows]
+            log_odds[slots] = _combined(*found, log_odds[slots], pool.prior_log_odds)
     return log_odds
 
 
@@ -66,14 +65,15 @@ def calibrated_block(
     field: DistanceSource, chunk: NDArray[np.int64], marginal: NDArray[np.float32], prior: float
 ) -> NDArray[np.float32]:
     """The same for the voxels of a chunk (3,), whose marginals' log-odds are (64, 64, 64)."""
-    first = chunk * CHUNK_VOXELS - 1 - MARGIN
-    return _combined(*surface_evidence(*_around(field, first)), marginal, prior)
+    return _combined(*_around(field, chunk), marginal, prior)
 
 
-def _around(field: DistanceSource, first: NDArray[np.int64]) -> list[NDArray[np.float32]]:
-    """Blended weights, and distances times weight, of a chunk and the voxels next to it."""
+def _around(field: DistanceSource, chunk: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """What surface_evidence says of the voxels of a chunk, (64, 64, 64)."""
+    first = chunk * CHUNK_VOXELS - 1 - MARGIN  # gradients and blending need the voxels around
     weight, distance, _ = field.box(first, CHUNK_VOXELS + 2 + 2 * MARGIN)
-    return blended_sums(weight, distance)
+    weight, distance = blended_sums(weight, distance)
+    return surface_evidence(weight, distance)
 
 
 def _combined(
@@ -81,7 +81,7 @@ def _combined(
 ) -> NDArray[np.float32]:
     """Log-odds of voxels from what surface_evidence says of them and their marginals, of one shape."""
     likely = evidence - DOUBT + PRIOR * prior + MARGINAL * np.clip(marginal - prior, -SUREST, SUREST)
-    likely = np.where(behind, np.maximum(likely, prior), likely)
+    likely = np.where(behind, np.maximum(likely, np.minimum(marginal, prior)), likely)
     return np.where(np.isnan(evidence), marginal, likely)
 
 
