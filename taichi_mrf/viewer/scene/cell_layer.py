@@ -22,8 +22,9 @@ from taichi_mrf.voxels.cells import SIDES, SUREST, lowest_voxels, standing_in, v
 from taichi_mrf.voxels.colors import NO_COLOR
 from taichi_mrf.voxels.layout import BRICK, CHUNK_VOXELS
 
-AT_ONCE_S = 0.1
-"""Cells are computed for so long, in seconds, before events are handled."""
+AT_ONCE_S, WHILE_CHANGING_S = 0.1, 0.03
+"""Cells are computed for so long, in seconds, before events are handled: at rest, and while the map
+changes."""
 
 SHARE_OF_TIME = 0.1
 """While the map changes, computing cells takes at most this share of the time."""
@@ -64,7 +65,7 @@ class CellLayer:
         """``min_evidence`` in log-odds: voxels that are not so much likelier than the prior do not count."""
         self._scene, self._prefix, self._voxel_size = scene, prefix, voxel_size
         self._evidence = prior_log_odds + min_evidence
-        self._stale: set[ChunkKey] = set()
+        self._stale: dict[ChunkKey, None] = {}  # the oldest first
         self._due = -math.inf
         self._sent: dict[NodeKey, _Points] = {}
         self._prepared: dict[NodeKey, _Points | None] = {}
@@ -83,14 +84,14 @@ class CellLayer:
 
     def outdate(self, chunks: set[ChunkKey]) -> None:
         """Note that some chunks look different."""
-        self._stale |= chunks
+        self._stale |= dict.fromkeys(sorted(chunks))
 
-    def prepare(self, store: VoxelStore, look: Look, seconds: float = AT_ONCE_S) -> None:
+    def prepare(self, store: VoxelStore, look: Look, seconds: float) -> None:
         """Compute the cells of chunks that have changed, for at most about so long; :meth:`send` sends
         them."""
         begin = time.monotonic()
-        for key in sorted(self._stale):
-            self._stale.discard(key)
+        for key in list(self._stale):
+            del self._stale[key]
             chunk = store.chunks.get(key) if look.cells else None
             found = {} if chunk is None else self._points(key, chunk, look)
             for side in SIDES:

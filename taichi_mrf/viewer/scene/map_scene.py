@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.viewer.messages import BrickColors, Bricks, Hello, Layer
 from taichi_mrf.viewer.scene.brick_lines import BrickLines
-from taichi_mrf.viewer.scene.cell_layer import CellLayer
+from taichi_mrf.viewer.scene.cell_layer import AT_ONCE_S, WHILE_CHANGING_S, CellLayer
 from taichi_mrf.viewer.scene.coloring import Scale
 from taichi_mrf.viewer.scene.cut_plane import CutPlane, cut_picture
 from taichi_mrf.viewer.scene.look import Look, look_of
@@ -176,7 +176,7 @@ class MapScene:
                 self.cells.outdate(chunks)
         due = self.cells.due(self._news_at + REST_S)
         if due is not None and time.monotonic() >= due:
-            self.cells.prepare(self.store, look)
+            self.cells.prepare(self.store, look, AT_ONCE_S if rested else WHILE_CHANGING_S)
         if everything:
             self.surface.outdate()
         if self.shows_surface:
