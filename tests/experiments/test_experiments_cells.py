@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from small_scenes import CAMERA, clean_depth, make_data, poses, room
 
 from taichi_mrf.datasets.synthetic.analytic_mesh import scene_mesh
@@ -78,6 +79,7 @@ def test_cells_are_found_more_often_than_voxels(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(cells, "PATHS", 200)
     monkeypatch.setattr(cells, "SIDES", (1, 8))
     monkeypatch.setattr(cells, "RADII_M", (0.2,))
+    monkeypatch.setattr(cells, "reliability_figure", lambda _: Figure())  # drawing takes long
     monkeypatch.setattr(cells, "_ROOM", "synthetic:room?width=80&height=60&frames=3")
     tables, paths = run_experiment("cells", data, tmp_path, (0.1,), (0,), None, lambda *_: None)
     of_cells, of_paths = (table.rows for table in tables)
