@@ -85,7 +85,7 @@ def export_note(m: ExportedMap, path: str | Path, options: ExportOptions = _DEFA
     """A note for the user on a written file: what a mesh shows, how a floor plan lies in the world."""
     writer = _WRITERS.get(Path(path).suffix.lower())
     if writer is _surface or (writer is _points_or_surface and options.mesh):
-        if options.cubes:
+        if options.cubes or not hasattr(m, "has_surface"):
             return None
         if _with_rays(m, Path(path), options) is None:
             no_images = options.surface == "auto" and METHODS[m.config.method].can_freeze
