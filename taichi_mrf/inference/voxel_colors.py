@@ -7,8 +7,8 @@ outliers):
     w_ri = nu_i m_i vis_i / (sum_j nu_j m_j vis_j + beyond + o)        colour_i = sum_r w_ri c_r / sum_r w_ri
 
 What stands behind gets nothing of it, and a measurement that the map holds for an outlier gives nothing.
-Where more rays than ENOUGH meet a voxel, one of up to MOST_STRIDE is followed and counts for all of them: a
-mean colour needs fewer rays than a message.
+Where n rays meet a voxel, about sqrt(n) of them are followed, each of which counts for sqrt(n): a mean
+colour needs fewer rays than a message.
 """
 
 from dataclasses import dataclass, replace
@@ -30,11 +30,8 @@ from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 
-ENOUGH = 2.5
-"""Rays at a voxel that faces the camera, of which all are followed."""
-
 MOST_STRIDE = 4
-"""Of more rays than this one is followed in any case."""
+"""Of so many rays one is followed in any case."""
 
 COLOR_SHARE = 1.0 / 512.0
 """Of the scale of the sums of lengths: colours reach 255, and a ray that counts for several may do so in a
@@ -83,8 +80,8 @@ class ColorPass:
             free_logs = FreeLogs.with_bricks(cast.swept.log_free, n, pool.prior_log_odds)
             spread = _Spread(
                 _pixels(color), image.camera.width, cast.swept.sums, self._bw, scale, cast.trace,
-                (s.voxel_size * image.camera.pixels_per_radian) ** 2 / ENOUGH,
-                200.0 * s.voxel_size * s.inference.ray_density / ENOUGH,
+                (s.voxel_size * image.camera.pixels_per_radian) ** 2,
+                200.0 * s.voxel_size * s.inference.ray_density,
             )  # fmt: skip
             follow_rays(
                 keyframe.ray_list, keyframe.entry_depths, int(keyframe.entry_depths_known),
@@ -117,8 +114,8 @@ class _Spread(RayVisitor):
 
     ``image`` (H * W) are packed colours, 0 for none. Red and green go to ``rg``, blue and weight to ``bw``
     (visible bricks * 512), in units of 1 / ``scale``. ``crowded`` / (depth^2 * pixels of a ray) is how many
-    times ENOUGH rays meet a voxel if those beside it have as many pixels; beyond ``most_many`` it is a ray of
-    its own, as at edges, and is followed.
+    rays meet a voxel if those beside it have as many pixels; beyond ``most_many`` it is a ray of its own, as
+    at edges, and is followed.
     """
 
     image: I32Array
@@ -136,7 +133,7 @@ class _Spread(RayVisitor):
         many = self.crowded / (measured * measured * pixels)
         stride = 1
         if many <= self.most_many:
-            stride = ti.max(1, ti.cast(ti.min(many, MOST_STRIDE), ti.i32))
+            stride = ti.max(1, ti.min(MOST_STRIDE, ti.cast(ti.sqrt(many) + 0.5, ti.i32)))
         return stride
 
     @ti.func
