@@ -153,7 +153,9 @@ def _reach_of(sensor: Template, measured: F32, noise: Template, band: Template, 
 @ti.func
 def _mark_brick(state: Template, marked: Template, ray: Template, brick: IVec3, t: F32, t_leave: F32):
     """Mark one brick of a band."""
-    marked.marks[flat(brick, marked.shape)] = 1
+    cell = flat(brick, marked.shape)
+    if marked.marks[cell] == 0:  # a NumPy array that is not read comes back from Vulkan undefined elsewhere
+        marked.marks[cell] = 1
     return 1
 
 

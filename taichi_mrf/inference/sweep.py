@@ -1,8 +1,7 @@
 """One sweep over one keyframe: the host's side of sum_product.py, with the scratch that it needs."""
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,13 +48,22 @@ def unknown_entry_depths(rays: RayList) -> "ti.Ndarray":
 
 @dataclass(frozen=True)
 class CastRays:
-    """What the rays of one keyframe read and write (Sweeper.casting), as kernels take it."""
+    """What the rays of one keyframe read and write, as kernels take it: the scratch, ready in a ``with``
+    block."""
 
     view: Viewpoint
     space: Space
     swept: SweptVoxels
     trace: Trace
     workers: Workers
+    clear: Callable[[], None]
+    """Make the scratch ready for the next keyframe."""
+
+    def __enter__(self) -> "CastRays":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.clear()
 
 
 class Sweeper:
@@ -121,10 +129,9 @@ class Sweeper:
         keyframe.revision = pool.revision
         return True
 
-    @contextmanager
     def casting(
         self, keyframe: Keyframe, belief: "ti.Ndarray", messages: "ti.Ndarray", prior_log_odds: float
-    ) -> Iterator[CastRays]:
+    ) -> CastRays:
         """The scratch made ready for a keyframe's rays; it must see a brick. It holds the cavity of
         ``belief`` (pool * 512) without ``messages`` (eq. 6), and sums of zero, to which rays add."""
         visible, footprint, n = keyframe.visible, keyframe.footprint, len(keyframe.visible.slots)
@@ -140,16 +147,14 @@ class Sweeper:
             swept.log_free, swept.sums, strip_length(),
         )  # fmt: skip
         self.index.fill(window, bricks.cells, self.order)
-        try:
-            yield CastRays(
-                window.viewpoint(keyframe.T_world_camera),
-                self.index.space(window, self.volume.lower, self.volume.upper),
-                swept,
-                Trace(self.trace_voxel, self.trace, footprint.longest, self.steps),
-                workers,
-            )
-        finally:
-            self.index.clear(window, bricks.cells)
+        return CastRays(
+            window.viewpoint(keyframe.T_world_camera),
+            self.index.space(window, self.volume.lower, self.volume.upper),
+            swept,
+            Trace(self.trace_voxel, self.trace, footprint.longest, self.steps),
+            workers,
+            lambda: self.index.clear(window, bricks.cells),
+        )
 
     def model(self) -> RayModel:
         """What the rays of all keyframes share."""

@@ -38,7 +38,7 @@ coordinates = st.tuples(*[st.integers(-20, 20)] * 3)
 @given(
     history=st.lists(st.tuples(st.booleans(), st.sets(coordinates, min_size=1, max_size=4)), max_size=8),
     seed=st.integers(0, 1000),
-    log_odds=st.floats(-3, 3),
+    log_odds=st.floats(-3, 3, allow_subnormal=False),  # kernels make a process flush those to 0
 )
 def test_what_is_put_in_and_not_removed_is_shown(
     history: list[tuple[bool, set[tuple[int, ...]]]], seed: int, log_odds: float
