@@ -31,6 +31,7 @@ WATCH = count_launches.__wrapped__.__code__.co_filename  # type: ignore[attr-def
 WITHIN_TAICHI = (WATCH, positions.__file__)
 """Files of this package that Taichi calls, or that stand for it: their time is Taichi's."""
 IN_TAICHI = "Taichi: launches, arguments, copies"
+OTHERS = "Python: called by none of these"
 RAYS = "send_messages"
 
 
@@ -150,41 +151,61 @@ def kernel_seconds() -> dict[str, list[float]]:
 
 def host_seconds(watch: cProfile.Profile) -> dict[str, tuple[int, float]]:
     """Calls and seconds of each function of this package, with what it spends in NumPy and the like; all that
-    is spent in Taichi, kernels included, is one entry."""
+    is spent in Taichi, kernels included, is one entry.
+
+    What is divided is each function's own time, so that a callback, whoever calls it, counts once.
+    """
     found: dict[str, tuple[int, float]] = defaultdict(lambda: (0, 0.0))
-
-    def note(function: str, calls: int, seconds: float) -> None:
-        before = found[function]
-        found[function] = before[0] + calls, before[1] + seconds
-
     stats = pstats.Stats(watch).stats  # type: ignore[attr-defined]
-    # What comes back from outside: ``next`` of a generator of this package, for instance.
-    returned: dict[Any, float] = defaultdict(float)
-    for (file, _, _), (_, _, _, _, callers) in stats.items():
-        if _is_ours(file):
-            for caller, (_, _, _, cumulative) in callers.items():
-                returned[caller] += cumulative
-    for function, (_, calls, own, total, callers) in stats.items():
-        file, _, name = function
-        abroad = 1.0 - min(1.0, returned[function] / total) if total > 0 else 0.0
-        if _is_ours(file):
-            note(_title(file, name), calls, own)
+    owners: dict[Any, dict[str, float]] = {}
+    for function, (_, calls, own, _, callers) in stats.items():
+        title = _title(function)
+        if title is not None and title != IN_TAICHI:
+            found[title] = found[title][0] + calls, found[title][1] + own
             continue
-        for (caller_file, _, caller), (_, inner_calls, _, cumulative) in callers.items():
-            if _is_ours(caller_file):
-                if file.startswith((TAICHI, *WITHIN_TAICHI)):
-                    note(IN_TAICHI, inner_calls, cumulative)
-                else:
-                    note(_title(caller_file, caller), 0, cumulative * abroad)
+        if title == IN_TAICHI:
+            calls = sum(
+                n for caller, (_, n, _, _) in callers.items() if _title(caller) not in (None, IN_TAICHI)
+            )
+            found[title] = found[title][0] + calls, found[title][1] + own
+            continue
+        for caller, (_, _, seconds, _) in callers.items():
+            own -= seconds
+            for owner, share in _owners(caller, stats, owners).items():
+                found[owner] = found[owner][0], found[owner][1] + share * seconds
+        found[OTHERS] = found[OTHERS][0], found[OTHERS][1] + own
     return dict(found)
 
 
-def _is_ours(file: str) -> bool:
-    return file.startswith(PACKAGE) and file not in WITHIN_TAICHI
+def _owners(function: Any, stats: dict[Any, Any], known: dict[Any, dict[str, float]]) -> dict[str, float]:
+    """Who answers for a function's time: itself, or, for a library's, its callers by the time that each one
+    gives to it. The shares add up to one; ``known`` keeps them."""
+    if function in known:
+        return known[function]
+    title = _title(function)
+    if title is not None:
+        known[function] = {title: 1.0}
+        return known[function]
+    known[function] = {OTHERS: 1.0}  # where calls go round in a circle
+    callers = stats[function][4]
+    total = sum(cumulative for _, _, _, cumulative in callers.values())
+    shares: dict[str, float] = defaultdict(float)
+    for caller, (_, _, _, cumulative) in callers.items() if total > 0 else ():
+        for owner, share in _owners(caller, stats, known).items():
+            shares[owner] += share * cumulative / total
+    if shares:
+        known[function] = dict(shares)
+    return known[function]
 
 
-def _title(file: str, function: str) -> str:
-    return f"{Path(file).relative_to(PACKAGE).with_suffix('').as_posix()}: {function}"
+def _title(function: tuple[str, int, str]) -> str | None:
+    """What a function's own time is listed as; ``None``: as its caller's."""
+    file, _, name = function
+    if file.startswith((TAICHI, *WITHIN_TAICHI)):
+        return IN_TAICHI
+    if file.startswith(PACKAGE):
+        return f"{Path(file).relative_to(PACKAGE).with_suffix('').as_posix()}: {name}"
+    return None
 
 
 def _work_of(m: MRFMap, created: int) -> Work:

@@ -1,6 +1,7 @@
 """The benchmark runs, and measures what it says."""
 
 import cProfile
+import importlib
 import json
 import pstats
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 import small_room
 from console import as_process
 
+from taichi_mrf.benchmark import profile
 from taichi_mrf.benchmark.bandwidth import copy_bandwidth
 from taichi_mrf.benchmark.bench import TARGETS, bench_mapping, octomap_available
 from taichi_mrf.benchmark.growth import elsewhere, fit_line, measure_growth
@@ -115,6 +117,44 @@ def test_the_host_profile_leaves_nothing_out_and_counts_nothing_twice() -> None:
             total = pstats.Stats(watch).total_tt  # type: ignore[attr-defined]
             parts = sum(seconds for _, seconds in host_seconds(watch).values())
             assert parts == pytest.approx(total, rel=0.01), name
+
+
+def test_what_a_library_calls_back_counts_once_and_its_own_time_is_its_callers(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    package, library = tmp_path / "package", tmp_path / "elsewhere"
+    package.mkdir()
+    library.mkdir()
+    (package / "ours.py").write_text(
+        "from library import clock, twice\n"
+        "def spend():\n    clock[0] += 100\n"
+        "def short():\n    twice(spend, 1)\n"
+        "def long():\n    twice(spend, 7)\n    clock[0] += 10\n"
+    )
+    (library / "library.py").write_text(
+        "clock = [0]\n"
+        "def twice(f, own):\n    f()\n    deeper(f, own)\n    clock[0] += own\n"
+        "def deeper(f, own):\n    f()\n    clock[0] += own\n"
+    )
+    for folder in package, library:
+        monkeypatch.syspath_prepend(str(folder))
+    monkeypatch.setattr(profile, "PACKAGE", str(package))
+    ours = importlib.import_module("ours")
+
+    def run() -> None:
+        ours.short()
+        ours.long()
+        ours.clock[0] += 5
+
+    watch = cProfile.Profile(lambda: ours.clock[0], 1.0)
+    watch.runcall(run)
+    found = {name: seconds for name, (_, seconds) in host_seconds(watch).items()}
+    # ``deeper``'s own 8 are shared as the callers of ``twice`` share its time: 202 and 214 of 416.
+    assert found["ours: short"] == pytest.approx(1 + 8 * 202 / 416)
+    assert found["ours: long"] == pytest.approx(10 + 7 + 8 * 214 / 416)
+    assert found["ours: spend"] == 400
+    assert found[profile.OTHERS] == 5
+    assert sum(found.values()) == pytest.approx(pstats.Stats(watch).total_tt)  # type: ignore[attr-defined]
 
 
 def test_floors_count_bytes() -> None:

@@ -48,9 +48,10 @@ class _Record(RayVisitor):
 
     @ti.func
     def end(self, ahead: Template, sight: Template, beyond: F32):  # noqa: ANN202 (Taichi takes no None)
-        self.found[3 * sight.number] = ahead.explained
-        self.found[3 * sight.number + 1] = ahead.visibility
-        self.found[3 * sight.number + 2] = beyond
+        # Added, not assigned: an array that is not read comes back from Vulkan undefined where no ray writes.
+        self.found[3 * sight.number] += ahead.explained
+        self.found[3 * sight.number + 1] += ahead.visibility
+        self.found[3 * sight.number + 2] += beyond
 
 
 def _followed(m: MRFMap, enough: float) -> tuple[np.ndarray, np.ndarray]:
