@@ -33,15 +33,19 @@ BLENDED_BELOW = 0.3
 LEAST_WEIGHT = 0.02
 """A voxel with less has no distance, nor has one that no ray has crossed."""
 
-RAY_STD = 0.55
+RAY_STD = 0.48
 """Standard deviation of a vertex as a multiple of what the weight there gives: blending uses more rays."""
 
-MIXED_STD = 0.2
-"""And as a multiple of how far distances differ beyond their noise: rays that met different surfaces."""
+MIXED_STD, MIXED_FAR = 0.067, 36.0
+"""And in voxels for each voxel^2 by which squared distances exceed their noise, because rays met different
+surfaces; from the second number of voxels^2 on it grows with the root."""
 
-GRID_STD, BENT_STD, BORDER_STD = 0.02, 0.5, 0.3
-"""Standard deviations in voxels of what interpolation between voxels adds: everywhere, where the surface is
-bent most, and where it ends. All were fitted together on the scenes of docs/surfaces.md."""
+BENT_STD = 1.15
+"""In voxels where the surface is bent most: what interpolation between voxels adds."""
+
+COMMON_STD_M = 0.7e-3
+"""In metres, everywhere: what no number of rays averages out. All were fitted together on the scenes of
+docs/surfaces.md."""
 
 BLENDED_VARIANCE = 0.5
 """Variance in voxels^2 of the distances of 27 voxels with binomial weights, whatever was measured."""
@@ -141,9 +145,8 @@ def fused_surface(
     first, triangles_of = welded_rows(points, np.concatenate(triangles))
     vertices_m = (points[first] + 0.5) * voxel_size
     normals, bent = _normals(vertices_m, triangles_of)
-    grid_variance = GRID_STD**2 + BENT_STD**2 * bent
-    grid_variance[_border(triangles_of)] += BORDER_STD**2
-    std_m = voxel_size * np.sqrt(grid_variance + np.concatenate(variances)[first])
+    variance = BENT_STD**2 * bent + np.concatenate(variances)[first]
+    std_m = np.sqrt(COMMON_STD_M**2 + voxel_size**2 * variance)
     return FusedSurface(vertices_m, triangles_of, normals, std_m.astype(np.float32))
 
 
@@ -240,29 +243,31 @@ def _ray_variance(
         differ = excess[end] / gathered - mean[end] ** 2 - BLENDED_VARIANCE * (1.0 - own[end] / gathered)
         total += part * gathered
         mixed += part * differ
-    return RAY_STD**2 / (16.0 * total) + MIXED_STD**2 * np.maximum(mixed, 0.0)
-
-
-def _border(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The vertices of edges that have a triangle on one side only."""
-    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    keys, count = np.unique(edges[:, 0] << 32 | edges[:, 1], return_counts=True)
-    alone = keys[count == 1]
-    return np.concatenate([alone >> 32, alone & 0xFFFFFFFF])
+    mixed = np.maximum(mixed, 0.0)
+    return RAY_STD**2 / (16.0 * total) + MIXED_STD**2 * mixed**2 / (1.0 + mixed / MIXED_FAR)
 
 
 def _normals(
     vertices_m: NDArray[np.float64], triangles: NDArray[np.int64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Unit normals (V, 3) of vertices: those of the triangles around each, by their areas; and how far these
-    differ from each other (V,), 0 where the surface is flat, at most 1."""
+    """Unit normals (V, 3) of vertices: those of the triangles around each, by their areas; and how far the
+    normals around it differ, two triangles far, (V,): 0 where the surface is flat, at most 1."""
     corners = vertices_m[triangles]
     areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.zeros((len(vertices_m), 3))
+    sums = _sums_around(areas, triangles, len(vertices_m))
+    normals = sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-30)[:, None]
+    mean, around = normals, np.maximum(np.bincount(triangles.ravel(), minlength=len(normals)), 1)[:, None]
+    for _ in range(2):
+        mean = _sums_around(mean[triangles].mean(axis=1), triangles, len(normals)) / around
+    return normals.astype(np.float32), np.maximum(1.0 - np.linalg.norm(mean, axis=1), 0.0)
+
+
+def _sums_around(
+    values: NDArray[np.float64], triangles: NDArray[np.int64], vertices: int
+) -> NDArray[np.float64]:
+    """Sums for each vertex of what the triangles around it have, (T, 3)."""
+    sums = np.zeros((vertices, 3))
     for axis in range(3):
         for corner in range(3):
-            normals[:, axis] += np.bincount(triangles[:, corner], areas[:, axis], len(vertices_m))
-    length = np.linalg.norm(normals, axis=1)
-    area = np.bincount(triangles.ravel(), np.repeat(np.linalg.norm(areas, axis=1), 3), len(vertices_m))
-    bent = np.maximum(1.0 - length / np.maximum(area, 1e-30), 0.0)
-    return (normals / np.maximum(length, 1e-30)[:, None]).astype(np.float32), bent
+            sums[:, axis] += np.bincount(triangles[:, corner], values[:, axis], vertices)
+    return sums

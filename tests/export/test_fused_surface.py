@@ -9,7 +9,7 @@ import pytest
 from taichi_mrf import MRFMap, PinholeCamera, PolynomialNoise
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.formats import export_map, export_note
-from taichi_mrf.export.fused_surface import without_free
+from taichi_mrf.export.fused_surface import _normals, without_free
 from taichi_mrf.export.options import ExportOptions
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -75,6 +75,23 @@ def test_the_standard_deviation_grows_where_rays_are_few() -> None:
     assert np.mean(error <= 2 * surface.std_m) > 0.9
     middle = np.abs(surface.vertices_m[:, :2]).max(axis=1) < 0.3
     assert surface.std_m[middle].mean() < 0.5 * surface.std_m.max()
+
+
+def test_normals_differ_around_a_fold_and_nowhere_else() -> None:
+    rows, columns = 4, 12  # a strip of squares, folded at a right angle in its middle
+    along, across = np.meshgrid(np.arange(columns + 1.0), np.arange(rows + 1.0))
+    folded = np.maximum(along - columns // 2, 0)
+    vertices = np.stack([along - folded, across, folded], axis=-1).reshape(-1, 3)
+    corner = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()
+    right, up = corner + 1, corner + columns + 1
+    triangles = np.concatenate(
+        [np.stack(each, axis=1) for each in ((corner, right, up), (right, up + 1, up))]
+    )
+    normals, bent = _normals(vertices, triangles)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
+    far = np.abs(along.ravel() - columns // 2)
+    np.testing.assert_allclose(bent[far >= 4], 0, atol=1e-12)
+    assert bent[far == 0].min() > bent[far == 2].max() > 1e-3
 
 
 def test_files_hold_it_by_default(tmp_path: Path) -> None:
