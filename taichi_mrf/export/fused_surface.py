@@ -157,10 +157,10 @@ class _Believing(Protocol):
 
 
 def without_free(m: _Believing, surface: FusedSurface, least: float) -> FusedSurface:
-    """The surface without what the map takes for free: vertices around which, within 2 voxels or standard
-    deviations along the normal, no voxel has the probability ``least``. Rays with a large sigma leave such
-    vertices in front of a surface and behind it."""
-    step = np.maximum(m.voxel_size, surface.std_m)[:, None] * surface.normals
+    """The surface without what the map takes for free: vertices around which, within 2 voxels along the
+    normal, no voxel has the probability ``least``. Rays with a large sigma leave such vertices in front of a
+    surface and behind it."""
+    step = m.voxel_size * surface.normals
     likely = np.zeros(len(step), bool)
     for number in (0, -1, 1, -2, 2):
         rows = np.flatnonzero(~likely)
