@@ -3,7 +3,7 @@ frames."""
 
 import json
 import shlex
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from typing import Any
 
 from rich.table import Table
@@ -19,6 +19,7 @@ from taichi_mrf.datasets.ros.summary import summarise as summarise_bag
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.summary import summarise
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.system import runtime
 
 CANNOT_BE_MAPPED = 2
@@ -72,7 +73,24 @@ def _source_facts(options: Info) -> dict[str, Any]:
         runtime.init(options.arch)
     dataset = open_dataset(options.source, color=False, **options.reading.keywords())
     notes = list(dataset.notes)
-    return facts | {"format": format_name(options.source)} | asdict(summarise(dataset)) | {"notes": notes}
+    found = summarise(dataset)
+    content = {field.name: getattr(found, field.name) for field in fields(found)}
+    content["camera"] = _camera_facts(found.camera)
+    return facts | {"format": format_name(options.source)} | content | {"notes": notes}
+
+
+def _camera_facts(camera: Camera) -> dict[str, Any]:
+    """A camera as plain values: all of a pinhole, of others the kind and the size of their images."""
+    if isinstance(camera, PinholeCamera):
+        return asdict(camera)
+    return {"kind": type(camera).__name__, "width": camera.width, "height": camera.height}
+
+
+def _camera_words(camera: Camera) -> str:
+    size = f"{camera.width} x {camera.height}"
+    if isinstance(camera, PinholeCamera):
+        return f"{size}, fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g}"
+    return f"{type(camera).__name__}, {size} rays"
 
 
 def _print_backends(console: Terminal, arch: Arch) -> None:
@@ -135,8 +153,7 @@ def _print_frames(console: Terminal, format_name: str, dataset: Dataset) -> bool
     table.add_column()
     table.add_row("format", format_name)
     table.add_row("frames", "without end" if found.frames is None else str(found.frames))
-    intrinsics = f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g}"
-    table.add_row("camera", f"{camera.width} x {camera.height}, {intrinsics}")
+    table.add_row("camera", _camera_words(camera))
     if found.seconds is not None:
         table.add_row("time", f"{found.seconds:.1f} s")
     if found.depth_range is not None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.geometry.poses import Pose, look_at
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.frame import Frame
 
 
@@ -58,7 +58,7 @@ class Dataset(ABC):
     """
 
     name: str
-    camera: PinholeCamera
+    camera: Camera
     notes: list[str] = field(default_factory=list)
     dropped: int = 0
     distortion: tuple[float, ...] = ()

@@ -16,6 +16,7 @@ from taichi_mrf.datasets.depth_scale import PLAUSIBLE_MEDIAN_M, USUAL, Evidence,
 from taichi_mrf.datasets.images import read_color, read_depth
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
 from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 
 
@@ -45,6 +46,7 @@ class Recording(Dataset):
     registered to depth.
     """
 
+    camera: PinholeCamera
     frames: Sequence[RecordedFrame] = ()
     steps_per_metre: float = 1000.0
     scale_source: str = "the format's"

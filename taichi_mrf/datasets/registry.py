@@ -17,8 +17,8 @@ from taichi_mrf.datasets.resampled import resampled
 from taichi_mrf.datasets.ros import bag
 from taichi_mrf.datasets.stereo import kitti, rig_file
 from taichi_mrf.datasets.synthetic import corridor, mesh_sequence, room
-from taichi_mrf.errors import DatasetError
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.sensor.camera import PinholeCamera, pinhole
 from taichi_mrf.system.files import exists, is_folder
 
 FORMATS: tuple[Format, ...] = (
@@ -105,7 +105,11 @@ def bag_path(source: str) -> Path | None:
 def _as_asked(dataset: Dataset, options: ReadOptions) -> Dataset:
     """Apply the options that all formats share: the caller's intrinsics, undistortion, every n-th pixel."""
     if options.intrinsics is not None:
-        dataset.camera = PinholeCamera(dataset.camera.width, dataset.camera.height, *options.intrinsics)
+        try:
+            recorded = pinhole(dataset.camera, "--camera")
+        except ConfigError as error:
+            raise DatasetError(f"{dataset.name}: {error}") from error
+        dataset.camera = PinholeCamera(recorded.width, recorded.height, *options.intrinsics)
     dataset.notes += dataset.check_scale(not (dataset.tracked or options.track))
     distortion = dataset.distortion if options.undistort is None else options.undistort
     picked = resampled(dataset, distortion, options.stride)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.derived import Derived
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import PinholeCamera, pinhole
 from taichi_mrf.sensor.frame import Frame
 
 
@@ -43,7 +43,11 @@ class Resampled(Derived):
         if frame.color is not None:
             color = frame.color[self.rows, self.columns]
             color[outside] = 0
-        return replace(frame, depth_m=depth_m, camera=self.camera, color=color)
+        sigma_m = None if frame.sigma_m is None else frame.sigma_m[self.rows, self.columns]
+        no_return = None if frame.no_return is None else frame.no_return[self.rows, self.columns] & ~outside
+        return replace(
+            frame, depth_m=depth_m, camera=self.camera, color=color, sigma_m=sigma_m, no_return=no_return
+        )
 
 
 def resampled(dataset: Dataset, distortion: Sequence[float], stride: int) -> Dataset:
@@ -51,13 +55,17 @@ def resampled(dataset: Dataset, distortion: Sequence[float], stride: int) -> Dat
 
     ``distortion`` are OpenCV's coefficients of the recorded images (none or zeros: they are a pinhole
     camera's). The camera keeps its intrinsics but for the stride. Raises DatasetError if nothing would be
-    left of an image.
+    left of an image, and if its camera is no pinhole.
     """
     distorted = any(distortion)
     if not distorted and stride == 1:
         return dataset
     try:
-        camera, first = strided(dataset.camera, stride)
+        recorded = pinhole(dataset.camera, "--undistort" if distorted else "--image-scale")
+    except ConfigError as error:
+        raise DatasetError(f"{dataset.name}: {error}") from error
+    try:
+        camera, first = strided(recorded, stride)
     except ConfigError as error:
         raise DatasetError(f"{dataset.name}: image_scale 1/{stride} leaves no pixel: {error}") from error
     rows, columns = np.meshgrid(
@@ -67,7 +75,7 @@ def resampled(dataset: Dataset, distortion: Sequence[float], stride: int) -> Dat
     )
     notes = list(dataset.notes)
     if distorted:
-        rows, columns = _recorded_pixels(dataset.camera, distortion, rows, columns)
+        rows, columns = _recorded_pixels(recorded, distortion, rows, columns)
         share = float((rows < 0).mean())
         notes.append(
             f"images undistorted with {', '.join(f'{k:g}' for k in distortion)}, "

@@ -6,7 +6,7 @@ import numpy as np
 
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.errors import DatasetError, FrameError
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera
 
 LOOKED_AT = 8
 """Frames, evenly spread, that a summary reads."""
@@ -21,7 +21,7 @@ class Summary:
     """
 
     frames: int | None
-    camera: PinholeCamera
+    camera: Camera
     seconds: float | None
     depth_range: tuple[float, float] | None
     measured: float | None

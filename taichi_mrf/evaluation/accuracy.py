@@ -21,7 +21,7 @@ from taichi_mrf.evaluation.depth_error import DepthError, depth_error
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.queries.survey import SurfaceSurvey
 from taichi_mrf.queries.view import View
-from taichi_mrf.sensor.camera import PinholeCamera, check_camera
+from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.noise import NoiseModel, NoiseTable, PolynomialNoise
 
 Tolerance = Literal["voxel", "1.5sigma", "5cm", "sensor"]
@@ -155,7 +155,7 @@ def judge_view(
     m: JudgedMap,
     depth_m: ArrayLike,
     T_world_camera: ArrayLike,
-    camera: PinholeCamera,
+    camera: Camera,
     *,
     measured_m: ArrayLike | None = None,
     noise: NoiseModel | None = None,
@@ -203,7 +203,7 @@ def accuracy(
     m: JudgedMap,
     depth_m: ArrayLike,
     T_world_camera: ArrayLike,
-    camera: PinholeCamera,
+    camera: Camera,
     tolerance: Tolerance = "voxel",
     *,
     noise: NoiseModel | None = None,

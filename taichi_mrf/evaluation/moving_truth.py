@@ -122,9 +122,10 @@ class MovingTruth:
     def frame_without_things(self, index: int) -> Frame:
         """A frame as it would be if all that moves were never there, with the same noise."""
         frame = self.room.read(index)
-        depth_m = render(self.scene.static, frame.camera, frame.T_world_camera, color=False)[0]
+        camera = self.room.camera
+        depth_m = render(self.scene.static, camera, frame.T_world_camera, color=False)[0]
         if self.room.options.noise == "kinect":
-            depth_m = simulate(depth_m, frame.camera, KINECT_1, seed=(self.room.options.seed, index))
+            depth_m = simulate(depth_m, camera, KINECT_1, seed=(self.room.options.seed, index))
         return replace(frame, depth_m=depth_m, color=None)
 
     def away_from_things(self, centres: Points, stamp_s: float) -> Mask:

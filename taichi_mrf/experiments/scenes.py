@@ -19,6 +19,7 @@ from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, as_pose, look_at
 from taichi_mrf.mapping.selection import KeyframeSelector
+from taichi_mrf.sensor.camera import pinhole
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.simulate import KINECT_1_LATERAL, simulate, simulate_model
 
@@ -97,13 +98,13 @@ def coffin_scene(data: Path, seed: int = 0) -> Scene:
 def house_scene(data: Path, seed: int = 0, limit: int | None = None) -> Scene:
     """In the manner of MRFMap's Table II: clean views of a living room, with the noise of a Kinect 1."""
     dataset = open_dataset(data / "house_livingroom", color=False)
-    views = []
+    camera, views = pinhole(dataset.camera, "the house"), []
     for index in range(len(dataset))[:limit]:
         frame = dataset.read(index)
-        measured = simulate(frame.depth_m, frame.camera, KINECT_1_LATERAL, seed=(seed, index))
+        measured = simulate(frame.depth_m, camera, KINECT_1_LATERAL, seed=(seed, index))
         views.append(SceneView(frame.name, frame.T_world_camera, measured, frame.depth_m, frame.depth_m > 0))
     noise = PolynomialNoise(KINECT_1_LATERAL.sigma, KINECT_1_LATERAL.bias)
-    return Scene("house_livingroom", dataset.camera, noise, VolumeConfig(), 10.0, views)
+    return Scene("house_livingroom", camera, noise, VolumeConfig(), 10.0, views)
 
 
 def kitchen_scene(data: Path, limit: int | None = None) -> Scene:
@@ -115,7 +116,9 @@ def kitchen_scene(data: Path, limit: int | None = None) -> Scene:
         depth = frame.depth_m
         views.append(SceneView(frame.name, frame.T_world_camera, depth, depth, depth > 0, frame.stamp))
     noise = PolynomialNoise(KINECT_1_LATERAL.sigma, KINECT_1_LATERAL.bias)
-    return Scene("seven_scenes_redkitchen", dataset.camera, noise, VolumeConfig(), 10.0, views)
+    return Scene(
+        "seven_scenes_redkitchen", pinhole(dataset.camera, "the kitchen"), noise, VolumeConfig(), 10.0, views
+    )
 
 
 def turned(scene: Scene, mesh: TriangleMesh) -> tuple[Scene, TriangleMesh]:

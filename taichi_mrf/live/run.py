@@ -19,6 +19,7 @@ from taichi_mrf.methods.capabilities import can_freeze, window_of
 from taichi_mrf.queries.colored import is_colored
 from taichi_mrf.runs.files import MAP_FILE
 from taichi_mrf.runs.folder import RunFacts
+from taichi_mrf.sensor.camera import pinhole
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system import runtime
 from taichi_mrf.viewer.messages import Bricks, CurrentCamera, Hello, KeyframeInfo, Notice
@@ -132,7 +133,7 @@ class Run(SessionCore):
         """Show the viewer the pose of a frame."""
         self.current = frame
         self.version += 1
-        self.send(CurrentCamera(frame.name, frame.T_world_camera, frame.camera))
+        self.send(CurrentCamera(frame.name, frame.T_world_camera, pinhole(frame.camera, "the live page")))
 
     def describe(self, id: int) -> KeyframeInfo:
         """The message that describes a keyframe to the viewer."""

@@ -28,7 +28,7 @@ from taichi_mrf.queries.points import classify, point_log_odds, probability
 from taichi_mrf.queries.profile import RayProfile
 from taichi_mrf.queries.view import View
 from taichi_mrf.queries.within import occupied_within, path_collision
-from taichi_mrf.sensor.camera import Camera, PinholeCamera, check_camera
+from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config
 from taichi_mrf.system import runtime
 from taichi_mrf.system.owner import Owned, owned_attribute
@@ -123,7 +123,7 @@ class BrickMap(Owned):
         self.view = View(self._pool, self.voxel_size, shown, occlusion)
 
     @classmethod
-    def from_config(cls: type[MapT], config: Config, camera: PinholeCamera) -> MapT:
+    def from_config(cls: type[MapT], config: Config, camera: Camera) -> MapT:
         """A map with a configuration's parameters; ``camera`` is what its noise tables must fit."""
         instance(config, Config, "config", "a Config")
         check_camera(camera)

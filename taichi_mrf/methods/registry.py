@@ -8,11 +8,11 @@ from taichi_mrf.errors import MapFileError
 from taichi_mrf.export.chunk_store import SUFFIX
 from taichi_mrf.methods.map_file import method_of, open_map_file
 from taichi_mrf.methods.protocol import OccupancyMap
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.system.files import is_folder
 
 
-def create_map(config: Config, camera: PinholeCamera) -> OccupancyMap:
+def create_map(config: Config, camera: Camera) -> OccupancyMap:
     """An empty map of the method ``config.method``; ``camera`` is what its noise tables must fit."""
     m: OccupancyMap = METHODS[config.method].load_class().from_config(config, camera)
     return m

@@ -179,6 +179,14 @@ class PinholeCamera:
         return math.hypot(1.0, x, y)
 
 
+def pinhole(camera: Camera, who: str) -> PinholeCamera:
+    """The camera, for what works with pinholes alone. Raises ConfigError for any other: ``who``, such as
+    "--undistort", begins its text."""
+    if not isinstance(camera, PinholeCamera):
+        raise ConfigError(f"{who} needs a pinhole camera, not a {type(camera).__name__}")
+    return camera
+
+
 def check_camera(camera: object) -> None:
     """Raise ArgumentTypeError for an argument ``camera`` that is none."""
     instance(camera, Camera, "camera", "a PinholeCamera")

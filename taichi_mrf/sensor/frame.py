@@ -1,27 +1,38 @@
-"""One measurement of a depth camera, whatever it was recorded with."""
+"""One measurement of a depth camera or a lidar, whatever it was recorded with."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera
+
+if TYPE_CHECKING:
+    from taichi_mrf.sensor.noise import NoiseModel
 
 
 @dataclass(frozen=True)
 class Frame:
     """A depth image, where it was taken, and with what.
 
-    ``depth_m`` is axial depth (along the optical axis), (H, W) float32 in metres; 0 means no
-    measurement. ``T_world_camera`` is (4, 4) float64. ``stamp`` is in seconds. ``color`` is (H, W, 3)
-    uint8 RGB of the same pixels, 0 0 0 where a pixel has none, or None. ``name`` is what error messages
-    and reports call this frame.
+    ``depth_m`` is depth along the camera's rays, (H, W) float32 in metres; 0 means no measurement. It is
+    axial depth for a pinhole, and range where rays have the length 1, as a lidar's have. ``T_world_camera``
+    is (4, 4) float64. ``stamp`` is in seconds. ``color`` is (H, W, 3) uint8 RGB of the same pixels, 0 0 0
+    where a pixel has none, or None. ``name`` is what error messages and reports call this frame.
+
+    The other fields are None where the sensor's configuration answers for all frames: ``sigma_m``, (H, W)
+    float32, the standard deviation in metres of each pixel's depth; ``noise``, a noise model for this frame;
+    ``no_return``, (H, W) bool, the pixels that looked and got nothing back.
     """
 
     depth_m: NDArray[np.float32]
     T_world_camera: Pose
-    camera: PinholeCamera
+    camera: Camera
     stamp: float
     name: str
     color: NDArray[np.uint8] | None = None
+    sigma_m: NDArray[np.float32] | None = None
+    noise: "NoiseModel | None" = None
+    no_return: NDArray[np.bool_] | None = None

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.config.arguments import array
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.errors import ConfigError, said
-from taichi_mrf.sensor.camera import Camera, PinholeCamera
+from taichi_mrf.sensor.camera import Camera, PinholeCamera, pinhole
 from taichi_mrf.sensor.limits import LEAST_SIGMA_M, TERMS
 from taichi_mrf.system.npz_file import open_npz, read_npy
 
@@ -92,7 +92,7 @@ class PolynomialNoise:
 class PatchNoise:
     """Learnt bias and sigma for each square patch of pixels of one camera."""
 
-    def __init__(self, sigma: ArrayLike, bias: ArrayLike, patch: int, camera: PinholeCamera) -> None:
+    def __init__(self, sigma: ArrayLike, bias: ArrayLike, patch: int, camera: Camera) -> None:
         """``sigma`` and ``bias`` are (rows * columns, degree + 1), patches row by row, ``patch`` pixels
         wide and high (the last ones may hang over the image's edge).
 
@@ -128,8 +128,8 @@ class PatchNoise:
             raise ConfigError(f"{path}: {error}") from error
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """What :meth:`load` reads, by name."""
-        k = self.camera
+        """What :meth:`load` reads, by name. Raises ConfigError for a camera that is no pinhole."""
+        k = pinhole(self.camera, "a file of noise tables")
         camera = np.array([k.width, k.height, k.fx, k.fy, k.cx, k.cy], np.float64)
         return {"sigma": self.sigma, "bias": self.bias, "patch": np.array(self.patch), "camera": camera}
 
@@ -142,7 +142,7 @@ class PatchNoise:
         return _table(self.sigma, self.bias, self.patch, self.columns)
 
 
-def noise_from_config(config: SensorConfig, camera: PinholeCamera) -> NoiseModel:
+def noise_from_config(config: SensorConfig, camera: Camera) -> NoiseModel:
     """The noise model that a configuration describes. Raises ConfigError naming field and file."""
     if config.sigma_table is None and config.bias_table is None:
         return PolynomialNoise(config.sigma, config.bias)

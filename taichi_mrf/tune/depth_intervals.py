@@ -24,7 +24,7 @@ from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Templ
 from taichi_mrf.queries.occlusion import occlusion, stopped_share
 from taichi_mrf.queries.survey import OPAQUE
 from taichi_mrf.queries.view import View
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.forward import SUPPORT, normal_density, normal_tail
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import NoiseTable
@@ -53,7 +53,7 @@ def probability_below(
     view: View,
     measured_m: NDArray[np.float32],
     T_world_camera: Pose,
-    camera: PinholeCamera,
+    camera: Camera,
     noise: NoiseTable,
     max_depth: float,
 ) -> NDArray[np.float32]:

@@ -11,7 +11,7 @@ from taichi_mrf.evaluation.occupancy_scores import reliability_bins
 from taichi_mrf.evaluation.occupancy_truth import OccupancyTruth, occupancy_truth
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.methods.protocol import OccupancyMap
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import PinholeCamera, pinhole
 
 MOST_VOXELS = 2_000_000
 """Most voxels that are compared; of more, every second, third, ... one is."""
@@ -64,7 +64,7 @@ def truth_of(dataset: Dataset, indices: Sequence[int]) -> VoxelTruth | None:
     source = dataset  # SyntheticRoom or MeshSequence, which alone have what follows
     depths = [source.clean_depth(index) for index in indices]  # type: ignore[attr-defined]
     poses = [source.pose(index) for index in indices]  # type: ignore[attr-defined]
-    return VoxelTruth(mesh, depths, poses, dataset.camera)
+    return VoxelTruth(mesh, depths, poses, pinhole(dataset.camera, "the truth of a rendered scene"))
 
 
 def _mesh_of(dataset: Dataset) -> TriangleMesh | None:

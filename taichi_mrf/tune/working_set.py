@@ -12,7 +12,7 @@ import numpy as np
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 from taichi_mrf.mapping.selection import is_held_out
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.tune.voxel_truth import VoxelTruth, truth_of
 from taichi_mrf.viewer.tune.messages import FrameChoice
@@ -29,7 +29,7 @@ class WorkingSet:
     error of each unreadable frame; ``truth`` is the true occupancy, if the scene is known."""
 
     source: str
-    camera: PinholeCamera
+    camera: Camera
     choice: FrameChoice
     training: tuple[Frame, ...]
     held_out: tuple[Frame, ...]
@@ -84,7 +84,7 @@ def read_working_set(dataset: Dataset, choice: FrameChoice, keep_unseen: bool = 
     )
 
 
-def coarse_stride(camera: PinholeCamera) -> int:
+def coarse_stride(camera: Camera) -> int:
     """The pixel stride of a first look: about 160 columns."""
     return max(1, camera.width // FIRST_LOOK_COLUMNS)
 

@@ -47,6 +47,7 @@ class BagOptions(PoseChoice):
 class RosBag(Dataset):
     """The depth images of one topic, each with its pose; ``entries`` says where in the bag they are."""
 
+    camera: PinholeCamera
     reader: RosReader = field(kw_only=True)
     topic: str = field(kw_only=True)
     entries: Sequence[Entry] = field(kw_only=True)

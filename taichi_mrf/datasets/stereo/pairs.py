@@ -15,6 +15,7 @@ from taichi_mrf.datasets.images import image_size, read_color
 from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX, StereoMatching, StereoRig, stereo_depth
 from taichi_mrf.datasets.trajectories import RecordedPose
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
+from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.files import read_text
 
@@ -36,6 +37,7 @@ class StereoPairs(Dataset):
     ``matching`` may be set to other parameters before frames are read.
     """
 
+    camera: PinholeCamera
     pairs: Sequence[RecordedPair] = ()
     baseline_m: float = 1.0
     color: bool = True

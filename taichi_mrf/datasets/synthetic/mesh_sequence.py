@@ -86,6 +86,7 @@ class MeshOptions:
 class MeshSequence(Dataset):
     """A mesh as a sequence of frames, rendered on request, with ground truth."""
 
+    camera: PinholeCamera
     scene: MeshScene = field(kw_only=True)
     trajectory: Trajectory = field(kw_only=True)
     options: MeshOptions = field(kw_only=True)

@@ -66,6 +66,7 @@ class RenderedSequence(Dataset):
     Reading a frame needs Taichi to run (:func:`taichi_mrf.init`), else BackendError.
     """
 
+    camera: PinholeCamera
     options: RenderOptions = RenderOptions()
     color: bool = True
 
