@@ -12,7 +12,7 @@ import taichi_mrf
 GROUPS: dict[str, tuple[str, ...]] = {
     "Starting": ("init",),
     "Maps": ("MRFMap", "LogOddsMap", "VisibilityMap"),
-    "Sensors": ("PinholeCamera", "PolynomialNoise", "PatchNoise", "Frame"),
+    "Sensors": ("PinholeCamera", "SphericalCamera", "RayTable", "PolynomialNoise", "PatchNoise", "Frame"),
     "Queries": (
         "UNKNOWN",
         "FREE",

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from taichi_mrf.sensor.frame import Frame as Frame
     from taichi_mrf.sensor.noise import PatchNoise as PatchNoise
     from taichi_mrf.sensor.noise import PolynomialNoise as PolynomialNoise
+    from taichi_mrf.sensor.ray_table import RayTable as RayTable
+    from taichi_mrf.sensor.spherical import SphericalCamera as SphericalCamera
     from taichi_mrf.system.runtime import init as init
 
 __version__ = "0.1.0"
@@ -45,6 +47,8 @@ taichi_environment.prepare()
 _PUBLIC = {
     "init": "taichi_mrf.system.runtime",
     "PinholeCamera": "taichi_mrf.sensor.camera",
+    "SphericalCamera": "taichi_mrf.sensor.spherical",
+    "RayTable": "taichi_mrf.sensor.ray_table",
     "PolynomialNoise": "taichi_mrf.sensor.noise",
     "PatchNoise": "taichi_mrf.sensor.noise",
     "MRFMap": "taichi_mrf.methods.mrf.map",

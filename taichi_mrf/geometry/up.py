@@ -17,9 +17,9 @@ Z_UP: Up = (2, 1)
 UP_NAMES = ("x", "y", "z", "-x", "-y", "-z")
 
 
-def up_of(T_world_camera: Pose) -> Up:
-    """The world axis nearest to a camera's upward direction (its image's -y)."""
-    upwards = -T_world_camera[:3, 1]
+def up_of(T_world_camera: Pose, up: tuple[float, float, float] = (0.0, -1.0, 0.0)) -> Up:
+    """The world axis nearest to a camera's upward direction, which in its own frame is ``up``."""
+    upwards = T_world_camera[:3, :3] @ np.asarray(up, np.float64)
     axis = int(np.argmax(np.abs(upwards)))
     return axis, 1 if upwards[axis] > 0 else -1
 

@@ -58,7 +58,7 @@ def bench_viewer(
         prior = m.view.pool.prior_log_odds
         hello = Hello("bench", "", "", config.method, m.voxel_size, prior, config.volume.min_evidence, "")
         scene = MapScene(server, hello)
-        up = up_of(frames[0].T_world_camera)
+        up = up_of(frames[0].T_world_camera, frames[0].camera.up)
         reader.settled()
         rows = []
         for done, frame in enumerate(frames, start=1):

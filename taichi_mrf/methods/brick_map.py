@@ -146,10 +146,10 @@ class BrickMap(Owned):
         """A new keyframe's stamp; the number of keyframes added before if it is None."""
         return float(self._next_id) if stamp_s is None else seconds(stamp_s, "stamp_s")
 
-    def _note_up(self, T_world_camera: Pose) -> None:
+    def _note_up(self, T_world_camera: Pose, camera: Camera) -> None:
         """Keep which way is up if this is the first keyframe."""
         if self._up is None:
-            self._up = up_of(T_world_camera)
+            self._up = up_of(T_world_camera, camera.up)
 
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
         """Probability of occupied at (N, 3) points in metres, (N,) float32; the prior where nothing was

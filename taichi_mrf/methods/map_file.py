@@ -208,7 +208,7 @@ def read_bricks(path: Path, file: NpzFile) -> tuple[NDArray[np.int32], NDArray[n
 
 def _up(path: Path, file: NpzFile, keyframes: list[StoredKeyframe]) -> Up | None:
     if "up" not in file:  # a file of an earlier version
-        return up_of(keyframes[0].T_world_camera) if keyframes else None
+        return up_of(keyframes[0].T_world_camera, keyframes[0].camera.up) if keyframes else None
     name = file.scalar("up", "U")
     if name not in ("", *UP_NAMES):
         raise MapFileError(f"{path}: damaged: up is {name!r}")

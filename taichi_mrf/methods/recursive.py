@@ -156,7 +156,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         if not self._stale:
             self._add(record)
         self._keyframes[record.id] = record
-        self._note_up(T)
+        self._note_up(T, camera)
         self._next_id += 1
         return record.id
 

@@ -25,7 +25,7 @@ _NO_SKEW = 1e-6
 class Camera(Protocol):
     """What mapping asks of a camera.
 
-    A camera is immutable, equal to another that maps pixels to the same rays, and its ``repr`` is complete.
+    A camera is immutable, equal to another that maps pixels to the same rays, and so is its ``repr``.
     Depth is the parameter of a ray along its direction: axial depth if directions have z = 1, range if they
     have the length 1.
     """
@@ -43,8 +43,12 @@ class Camera(Protocol):
         """(height, width)."""
 
     @property
+    def up(self) -> tuple[float, float, float]:
+        """Upwards in the camera frame, if it is held level."""
+
+    @property
     def pixels_per_radian(self) -> float:
-        """Pixels along one radian, where there are fewest."""
+        """Pixels along one radian, where there are fewest; 0 if neighbouring pixels may look anywhere."""
 
     def directions(self, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
         """Rays through columns and rows that broadcast with each other, (..., 3) in the camera frame for one
@@ -122,6 +126,11 @@ class PinholeCamera:
         )
 
     @property
+    def up(self) -> tuple[float, float, float]:
+        """Upwards in the camera frame: -y."""
+        return 0.0, -1.0, 0.0
+
+    @property
     def pixels_per_radian(self) -> float:
         """The smaller focal length: pixels along one radian at the image's centre."""
         return min(self.fx, self.fy)
@@ -189,4 +198,4 @@ def pinhole(camera: Camera, who: str) -> PinholeCamera:
 
 def check_camera(camera: object) -> None:
     """Raise ArgumentTypeError for an argument ``camera`` that is none."""
-    instance(camera, Camera, "camera", "a PinholeCamera")
+    instance(camera, Camera, "camera", "a camera such as PinholeCamera")

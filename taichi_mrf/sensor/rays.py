@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import taichi as ti
 
 from taichi_mrf.kernels.bundles import Bundle
-from taichi_mrf.kernels.types import F32, I32, Vec3, Vec4
+from taichi_mrf.kernels.types import F32, I32, F32Array2, Vec3, Vec4
 
 
 @dataclass(frozen=True)
@@ -53,4 +53,57 @@ class PinholeRays(CameraRays):
         ray = self.direction(u, v)
         n = Vec3(along_u * self.intrinsics[0], along_v * self.intrinsics[1], 0.0)
         n[2] = inverse - n[0] * ray[0] - n[1] * ray[1]
+        return n
+
+
+@dataclass(frozen=True)
+class TableRays(CameraRays):
+    """The directions of all pixels in a table (ray_table.RayTable). Depth is the parameter along them."""
+
+    height: I32
+    """Rows of the image."""
+
+    unit: I32
+    """1 if all directions have the length 1, which those between pixels then have too."""
+
+    table: F32Array2
+    """(H * W, 3)"""
+
+    @ti.func
+    def direction(self, u: F32, v: F32):
+        """The ray through column u and row v, whole numbers for a pixel's centre; between pixels linear in
+        both."""
+        left, top = ti.cast(ti.floor(u), ti.i32), ti.cast(ti.floor(v), ti.i32)
+        a, b = u - left, v - top
+        ray = self._entry(left, top)
+        if a > 0.0 or b > 0.0:
+            above = ray + a * (self._entry(left + 1, top) - ray)
+            first, second = self._entry(left, top + 1), self._entry(left + 1, top + 1)
+            below = first + a * (second - first)
+            ray = above + b * (below - above)
+            if self.unit == 1:
+                ray = ray / ray.norm()
+        return ray
+
+    @ti.func
+    def _entry(self, u: I32, v: I32):
+        """The direction of the pixel (u, v), or of the nearest one at the image's edge."""
+        column, row = ti.max(0, ti.min(u, self.width - 1)), ti.max(0, ti.min(v, self.height - 1))
+        i = row * self.width + column
+        return Vec3(self.table[i, 0], self.table[i, 1], self.table[i, 2])
+
+    @ti.func
+    def plane(self, u: F32, v: F32, along_u: F32, along_v: F32, inverse: F32):
+        """As PinholeRays has it: n . direction is the inverse depth at (u, v), and to first order around it.
+        Where directions do not change, the plane that the ray meets at a right angle."""
+        ray = self.direction(u, v)
+        left, right = ti.max(0.0, u - 0.5), ti.min(self.width - 1.0, u + 0.5)
+        top, bottom = ti.max(0.0, v - 0.5), ti.min(self.height - 1.0, v + 0.5)
+        across = (self.direction(right, v) - self.direction(left, v)) / ti.max(right - left, 0.5)
+        down = (self.direction(u, bottom) - self.direction(u, top)) / ti.max(bottom - top, 0.5)
+        normal = across.cross(down)
+        volume = ray.dot(normal)
+        n = ray * (inverse / ray.dot(ray))
+        if ti.abs(volume) > 1e-4 * across.norm() * down.norm() * ray.norm():
+            n = (inverse * normal + along_u * down.cross(ray) + along_v * ray.cross(across)) / volume
         return n

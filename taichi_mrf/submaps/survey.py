@@ -10,7 +10,7 @@ from taichi_mrf.cluster.runner import TaskRunner
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose, as_pose
-from taichi_mrf.geometry.up import up_of
+from taichi_mrf.geometry.up import Z_UP, Up, up_of
 from taichi_mrf.mapping.selection import KeyframeSelector, is_held_out
 from taichi_mrf.submaps.job import Sequence
 from taichi_mrf.submaps.partial_map import PartialMap
@@ -37,7 +37,7 @@ class SurveyTask:
 @dataclass(frozen=True)
 class SurveyedFrame:
     """A frame's pose, the chunks (n, 3) that its rays cross, and whether it holds any measurement, even one
-    that no ray is cast for; ``problem``: why it could not be read."""
+    that no ray is cast for; ``problem``: why it could not be read; ``up``: its upward axis."""
 
     index: int
     name: str
@@ -45,6 +45,7 @@ class SurveyedFrame:
     chunks: NDArray[np.int32]
     measured: bool = False
     problem: str | None = None
+    up: Up = Z_UP
 
 
 def survey_frames(task: SurveyTask) -> list[SurveyedFrame]:
@@ -70,7 +71,8 @@ def survey_frames(task: SurveyTask) -> list[SurveyedFrame]:
                 bricks = np.concatenate([bricks, m.measured_bricks()])
             chunks = np.unique(bricks // CHUNK, axis=0)
             m.remove_keyframe(id)
-        found.append(SurveyedFrame(index, name, T_world_camera, chunks, measured))
+        up = up_of(T_world_camera, frame.camera.up)
+        found.append(SurveyedFrame(index, name, T_world_camera, chunks, measured, up=up))
     return found
 
 
@@ -122,5 +124,5 @@ def _chosen(
             if len(frame.chunks):  # else no ray is cast for it
                 T = frame.T_world_camera
                 x, y, z = T[:3, 3].tolist()
-                keyframes.append(SeenKeyframe(frame.index, (x, y, z), frame.chunks, up_of(T)))
+                keyframes.append(SeenKeyframe(frame.index, (x, y, z), frame.chunks, frame.up))
     return keyframes, skipped

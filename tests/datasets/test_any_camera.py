@@ -5,7 +5,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from spherical_camera import SphericalCamera
 
 from taichi_mrf.cli.main import main
 from taichi_mrf.datasets import Dataset, open_dataset
@@ -15,8 +14,9 @@ from taichi_mrf.datasets.resampled import resampled
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.spherical import SphericalCamera
 
-SCANNER = SphericalCamera(32, 8, 0.5)
+SCANNER = SphericalCamera(np.linspace(0.5, -0.5, 8), np.linspace(3.0, -3.0, 32))
 
 
 class Scans(Dataset):

@@ -59,7 +59,7 @@ def test_a_constructor_names_what_is_wrong(
 def test_a_map_is_made_from_a_configuration_and_a_camera(one_backend: str, kind: type) -> None:
     with pytest.raises(TypeError, match="config must be a Config, not None"):
         kind.from_config(None, CAMERA)
-    with pytest.raises(TypeError, match="camera must be a PinholeCamera, not None"):
+    with pytest.raises(TypeError, match="camera must be a camera such as PinholeCamera, not None"):
         kind.from_config(tm.Config(), None)
 
 
@@ -75,7 +75,10 @@ def calls(m: Any) -> dict[str, tuple[type[Exception], Callable[[], object]]]:
     """What to do with a map that is wrong, by what the error says."""
     eye = np.eye(4)
     return {
-        "camera must be a PinholeCamera, not None": (TypeError, lambda: m.add_keyframe(DEPTH, eye, None)),
+        "camera must be a camera such as PinholeCamera, not None": (
+            TypeError,
+            lambda: m.add_keyframe(DEPTH, eye, None),
+        ),
         "name must be a string, not 5": (TypeError, lambda: m.add_keyframe(DEPTH, eye, CAMERA, name=5)),
         "sweeps must be at least 0, not -1": (ValueError, lambda: m.infer(sweeps=-1)),
         "sweeps must be a whole number, not 1.5": (TypeError, lambda: m.infer(sweeps=1.5)),
@@ -83,7 +86,7 @@ def calls(m: Any) -> dict[str, tuple[type[Exception], Callable[[], object]]]:
         "keyframes must be a list of keyframe ids, not 3": (TypeError, lambda: m.infer(keyframes=3)),
         "min_probability must be a number, not 'a'": (TypeError, lambda: m.voxels("a")),
         "points must be an array of numbers, not 'abc'": (TypeError, lambda: m.occupancy("abc")),
-        "camera must be a PinholeCamera, not 3": (TypeError, lambda: m.render_depth(3, eye)),
+        "camera must be a camera such as PinholeCamera, not 3": (TypeError, lambda: m.render_depth(3, eye)),
         "max_range must be more than 0, not -1": (ValueError, lambda: m.ray_profile([0] * 3, [1, 0, 0], -1)),
         "direction must be an array of numbers": (TypeError, lambda: m.ray_profile([0, 0, 0], "ahead")),
     }

@@ -3,15 +3,24 @@
 import numpy as np
 import pytest
 import taichi as ti
+from numpy.typing import NDArray
 
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import AnyArray, F32Array2, F32Array3
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera, PinholeCamera
+from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.sensor.rays import CameraRays
+from taichi_mrf.sensor.spherical import SphericalCamera
 
 pytestmark = pytest.mark.usefixtures("backend")
 
 CAMERA = PinholeCamera(13, 9, 20.0, 17.0, 5.3, 4.9)
+LIDAR = SphericalCamera(
+    np.linspace(0.6, -0.5, 9), np.linspace(3.0, -3.0, 13) / 4, np.tile([0.0, 0.05], 5)[:9]
+)
+CAMERAS = pytest.mark.parametrize(
+    "camera", [CAMERA, RayTable(CAMERA.rays()), LIDAR], ids=["pinhole", "pinhole as a table", "lidar"]
+)
 
 
 @kernel
@@ -32,23 +41,57 @@ def _planes(camera: CameraRays, slopes: AnyArray, out: F32Array2) -> None:
             out[i, axis] = n[axis]
 
 
-def test_directions_are_the_cameras() -> None:
+@CAMERAS
+def test_directions_are_the_cameras(camera: Camera) -> None:
     out = np.zeros((9, 13, 3), np.float32)
-    _directions(CAMERA.in_kernels(), out)
-    np.testing.assert_allclose(out, CAMERA.rays(), atol=1e-6)
+    _directions(camera.in_kernels(), out)
+    np.testing.assert_allclose(out, camera.rays(), atol=1e-6)
 
 
-def test_planes_have_the_inverse_depth_that_they_are_made_of() -> None:
+@kernel
+def _between(camera: CameraRays, places: F32Array2, out: F32Array2) -> None:
+    for i in range(out.shape[0]):
+        d = camera.direction(places[i, 0], places[i, 1])
+        for axis in ti.static(range(3)):
+            out[i, axis] = d[axis]
+
+
+@CAMERAS
+def test_directions_between_pixels_are_the_cameras_too(camera: Camera) -> None:
+    places = np.random.default_rng(0).uniform((0, 0), (12, 8), (60, 2)).astype(np.float32)
+    out = np.zeros((60, 3), np.float32)
+    _between(camera.in_kernels(), places, out)
+    np.testing.assert_allclose(out, camera.directions(*places.T), atol=1e-6)
+
+
+def test_between_pixels_a_lidars_rays_have_the_length_1_and_lie_in_the_middle() -> None:
+    middle = LIDAR.directions(np.arange(12) + 0.5, 4.0)
+    np.testing.assert_allclose(np.linalg.norm(middle, axis=1), 1.0, atol=1e-12)
+    row = LIDAR.rays()[4]
+    np.testing.assert_allclose((middle * row[:-1]).sum(axis=1), (middle * row[1:]).sum(axis=1), atol=1e-6)
+
+
+@CAMERAS
+def test_planes_have_the_inverse_depth_that_they_are_made_of(camera: Camera) -> None:
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(50, 3))
-    u, v = rng.integers(0, 13, 50), rng.integers(0, 9, 50)
-    inverse = [
-        (normals * CAMERA.directions(u + du, v + dv)).sum(axis=1) for du, dv in ((0, 0), (1, 0), (0, 1))
-    ]
-    slopes = np.stack([u, v, inverse[1] - inverse[0], inverse[2] - inverse[0], inverse[0]], axis=1)
+    u, v = rng.integers(1, 12, 50), rng.integers(1, 8, 50)
+
+    def inverse(du: float, dv: float) -> NDArray[np.float64]:
+        return (normals * camera.directions(u + du, v + dv)).sum(axis=1)
+
+    along_u, along_v = inverse(0.5, 0) - inverse(-0.5, 0), inverse(0, 0.5) - inverse(0, -0.5)
+    slopes = np.stack([u, v, along_u, along_v, inverse(0, 0)], axis=1)
     out = np.zeros((50, 3), np.float32)
-    _planes(CAMERA.in_kernels(), slopes.astype(np.float32), out)
+    _planes(camera.in_kernels(), slopes.astype(np.float32), out)
     np.testing.assert_allclose(out, normals, atol=1e-4)
+
+
+def test_where_directions_do_not_change_a_plane_faces_its_ray() -> None:
+    camera = RayTable(np.broadcast_to([0.6, 0.0, 0.8], (2, 3, 3)))
+    out = np.zeros((1, 3), np.float32)
+    _planes(camera.in_kernels(), np.array([[1, 1, 0.3, 0.2, 0.5]], np.float32), out)
+    np.testing.assert_allclose(out[0], [0.3, 0.0, 0.4], atol=1e-6)
 
 
 def test_a_tiles_hull_holds_its_rays() -> None:

@@ -138,7 +138,7 @@ class MRFMap(ReadableMRF):
         image = self._upload(depth_m, camera, color)
         keyframe = self._allocator.place(self._next_id, name, image, T, stamp_s)
         self._keyframes[keyframe.id] = keyframe
-        self._note_up(T)
+        self._note_up(T, camera)
         self._next_id += 1
         self._settled = False
         if self.window is not None:

@@ -82,7 +82,7 @@ class Page(BasePage[Panel]):
 
     def _take_keyframe(self, keyframe: m.KeyframeInfo) -> None:
         if not self.keyframes.keyframes:
-            self.viewpoint.set_up(up_of(keyframe.T_world_camera))
+            self.viewpoint.set_up(up_of(keyframe.T_world_camera, keyframe.camera.up))
             self.keyframes.chosen = keyframe.id
         self.keyframes.put(keyframe)
         self.keyframes.draw_way()

@@ -91,7 +91,7 @@ class TunePage(BasePage[TunePanel]):
 
     def _take_keyframe(self, keyframe: m.KeyframeInfo) -> None:
         if not self.keyframes.keyframes:
-            up = up_of(keyframe.T_world_camera)
+            up = up_of(keyframe.T_world_camera, keyframe.camera.up)
             if up != self.viewpoint.up or not self._has_up:  # another map keeps the user's view
                 self.viewpoint.set_up(up)
                 self._has_up = True

@@ -1,0 +1,199 @@
+"""Cameras that are a table with the direction of each pixel: free rays, and the base of spherical cameras."""
+
+import hashlib
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf.config.arguments import array
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.sensor.directions import DirectionCounts, morton_order
+
+if TYPE_CHECKING:
+    from taichi_mrf.sensor.rays import TableRays
+
+_UNIT = 1e-5
+"""Lengths that differ by no more from 1 count as 1."""
+
+_SHORTEST = 1e-6
+"""No direction is shorter than this."""
+
+
+class RayTable:
+    """A camera whose rays are given one by one (camera.Camera). It never changes, and equals every other
+    table with the same rays.
+
+    Depth is the parameter of a ray along its direction: range for directions of length 1, axial depth for
+    those with z = 1. Between pixels directions are linear in column and row, and keep the length 1 if all
+    have it. Rays without a pattern, such as those of a point cloud, are an image of one row, and each is cast
+    alone, since neighbours in the row may be far from each other.
+    """
+
+    def __init__(self, directions: ArrayLike) -> None:
+        """``directions`` are (H, W, 3), or (N, 3) for rays without a pattern, in the camera frame, kept as
+        float32. Raises ConfigError for other shapes, and for a direction that is not finite or has no
+        length."""
+        given = array(directions, "directions")
+        if given.ndim not in (2, 3) or given.shape[-1] != 3 or given.size == 0:
+            raise ConfigError(f"directions must be of shape (H, W, 3) or (N, 3), not {given.shape}")
+        self.has_pattern: bool = given.ndim == 3
+        """Whether neighbours in the image are neighbours in space."""
+        with np.errstate(over="ignore"):
+            self._table = np.ascontiguousarray(given, np.float32).reshape((-1, *given.shape[-2:]))
+        lengths = np.linalg.norm(self.rays(), axis=-1)
+        wrong = ~(np.isfinite(lengths) & (lengths > _SHORTEST))
+        if wrong.any():
+            v, u = np.argwhere(wrong)[0]
+            raise ConfigError(f"the direction of column {u}, row {v} is not finite or has no length")
+        self.measures_range = bool((np.abs(lengths - 1.0) < _UNIT).all())
+        """Whether depth is range: all directions have the length 1."""
+        self._table.flags.writeable = False
+        self._hulls: dict[int, NDArray[np.float64]] = {}
+
+    @classmethod
+    def of_points(cls, points_m: ArrayLike) -> "tuple[RayTable, NDArray[np.float32]]":
+        """The rays to the points (N, 3) of a cloud of unknown pattern, in metres from the sensor, and their
+        ranges as an image (1, N). Rays near each other come one after the other; points that are not finite,
+        or at the sensor, are left out. Raises ConfigError if none is left."""
+        points = array(points_m, "points_m")
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ConfigError(f"points_m must be of shape (N, 3), not {points.shape}")
+        ranges = np.linalg.norm(points, axis=1)
+        seen = np.isfinite(ranges) & (ranges > _SHORTEST)
+        if not seen.any():
+            raise ConfigError("no point of the cloud has a finite distance from the sensor")
+        directions, ranges = points[seen] / ranges[seen, None], ranges[seen]
+        order = morton_order(directions)
+        return RayTable(directions[order]), ranges[order].astype(np.float32)[None]
+
+    @property
+    def width(self) -> int:
+        """Columns of its images."""
+        return self._table.shape[1]
+
+    @property
+    def height(self) -> int:
+        """Rows of its images."""
+        return self._table.shape[0]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width)."""
+        return self.height, self.width
+
+    @property
+    def table(self) -> NDArray[np.float32]:
+        """The directions of all pixels as kernels read them, (H, W, 3), read-only."""
+        return self._table
+
+    @cached_property
+    def digest(self) -> str:
+        """A text that tells these rays from all others."""
+        content = hashlib.blake2b(repr((self.shape, self.has_pattern)).encode(), digest_size=16)
+        content.update(self._table.tobytes())
+        return content.hexdigest()
+
+    def __repr__(self) -> str:
+        pattern = "" if self.has_pattern else " without a pattern"
+        return f"<{self.height} x {self.width} rays{pattern}, {self.digest}>"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, RayTable) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return RayTable, (self._table if self.has_pattern else self._table[0],)
+
+    @property
+    def up(self) -> tuple[float, float, float]:
+        """Upwards in the camera frame of a level sensor: z of a lidar, -y of a camera with axial depth."""
+        return (0.0, 0.0, 1.0) if self.measures_range else (0.0, -1.0, 0.0)
+
+    @cached_property
+    def pixels_per_radian(self) -> float:
+        """Pixels along a metre at one metre of depth, which is a radian, where there are fewest; 0 for rays
+        without a pattern, which are never taken together."""
+        if not self.has_pattern or self._table.size == 3:
+            return 0.0
+        return 1.0 / max(_largest_step(self.rays()), 1e-6)
+
+    def rays(self) -> NDArray[np.float64]:
+        """Directions of all pixels, (H, W, 3)."""
+        return self._table.astype(np.float64)
+
+    def directions(self, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
+        """Rays through columns and rows that broadcast with each other, (..., 3); those outside the image are
+        those of its edge."""
+        columns, lines = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
+        columns, lines = np.clip(columns, 0, self.width - 1), np.clip(lines, 0, self.height - 1)
+        left, top = np.floor(columns).astype(np.intp), np.floor(lines).astype(np.intp)
+        right, bottom = np.minimum(left + 1, self.width - 1), np.minimum(top + 1, self.height - 1)
+        a, b = (columns - left)[..., None], (lines - top)[..., None]
+        rows = [
+            (1 - a) * self._table[row, left].astype(np.float64) + a * self._table[row, right]
+            for row in (top, bottom)
+        ]
+        between = (1 - b) * rows[0] + b * rows[1]
+        if self.measures_range:
+            lengths = np.linalg.norm(between, axis=-1, keepdims=True)
+            between = np.where((a > 0) | (b > 0), between / np.maximum(lengths, _SHORTEST), between)
+        return between
+
+    def tile_hulls(self, tile: int) -> NDArray[np.float64]:
+        """For each square of ``tile`` pixels, (rows, columns, 8, 3): the corners of the box around its
+        directions and half a pixel more."""
+        if tile not in self._hulls:
+            rays = self.rays()
+            margin = np.zeros(rays.shape)
+            for axis in (0, 1) if self.has_pattern else ():
+                if rays.shape[axis] > 1:
+                    half = 0.5 * np.abs(np.diff(rays, axis=axis))
+                    margin += np.concatenate([half, half.take([-1], axis=axis)], axis=axis)
+            sides = np.stack(
+                [_by_tile(np.minimum, rays - margin, tile), _by_tile(np.maximum, rays + margin, tile)]
+            )
+            corners = [
+                [sides[c, ..., axis] for axis, c in enumerate(corner)] for corner in np.ndindex(2, 2, 2)
+            ]
+            self._hulls[tile] = np.moveaxis(np.array(corners), (0, 1), (2, 3))
+        return self._hulls[tile]
+
+    def most_pixels_in_cone(self, half_angle: float, block: int) -> float:
+        """A bound on the pixels in a cone of ``half_angle`` radians, wherever it points, and in the square
+        blocks of ``block`` pixels a side whose middle lies in it: all pixels of a cone wider by half a
+        block's diagonal, counted."""
+        if block > 1:
+            half_angle += (block - 1) * self._counts.largest_turn
+        return float(self._counts.most_in_cone(half_angle))
+
+    @cached_property
+    def _counts(self) -> DirectionCounts:
+        return DirectionCounts(self.rays())
+
+    @cached_property
+    def _in_kernels(self) -> "TableRays":
+        from taichi_mrf.kernels.resident import resident
+        from taichi_mrf.sensor.rays import TableRays
+
+        table = resident(self._table.reshape(-1, 3))
+        return TableRays(self.width, self.height, int(self.measures_range), table)
+
+    def in_kernels(self) -> "TableRays":
+        """The camera as kernels take it: a rays.TableRays."""
+        return self._in_kernels
+
+
+def _largest_step(rays: NDArray[np.float64]) -> float:
+    """The largest distance between the directions of neighbouring pixels of (H, W, 3)."""
+    steps = (np.linalg.norm(np.diff(rays, axis=axis), axis=-1) for axis in (0, 1))
+    return max(float(step.max(initial=0.0)) for step in steps)
+
+
+def _by_tile(best: np.ufunc, values: NDArray[np.float64], tile: int) -> NDArray[np.float64]:
+    """The smallest or largest of (H, W, 3) values in each tile, (rows, columns, 3)."""
+    rows, columns = (np.arange(0, size, tile) for size in values.shape[:2])
+    return best.reduceat(best.reduceat(values, rows, axis=0), columns, axis=1)

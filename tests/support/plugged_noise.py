@@ -1,0 +1,84 @@
+"""A sigma for each pixel, and another law of measurements, as plugs from outside."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import taichi as ti
+from numpy.typing import NDArray
+
+from taichi_mrf.kernels.resident import resident
+from taichi_mrf.kernels.types import F32, I32, F32Array, Struct, Template
+from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.sensor.polynomials import SensorNoise
+
+# ruff: noqa: ANN201, ANN202 - Taichi does not allow `-> None` on a kernel or a func.
+
+
+@ti.dataclass
+class _Sigma(Struct):
+    """A pixel's own sigma, at every depth, and no bias."""
+
+    value: F32
+
+    @ti.func
+    def sigma(self, depth: F32):
+        return self.value
+
+    @ti.func
+    def bias(self, depth: F32):
+        return 0.0
+
+    @ti.func
+    def sigma_slope(self, depth: F32):
+        return 0.0
+
+    @ti.func
+    def bias_slope(self, depth: F32):
+        return 0.0
+
+
+@dataclass(frozen=True)
+class PixelSigmas(SensorNoise):
+    """``sigma_m`` (H * W), metres."""
+
+    sigma_m: F32Array
+    width: I32
+
+    @ti.func
+    def at_pixel(self, u: I32, v: I32):
+        return _Sigma(self.sigma_m[v * self.width + u])
+
+
+@dataclass(frozen=True)
+class PixelNoise:
+    """A noise model with a sigma for each pixel, (H, W) metres, and perhaps another law of measurements."""
+
+    sigma_m: NDArray[np.float32]
+    law: type[Sensor] = Sensor
+
+    def table(self, camera: Any) -> "PixelNoise":
+        return self
+
+    def at_pixels(self, depth_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return self.sigma_m.astype(np.float64), np.zeros(self.sigma_m.shape)
+
+    def largest(self, depth_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return np.full(depth_m.size, float(self.sigma_m.max())), np.zeros(depth_m.size)
+
+    def sensor(self, camera: Any) -> Sensor:
+        sigmas = PixelSigmas(resident(self.sigma_m.reshape(-1)), camera.width)
+        return self.law(camera.in_kernels(), sigmas)
+
+
+@dataclass(frozen=True)
+class UniformLaw(Sensor):
+    """Measurements lie anywhere within two sigmas of the surface."""
+
+    @ti.func
+    def likelihood(
+        self, measured: F32, near: F32, far: F32, noise: Template, voxel_size: F32, mode: Template
+    ):
+        half = 2.0 * noise.sigma(measured)
+        inside = ti.max(0.0, ti.min(far, measured + half) - ti.max(near, measured - half))
+        return inside / ti.max(far - near, 1e-6) / (2.0 * half)
