@@ -12,7 +12,15 @@ import taichi_mrf
 GROUPS: dict[str, tuple[str, ...]] = {
     "Starting": ("init",),
     "Maps": ("MRFMap", "LogOddsMap", "VisibilityMap"),
-    "Sensors": ("PinholeCamera", "SphericalCamera", "RayTable", "PolynomialNoise", "PatchNoise", "Frame"),
+    "Sensors": (
+        "PinholeCamera",
+        "SphericalCamera",
+        "RayTable",
+        "PolynomialNoise",
+        "PatchNoise",
+        "sigma_of_confidence",
+        "Frame",
+    ),
     "Queries": (
         "UNKNOWN",
         "FREE",

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from taichi_mrf.sensor.frame import Frame as Frame
     from taichi_mrf.sensor.noise import PatchNoise as PatchNoise
     from taichi_mrf.sensor.noise import PolynomialNoise as PolynomialNoise
+    from taichi_mrf.sensor.own_evidence import sigma_of_confidence as sigma_of_confidence
     from taichi_mrf.sensor.ray_table import RayTable as RayTable
     from taichi_mrf.sensor.spherical import SphericalCamera as SphericalCamera
     from taichi_mrf.system.runtime import init as init
@@ -70,6 +71,7 @@ _PUBLIC = {
     "compare_maps": "taichi_mrf.queries.change",
     "export_map": "taichi_mrf.export.formats",
     "ExportOptions": "taichi_mrf.export.options",
+    "sigma_of_confidence": "taichi_mrf.sensor.own_evidence",
     "Frame": "taichi_mrf.sensor.frame",
     "open_dataset": "taichi_mrf.datasets",
     "Config": "taichi_mrf.config.schema",

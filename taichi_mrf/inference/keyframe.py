@@ -14,6 +14,7 @@ from taichi_mrf.kernels.types import I32, F32Array, I32Array
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import NoiseModel, NoiseTable
+from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.voxels.window import Window
 
 Cells = NDArray[np.int32]
@@ -66,7 +67,7 @@ class DepthImage:
     ``depth`` is (H * W) float32 in metres along each pixel's ray (axial depth for a pinhole), 0 where there
     is no measurement; ``farthest`` the largest in each tile (rows, columns). ``sensor`` is camera and noise
     as kernels take them, ``rays`` the number of measurements. ``color`` is (H, W, 3) RGB in host memory, 0
-    0 0 where a pixel has no colour, or None.
+    0 0 where a pixel has no colour, or None. ``own`` is what the keyframe states of its measurements.
     """
 
     depth: Resident
@@ -76,6 +77,7 @@ class DepthImage:
     rays: int
     farthest: NDArray[np.float32]
     color: NDArray[np.uint8] | None = None
+    own: OwnEvidence = NOTHING
 
     @staticmethod
     def upload(
@@ -83,18 +85,21 @@ class DepthImage:
         camera: Camera,
         noise: NoiseModel,
         color: NDArray[np.uint8] | None = None,
+        own: OwnEvidence = NOTHING,
     ) -> "DepthImage":
         """Put :func:`checked_depth` (H, W), which must not change from now on, where kernels can reach it.
-        Raises ConfigError if the noise model does not fit the camera."""
-        table = noise.table(camera)
+        ``noise`` is the map's, for what the keyframe does not state itself. Raises ConfigError if the noise
+        model does not fit the camera."""
+        table = own.noise_model(noise, depth_m).table(camera)
         depth, sensor = resident(depth_m.reshape(-1)), table.sensor(camera)
         rays = int(np.count_nonzero(depth_m))
-        return DepthImage(depth, camera, sensor, table, rays, _farthest(depth_m), color)
+        return DepthImage(depth, camera, sensor, table, rays, _farthest(depth_m), color, own)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of depth and colour."""
-        return self.depth.shape[0] * 4 + (0 if self.color is None else self.color.nbytes)
+        """Bytes of depth, colour and sigmas."""
+        color = 0 if self.color is None else self.color.nbytes
+        return self.depth.shape[0] * 4 + color + self.own.nbytes
 
     def to_numpy(self) -> NDArray[np.float32]:
         """(H, W) axial depth in metres, 0 where there is no measurement."""
@@ -229,6 +234,11 @@ class Keyframe:
     def color(self) -> NDArray[np.uint8] | None:
         """(H, W, 3) RGB, 0 0 0 where a pixel has no colour; None without a colour image."""
         return self.image.color
+
+    @property
+    def own(self) -> OwnEvidence:
+        """What it states of its measurements."""
+        return self.image.own
 
     @property
     def image_bytes(self) -> int:

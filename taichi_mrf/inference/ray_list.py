@@ -2,8 +2,9 @@
 
 Near the camera a voxel covers hundreds of pixels, whose rays send it nearly the same message. Blocks of
 pixels are therefore merged, two of a size at a time, as long as enough rays still meet a voxel at their depth
-and their measurements agree. The ray through a block's middle has their mean depth, and their number as its
-weight. Pixels that do not agree, such as those at the edge of a surface, keep rays of their own.
+and their measurements agree, and their sigmas where each pixel has its own. The ray through a block's middle
+has their mean depth, and their number as its weight. Pixels that do not agree, such as those at the edge of a
+surface, keep rays of their own.
 """
 
 import math
@@ -145,6 +146,10 @@ def _merge(rule: Template, blocks: Template, sensor: Template, u: I32, v: I32, n
             if not agree:  # the noise need not be looked up for most
                 sigma = sensor.noise_at(u + wide // 2, v + high // 2).sigma(near)
                 agree = far - near <= rule.agree_sigmas * sigma
+            if ti.static(sensor.noise.own_sigmas):
+                # Both halves are of one level each.
+                column, row = b % sensor.camera.width, b // sensor.camera.width
+                agree = agree and sensor.noise.sigma_level(u, v) == sensor.noise.sigma_level(column, row)
             if agree:
                 blocks.nearest[a] = near
                 blocks.farthest[a] = far

@@ -83,10 +83,12 @@ def driven(
 
 
 def content_key(keyframe: Keyframe) -> bytes:
-    """What a keyframe holds, as bytes to sort by: measurement, pose and camera, but not its number."""
+    """What a keyframe holds, as bytes to sort by: measurement, pose, camera and what it states of its
+    measurements, but not its number."""
     digest = hashlib.blake2b(keyframe.T_world_camera.tobytes(), digest_size=16)
     digest.update(repr(keyframe.camera).encode())
     digest.update(on_host(keyframe.image.depth).tobytes())
+    digest.update(keyframe.own.content())
     return digest.digest()
 
 

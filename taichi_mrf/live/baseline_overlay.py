@@ -61,9 +61,9 @@ class BaselineOverlay:
             return True
         for entry in mapper.roster.with_state("on"):
             if entry.id not in self._places:
-                depth_m = mapper.posed_image(entry).depth_m
+                image = mapper.posed_image(entry)
                 parts = (entry.T_world_camera, entry.camera, entry.name, entry.stamp_s)
-                here = self.map.add_keyframe(depth_m, *parts)
+                here = self.map.add_keyframe(image.depth_m, *parts, **image.own.arguments())
                 self._places[entry.id] = here, entry.T_world_camera
                 return True
         return False

@@ -9,14 +9,15 @@ from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.methods.protocol import PosedDepth
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.viewer.messages import KeyframeState
 
 
 @dataclass
 class LiveKeyframe:
-    """One keyframe. ``map_id`` is its number in the map while it is on; ``depth_m`` (H, W) is its depth image
-    in metres, 0 for no measurement, and ``color`` (H, W, 3) its colour image, if it has one, while it is off.
-    A frozen keyframe has none of them.
+    """One keyframe. ``map_id`` is its number in the map while it is on. While it is off, ``depth_m`` (H, W)
+    is its depth image in metres, 0 for no measurement, ``color`` (H, W, 3) its colour image, if it has one,
+    and ``own`` what it states of its measurements. A frozen keyframe has none of them.
 
     ``T_recorded`` is the recorded pose and ``T_home`` the one found by alignment, which is the same if poses
     are not refined; ``moved_by_hand``: a user has moved it elsewhere.
@@ -33,6 +34,7 @@ class LiveKeyframe:
     state: KeyframeState = "on"
     depth_m: NDArray[np.float32] | None = None
     color: NDArray[np.uint8] | None = None
+    own: OwnEvidence = NOTHING
     moved_by_hand: bool = False
 
     def __post_init__(self) -> None:

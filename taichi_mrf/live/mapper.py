@@ -24,6 +24,7 @@ from taichi_mrf.mapping.selection import surplus
 from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.methods.capabilities import can_freeze, has_messages, window_of
 from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap
+from taichi_mrf.sensor.own_evidence import NOTHING
 from taichi_mrf.viewer import messages
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 
@@ -97,11 +98,13 @@ class Mapper:
             entry.map_id = self._add(entry)
             if self.refiner is not None:
                 self.refiner.note_recorded(entry.map_id, entry.T_recorded)
-            entry.depth_m, entry.color, entry.state = None, None, "on"
+            entry.depth_m, entry.color, entry.own, entry.state = None, None, NOTHING, "on"
         else:
-            depth_m, color = self._keyframe(entry).depth_m, self._keyframe(entry).color
+            keyframe = self._keyframe(entry)
+            kept = keyframe.depth_m, keyframe.color, keyframe.own
             self.map.remove_keyframe(self._map_id(entry))
-            entry.map_id, entry.depth_m, entry.color, entry.state = None, depth_m, color, "off"
+            entry.depth_m, entry.color, entry.own = kept
+            entry.map_id, entry.state = None, "off"
         self.unsettled = self.edited = self.cavities_changed = True
         return entry
 
@@ -201,7 +204,8 @@ class Mapper:
             raise KeyframeError(
                 f"keyframe {entry.id} ({entry.name}) is frozen: its depth image is no longer in memory"
             )
-        return PosedDepthImage(entry.name, entry.T_world_camera, entry.camera, depth_m, entry.id)
+        own = self._keyframe(entry).own if entry.state == "on" else entry.own
+        return PosedDepthImage(entry.name, entry.T_world_camera, entry.camera, depth_m, entry.id, own)
 
     def posed_images_near(self, point: NDArray[np.float64]) -> Iterator[PosedDepthImage]:
         """All keyframes that are on, the nearest to a point first."""
@@ -219,7 +223,7 @@ class Mapper:
         """Add a keyframe that was off, and sweep it once. If that fails, the map is unchanged."""
         assert entry.depth_m is not None
         parts = (entry.T_world_camera, entry.camera, entry.name, entry.stamp_s, entry.color)
-        map_id = self.map.add_keyframe(entry.depth_m, *parts)
+        map_id = self.map.add_keyframe(entry.depth_m, *parts, **entry.own.arguments())
         try:
             self.sweep(map_id)
         except BaseException:

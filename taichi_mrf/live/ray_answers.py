@@ -11,7 +11,8 @@ from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.sensor.noise import LEAST_SIGMA_M, NoiseTable, evaluate
+from taichi_mrf.sensor.noise import NoiseModel
+from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.viewer.messages import RayAnswer
 
 BEHIND_SIGMAS = 3.0
@@ -28,6 +29,13 @@ class PosedDepthImage:
     depth_m: NDArray[np.float32]
     keyframe: int | None = None
     """The viewer's number of the keyframe, if it is one."""
+
+    own: OwnEvidence = NOTHING
+    """What the keyframe states of its measurements."""
+
+    def noise_model(self, default: NoiseModel) -> NoiseModel:
+        """The image's noise, if its map has the noise ``default``."""
+        return self.own.noise_model(default, self.depth_m)
 
 
 @dataclass(frozen=True)
@@ -86,16 +94,6 @@ def pixel_direction(camera: PinholeCamera, u: float, v: float) -> NDArray[np.flo
     return np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0])
 
 
-def noise_at(
-    table: NoiseTable, camera: PinholeCamera, u: float, v: float, depth_m: float
-) -> tuple[float, float]:
-    """(bias, sigma) in metres of axial depth, of the pixel nearest to (u, v)."""
-    column, row = _nearest(camera, u, v)
-    patch = (row // table.patch) * table.columns + column // table.patch
-    sigma, bias = (float(evaluate(table.coefficients[patch, which], depth_m)) for which in (0, 1))
-    return bias, max(sigma, LEAST_SIGMA_M)
-
-
 def _answer(
     m: OccupancyMap, image: PosedDepthImage, u: float, v: float, along: NDArray[np.float64]
 ) -> RayAnswer:
@@ -103,7 +101,7 @@ def _answer(
     depth, range_per_depth = float(image.depth_m[row, column]), float(np.linalg.norm(along))
     noise = None
     if depth > 0:
-        bias, sigma = noise_at(m.noise.table(image.camera), image.camera, u, v, depth)
+        sigma, bias = image.noise_model(m.noise).table(image.camera).at_pixel(column, row, depth)
         noise = PixelNoise(depth * range_per_depth, bias * range_per_depth, sigma * range_per_depth)
     title = f"{image.name}, pixel ({column}, {row})"
     start, turned = image.T_world_camera[:3, 3], image.T_world_camera[:3, :3] @ along
@@ -142,7 +140,7 @@ def _sees(m: OccupancyMap, image: PosedDepthImage, u: float, v: float, depth_m: 
     measured = float(image.depth_m[row, column])
     if measured <= 0:
         return False
-    _, sigma = noise_at(m.noise.table(image.camera), image.camera, u, v, measured)
+    sigma, _ = image.noise_model(m.noise).table(image.camera).at_pixel(column, row, measured)
     return depth_m <= measured + max(BEHIND_SIGMAS * sigma, 2 * m.voxel_size)
 
 

@@ -56,7 +56,8 @@ class PoseRefiner:
         """Add keyframes at the poses to which an earlier run has refined them, and sweep each once, as that
         run did: the map that later keyframes are aligned with is the same, bit for bit."""
         for k in keyframes:
-            id = self.map.add_keyframe(k.depth_m, k.T_world_camera, k.camera, k.name, k.stamp_s, k.color)
+            parts = (k.depth_m, k.T_world_camera, k.camera, k.name, k.stamp_s, k.color)
+            id = self.map.add_keyframe(*parts, **k.own.arguments())
             self.map.infer(keyframes=[id], sweeps=1)
 
     def drop_recorded(self, keyframe: int) -> None:

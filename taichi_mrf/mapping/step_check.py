@@ -125,7 +125,9 @@ def _median_depth(keyframe: PosedDepth) -> float:
 
 
 def _points(keyframe: PosedDepth, noise: NoiseModel, max_depth: float) -> OrientedPoints:
-    points = oriented_points(DepthImage.upload(keyframe.depth_m, keyframe.camera, noise), max_depth)
+    points = oriented_points(
+        DepthImage.upload(keyframe.depth_m, keyframe.camera, noise, own=keyframe.own), max_depth
+    )
     return points.thinned(max(1, round(math.sqrt(len(points.points) / POINTS))))
 
 

@@ -30,6 +30,7 @@ from taichi_mrf.queries.view import View
 from taichi_mrf.queries.within import occupied_within, path_collision
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config
+from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.system import runtime
 from taichi_mrf.system.owner import Owned, owned_attribute
 from taichi_mrf.voxels.pool import BrickPool
@@ -179,11 +180,15 @@ class BrickMap(Owned):
         return self.view.ray_profile(origin, direction, max_range or self.sensor.max_depth)
 
     def ray_scores(
-        self, depth_m: ArrayLike, T_world_camera: ArrayLike, camera: Camera
+        self,
+        depth_m: ArrayLike,
+        T_world_camera: ArrayLike,
+        camera: Camera,
+        own: OwnEvidence = NOTHING,
     ) -> NDArray[np.float32]:
         """How much each pixel of a depth image that is not in the map contradicts it, (H, W) float32 in nats:
         above 0 something new, below 0 a surface that is gone (queries.contradiction.ray_scores)."""
-        return ray_scores(self, depth_m, T_world_camera, camera)
+        return ray_scores(self, depth_m, T_world_camera, camera, own)
 
     def occupied_within(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
         """The probability that something lies within ``radius_m`` metres of points (N, 3) in metres, (N,)

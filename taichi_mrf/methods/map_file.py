@@ -21,9 +21,11 @@ from taichi_mrf.errors import CapacityError, MapFileError, TaichiMRFError, said
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.geometry.up import UP_NAMES, Up, up_from_name, up_name, up_of
 from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.methods.noise_file import evidence_arrays, noise_arrays, read_evidence, read_noise
 from taichi_mrf.methods.sensor_section import describing
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
-from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
+from taichi_mrf.sensor.noise import NoiseModel
+from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.system.npz_file import NpzFile, open_npz
 from taichi_mrf.voxels.layout import VOXELS
 
@@ -41,7 +43,8 @@ class StoredKeyframe:
     """A keyframe in host memory, as it is saved; recursive maps hold their keyframes in this form.
 
     ``depth_m`` is (H, W) float32 axial depth in metres, 0 where there is no measurement, ``stamp_s`` when it
-    was taken, in seconds, and ``color`` (H, W, 3) uint8 RGB or None.
+    was taken, in seconds, ``color`` (H, W, 3) uint8 RGB or None, and ``own`` what it states of its
+    measurements.
     """
 
     id: int
@@ -51,11 +54,12 @@ class StoredKeyframe:
     camera: Camera
     stamp_s: float
     color: NDArray[np.uint8] | None = None
+    own: OwnEvidence = NOTHING
 
     @staticmethod
     def of(k: Keyframe) -> "StoredKeyframe":
         """A keyframe of an MRFMap."""
-        return StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera, k.stamp_s, k.color)
+        return StoredKeyframe(k.id, k.name, k.depth_m, k.T_world_camera, k.camera, k.stamp_s, k.color, k.own)
 
     @property
     def rays(self) -> int:
@@ -108,12 +112,13 @@ class MapHeader:
             "next_id": np.asarray(self.next_id),
             "settled": np.asarray(self.settled),
             "up": np.asarray(self.up_axis),
-            **_noise_arrays(self.noise),
+            **noise_arrays(self.noise),
         }
         for number, keyframe in enumerate(keyframes):
             arrays[f"keyframe_depth_{number}"] = keyframe.depth_m
             if keyframe.color is not None:
                 arrays[f"keyframe_color_{number}"] = keyframe.color
+            arrays |= evidence_arrays(keyframe.own, f"keyframe_{number}_")
         return arrays
 
 
@@ -187,11 +192,12 @@ def read_header(path: Path, file: NpzFile) -> MapHeader:
         if f"keyframe_color_{i}" in file:
             color = file.array(f"keyframe_color_{i}", "u", (*camera.shape, 3)).astype(np.uint8)
         place = as_pose(poses[i]), camera, float(stamps[i])
-        keyframes.append(StoredKeyframe(id, names[i], depth_m, *place, color))
+        own = read_evidence(file, f"keyframe_{i}_", camera)
+        keyframes.append(StoredKeyframe(id, names[i], depth_m, *place, color, own))
     next_id = file.scalar("next_id", "i")
     if len(set(ids.tolist())) < n or not all(0 <= id < next_id for id in ids.tolist()):
         raise MapFileError(f"{path}: damaged: the ids of its keyframes are not valid")
-    config, noise = _config(path, file), _noise(file)
+    config, noise = _config(path, file), read_noise(file)
     # Maps of earlier versions saved the default sensor, whatever their noise.
     config = replace(config, sensor=describing(noise, config.sensor))
     settled = file.scalar("settled", "b") if "settled" in file else True  # earlier versions did not save it
@@ -232,25 +238,3 @@ def _camera_row(camera: Camera) -> list[float]:
 def _camera(row: NDArray[np.float64]) -> PinholeCamera:
     width, height, *rest = row.tolist()
     return PinholeCamera(int(width), int(height), *rest)
-
-
-def _noise_arrays(noise: NoiseModel) -> dict[str, NDArray]:
-    if isinstance(noise, PatchNoise):
-        return {
-            "noise_sigma": noise.sigma,
-            "noise_bias": noise.bias,
-            "noise_patch": np.asarray(noise.patch),
-            "noise_camera": np.asarray(_camera_row(noise.camera)),
-        }
-    if isinstance(noise, PolynomialNoise):
-        return {"noise_sigma": noise.sigma, "noise_bias": noise.bias}
-    raise MapFileError(f"a noise model of type {type(noise).__name__} cannot be saved")
-
-
-def _noise(file: NpzFile) -> NoiseModel:
-    if "noise_patch" in file:
-        camera = _camera(file.array("noise_camera", "fi", (_CAMERA_VALUES,)))
-        sigma, bias = (file.array(name, "f", (None, None)) for name in ("noise_sigma", "noise_bias"))
-        return PatchNoise(sigma, bias, file.scalar("noise_patch", "iu"), camera)
-    sigma, bias = (file.array(name, "f", (1, None))[0] for name in ("noise_sigma", "noise_bias"))
-    return PolynomialNoise(sigma, bias)

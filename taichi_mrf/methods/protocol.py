@@ -17,6 +17,7 @@ from taichi_mrf.queries.profile import RayProfile
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel
+from taichi_mrf.sensor.own_evidence import OwnEvidence
 
 
 class PosedDepth(Protocol):
@@ -31,6 +32,10 @@ class PosedDepth(Protocol):
     def camera(self) -> Camera: ...
     @property
     def depth_m(self) -> NDArray[np.float32]: ...
+    @property
+    def own(self) -> OwnEvidence:
+        """What it states of its measurements."""
+        ...
 
 
 class MappedKeyframe(PosedDepth, Protocol):
@@ -102,10 +107,14 @@ class OccupancyMap(Protocol):
         name: str = "",
         stamp_s: float | None = None,
         color: ArrayLike | None = None,
+        noise: NoiseModel | None = None,
+        sigma_m: ArrayLike | None = None,
     ) -> int:
         """Add a depth image, (H, W) axial depth in metres, taken at a pose (4, 4) and a time in seconds, by
         default the number of keyframes added before; returns its id. ``color`` (H, W, 3) uint8 RGB is for
-        maps that have colours (``METHOD.has_colors``); others raise ConfigError."""
+        maps that have colours (``METHOD.has_colors``); others raise ConfigError. ``noise`` is the keyframe's
+        own noise model, ``sigma_m`` (H, W) its own standard deviation of each pixel's depth in metres (0 and
+        NaN: the noise model's)."""
         ...
 
     def remove_keyframe(self, id: int) -> None:

@@ -39,6 +39,7 @@ from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
+from taichi_mrf.sensor.own_evidence import checked_evidence
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.strips import strip_length
@@ -136,12 +137,15 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         name: str = "",
         stamp_s: float | None = None,
         color: ArrayLike | None = None,
+        noise: NoiseModel | None = None,
+        sigma_m: ArrayLike | None = None,
     ) -> int:
         """Add a depth image and integrate it at once; in a stale map the next :meth:`infer` does.
 
         ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
         ``T_world_camera`` is (4, 4); ``stamp_s`` is when it was taken, in seconds, by default the number of
-        keyframes added before. Returns the keyframe's id.
+        keyframes added before; ``noise`` and ``sigma_m`` are those of MRFMap.add_keyframe. Returns the
+        keyframe's id.
         Raises KeyframeError for a wrong shape or pose, CapacityError if the map would not fit, ConfigError
         for a ``color`` image: the map has no colours.
         """
@@ -149,10 +153,12 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
             raise ConfigError(f"a map of the method {self.METHOD.name} has no colours: pass no color")
         T, name = as_pose(T_world_camera), instance(name, str, "name", "a string")
         depth = checked_depth(depth_m, camera, self.sensor.min_depth)
+        depth, own = checked_evidence(depth, camera, noise, sigma_m)
         if not self._keyframes:
-            warn_of_bad_sigma(self.noise.table(camera), self.sensor.min_depth, self.sensor.max_depth)
+            table = own.noise_model(self.noise, depth).table(camera)
+            warn_of_bad_sigma(table, self.sensor.min_depth, self.sensor.max_depth)
         name = name or f"keyframe {self._next_id}"
-        record = StoredKeyframe(self._next_id, name, depth, T, camera, self._stamp(stamp_s))
+        record = StoredKeyframe(self._next_id, name, depth, T, camera, self._stamp(stamp_s), own=own)
         if not self._stale:
             self._add(record)
         self._keyframes[record.id] = record
@@ -269,7 +275,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
     def _add(self, record: StoredKeyframe) -> None:
         """Allocate the bricks that a scan's rays cross and integrate it. An error leaves the map
         unchanged."""
-        image = DepthImage.upload(record.depth_m, record.camera, self.noise)
+        image = DepthImage.upload(record.depth_m, record.camera, self.noise, own=record.own)
         footprint = self._reach(image, record.T_world_camera)
         self._fade(record.stamp_s)
         self._registry.anchor_at(record.T_world_camera[:3, 3])

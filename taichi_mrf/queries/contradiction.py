@@ -27,6 +27,7 @@ from taichi_mrf.queries.survey import SurfaceSurvey
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.noise import NoiseModel
+from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 
 OUTLIERS = 0.01
 """Share of the measurements that may come from anywhere in the sensor's range (o)."""
@@ -44,17 +45,22 @@ class MeasuredMap(Protocol):
 
 
 def ray_scores(
-    m: MeasuredMap, depth_m: ArrayLike, T_world_camera: ArrayLike, camera: Camera
+    m: MeasuredMap,
+    depth_m: ArrayLike,
+    T_world_camera: ArrayLike,
+    camera: Camera,
+    own: OwnEvidence = NOTHING,
 ) -> NDArray[np.float32]:
     """How much each pixel of a depth image contradicts a map, (H, W) float32, in nats (natural logarithms of
     likelihood ratios).
 
     ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
-    ``T_world_camera`` is (4, 4). Above 0 the measurement is nearer than the map's surface, in space that is
-    known to be free: something new. Below 0 the ray has passed through a surface of the map: it is gone.
-    From about 3 on a score is more than noise, and none is beyond about 10. It is 0 for what is measured in
-    unknown space, of which the map says nothing, and NaN without a measurement between ``sensor.min_depth``
-    and ``sensor.max_depth``. Raises ConfigError for a wrong shape, KeyframeError for an impossible pose.
+    ``T_world_camera`` is (4, 4); ``own`` is what is stated of these measurements. Above 0 the measurement is
+    nearer than the map's surface, in space that is known to be free: something new. Below 0 the ray has
+    passed through a surface of the map: it is gone. From about 3 on a score is more than noise, and none is
+    beyond about 10. It is 0 for what is measured in unknown space, of which the map says nothing, and NaN
+    without a measurement between ``sensor.min_depth`` and ``sensor.max_depth``. Raises ConfigError for a
+    wrong shape, KeyframeError for an impossible pose.
     """
     check_camera(camera)
     T = as_pose(T_world_camera)
@@ -64,7 +70,7 @@ def ray_scores(
     nearest, farthest = m.sensor.min_depth, m.sensor.max_depth
     judged = (depth > 0) & (depth >= nearest) & (depth <= farthest)  # NaN is not
     measured = np.where(judged, depth, 0.0)
-    noise = m.noise.table(camera)
+    noise = own.noise_model(m.noise, measured).table(camera)
     survey = m.view.survey(camera, T, farthest, measured.astype(np.float32), noise)
     sigma, bias = noise.at_pixels(measured)
     surface_m = measured - bias

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.own_evidence import OwnEvidence
 
 if TYPE_CHECKING:
     from taichi_mrf.sensor.noise import NoiseModel
@@ -36,3 +37,8 @@ class Frame:
     sigma_m: NDArray[np.float32] | None = None
     noise: "NoiseModel | None" = None
     no_return: NDArray[np.bool_] | None = None
+
+    @property
+    def own(self) -> OwnEvidence:
+        """What the frame states of its measurements, as it was read."""
+        return OwnEvidence(self.noise, self.sigma_m)

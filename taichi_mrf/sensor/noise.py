@@ -45,6 +45,12 @@ class NoiseTable:
         sigma, bias = (evaluate(self.coefficients[row, which], depth_m) for which in (0, 1))
         return np.maximum(sigma, LEAST_SIGMA_M), bias
 
+    def at_pixel(self, column: int, row: int, depth_m: float) -> tuple[float, float]:
+        """sigma and bias of one pixel for a surface at a depth."""
+        patch = (row // self.patch) * self.columns + column // self.patch
+        sigma, bias = (float(evaluate(self.coefficients[patch, which], depth_m)) for which in (0, 1))
+        return max(sigma, LEAST_SIGMA_M), bias
+
     def largest(self, depth_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The largest sigma and the largest absolute bias that any pixel has at each of some depths, (N,)."""
         values = np.abs(evaluate(self.coefficients[:, :, None], depth_m.reshape(1, 1, -1)))

@@ -1,13 +1,19 @@
 """Noise in kernels, as polynomials of depth for each patch of pixels. How noise plugs in: sensor/model.py."""
 
+import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import taichi as ti
 
 from taichi_mrf.kernels.bundles import Bundle
-from taichi_mrf.kernels.types import F32, I32, F32Array3, Struct, Vec5
+from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array3, Struct, Vec5
 from taichi_mrf.sensor.limits import LEAST_SIGMA_M, TERMS
+
+SAME_SIGMA = 2**0.5
+"""Pixels whose sigmas differ by no more than about this factor may share a ray."""
+
+LEVELS_IN_E = 1.0 / math.log(SAME_SIGMA)
 
 
 @ti.func
@@ -63,6 +69,9 @@ class SensorNoise(Bundle):
     """A ti.func, as PolynomialTable has it. What it returns has the methods of PixelNoise, and may hold
     whatever a pixel needs."""
 
+    own_sigmas: ClassVar[bool] = False
+    """Whether pixels of one patch differ: then there is a ``sigma_level``, as ScaledTable has it."""
+
 
 @dataclass(frozen=True)
 class PolynomialTable(SensorNoise):
@@ -86,3 +95,67 @@ class PolynomialTable(SensorNoise):
             noise.sigma_terms[term] = self.coefficients[row, 0, term]
             noise.bias_terms[term] = self.coefficients[row, 1, term]
         return noise
+
+
+@ti.dataclass
+class ScaledPixelNoise(Struct):
+    """The noise of one pixel whose sigma is ``scale`` times that of polynomials."""
+
+    sigma_terms: Vec5
+    bias_terms: Vec5
+    scale: F32
+
+    @ti.func
+    def sigma(self, depth: F32):
+        """Standard deviation of the measurement of a surface at ``depth``, at least LEAST_SIGMA_M."""
+        unscaled = ti.max(polynomial(self.sigma_terms, depth), LEAST_SIGMA_M)
+        return ti.max(self.scale * unscaled, LEAST_SIGMA_M)
+
+    @ti.func
+    def bias(self, depth: F32):
+        """Mean of measured minus true depth for a surface at ``depth``, in metres."""
+        return polynomial(self.bias_terms, depth)
+
+    @ti.func
+    def sigma_slope(self, depth: F32):
+        """Derivative of sigma by depth, without the bound from below."""
+        return self.scale * slope(self.sigma_terms, depth)
+
+    @ti.func
+    def bias_slope(self, depth: F32):
+        """Derivative of the bias by depth."""
+        return slope(self.bias_terms, depth)
+
+
+@dataclass(frozen=True)
+class ScaledTable(SensorNoise):
+    """The polynomials of each square patch of pixels, and a factor of each pixel's sigma
+    (pixel_sigma.ScaledNoiseTable)."""
+
+    own_sigmas: ClassVar[bool] = True
+
+    coefficients: F32Array3
+    patch: I32
+    columns: I32
+    """As in PolynomialTable."""
+
+    scale: F32Array
+    """(H * W): the factors, row by row."""
+
+    width: I32
+    """Pixels in a row of the image."""
+
+    @ti.func
+    def at_pixel(self, u: I32, v: I32):
+        """The noise of pixel (u, v)."""
+        row = (v // self.patch) * self.columns + u // self.patch
+        noise = ScaledPixelNoise(Vec5(0.0), Vec5(0.0), self.scale[v * self.width + u])
+        for term in ti.static(range(TERMS)):
+            noise.sigma_terms[term] = self.coefficients[row, 0, term]
+            noise.bias_terms[term] = self.coefficients[row, 1, term]
+        return noise
+
+    @ti.func
+    def sigma_level(self, u: I32, v: I32):
+        """The power of SAME_SIGMA that is nearest to the factor of pixel (u, v)."""
+        return ti.cast(ti.round(ti.log(self.scale[v * self.width + u]) * LEVELS_IN_E), ti.i32)

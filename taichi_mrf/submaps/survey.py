@@ -65,7 +65,8 @@ def survey_frames(task: SurveyTask) -> list[SurveyedFrame]:
         T_world_camera, chunks = as_pose(frame.T_world_camera), nowhere
         measured = bool((frame.depth_m > 0).any())
         if measured:
-            id = m.add_keyframe(frame.depth_m, T_world_camera, frame.camera, name, frame.stamp)
+            parts = (frame.depth_m, T_world_camera, frame.camera, name, frame.stamp)
+            id = m.add_keyframe(*parts, **frame.own.arguments())
             bricks = m.all_crossed_bricks()
             if config.keep_surface:
                 bricks = np.concatenate([bricks, m.measured_bricks()])

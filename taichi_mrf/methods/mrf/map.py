@@ -41,10 +41,10 @@ from taichi_mrf.methods.mrf.moving_window import MovingWindow
 from taichi_mrf.methods.mrf.plug import METHOD
 from taichi_mrf.methods.mrf.reading import ReadableMRF
 from taichi_mrf.methods.mrf.storage import contents_of, read_contents, write_contents
-from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
+from taichi_mrf.sensor.own_evidence import checked_evidence
 from taichi_mrf.voxels.layout import VOXELS
 
 
@@ -124,18 +124,23 @@ class MRFMap(ReadableMRF):
         name: str = "",
         stamp_s: float | None = None,
         color: ArrayLike | None = None,
+        noise: NoiseModel | None = None,
+        sigma_m: ArrayLike | None = None,
     ) -> int:
         """Add a depth image. It takes part in the next :meth:`infer`.
 
         ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
         ``T_world_camera`` is (4, 4); ``stamp_s`` is when it was taken, in seconds, by default the number of
         keyframes added before; ``color`` is (H, W, 3) uint8 RGB of the same pixels, 0 0 0 for none, from
-        which :meth:`colors` follow. Returns the keyframe's id.
-        Raises KeyframeError for a wrong shape or pose, CapacityError if the map would not fit.
+        which :meth:`colors` follow; ``noise`` is its own noise model; ``sigma_m`` is (H, W), the standard
+        deviation of each pixel's depth in metres, in place of the noise model's: 0, negative and NaN stand
+        for the model's, and an infinite one means no measurement. Returns the keyframe's id.
+        Raises KeyframeError for a wrong shape or pose, CapacityError if the map would not fit,
+        ConfigError for noise that does not fit the camera.
         """
         T, stamp_s = as_pose(T_world_camera), self._stamp(stamp_s)
         name = instance(name, str, "name", "a string") or f"keyframe {self._next_id}"
-        image = self._upload(depth_m, camera, color)
+        image = self._upload(depth_m, camera, color, noise, sigma_m)
         keyframe = self._allocator.place(self._next_id, name, image, T, stamp_s)
         self._keyframes[keyframe.id] = keyframe
         self._note_up(T, camera)
@@ -320,23 +325,6 @@ class MRFMap(ReadableMRF):
         if self._dated is not None:
             self._dated.outdate()
 
-    @property
-    def last_voxel_steps(self) -> int:
-        """Voxels that the rays of the last swept keyframe crossed, summed over its rays."""
-        return self._sweeper.voxel_steps
-
-    def statistics(self) -> MapStatistics:
-        """The size of the map."""
-        keyframes = self._keyframes.values()
-        return measure(
-            self._pool,
-            keyframes=len(keyframes),
-            frozen=len(self._frozen),
-            rays=sum(k.rays for k in keyframes),
-            message_bytes=sum(k.voxel_bytes for k in keyframes),
-            other_bytes=sum(k.image_bytes for k in keyframes) + self._sweeper.nbytes + self._left_bytes,
-        )
-
     def save(self, path: str | Path) -> None:
         """Write the map to one .npz file, under a temporary name first. Raises MapFileError."""
         keyframes = list(self._keyframes.values())
@@ -362,7 +350,7 @@ class MRFMap(ReadableMRF):
             m._restore_shares(contents.frozen_colors, contents.kept)
             m._frozen = dict(contents.frozen)
             for k in header.keyframes:
-                image = m._upload(k.depth_m, k.camera, k.color)
+                image = m._upload(k.depth_m, k.camera, k.color, **k.own.arguments())
                 parts = (image, k.T_world_camera, k.stamp_s)
                 m._keyframes[k.id] = m._allocator.place(k.id, k.name, *parts)
             if m.window is not None:
@@ -378,9 +366,13 @@ class MRFMap(ReadableMRF):
         m._messages_lost, m._settled = bool(m._keyframes), header.settled
         return m
 
-    def _upload(self, depth_m: ArrayLike, camera: Camera, color: ArrayLike | None) -> DepthImage:
+    def _upload(
+        self, depth_m: ArrayLike, camera: Camera, color: ArrayLike | None,
+        noise: NoiseModel | None, sigma_m: ArrayLike | None,
+    ) -> DepthImage:  # fmt: skip
         depth = checked_depth(depth_m, camera, self.sensor.min_depth)
-        image = DepthImage.upload(depth, camera, self.noise, checked_color(color, camera))
+        depth, own = checked_evidence(depth, camera, noise, sigma_m)
+        image = DepthImage.upload(depth, camera, self.noise, checked_color(color, camera), own)
         if not self._keyframes:
             warn_of_bad_sigma(image.noise_table, self.sensor.min_depth, self.sensor.max_depth)
         return image

@@ -24,6 +24,7 @@ from taichi_mrf.methods.mrf.calibrated import calibrated_log_odds
 from taichi_mrf.methods.mrf.kept_rays import RayShare
 from taichi_mrf.methods.mrf.map_reading import MapReading, RaysThen
 from taichi_mrf.methods.mrf.surfacing import LEAST, WithSurface
+from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.change import MapChange, compare_maps
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import copied
@@ -62,6 +63,23 @@ class ReadableMRF(WithSurface):
         frozen ones count as one; 255 means 255 or more."""
         sent = [(k.visible, k.messages) for k in self._keyframes.values() if k.messages is not None]
         return count_observations(slots, sent, self._pool)
+
+    @property
+    def last_voxel_steps(self) -> int:
+        """Voxels that the rays of the last swept keyframe crossed, summed over its rays."""
+        return self._sweeper.voxel_steps
+
+    def statistics(self) -> MapStatistics:
+        """The size of the map."""
+        keyframes = self._keyframes.values()
+        return measure(
+            self._pool,
+            keyframes=len(keyframes),
+            frozen=len(self._frozen),
+            rays=sum(k.rays for k in keyframes),
+            message_bytes=sum(k.voxel_bytes for k in keyframes),
+            other_bytes=sum(k.image_bytes for k in keyframes) + self._sweeper.nbytes + self._left_bytes,
+        )
 
     @property
     def has_colors(self) -> bool:

@@ -1,0 +1,101 @@
+"""What one keyframe states of its own measurements, in place of what its map assumes of all."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf.config.arguments import array
+from taichi_mrf.errors import ConfigError, KeyframeError
+from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.limits import LEAST_SIGMA_M
+from taichi_mrf.sensor.noise import NoiseModel
+from taichi_mrf.sensor.pixel_sigma import PixelSigma
+
+
+@dataclass(frozen=True)
+class OwnEvidence:
+    """A keyframe's own noise model and its own sigma for each pixel; None for what its map assumes.
+
+    ``sigma_m`` is (H, W) float32, the standard deviation of each pixel's depth in metres; 0 stands for that
+    of the noise model.
+    """
+
+    noise: NoiseModel | None = None
+    sigma_m: NDArray[np.float32] | None = None
+
+    def noise_model(self, default: NoiseModel, depth_m: NDArray[np.floating]) -> NoiseModel:
+        """The noise of a depth image (H, W) whose map has the noise ``default``."""
+        noise = default if self.noise is None else self.noise
+        return noise if self.sigma_m is None else PixelSigma(noise, self.sigma_m, depth_m)
+
+    def arguments(self) -> Mapping[str, Any]:
+        """The arguments of ``add_keyframe`` that state this again."""
+        return {"noise": self.noise, "sigma_m": self.sigma_m}
+
+    def content(self) -> bytes:
+        """What it states, as bytes to sort by; empty if it states nothing."""
+        noise = self.noise
+        parts = [] if noise is None else [type(noise).__name__.encode(), *map(_bytes, vars(noise).values())]
+        return b"".join(parts if self.sigma_m is None else [*parts, self.sigma_m.tobytes()])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of its images in host memory and of what kernels read of them."""
+        return 0 if self.sigma_m is None else 2 * self.sigma_m.nbytes
+
+
+NOTHING = OwnEvidence()
+"""A keyframe of which the map's noise is true."""
+
+
+def checked_evidence(
+    depth_m: NDArray[np.float32], camera: Camera, noise: NoiseModel | None, sigma_m: ArrayLike | None
+) -> tuple[NDArray[np.float32], OwnEvidence]:
+    """A keyframe's depth (H, W), 0 for no measurement, and what it states of it: copies of the arguments of
+    ``add_keyframe``. A pixel of infinite sigma is no measurement. Raises KeyframeError for a wrong shape or
+    type."""
+    if noise is not None and not isinstance(noise, NoiseModel):
+        raise KeyframeError(
+            f"noise must be a noise model such as PolynomialNoise, not {type(noise).__name__}"
+        )
+    if sigma_m is None:
+        return depth_m, OwnEvidence(noise)
+    given = np.asarray(sigma_m)
+    if given.shape != camera.shape or not np.issubdtype(given.dtype, np.floating):
+        raise KeyframeError(
+            f"sigma_m must be floating-point metres of the shape {camera.shape}, "
+            f"not {given.dtype} {given.shape}"
+        )
+    with np.errstate(over="ignore"):
+        sigma = given.astype(np.float32)
+    depth_m = np.where(np.isposinf(sigma), np.float32(0.0), depth_m)
+    stated = (depth_m > 0) & (sigma > 0)  # NaN is not
+    return depth_m, OwnEvidence(noise, np.where(stated, np.maximum(sigma, LEAST_SIGMA_M), np.float32(0.0)))
+
+
+def sigma_of_confidence(
+    confidence: ArrayLike, depth_m: ArrayLike, noise: NoiseModel, camera: Camera, least: float = 0.1
+) -> NDArray[np.float32]:
+    """A sigma for each pixel, (H, W) metres, from a confidence between 0 and 1: that of the noise model at
+    the measured depth, divided by the confidence.
+
+    A confidence of 1 or more leaves the model's sigma. One below ``least`` counts as ``least``, so that sigma
+    is at most 1 / ``least`` times the model's. 0, negative and NaN mean that the pixel is no measurement: its
+    sigma is infinite. Levels, such as ARKit's 0 to 2, have to be scaled first. Raises ConfigError for a wrong
+    shape.
+    """
+    share, depth = array(confidence, "confidence"), array(depth_m, "depth_m")
+    if share.shape != camera.shape or depth.shape != camera.shape:
+        raise ConfigError(f"confidence and depth_m must be of the shape {camera.shape}")
+    if not 0 < least <= 1:
+        raise ConfigError(f"least must be above 0 and at most 1, not {least}")
+    measured = np.where(np.isfinite(depth) & (depth > 0), depth, 0.0)
+    sigma = noise.table(camera).at_pixels(measured)[0] / np.clip(share, least, 1.0)
+    return np.where(share > 0, sigma, np.inf).astype(np.float32)
+
+
+def _bytes(value: Any) -> bytes:
+    return value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()

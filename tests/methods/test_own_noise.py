@@ -1,0 +1,242 @@
+"""Keyframes with a noise model or a sigma for each pixel of their own: all that a map does with them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import small_room
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from live_scene import FakeLink, RoomFrames, finished, marginals, session_of
+from numpy.typing import NDArray
+from one_pixel import EXACT, VOXEL, allocated, random_pose
+from oracles import inference as reference
+from oracles.forward import Noise
+
+from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.inference.keyframe import DepthImage
+from taichi_mrf.inference.prior import prior_probability
+from taichi_mrf.inference.ray_list import RayBundler, block_of
+from taichi_mrf.kernels.bundles import kernel
+from taichi_mrf.kernels.types import I32, AnyArray, I32Array
+from taichi_mrf.methods.log_odds.map import LogOddsMap
+from taichi_mrf.methods.map_file import StoredKeyframe
+from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.visibility.map import VisibilityMap
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.noise import PatchNoise, PolynomialNoise
+from taichi_mrf.sensor.own_evidence import OwnEvidence
+from taichi_mrf.tune.trial import judge
+from taichi_mrf.viewer.messages import Switch
+
+pytestmark = pytest.mark.usefixtures("one_backend")
+
+BIASED = PolynomialNoise((0.01, 0.0, 0.006), (0.3,))
+COARSE = PolynomialNoise((0.01, 0.0, 0.006), (0.01,))
+
+
+def stating(number: int, noise: PolynomialNoise | None = None) -> Frame:
+    """A frame of the room with a sigma of its own at most pixels: coarse on the left, fine on the right."""
+    frame = small_room.frames()[number]
+    sigma = np.geomspace(0.1, 0.008, frame.camera.width) * np.ones((frame.camera.height, 1))
+    sigma[::7] = 0.0
+    return replace(frame, noise=noise, sigma_m=sigma.astype(np.float32))
+
+
+def add(m: MRFMap, frame: Frame) -> int:
+    parts = (frame.depth_m, frame.T_world_camera, frame.camera, frame.name)
+    return m.add_keyframe(*parts, **frame.own.arguments())
+
+
+def built(frames: list[Frame]) -> MRFMap:
+    m = MRFMap(small_room.VOXEL_SIZE)
+    for frame in frames:
+        add(m, frame)
+    m.infer()
+    return m
+
+
+def test_a_keyframes_noise_is_that_of_a_map_which_has_it() -> None:
+    own = built([replace(frame, noise=COARSE) for frame in small_room.frames()[:2]])
+    m = MRFMap(small_room.VOXEL_SIZE, COARSE)
+    for frame in small_room.frames()[:2]:
+        small_room.add(m, frame)
+    m.infer()
+    assert marginals(own) == marginals(m)
+    assert marginals(own) != marginals(small_room.build([0, 1]))
+
+
+def test_the_models_sigma_given_for_each_pixel_changes_nothing() -> None:
+    frame = small_room.frames()[0]
+    plain = small_room.build([0])
+    sigma = plain.noise.table(frame.camera).at_pixels(frame.depth_m)[0].astype(np.float32)
+    same = built([replace(frame, sigma_m=sigma)])
+    assert same.keyframes[0].ray_list.number == plain.keyframes[0].ray_list.number
+    centres, p = plain.voxels(0.0)
+    np.testing.assert_allclose(same.occupancy(centres), p, atol=1e-3)
+    assert marginals(built([replace(frame, sigma_m=np.zeros_like(sigma))])).keys() == marginals(plain).keys()
+
+
+@settings(max_examples=8)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_messages_equal_those_of_numpy_with_a_noise_for_each_ray(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    camera, T = PinholeCamera(2, 2, 4.0, 4.0, 0.5, 0.5), random_pose(rng)
+    depth = rng.uniform(0.5, 1.0, (2, 2)).astype(np.float32)
+    sigma = rng.uniform(0.03, 0.3, (2, 2)).astype(np.float32)
+    config = InferenceConfig(sweeps=1, **EXACT)
+    rays = []
+    for v, u in np.ndindex(2, 2):
+        one = np.zeros_like(depth)
+        one[v, u] = depth[v, u]
+        rays += reference.cast(one, T, camera, VOXEL, Noise((float(sigma[v, u]),), (0.02,)), config, 1.5)
+    m = MRFMap(VOXEL, PolynomialNoise((0.1,), (0.02,)), inference=config, max_depth=1.5)
+    m.add_keyframe(depth, T, camera, sigma_m=sigma)
+    m.infer()
+    expected = reference.infer([rays], allocated(m), prior_probability(config, VOXEL), config)
+    p = np.array([reference.logistic(x) for x in expected.values()])
+    found = m.occupancy((np.array(list(expected)) + 0.5) * VOXEL)
+    assert np.mean(np.abs(found - p) < 1e-3) > 0.98  # float32 may take the other way round a corner
+
+
+@kernel
+def _blocks(rays: I32Array, width: I32, out: AnyArray) -> None:
+    for i in range(rays.shape[0]):
+        u, v, wide, high = block_of(rays[i], width)
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3] = u, v, wide, high
+
+
+def blocks(image: DepthImage) -> NDArray[np.int32]:
+    """(n, 4): first column and row of each ray's block, its columns and rows."""
+    rays = RayBundler(0.5, InferenceConfig(ray_density=0.02)).rays_of(image)
+    out = np.zeros((rays.number, 4), np.int32)
+    _blocks(rays.blocks.to_numpy()[: rays.number], image.camera.width, out)
+    return out
+
+
+def test_pixels_of_other_sigmas_share_no_ray() -> None:
+    camera = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
+    depth = np.ones(camera.shape, np.float32)
+    model = PolynomialNoise((0.02,))
+    plain = blocks(DepthImage.upload(depth, camera, model))
+    assert plain[:, 2].max() > 4
+    sigma = np.full(camera.shape, 0.02, np.float32)
+    np.testing.assert_array_equal(
+        blocks(DepthImage.upload(depth, camera, model, own=OwnEvidence(None, 1.1 * sigma))), plain
+    )
+    sigma[:, 21:] = 0.05
+    sigma[7, 5] = 0.3
+    found = blocks(DepthImage.upload(depth, camera, model, own=OwnEvidence(None, sigma)))
+    assert len(plain) < len(found) < depth.size / 4
+    assert (found[:, 2] * found[:, 3]).sum() == depth.size
+    for u, v, wide, high in found:
+        assert np.ptp(sigma[v : v + high, u : u + wide]) == 0
+
+
+edits = st.lists(
+    st.tuples(st.sampled_from(["add", "remove", "move", "infer"]), st.integers(0, 3)), max_size=7
+)
+
+
+@settings(max_examples=5)
+@given(history=edits)
+def test_edits_in_any_order_end_in_the_same_map_bit_for_bit(history: list[tuple[str, int]]) -> None:
+    frames = [stating(0), stating(1, COARSE), small_room.frames()[2], replace(stating(0), sigma_m=None)]
+    m, present = MRFMap(small_room.VOXEL_SIZE), {}
+    for verb, number in history:
+        if verb == "add" and number not in present:
+            present[number] = add(m, frames[number])
+        elif verb == "remove" and number in present:
+            m.remove_keyframe(present.pop(number))
+        elif verb == "move" and number in present:
+            m.move_keyframe(present[number], frames[3 - number].T_world_camera)
+            m.move_keyframe(present[number], frames[number].T_world_camera)
+        elif verb == "infer":
+            m.infer(sweeps=1)
+    for number in range(3):
+        if number not in present:
+            add(m, frames[number])
+    if 3 in present:
+        m.remove_keyframe(present[3])
+    m.infer()
+    assert marginals(m) == marginals(built(frames[:3]))
+
+
+def test_saved_maps_keep_what_keyframes_state(tmp_path: Path) -> None:
+    camera = small_room.frames()[0].camera
+    patches = PatchNoise(np.full((4, 2), 0.01), np.full((4, 1), 0.002), 80, camera)
+    frames = [stating(0, COARSE), replace(small_room.frames()[1], noise=patches), small_room.frames()[2]]
+    m = built(frames)
+    m.freeze_keyframe(2)
+    m.infer()
+    m.save(tmp_path / "map.npz")
+    loaded = MRFMap.load(tmp_path / "map.npz")
+    assert marginals(loaded) == marginals(m)
+    for id, keyframe in loaded.keyframes.items():
+        assert keyframe.own.content() == m.keyframes[id].own.content()
+    for each in (m, loaded):
+        each.move_keyframe(0, frames[2].T_world_camera)
+        each.infer()
+    assert marginals(loaded) == marginals(m)
+
+
+def test_recursive_maps_use_and_save_it(tmp_path: Path) -> None:
+    for kind, parameters in ((LogOddsMap, {"correct_bias": True}), (VisibilityMap, {})):
+        m, plain, coarse = (kind(small_room.VOXEL_SIZE, n, **parameters) for n in (None, None, BIASED))
+        add(m, replace(small_room.frames()[0], noise=BIASED))
+        small_room.add(plain, small_room.frames()[0])
+        small_room.add(coarse, small_room.frames()[0])
+        assert marginals(m) == marginals(coarse) != marginals(plain)
+        m.save(tmp_path / "map.npz")
+        loaded = kind.load(tmp_path / "map.npz")
+        loaded.move_keyframe(0, small_room.frames()[0].T_world_camera)
+        loaded.infer()
+        assert marginals(loaded) == marginals(coarse)
+    stated = VisibilityMap(small_room.VOXEL_SIZE)
+    add(stated, stating(0))
+    assert marginals(stated) != marginals(plain)
+    stored = stated.keyframes[0]
+    assert isinstance(stored, StoredKeyframe)
+    assert stored.own.sigma_m is not None
+
+
+class StatingRoom(RoomFrames):
+    def read(self, index: int) -> Frame:
+        return stating(index, COARSE if index == 1 else None)
+
+
+def test_a_live_run_switches_them_off_and_on_bit_for_bit() -> None:
+    link = FakeLink()
+    session = session_of(link, StatingRoom("room", small_room.frames()[0].camera, count=3))
+    before = marginals(finished(session))
+    assert before == marginals(built([stating(0), stating(1, COARSE), stating(2)]))
+    for on in (False, True):
+        link.ask(Switch(1, on=on))
+        assert (marginals(finished(session)) == before) is on
+
+
+def test_held_out_frames_are_judged_by_their_own_noise_and_aligned_by_it() -> None:
+    m = built([stating(0), stating(1)])
+    frame = stating(2)
+    judged, plain = judge(m, frame), judge(m, small_room.frames()[2])
+    sigma, _ = judged.noise.at_pixels(frame.depth_m)
+    stated = (frame.sigma_m > 0) & (frame.depth_m > 0)
+    np.testing.assert_allclose(sigma[stated], frame.sigma_m[stated], rtol=1e-5)
+    assert judged.log_likelihood() != plain.log_likelihood()
+    parts = (frame.depth_m, frame.T_world_camera, frame.camera)
+    scores = m.ray_scores(*parts, frame.own)
+    assert not np.array_equal(scores, m.ray_scores(*parts), equal_nan=True)
+
+
+class NoPolynomials:
+    def table(self, camera: object) -> object:
+        return object()
+
+
+def test_sigmas_need_polynomials() -> None:
+    frame = stating(0)
+    with pytest.raises(ConfigError, match="sigma_m needs noise made of polynomials, which NoPolynomials"):
+        add(MRFMap(0.1), replace(frame, noise=NoPolynomials()))  # type: ignore[arg-type]
