@@ -21,21 +21,23 @@ from taichi_mrf.errors import CapacityError, MapFileError, TaichiMRFError, said
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.geometry.up import UP_NAMES, Up, up_from_name, up_name, up_of
 from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.methods.camera_file import NUMBERS, camera_arrays, read_cameras
 from taichi_mrf.methods.noise_file import evidence_arrays, noise_arrays, read_evidence, read_noise
 from taichi_mrf.methods.sensor_section import describing
-from taichi_mrf.sensor.camera import Camera, PinholeCamera
+from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.system.npz_file import NpzFile, open_npz
 from taichi_mrf.voxels.layout import VOXELS
 
-FORMAT = 2
-"""The format that is written. Format 2 added the manifest."""
+FORMAT = 3
+"""The newest format. Format 2 added the manifest, format 3 cameras that are no pinholes."""
 
-READABLE = (1, 2)
+PINHOLE_FORMAT = 2
+"""The format that is written where all cameras are pinholes, so that earlier versions can read it."""
+
+READABLE = (1, 2, 3)
 """The formats that can be read."""
-
-_CAMERA_VALUES = 6
 
 
 @dataclass(frozen=True)
@@ -98,16 +100,18 @@ class MapHeader:
         return replace(self.config, volume=volume)
 
     def arrays(self) -> dict[str, NDArray]:
-        """The header as arrays by name. Raises MapFileError for a noise model that cannot be saved."""
+        """The header as arrays by name. Raises MapFileError for a camera or a noise model that cannot be
+        saved."""
         keyframes = self.keyframes
+        cameras = camera_arrays([k.camera for k in keyframes])
         arrays: dict[str, NDArray] = {
-            "format": np.asarray(FORMAT),
+            "format": np.asarray(FORMAT if NUMBERS in cameras else PINHOLE_FORMAT),
             "method": np.asarray(self.config.method),
             "config": np.asarray(to_yaml(self.config)),
             "keyframe_ids": np.array([k.id for k in keyframes], np.int64),
             "keyframe_names": np.array([k.name for k in keyframes], np.str_),
             "keyframe_T_world_camera": np.array([k.T_world_camera for k in keyframes]).reshape(-1, 4, 4),
-            "keyframe_cameras": np.array([_camera_row(k.camera) for k in keyframes]).reshape(-1, 6),
+            **cameras,
             "keyframe_stamps": np.array([k.stamp_s for k in keyframes], np.float64),
             "next_id": np.asarray(self.next_id),
             "settled": np.asarray(self.settled),
@@ -179,14 +183,14 @@ def read_header(path: Path, file: NpzFile) -> MapHeader:
     n = len(ids)
     names = file.array("keyframe_names", "U", (n,)).tolist()
     poses = file.array("keyframe_T_world_camera", "f", (n, 4, 4))
-    cameras = file.array("keyframe_cameras", "fi", (n, _CAMERA_VALUES))
+    cameras = read_cameras(file, n)
     # Earlier versions saved no stamps: without one, the number of a keyframe counts.
     stamps = file.array("keyframe_stamps", "f", (n,)) if "keyframe_stamps" in file else ids.astype(np.float64)
     if not np.isfinite(stamps).all():
         raise MapFileError(f"{path}: damaged: a keyframe's stamp is no number")
     keyframes = []
     for i, id in enumerate(ids.tolist()):
-        camera = _camera(cameras[i])
+        camera = cameras[i]
         depth_m = file.array(f"keyframe_depth_{i}", "f", camera.shape)
         color = None
         if f"keyframe_color_{i}" in file:
@@ -226,15 +230,3 @@ def _config(path: Path, file: NpzFile) -> Config:
         return from_dict(Config, parse_yaml(file.scalar("config", "U")), str(path))
     except ValueError as error:
         raise MapFileError(f"{path}: damaged: config cannot be read: {said(error)}") from error
-
-
-def _camera_row(camera: Camera) -> list[float]:
-    """What a file keeps of a camera. Raises MapFileError for one that is no pinhole."""
-    if not isinstance(camera, PinholeCamera):
-        raise MapFileError(f"a keyframe's camera of type {type(camera).__name__} cannot be saved")
-    return [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
-
-
-def _camera(row: NDArray[np.float64]) -> PinholeCamera:
-    width, height, *rest = row.tolist()
-    return PinholeCamera(int(width), int(height), *rest)

@@ -1,7 +1,6 @@
 """Another camera, other noise, another law of measurements: the same kernels map the right surface."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -10,7 +9,6 @@ from numpy.typing import NDArray
 from plugged_noise import PixelNoise, UniformLaw
 
 from taichi_mrf.alignment.oriented_points import oriented_points
-from taichi_mrf.errors import MapFileError
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.inference.keyframe import DepthImage
 from taichi_mrf.methods.log_odds.map import LogOddsMap
@@ -169,11 +167,3 @@ def test_normals_of_an_unrolled_image_are_those_of_the_walls() -> None:
     cosine = -np.sign(world[rows, axis]) * normals[rows, axis]
     assert np.median(cosine) > 0.999
     assert np.quantile(cosine, 0.1) > 0.98
-
-
-@ONE_BACKEND
-def test_a_map_with_another_camera_is_not_saved_by_mistake(tmp_path: Path) -> None:
-    m = mapped(MRFMap(VOXEL, PolynomialNoise((SIGMA,))))
-    with pytest.raises(MapFileError, match="camera of type SphericalCamera cannot be saved"):
-        m.save(tmp_path / "map.npz")
-    assert not (tmp_path / "map.npz").exists()
