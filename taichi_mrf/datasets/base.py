@@ -72,8 +72,14 @@ class Dataset(ABC):
 
     @property
     def recorded_sigma(self) -> tuple[float, ...] | None:
-        """Standard deviation of depth that the recording itself gives, as coefficients in ascending powers of
-        depth in metres; None if it gives none."""
+        """Standard deviation of depth that the recording, or its kind of sensor, gives: coefficients in
+        ascending powers of depth in metres; None if it gives none."""
+        return None
+
+    @property
+    def recorded_reach(self) -> float | None:
+        """How far the sensor measures, in metres, if that is further than depth cameras do; None if it is not
+        known."""
         return None
 
     def check_scale(self, poses_are_used: bool) -> list[str]:

@@ -26,6 +26,11 @@ class Derived(Dataset):
         return self.source.recorded_sigma
 
     @property
+    def recorded_reach(self) -> float | None:
+        """The source's."""
+        return self.source.recorded_reach
+
+    @property
     def frame_names(self) -> Sequence[str]:
         """The source's."""
         return self.source.frame_names

@@ -1,4 +1,5 @@
-"""Hints for data that no reader supports: laser and lidar scans, meshes, maps, a text file for each image."""
+"""Hints for data that no reader supports: laser scans, clouds without poses, meshes, maps, a text for each
+image."""
 
 import re
 import shlex
@@ -11,13 +12,19 @@ from taichi_mrf.datasets.laser.readers import holds_scans
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.system.files import is_file, is_folder, read_text
 
-_LIDAR = (".pcd", ".las", ".laz", ".bin", ".osf", ".pcap", ".velodyne")
+_LIDAR = (".las", ".laz", ".bin", ".velodyne")
+_OUSTER = (".osf", ".pcap")
 _MESHES = (".ply", ".obj", ".stl", ".glb", ".off")
 _OCTOMAPS = (".bt", ".ot")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 ONE_FILE = (
     "write them into poses.txt in this folder, for each image a line of the 12 numbers of the first three "
     "rows of T_world_camera"
+)
+LIDAR_POSES = (
+    "contains lidar point clouds without poses; scans are read from a folder of one .npz, .ply, .pcd or .bin "
+    "for each, with poses.npz or a file of poses beside them, and KITTI's from velodyne/ with calib.txt and "
+    "poses.txt"
 )
 _POSE_TEXTS = (".txt", ".pose", ".cam", ".info")
 
@@ -44,11 +51,13 @@ def hint_for(path: Path) -> str | None:
 def _kind(path: Path) -> str | None:
     suffix = path.suffix.lower()
     if suffix in _LIDAR:
-        return "contains lidar point clouds, which are not supported; depth images are"
+        return LIDAR_POSES
+    if suffix in _OUSTER:
+        return "contains packets of a lidar, which are not supported; point clouds with poses are"
     if suffix in _MESHES:
         return (
             f"contains a mesh or points ({path.name}), not depth images; "
-            f"'mesh:{path}?poses=FILE' renders depth images of a mesh"
+            f"'mesh:{path}?poses=FILE' renders depth images of a mesh; a lidar's scans need poses beside them"
         )
     if suffix in _OCTOMAPS:
         return f"contains an OctoMap ({path.name}), not depth images; taichi-mrf import reads it"

@@ -1,4 +1,5 @@
-"""The noise of depth that a recording itself gives, as a stereo calibration does, put into the parameters."""
+"""What a recording itself says of its sensor, put into the parameters: the noise of depth that a stereo
+calibration gives, the reach of a lidar."""
 
 from dataclasses import replace
 
@@ -7,10 +8,15 @@ from taichi_mrf.datasets.base import Dataset
 
 
 def with_recorded_noise(settings: Config, dataset: Dataset) -> Config:
-    """The parameters with the recording's own sigma in place of the default; adds a note to the dataset.
+    """The parameters with the recording's own sigma and reach in place of the defaults; adds notes to the
+    dataset.
 
-    A sigma or a sigma table that the user has set stays.
+    A sigma, a sigma table or a largest depth that the user has set stays.
     """
+    return _with_reach(_with_sigma(settings, dataset), dataset)
+
+
+def _with_sigma(settings: Config, dataset: Dataset) -> Config:
     own, sensor = dataset.recorded_sigma, settings.sensor
     if own is None or sensor.sigma == own:
         return settings
@@ -20,3 +26,11 @@ def with_recorded_noise(settings: Config, dataset: Dataset) -> Config:
         return settings
     dataset.notes.append(f"sensor.sigma is [{text}], the recording's own; setting sensor.sigma overrides it")
     return replace(settings, sensor=replace(sensor, sigma=own))
+
+
+def _with_reach(settings: Config, dataset: Dataset) -> Config:
+    own, sensor = dataset.recorded_reach, settings.sensor
+    if own is None or sensor.max_depth != SensorConfig().max_depth or sensor.max_depth == own:
+        return settings
+    dataset.notes.append(f"sensor.max_depth is {own:g} m, the recording's reach; setting it overrides that")
+    return replace(settings, sensor=replace(sensor, max_depth=own))

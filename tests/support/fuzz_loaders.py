@@ -35,6 +35,9 @@ from inputs_bags import Bag, Kind, plain, writing
 from kitti_street import write_kitti
 from laser_logs import ODOMETRY, flaser, robotlaser
 from laser_logs import write_npz as write_scans
+from point_clouds import Walk, write_pcd, write_velodyne
+from point_clouds import write_ply as write_cloud_ply
+from point_clouds import write_scans as write_lidar_scans
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
@@ -65,6 +68,8 @@ from taichi_mrf.sensor.noise import PatchNoise, noise_from_config
 from taichi_mrf.system.atomic import write_npz as write_arrays
 
 CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
+WALK = Walk(points=12)
+PCD_KINDS = ("ascii", "binary", "binary_compressed")
 
 
 class FramesRefusedError(TaichiMRFError):
@@ -91,18 +96,25 @@ def frames_of(dataset: Dataset) -> bytes:
         except FrameError as error:
             refused.append((name, str(error)))
             continue
-        assert frame.depth_m.shape == frame.camera.shape == dataset.camera.shape
+        assert frame.depth_m.shape == frame.camera.shape
+        assert frame.camera == dataset.camera or not isinstance(frame.camera, PinholeCamera)
         assert frame.depth_m.dtype == np.float32
         assert np.isfinite(frame.depth_m).all()
         assert (frame.depth_m >= 0).all()
         assert frame.T_world_camera.shape == (4, 4)
         assert np.isfinite(frame.T_world_camera).all()
-        parts = (frame.depth_m.tobytes(), frame.T_world_camera.tobytes(), frame.stamp, name)
+        parts = (
+            frame.depth_m.tobytes(),
+            frame.T_world_camera.tobytes(),
+            frame.stamp,
+            name,
+            repr(frame.camera),
+        )
         found.append((*parts, None if frame.color is None else frame.color.tobytes()))
     assert all(f"frame {name}: " in said for name, said in refused)
     if refused:
         raise FramesRefusedError(refused[0][1])
-    return pickle.dumps((astuple(dataset.camera), dataset.dropped, found))
+    return pickle.dumps((repr(dataset.camera), dataset.dropped, found))
 
 
 def mapped(dataset: Dataset) -> None:
@@ -281,6 +293,24 @@ def _kitti(folder: Path) -> Path:
     return write_kitti(folder)
 
 
+def _lidar_plies(folder: Path) -> Path:
+    for i, cloud in enumerate(WALK.clouds):
+        write_cloud_ply(folder / f"{i + 0.5}.ply", cloud, ("ascii", "binary_little_endian")[i % 2])
+    lines = [stamped_line(0.5 * i, WALK.poses[i // 2]) for i in range(2 * WALK.count)]
+    (folder / "poses.txt").write_text("\n".join(lines))
+    return folder
+
+
+def _pcds(encoding: str, folder: Path) -> Path:
+    for i, (cloud, T) in enumerate(zip(WALK.clouds, WALK.poses, strict=True)):
+        write_pcd(folder / f"{i}.pcd", cloud @ T[:3, :3].T + T[:3, 3], encoding, T)
+    return folder
+
+
+def _velodyne(folder: Path) -> Path:
+    return write_velodyne(folder / "walk", WALK, WALK.poses[2])
+
+
 def _stereo(folder: Path) -> Path:
     return write_stereo_file(folder, ["a", "b", "c"])
 
@@ -454,6 +484,13 @@ LOADERS = [
     Loader("frames npz, folder", _npz_folder, _dataset, sealed=True),
     Loader("KITTI stereo", _kitti, _dataset),
     Loader("stereo YAML", _stereo, _dataset),
+    Loader("lidar npz", partial(write_lidar_scans, walk=WALK), _dataset, sealed=True),
+    Loader("lidar PLY", _lidar_plies, _dataset),
+    *(
+        Loader(f"PCD {each}", partial(_pcds, each), _dataset)
+        for each in ("ascii", "binary", "binary_compressed")
+    ),
+    Loader("KITTI velodyne", _velodyne, _dataset),
     Loader("ROS 1 bag", partial(_bag, "ros1"), _dataset),
     Loader("ROS 2 bag, sqlite", partial(_bag, "sqlite"), _dataset),
     Loader("MCAP", partial(_bag, "mcap"), _dataset),

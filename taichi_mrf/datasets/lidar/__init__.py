@@ -1,0 +1,1 @@
+"""Lidar scans: point clouds with poses, as frames whose pixels are rays."""

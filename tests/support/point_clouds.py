@@ -1,0 +1,136 @@
+"""Writes point clouds and recordings of lidar scans, for the tests of their readers."""
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from datasets_recordings import quaternion_of, row_of
+from numpy.typing import NDArray
+
+from taichi_mrf.geometry.poses import Pose, inverse, look_at
+
+Points = NDArray[np.floating]
+
+
+@dataclass
+class Walk:
+    """Scans of a lidar that moves: ``clouds`` in its own frame, (N, 3) float32 each, and T_world_lidar."""
+
+    count: int = 3
+    points: int = 40
+    clouds: list[Points] = field(init=False)
+    poses: list[Pose] = field(init=False)
+
+    def __post_init__(self) -> None:
+        random = np.random.default_rng(7)
+        self.clouds = [random.uniform(-4, 4, (self.points, 3)).astype(np.float32) for _ in range(self.count)]
+        self.poses = [look_at([0.3 * i, 0.1, 1.0], [3.0, 0.2 * i, 1.2]) for i in range(self.count)]
+
+
+def lzf(data: bytes) -> bytes:
+    """Pack bytes as libLZF does: repeats of three bytes and more, found by the last place of each triple."""
+    out, literals, last, at = bytearray(), bytearray(), {}, 0
+
+    def flush() -> None:
+        for start in range(0, len(literals), 32):
+            piece = literals[start : start + 32]
+            out.append(len(piece) - 1)
+            out.extend(piece)
+        literals.clear()
+
+    while at < len(data):
+        triple = data[at : at + 3]
+        first = last.get(triple)
+        last[triple] = at
+        if first is None or len(triple) < 3 or at - first > 8192:
+            literals.append(data[at])
+            at += 1
+            continue
+        length = 3
+        while length < 264 and at + length < len(data) and data[first + length] == data[at + length]:
+            length += 1
+        flush()
+        distance, coded = at - first - 1, length - 2
+        out.append(min(coded, 7) << 5 | distance >> 8)
+        if coded >= 7:
+            out.append(coded - 7)
+        out.append(distance & 255)
+        at += length
+    flush()
+    return bytes(out)
+
+
+def write_pcd(
+    path: Path, points: Points, encoding: str = "binary", T_world_sensor: Pose | None = None
+) -> Path:
+    """A PCD with an intensity between y and z, and padding, as PCL has them."""
+    viewpoint = "0 0 0 1 0 0 0"
+    if T_world_sensor is not None:
+        x, y, z, w = quaternion_of(T_world_sensor[:3, :3])
+        viewpoint = " ".join(f"{v:.9g}" for v in (*T_world_sensor[:3, 3], w, x, y, z))
+    head = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y intensity _ z\nSIZE 4 4 2 1 4\nTYPE F F U U F\n"
+        "COUNT 1 1 1 3 1\n"
+        f"WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT {viewpoint}\nPOINTS {len(points)}\nDATA {encoding}\n"
+    ).encode()
+    dtype = np.dtype([("x", "<f4"), ("y", "<f4"), ("intensity", "<u2"), ("_", "u1", (3,)), ("z", "<f4")])
+    rows = np.zeros(len(points), dtype)
+    rows["x"], rows["y"], rows["z"] = np.asarray(points, np.float32).T
+    rows["intensity"] = 7
+    if encoding == "ascii":
+        body = "".join(f"{r['x']:.9g} {r['y']:.9g} 7 0 0 0 {r['z']:.9g}\n" for r in rows).encode()
+    elif encoding == "binary":
+        body = rows.tobytes()
+    else:
+        columns = b"".join(rows[name].tobytes() for name in dtype.names or ())
+        packed = lzf(columns)
+        body = struct.pack("<II", len(packed), len(columns)) + packed
+    path.write_bytes(head + body)
+    return path
+
+
+def write_ply(path: Path, points: Points, encoding: str = "binary_little_endian", faces: int = 0) -> Path:
+    """A PLY whose vertices have a ring before their coordinates."""
+    head = (
+        f"ply\nformat {encoding} 1.0\ncomment made by hand\nelement vertex {len(points)}\n"
+        "property uchar ring\nproperty double x\nproperty double y\nproperty float z\n"
+        f"element face {faces}\nproperty list uchar int vertex_indices\nend_header\n"
+    ).encode()
+    order = ">" if "big" in encoding else "<"
+    rows = np.zeros(
+        len(points), np.dtype([("ring", "u1"), ("x", f"{order}f8"), ("y", f"{order}f8"), ("z", f"{order}f4")])
+    )
+    rows["x"], rows["y"], rows["z"] = np.asarray(points, np.float64).T
+    text = "".join(f"0 {r['x']:.9g} {r['y']:.9g} {r['z']:.9g}\n" for r in rows).encode()
+    path.write_bytes(head + (text if encoding == "ascii" else rows.tobytes()))
+    return path
+
+
+def write_scans(folder: Path, walk: Walk, numbers: Sequence[int] = (0, 3, 12)) -> Path:
+    """scan-NNN.npz in steps of 2 mm, and poses.npz."""
+    folder.mkdir(exist_ok=True)
+    for number, cloud in zip(numbers, walk.clouds, strict=True):
+        np.savez(folder / f"scan-{number:03d}.npz", xyz_2mm=np.rint(cloud / 0.002).astype(np.int16))
+    poses = {
+        "scan": np.array(numbers),
+        "T_world_lidar": np.array(walk.poses),
+        "stamp_s": 5.0 + np.arange(len(numbers)),
+    }
+    np.savez(folder / "poses.npz", **poses)
+    return folder
+
+
+def write_velodyne(folder: Path, walk: Walk, T_camera_lidar: Pose, times: bool = True) -> Path:
+    """A sequence of KITTI's odometry: its poses are those of the left camera, relative to the first."""
+    (folder / "velodyne").mkdir(parents=True)
+    for number, cloud in enumerate(walk.clouds):
+        rows = np.column_stack([cloud, np.full(len(cloud), 0.5)]).astype("<f4")
+        (folder / "velodyne" / f"{number:06d}.bin").write_bytes(rows.tobytes())
+    T_cameras = [pose @ inverse(T_camera_lidar) for pose in walk.poses]
+    (folder / "poses.txt").write_text("\n".join(row_of((inverse(T_cameras[0]) @ T)[:3]) for T in T_cameras))
+    (folder / "calib.txt").write_text(f"P0: 7 0 6 0 0 7 1 0 0 0 1 0\nTr: {row_of(T_camera_lidar[:3])}\n")
+    if times:
+        (folder / "times.txt").write_text("".join(f"{0.25 * i:e}\n" for i in range(walk.count)))
+    return folder
