@@ -14,6 +14,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "Maps": ("MRFMap", "LogOddsMap", "VisibilityMap"),
     "Sensors": (
         "PinholeCamera",
+        "DistortedCamera",
         "SphericalCamera",
         "RayTable",
         "PolynomialNoise",

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from taichi_mrf.queries.points import UNKNOWN as UNKNOWN
     from taichi_mrf.queries.slices import slice_map as slice_map
     from taichi_mrf.sensor.camera import PinholeCamera as PinholeCamera
+    from taichi_mrf.sensor.distortion import DistortedCamera as DistortedCamera
     from taichi_mrf.sensor.frame import Frame as Frame
     from taichi_mrf.sensor.noise import PatchNoise as PatchNoise
     from taichi_mrf.sensor.noise import PolynomialNoise as PolynomialNoise
@@ -48,6 +49,7 @@ taichi_environment.prepare()
 _PUBLIC = {
     "init": "taichi_mrf.system.runtime",
     "PinholeCamera": "taichi_mrf.sensor.camera",
+    "DistortedCamera": "taichi_mrf.sensor.distortion",
     "SphericalCamera": "taichi_mrf.sensor.spherical",
     "RayTable": "taichi_mrf.sensor.ray_table",
     "PolynomialNoise": "taichi_mrf.sensor.noise",

@@ -1,5 +1,5 @@
-"""The cameras of keyframes in a map file: a row for each keyframe if all are pinholes, as earlier versions had
-it, otherwise each camera once, and its number for each keyframe."""
+"""The cameras of keyframes in a map file: a row for each keyframe if all are pinholes, as earlier versions
+have it, otherwise each camera once, and its number for each keyframe."""
 
 from collections.abc import Sequence
 
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
+from taichi_mrf.sensor.distortion import DistortedCamera
 from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.system.npz_file import NpzFile
@@ -43,13 +44,15 @@ def read_cameras(file: NpzFile, keyframes: int) -> list[Camera]:
 
 def _arrays(camera: Camera) -> dict[str, NDArray]:
     if isinstance(camera, PinholeCamera):
-        return {"pinhole": np.array(_row(camera), np.float64)}
+        return {"pinhole": np.array(_row(camera))}
     if isinstance(camera, SphericalCamera):
         return {
             "elevations_rad": camera.elevations_rad,
             "azimuths_rad": camera.azimuths_rad,
             "azimuth_offsets_rad": camera.azimuth_offsets_rad,
         }
+    if isinstance(camera, DistortedCamera):
+        return {"pinhole": np.array(_row(camera.pinhole)), "distortion": camera.coefficients}
     if isinstance(camera, RayTable):
         return {"directions" if camera.has_pattern else "free_directions": camera.table}
     raise MapFileError(f"a keyframe's camera of type {type(camera).__name__} cannot be saved")
@@ -57,7 +60,10 @@ def _arrays(camera: Camera) -> dict[str, NDArray]:
 
 def _read(file: NpzFile, prefix: str) -> Camera:
     if f"{prefix}pinhole" in file:
-        return _pinhole(file.array(f"{prefix}pinhole", "f", (_ROW,)))
+        pinhole = _pinhole(file.array(f"{prefix}pinhole", "f", (_ROW,)))
+        if f"{prefix}distortion" in file:
+            return DistortedCamera(pinhole, file.array(f"{prefix}distortion", "f", (None,)))
+        return pinhole
     if f"{prefix}elevations_rad" in file:
         names = ("elevations_rad", "azimuths_rad", "azimuth_offsets_rad")
         return SphericalCamera(*(file.array(prefix + name, "f", (None,)) for name in names))
@@ -67,7 +73,7 @@ def _read(file: NpzFile, prefix: str) -> Camera:
 
 
 def _row(camera: PinholeCamera) -> list[float]:
-    return [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
+    return [float(camera.width), camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
 
 
 def _pinhole(row: NDArray[np.float64]) -> PinholeCamera:

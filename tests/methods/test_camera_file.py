@@ -15,6 +15,7 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.registry import load_map
 from taichi_mrf.methods.visibility.map import VisibilityMap
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
+from taichi_mrf.sensor.distortion import DistortedCamera
 from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.sensor.spherical import SphericalCamera
 
@@ -26,7 +27,8 @@ LIDAR = SphericalCamera(
 PINHOLE = PinholeCamera(16, 12, 14.0, 14.0, 7.5, 5.5)
 TABLE = RayTable(PinholeCamera(12, 10, 9.0, 9.0, 5.0, 5.0).rays())
 FREE = RayTable(LIDAR.rays().reshape(-1, 3)[::3])
-CAMERAS: tuple[Camera, ...] = (LIDAR, PINHOLE, TABLE, FREE, LIDAR)
+BENT = DistortedCamera(PINHOLE, (0.05, -0.01, 0.002, 0.001, 0.0))
+CAMERAS: tuple[Camera, ...] = (LIDAR, PINHOLE, TABLE, FREE, LIDAR, BENT)
 
 
 def build(m: Any, cameras: tuple[Camera, ...] = CAMERAS) -> Any:
@@ -79,7 +81,7 @@ def test_a_map_of_pinholes_is_readable_by_earlier_versions(tmp_path: Path) -> No
         ("camera_0_azimuths_rad", np.full(40, np.nan), "camera_0_azimuths_rad holds a value"),
         ("camera_2_directions", np.zeros((10, 12, 3), np.float32), "column 0, row 0"),
         ("camera_3_free_directions", np.ones((1, 5, 3), np.float32), "keyframe_depth_3"),
-        ("keyframe_camera_numbers", np.array([0, 1, 2, 9, 0]), "camera_9_free_directions is missing"),
+        ("keyframe_camera_numbers", np.array([0, 1, 2, 9, 0, 0]), "camera_9_free_directions is missing"),
     ],
 )
 def test_a_damaged_camera_is_named(tmp_path: Path, name: str, value: NDArray[Any], words: str) -> None:
