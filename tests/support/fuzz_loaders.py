@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from bag_clouds import write as write_clouds
 from datasets_recordings import (
     INTRINSIC,
     Content,
@@ -494,6 +495,7 @@ LOADERS = [
     Loader("ROS 1 bag", partial(_bag, "ros1"), _dataset),
     Loader("ROS 2 bag, sqlite", partial(_bag, "sqlite"), _dataset),
     Loader("MCAP", partial(_bag, "mcap"), _dataset),
+    Loader("ROS 2 bag, clouds", partial(write_clouds, kind="sqlite"), _dataset),
     Loader("ROS 2 bag, packed messages", partial(_packed_bag, CompressionMode.MESSAGE), _dataset),
     Loader("ROS 2 bag, packed file", partial(_packed_bag, CompressionMode.FILE), _dataset),
     *(

@@ -51,7 +51,7 @@ class Bag:
             self.connections[topic], nanoseconds(stamp + self.latency), serialize(message, name)
         )
 
-    def message(self, name: str, **fields: Any) -> Any:
+    def message(self, name: str, /, **fields: Any) -> Any:
         return self.types.types[name](**fields)
 
     def header(self, stamp: float, frame: str) -> Any:

@@ -1,10 +1,10 @@
 """ROS 1 bags, ROS 2 bags and MCAP files: ``walk.bag?depth=/camera/depth/image_raw&pose=/odom&frame=map``.
 
 The fields of :class:`BagOptions` are the options; without any, the only depth topic and the only source of
-poses are used. On opening, the stamp of each depth message is read; images are decoded
-when their frame is read. A pose is interpolated between its neighbours in time, and an image that has none
-near enough is left out and counted. ``poses=track`` finds all poses from the images while mapping.
-Reading needs the extra ``ros``.
+poses are used; the point clouds of a lidar, where there are no depth images or ``points`` names them
+(lidar.py). On opening, the stamp of each message is read; images are decoded when their frame is read. A pose
+is interpolated between its neighbours in time, and an image that has none near enough is left out and
+counted. ``poses=track`` finds all poses from the images while mapping. Reading needs the extra ``ros``.
 """
 
 import weakref
@@ -12,18 +12,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.lidar.scans import refuse_image_options
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.color import BagColors, find_colors
+from taichi_mrf.datasets.ros.lidar import LidarBag
+from taichi_mrf.datasets.ros.messages import frame_name
+from taichi_mrf.datasets.ros.point_cloud import POINT_CLOUD
 from taichi_mrf.datasets.ros.poses import BagPoses, PoseChoice, find_poses
 from taichi_mrf.datasets.ros.reader import METADATA, SUFFIXES, Entry, RosReader, is_bag
-from taichi_mrf.datasets.ros.topics import DepthTopic, choose, depth_topics, described
+from taichi_mrf.datasets.ros.topics import DepthTopic, choose, cloud_topics, depth_topics, described
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.ray_table import RayTable
 
 REALSENSE = "/device_0/sensor_"
 """The beginning of topics in the files of Intel's library, whose messages differ from those of ROS."""
@@ -41,6 +48,13 @@ class BagOptions(PoseChoice):
 
     color: str = ""
     """The topic of colour images, by default the only one."""
+
+    points: str = ""
+    """The topic of a lidar's point clouds, in place of depth images; of a bag without depth images by default
+    the only one."""
+
+    deskew: bool = True
+    """Undo the lidar's motion during a scan, where points have times."""
 
 
 @dataclass
@@ -92,7 +106,7 @@ class RosBag(Dataset):
         return Frame(depth_m, self.poses[index], self.camera, self.entries[index].stamp, name, color)
 
 
-def open_bag(path: Path, query: str, options: ReadOptions) -> RosBag:
+def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
     """Open a bag with the options after the question mark of its name.
 
     Raises DatasetError, whose text names the file and where it applies the topic, for a bag that cannot be
@@ -118,26 +132,15 @@ def open_bag(path: Path, query: str, options: ReadOptions) -> RosBag:
     return bag
 
 
-def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> RosBag:
+def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Dataset:
+    if chosen.points or (not chosen.depth and cloud_topics(reader) and not depth_topics(reader)):
+        return _open_lidar(reader, chosen, options)
     depth = _depth_topic(reader, chosen.depth)
     camera, distortion = _camera(reader, depth, chosen.info, options)
-    found = find_poses(reader, depth, chosen)
-    gap = INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
+    found = find_poses(reader, depth.frame, chosen)
     entries = sorted((entry for entry, _ in reader.messages(depth.name)), key=lambda entry: entry.stamp)
-    posed = [
-        (i, entry, pose)
-        for i, entry in enumerate(entries)
-        if (pose := found.at(entry.stamp, gap)) is not None
-    ]
-    if not posed:
-        raise DatasetError(_without_poses(reader, depth, entries, found, gap))
-    notes = list(found.notes)
+    posed, notes = _posed(reader, depth.name, "images", entries, found, options)
     dropped = len(entries) - len(posed)
-    if dropped:
-        notes.append(
-            f"{dropped} of {len(entries)} images of {depth.name} dropped: "
-            f"no poses within {gap:g} s on both sides"
-        )
     colors = None
     if options.color:
         stamps = [entry.stamp for _, entry, _ in posed]
@@ -158,6 +161,74 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> RosBag
         tracked=chosen.poses == TRACK,
         colors=colors,
     )
+
+
+def _open_lidar(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> LidarBag:
+    refuse_image_options(f"{reader.path}", options)
+    topic = choose(reader, "points", chosen.points, cloud_topics(reader), "topics of point clouds")
+    if reader.topics[topic].type != POINT_CLOUD:
+        raise DatasetError(
+            f"{reader.path}: topic {topic} is of type {reader.topics[topic].type}, not {POINT_CLOUD}"
+        )
+    frame, entries = "", []
+    for entry, message in reader.messages(topic):
+        frame = frame or frame_name(message.header.frame_id)
+        entries.append(entry)
+    entries.sort(key=lambda entry: entry.stamp)
+    tracked = chosen.poses == TRACK
+    found = find_poses(reader, frame, chosen)
+    if tracked:
+        found = replace(found, at=lambda stamp, largest_gap: np.eye(4))
+    posed, notes = _posed(reader, topic, "clouds", entries, found, options)
+    gap = _gap(options)
+    bag = LidarBag(
+        name=reader.path.stem,
+        camera=RayTable([[1.0, 0.0, 0.0]]),
+        notes=notes,
+        dropped=len(entries) - len(posed),
+        reader=reader,
+        topic=topic,
+        entries=[entry for _, entry, _ in posed],
+        poses=[pose for _, _, pose in posed],
+        names=[f"{i:06d}" for i, _, _ in posed],
+        at=(lambda stamp: found.at(stamp, gap)) if chosen.deskew and not tracked else None,
+        tracked=tracked,
+    )
+    bag.look_at_first()
+    return bag
+
+
+Posed = list[tuple[int, Entry, Pose]]
+"""Messages with their numbers in the topic and their poses."""
+
+
+def _posed(
+    reader: RosReader, topic: str, what: str, entries: Sequence[Entry], found: BagPoses, options: ReadOptions
+) -> tuple[Posed, list[str]]:
+    """The messages that have a pose, and notes. Raises DatasetError if none has."""
+    gap = _gap(options)
+    posed = [
+        (i, entry, pose)
+        for i, entry in enumerate(entries)
+        if (pose := found.at(entry.stamp, gap)) is not None
+    ]
+    if not posed:
+        raise DatasetError(
+            f"{reader.path}: none of {len(entries)} {what} of {topic} ({entries[0].stamp:.3f} to "
+            f"{entries[-1].stamp:.3f} s) has poses within {gap:g} s on both sides ({found.source})"
+        )
+    notes = list(found.notes)
+    dropped = len(entries) - len(posed)
+    if dropped:
+        notes.append(
+            f"{dropped} of {len(entries)} {what} of {topic} dropped: no poses within {gap:g} s on both sides"
+        )
+    return posed, notes
+
+
+def _gap(options: ReadOptions) -> float:
+    """The largest time to a neighbouring pose, in seconds."""
+    return INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
 
 
 def _depth_topic(reader: RosReader, wanted: str) -> DepthTopic:
@@ -198,15 +269,6 @@ def _size(reader: RosReader, depth: DepthTopic) -> tuple[int, int]:
     except DatasetError as error:
         raise DatasetError(f"{reader.path}: topic {depth.name}: {error}") from error
     return width, height
-
-
-def _without_poses(
-    reader: RosReader, depth: DepthTopic, entries: Sequence[Entry], found: BagPoses, gap: float
-) -> str:
-    return (
-        f"{reader.path}: none of {len(entries)} images of {depth.name} ({entries[0].stamp:.3f} to "
-        f"{entries[-1].stamp:.3f} s) has poses within {gap:g} s on both sides ({found.source})"
-    )
 
 
 FORMAT = Format(

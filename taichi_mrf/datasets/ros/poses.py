@@ -16,7 +16,7 @@ from taichi_mrf.datasets.options import TRACK
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.reader import RosReader
-from taichi_mrf.datasets.ros.topics import FROM_TF, DepthTopic, choose, pose_topics, read_tree
+from taichi_mrf.datasets.ros.topics import FROM_TF, choose, pose_topics, read_tree
 from taichi_mrf.datasets.ros.transform_tree import TransformTree
 from taichi_mrf.datasets.timed_poses import TimedPoses, read_timed_poses
 from taichi_mrf.errors import DatasetError, KeyframeError
@@ -47,7 +47,7 @@ class PoseChoice:
     """The frame that the poses of a topic are of."""
 
     optical: str = ""
-    """The camera's frame (x right, y down, z forward)."""
+    """The sensor's frame: of a camera x right, y down, z forward; of a lidar z up."""
 
 
 @dataclass
@@ -66,8 +66,9 @@ def pose_candidates(reader: RosReader, tree: TransformTree, optical: str) -> lis
     return [*pose_topics(reader), *([FROM_TF] if tree.moves(root, optical) else [])]
 
 
-def find_poses(reader: RosReader, depth: DepthTopic, choice: PoseChoice) -> BagPoses:
-    """The camera's poses as the user chose, else from the only source in the bag.
+def find_poses(reader: RosReader, frame: str, choice: PoseChoice) -> BagPoses:
+    """The poses of the sensor whose messages are in ``frame``, as the user chose, else from the only source
+    in the bag.
 
     Raises DatasetError, whose text names the file and lists the candidates or the frames, if there are none
     or several, or if the named frames are not connected.
@@ -78,7 +79,7 @@ def find_poses(reader: RosReader, depth: DepthTopic, choice: PoseChoice) -> BagP
         timed = read_timed_poses(Path(choice.poses))
         return BagPoses(timed.at, f"{choice.poses}: {_span(timed)}")
     tree = read_tree(reader)
-    optical = choice.optical or depth.frame
+    optical = choice.optical or frame
     candidates = pose_candidates(reader, tree, optical)
     if not candidates and not choice.pose:
         raise DatasetError(NO_POSES.format(path=reader.path, frame=optical or "camera frame"))

@@ -7,7 +7,7 @@ from pathlib import Path
 from taichi_mrf.datasets.ros.bag import REALSENSE
 from taichi_mrf.datasets.ros.poses import pose_candidates
 from taichi_mrf.datasets.ros.reader import RosReader, Topic
-from taichi_mrf.datasets.ros.topics import DepthTopic, depth_topics, read_tree
+from taichi_mrf.datasets.ros.topics import DepthTopic, cloud_topics, depth_topics, message_frame, read_tree
 from taichi_mrf.datasets.ros.transform_tree import TransformTree
 from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.errors import DatasetError
@@ -43,12 +43,14 @@ def summarise(path: Path) -> BagSummary:
             return BagSummary(topics, {}, reader.duration, [], [f"realsense:{path}?poses=FILE"], "")
         depth, tree = depth_topics(reader), read_tree(reader)
         remarks = {each.name: f"depth, {each.encoding}, frame {each.frame or 'unnamed'}" for each in depth}
+        clouds = {name: message_frame(reader, name) for name in cloud_topics(reader)}
+        remarks |= {name: f"points, frame {frame or 'unnamed'}" for name, frame in clouds.items()}
         return BagSummary(
             topics,
             remarks,
             reader.duration,
             _transforms(tree),
-            _sources(reader, tree, depth),
+            [*_sources(reader, tree, depth), *_cloud_sources(reader, tree, clouds, bool(depth))],
             "" if all(each.info for each in depth) else " --camera fx,fy,cx,cy",
         )
     finally:
@@ -63,18 +65,37 @@ def _transforms(tree: TransformTree) -> list[str]:
     return words
 
 
+def _cloud_sources(
+    reader: RosReader, tree: TransformTree, clouds: dict[str, str], has_depth: bool
+) -> list[str]:
+    """The same for each pair of a topic of point clouds and a source of poses."""
+    sources = []
+    for name, frame in clouds.items():
+        points = [f"points={name}"] if has_depth or len(clouds) > 1 else []
+        sources += [
+            f"{reader.path}?{'&'.join(options)}" if options else str(reader.path)
+            for options in ([*points, *pose] for pose in _pose_options(reader, tree, frame))
+        ]
+    return sources
+
+
+def _pose_options(reader: RosReader, tree: TransformTree, frame: str) -> list[list[str]]:
+    """For each source of poses the options that choose it."""
+    try:
+        poses = [f"pose={name}" for name in pose_candidates(reader, tree, frame)]
+    except DatasetError:  # frames that form a cycle
+        poses = []
+    return [[]] if len(poses) == 1 else [[pose] for pose in poses or ["poses=FILE"]]
+
+
 def _sources(reader: RosReader, tree: TransformTree, depth: Sequence[DepthTopic]) -> list[str]:
     """A source name for each pair of a depth topic and a source of poses, with the options that are
     ambiguous."""
     sources = []
     for topic in depth:
-        try:
-            poses = [f"pose={name}" for name in pose_candidates(reader, tree, topic.frame)]
-        except DatasetError:  # frames that form a cycle
-            poses = []
-        for pose in poses or ["poses=FILE"]:
+        for pose in _pose_options(reader, tree, topic.frame):
             options = [f"depth={topic.name}"] if len(depth) > 1 else []
             options += [f"info={topic.info[0]}"] if len(topic.info) > 1 else []
-            options += [pose] if len(poses) != 1 else []
+            options += pose
             sources.append(f"{reader.path}?{'&'.join(options)}" if options else str(reader.path))
     return sources

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name
+from taichi_mrf.datasets.ros.point_cloud import POINT_CLOUD
 from taichi_mrf.datasets.ros.reader import RosReader
 from taichi_mrf.datasets.ros.transform_tree import Edge, TransformTree
 from taichi_mrf.datasets.timed_poses import TimedPoses
@@ -48,6 +49,17 @@ def depth_topics(reader: RosReader) -> list[DepthTopic]:
         or "compressedDepth" in topic.encoding
         or (topic.encoding == "mono16" and "depth" in topic.name.lower())
     ]
+
+
+def cloud_topics(reader: RosReader) -> list[str]:
+    """The topics of point clouds."""
+    return [topic.name for topic in reader.topics.values() if topic.type == POINT_CLOUD and topic.messages]
+
+
+def message_frame(reader: RosReader, topic: str) -> str:
+    """The coordinate frame of a topic's first message, empty if there is none."""
+    message = reader.first(topic)
+    return "" if message is None else frame_name(message.header.frame_id)
 
 
 def described(reader: RosReader, name: str) -> DepthTopic:

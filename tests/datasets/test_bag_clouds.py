@@ -1,0 +1,193 @@
+"""Point clouds in bags: fields by name, rings, times, poses; and what is wrong with them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_clouds import CAMERA, LIDAR, LOST, SCANS, T_BODY_LIDAR, drive, points, pose, send, stamp, write
+from inputs_bags import BODY, Kind, images, mounted, odometry, writing
+from numpy.typing import NDArray
+
+from taichi_mrf.cli.main import main
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.ros.lidar import LidarBag
+from taichi_mrf.datasets.ros.point_cloud import decode
+from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.sensor.ray_table import RayTable
+
+
+@pytest.mark.parametrize(("kind", "big"), [("ros1", False), ("sqlite", True), ("mcap", False)])
+def test_a_cloud_with_rows_is_an_image(tmp_path: Path, kind: Kind, big: bool) -> None:
+    dataset = open_dataset(write(tmp_path, kind, big=big))
+    assert isinstance(dataset, LidarBag)
+    assert (len(dataset), dataset.dropped, dataset.recorded_reach) == (SCANS, 0, 10.0)
+    for scan, frame in enumerate(dataset):
+        np.testing.assert_allclose(frame.camera.rays(), CAMERA.rays(), atol=1e-5)
+        assert frame.no_return is not None
+        np.testing.assert_array_equal(frame.no_return, LOST)
+        expected = np.linalg.norm(points(scan), axis=-1)
+        np.testing.assert_allclose(frame.depth_m[~LOST], expected[~LOST], rtol=1e-6)
+        np.testing.assert_allclose(frame.T_world_camera, pose(stamp(scan)) @ T_BODY_LIDAR, atol=1e-3)
+    assert "/points: images of 24 x 4 rays" in dataset.notes
+
+
+def test_rings_make_an_image_and_other_points_free_rays(tmp_path: Path) -> None:
+    ring = np.repeat(np.arange(4, dtype=np.uint16), 24)[::-1][None]
+    flat = points(0).reshape(1, -1, 3)
+    with writing(tmp_path / "walk", "mcap") as bag:
+        send(bag, stamp(0), flat, ring=ring)
+        send(bag, stamp(1), flat[:, ~LOST.reshape(-1)], ring=ring[:, ~LOST.reshape(-1)])
+        drive(bag)
+    image, free = open_dataset(tmp_path / "walk")
+    assert image.camera.shape == CAMERA.shape
+    np.testing.assert_allclose(image.camera.rays(), CAMERA.rays(), atol=1e-5)
+    assert isinstance(free.camera, RayTable)
+    assert not free.camera.has_pattern
+    assert free.no_return is None
+    found = (free.camera.rays() * free.depth_m[..., None]).reshape(-1, 3)
+    expected = flat[0][~LOST.reshape(-1)]
+    np.testing.assert_allclose(found[np.lexsort(found.T)], expected[np.lexsort(expected.T)], atol=1e-5)
+
+
+@pytest.mark.parametrize("unit", ["t", "time", "timestamp"])
+def test_motion_during_a_scan_is_undone(tmp_path: Path, unit: str) -> None:
+    """Walls that stand still are seen from where the lidar is at the time of each column."""
+    seconds = np.tile(np.linspace(-0.04, 0.04, 24), (4, 1))
+    where = np.array([pose(stamp(0) + s) @ T_BODY_LIDAR for s in seconds[0]])
+    T_world_stamp = pose(stamp(0)) @ T_BODY_LIDAR
+    still = points(0) @ T_world_stamp[:3, :3].T + T_world_stamp[:3, 3]
+    seen = np.einsum("wji,hwj->hwi", where[:, :3, :3], still - where[:, :3, 3])
+    times = {
+        "t": ((seconds + 0.04) * 1e9).astype(np.uint32),
+        "time": seconds.astype(np.float32),
+        "timestamp": 1_600_000_000.0 + stamp(0) + seconds,
+    }
+    first = stamp(0) - 0.04 if unit == "t" else stamp(0)  # unsigned: from the beginning of the scan
+    with writing(tmp_path / "walk", "mcap") as bag:
+        send(bag, first, seen, **{unit: times[unit]})
+        drive(bag)
+    frame = open_dataset(tmp_path / "walk").read(0)
+    found = (frame.camera.rays() * frame.depth_m[..., None]).reshape(-1, 3)
+    T = frame.T_world_camera
+    found = found @ T[:3, :3].T + T[:3, 3]
+    expected = still[~LOST]
+    nearest = np.linalg.norm(found[:, None] - expected[None], axis=-1).min(axis=1)
+    assert nearest.max() < 0.02, "poses are interpolated on chords"
+    skewed = open_dataset(f"{tmp_path / 'walk'}?deskew=false").read(0)
+    assert skewed.no_return is not None
+    np.testing.assert_allclose(skewed.depth_m[~LOST], np.linalg.norm(seen, axis=-1)[~LOST], rtol=1e-5)
+
+
+def test_a_lidar_that_stands_still_keeps_its_image(tmp_path: Path) -> None:
+    with writing(tmp_path / "walk", "mcap") as bag:
+        send(bag, 1.0, points(0), t=np.tile(np.arange(24, dtype=np.uint32) * 4_000_000, (4, 1)))
+        for i in range(5):
+            bag.odometry("/odom", 0.9 + 0.1 * i, "odom", LIDAR, np.eye(4))
+    assert open_dataset(tmp_path / "walk").read(0).camera.shape == CAMERA.shape
+
+
+def test_depth_images_come_first_and_points_can_be_chosen(tmp_path: Path) -> None:
+    with writing(tmp_path / "walk", "mcap") as bag:
+        images(bag)
+        odometry(bag)
+        mounted(bag)
+        send(bag, stamp(0), points(0))
+        bag.tf("/tf_static", 0.0, BODY, LIDAR, T_BODY_LIDAR)
+    assert open_dataset(tmp_path / "walk").read(0).depth_m.shape == (12, 16)
+    chosen = open_dataset(f"{tmp_path / 'walk'}?points=/points")
+    assert chosen.read(0).camera.shape == CAMERA.shape
+
+
+def test_info_lists_clouds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write(tmp_path)
+    assert main(["info", str(path)]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "points, frame" in printed
+    assert "RayTable, 24 x 4 rays" in printed
+    assert f"taichi-mrf map {path} --out DIR" in printed
+
+
+def refused(source: object, **options: object) -> str:
+    with pytest.raises(DatasetError) as caught:
+        open_dataset(str(source), **options)  # type: ignore[arg-type]
+    assert not isinstance(caught.value, FrameError)
+    return str(caught.value)
+
+
+def test_what_cannot_be_opened_is_named(tmp_path: Path) -> None:
+    with writing(tmp_path / "two", "mcap") as bag:
+        send(bag, 1.0, points(0), "/front/points")
+        send(bag, 1.0, points(0), "/rear/points")
+        drive(bag)
+    both = refused(tmp_path / "two")
+    assert (
+        "several topics of point clouds: choose one with ?points=/front/points or ?points=/rear/points"
+        in both
+    )
+    assert "topic /odom is of type nav_msgs/msg/Odometry" in refused(f"{tmp_path / 'two'}?points=/odom")
+    path = write(tmp_path)
+    assert "contains lidar scans; --depth-scale is for depth images" in refused(path, depth_scale=5.0)
+    with writing(tmp_path / "late", "mcap") as bag:
+        send(bag, 50.0, points(0))
+        drive(bag)
+    assert "none of 1 clouds of /points" in refused(tmp_path / "late")
+
+
+def test_a_broken_cloud_is_named_and_the_others_are_read(tmp_path: Path) -> None:
+    with writing(tmp_path / "walk", "mcap") as bag:
+        send(bag, stamp(0), np.full((4, 24, 3), np.nan))
+        send(bag, stamp(1), points(1))
+        drive(bag)
+    dataset = open_dataset(tmp_path / "walk")
+    with pytest.raises(
+        FrameError, match=r"^frame 000000: .*topic /points: none of 96 points is a measurement"
+    ):
+        dataset.read(0)
+    assert dataset.camera == dataset.read(1).camera
+    with writing(tmp_path / "none", "mcap") as bag:
+        send(bag, stamp(0), np.full((4, 24, 3), np.nan))
+        drive(bag)
+    assert "no cloud can be read: frame 000000" in refused(tmp_path / "none")
+
+
+class Message:
+    """A PointCloud2 made by hand."""
+
+    def __init__(self, **changed: object) -> None:
+        fields = [type("Field", (), {"name": n, "offset": 4 * i, "datatype": 7}) for i, n in enumerate("xyz")]
+        values = {
+            "height": 1, "width": 2, "point_step": 12, "row_step": 24, "is_bigendian": False,
+            "fields": fields, "data": np.arange(6, dtype="<f4").view(np.uint8),
+        } | changed  # fmt: skip
+        self.__dict__.update(values)
+
+
+@pytest.mark.parametrize(
+    ("changed", "problem"),
+    [
+        ({"width": 3}, "24 bytes are too few for 3 x 1 points"),
+        ({"height": 0}, "2 x 0 points"),
+        ({"point_step": 8}, "field 'z' of type 7 lies outside a point"),
+        ({"point_step": 0}, "points of 0 bytes"),
+        ({"width": 1 << 30, "height": 1 << 30}, "are read"),
+        ({"fields": []}, "has no field x, y, z, only none"),
+        ({"height": 2, "width": 1, "row_step": 3}, "too few"),
+    ],
+)
+def test_data_that_do_not_fit_the_fields_are_refused(changed: dict[str, object], problem: str) -> None:
+    with pytest.raises(DatasetError, match=problem):
+        decode(Message(**changed), 0.0)
+
+
+def test_a_row_step_of_zero_is_that_of_one_row() -> None:
+    cloud = decode(Message(row_step=0), 0.0)
+    np.testing.assert_array_equal(cloud.points_m, [[[0, 1, 2], [3, 4, 5]]])
+
+
+@pytest.mark.parametrize("times", [np.array([0.0, 9.0]), np.array([1e15, 2e15]), np.array([np.nan, np.nan])])
+def test_times_that_are_far_from_the_stamp_are_not_believed(times: NDArray) -> None:
+    fields = [*Message().fields, type("Field", (), {"name": "time", "offset": 12, "datatype": 8})]  # type: ignore[attr-defined]
+    rows = np.zeros(2, np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f8")]))
+    rows["time"] = times
+    cloud = decode(Message(fields=fields, point_step=20, row_step=40, data=rows.view(np.uint8)), 100.0)
+    assert cloud.seconds is None
