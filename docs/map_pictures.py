@@ -15,7 +15,7 @@ from PIL import Image
 
 import taichi_mrf
 from taichi_mrf.evaluation.pictures.figures import color_bar, draw_way, new_figure
-from taichi_mrf.evaluation.pictures.surfaces import seen_surfaces, up_direction
+from taichi_mrf.evaluation.pictures.surfaces import seen_surfaces, up_direction, upward_axis
 from taichi_mrf.evaluation.pictures.viewpoint import faces_viewer, overview_pose
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.export.options import ExportOptions
@@ -111,7 +111,7 @@ def mesh(run: Path) -> Image.Image:
         solid = trimesh.load_mesh(path, process=False)
     count = len(solid.faces)
     surfaces = seen_surfaces(m)
-    up = up_direction([each.T_world_camera for each in m.keyframes.values()], surfaces.normals)
+    up = up_direction(map(upward_axis, m.keyframes.values()), surfaces.normals)
     normals = surfaces.thickened().normals_at(solid.triangles_center)
     pose = overview_pose(solid.triangles_center, normals, up, _CAMERA, m.voxel_size)
     solid.update_faces(faces_viewer(solid.triangles_center, normals, pose[:3, 3]))

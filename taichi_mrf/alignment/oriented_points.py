@@ -6,6 +6,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
+from taichi_mrf.alignment.free_points import fit_free_planes
 from taichi_mrf.inference.keyframe import DepthImage
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import I32, F32Array, F32Array2
@@ -58,6 +59,8 @@ class OrientedPoints:
 def oriented_points(image: DepthImage, max_depth: float) -> OrientedPoints:
     """The points of a depth image, up to ``max_depth`` metres, around which the surface is smooth."""
     camera = image.camera
+    if camera.pixels_per_radian == 0:
+        return _of_free_rays(image, max_depth)
     columns, rows = -(-camera.width // STRIDE), -(-camera.height // STRIDE)
     half = max(LEAST_WINDOW, round(WINDOW * camera.pixels_per_radian))
     step = -(-half // MOST_STEPS)
@@ -70,6 +73,19 @@ def oriented_points(image: DepthImage, max_depth: float) -> OrientedPoints:
     rays = camera.directions(places[:, 0] * STRIDE, places[:, 1] * STRIDE)
     points = (rays * depth[found, None]).astype(np.float32)
     return OrientedPoints(points, normals[found], sigmas[found], places)
+
+
+def _of_free_rays(image: DepthImage, max_depth: float) -> OrientedPoints:
+    rays, depth, sigmas, normals, found = fit_free_planes(image, LARGEST_JUMP, LEAST_SHARE)
+    cosine = -(normals * rays).sum(axis=-1)
+    found &= (depth > 0) & (depth <= max_depth) & (cosine > STEEPEST * np.linalg.norm(rays, axis=-1))
+    v, u = np.nonzero(found)
+    return OrientedPoints(
+        (rays * depth[..., None])[found].astype(np.float32),
+        normals[found].astype(np.float32),
+        (cosine * sigmas)[found].astype(np.float32),
+        np.stack([u, v], axis=1).astype(np.int32),
+    )
 
 
 @kernel

@@ -154,9 +154,17 @@ def test_pixels_with_a_large_sigma_are_trusted_less() -> None:
     assert np.median(left) < np.median(right) - 0.2
 
 
+def free(rays: int) -> RayTable:
+    """Rays without a pattern, up to 0.7 radians above and below the level."""
+    points = np.random.default_rng(0).normal(size=(3 * rays, 3))
+    level = np.abs(points[:, 2]) < 0.65 * np.linalg.norm(points, axis=1)
+    return RayTable.of_points(points[level][:rays])[0]
+
+
 @ONE_BACKEND
-def test_normals_of_an_unrolled_image_are_those_of_the_walls() -> None:
-    T, fine = pose(EYES[0]), lidar(768, 192)
+@pytest.mark.parametrize("fine", [lidar(768, 192), free(60_000)], ids=["lidar", "free rays"])
+def test_normals_are_those_of_the_walls(fine: RayTable) -> None:
+    T = pose(EYES[0])
     image = DepthImage.upload(ranges(T, fine), fine, PolynomialNoise((SIGMA,)))
     points = oriented_points(image, 10.0)
     world, normals = points.points @ T[:3, :3].T + T[:3, 3], points.normals @ T[:3, :3].T
@@ -167,3 +175,18 @@ def test_normals_of_an_unrolled_image_are_those_of_the_walls() -> None:
     cosine = -np.sign(world[rows, axis]) * normals[rows, axis]
     assert np.median(cosine) > 0.999
     assert np.quantile(cosine, 0.1) > 0.98
+
+
+@ONE_BACKEND
+@pytest.mark.parametrize("camera", [lidar(512, 96), free(30_000)], ids=["lidar", "free rays"])
+def test_a_misplaced_keyframe_is_put_right(camera: RayTable) -> None:
+    m = mapped(MRFMap(VOXEL, PolynomialNoise((SIGMA,))), camera)
+    true = pose((0.4, 0.3, -0.1))
+    wrong = true.copy()
+    wrong[:3, 3] += (0.08, -0.05, 0.04)
+    id = m.add_keyframe(ranges(true, camera), wrong, camera)
+    m.infer()
+    refined = m.refine_pose(id)
+    assert refined.accepted
+    assert refined.directions == 6
+    np.testing.assert_allclose(refined.T_world_camera, true, atol=0.01)

@@ -17,12 +17,13 @@ from taichi_mrf.evaluation.pictures.room_views import (
     surface_view,
     top_view,
 )
-from taichi_mrf.evaluation.pictures.surfaces import seen_surfaces, up_direction
+from taichi_mrf.evaluation.pictures.surfaces import seen_surfaces, up_direction, upward_axis
 from taichi_mrf.geometry.up import Z_UP
 from taichi_mrf.methods.capabilities import measures_surface
 from taichi_mrf.methods.protocol import OccupancyMap, PosedDepth
 from taichi_mrf.queries.cells import FilledMap
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.unrolled import unrolled
 from taichi_mrf.system.atomic import atomic_path
 from taichi_mrf.voxels.colors import LOWEST
 
@@ -79,14 +80,14 @@ def _room_figures(m: OccupancyMap, shown: ShownMap) -> dict[str, "Figure"]:
         nothing = notice(f"The map holds no voxel with a marginal of {LOWEST} or more.")
         return {"top_view.png": nothing, "perspective.png": nothing}
     surfaces = seen_surfaces(m)
-    poses = [keyframe.T_world_camera for keyframe in m.keyframes.values()]
+    keyframes = list(m.keyframes.values())
     room = DrawnMap(
         centres=centres,
         probability=probability,
         normals=surfaces.thickened().normals_at(centres),
         voxel_size=m.voxel_size,
-        up=up_direction(poses, surfaces.normals, m.up or Z_UP),
-        T_world_cameras=poses,
+        up=up_direction(map(upward_axis, keyframes), surfaces.normals, m.up or Z_UP),
+        T_world_cameras=[keyframe.T_world_camera for keyframe in keyframes],
         of_cells=len(centres) - len(m.voxels(LOWEST)[0]) if isinstance(shown, FilledMap) else 0,
     )
     return {"top_view.png": top_view(room), "perspective.png": perspective(room)}
@@ -98,14 +99,14 @@ def _surface_figure(m: OccupancyMap) -> "Figure":
     found = m.surface()
     if not len(found.triangles):
         return notice("The keyframes have measured no surface.")
-    poses = [keyframe.T_world_camera for keyframe in m.keyframes.values()]
-    up = up_direction(poses, found.normals, m.up or Z_UP)
+    up = up_direction(map(upward_axis, m.keyframes.values()), found.normals, m.up or Z_UP)
     drawn = DrawnSurface(found.vertices_m, found.triangles, found.normals, found.colors)
     return surface_view(drawn, m.voxel_size, up)
 
 
 def depth_comparison(m: OccupancyMap, held_out: Sequence[Frame]) -> "Figure":
-    """Measured and rendered depth and their difference, a row for each of a few frames.
+    """Measured and rendered depth and their difference, a row for each of a few frames; those without a flat
+    image are unrolled.
 
     Without held-out frames it shows a keyframe, and says so.
     """
@@ -121,14 +122,16 @@ def depth_comparison(m: OccupancyMap, held_out: Sequence[Frame]) -> "Figure":
     depth_colors = colormaps["turbo"].with_extremes(bad=_NO_DEPTH_GREY)
     difference_colors = colormaps["RdBu_r"].with_extremes(bad=_NO_DEPTH_GREY)
     limit = Normalize(-_DIFFERENCE_RANGE_CM, _DIFFERENCE_RANGE_CM)
-    aspect = max(frame.camera.height / frame.camera.width for frame in chosen)
+    pictures = [unrolled(frame.camera) for frame in chosen]
+    aspect = max(picture.camera.height / picture.camera.width for picture in pictures)
     figure = new_figure(15.0, rows * (4.3 * aspect + 0.35) + 0.1)
-    for axes, frame in zip(figure.subplots(rows, 3, squeeze=False), chosen, strict=True):
+    for axes, frame, picture in zip(figure.subplots(rows, 3, squeeze=False), chosen, pictures, strict=True):
         rendered = np.asarray(m.render_depth(frame.camera, frame.T_world_camera), np.float64)
         measured = np.where(np.isfinite(frame.depth_m) & (frame.depth_m > 0), frame.depth_m, np.nan)
         error = depth_error(rendered, measured)
         depths = np.concatenate([image[np.isfinite(image)] for image in (measured, rendered)])
         scale = Normalize(*np.quantile(depths, [0.01, 0.99])) if depths.size else Normalize(0.0, 1.0)
+        measured, rendered = (picture.image(image, np.nan) for image in (measured, rendered))
         axes[0].imshow(measured, cmap=depth_colors, norm=scale)
         axes[0].set_title(f"measured, {kind} {frame.name}")
         shown = axes[1].imshow(rendered, cmap=depth_colors, norm=scale)

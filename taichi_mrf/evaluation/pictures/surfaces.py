@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Z_UP, Up, up_vector
-from taichi_mrf.methods.protocol import OccupancyMap
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.methods.protocol import OccupancyMap, PosedDepth
+from taichi_mrf.sensor.camera import Camera, PinholeCamera
+from taichi_mrf.sensor.unrolled import covering
 from taichi_mrf.voxels.layout import grid_keys
 
 _VIEWS = 60
@@ -22,6 +22,8 @@ _VIEWS = 60
 _VIEW_WIDTH = 160
 """Width in pixels of the depth images that normals are taken from."""
 
+_VIEW_PIXELS = 160 * 120
+"""About so many pixels have those of cameras that are no pinholes."""
 
 _RINGS = 2
 """Rings of neighbouring cells that ``thickened`` adds."""
@@ -76,7 +78,7 @@ def seen_surfaces(m: OccupancyMap) -> Surfaces:
     keyframes = list(m.keyframes.values())
     for at in np.unique(np.linspace(0, len(keyframes) - 1, _VIEWS).round().astype(int)) if keyframes else ():
         keyframe = keyframes[at]
-        camera = keyframe.camera.scaled(min(1.0, _VIEW_WIDTH / keyframe.camera.width))
+        camera = _small_view(keyframe.camera)
         depth_m = m.render_depth(camera, keyframe.T_world_camera)
         p, n = _normals(depth_m, camera, step_m=cell_m)
         R, t = keyframe.T_world_camera[:3, :3], keyframe.T_world_camera[:3, 3]
@@ -86,17 +88,25 @@ def seen_surfaces(m: OccupancyMap) -> Surfaces:
     return Surfaces(cell_m, keys, means)
 
 
+def _small_view(camera: Camera) -> Camera:
+    """A camera that sees about the same with fewer pixels."""
+    if isinstance(camera, PinholeCamera):
+        return camera.scaled(min(1.0, _VIEW_WIDTH / camera.width))
+    return covering(camera, min(_VIEW_PIXELS, camera.width * camera.height))
+
+
 def up_direction(
-    T_world_cameras: Iterable[Pose], normals: NDArray[np.floating], otherwise: Up = Z_UP
+    upwards: Iterable[NDArray[np.floating]], normals: NDArray[np.floating], otherwise: Up = Z_UP
 ) -> NDArray[np.float64]:
     """Unit vector that points up, (3,), world frame.
 
-    The first guess is the mean upward axis (-y) of the cameras. It is tilted where the camera looked
-    down most of the time, so it is refined as by Gupta, Arbelaez and Malik (CVPR 2013, section 4): the
-    direction that is most parallel to the nearly parallel surface normals (N, 3), of any length, and most
-    perpendicular to the nearly perpendicular ones. Without cameras it is ``otherwise``.
+    The first guess is the mean of ``upwards``, (3,) each, the cameras' upward axes (:func:`upward_axis`). It
+    is tilted where the camera looked down most of the time, so it is refined as by Gupta, Arbelaez and Malik
+    (CVPR 2013, section 4): the direction that is most parallel to the nearly parallel surface normals (N, 3),
+    of any length, and most perpendicular to the nearly perpendicular ones. Without cameras it is
+    ``otherwise``.
     """
-    axes = [-T[:3, 1] for T in T_world_cameras]
+    axes = list(upwards)
     mean = np.mean(axes, axis=0) if axes else np.zeros(3)
     if np.linalg.norm(mean) < 0.1:
         return up_vector(otherwise)
@@ -115,6 +125,11 @@ def up_direction(
     return up
 
 
+def upward_axis(keyframe: PosedDepth) -> NDArray[np.float64]:
+    """The upward axis of a keyframe's camera in the world, (3,)."""
+    return keyframe.T_world_camera[:3, :3] @ np.asarray(keyframe.camera.up)
+
+
 def level_rotation(up: NDArray[np.float64]) -> NDArray[np.float64]:
     """R_level_world (3, 3): the smallest rotation that turns ``up`` (a unit vector) to +z."""
     z = np.array([0.0, 0.0, 1.0])
@@ -126,16 +141,17 @@ def level_rotation(up: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _normals(
-    depth_m: NDArray[np.floating], camera: PinholeCamera, step_m: float
+    depth_m: NDArray[np.floating], camera: Camera, step_m: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Points and unit normals towards the camera of a depth image, (N, 3) each, camera frame.
 
     Differences span about ``step_m`` on the surface (several voxels, whose steps would show
     otherwise) and never cross an edge where the depth jumps.
     """
-    points = camera.rays() * np.asarray(depth_m, np.float64)[..., None]
+    depth = np.asarray(depth_m, np.float64)
+    points = camera.rays() * depth[..., None]
     middle = float(np.nanmedian(depth_m)) if np.isfinite(depth_m).any() else 1.0
-    step = max(1, round(0.5 * step_m * camera.fx / middle))
+    step = max(1, round(0.5 * step_m * camera.pixels_per_radian / middle))
     if min(camera.shape) <= 2 * step:
         return np.zeros((0, 3)), np.zeros((0, 3))
     inner = slice(step, -step)
@@ -143,8 +159,9 @@ def _normals(
     down = points[2 * step :, inner] - points[: -2 * step, inner]
     normal = np.cross(down, across)
     length = np.linalg.norm(normal, axis=-1)
-    steep = np.maximum(np.abs(across[..., 2]), np.abs(down[..., 2])) > 4.0 * step_m
-    ok = np.isfinite(length) & (length > 0) & ~steep & np.isfinite(points[inner, inner, 2])
+    beside = np.abs(depth[inner, 2 * step :] - depth[inner, : -2 * step])
+    steep = np.maximum(beside, np.abs(depth[2 * step :, inner] - depth[: -2 * step, inner])) > 4.0 * step_m
+    ok = np.isfinite(length) & (length > 0) & ~steep & np.isfinite(depth[inner, inner])
     return points[inner, inner][ok], normal[ok] / length[ok][:, None]
 
 
