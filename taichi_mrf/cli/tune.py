@@ -35,7 +35,7 @@ def run_tune(options: Tune) -> int:
         link = _page(options, print_line, stack) if options.viewer else NoPage()
         # Imported late: the page starts meanwhile, in a process of its own.
         from taichi_mrf.datasets import open_dataset
-        from taichi_mrf.datasets.recorded_noise import with_recorded_noise
+        from taichi_mrf.datasets.recorded_noise import with_tuned_noise
         from taichi_mrf.errors import DatasetError
         from taichi_mrf.system import runtime
         from taichi_mrf.tune.search import DEFAULT_SEARCH, Search
@@ -45,7 +45,7 @@ def run_tune(options: Tune) -> int:
         dataset = open_dataset(options.source, color=False, **options.reading.keywords())
         if dataset.tracked:
             raise DatasetError(f"{options.source}: tune needs poses: map it, and give poses=trajectory.txt")
-        settings = with_recorded_noise(settings, dataset)
+        settings = with_tuned_noise(settings, dataset)
         search = None
         if options.auto is not None:
             search = Search(settings, options.names or DEFAULT_SEARCH, options.auto, options.seed)

@@ -46,6 +46,10 @@ class SensorConfig:
     patch: int = 20
     """Side of the tables' square pixel patches, in pixels."""
 
+    pixel_sigma: bool = True
+    """Use the standard deviation that frames state for each pixel, as stereo matching does. Otherwise
+    ``sigma`` or its table holds for all pixels."""
+
     min_depth: float = 0.1
     """Ignore measurements nearer than this (metres)."""
 

@@ -77,6 +77,11 @@ class Dataset(ABC):
         return None
 
     @property
+    def states_pixel_sigma(self) -> bool:
+        """Whether its frames state a sigma for each pixel."""
+        return False
+
+    @property
     def recorded_reach(self) -> float | None:
         """How far the sensor measures, in metres, if that is further than depth cameras do; None if it is not
         known."""

@@ -26,6 +26,11 @@ class Derived(Dataset):
         return self.source.recorded_sigma
 
     @property
+    def states_pixel_sigma(self) -> bool:
+        """As the source's."""
+        return self.source.states_pixel_sigma
+
+    @property
     def recorded_reach(self) -> float | None:
         """The source's."""
         return self.source.recorded_reach

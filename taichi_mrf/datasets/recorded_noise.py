@@ -11,7 +11,8 @@ def with_recorded_noise(settings: Config, dataset: Dataset) -> Config:
     """The parameters with the recording's own sigma and reach in place of the defaults; adds notes to the
     dataset.
 
-    A sigma, a sigma table or a largest depth that the user has set stays.
+    A sigma, a sigma table or a largest depth that the user has set stays, and such a sigma is that of all
+    pixels.
     """
     return _with_reach(_with_sigma(settings, dataset), dataset)
 
@@ -23,9 +24,21 @@ def _with_sigma(settings: Config, dataset: Dataset) -> Config:
     text = ", ".join(f"{value:.4g}" for value in own)
     if sensor.sigma_table is not None or sensor.sigma != SensorConfig().sigma:
         dataset.notes.append(f"sensor.sigma is set, so the recording's own sigma, [{text}], is not used")
-        return settings
+        return _for_all_pixels(settings, dataset)
     dataset.notes.append(f"sensor.sigma is [{text}], the recording's own; setting sensor.sigma overrides it")
     return replace(settings, sensor=replace(sensor, sigma=own))
+
+
+def with_tuned_noise(settings: Config, dataset: Dataset) -> Config:
+    """The same for whoever tries other values of ``sensor.sigma``, which then is that of all pixels."""
+    return _for_all_pixels(with_recorded_noise(settings, dataset), dataset)
+
+
+def _for_all_pixels(settings: Config, dataset: Dataset) -> Config:
+    if not (dataset.states_pixel_sigma and settings.sensor.pixel_sigma):
+        return settings
+    dataset.notes.append("sensor.pixel_sigma is false: sensor.sigma holds for all pixels of these frames")
+    return replace(settings, sensor=replace(settings.sensor, pixel_sigma=False))
 
 
 def _with_reach(settings: Config, dataset: Dataset) -> Config:

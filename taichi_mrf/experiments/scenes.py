@@ -53,7 +53,8 @@ COFFIN_SEED = 100
 class SceneView:
     """One view. ``measured_m`` and ``true_m`` are (H, W) axial depth in metres, 0 for none; in a recording
     what was measured is all that is known of the truth. ``judged`` (H, W): pixels that count. ``stamp_s`` is
-    when it was taken, in seconds; None if nothing is known of that."""
+    when it was taken, in seconds; None if nothing is known of that. ``sigma_m`` (H, W) is the standard
+    deviation of each pixel's depth in metres; None if that of the sensor holds."""
 
     name: str
     T_world_camera: Pose
@@ -61,6 +62,7 @@ class SceneView:
     true_m: NDArray[np.float32]
     judged: NDArray[np.bool_]
     stamp_s: float | None = None
+    sigma_m: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)

@@ -178,7 +178,8 @@ class Intake:
                 self._expects_color = False
                 warnings.warn(f"frame {frame.name} has no colour image", stacklevel=2)
             parts = (frame.T_world_camera, frame.camera, frame.name, frame.stamp, color)
-            keyframe = self.map.add_keyframe(frame.depth_m, *parts, **frame.own.arguments())
+            own = frame.own_for(self.map.sensor)
+            keyframe = self.map.add_keyframe(frame.depth_m, *parts, **own.arguments())
         try:
             if self.refiner is not None:
                 with self.result.timed("refining"):

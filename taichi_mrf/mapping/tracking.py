@@ -112,7 +112,7 @@ class Tracker:
                 frame, frame.T_world_camera if self._last is None else self._pose(self._last), 6
             )
         depth_m = checked_depth(frame.depth_m, frame.camera, m.sensor.min_depth)
-        image = DepthImage.upload(depth_m, frame.camera, m.noise, own=frame.own)
+        image = DepthImage.upload(depth_m, frame.camera, m.noise, own=frame.own_for(m.sensor))
         located = self._locator.locate(image, self._guesses(frame.stamp), m.keyframes, self._config)
         if located.T_world_camera is None:
             self._lost += 1

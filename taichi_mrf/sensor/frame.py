@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.own_evidence import OwnEvidence
@@ -42,3 +43,7 @@ class Frame:
     def own(self) -> OwnEvidence:
         """What the frame states of its measurements, as it was read."""
         return OwnEvidence(self.noise, self.sigma_m)
+
+    def own_for(self, sensor: SensorConfig) -> OwnEvidence:
+        """The part of it that a map with this configuration takes."""
+        return OwnEvidence(self.noise, self.sigma_m if sensor.pixel_sigma else None)

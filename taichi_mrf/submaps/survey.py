@@ -66,7 +66,7 @@ def survey_frames(task: SurveyTask) -> list[SurveyedFrame]:
         measured = bool((frame.depth_m > 0).any())
         if measured:
             parts = (frame.depth_m, T_world_camera, frame.camera, name, frame.stamp)
-            id = m.add_keyframe(*parts, **frame.own.arguments())
+            id = m.add_keyframe(*parts, **frame.own_for(m.sensor).arguments())
             bricks = m.all_crossed_bricks()
             if config.keep_surface:
                 bricks = np.concatenate([bricks, m.measured_bricks()])

@@ -82,7 +82,7 @@ def judge(m: OccupancyMap, frame: Frame, pixel_stride: int = 1) -> JudgedView:
     """Judge the map's depth in the view of a frame, with its own noise or the map's. Raises FrameError if it
     holds no measurement in the sensor's range."""
     depth_m = thinned(frame, pixel_stride).depth_m
-    noise = frame.own.noise_model(m.noise, depth_m)
+    noise = frame.own_for(m.sensor).noise_model(m.noise, depth_m)
     return judge_view(m, depth_m, frame.T_world_camera, frame.camera, noise=noise)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.recorded_noise import with_recorded_noise
+from taichi_mrf.datasets.recorded_noise import with_recorded_noise, with_tuned_noise
 from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX, StereoMatching, stereo_depth
 from taichi_mrf.datasets.stereo.pairs import StereoPairs
 from taichi_mrf.errors import DatasetError, FrameError
@@ -63,8 +63,12 @@ def test_the_noise_of_the_rig_takes_the_place_of_the_default(folder: Path) -> No
     assert dataset.notes[-1].startswith("sensor.sigma is [0, 0, ")
     assert with_recorded_noise(applied, dataset) is applied
     chosen = replace(Config(), sensor=SensorConfig(sigma=(0.05,)))
-    assert with_recorded_noise(chosen, dataset) is chosen
-    assert "is not used" in dataset.notes[-1]
+    for_all_pixels = with_recorded_noise(chosen, dataset)
+    assert for_all_pixels.sensor == replace(chosen.sensor, pixel_sigma=False)
+    assert "is not used" in dataset.notes[-2]
+    assert "pixel_sigma is false" in dataset.notes[-1]
+    assert with_recorded_noise(for_all_pixels, dataset) is for_all_pixels
+    assert not with_tuned_noise(Config(), dataset).sensor.pixel_sigma
 
 
 def test_a_recording_without_noise_of_its_own_keeps_the_default(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from taichi_mrf.experiments.stereo import maps as stereo
 from taichi_mrf.experiments.stereo.artefact_curve import artefacts_at, curve, threshold_for
 from taichi_mrf.experiments.stereo.artefact_tables import ratio
 from taichi_mrf.experiments.stereo.growth import corridor_scene, grow, updates_to
+from taichi_mrf.experiments.stereo.maps import log_likelihood
 from taichi_mrf.experiments.stereo.street import (
     RECORDING,
     Row,
@@ -268,6 +269,9 @@ def test_the_whole_experiment_runs_and_resumes(tmp_path: Path, monkeypatch: pyte
         assert each["coverage"] > 0.9
         assert each["artefacts"] > 0  # the box
     assert rows["MRFMap"]["artefacts"] < octomap["artefacts"]
+    stated = rows["MRFMap, sigma of each pixel"]
+    assert np.isfinite(stated["log-likelihood"])
+    assert stated["log-likelihood"] != rows["MRFMap"]["log-likelihood"]
 
     again = experiment(tmp_path / "data", tmp_path / "out")
     repeated, _ = stereo.run_stereo(again)
@@ -298,6 +302,16 @@ def test_on_the_real_street_mrf_leaves_the_fewest_artefacts(street: Scene) -> No
         assert swept["coverage"][0] > 0.8
         at[row.name] = artefacts_at(swept, 0.8)
     assert at["MRFMap"] < 0.7 * at["OctoMap-style, Table I"]
+
+
+@pytest.mark.shared_data
+@pytest.mark.usefixtures("one_backend")
+def test_on_the_real_street_a_sigma_for_each_pixel_predicts_better(street: Scene) -> None:
+    """Both with the noise that maps take, and where both are judged by the disparity-only sigma."""
+    plain, stated = Row(mrf_of_street()), Row(mrf_of_street(), pixel_sigma=True)
+    of_plain, of_stated = (row.build(street, 0.4) for row in (plain, stated))
+    assert log_likelihood(of_stated, stated, street) > log_likelihood(of_plain, plain, street) + 0.1
+    assert log_likelihood(of_stated, plain, street) > log_likelihood(of_plain, plain, street)
 
 
 @pytest.mark.shared_data

@@ -78,6 +78,10 @@ class StereoMatching:
     """Smaller disparities (pixels) are dropped, which bounds depth by baseline * focal length /
     least_disparity: the relative error of depth is sigma_d / disparity, and the sky's is near 0."""
 
+    pixel_sigma: bool = True
+    """Whether frames state a sigma for each pixel, by how sure the matching is of it (stereo/confidence.py).
+    Otherwise sigma follows from depth alone, with one sigma_d for all pixels."""
+
     def __post_init__(self) -> None:
         fits = 16 <= self.disparities <= 1024 and self.disparities % 16 == 0
         _check(fits, "disparities", "must be a multiple of 16 up to 1024")
@@ -115,6 +119,18 @@ class StereoRig:
         depth_m = np.zeros(disparity.shape)
         np.divide(self.baseline_m * self.camera.fx, disparity, out=depth_m, where=disparity > 0)
         return depth_m.astype(np.float32)
+
+    def disparity(self, depth_m: NDArray[np.floating]) -> NDArray[np.float32]:
+        """The inverse of :meth:`depth`: pixels from metres, float32; 0 = none in both."""
+        return self.depth(depth_m)  # each is baseline times focal length over the other
+
+    def sigma_at(
+        self, depth_m: NDArray[np.floating], sigma_d_px: NDArray[np.floating]
+    ) -> NDArray[np.float32]:
+        """Standard deviation of measured depths, (H, W) float32 in metres, from that of their disparities in
+        pixels."""
+        sigma_m = depth_m.astype(np.float64) ** 2 * sigma_d_px / (self.baseline_m * self.camera.fx)
+        return sigma_m.astype(np.float32)
 
     def sigma(self, sigma_d_px: float = SIGMA_D_PX) -> tuple[float, float, float]:
         """:func:`depth_sigma` of this rig."""

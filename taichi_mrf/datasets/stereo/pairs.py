@@ -1,6 +1,6 @@
 """Rectified stereo pairs as depth frames, independent of the recording's layout.
 
-Depth is not recorded: it is matched when a frame is read.
+Depth is not recorded: it is matched when a frame is read, and so is the sigma of each pixel.
 """
 
 from collections.abc import Iterable, Sequence
@@ -12,6 +12,7 @@ import numpy as np
 
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.images import image_size, read_color
+from taichi_mrf.datasets.stereo.confidence import disparity_sigma
 from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX, StereoMatching, StereoRig, stereo_depth
 from taichi_mrf.datasets.trajectories import RecordedPose
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
@@ -54,6 +55,11 @@ class StereoPairs(Dataset):
         return self.rig.sigma()
 
     @property
+    def states_pixel_sigma(self) -> bool:
+        """By how sure the matching is, unless ``matching`` says otherwise."""
+        return self.matching.pixel_sigma
+
+    @property
     def rig(self) -> StereoRig:
         """The left camera and the baseline."""
         return StereoRig(self.camera, self.baseline_m)
@@ -77,7 +83,12 @@ class StereoPairs(Dataset):
             raise FrameError(f"frame {name}: {error}") from error
         grey_left, grey_right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right))
         depth_m = stereo_depth(grey_left, grey_right, self.rig, self.matching)
-        return Frame(depth_m, T_world_camera, self.camera, pair.stamp, name, left if self.color else None)
+        sigma_m = None
+        if self.matching.pixel_sigma:
+            sigma_d_px = disparity_sigma(grey_left, grey_right, self.rig.disparity(depth_m))
+            sigma_m = self.rig.sigma_at(depth_m, sigma_d_px)
+        color = left if self.color else None
+        return Frame(depth_m, T_world_camera, self.camera, pair.stamp, name, color, sigma_m)
 
 
 def noise_note(rig: StereoRig, left: str, right: str) -> str:

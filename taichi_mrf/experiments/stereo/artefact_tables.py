@@ -25,7 +25,7 @@ def artefact_table(name: str, results: Mapping[str, Result], scene: Scene, voxel
         for coverage in COVERAGES:
             found = artefacts_at(swept, coverage)
             line += [None if found is None else round(found), ratio(swept, baseline, coverage, MAJORITY)]
-        rows.append([*line, result["build_seconds"]])
+        rows.append([*line, result.get("log_likelihood"), result["build_seconds"]])
     columns = ["map", "coverage", "occupied", "artefacts"]
     for coverage in COVERAGES:
         columns += [f"at {coverage:g}", f"ratio at {coverage:g}"]
@@ -38,11 +38,13 @@ def artefact_table(name: str, results: Mapping[str, Result], scene: Scene, voxel
         f"{MAJORITY:.0%} measure a surface more than {SIGMAS:g} sigma behind it.",
         f"Coverage: held-out measurements with an occupied voxel on their ray within {SIGMAS:g} sigma and a "
         "voxel size.",
+        "Log-likelihood: mean log density, per metre, of the held-out measurements under the map and the "
+        "noise that it was made with.",
         f"'{PASSES} passes': the pairs are integrated one after the other, and that {PASSES} times. "
         "'At once': unknown voxels stop no ray.",
     ]
     title = f"Artefacts of stereo maps, {voxel_size:g} m"
-    return Table(name, title, [*columns, "seconds"], rows, notes, 2)
+    return Table(name, title, [*columns, "log-likelihood", "seconds"], rows, notes, 2)
 
 
 def majority_table(name: str, results: Mapping[str, Result]) -> Table:

@@ -5,7 +5,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from taichi_mrf.benchmark.bench import octomap_available
+from taichi_mrf.evaluation.accuracy import judge_view
 from taichi_mrf.evaluation.artefacts import sightings
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.folds import Experiment
@@ -33,6 +36,8 @@ from taichi_mrf.experiments.stereo.street import (
     visibility_at_once,
 )
 from taichi_mrf.experiments.stereo.street_plan import plan, plan_figure
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.sensor.own_evidence import OwnEvidence
 from taichi_mrf.system.atomic import atomic_path
 
 if TYPE_CHECKING:
@@ -116,7 +121,20 @@ def _map_and_judge(row: Row, scene: Scene, voxel_size: float) -> Result:
         "plan": plan(seen, scene, voxel_size, threshold),
         "build_seconds": seconds,
         "keyframes": len(m.keyframes),
+        "log_likelihood": log_likelihood(m, row, scene),
     }
+
+
+def log_likelihood(m: OccupancyMap, row: Row, scene: Scene) -> float:
+    """Mean log density, per metre, of the held-out measurements under the map and its noise."""
+    found = []
+    for view in scene.views[1::2]:
+        measured = np.where(view.measured_m <= scene.max_depth, view.measured_m, np.float32(0.0))
+        own = OwnEvidence(None, view.sigma_m if row.pixel_sigma else None)
+        noise = own.noise_model(scene.noise, measured)
+        judged = judge_view(m, measured, view.T_world_camera, scene.camera, noise=noise)
+        found.append(judged.log_likelihood())
+    return float(np.mean(found))
 
 
 def _growth(experiment: Experiment, street: Scene) -> "tuple[Table, Figure]":

@@ -45,12 +45,13 @@ on those half-way between, which are all mapped here and not judged."""
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the table: who maps, how often the pairs are gone through, and the probability from which a
-    voxel can count as occupied at all."""
+    """A row of the table: who maps, how often the pairs are gone through, the probability from which a
+    voxel can count as occupied at all, and whether the map takes the views' own sigma of each pixel."""
 
     contender: Contender
     passes: int = 1
     least_probability: float = 0.5
+    pixel_sigma: bool = False
 
     @property
     def name(self) -> str:
@@ -62,7 +63,8 @@ class Row:
         m = self.contender.make(scene, voxel_size)
         for _ in range(self.passes):
             for view in scene.views[::2]:
-                m.add_keyframe(view.measured_m, view.T_world_camera, scene.camera, view.name)
+                sigma_m = view.sigma_m if self.pixel_sigma else None
+                m.add_keyframe(view.measured_m, view.T_world_camera, scene.camera, view.name, sigma_m=sigma_m)
         m.infer()
         return m
 
@@ -109,6 +111,7 @@ def rows() -> list[Row]:
         Row(visibility(f"visibility map, Table I, {PASSES} passes"), passes=PASSES),
         Row(visibility_at_once()),
         Row(mrf_of_street(), least_probability=least),
+        Row(mrf("MRFMap, sigma of each pixel", **STREET), least_probability=least, pixel_sigma=True),
         Row(no_floor, least_probability=least),
     ]
 
@@ -122,7 +125,10 @@ def street_scene(data: Path, limit: int | None = None) -> Scene:
     frames = [dataset.read(index) for index in range(len(dataset))[:limit]]
     if len(frames) < 2:
         raise ConfigError(f"{data / RECORDING}: {len(frames)} pairs; the experiment needs at least 2")
-    views = [SceneView(f.name, f.T_world_camera, f.depth_m, f.depth_m, f.depth_m > 0) for f in frames]
+    views = [
+        SceneView(f.name, f.T_world_camera, f.depth_m, f.depth_m, f.depth_m > 0, sigma_m=f.sigma_m)
+        for f in frames
+    ]
     noise = PolynomialNoise(dataset.rig.sigma())
     return Scene(dataset.name, dataset.camera, noise, VolumeConfig(), MAX_DEPTH_M, views)
 
@@ -137,6 +143,7 @@ def thinned(scene: Scene, stride: int) -> Scene:
             measured_m=np.ascontiguousarray(view.measured_m[::stride, ::stride]),
             true_m=view.true_m[::stride, ::stride],
             judged=view.judged[::stride, ::stride],
+            sigma_m=None if view.sigma_m is None else np.ascontiguousarray(view.sigma_m[::stride, ::stride]),
         )
         for view in scene.views
     ]
