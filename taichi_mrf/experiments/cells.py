@@ -129,8 +129,8 @@ def _judge(contender: Contender, place: _Place, voxel_size: float, seed: int) ->
     m.infer()
     clean = [np.where(view.true_m < scene.max_depth, view.true_m, np.float32(0)) for view in scene.views]
     poses = [view.T_world_camera for view in scene.views]
-    truth = occupancy_truth(place.mesh, clean, poses, scene.camera, voxel_size)
-    space = SeenSpace(truth, clean, poses, scene.camera)
+    truth = occupancy_truth(place.mesh, clean, poses, scene.pinhole, voxel_size)
+    space = SeenSpace(truth, clean, poses, scene.pinhole)
     return {reading: _answers(m.reading(reading), truth, space, seed) for reading in READINGS}
 
 

@@ -133,7 +133,7 @@ def _draw_profile(
 ) -> None:
     """Probability, visibility and omega along the ray, by range, with the depths that matter as lines."""
     u, v = pixel
-    per_depth = float(scene.camera.range_per_depth()[v, u])
+    per_depth = float(scene.pinhole.range_per_depth()[v, u])
     true, measured = (float(image[v, u]) * per_depth for image in (view.true_m, view.measured_m))
     begins = profile.distance - 0.5 * profile.length
     peak = float(profile.omega.max(initial=0.0)) or 1.0

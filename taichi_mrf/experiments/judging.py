@@ -23,7 +23,8 @@ def build(
     m = contender.make(scene, voxel_size)
     for index in keyframes:
         view = scene.views[index]
-        m.add_keyframe(view.measured_m, view.T_world_camera, scene.camera, view.name, view.stamp_s)
+        camera = view.camera or scene.camera
+        m.add_keyframe(view.measured_m, view.T_world_camera, camera, view.name, view.stamp_s)
     m.infer()
     return m, time.perf_counter() - start
 
@@ -57,7 +58,7 @@ def build_and_judge(
 
 def _figures(m: OccupancyMap, scene: Scene, view: SceneView, changes: dict[str, float]) -> Figures:
     judged = judge_view(
-        m, view.true_m, view.T_world_camera, scene.camera,
+        m, view.true_m, view.T_world_camera, view.camera or scene.camera,
         measured_m=view.measured_m, noise=scene.noise, mask=view.judged,
         view=m.view.with_occlusion(**changes) if changes else m.view,
     )  # fmt: skip

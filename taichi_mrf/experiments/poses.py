@@ -109,7 +109,7 @@ def kitchen(experiment: Experiment) -> Scene:
 
 def halved(scene: Scene) -> Scene:
     """A scene by a camera with every second pixel along both axes."""
-    k = scene.camera
+    k = scene.pinhole
     camera = PinholeCamera(-(-k.width // 2), -(-k.height // 2), k.fx / 2, k.fy / 2, k.cx / 2, k.cy / 2)
 
     return replace(scene, camera=camera, views=[_halved(view) for view in scene.views])

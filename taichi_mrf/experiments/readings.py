@@ -188,7 +188,7 @@ def _truth(scene: Scene, mesh: TriangleMesh, keyframes: list[int], voxel_size: f
         mesh,
         [np.where(view.measured_m > 0, view.true_m, 0) for view in views],
         [view.T_world_camera for view in views],
-        scene.camera,
+        scene.pinhole,
         voxel_size,
     )
 
@@ -220,7 +220,7 @@ def _house(experiment: Experiment, noise: str) -> Judged:
         views = []
         for index, view in enumerate(scene.views):
             true_m = np.where(view.true_m < D435_RANGE_M, view.true_m, 0).astype(np.float32)
-            measured_m = simulate_model(true_m, scene.camera, model, seed=500 + index)
+            measured_m = simulate_model(true_m, scene.pinhole, model, seed=500 + index)
             views.append(replace(view, measured_m=measured_m))
         scene = replace(scene, name=f"{scene.name}, D435", noise=model, views=views)
     return scene, load_mesh(experiment.data / "meshes" / "house.ply")

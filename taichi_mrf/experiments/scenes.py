@@ -19,7 +19,7 @@ from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, as_pose, look_at
 from taichi_mrf.mapping.selection import KeyframeSelector
-from taichi_mrf.sensor.camera import pinhole
+from taichi_mrf.sensor.camera import Camera, pinhole
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.simulate import KINECT_1_LATERAL, simulate, simulate_model
 
@@ -51,10 +51,10 @@ COFFIN_SEED = 100
 
 @dataclass(frozen=True)
 class SceneView:
-    """One view. ``measured_m`` and ``true_m`` are (H, W) axial depth in metres, 0 for none; in a recording
-    what was measured is all that is known of the truth. ``judged`` (H, W): pixels that count. ``stamp_s`` is
-    when it was taken, in seconds; None if nothing is known of that. ``sigma_m`` (H, W) is the standard
-    deviation of each pixel's depth in metres; None if that of the sensor holds."""
+    """One view. ``measured_m`` and ``true_m`` are (H, W) depth in metres, 0 for none; in a recording what was
+    measured is all that is known of the truth. ``judged`` (H, W): pixels that count. ``stamp_s`` is when it
+    was taken, in seconds; None if nothing is known of that. ``sigma_m`` (H, W) is the standard deviation of
+    each pixel's depth in metres; None if that of the sensor holds. ``camera`` is None for the scene's."""
 
     name: str
     T_world_camera: Pose
@@ -63,18 +63,25 @@ class SceneView:
     judged: NDArray[np.bool_]
     stamp_s: float | None = None
     sigma_m: NDArray[np.float32] | None = None
+    camera: Camera | None = None
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Views of one place by one camera, the noise of its sensor, and where the map may be."""
+    """Views of one place by one sensor, its noise, and where the map may be. ``camera`` is that of all views
+    that have none of their own."""
 
     name: str
-    camera: PinholeCamera
+    camera: Camera
     noise: NoiseModel
     volume: VolumeConfig
     max_depth: float
     views: Sequence[SceneView]
+
+    @property
+    def pinhole(self) -> PinholeCamera:
+        """The camera, for what works with pinholes alone. Raises ConfigError for any other."""
+        return pinhole(self.camera, self.name)
 
 
 def coffin_scene(data: Path, seed: int = 0) -> Scene:

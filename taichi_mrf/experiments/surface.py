@@ -91,7 +91,7 @@ class _Case:
         views = self.scene.views
         depths, poses = [view.true_m for view in views], [view.T_world_camera for view in views]
         return surface_truth(
-            depths, poses, self.scene.camera, _used(self.scene), [view.judged for view in views]
+            depths, poses, self.scene.pinhole, _used(self.scene), [view.judged for view in views]
         )
 
 
@@ -181,7 +181,7 @@ class Open3DGrid:
         """``truncation`` in voxels. Raises TaichiMRFError without Open3D."""
         self._o3d = library("open3d", "the comparison needs", "bench")
         core = self._o3d.core
-        k = scene.camera
+        k = scene.pinhole
         self._K = core.Tensor([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]], core.float64)
         self._grid = self._o3d.t.geometry.VoxelBlockGrid(
             ("tsdf", "weight"), (core.float32, core.float32), ((1), (1)), voxel_size, BLOCK, 50_000

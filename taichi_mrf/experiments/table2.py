@@ -116,7 +116,7 @@ def _truth(
         load_mesh(experiment.data / "meshes" / "house.ply"),
         [view.true_m for view in views],
         [view.T_world_camera for view in views],
-        scene.camera,
+        scene.pinhole,
         voxel_size,
     )
 

@@ -112,7 +112,7 @@ def _map_and_judge(row: Row, scene: Scene, voxel_size: float) -> Result:
     start = time.perf_counter()
     m = row.build(scene, voxel_size)
     seconds = time.perf_counter() - start
-    measured = (scene.views[1::2], scene.camera, scene.noise, scene.max_depth)
+    measured = (scene.views[1::2], scene.pinhole, scene.noise, scene.max_depth)
     seen = sightings(m, *measured, row.least_probability)
     swept = curve(seen, row.least_probability)
     threshold = swept["threshold"][threshold_for(swept, PICTURE_COVERAGE)]

@@ -136,7 +136,7 @@ def street_scene(data: Path, limit: int | None = None) -> Scene:
 def thinned(scene: Scene, stride: int) -> Scene:
     """The scene with every ``stride``-th row and column only. Depths keep the precision that they have at
     full resolution, as the paper's do."""
-    k = scene.camera
+    k = scene.pinhole
     views = [
         dataclasses.replace(
             view,
