@@ -82,6 +82,11 @@ class Dataset(ABC):
         return False
 
     @property
+    def sigma_origin(self) -> str:
+        """Where :attr:`recorded_sigma` comes from, in the words of a note."""
+        return "the recording's own"
+
+    @property
     def recorded_reach(self) -> float | None:
         """How far the sensor measures, in metres, if that is further than depth cameras do; None if it is not
         known."""

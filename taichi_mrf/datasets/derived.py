@@ -31,6 +31,11 @@ class Derived(Dataset):
         return self.source.states_pixel_sigma
 
     @property
+    def sigma_origin(self) -> str:
+        """The source's."""
+        return self.source.sigma_origin
+
+    @property
     def recorded_reach(self) -> float | None:
         """The source's."""
         return self.source.recorded_reach

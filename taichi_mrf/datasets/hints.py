@@ -13,7 +13,6 @@ from taichi_mrf.errors import DatasetError
 from taichi_mrf.system.files import is_file, is_folder, read_text
 
 _LIDAR = (".las", ".laz", ".bin", ".velodyne")
-_OUSTER = (".osf", ".pcap")
 _MESHES = (".ply", ".obj", ".stl", ".glb", ".off")
 _OCTOMAPS = (".bt", ".ot")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -52,8 +51,6 @@ def _kind(path: Path) -> str | None:
     suffix = path.suffix.lower()
     if suffix in _LIDAR:
         return LIDAR_POSES
-    if suffix in _OUSTER:
-        return "contains packets of a lidar, which are not supported; point clouds with poses are"
     if suffix in _MESHES:
         return (
             f"contains a mesh or points ({path.name}), not depth images; "

@@ -21,11 +21,11 @@ def _with_sigma(settings: Config, dataset: Dataset) -> Config:
     own, sensor = dataset.recorded_sigma, settings.sensor
     if own is None or sensor.sigma == own:
         return settings
-    text = ", ".join(f"{value:.4g}" for value in own)
+    text, origin = ", ".join(f"{value:.4g}" for value in own), dataset.sigma_origin
     if sensor.sigma_table is not None or sensor.sigma != SensorConfig().sigma:
-        dataset.notes.append(f"sensor.sigma is set, so the recording's own sigma, [{text}], is not used")
+        dataset.notes.append(f"sensor.sigma is set, so [{text}], {origin}, is not used")
         return _for_all_pixels(settings, dataset)
-    dataset.notes.append(f"sensor.sigma is [{text}], the recording's own; setting sensor.sigma overrides it")
+    dataset.notes.append(f"sensor.sigma is [{text}], {origin}; setting sensor.sigma overrides it")
     return replace(settings, sensor=replace(sensor, sigma=own))
 
 
@@ -45,5 +45,6 @@ def _with_reach(settings: Config, dataset: Dataset) -> Config:
     own, sensor = dataset.recorded_reach, settings.sensor
     if own is None or sensor.max_depth != SensorConfig().max_depth or sensor.max_depth == own:
         return settings
-    dataset.notes.append(f"sensor.max_depth is {own:g} m, the recording's reach; setting it overrides that")
+    reach = f"{own:g} m, as far as the first scan reaches"
+    dataset.notes.append(f"sensor.max_depth is {reach}; setting sensor.max_depth overrides it")
     return replace(settings, sensor=replace(sensor, max_depth=own))

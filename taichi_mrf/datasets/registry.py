@@ -11,7 +11,7 @@ from pathlib import Path
 from taichi_mrf.datasets.base import BuiltIn, Dataset, Format
 from taichi_mrf.datasets.formats import frames_npz, numbered_depth, replica, scannet, seven_scenes, tum_rgbd
 from taichi_mrf.datasets.hints import hint_for
-from taichi_mrf.datasets.lidar import kitti_velodyne, pcd_viewpoints, scan_folder
+from taichi_mrf.datasets.lidar import kitti_velodyne, ouster, pcd_viewpoints, scan_folder
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.realsense import device
 from taichi_mrf.datasets.resampled import resampled
@@ -33,6 +33,7 @@ FORMATS: tuple[Format, ...] = (
     kitti_velodyne.FORMAT,
     scan_folder.FORMAT,
     pcd_viewpoints.FORMAT,
+    ouster.FORMAT,
     frames_npz.FORMAT,
     rig_file.FORMAT,
 )

@@ -85,7 +85,6 @@ def test_laser_scans_name_the_command_that_maps_them(tmp_path: Path, name: str) 
     [
         ("scan.bin", "contains lidar point clouds without poses"),
         ("walk.laz", "lidar point clouds without poses"),
-        ("walk.osf", "contains packets of a lidar"),
         ("house.ply", "?poses=FILE' renders depth images of a mesh"),
         ("office.bt", "taichi-mrf import reads it"),
         ("scene.sens", "extract it"),

@@ -21,6 +21,9 @@ from taichi_mrf.sensor.ray_table import RayTable
 LIDAR_SIGMA_M = 0.03
 """Standard deviation of range that is assumed: spinning lidars are specified with 2 to 3 cm at all ranges."""
 
+SIGMA_ORIGIN = "assumed for a lidar"
+"""What reports say of it."""
+
 SECONDS_PER_SCAN = 0.1
 """Assumed where nothing tells: most lidars turn ten times a second."""
 
@@ -59,6 +62,11 @@ class LidarScans(Dataset):
     def recorded_sigma(self) -> tuple[float, ...] | None:
         """The same at every range."""
         return (LIDAR_SIGMA_M,)
+
+    @property
+    def sigma_origin(self) -> str:
+        """It is assumed."""
+        return SIGMA_ORIGIN
 
     @property
     def recorded_reach(self) -> float | None:
@@ -116,22 +124,13 @@ def lidar_scans(
             continue
         camera: Camera = RayTable.of_points(points_m)[0]
         reach_m = reach_of(np.linalg.norm(points_m, axis=1))
-        said = [*notes, noise_note(reach_m)]
-        return LidarScans(name, camera, said, dropped, scans=scans, reach_m=reach_m)
+        return LidarScans(name, camera, list(notes), dropped, scans=scans, reach_m=reach_m)
     raise DatasetError(f"{name}: no scan can be read: {problem}") from problem
 
 
 def reach_of(range_m: NDArray[np.floating]) -> float:
     """The largest range, rounded up to tens of metres."""
     return float(max(1.0, np.ceil(range_m.max() / _REACH_STEP_M)) * _REACH_STEP_M)
-
-
-def noise_note(reach_m: float) -> str:
-    """The report's note on what is assumed of a lidar."""
-    return (
-        f"the sigma of the lidar is assumed: {LIDAR_SIGMA_M:g} m at all ranges; the first scan reaches "
-        f"{reach_m:g} m"
-    )
 
 
 def refuse_image_options(name: str, options: ReadOptions) -> None:

@@ -207,6 +207,8 @@ def _posed(
 ) -> tuple[Posed, list[str]]:
     """The messages that have a pose, and notes. Raises DatasetError if none has."""
     gap = _gap(options)
+    if not entries:  # in a damaged file, whose index counts some
+        raise DatasetError(f"{reader.path}: topic {topic} contains no message")
     posed = [
         (i, entry, pose)
         for i, entry in enumerate(entries)

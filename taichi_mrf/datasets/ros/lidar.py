@@ -6,27 +6,23 @@ lidar moved meanwhile, points are taken to where they were measured, by the pose
 into the lidar's frame at the stamp of the scan.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.lidar.motion import PoseAt, without_motion
 from taichi_mrf.datasets.lidar.organised import by_ring, organised
-from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M, measured_points, noise_note, reach_of
+from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M, SIGMA_ORIGIN, measured_points, reach_of
 from taichi_mrf.datasets.ros.point_cloud import Cloud, decode
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
-from taichi_mrf.datasets.timed_poses import interpolate
 from taichi_mrf.errors import DatasetError, FrameError
-from taichi_mrf.geometry.poses import Pose, inverse, tangent_norms
+from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.ray_table import RayTable
-
-_FAR_M = 10.0
-_LOOKED_UP, _POSES_A_SCAN = 16, 1024
-"""Poses are looked up so many times during a scan, and interpolated for so many columns."""
 
 
 @dataclass
@@ -39,7 +35,7 @@ class LidarBag(Dataset):
     entries: Sequence[Entry] = field(kw_only=True)
     poses: Sequence[Pose] = field(kw_only=True)
     names: Sequence[str] = field(kw_only=True)
-    at: Callable[[float], Pose | None] | None = None
+    at: PoseAt | None = None
     reach_m: float | None = None
 
     @property
@@ -49,8 +45,13 @@ class LidarBag(Dataset):
 
     @property
     def recorded_sigma(self) -> tuple[float, ...] | None:
-        """A lidar's, the same at every range."""
+        """The same at every range."""
         return (LIDAR_SIGMA_M,)
+
+    @property
+    def sigma_origin(self) -> str:
+        """It is assumed."""
+        return SIGMA_ORIGIN
 
     @property
     def recorded_reach(self) -> float | None:
@@ -78,7 +79,10 @@ class LidarBag(Dataset):
         if not measured.any():
             raise FrameError(f"frame {name}: {where}: none of {measured.size} points is a measurement")
         pose = self.poses[index]
-        moved = _unmoved(cloud, measured, pose, entry.stamp, self.at)
+        moved = None
+        if self.at is not None and cloud.seconds is not None:
+            parts = cloud.points_m[measured], cloud.seconds[measured]
+            moved = without_motion(*parts, entry.stamp, pose, self.at)
         camera, range_m, no_return = _rays(cloud) if moved is None else _free(moved)
         return Frame(range_m, pose, camera, entry.stamp, name, no_return=no_return)
 
@@ -95,7 +99,7 @@ class LidarBag(Dataset):
             self.camera, self.reach_m = frame.camera, reach_of(frame.depth_m)
             pattern = isinstance(frame.camera, RayTable) and frame.camera.has_pattern
             rays = f"images of {frame.camera.width} x {frame.camera.height} rays" if pattern else "free rays"
-            self.notes += [f"{self.topic}: {rays}", noise_note(self.reach_m)]
+            self.notes.append(f"{self.topic}: {rays}")
             return
         raise DatasetError(f"{self.name}: no cloud can be read: {problem}") from problem
 
@@ -116,35 +120,3 @@ def _rays(cloud: Cloud) -> Rays:
 def _free(points_m: NDArray[np.float64]) -> Rays:
     table, range_m = RayTable.of_points(points_m[measured_points(points_m)])
     return table, range_m, None
-
-
-def _unmoved(
-    cloud: Cloud,
-    measured: NDArray[np.bool_],
-    T_world_lidar: Pose,
-    stamp: float,
-    at: Callable[[float], Pose | None] | None,
-) -> NDArray[np.float64] | None:
-    """The measured points (N, 3), in the lidar's frame at the stamp, without the motion during the scan. None
-    if it did not move enough to matter, or if nothing tells."""
-    if at is None or cloud.seconds is None:
-        return None
-    points_m, seconds = cloud.points_m[measured], cloud.seconds[measured]
-    if not np.isfinite(seconds).all() or seconds.max() == seconds.min():
-        return None
-    first, last = float(seconds.min()), float(seconds.max())
-    poses = [at(stamp + time) for time in np.linspace(first, last, _LOOKED_UP)]
-    known = [pose for pose in poses if pose is not None]
-    if len(known) < _LOOKED_UP:
-        return None
-    rotation, translation = tangent_norms(known[0], known[-1])
-    if _FAR_M * rotation + translation < LIDAR_SIGMA_M:
-        return None
-    T_lidar_world = inverse(T_world_lidar)
-    T_lidar_then = np.array([T_lidar_world @ pose for pose in known])
-    place = np.linspace(0, _LOOKED_UP - 1, _POSES_A_SCAN)
-    before = np.minimum(place.astype(int), _LOOKED_UP - 2)
-    T = interpolate(T_lidar_then[before], T_lidar_then[before + 1], place - before)
-    column = np.rint((seconds - first) / (last - first) * (_POSES_A_SCAN - 1)).astype(int)
-    turned: NDArray[np.float64] = np.einsum("nij,nj->ni", T[column, :3, :3], points_m)
-    return turned + T[column, :3, 3]

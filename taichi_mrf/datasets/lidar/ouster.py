@@ -1,0 +1,280 @@
+"""Recordings of Ouster's lidars: ``walk.osf?poses=FILE``, or a ``.pcap`` with its ``.json`` beside it.
+
+The fields of :class:`OusterOptions` are the options. Poses are those in the recording (OSF files that a SLAM
+has written have one for each column) or in a file of ``stamp tx ty tz qx qy qz qw`` lines, by the stamps of
+the sensor; without either the sensor is assumed to stand still. A scan is an image of beams and columns; if
+the sensor moved meanwhile, its points are taken to where they were measured (motion.py) and become free rays.
+Reading needs the extra ``ouster``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.lidar.beams import Beams
+from taichi_mrf.datasets.lidar.motion import PoseAt, without_motion
+from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M, SIGMA_ORIGIN, reach_of, refuse_image_options
+from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
+from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
+from taichi_mrf.errors import DatasetError, FrameError, KeyframeError, said
+from taichi_mrf.geometry.poses import Pose, as_pose
+from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.ray_table import RayTable
+from taichi_mrf.system.files import check_regular, is_file
+from taichi_mrf.system.libraries import library
+
+SUFFIXES = (".osf", ".pcap")
+STANDS_STILL = "contains no poses: the lidar is assumed to stand still; for one that moves add ?poses=FILE"
+_LONGEST_GAP_S = 1.0
+
+
+@dataclass(frozen=True)
+class OusterOptions:
+    """The options after the name of a recording."""
+
+    poses: str = ""
+    """A file of the sensor's poses in TUM's layout, in place of those in the recording; or track, to find
+    them while mapping."""
+
+    meta: str = ""
+    """The metadata of a .pcap, if it is not beside it."""
+
+    sensor: int = 0
+    """Which sensor of a recording with several, from 0."""
+
+    deskew: bool = True
+    """Undo the motion of the sensor during a scan."""
+
+
+@dataclass(frozen=True)
+class RecordedColumns:
+    """What is kept of a scan from opening: its number in the source, and its stamp, the middle of its
+    columns."""
+
+    number: int
+    stamp: float
+
+
+@dataclass
+class OusterScans(Dataset):
+    """The scans of one sensor. ``source`` is ouster.sdk's; ``trajectory`` are poses of the sensor,
+    T_world_sensor, from a file, None for those in the recording."""
+
+    path: Path = field(kw_only=True)
+    source: Any = field(kw_only=True)
+    sensor: int = field(kw_only=True)
+    beams: Beams = field(kw_only=True)
+    scans: Sequence[RecordedColumns] = field(kw_only=True)
+    trajectory: TimedPoses | None = None
+    gap: float = INTERPOLATION_GAP
+    deskew: bool = True
+    reach_m: float | None = None
+
+    @property
+    def frame_names(self) -> Sequence[str]:
+        """The number of each scan in the recording, from 0."""
+        return [f"{scan.number:06d}" for scan in self.scans]
+
+    @property
+    def recorded_sigma(self) -> tuple[float, ...] | None:
+        """The same at every range."""
+        return (LIDAR_SIGMA_M,)
+
+    @property
+    def sigma_origin(self) -> str:
+        """It is assumed."""
+        return SIGMA_ORIGIN
+
+    @property
+    def recorded_reach(self) -> float | None:
+        """The largest range of the first scan, rounded up to tens of metres."""
+        return self.reach_m
+
+    def read(self, index: int) -> Frame:
+        """Decode one scan. Raises FrameError, which names frame and file, if it is damaged, has no
+        measurement or no valid pose. Raises IndexError outside 0 to len - 1."""
+        if not 0 <= index < len(self.scans):
+            raise IndexError(f"{self.name} has {len(self.scans)} frames, there is no frame {index}")
+        scan, name = self.scans[index], self.frame_names[index]
+        try:
+            columns = columns_of(self.source, scan.number, self.sensor)
+            if columns is None:
+                raise DatasetError("it has no column")
+            at = self._poses(columns)
+            T_world_sensor = at(scan.stamp)
+            if T_world_sensor is None:
+                raise DatasetError("its pose is not known")
+            return self._frame(columns, as_pose(T_world_sensor @ self.beams.T_sensor_lidar), at, scan, name)
+        except (DatasetError, KeyframeError) as error:
+            raise FrameError(f"frame {name}: {self.path}: {error}") from error
+
+    def _frame(
+        self, columns: "Columns", T_world_lidar: Pose, at: PoseAt, scan: RecordedColumns, name: str
+    ) -> Frame:
+        range_m = self.beams.from_centre(self.beams.shifted(columns.range_m))
+        measured = range_m > 0
+        if not measured.any():
+            raise DatasetError("none of its pixels is a measurement")
+        if self.deskew and not self.tracked:
+            points_m = self.beams.camera.rays()[measured] * range_m[measured, None]
+            stamps = self.beams.shifted(np.broadcast_to(columns.stamps, range_m.shape))[measured]
+
+            def lidar_at(stamp: float) -> Pose | None:
+                T = at(stamp)
+                return None if T is None else T @ self.beams.T_sensor_lidar
+
+            moved = without_motion(points_m, stamps - scan.stamp, scan.stamp, T_world_lidar, lidar_at)
+            if moved is not None:
+                table, range_m = RayTable.of_points(moved)
+                return Frame(range_m, T_world_lidar, table, scan.stamp, name)
+        looked = self.beams.shifted(np.broadcast_to(columns.valid, range_m.shape))
+        no_return = looked & ~measured
+        return Frame(range_m, T_world_lidar, self.beams.camera, scan.stamp, name, no_return=no_return)
+
+    def _poses(self, columns: "Columns") -> PoseAt:
+        """The sensor's pose at any time of a scan."""
+        if self.tracked:
+            return lambda stamp: np.eye(4)
+        timed, gap = (
+            (columns.poses, _LONGEST_GAP_S) if self.trajectory is None else (self.trajectory, self.gap)
+        )
+        return lambda stamp: timed.at(stamp, gap)
+
+
+@dataclass(frozen=True)
+class Columns:
+    """A scan by measurement: ranges (H, W) in metres, 0 for none; of its columns (W,) the stamps in seconds,
+    which are ``valid``, and the poses T_world_sensor of those."""
+
+    range_m: NDArray[np.float64]
+    stamps: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+    poses: TimedPoses
+
+
+def columns_of(source: Any, number: int, sensor: int) -> Columns | None:
+    """A scan of one sensor, None if it has no column. Raises DatasetError if it cannot be decoded."""
+    try:
+        frame = _of_sensor(source[number], sensor)
+        if frame is None:
+            return None
+        valid = (np.asarray(frame.status) & 1) > 0
+        stamps = np.asarray(frame.timestamp, np.float64) * 1e-9
+        range_m = np.asarray(frame.field("RANGE"), np.float64) / 1000
+        poses = np.asarray(frame.body_to_world, np.float64)
+        extrinsic = np.asarray(frame.sensor_info.sensor_to_body, np.float64)
+    except Exception as error:  # the library raises many kinds of errors
+        raise DatasetError(f"cannot be decoded: {said(error)}") from error
+    if not valid.any():
+        return None
+    range_m = np.where(valid[None, :], range_m, 0.0)
+    return Columns(range_m, stamps, valid, TimedPoses(stamps[valid], poses[valid] @ extrinsic))
+
+
+def recognises(path: Path) -> bool:
+    """Whether a file is one of these, by its ending."""
+    return path.suffix.lower() in SUFFIXES and is_file(path)
+
+
+def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
+    """Open a recording with the options after the question mark of its name, and read the stamps of its
+    scans.
+
+    Raises DatasetError, which names the file, if ouster-sdk is not installed, metadata are missing, and if no
+    scan can be read or has a pose.
+    """
+    chosen = parse_options(OusterOptions, query, str(path))
+    refuse_image_options(f"{path}", options)
+    check_regular(path, DatasetError)
+    tracked = options.track or chosen.poses == TRACK
+    trajectory = None if tracked or not chosen.poses else read_timed_poses(Path(chosen.poses))
+    gap = INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
+    source, count = _open(path, chosen)
+    beams = _beams(path, source, chosen.sensor)
+    scans, notes, dropped, moves = [], [], 0, False
+    for number in range(count):
+        try:
+            columns = columns_of(source, number, chosen.sensor)
+        except DatasetError:  # reading the scan reports it
+            columns = None
+        if columns is None:
+            dropped += 1
+            continue
+        first, last = columns.stamps[columns.valid][[0, -1]]
+        stamp = 0.5 * (first + last)
+        moves = moves or not np.array_equal(columns.poses.poses[0], columns.poses.poses[-1])
+        if trajectory is not None and trajectory.at(stamp, gap) is None:
+            dropped += 1
+            continue
+        scans.append(RecordedColumns(number, stamp))
+    if not scans:
+        why = (
+            f"has poses within {gap:g} s on both sides" if trajectory is not None and count else "can be read"
+        )
+        raise DatasetError(f"{path}: none of its {count} scans {why}")
+    if dropped:
+        notes.append(
+            f"{dropped} of {count} scans dropped: damaged, or no poses within {gap:g} s on both sides"
+        )
+    if trajectory is None and not moves and not tracked:
+        notes.append(STANDS_STILL)
+    found = OusterScans(
+        path.stem,
+        beams.camera,
+        notes,
+        dropped,
+        path=path,
+        source=source,
+        sensor=chosen.sensor,
+        beams=beams,
+        scans=scans,
+        trajectory=trajectory,
+        gap=gap,
+        deskew=chosen.deskew,
+        tracked=tracked,
+    )
+    columns = columns_of(source, scans[0].number, chosen.sensor)
+    assert columns is not None, "it was read above"
+    found.reach_m = reach_of(columns.range_m)
+    return found
+
+
+def _open(path: Path, chosen: OusterOptions) -> tuple[Any, int]:
+    sdk = library("ouster.sdk", "recordings of Ouster's lidars need", "ouster", DatasetError)
+    more: dict[str, Any] = {"meta": [chosen.meta]} if chosen.meta else {}
+    try:
+        source = sdk.open_source(str(path), index=True, **more)
+        return source, len(source)
+    except Exception as error:  # as above
+        hint = "; a .pcap needs its metadata: a .json of the same name beside it, or ?meta=FILE"
+        pcap = path.suffix.lower() == ".pcap"
+        raise DatasetError(f"{path}: cannot be read: {said(error)}{hint if pcap else ''}") from error
+
+
+def _beams(path: Path, source: Any, sensor: int) -> Beams:
+    infos = list(source.sensor_info)
+    if not 0 <= sensor < len(infos):
+        raise DatasetError(f"{path}: has {len(infos)} sensors, so there is no sensor {sensor}")
+    try:
+        return Beams.of(infos[sensor])
+    except DatasetError as error:
+        raise DatasetError(f"{path}: sensor {sensor}: {error}") from error
+
+
+def _of_sensor(frames: Any, sensor: int) -> Any | None:
+    """The scan of one sensor in what the source gives at a time."""
+    return next(iter([frame for i, frame in enumerate(frames) if i == sensor]), None)
+
+
+FORMAT = Format(
+    name="Ouster",
+    looks_for="*.osf, or *.pcap with its .json",
+    recognises=recognises,
+    open=lambda path, options: open_recording(path, "", options),
+    open_with_query=open_recording,
+)

@@ -1,0 +1,230 @@
+"""Ouster's recordings: the geometry of their beams, poses, and what is said without ouster-sdk."""
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from datasets_recordings import stamped_line
+from numpy.typing import NDArray
+
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.lidar.beams import NOMINAL_M, Beams
+from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.geometry.poses import look_at
+from taichi_mrf.sensor.ray_table import RayTable
+
+ROWS, COLUMNS, N_M = 3, 32, 0.0277
+ALTITUDE, AZIMUTH, SHIFTS = np.array([30.0, 0.0, -40.0]), np.array([11.0, -11.5, 1.0]), [2, 0, 1]
+TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+def metadata(sensor_height_m: float = 0.04) -> Any:
+    """What ouster-sdk says of a sensor of three beams."""
+    T_lidar_beam, T_sensor_lidar = np.eye(4), TURNED.copy()
+    T_lidar_beam[0, 3], T_sensor_lidar[2, 3] = 1000 * N_M, 1000 * sensor_height_m
+    return SimpleNamespace(
+        beam_altitude_angles=ALTITUDE.tolist(),
+        beam_azimuth_angles=AZIMUTH.tolist(),
+        beam_to_lidar_transform=T_lidar_beam,
+        lidar_to_sensor_transform=T_sensor_lidar,
+        sensor_to_body=np.eye(4),
+        format=SimpleNamespace(columns_per_frame=COLUMNS, pixel_shift_by_row=SHIFTS),
+    )
+
+
+def points(range_m: NDArray) -> NDArray:
+    """Points (H, W, 3) by measurement in the lidar's frame, by Ouster's own formula."""
+    encoder = 2 * np.pi * (1 - np.arange(COLUMNS) / COLUMNS)[None, :]
+    azimuth, altitude = -np.radians(AZIMUTH)[:, None], np.radians(ALTITUDE)[:, None]
+    along = range_m - N_M
+    return np.stack(
+        [
+            along * np.cos(encoder + azimuth) * np.cos(altitude) + N_M * np.cos(encoder),
+            along * np.sin(encoder + azimuth) * np.cos(altitude) + N_M * np.sin(encoder),
+            along * np.sin(altitude) + 0 * encoder,
+        ],
+        axis=-1,
+    )
+
+
+@pytest.mark.parametrize(("range_m", "tolerance_m"), [(NOMINAL_M, 1e-4), (2.0, N_M), (2 * NOMINAL_M, N_M)])
+def test_points_lie_where_the_maker_says(range_m: float, tolerance_m: float) -> None:
+    beams, ranges = Beams.of(metadata()), np.full((ROWS, COLUMNS), range_m)
+    distance_m = beams.from_centre(beams.shifted(ranges))
+    found = beams.camera.rays() * distance_m[..., None]
+    expected = np.stack([beams.shifted(axis) for axis in np.moveaxis(points(ranges), -1, 0)], axis=-1)
+    assert np.linalg.norm(found - expected, axis=-1).max() < tolerance_m
+    np.testing.assert_allclose(distance_m, np.linalg.norm(expected, axis=-1), rtol=1e-5)
+    assert beams.T_sensor_lidar[2, 3] == 0.04
+
+
+def test_no_measurement_stays_none() -> None:
+    beams = Beams.of(metadata())
+    assert not beams.from_centre(np.zeros((ROWS, COLUMNS))).any()
+
+
+def test_a_sensor_that_does_not_spin_is_refused() -> None:
+    info = metadata()
+    info.beam_altitude_angles = np.zeros((ROWS, COLUMNS))
+    with pytest.raises(DatasetError, match="does not spin"):
+        Beams.of(info)
+
+
+class Source:
+    """A stand-in for what ouster.sdk.open_source returns: scans of 0.1 s, a tenth of a second apart."""
+
+    def __init__(self, poses: list[NDArray], ranges_mm: NDArray | None = None) -> None:
+        self.sensor_info = [metadata()]
+        ranges = np.full((ROWS, COLUMNS), 5000, np.uint32) if ranges_mm is None else ranges_mm
+        self.frames = [
+            SimpleNamespace(
+                status=np.ones(COLUMNS, np.uint32),
+                timestamp=((10 + 0.1 * i + 0.1 * np.arange(COLUMNS) / (COLUMNS - 1)) * 1e9).astype(np.uint64),
+                field=lambda name: ranges,
+                body_to_world=pose,
+                sensor_info=self.sensor_info[0],
+            )
+            for i, pose in enumerate(poses)
+        ]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, index: int) -> list[Any]:
+        return [self.frames[index]]
+
+
+STILL = np.tile(np.eye(4), (COLUMNS, 1, 1))
+
+
+def driving() -> NDArray:
+    """Poses of the columns of a scan in which the sensor drives a metre along x."""
+    poses = STILL.copy()
+    poses[:, 0, 3] = np.linspace(0, 1, COLUMNS)
+    return poses
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    (tmp_path / "walk.osf").write_bytes(b"scans")
+    return tmp_path / "walk.osf"
+
+
+def install(monkeypatch: pytest.MonkeyPatch, source: object) -> None:
+    def open_source(path: str, **more: object) -> object:
+        if isinstance(source, Exception):
+            raise source
+        return source
+
+    monkeypatch.setitem(sys.modules, "ouster", SimpleNamespace())
+    monkeypatch.setitem(sys.modules, "ouster.sdk", SimpleNamespace(open_source=open_source))
+
+
+def test_a_sensor_that_stands_still_gives_images(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ranges = np.full((ROWS, COLUMNS), 5000, np.uint32)
+    ranges[1, 4] = 0
+    install(monkeypatch, Source([STILL, STILL], ranges))
+    dataset = open_dataset(recording)
+    frame = dataset.read(1)
+    assert (len(dataset), frame.name, dataset.recorded_reach) == (2, "000001", 10.0)
+    assert frame.camera == dataset.camera
+    assert frame.no_return is not None
+    assert np.argwhere(frame.no_return).tolist() == [[1, 4 + SHIFTS[1]]]
+    np.testing.assert_allclose(frame.T_world_camera[:3, :3], TURNED[:3, :3])
+    assert frame.stamp == pytest.approx(10.15)
+    assert any("assumed to stand still" in note for note in dataset.notes)
+
+
+def test_poses_of_columns_undo_the_motion(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Source([driving()])
+    install(monkeypatch, source)
+    frame = open_dataset(recording).read(0)
+    assert isinstance(frame.camera, RayTable)
+    assert not frame.camera.has_pattern
+    T = frame.T_world_camera
+    found = (frame.camera.rays() * frame.depth_m[..., None]).reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
+    expected = points(np.full((ROWS, COLUMNS), 5.0)) @ TURNED[:3, :3].T + [0, 0, 0.04]
+    expected += driving()[None, :, :3, 3]
+    nearest = np.linalg.norm(found[:, None] - expected.reshape(1, -1, 3), axis=-1).min(axis=1)
+    assert nearest.max() < N_M
+    rigid = open_dataset(f"{recording}?deskew=false").read(0)
+    assert rigid.no_return is not None
+    np.testing.assert_allclose(rigid.T_world_camera[:3, 3], [0.5, 0, 0.04], atol=1e-6)
+
+
+def test_poses_of_a_file(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(monkeypatch, Source([STILL, STILL, STILL]))
+    T = look_at([1.0, 2.0, 3.0], [4.0, 2.0, 3.0])
+    lines = [stamped_line(stamp, T) for stamp in (10.0, 10.1, 10.2)]
+    (recording.parent / "poses.txt").write_text("\n".join(lines))
+    dataset = open_dataset(f"{recording}?poses={recording.parent / 'poses.txt'}")
+    assert (len(dataset), dataset.dropped) == (2, 1)
+    expected = T @ Beams.of(metadata()).T_sensor_lidar
+    np.testing.assert_allclose(dataset.read(0).T_world_camera, expected, atol=1e-6)
+    assert open_dataset(f"{recording}?poses=track").tracked
+
+
+@pytest.mark.parametrize(
+    ("source", "query", "problem"),
+    [
+        (RuntimeError("no metadata"), "", "cannot be read: no metadata"),
+        (Source([]), "", "none of its 0 scans can be read"),
+        (Source([STILL]), "?sensor=1", "has 1 sensors, so there is no sensor 1"),
+        (Source([STILL]), "?sensors=1", "unknown parameter 'sensors'"),
+    ],
+)
+def test_what_cannot_be_opened_is_named(
+    recording: Path, monkeypatch: pytest.MonkeyPatch, source: object, query: str, problem: str
+) -> None:
+    install(monkeypatch, source)
+    with pytest.raises(DatasetError, match=problem) as caught:
+        open_dataset(f"{recording}{query}")
+    assert str(recording) in str(caught.value)
+
+
+def test_a_scan_without_returns_is_named(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Source([STILL, STILL])
+    install(monkeypatch, source)
+    dataset = open_dataset(recording)
+    source.frames[1].field = lambda name: np.zeros((ROWS, COLUMNS), np.uint32)
+    with pytest.raises(FrameError, match=r"frame 000001: .*walk\.osf: none of its pixels is a measurement"):
+        dataset.read(1)
+
+
+def test_without_the_library_the_extra_is_named(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ouster.sdk", None)
+    with pytest.raises(DatasetError, match=r"need ouster, .*: pip install 'taichi-mrf\[ouster\]'"):
+        open_dataset(recording)
+
+
+@pytest.mark.shared_data
+@pytest.mark.parametrize(
+    ("name", "count", "shape"),
+    [
+        ("OS-1-128_v2.3.0_1024x10_lb_n3.osf", 3, (128, 1024)),
+        ("osf_fw_3.2_10scans.osf", 10, (8, 2048)),
+        ("OS-0-128-U1_v2.3.0_1024x10.pcap", 1, (128, 1024)),
+    ],
+)
+def test_real_recordings(shared_data: Path, name: str, count: int, shape: tuple[int, int]) -> None:
+    """The points are those that ouster-sdk computes."""
+    sdk = pytest.importorskip("ouster.sdk", reason="reading real recordings needs ouster-sdk")
+    from ouster.sdk import core
+
+    path = shared_data / "ouster" / name
+    dataset = open_dataset(path)
+    frame = dataset.read(0)
+    assert (len(dataset), frame.depth_m.shape) == (count, shape)
+    source = sdk.open_source(str(path), index=True)
+    info, scan = source.sensor_info[0], next(iter(source[0]))
+    expected = core.destagger(info, core.XYZLut(info, False)(scan))
+    seen = frame.depth_m > 0
+    found = frame.camera.rays() * frame.depth_m[..., None]
+    T = Beams.of(info).T_sensor_lidar
+    error = np.linalg.norm(found @ T[:3, :3].T + T[:3, 3] - expected, axis=-1)[seen]
+    assert seen.mean() > 0.3
+    assert np.median(error) < 0.01
+    assert error.max() < 0.03
