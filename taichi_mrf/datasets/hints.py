@@ -21,8 +21,8 @@ ONE_FILE = (
     "rows of T_world_camera"
 )
 LIDAR_POSES = (
-    "contains lidar point clouds without poses; scans are read from a folder of one .npz, .ply, .pcd or .bin "
-    "for each, with poses.npz or a file of poses beside them, and KITTI's from velodyne/ with calib.txt and "
+    "contains lidar point clouds without poses; scans are read from a folder with one .npz, .ply, .pcd, .las "
+    "or .bin for each and poses.npz or a file of poses beside them, KITTI's from velodyne/ with calib.txt and "
     "poses.txt"
 )
 _POSE_TEXTS = (".txt", ".pose", ".cam", ".info")

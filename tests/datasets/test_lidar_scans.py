@@ -281,7 +281,8 @@ def test_sigma_and_reach_of_a_lidar_take_the_place_of_the_defaults(tmp_path: Pat
     assert with_recorded_noise(Config(), dataset).sensor.max_depth == 40.0
     chosen = Config(sensor=SensorConfig(sigma=(0.01,), max_depth=25.0))
     assert with_recorded_noise(chosen, dataset) == chosen
-    assert [reach_of(np.array([x])) for x in (3.0, 10.0, 44.2)] == [10.0, 10.0, 50.0]
+    assert [reach_of(np.array([0.0, x])) for x in (3.0, 10.0, 44.2, 1e30)] == [10.0, 10.0, 50.0, 500.0]
+    assert reach_of(np.append(np.full(5000, 22.0), 1e9)) == 30.0, "a damaged point says nothing"
 
 
 @pytest.mark.shared_data

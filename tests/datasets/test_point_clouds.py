@@ -1,7 +1,9 @@
 """Point clouds in files: PCD of three encodings, PLY, npz and KITTI's, whole and damaged."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -158,6 +160,54 @@ def test_an_npz_without_points_is_refused(
     np.savez(tmp_path / "a.npz", **arrays)
     with pytest.raises(DatasetError, match=problem):
         read_cloud(tmp_path / "a.npz")
+
+
+class LasFile:
+    """A stand-in for an open file of laspy's, with a header and points."""
+
+    def __init__(self, count: int) -> None:
+        self.header = SimpleNamespace(point_count=count, point_format=SimpleNamespace(size=20))
+
+    def __enter__(self) -> "LasFile":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+    def read(self) -> SimpleNamespace:
+        return SimpleNamespace(xyz=POINTS)
+
+
+@pytest.mark.parametrize(("suffix", "size"), [(".las", 20 * 42), (".laz", 100)])
+def test_las(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, size: int) -> None:
+    monkeypatch.setitem(sys.modules, "laspy", SimpleNamespace(open=lambda path: LasFile(42)))
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(bytes(size))
+    np.testing.assert_array_equal(read_cloud(path), POINTS)
+    path.write_bytes(bytes(8))
+    with pytest.raises(DatasetError, match=r"a\.la[sz]: cannot be read: it claims 42 points of 20 bytes"):
+        read_cloud(path)
+
+
+def test_las_without_its_library_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    (tmp_path / "a.las").write_bytes(b"LASF")
+    with pytest.raises(DatasetError, match=r"need laspy, .*: pip install 'taichi-mrf\[las\]'"):
+        read_cloud(tmp_path / "a.las")
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_las_as_laspy_writes_it(tmp_path: Path, suffix: str) -> None:
+    laspy = pytest.importorskip("laspy", reason="LAS files need laspy")
+    file = laspy.create(point_format=3, file_version="1.2")
+    file.header.scales = [0.001] * 3
+    file.x, file.y, file.z = np.asarray(Walk(1).clouds[0], np.float64).T
+    path = tmp_path / f"a{suffix}"
+    file.write(path)
+    np.testing.assert_allclose(read_cloud(path), Walk(1).clouds[0], atol=6e-4)
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(DatasetError, match="cannot be read"):
+        read_cloud(path)
 
 
 def test_meshes_and_images_are_no_clouds(tmp_path: Path) -> None:

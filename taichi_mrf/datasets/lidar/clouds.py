@@ -1,4 +1,4 @@
-"""Point clouds in files, by their endings: .npz, .ply, .pcd, and KITTI's .bin."""
+"""Point clouds in files, by their endings: .npz, .ply, .pcd, .las, .laz, and KITTI's .bin."""
 
 import re
 from collections.abc import Callable
@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.lidar.pcd_file import read_pcd
 from taichi_mrf.datasets.lidar.ply_file import read_ply_header, read_ply_points
-from taichi_mrf.errors import DatasetError
-from taichi_mrf.system.files import read_bytes
+from taichi_mrf.errors import CapacityError, DatasetError, said
+from taichi_mrf.system.files import check_regular, read_bytes
+from taichi_mrf.system.libraries import library
+from taichi_mrf.system.memory import check_memory
 from taichi_mrf.system.npz_file import NpzFile, open_npz
 
 ARRAYS = ("points_m", "points", "xyz")
@@ -18,6 +20,8 @@ ARRAYS = ("points_m", "points", "xyz")
 
 _STEPS = re.compile(r"(?:xyz|points)_(\d+)mm")
 _VELODYNE_BYTES = 16
+_LAZ_RATIO = 100
+"""LAZ packs points five to ten times."""
 
 
 def read_cloud(path: Path) -> NDArray[np.float64]:
@@ -71,11 +75,31 @@ def _pcd_points(path: Path) -> NDArray[np.float64]:
     return read_pcd(path)[0]
 
 
+def _las_points(path: Path) -> NDArray[np.float64]:
+    """LAS and LAZ, by the library laspy (extra ``las``)."""
+    laspy = library("laspy", "LAS and LAZ files need", "las", DatasetError)
+    size = check_regular(path, DatasetError)
+    try:
+        with laspy.open(path) as file:
+            count, point_bytes = int(file.header.point_count), int(file.header.point_format.size)
+            largest = _LAZ_RATIO * size if path.suffix.lower() == ".laz" else size
+            if count * point_bytes > largest:
+                raise ValueError(f"it claims {count} points of {point_bytes} bytes, more than it can hold")
+            check_memory(count * (point_bytes + 24), f"{path}")
+            return np.array(file.read().xyz, np.float64)
+    except CapacityError:
+        raise
+    except Exception as error:  # the library raises many kinds of errors
+        raise DatasetError(f"{path}: cannot be read: {said(error)}") from error
+
+
 READERS: dict[str, Callable[[Path], NDArray[np.float64]]] = {
     ".npz": _npz_points,
     ".ply": read_ply_points,
     ".pcd": _pcd_points,
     ".bin": _velodyne_points,
+    ".las": _las_points,
+    ".laz": _las_points,
 }
 """What reads a file, by its ending."""
 

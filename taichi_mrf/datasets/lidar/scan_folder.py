@@ -1,7 +1,8 @@
 """A folder of point clouds in the sensor's frame with their poses.
 
-Each scan is a file (.npz, .ply, .pcd or .bin). ``?poses=FILE`` after the folder's name takes the poses from
-another file. Clouds without a pose are left out and counted. How poses and scans go together: scan_poses.py.
+Each scan is a file (.npz, .ply, .pcd, .las, .laz or .bin). ``?poses=FILE`` after the folder's name takes the
+poses from another file. Clouds without a pose are left out and counted. How poses and scans go together:
+scan_poses.py.
 """
 
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.system.files import is_file, is_folder
 
-PLACES = ("", "scans", "clouds", "lidar", "velodyne", "pcd", "ply")
+PLACES = ("", "scans", "clouds", "lidar", "velodyne", "pcd", "ply", "las")
 """Where clouds are in a folder."""
 
 
@@ -90,7 +91,7 @@ def _scan(cloud: Path, pose: ScanPose) -> RecordedScan:
 
 FORMAT = Format(
     name="lidar scans",
-    looks_for=f"scan-NNN.npz (xyz), *.ply, *.pcd or *.bin with {POSES_NPZ} or a file of poses",
+    looks_for=f"scan-NNN.npz (xyz), *.ply, *.pcd, *.las or *.bin with {POSES_NPZ} or a file of poses",
     recognises=recognises,
     open=lambda path, options: open_folder(path, "", options),
     open_with_query=open_folder,

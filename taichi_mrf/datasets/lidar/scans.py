@@ -27,7 +27,7 @@ SIGMA_ORIGIN = "assumed for a lidar"
 SECONDS_PER_SCAN = 0.1
 """Assumed where nothing tells: most lidars turn ten times a second."""
 
-_REACH_STEP_M = 10.0
+_REACH_STEP_M, MOST_REACH_M = 10.0, 500.0
 
 ScanReader = Callable[[], tuple[NDArray[np.float64], Pose]]
 """Points (N, 3) in metres in the sensor's frame, NaN and 0 where nothing came back, and T_world_sensor,
@@ -129,8 +129,10 @@ def lidar_scans(
 
 
 def reach_of(range_m: NDArray[np.floating]) -> float:
-    """The largest range, rounded up to tens of metres."""
-    return float(max(1.0, np.ceil(range_m.max() / _REACH_STEP_M)) * _REACH_STEP_M)
+    """How far ranges, 0 for none, go: all but the thousandth of them that may be damaged, rounded up to tens
+    of metres, and at most MOST_REACH_M."""
+    reach_m = np.quantile(range_m[range_m > 0], 0.999)
+    return float(min(max(1.0, np.ceil(reach_m / _REACH_STEP_M)) * _REACH_STEP_M, MOST_REACH_M))
 
 
 def refuse_image_options(name: str, options: ReadOptions) -> None:
