@@ -22,8 +22,8 @@ ONE_FILE = (
 )
 LIDAR_POSES = (
     "contains lidar point clouds without poses; scans are read from a folder with one .npz, .ply, .pcd, .las "
-    "or .bin for each and poses.npz or a file of poses beside them, KITTI's from velodyne/ with calib.txt and "
-    "poses.txt"
+    "or .bin for each and poses.npz or a file of poses beside them, KITTI's from velodyne/ with calib.txt "
+    "and poses.txt"
 )
 _POSE_TEXTS = (".txt", ".pose", ".cam", ".info")
 
