@@ -14,7 +14,6 @@ from taichi_mrf.live.run import Run
 from taichi_mrf.live.shown_colors import ShownColors
 from taichi_mrf.live.shown_surface import ShownSurface
 from taichi_mrf.methods.capabilities import measures_surface
-from taichi_mrf.sensor.camera import pinhole
 from taichi_mrf.viewer.messages import BrickColors, Notice, SceneChanges, Watch
 
 NOTHING = Watch(images=False, view=None, baseline=False)
@@ -213,5 +212,6 @@ class Extras:
                 )
             )
         elif frame is not None:
-            camera = pinhole(frame.camera, "the live page")
-            self._run.send(view_images(mapper.map, frame.name, camera, frame.T_world_camera, frame.depth_m))
+            self._run.send(
+                view_images(mapper.map, frame.name, frame.camera, frame.T_world_camera, frame.depth_m)
+            )

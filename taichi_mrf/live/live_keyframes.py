@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.methods.protocol import PosedDepth
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.viewer.messages import KeyframeState
 
@@ -26,8 +26,9 @@ class LiveKeyframe:
     id: int
     name: str
     T_world_camera: Pose
-    camera: PinholeCamera
+    camera: Camera
     rays: int
+    shown: Camera
     picture: NDArray[np.uint8]
     map_id: int | None
     stamp_s: float
@@ -49,15 +50,16 @@ class LiveKeyframes:
     next_id: int = 0
 
     def add(
-        self, frame: PosedDepth, rays: int, picture: NDArray[np.uint8], map_id: int, stamp_s: float
+        self,
+        frame: PosedDepth,
+        rays: int,
+        picture: tuple[Camera, NDArray[np.uint8]],
+        map_id: int,
+        stamp_s: float,
     ) -> LiveKeyframe:
-        """Add a keyframe that has just been added to the map. Raises KeyframeError for one without a pinhole
-        camera."""
-        if not isinstance(frame.camera, PinholeCamera):
-            kind = type(frame.camera).__name__
-            raise KeyframeError(f"{frame.name}: the live page cannot show a camera of type {kind}")
+        """Add a keyframe that has just been added to the map, with its pictures.thumbnail."""
         entry = LiveKeyframe(
-            self.next_id, frame.name, frame.T_world_camera, frame.camera, rays, picture, map_id, stamp_s
+            self.next_id, frame.name, frame.T_world_camera, frame.camera, rays, *picture, map_id, stamp_s
         )
         self.entries[entry.id] = entry
         self.next_id += 1

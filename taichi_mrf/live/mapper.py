@@ -51,7 +51,9 @@ class Mapper:
         self.inferred: InferReport | None = None
         self.roster = LiveKeyframes(next_id=first_id)
         for id, keyframe in m.keyframes.items():
-            self.roster.add(keyframe, keyframe.rays, thumbnail(keyframe.depth_m), id, keyframe.stamp_s)
+            self.roster.add(
+                keyframe, keyframe.rays, thumbnail(keyframe.camera, keyframe.depth_m), id, keyframe.stamp_s
+            )
         self.shown = ShownMap(m)
         # A map from a file has beliefs but no messages; an edit would need full inference first.
         self.lacks_messages = bool(m.keyframes) and has_messages(m)
@@ -75,7 +77,9 @@ class Mapper:
         self.unsettled = self.cavities_changed = True
         self.unaligned = self.refiner is not None
         frame = added.frame
-        entry = self.roster.add(frame, added.rays, thumbnail(frame.depth_m), added.keyframe, frame.stamp)
+        entry = self.roster.add(
+            frame, added.rays, thumbnail(frame.camera, frame.depth_m), added.keyframe, frame.stamp
+        )
         entry.T_world_camera = entry.T_home = self.map.keyframes[added.keyframe].T_world_camera
         return entry
 
@@ -251,7 +255,7 @@ class Mapper:
             entry.id,
             entry.name,
             entry.T_world_camera,
-            entry.camera,
+            entry.shown,
             entry.rays,
             entry.state,
             picture,

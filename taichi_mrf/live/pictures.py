@@ -1,5 +1,7 @@
 """Depth images and accuracy as small coloured pictures."""
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +10,8 @@ from taichi_mrf.errors import FrameError
 from taichi_mrf.evaluation.accuracy import NO_ANSWER, NOT_JUDGED, RIGHT, WRONG, judge_view
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.methods.protocol import OccupancyMap
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera, PinholeCamera
+from taichi_mrf.sensor.unrolled import covering, unrolled
 from taichi_mrf.viewer.messages import Images
 
 THUMBNAIL_WIDTH = 160
@@ -16,6 +19,9 @@ THUMBNAIL_WIDTH = 160
 
 IMAGE_WIDTH = 320
 """Most columns of the images beside the map."""
+
+THUMBNAIL_PIXELS, IMAGE_PIXELS = 2400, 320 * 240
+"""About the most pixels of both where images are unrolled."""
 
 _NO_DEPTH = np.array([90, 90, 90], np.uint8)
 
@@ -27,10 +33,20 @@ ACCURACY_COLORS[WRONG] = 213, 94, 0
 ACCURACY_COLORS[RIGHT] = 0, 114, 178
 
 
-def thumbnail(depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """(H, W) axial depth in metres, 0 for none -> (h, w, 3) uint8."""
-    step = _step(depth_m.shape[1], THUMBNAIL_WIDTH)
-    return depth_colors(depth_m[::step, ::step])
+def thumbnail(camera: Camera, depth_m: NDArray[np.float32]) -> tuple[Camera, NDArray[np.uint8]]:
+    """A small picture (h, w, 3) of a depth image (H, W) in metres, 0 for none, and the camera that tells its
+    place in the scene: a pinhole itself, of any other the camera of the unrolled picture's pixels."""
+    if isinstance(camera, PinholeCamera):
+        step = _step(depth_m.shape[1], THUMBNAIL_WIDTH)
+        return camera, depth_colors(depth_m[::step, ::step])
+    picture = unrolled(camera)
+    step = _step_of(picture.camera, THUMBNAIL_PIXELS)
+    return picture.camera.thinned(step), depth_colors(picture.image(depth_m)[::step, ::step])
+
+
+def outlined(camera: Camera) -> Camera:
+    """A camera of few pixels that looks where another does, to be drawn; a pinhole is the same."""
+    return camera if isinstance(camera, PinholeCamera) else covering(camera, THUMBNAIL_PIXELS)
 
 
 def depth_colors(
@@ -57,22 +73,24 @@ def depth_bounds(depth_m: NDArray[np.float32]) -> tuple[float, float]:
 def view_images(
     m: OccupancyMap,
     name: str,
-    camera: PinholeCamera,
+    camera: Camera,
     T_world_camera: Pose,
     depth_m: NDArray[np.float32] | None,
 ) -> Images:
     """Measured depth, rendered depth and accuracy of a view; ``depth_m`` is None if the image is no longer
-    in memory.
+    in memory. An image without a flat plane is unrolled.
 
     A pixel is right if the map's answer lies within 1.5 sigma of the measurement, sigma being one voxel.
     """
-    step = _step(camera.width, IMAGE_WIDTH)
-    small = thinned(camera, step)
+    flat = isinstance(camera, PinholeCamera)
+    step = _step(camera.width, IMAGE_WIDTH) if flat else _step_of(camera, IMAGE_PIXELS)
+    small = camera.thinned(step)
+    picture = unrolled(small)
     rendered = m.render_depth(small, T_world_camera)
     if depth_m is None:
-        nothing = np.full((*small.shape, 3), _NO_DEPTH, np.uint8)
+        nothing = np.full((*picture.camera.shape, 3), _NO_DEPTH, np.uint8)
         score = "its depth image was dropped when it was frozen"
-        return Images(name, nothing, depth_colors(rendered), nothing, score)
+        return Images(name, nothing, depth_colors(picture.image(rendered)), nothing, score)
     measured = np.ascontiguousarray(depth_m[::step, ::step])
     bounds = depth_bounds(measured)
     verdict, score = np.full(small.shape, NOT_JUDGED, np.int8), "nothing to judge: no measurement"
@@ -85,25 +103,19 @@ def view_images(
         score = f"right {judged.score:.0%} within 1.5 sigma, no surface {judged.unanswered:.0%}"
     return Images(
         name,
-        depth_colors(measured, bounds),
-        depth_colors(rendered, bounds),
-        ACCURACY_COLORS[verdict],
+        depth_colors(picture.image(measured), bounds),
+        depth_colors(picture.image(rendered), bounds),
+        ACCURACY_COLORS[picture.image(verdict, NOT_JUDGED)],
         score,
-    )
-
-
-def thinned(camera: PinholeCamera, step: int) -> PinholeCamera:
-    """The camera that has every ``step``-th pixel of a camera along both sides."""
-    return PinholeCamera(
-        -(-camera.width // step),
-        -(-camera.height // step),
-        camera.fx / step,
-        camera.fy / step,
-        camera.cx / step,
-        camera.cy / step,
     )
 
 
 def _step(width: int, most: int) -> int:
     """The stride with which at most ``most`` of ``width`` pixels are taken."""
     return -(-width // most)
+
+
+def _step_of(camera: Camera, most: int) -> int:
+    """The stride along both sides with which about ``most`` pixels are taken; of a row every one counts."""
+    share = camera.width * camera.height / most
+    return max(1, math.ceil(share if camera.height == 1 else math.sqrt(share)))

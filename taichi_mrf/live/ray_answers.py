@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.methods.protocol import OccupancyMap
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.viewer.messages import RayAnswer
@@ -25,7 +25,7 @@ class PosedDepthImage:
 
     name: str
     T_world_camera: Pose
-    camera: PinholeCamera
+    camera: Camera
     depth_m: NDArray[np.float32]
     keyframe: int | None = None
     """The viewer's number of the keyframe, if it is one."""
@@ -49,7 +49,7 @@ class PixelNoise:
 
 def pixel_answer(m: OccupancyMap, image: PosedDepthImage, u: float, v: float) -> RayAnswer:
     """The ray of a pixel. Raises KeyframeError if the image has no such pixel."""
-    along = pixel_direction(image.camera, u, v)
+    along = image.camera.directions(u, v)
     if not _in_image(image.camera, u, v):
         raise KeyframeError(f"{image.name} has no pixel ({u:g}, {v:g})")
     return _answer(m, image, u, v, along)
@@ -68,11 +68,11 @@ def point_answer(
     if not (np.isfinite(where).all() and np.isfinite(eye).all()):
         raise KeyframeError("a point is not finite")
     if wanted is not None and (pixel := projected(wanted, where)) is not None:
-        return _answer(m, wanted, pixel[0], pixel[1], pixel_direction(wanted.camera, pixel[0], pixel[1]))
+        return _answer(m, wanted, pixel[0], pixel[1], wanted.camera.directions(pixel[0], pixel[1]))
     for image in others:
         pixel = projected(image, where)
         if pixel is not None and _sees(m, image, *pixel):
-            return _answer(m, image, pixel[0], pixel[1], pixel_direction(image.camera, pixel[0], pixel[1]))
+            return _answer(m, image, pixel[0], pixel[1], image.camera.directions(pixel[0], pixel[1]))
     start, along = np.asarray(eye, np.float64), where - np.asarray(eye, np.float64)
     # The viewpoint may be further away than the range of any sensor.
     reach = max(m.sensor.max_depth, 1.2 * float(np.linalg.norm(along)))
@@ -80,18 +80,9 @@ def point_answer(
 
 
 def projected(image: PosedDepthImage, point: NDArray[np.float64]) -> tuple[float, float, float] | None:
-    """(u, v, axial depth) of a world point in an image, None if it lies outside or behind."""
-    x, y, z = (inverse(image.T_world_camera) @ np.append(point, 1.0))[:3]
-    if z <= 0:
-        return None
-    camera = image.camera
-    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    return (float(u), float(v), float(z)) if _in_image(camera, u, v) else None
-
-
-def pixel_direction(camera: PinholeCamera, u: float, v: float) -> NDArray[np.float64]:
-    """The direction of a pixel in the camera frame, with z = 1."""
-    return np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0])
+    """(u, v, depth) of a world point in an image, None if no pixel sees it."""
+    seen = image.camera.project((inverse(image.T_world_camera) @ np.append(point, 1.0))[None, :3])[0]
+    return None if np.isnan(seen).any() else (float(seen[0]), float(seen[1]), float(seen[2]))
 
 
 def _answer(
@@ -144,10 +135,10 @@ def _sees(m: OccupancyMap, image: PosedDepthImage, u: float, v: float, depth_m: 
     return depth_m <= measured + max(BEHIND_SIGMAS * sigma, 2 * m.voxel_size)
 
 
-def _nearest(camera: PinholeCamera, u: float, v: float) -> tuple[int, int]:
+def _nearest(camera: Camera, u: float, v: float) -> tuple[int, int]:
     """(column, row) of the pixel that holds (u, v)."""
     return min(max(round(u), 0), camera.width - 1), min(max(round(v), 0), camera.height - 1)
 
 
-def _in_image(camera: PinholeCamera, u: float, v: float) -> bool:
+def _in_image(camera: Camera, u: float, v: float) -> bool:
     return -0.5 <= u < camera.width - 0.5 and -0.5 <= v < camera.height - 0.5

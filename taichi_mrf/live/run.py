@@ -8,6 +8,7 @@ from taichi_mrf.config.schema import to_yaml
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.live.link import Link
 from taichi_mrf.live.mapper import Mapper
+from taichi_mrf.live.pictures import outlined
 from taichi_mrf.live.progress import Progress
 from taichi_mrf.live.replay import Replay
 from taichi_mrf.live.session_core import SessionCore
@@ -19,7 +20,6 @@ from taichi_mrf.methods.capabilities import can_freeze, window_of
 from taichi_mrf.queries.colored import is_colored
 from taichi_mrf.runs.files import MAP_FILE
 from taichi_mrf.runs.folder import RunFacts
-from taichi_mrf.sensor.camera import pinhole
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system import runtime
 from taichi_mrf.viewer.messages import Bricks, CurrentCamera, Hello, KeyframeInfo, Notice
@@ -133,7 +133,7 @@ class Run(SessionCore):
         """Show the viewer the pose of a frame."""
         self.current = frame
         self.version += 1
-        self.send(CurrentCamera(frame.name, frame.T_world_camera, pinhole(frame.camera, "the live page")))
+        self.send(CurrentCamera(frame.name, frame.T_world_camera, outlined(frame.camera)))
 
     def describe(self, id: int) -> KeyframeInfo:
         """The message that describes a keyframe to the viewer."""

@@ -18,7 +18,6 @@ from taichi_mrf.methods.map_file import open_map_file, read_header
 from taichi_mrf.methods.mrf.parked_chunks import folder_beside
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map, load_map
-from taichi_mrf.sensor.camera import pinhole
 from taichi_mrf.system import runtime
 from taichi_mrf.system.files import is_file
 
@@ -85,7 +84,6 @@ def open_source(
         return Source(path.name, parameters, lambda: load_map(path)), notes
     keywords = (reading or SourceFlags()).keywords()
     dataset = open_dataset(name, color=config.color, track=track, **keywords)
-    pinhole(dataset.camera, "the live page")
     config = with_recorded_noise(config, dataset)
     # Held-out frames of a tracked source are read, so that their poses are known when the map is checked.
     unread = 0 if dataset.tracked else hold_out_of(dataset, config)

@@ -57,6 +57,13 @@ class Camera(Protocol):
     def rays(self) -> NDArray[np.float64]:
         """:meth:`directions` of all pixels, (H, W, 3)."""
 
+    def project(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Column, row and depth at which points (N, 3) of the camera frame are seen, (N, 3), NaN for those
+        that no pixel sees."""
+
+    def thinned(self, step: int) -> "Camera":
+        """The camera of every ``step``-th column and row."""
+
     def tile_hulls(self, tile: int) -> NDArray[np.float64]:
         """For each square of ``tile`` pixels, (rows, columns, k, 3): directions for one metre of depth whose
         convex hull, with the camera's centre, holds all points of its rays up to that depth."""
@@ -148,6 +155,20 @@ class PinholeCamera:
         u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
         return self.directions(u, v)
 
+    def project(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Column, row and axial depth at which points (N, 3) of the camera frame are seen, (N, 3), NaN for
+        those that no pixel sees."""
+        x, y, z = points_m.T
+        ahead = np.where(z > 0, z, np.nan)
+        u, v = self.fx * x / ahead + self.cx, self.fy * y / ahead + self.cy
+        inside = (u >= -0.5) & (u < self.width - 0.5) & (v >= -0.5) & (v < self.height - 0.5)
+        return np.where(inside[:, None], np.stack([u, v, ahead], axis=1), np.nan)
+
+    def thinned(self, step: int) -> "PinholeCamera":
+        """The camera of every ``step``-th column and row."""
+        width, height = -(-self.width // step), -(-self.height // step)
+        return PinholeCamera(width, height, self.fx / step, self.fy / step, self.cx / step, self.cy / step)
+
     def tile_hulls(self, tile: int) -> NDArray[np.float64]:
         """The outer corners of each square of ``tile`` pixels as directions, (rows, columns, 4, 3), z = 1."""
         u = np.minimum(np.arange(-(-self.width // tile) + 1) * tile, self.width) - 0.5
@@ -194,6 +215,11 @@ def pinhole(camera: Camera, who: str) -> PinholeCamera:
     if not isinstance(camera, PinholeCamera):
         raise ConfigError(f"{who} needs a pinhole camera, not a {type(camera).__name__}")
     return camera
+
+
+def forwards(camera: Camera) -> NDArray[np.float64]:
+    """The direction in the camera frame in which a level camera looks, (3,): z if y is down, x if z is up."""
+    return np.array([1.0, 0.0, 0.0] if camera.up[2] else [0.0, 0.0, 1.0])
 
 
 def check_camera(camera: object) -> None:

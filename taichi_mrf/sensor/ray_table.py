@@ -1,6 +1,7 @@
 """Cameras that are a table with the direction of each pixel: free rays, and the base of spherical cameras."""
 
 import hashlib
+import math
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -142,6 +143,34 @@ class RayTable:
             lengths = np.linalg.norm(between, axis=-1, keepdims=True)
             between = np.where((a > 0) | (b > 0), between / np.maximum(lengths, _SHORTEST), between)
         return between
+
+    def project(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Column, row and depth of the pixels whose rays pass nearest to points (N, 3) of the camera frame,
+        (N, 3), NaN where even that ray passes further away than half a pixel's diagonal."""
+        rays = self.rays().reshape(-1, 3)
+        units = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        found = np.full(points_m.shape, np.nan)
+        for i, point in enumerate(points_m):
+            along = units @ point
+            pixel = int(np.argmax(along))
+            range_m = float(np.linalg.norm(point))
+            if along[pixel] > range_m * math.cos(self._pixel_radius):
+                v, u = divmod(pixel, self.width)
+                found[i] = u, v, along[pixel] / np.linalg.norm(rays[pixel])
+        return found
+
+    @cached_property
+    def _pixel_radius(self) -> float:
+        """Half the diagonal of the largest pixel, in radians; of rays without a pattern the whole one if they
+        were spread evenly over the sphere."""
+        if self.has_pattern and self._table.size > 3:
+            return 0.75 * self._counts.largest_turn
+        return math.sqrt(4 * math.pi / (self._table.size / 3))
+
+    def thinned(self, step: int) -> "RayTable":
+        """The camera of every ``step``-th column and row."""
+        thin = self._table[::step, ::step]
+        return RayTable(thin if self.has_pattern else thin[0])
 
     def tile_hulls(self, tile: int) -> NDArray[np.float64]:
         """For each square of ``tile`` pixels, (rows, columns, 8, 3): the corners of the box around its

@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.camera import Camera, forwards
 from taichi_mrf.sensor.ray_table import RayTable
 
 RAYS_PER_PIXEL = 3
@@ -71,8 +71,8 @@ class _Grid:
     @staticmethod
     def of(camera: Camera, pixels: int) -> "_Grid":
         up = np.asarray(camera.up)
-        forwards = np.array([1.0, 0.0, 0.0] if up[2] else [0.0, 0.0, 1.0])
-        axes = np.stack([forwards, np.cross(up, forwards), up])
+        ahead = forwards(camera)
+        axes = np.stack([ahead, np.cross(up, ahead), up])
         azimuth, elevation = _angles(camera.rays().reshape(-1, 3), axes)
         left, width = _sector(azimuth)
         low, top = float(elevation.min()), float(elevation.max())

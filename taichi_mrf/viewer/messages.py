@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera
 
 LOG_ODDS_STEP = 1 / 512
 """Log-odds are sent as int16 multiples of this. They are rounded down, so that their sign, and with it the
@@ -113,7 +113,8 @@ class SurfacePatch(Update):
 class KeyframeInfo(Update):
     """A keyframe that is new or has changed.
 
-    ``picture`` is a small depth image in colours, (h, w, 3) uint8; ``crossed`` (n, 3) int32 are the bricks
+    ``picture`` is a small depth image in colours, (h, w, 3) uint8. If ``camera`` is no pinhole, it is that of
+    the picture's pixels; ``crossed`` (n, 3) int32 are the bricks
     that its rays cross, which are free where the map has no voxels. ``T_home`` is the pose that *Put back*
     restores; None means the pose of the first message about this keyframe.
     """
@@ -121,7 +122,7 @@ class KeyframeInfo(Update):
     id: int
     name: str
     T_world_camera: Pose
-    camera: PinholeCamera
+    camera: Camera
     rays: int
     state: KeyframeState
     picture: NDArray[np.uint8]
@@ -135,7 +136,7 @@ class CurrentCamera(Update):
 
     name: str
     T_world_camera: Pose
-    camera: PinholeCamera
+    camera: Camera
 
 
 @dataclass(frozen=True)

@@ -67,6 +67,29 @@ def test_a_pinhole_as_a_table_has_the_pinholes_pixels() -> None:
     np.testing.assert_allclose(table.directions(3.25, 7.5), PINHOLE.directions(3.25, 7.5), atol=1e-6)
 
 
+@pytest.mark.parametrize("camera", [LIDAR, PINHOLE, RayTable(PINHOLE.rays()), RayTable(random_units(400))])
+def test_points_on_rays_are_projected_to_their_pixels(camera: Camera) -> None:
+    rng = np.random.default_rng(0)
+    u, v = rng.integers(0, camera.width, 20), rng.integers(0, camera.height, 20)
+    depth = rng.uniform(0.5, 9.0, 20)
+    found = camera.project(camera.directions(u, v) * depth[:, None])
+    np.testing.assert_allclose(found, np.stack([u, v, depth], axis=1), atol=1e-4)
+
+
+def test_points_beside_all_rays_are_seen_by_no_pixel() -> None:
+    assert np.isnan(LIDAR.project(np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0]]))).all()
+    assert not np.isnan(LIDAR.project(np.array([[-3.0, 0.01, 0.1]]))).any()
+    assert np.isnan(PINHOLE.project(np.array([[0.0, 0.0, -1.0], [3.0, 0.0, 1.0]]))).all()
+    assert np.isnan(RayTable([[1.0, 0.0, 0.0]] * 2000).project(np.array([[1.0, 0.3, 0.0]]))).all()
+
+
+@pytest.mark.parametrize("camera", [LIDAR, PINHOLE, RayTable(random_units(100))])
+def test_a_thinned_camera_has_every_third_pixel(camera: Camera) -> None:
+    thin = camera.thinned(3)
+    np.testing.assert_allclose(thin.rays(), camera.rays()[::3, ::3], atol=1e-6)
+    assert thin.shape == thin.rays().shape[:2]
+
+
 @pytest.mark.parametrize("camera", [LIDAR, RayTable(random_units(100))])
 def test_a_tiles_hull_holds_its_rays(camera: RayTable) -> None:
     hulls = camera.tile_hulls(16)

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from taichi_mrf.geometry.poses import as_pose
+from taichi_mrf.geometry.poses import as_pose, look_at
 from taichi_mrf.geometry.up import up_of, up_vector
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera, PinholeCamera
+from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, KeyframeInfo, RayAnswer, pack_log_odds
 from taichi_mrf.viewer.scene.coloring import legend_html, scale_of, voxel_colors
 from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, Placement
@@ -17,6 +18,7 @@ from taichi_mrf.viewer.scene.look import look_of
 from taichi_mrf.viewer.scene.options import UNPAINTED, ColorBy, ViewOptions
 from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
 from taichi_mrf.viewer.scene.ray_plot import curves
+from taichi_mrf.viewer.scene.rings import border
 from taichi_mrf.viewer.scene.voxel_store import Shown, VoxelStore, facing
 from taichi_mrf.voxels.colors import NO_COLOR, marginal_colors
 
@@ -140,9 +142,9 @@ def test_every_option_of_the_voxels_makes_another_look(changes: dict[str, Any]) 
 CAMERA = PinholeCamera(64, 48, 50.0, 55.0, 30.0, 25.0)
 
 
-def keyframe(id: int, T_world_camera: np.ndarray) -> KeyframeInfo:
+def keyframe(id: int, T_world_camera: np.ndarray, camera: Camera = CAMERA) -> KeyframeInfo:
     return KeyframeInfo(
-        id, "k", T_world_camera, CAMERA, 1, "on", np.zeros((2, 2, 3), np.uint8), np.zeros((0, 3), np.int32)
+        id, "k", T_world_camera, camera, 1, "on", np.zeros((2, 2, 3), np.uint8), np.zeros((0, 3), np.int32)
     )
 
 
@@ -161,6 +163,37 @@ def test_a_click_on_a_picture_finds_its_pixel() -> None:
     assert hit.range_m == pytest.approx(np.linalg.norm(point - eye))
     assert first_pixel(eye, eye - point, [keyframe(7, T)]) is None
     np.testing.assert_allclose(Placement.of(T).pose(), T, atol=1e-12)
+
+
+LIDAR = SphericalCamera(np.linspace(0.5, -0.5, 12), np.linspace(3.0, -3.0, 60))
+
+
+def test_a_click_on_a_ring_finds_the_pixel_on_its_near_side() -> None:
+    T = look_at((1.0, 2.0, 0.5), (2.0, 3.0, 0.5))
+    ray = LIDAR.rays()[4, 45]
+    point = T[:3, :3] @ (FRUSTUM_M * ray) + T[:3, 3]
+    eye = point + T[:3, :3] @ (2.0 * ray + (0.1, -0.2, 0.1))
+    hit = first_pixel(eye, point - eye, [keyframe(3, T, LIDAR)])
+    assert hit is not None
+    assert (hit.keyframe, hit.u, hit.v) == (3, 45, 4)
+    np.testing.assert_allclose(hit.point, point, atol=1e-9)
+    assert hit.range_m == pytest.approx(np.linalg.norm(point - eye))
+    above = T[:3, 3] + T[:3, :3] @ (0.0, 0.0, 1.0)  # no ray goes straight up or down
+    assert first_pixel(above, T[:3, 3] - above, [keyframe(3, T, LIDAR)]) is None
+    assert first_pixel(eye, eye - point, [keyframe(3, T, LIDAR)]) is None
+
+
+@pytest.mark.parametrize(("reach", "ends"), [(np.pi, 0), (1.0, 2)])
+def test_a_lidar_is_drawn_as_rings_or_as_a_closed_line(reach: float, ends: int) -> None:
+    azimuths = np.linspace(reach, -reach, 60, endpoint=False)
+    lines = border(SphericalCamera(np.linspace(0.5, -0.3, 12), azimuths), 0.2)
+    np.testing.assert_allclose(np.linalg.norm(lines, axis=-1), 0.2, atol=1e-6)
+    heights = np.arcsin(np.clip(lines[..., 2] / 0.2, -1, 1))
+    assert heights.max() == pytest.approx(0.5, abs=1e-5)
+    assert heights.min() == pytest.approx(-0.3, abs=1e-5)
+    upright = np.abs(np.diff(heights, axis=1)) > 1e-4
+    assert upright.sum() == ends * 11
+    assert len(lines) == 120 if ends == 0 else 2 * 59 + 2 * 11
 
 
 def test_a_click_meets_the_nearest_voxel_on_its_way() -> None:

@@ -11,6 +11,7 @@ import pytest
 from raw_viewer_client import RawClient, camera_message, raw_client, wait_for
 
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.actions import Action, Dragged
 from taichi_mrf.viewer.live.page import Page
@@ -268,3 +269,23 @@ def test_a_page_is_made_once_however_often_it_is_asked_for(
     assert len(made) == 1
     handled.act(Action.SAVE_PAGE, client)
     browser.hear_type("FileTransferStartDownload")
+
+
+def nodes(handled: HandledPage) -> set[str]:
+    return {name for name in handled.server.scene._handle_from_node_name if name.startswith("/keyframes/")}
+
+
+def test_a_lidars_keyframe_is_drawn_as_rings_with_its_picture(handled: HandledPage) -> None:
+    lidar = SphericalCamera(np.linspace(0.5, -0.5, 6), np.linspace(3.0, -3.0, 20))
+    ring = replace(keyframe(1, 1.0), camera=lidar, picture=np.full((6, 20, 3), 90, np.uint8))
+    handled.take(ring)
+    assert nodes(handled) == {"/keyframes/0", "/keyframes/1", "/keyframes/1/picture"}
+    handled.take(replace(ring, state="off"))
+    assert nodes(handled) == {"/keyframes/0", "/keyframes/1"}
+    handled.take(ring)
+    handled.page.keyframes.show_pictures(False)
+    assert nodes(handled) == {"/keyframes/0", "/keyframes/1"}
+    handled.page.keyframes.show_pictures(True)
+    handled.take(m.CurrentCamera("a scan", np.eye(4), lidar))
+    handled.page.keyframes.clear()
+    assert nodes(handled) == set()

@@ -6,6 +6,7 @@ import numpy as np
 import viser
 
 from taichi_mrf.geometry.up import up_of
+from taichi_mrf.sensor.camera import forwards
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.actions import Action, Clicked, Dragged
 from taichi_mrf.viewer.live.panel import CHOSEN_KEYFRAME, POSITION_STEP_M, SPEEDS, Panel
@@ -90,7 +91,7 @@ class Page(BasePage[Panel]):
 
     def _take_camera(self, camera: m.CurrentCamera) -> None:
         self.keyframes.show_camera(camera)
-        self.viewpoint.camera_moved(camera.T_world_camera)
+        self.viewpoint.camera_moved(camera.T_world_camera, forwards(camera.camera))
 
     def _show_ray(self, answer: m.RayAnswer) -> None:
         """Show the answer, and fill in the pixel: the button then shows the same ray again."""
@@ -197,7 +198,11 @@ class Page(BasePage[Panel]):
         voxel = first_voxel(click.origin, click.direction, *self.map.boxes())
         if pixel is not None and (voxel is None or pixel.range_m < voxel[1]):
             self._choose(pixel.keyframe)
-            self.ask(m.PixelRay(pixel.keyframe, pixel.u, pixel.v))
+            if pixel.point is None:
+                self.ask(m.PixelRay(pixel.keyframe, pixel.u, pixel.v))
+            else:
+                x, y, z = pixel.point.tolist()
+                self.ask(m.RayThrough((x, y, z), click.origin, pixel.keyframe))
         elif voxel is not None:
             point, chosen = voxel[0], self.keyframes.chosen
             self.ask(m.RayThrough((point[0], point[1], point[2]), click.origin, chosen))

@@ -1,4 +1,5 @@
-"""Keyframes in the scene: small frusta with their depth images, the camera's path, the current camera."""
+"""Keyframes in the scene: small frusta or rings with their depth images, the camera's path, the current
+camera."""
 
 from dataclasses import dataclass
 
@@ -8,8 +9,9 @@ import viser.transforms as vtf
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.viewer.messages import CurrentCamera, KeyframeInfo
+from taichi_mrf.viewer.scene.rings import border, on_sphere
 from taichi_mrf.viewer.scene.shown_keyframes import ShownKeyframes
 
 FRUSTUM_M = 0.15
@@ -51,7 +53,9 @@ class KeyframeLayer:
         self.gizmo: viser.TransformControlsHandle | None = None
         self.held = False
         """Whether a user is dragging the gizmo."""
-        self._frusta: dict[int, viser.CameraFrustumHandle] = {}
+        self._frusta: dict[int, viser.CameraFrustumHandle | viser.LineSegmentsHandle] = {}
+        self._on_spheres: dict[int, viser.PointCloudHandle] = {}
+        """The pictures of keyframes that have no frustum."""
         # viser remembers each name that was ever removed, so names are used again.
         self._places: dict[int, int] = {}
         self._free_places: list[int] = []
@@ -66,6 +70,7 @@ class KeyframeLayer:
         """Show a keyframe that is new or has changed."""
         forgotten = self.roster.put(keyframe)
         for id in forgotten:
+            self._take_off_picture(id)
             del self._frusta[id]  # its node is the next one's
             self._free_places.append(self._places.pop(id))
         if self.chosen in forgotten:
@@ -99,21 +104,7 @@ class KeyframeLayer:
 
     def show_camera(self, camera: CurrentCamera) -> None:
         """Show the camera of the latest frame."""
-        place = Placement.of(camera.T_world_camera)
-        fov, aspect = _view_angles(camera.camera)
-        self._scene.add_camera_frustum(
-            "/camera",
-            fov,
-            aspect,
-            scale=1.6 * _frustum_scale(fov, aspect),
-            thickness=3.0,
-            thickness_units="screen",
-            color=_WAY,
-            cast_shadow=False,
-            receive_shadow=False,
-            wxyz=place.wxyz,
-            position=place.position,
-        )
+        self._outline("/camera", camera.T_world_camera, camera.camera, _WAY, thickness=3.0, enlarged=1.6)
 
     def grab(self) -> viser.TransformControlsHandle:
         """Put a gizmo on the chosen keyframe. There must be one."""
@@ -145,7 +136,8 @@ class KeyframeLayer:
     def clear(self) -> None:
         """Remove all keyframes."""
         self.release()
-        for frustum in self._frusta.values():
+        for id, frustum in self._frusta.items():
+            self._take_off_picture(id)
             frustum.remove()
         self._frusta.clear()
         self._places.clear()
@@ -156,20 +148,68 @@ class KeyframeLayer:
             self._scene.remove_by_name(name)
 
     def _draw(self, keyframe: KeyframeInfo) -> None:
-        place = Placement.of(keyframe.T_world_camera)
-        fov, aspect = _view_angles(keyframe.camera)
-        is_chosen = keyframe.id == self.chosen
-        if keyframe.id not in self._places:
-            self._places[keyframe.id] = self._free_places.pop() if self._free_places else len(self._places)
-        self._frusta[keyframe.id] = self._scene.add_camera_frustum(
-            f"/keyframes/{self._places[keyframe.id]}",
+        id, is_chosen = keyframe.id, keyframe.id == self.chosen
+        if id not in self._places:
+            self._places[id] = self._free_places.pop() if self._free_places else len(self._places)
+        name = f"/keyframes/{self._places[id]}"
+        picture = keyframe.picture if self._pictures and keyframe.state != "off" else None
+        flat = isinstance(keyframe.camera, PinholeCamera)
+        self._frusta[id] = self._outline(
+            name,
+            keyframe.T_world_camera,
+            keyframe.camera,
+            _CHOSEN if is_chosen else _COLORS[keyframe.state],
+            thickness=3.0 if is_chosen else 1.5,
+            picture=picture if flat else None,
+        )
+        if flat or picture is None or picture.shape[:2] != keyframe.camera.shape:
+            self._take_off_picture(id)
+        else:
+            self._on_spheres[id] = self._scene.add_point_cloud(
+                f"{name}/picture",
+                points=on_sphere(keyframe.camera, FRUSTUM_M).reshape(-1, 3),
+                colors=picture.reshape(-1, 3),
+                point_size=FRUSTUM_M / max(keyframe.camera.pixels_per_radian, 1.0),
+                point_shape="square",
+                precision="float16",
+            )
+
+    def _take_off_picture(self, id: int) -> None:
+        if id in self._on_spheres:
+            self._on_spheres.pop(id).remove()
+
+    def _outline(
+        self,
+        name: str,
+        T_world_camera: Pose,
+        camera: Camera,
+        color: tuple[int, int, int],
+        thickness: float,
+        enlarged: float = 1.0,
+        picture: NDArray[np.uint8] | None = None,
+    ) -> viser.CameraFrustumHandle | viser.LineSegmentsHandle:
+        """A frustum, or what a camera without a flat image sees on a sphere: rings."""
+        place = Placement.of(T_world_camera)
+        if not isinstance(camera, PinholeCamera):
+            return self._scene.add_line_segments(
+                name,
+                border(camera, enlarged * FRUSTUM_M),
+                color,
+                thickness=thickness,
+                thickness_units="screen",
+                wxyz=place.wxyz,
+                position=place.position,
+            )
+        fov, aspect = _view_angles(camera)
+        return self._scene.add_camera_frustum(
+            name,
             fov,
             aspect,
-            scale=_frustum_scale(fov, aspect),
-            thickness=3.0 if is_chosen else 1.5,
+            scale=enlarged * _frustum_scale(fov, aspect),
+            thickness=thickness,
             thickness_units="screen",
-            color=_CHOSEN if is_chosen else _COLORS[keyframe.state],
-            image=keyframe.picture if self._pictures and keyframe.state != "off" else None,
+            color=color,
+            image=picture,
             format="jpeg",
             jpeg_quality=70,
             cast_shadow=False,

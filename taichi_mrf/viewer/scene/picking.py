@@ -6,18 +6,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.viewer.messages import KeyframeInfo
 from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M
+from taichi_mrf.viewer.scene.rings import hits_of_sphere
 
 
 @dataclass(frozen=True)
 class Pixel:
-    """A pixel of a keyframe's picture, and its distance from the viewpoint in metres."""
+    """A pixel of a keyframe's picture, and its distance from the viewpoint in metres. ``point`` (3,), in the
+    world, is on the picture if that is not flat; its pixels are then not those of the keyframe's image."""
 
     keyframe: int
     u: float
     v: float
     range_m: float
+    point: NDArray[np.float64] | None = None
 
 
 def first_voxel(
@@ -53,9 +57,11 @@ def first_pixel(origin: ArrayLike, direction: ArrayLike, keyframes: Iterable[Key
 
 def _pixel(start: NDArray[np.float64], along: NDArray[np.float64], keyframe: KeyframeInfo) -> Pixel | None:
     """The pixel where the ray crosses the picture, which stands FRUSTUM_M in front of the keyframe's
-    camera."""
+    camera, or lies on the sphere of that radius."""
     R, t = keyframe.T_world_camera[:3, :3], keyframe.T_world_camera[:3, 3]
     origin, direction = R.T @ (start - t), R.T @ along
+    if not isinstance(keyframe.camera, PinholeCamera):
+        return _pixel_on_sphere(keyframe, origin, direction)
     if abs(direction[2]) < 1e-9:
         return None
     range_m = (FRUSTUM_M - origin[2]) / direction[2]
@@ -64,3 +70,16 @@ def _pixel(start: NDArray[np.float64], along: NDArray[np.float64], keyframe: Key
     u, v = camera.fx * x + camera.cx, camera.fy * y + camera.cy
     inside = -0.5 <= u < camera.width - 0.5 and -0.5 <= v < camera.height - 0.5
     return Pixel(keyframe.id, float(u), float(v), float(range_m)) if inside and range_m > 0 else None
+
+
+def _pixel_on_sphere(
+    keyframe: KeyframeInfo, origin: NDArray[np.float64], direction: NDArray[np.float64]
+) -> Pixel | None:
+    """The nearer of the sphere's sides that has a pixel where the ray, in the camera frame, crosses it."""
+    for range_m in hits_of_sphere(origin, direction, FRUSTUM_M):
+        point = origin + range_m * direction
+        u, v, _ = keyframe.camera.project(point[None])[0]
+        if not np.isnan(u):
+            R, t = keyframe.T_world_camera[:3, :3], keyframe.T_world_camera[:3, 3]
+            return Pixel(keyframe.id, float(u), float(v), range_m, R @ point + t)
+    return None

@@ -24,6 +24,7 @@ class ViewpointController:
         self._server = server
         self.up: Up = (2, 1)
         self._camera: Pose | None = None
+        self._forwards = np.zeros(3)
         self._following = False
         self._seen_size = 0.0
         self._view: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
@@ -47,9 +48,10 @@ class ViewpointController:
         if view is not None:
             self._point(handle, *view)
 
-    def camera_moved(self, T_world_camera: Pose) -> None:
-        """Store the camera's pose, and follow it if following is on."""
-        self._camera = T_world_camera
+    def camera_moved(self, T_world_camera: Pose, forwards: NDArray[np.float64]) -> None:
+        """Store the pose of a camera that looks ``forwards`` (3,) in its own frame, and follow it if
+        following is on."""
+        self._camera, self._forwards = T_world_camera, T_world_camera[:3, :3] @ forwards
         self._follow()
 
     def set_following(self, on: bool) -> None:
@@ -99,7 +101,7 @@ class ViewpointController:
         """Eye and target that look over the camera's shoulder; None before the first frame."""
         if self._camera is None:
             return None
-        position, forward = self._camera[:3, 3], self._camera[:3, 2]
+        position, forward = self._camera[:3, 3], self._forwards
         eye = position - _BEHIND_M * forward + _ABOVE_M * up_vector(self.up)
         return eye, position + _AHEAD_M * forward
 
