@@ -56,7 +56,25 @@ class SensorConfig:
     max_depth: float = 10.0
     """Rays end at this depth (metres). A measurement beyond it only marks the space up to it as free."""
 
+    no_return: Literal["ignore", "free", "model"] = "ignore"
+    """What MRFMap concludes where frames name the pixels that got no return: nothing; that the way up to
+    ``no_return_depth`` is free; or that each surface on the way has given none by chance, which ``model``
+    gives by ``no_return_share``, ``no_return_depth`` and ``no_return_width``."""
+
+    no_return_share: float = 0.3
+    """Chance that a near surface gives no return, below 0.5: the share of dark, wet and shiny ones."""
+
+    no_return_depth: float = 10.0
+    """``free``: depth in metres up to which nothing stands where there is no return. ``model``: depth at
+    which half of the surfaces that return when they are near do so no more."""
+
+    no_return_width: float = 2.0
+    """Metres over which that share falls: at one width more it is 27%, at two 12%."""
+
     def __post_init__(self) -> None:
+        check_field(0 <= self.no_return_share < 0.5, "sensor.no_return_share", "must lie in 0 to below 0.5")
+        check_field(self.no_return_depth > 0, "sensor.no_return_depth", "must be positive")
+        check_field(self.no_return_width > 0, "sensor.no_return_width", "must be positive")
         check_field(len(self.sigma) >= 1, "sensor.sigma", "needs at least one coefficient")
         check_field(all(map(math.isfinite, self.sigma)), "sensor.sigma", "holds a value that is not finite")
         check_field(len(self.bias) >= 1, "sensor.bias", "needs at least one coefficient")

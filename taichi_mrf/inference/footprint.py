@@ -14,7 +14,7 @@ from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.inference.keyframe import TILE, DepthImage, Footprint, RayList
+from taichi_mrf.inference.keyframe import TILE, DepthImage, Footprint, NoReturnRays, RayList
 from taichi_mrf.inference.ray_list import listed_ray
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, I32Array, IVec3, Struct, Template, Vec3
@@ -38,27 +38,37 @@ def find_footprint(
     volume: VolumeConfig,
     beyond_m: float = 0.0,
     scouts: int = 1,
+    no_returns: NoReturnRays | None = None,
 ) -> Footprint:
     """Follow every ray of an image's list from the camera to ``end_sigmas`` beyond its measurement, and
     ``beyond_m`` metres of axial depth more. Near its measurement each ray counts; of the way there only that
-    of every ``scouts``-th ray is followed, so that bricks may go unnoticed that few rays graze.
+    of every ``scouts``-th ray is followed, so that bricks may go unnoticed that few rays graze. Rays of
+    ``no_returns`` cross bricks up to where they count and are near no surface.
 
     Raises CapacityError if the space that the image sees has too many bricks at this voxel size.
     """
     lower_m, upper_m = visible_box(image, T_world_camera, sensor.max_depth, inference.end_sigmas, beyond_m)
+    if no_returns is not None:
+        end = visible_box(no_returns.image, T_world_camera, no_returns.reach_m, inference.end_sigmas)
+        lower_m, upper_m = np.minimum(lower_m, end[0]), np.maximum(upper_m, end[1])
     window = window_around(lower_m, upper_m, voxel_size, volume)
-    if image.rays == 0 or window is None:
+    if (image.rays == 0 and no_returns is None) or window is None:
         nowhere = Window.covering(T_world_camera[:3, 3], T_world_camera[:3, 3], voxel_size)
         return Footprint(nowhere, np.zeros(0, np.int32), np.zeros(0, np.int32), 1)
     box_lower, box_upper = window.clip_box(volume.lower, volume.upper)
     # NumPy arrays, which a kernel on the CPU writes in place: small voxels make the window large.
     marks = np.zeros(window.cells, np.int32)
     longest = np.ones(1, np.int32)
-    _mark(
-        rays, image.sensor, window.viewpoint(T_world_camera),
-        _Reach(sensor.max_depth, inference.end_sigmas, beyond_m, scouts),
+    view, seen = (
+        window.viewpoint(T_world_camera),
         _Marks(window.shape_vector, box_lower, box_upper, marks, longest),
-    )  # fmt: skip
+    )
+    _mark(
+        rays, image.sensor, view, _Reach(0.0, sensor.max_depth, inference.end_sigmas, beyond_m, scouts), seen
+    )
+    if no_returns is not None:
+        reach = _Reach(sensor.min_depth, no_returns.reach_m, inference.end_sigmas, 0.0, 1)
+        _mark(no_returns.ray_list, no_returns.image.sensor, view, reach, seen)
     crossed = np.flatnonzero(marks).astype(np.int32)
     surface = crossed[marks[crossed] & SURFACE != 0]
     _check_size(len(crossed), len(surface), voxel_size, volume.memory_limit_gb)
@@ -116,6 +126,9 @@ def visible_box(
 @dataclass(frozen=True)
 class _Reach(Bundle):
     """How far rays are followed."""
+
+    min_depth: F32
+    """Metres of depth before which they cross nothing."""
 
     max_depth: F32
     """Metres of depth that no ray goes beyond."""
@@ -175,7 +188,7 @@ def _mark(rays: RayList, sensor: Sensor, view: Viewpoint, reach: _Reach, marks: 
         measured = rays.depth[i]
         ray, noise, _ = listed_ray(rays, i, sensor, view)
         last = sensor.farthest_depth(measured, noise, reach.end_sigmas) + reach.beyond_m
-        begin, end = 0.0, ti.min(last, reach.max_depth)
+        begin, end = reach.min_depth, ti.min(last, reach.max_depth)
         clip(ray, begin, end, marks.lower, marks.upper)
         if end > begin:
             # A step along the ray leaves a voxel through a face, or enters a brick anew.

@@ -140,6 +140,22 @@ class RayList(Bundle):
         return 8 * self.blocks.shape[0]
 
 
+@dataclass
+class NoReturnRays:
+    """The rays of the pixels that got no return. The depth of their ``image`` is that up to which they count,
+    and ``entry_depths`` (rays) that from which on they do (sensor/no_return.py)."""
+
+    image: DepthImage
+    ray_list: RayList
+    entry_depths: ti.Ndarray
+    reach_m: float
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the image and of the list of the rays."""
+        return self.image.nbytes + self.ray_list.nbytes + self.entry_depths.shape[0] * 4
+
+
 @dataclass(frozen=True)
 class Footprint:
     """What a depth image's rays cross, which depends on its pose and on nothing else in the map.
@@ -197,7 +213,7 @@ class Keyframe:
     the list, the depth up to which it crosses none of these bricks, once it is known. ``revision`` is that of
     the beliefs right after its last sweep, and ``change_count_at_last_sweep`` (bricks) how often marginals of
     each brick had changed by then. ``pending_visible`` is what the keyframe sees now, if its messages are
-    still those of ``visible``.
+    still those of ``visible``. ``no_returns`` are the rays of pixels that got no return, if they count.
     """
 
     id: int
@@ -214,6 +230,7 @@ class Keyframe:
     messages: ti.Ndarray | None = None
     change_count_at_last_sweep: NDArray[np.int64] | None = None
     pending_visible: VisibleBricks | None = None
+    no_returns: NoReturnRays | None = None
 
     @property
     def camera(self) -> Camera:
@@ -242,8 +259,9 @@ class Keyframe:
 
     @property
     def image_bytes(self) -> int:
-        """Bytes of the images and of the list of the rays."""
-        return self.image.nbytes + self.ray_list.nbytes + self.entry_depths.shape[0] * 4
+        """Bytes of the images and of the lists of the rays."""
+        no_returns = 0 if self.no_returns is None else self.no_returns.nbytes
+        return self.image.nbytes + self.ray_list.nbytes + self.entry_depths.shape[0] * 4 + no_returns
 
     @property
     def voxel_bytes(self) -> int:

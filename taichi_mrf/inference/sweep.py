@@ -13,6 +13,7 @@ from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.accumulators import finest_scale
 from taichi_mrf.inference.keyframe import Keyframe, RayList
+from taichi_mrf.inference.no_returns import send_no_returns, take_where_unmeasured
 from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
 from taichi_mrf.inference.workers import Workers, workers_for
 from taichi_mrf.kernels.resident import on_host, vec4_array
@@ -76,6 +77,7 @@ class Sweeper:
         self.index = WindowIndex()
         self.log_free = ti.ndarray(ti.f32, VOXELS)
         self.sums = ti.ndarray(ti.i64, VOXELS)
+        self.sums_of_no_returns = ti.ndarray(ti.i64, 1)
         self.order = ti.ndarray(ti.i32, 1)
         self.trace_voxel = ti.ndarray(ti.i32, 1)
         self.trace = vec4_array(1)
@@ -87,6 +89,7 @@ class Sweeper:
         """Bytes of the scratch."""
         return (
             self.log_free.shape[0] * 12
+            + self.sums_of_no_returns.shape[0] * 8
             + self.order.shape[0] * 4
             + self.trace_voxel.shape[0] * TRACE_BYTES
             + self.index.bricks.shape[0] * 4
@@ -94,7 +97,7 @@ class Sweeper:
 
     @property
     def voxel_steps(self) -> int:
-        """Voxels that the rays of the last sweep crossed, each ray's counted."""
+        """Voxels that the measured rays of the last sweep crossed, each ray's counted."""
         return int(self.steps.to_numpy()[: self._workers].sum(dtype=np.int64))
 
     def sweep(self, keyframe: Keyframe, pool: BrickPool) -> bool:
@@ -111,12 +114,21 @@ class Sweeper:
         # Eq. 6: the belief of each voxel without this keyframe's message.
         with self.casting(keyframe, pool.total, messages, pool.prior_log_odds) as cast:
             # Eqs. 4, 11, 13 and 14: the rays' messages.
+            retrace = config.return_pass == "retrace" and not model.maximise
+            if keyframe.no_returns is not None:
+                parts = (cast.view, cast.space, model, cast.swept, cast.trace, cast.workers, retrace)
+                send_no_returns(keyframe.no_returns, self._second_sums(), *parts)
             sum_product.send_messages(
                 keyframe.ray_list, keyframe.entry_depths, int(keyframe.entry_depths_known),
                 keyframe.image.sensor, cast.view, cast.space, model, cast.swept, cast.trace, cast.workers,
-                config.return_pass == "retrace" and not model.maximise,
+                retrace,
             )  # fmt: skip
             keyframe.entry_depths_known = True
+            if keyframe.no_returns is not None:
+                take_where_unmeasured(
+                    len(visible.slots) * VOXELS, cast.swept.sums, self._second_sums(),
+                    cast.swept.scale, config.min_length,
+                )  # fmt: skip
 
         # Eqs. 7 and 8: the average over rays is the keyframe's new message, and changes the beliefs.
         bricks.moved.fill(0)  # a NumPy array's method or a Taichi array's
@@ -180,18 +192,22 @@ class Sweeper:
         keyframe.change_count_at_last_sweep = pool.change_count[visible.slots]
         return moved
 
+    def _second_sums(self) -> "ti.Ndarray":
+        """Scratch of the size of the sums, for rays without a return."""
+        if self.sums_of_no_returns.shape[0] < self.sums.shape[0]:
+            runtime.settle()  # before the old scratch is dropped
+            self.sums_of_no_returns = ti.ndarray(ti.i64, self.sums.shape[0])
+        return self.sums_of_no_returns
+
     def _scale(self, keyframe: Keyframe) -> float:
         """The accumulators' scale, which follows from where the keyframe stands and from its bricks."""
         visible, image, window = keyframe.visible, keyframe.image, keyframe.footprint.window
         if visible.scale == 0.0:
-            visible.scale = finest_scale(
-                image.camera,
-                image.rays,
-                keyframe.T_world_camera,
-                window,
-                window.bricks_of(visible.cells),
-                keyframe.ray_list.widest,
-            )
+            rays, widest, no_returns = image.rays, keyframe.ray_list.widest, keyframe.no_returns
+            if no_returns is not None:
+                rays, widest = rays + no_returns.image.rays, max(widest, no_returns.ray_list.widest)
+            bricks = window.bricks_of(visible.cells)
+            visible.scale = finest_scale(image.camera, rays, keyframe.T_world_camera, window, bricks, widest)
         return visible.scale
 
     def _reserve(self, bricks: int, steps: int, workers: int) -> None:

@@ -40,6 +40,8 @@ def evidence_arrays(own: OwnEvidence, prefix: str) -> dict[str, NDArray[Any]]:
     arrays = {} if own.noise is None else noise_arrays(own.noise, prefix)
     if own.sigma_m is not None:
         arrays[f"{prefix}sigma_m"] = own.sigma_m
+    if own.no_return is not None:
+        arrays[f"{prefix}no_return"] = own.no_return
     return arrays
 
 
@@ -49,4 +51,7 @@ def read_evidence(file: NpzFile, prefix: str, camera: Camera) -> OwnEvidence:
     sigma_m = None
     if f"{prefix}sigma_m" in file:
         sigma_m = file.array(f"{prefix}sigma_m", "f", camera.shape).astype(np.float32)
-    return OwnEvidence(noise, sigma_m)
+    no_return = None
+    if f"{prefix}no_return" in file:
+        no_return = file.array(f"{prefix}no_return", "b", camera.shape)
+    return OwnEvidence(noise, sigma_m, no_return)

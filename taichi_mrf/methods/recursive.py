@@ -39,7 +39,7 @@ from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
-from taichi_mrf.sensor.own_evidence import checked_evidence
+from taichi_mrf.sensor.own_evidence import checked_evidence, checked_no_return
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.strips import strip_length
@@ -139,13 +139,14 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         color: ArrayLike | None = None,
         noise: NoiseModel | None = None,
         sigma_m: ArrayLike | None = None,
+        no_return: ArrayLike | None = None,
     ) -> int:
         """Add a depth image and integrate it at once; in a stale map the next :meth:`infer` does.
 
         ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
         ``T_world_camera`` is (4, 4); ``stamp_s`` is when it was taken, in seconds, by default the number of
-        keyframes added before; ``noise`` and ``sigma_m`` are those of MRFMap.add_keyframe. Returns the
-        keyframe's id.
+        keyframes added before; ``noise`` and ``sigma_m`` are those of MRFMap.add_keyframe, and
+        ``no_return`` is checked and ignored. Returns the keyframe's id.
         Raises KeyframeError for a wrong shape or pose, CapacityError if the map would not fit, ConfigError
         for a ``color`` image: the map has no colours.
         """
@@ -154,6 +155,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         T, name = as_pose(T_world_camera), instance(name, str, "name", "a string")
         depth = checked_depth(depth_m, camera, self.sensor.min_depth)
         depth, own = checked_evidence(depth, camera, noise, sigma_m)
+        checked_no_return(no_return, depth_m, camera)
         if not self._keyframes:
             table = own.noise_model(self.noise, depth).table(camera)
             warn_of_bad_sigma(table, self.sensor.min_depth, self.sensor.max_depth)

@@ -42,8 +42,9 @@ class Frame:
     @property
     def own(self) -> OwnEvidence:
         """What the frame states of its measurements, as it was read."""
-        return OwnEvidence(self.noise, self.sigma_m)
+        return OwnEvidence(self.noise, self.sigma_m, self.no_return)
 
     def own_for(self, sensor: SensorConfig) -> OwnEvidence:
         """The part of it that a map with this configuration takes."""
-        return OwnEvidence(self.noise, self.sigma_m if sensor.pixel_sigma else None)
+        sigma_m = self.sigma_m if sensor.pixel_sigma else None
+        return OwnEvidence(self.noise, sigma_m, self.no_return if sensor.no_return != "ignore" else None)

@@ -17,14 +17,16 @@ from taichi_mrf.sensor.pixel_sigma import PixelSigma
 
 @dataclass(frozen=True)
 class OwnEvidence:
-    """A keyframe's own noise model and its own sigma for each pixel; None for what its map assumes.
+    """A keyframe's own noise model and its own sigma for each pixel, None for what its map assumes; and its
+    pixels that got no return, None if they are not known or do not count.
 
     ``sigma_m`` is (H, W) float32, the standard deviation of each pixel's depth in metres; 0 stands for that
-    of the noise model.
+    of the noise model. ``no_return`` is (H, W) bool.
     """
 
     noise: NoiseModel | None = None
     sigma_m: NDArray[np.float32] | None = None
+    no_return: NDArray[np.bool_] | None = None
 
     def noise_model(self, default: NoiseModel, depth_m: NDArray[np.floating]) -> NoiseModel:
         """The noise of a depth image (H, W) whose map has the noise ``default``."""
@@ -33,18 +35,20 @@ class OwnEvidence:
 
     def arguments(self) -> Mapping[str, Any]:
         """The arguments of ``add_keyframe`` that state this again."""
-        return {"noise": self.noise, "sigma_m": self.sigma_m}
+        return {"noise": self.noise, "sigma_m": self.sigma_m, "no_return": self.no_return}
 
     def content(self) -> bytes:
         """What it states, as bytes to sort by; empty if it states nothing."""
         noise = self.noise
         parts = [] if noise is None else [type(noise).__name__.encode(), *map(_bytes, vars(noise).values())]
-        return b"".join(parts if self.sigma_m is None else [*parts, self.sigma_m.tobytes()])
+        images = (image.tobytes() for image in (self.sigma_m, self.no_return) if image is not None)
+        return b"".join([*parts, *images])
 
     @property
     def nbytes(self) -> int:
         """Bytes of its images in host memory and of what kernels read of them."""
-        return 0 if self.sigma_m is None else 2 * self.sigma_m.nbytes
+        sigma = 0 if self.sigma_m is None else 2 * self.sigma_m.nbytes
+        return sigma + (0 if self.no_return is None else self.no_return.nbytes)
 
 
 NOTHING = OwnEvidence()
@@ -74,6 +78,23 @@ def checked_evidence(
     depth_m = np.where(np.isposinf(sigma), np.float32(0.0), depth_m)
     stated = (depth_m > 0) & (sigma > 0)  # NaN is not
     return depth_m, OwnEvidence(noise, np.where(stated, np.maximum(sigma, LEAST_SIGMA_M), np.float32(0.0)))
+
+
+def checked_no_return(
+    no_return: ArrayLike | None, depth_m: ArrayLike, camera: Camera
+) -> NDArray[np.bool_] | None:
+    """A copy of (H, W) bool, the pixels that got no return, without those that hold a depth in the image as
+    it was given: a return from too near is a return. None for None, and if there are none. Raises
+    KeyframeError for a wrong shape or type."""
+    if no_return is None:
+        return None
+    given, depth = np.asarray(no_return), np.asarray(depth_m)
+    if given.shape != camera.shape or given.dtype != np.bool_:
+        raise KeyframeError(
+            f"no_return must be bool of the shape {camera.shape}, not {given.dtype} {given.shape}"
+        )
+    without = given & ~(np.isfinite(depth) & (depth > 0))
+    return without if without.any() else None
 
 
 def sigma_of_confidence(

@@ -12,9 +12,10 @@ from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.footprint import find_footprint
 from taichi_mrf.inference.incremental import change_count_seen_by
-from taichi_mrf.inference.keyframe import DepthImage, Footprint, Keyframe, RayList
+from taichi_mrf.inference.keyframe import DepthImage, Footprint, Keyframe, NoReturnRays, RayList
 from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
 from taichi_mrf.inference.messages import carry_over, new_messages, withdraw_messages
+from taichi_mrf.inference.no_returns import no_return_rays
 from taichi_mrf.inference.ray_list import RayBundler
 from taichi_mrf.inference.sweep import unknown_entry_depths
 from taichi_mrf.methods.brick_registry import BrickRegistry
@@ -45,27 +46,29 @@ class KeyframeAllocator:
         CapacityError if there is not enough memory."""
         rays, voxel_size = self.bundler.rays_of(image), self.registry.voxel_size
         parts = (voxel_size, self.sensor, self.inference, self.volume)
-        footprint = find_footprint(image, rays, T_world_camera, *parts, scouts=SCOUTS)
-        self.budget.check(footprint, image.nbytes + 4 * rays.blocks.shape[0] + rays.nbytes)
+        no_returns = no_return_rays(image, self.sensor, self.bundler)
+        footprint = find_footprint(image, rays, T_world_camera, *parts, scouts=SCOUTS, no_returns=no_returns)
+        of_no_returns = 0 if no_returns is None else no_returns.nbytes
+        self.budget.check(footprint, image.nbytes + 4 * rays.blocks.shape[0] + rays.nbytes + of_no_returns)
         self.registry.anchor_at(T_world_camera[:3, 3])
-        return self._claimed(id, name, image, rays, T_world_camera, stamp_s, footprint)
+        return self._claimed(id, name, image, rays, T_world_camera, stamp_s, footprint, no_returns)
 
     def put_back(self, keyframe: Keyframe) -> Keyframe:
         """Place a keyframe again, without messages, right after :meth:`take_out`. The memory that it needs
         was just released, so the budget is not checked."""
         parts = (keyframe.image, keyframe.ray_list, keyframe.T_world_camera, keyframe.stamp_s)
-        return self._claimed(keyframe.id, keyframe.name, *parts, keyframe.footprint)
+        return self._claimed(keyframe.id, keyframe.name, *parts, keyframe.footprint, keyframe.no_returns)
 
     def _claimed(
         self, id: int, name: str, image: DepthImage, rays: RayList, T_world_camera: Pose, stamp_s: float,
-        footprint: Footprint,
+        footprint: Footprint, no_returns: NoReturnRays | None,
     ) -> Keyframe:  # fmt: skip
         """Claim the bricks and return the keyframe, counted in the budget."""
         self.registry.claim(footprint)
         self.bounds.put(id, footprint.window)
         visible, entry_depths = self.registry.visible(footprint), unknown_entry_depths(rays)
         placed = (T_world_camera, stamp_s, footprint, visible, entry_depths)
-        keyframe = Keyframe(id, name, image, rays, *placed)
+        keyframe = Keyframe(id, name, image, rays, *placed, no_returns=no_returns)
         self.budget.take(keyframe)
         return keyframe
 

@@ -44,7 +44,7 @@ from taichi_mrf.methods.mrf.storage import contents_of, read_contents, write_con
 from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
-from taichi_mrf.sensor.own_evidence import checked_evidence
+from taichi_mrf.sensor.own_evidence import checked_evidence, checked_no_return
 from taichi_mrf.voxels.layout import VOXELS
 
 
@@ -126,6 +126,7 @@ class MRFMap(ReadableMRF):
         color: ArrayLike | None = None,
         noise: NoiseModel | None = None,
         sigma_m: ArrayLike | None = None,
+        no_return: ArrayLike | None = None,
     ) -> int:
         """Add a depth image. It takes part in the next :meth:`infer`.
 
@@ -134,13 +135,14 @@ class MRFMap(ReadableMRF):
         keyframes added before; ``color`` is (H, W, 3) uint8 RGB of the same pixels, 0 0 0 for none, from
         which :meth:`colors` follow; ``noise`` is its own noise model; ``sigma_m`` is (H, W), the standard
         deviation of each pixel's depth in metres, in place of the noise model's: 0, negative and NaN stand
-        for the model's, and an infinite one means no measurement. Returns the keyframe's id.
+        for the model's, and an infinite one means no measurement; ``no_return`` is (H, W) bool, the pixels
+        that got no return, which count as ``sensor.no_return`` says. Returns the keyframe's id.
         Raises KeyframeError for a wrong shape or pose, CapacityError if the map would not fit,
         ConfigError for noise that does not fit the camera.
         """
         T, stamp_s = as_pose(T_world_camera), self._stamp(stamp_s)
         name = instance(name, str, "name", "a string") or f"keyframe {self._next_id}"
-        image = self._upload(depth_m, camera, color, noise, sigma_m)
+        image = self._upload(depth_m, camera, color, noise, sigma_m, no_return)
         keyframe = self._allocator.place(self._next_id, name, image, T, stamp_s)
         self._keyframes[keyframe.id] = keyframe
         self._note_up(T, camera)
@@ -368,10 +370,12 @@ class MRFMap(ReadableMRF):
 
     def _upload(
         self, depth_m: ArrayLike, camera: Camera, color: ArrayLike | None,
-        noise: NoiseModel | None, sigma_m: ArrayLike | None,
+        noise: NoiseModel | None, sigma_m: ArrayLike | None, no_return: ArrayLike | None,
     ) -> DepthImage:  # fmt: skip
         depth = checked_depth(depth_m, camera, self.sensor.min_depth)
         depth, own = checked_evidence(depth, camera, noise, sigma_m)
+        if self.sensor.no_return != "ignore":
+            own = replace(own, no_return=checked_no_return(no_return, depth_m, camera))
         image = DepthImage.upload(depth, camera, self.noise, checked_color(color, camera), own)
         if not self._keyframes:
             warn_of_bad_sigma(image.noise_table, self.sensor.min_depth, self.sensor.max_depth)

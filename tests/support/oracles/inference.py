@@ -29,11 +29,12 @@ class Segment:
 @dataclass(frozen=True)
 class Ray:
     """A ray with its measurement. ``beyond`` is the density of the measurement if the first surface lies
-    past the last segment."""
+    past the last segment. Voxels that are not in ``told`` get no message, if it is given."""
 
     segments: list[Segment]
     densities: list[float]
     beyond: float
+    told: frozenset[Voxel] | None = None
 
 
 def cast(
@@ -177,6 +178,8 @@ def infer(
             sums: dict[Voxel, float] = dict.fromkeys(seen, 0.0)
             for ray in rays:
                 for voxel, weight, q in messages_of(ray, incoming, config):
+                    if ray.told is not None and voxel not in ray.told:
+                        continue
                     if config.average == "log_odds":
                         q = min(1 - 1e-16, max(1e-300, q))
                         q = min(config.message_clamp, max(-config.message_clamp, logit(q)))

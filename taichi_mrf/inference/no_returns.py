@@ -1,0 +1,67 @@
+"""The rays of pixels that got no return: which they are, and what they tell voxels."""
+
+from dataclasses import replace
+
+import numpy as np
+import taichi as ti
+
+from taichi_mrf.config.schema import SensorConfig
+from taichi_mrf.inference import sum_product
+from taichi_mrf.inference.accumulators import length_sum
+from taichi_mrf.inference.keyframe import DepthImage, NoReturnRays
+from taichi_mrf.inference.ray_list import RayBundler
+from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
+from taichi_mrf.inference.workers import Workers
+from taichi_mrf.kernels.bundles import kernel
+from taichi_mrf.kernels.types import F32, I32, I64Array
+from taichi_mrf.sensor.no_return import NoReturnLaw
+from taichi_mrf.voxels.traversal import Space, Viewpoint
+
+
+def no_return_rays(image: DepthImage, config: SensorConfig, bundler: RayBundler) -> NoReturnRays | None:
+    """The rays of the pixels of an image that got no return; None if there are none, or they do not count.
+
+    They are bundled as if all had measured the depth up to which they count: there a voxel covers the fewest
+    pixels.
+    """
+    law = NoReturnLaw.of(config)
+    if law is None or image.own.no_return is None:
+        return None
+    depth = np.where(image.own.no_return, np.float32(law.reach_m), np.float32(0.0))
+    without = DepthImage.upload(depth, image.camera, law)
+    rays = bundler.rays_of(without)
+    entry_depths = ti.ndarray(ti.f32, rays.blocks.shape[0])
+    entry_depths.fill(law.begin_m)
+    return NoReturnRays(without, rays, entry_depths, law.reach_m)
+
+
+def send_no_returns(
+    no_returns: NoReturnRays, sums: "ti.Ndarray", view: Viewpoint, space: Space,
+    model: RayModel, swept: SweptVoxels, trace: Trace, workers: Workers, retrace: bool,
+) -> None:  # fmt: skip
+    """Sum up the messages of rays without a return in ``sums``, as measured ones are in ``swept.sums``.
+
+    Chances take the place of densities. Each missing return is explained by one of them, so no floor is
+    added.
+    """
+    sums.fill(0)
+    sum_product.send_messages(
+        no_returns.ray_list, no_returns.entry_depths, 1, no_returns.image.sensor, view, space,
+        replace(model, max_depth=no_returns.reach_m, floor=0.0), replace(swept, sums=sums),
+        trace, workers, retrace,
+    )  # fmt: skip
+
+
+@kernel
+def take_where_unmeasured(
+    number: I32, sums: I64Array, of_no_returns: I64Array, scale: F32, least: F32
+) -> None:
+    """Where a keyframe's measured rays have crossed a voxel for no more than ``least`` voxel sizes, take the
+    sums of the rays without a return. Both are (visible bricks * 512), ``number`` long.
+
+    Missing returns beside measured ones are no further evidence: the rays that meet one dark or wet surface
+    have the same reason to give none.
+    """
+    for i in range(number):
+        if length_sum(sums[i], scale) <= least:
+            sums[i] = of_no_returns[i]
