@@ -5,7 +5,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from taichi_mrf.datasets.options import ReadOptions
+from taichi_mrf.errors import FrameError
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.frame import Frame
@@ -95,6 +99,21 @@ class Dataset(ABC):
     def check_scale(self, poses_are_used: bool) -> list[str]:
         """Check the unit of depth, once the camera is final, and return notes; empty for a known unit."""
         return []
+
+    def stamps(self) -> Sequence[float] | NDArray[np.float64]:
+        """When each frame was taken, in seconds. This reads all of them, unless the source overrides it; a
+        broken frame gets the stamp of the one before it."""
+        found: list[float] = []
+        for index in range(len(self)):
+            try:
+                found.append(self.read(index).stamp)
+            except FrameError:
+                found.append(found[-1] if found else 0.0)
+        return found
+
+    def sensor_of(self, index: int) -> str:
+        """The name of the sensor that took a frame (Frame.sensor), empty if there is only one."""
+        return ""
 
     @property
     @abstractmethod

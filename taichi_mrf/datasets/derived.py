@@ -3,6 +3,9 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.errors import LostFrameError
 from taichi_mrf.geometry.poses import Pose
@@ -39,6 +42,14 @@ class Derived(Dataset):
     def recorded_reach(self) -> float | None:
         """The source's."""
         return self.source.recorded_reach
+
+    def stamps(self) -> Sequence[float] | NDArray[np.float64]:
+        """The source's."""
+        return self.source.stamps()
+
+    def sensor_of(self, index: int) -> str:
+        """The source's."""
+        return self.source.sensor_of(index)
 
     @property
     def frame_names(self) -> Sequence[str]:

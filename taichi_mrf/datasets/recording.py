@@ -64,6 +64,10 @@ class Recording(Dataset):
         """The names of the frames in order, for errors and reports."""
         return self._names
 
+    def stamps(self) -> Sequence[float]:
+        """When each frame was taken, in seconds."""
+        return [frame.stamp for frame in self.frames]
+
     def read(self, index: int) -> Frame:
         """Read one frame from disk.
 

@@ -8,6 +8,7 @@ import difflib
 import re
 from pathlib import Path
 
+from taichi_mrf.datasets import several_sensors
 from taichi_mrf.datasets.base import BuiltIn, Dataset, Format
 from taichi_mrf.datasets.formats import frames_npz, numbered_depth, replica, scannet, seven_scenes, tum_rgbd
 from taichi_mrf.datasets.hints import hint_for
@@ -23,6 +24,7 @@ from taichi_mrf.sensor.camera import PinholeCamera, pinhole
 from taichi_mrf.system.files import exists, is_folder
 
 FORMATS: tuple[Format, ...] = (
+    several_sensors.format_of(lambda source, **options: open_dataset(source, **options)),
     seven_scenes.FORMAT,
     tum_rgbd.FORMAT,
     scannet.FORMAT,

@@ -130,7 +130,8 @@ class Intake:
             if is_held_out(number, self._hold_out):
                 self.result.held_out.append(index)
                 return Passed(HELD_OUT.reason, frame)
-        objection = self._selector.objection(frame.T_world_camera, bool((frame.depth_m > 0).any()))
+        measured = bool((frame.depth_m > 0).any())
+        objection = self._selector.objection(frame.T_world_camera, measured, frame.sensor)
         if objection is not None:
             return Passed(objection, frame)
         self._before_adding(frame)
@@ -142,18 +143,18 @@ class Intake:
             tracked = self.tracker.took(keyframe)
             if self._remembers and self.result.track is not None:
                 self.result.track.frames[index] = tracked
-        self._selector.accept(frame.T_world_camera)
+        self._selector.accept(frame.T_world_camera, frame.sensor)
         return Added(frame, keyframe, self.map.keyframes[keyframe].rays)
 
-    def go_on_from(self, keyframe: int, T_recorded: Pose) -> None:
-        """Go on after a keyframe that the map of an earlier run has brought along."""
+    def go_on_from(self, keyframe: int, T_recorded: Pose, sensor: str = "") -> None:
+        """Go on after a keyframe of a sensor that the map of an earlier run has brought along."""
         T_world_camera = self.map.keyframes[keyframe].T_world_camera
         if self.tracker is not None:
             self.tracker.resume(keyframe)
         if self.refiner is not None:
             T_world_camera = T_recorded
             self.refiner.note_recorded(keyframe, T_recorded)
-        self._selector.accept(T_world_camera)
+        self._selector.accept(T_world_camera, sensor)
 
     def _located(self, frame: Frame, index: int) -> Frame | Lost:
         """The frame at the pose where it was taken."""

@@ -198,7 +198,7 @@ class _BatchRun:
             if id is not None:
                 moved = self.intake.refiner is not None and self.intake.tracker is None
                 recorded = self.dataset.read(index) if moved else m.keyframes[id]
-                self.intake.go_on_from(id, recorded.T_world_camera)
+                self.intake.go_on_from(id, recorded.T_world_camera, self.dataset.sensor_of(index))
                 last_mapped = index
         return set(id_of), last_mapped
 

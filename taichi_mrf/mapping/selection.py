@@ -19,31 +19,35 @@ class KeyframeSelector:
 
     The norm is taken against the last keyframe, as in the paper, or against every earlier one, in which
     case a frame must be far from all of them. With both thresholds at 0 every frame is a keyframe; with
-    one of them at 0 only the other counts.
+    one of them at 0 only the other counts. Of several sensors each has keyframes of its own, which alone
+    its frames are compared with.
     """
 
     def __init__(self, config: KeyframeConfig) -> None:
         self._config = config
-        self._accepted: list[Pose] = []  # those that frames are compared with
+        self._accepted: dict[str, list[Pose]] = {}  # of each sensor those that frames are compared with
 
-    def wants(self, T_world_camera: Pose) -> bool:
-        """Whether a frame with this pose, (4, 4), should become a keyframe. Does not change the selector."""
+    def wants(self, T_world_camera: Pose, sensor: str = "") -> bool:
+        """Whether a frame of a sensor with this pose, (4, 4), should become a keyframe. Does not change the
+        selector."""
         if self._config.rotation == 0 and self._config.translation == 0:
             return True
-        return all(self._is_far(T_world_keyframe, T_world_camera) for T_world_keyframe in self._accepted)
+        accepted = self._accepted.get(sensor, [])
+        return all(self._is_far(T_world_keyframe, T_world_camera) for T_world_keyframe in accepted)
 
-    def objection(self, T_world_camera: Pose, measured: bool) -> str | None:
+    def objection(self, T_world_camera: Pose, measured: bool, sensor: str = "") -> str | None:
         """Why a frame with this pose, (4, 4), does not become a keyframe; None if it does. ``measured``: its
         image holds a measurement."""
-        if not self.wants(T_world_camera):
+        if not self.wants(T_world_camera, sensor):
             return "too near to a keyframe"
         return None if measured else "no pixel holds a measurement"
 
-    def accept(self, T_world_camera: Pose) -> None:
+    def accept(self, T_world_camera: Pose, sensor: str = "") -> None:
         """Note the pose of a frame that has become a keyframe."""
+        accepted = self._accepted.setdefault(sensor, [])
         if self._config.against == "last":
-            self._accepted.clear()  # an endless run has no end of poses
-        self._accepted.append(T_world_camera)
+            accepted.clear()  # an endless run has no end of poses
+        accepted.append(T_world_camera)
 
     def _is_far(self, T_world_keyframe: Pose, T_world_camera: Pose) -> bool:
         rotation, translation = tangent_norms(T_world_keyframe, T_world_camera)

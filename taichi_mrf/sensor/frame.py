@@ -26,7 +26,8 @@ class Frame:
 
     The other fields are None where the sensor's configuration answers for all frames: ``sigma_m``, (H, W)
     float32, the standard deviation in metres of each pixel's depth; ``noise``, a noise model for this frame;
-    ``no_return``, (H, W) bool, the pixels that looked and got nothing back.
+    ``no_return``, (H, W) bool, the pixels that looked and got nothing back. ``sensor`` names the sensor of a
+    recording of several.
     """
 
     depth_m: NDArray[np.float32]
@@ -38,6 +39,7 @@ class Frame:
     sigma_m: NDArray[np.float32] | None = None
     noise: "NoiseModel | None" = None
     no_return: NDArray[np.bool_] | None = None
+    sensor: str = ""
 
     @property
     def own(self) -> OwnEvidence:

@@ -98,7 +98,8 @@ def frames_of(dataset: Dataset) -> bytes:
             refused.append((name, str(error)))
             continue
         assert frame.depth_m.shape == frame.camera.shape
-        assert frame.camera == dataset.camera or not isinstance(frame.camera, PinholeCamera)
+        if isinstance(frame.camera, PinholeCamera) and not frame.sensor:
+            assert frame.camera == dataset.camera
         assert frame.depth_m.dtype == np.float32
         assert np.isfinite(frame.depth_m).all()
         assert (frame.depth_m >= 0).all()
@@ -312,6 +313,14 @@ def _velodyne(folder: Path) -> Path:
     return write_velodyne(folder / "walk", WALK, WALK.poses[2])
 
 
+def _several(folder: Path) -> Path:
+    _npz(folder)
+    write_lidar_scans(folder / "scans", WALK)
+    text = "sensors:\n  - name: depth\n    source: walk.npz\n  - source: scans\n    sigma: [0.02, 0.001]\n"
+    (folder / "robot.yaml").write_text(text + "    every: 2\n    max_depth: 5.0\n")
+    return folder / "robot.yaml"
+
+
 def _stereo(folder: Path) -> Path:
     return write_stereo_file(folder, ["a", "b", "c"])
 
@@ -484,6 +493,7 @@ LOADERS = [
     Loader("frames npz", _npz, _dataset, sealed=True),
     Loader("frames npz, folder", _npz_folder, _dataset, sealed=True),
     Loader("KITTI stereo", _kitti, _dataset),
+    Loader("several sensors", _several, _dataset),
     Loader("stereo YAML", _stereo, _dataset),
     Loader("lidar npz", partial(write_lidar_scans, walk=WALK), _dataset, sealed=True),
     Loader("lidar PLY", _lidar_plies, _dataset),

@@ -58,6 +58,10 @@ class FramesNpz(Dataset):
         """The file's name, with the frame's number in it if it holds several."""
         return self._names
 
+    def stamps(self) -> Sequence[float]:
+        """When each frame was taken, in seconds."""
+        return [float(part.stamps[i]) for part, i in self._places]
+
     def read(self, index: int) -> Frame:
         """Read one frame. Raises FrameError, which names frame, file and field, for damaged images and
         for an invalid pose; IndexError outside 0 to len - 1."""

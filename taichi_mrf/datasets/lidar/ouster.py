@@ -95,6 +95,10 @@ class OusterScans(Dataset):
         """The largest range of the first scan, rounded up to tens of metres."""
         return self.reach_m
 
+    def stamps(self) -> Sequence[float]:
+        """When each frame was taken, in seconds."""
+        return [scan.stamp for scan in self.scans]
+
     def read(self, index: int) -> Frame:
         """Decode one scan. Raises FrameError, which names frame and file, if it is damaged, has no
         measurement or no valid pose. Raises IndexError outside 0 to len - 1."""

@@ -73,6 +73,10 @@ class LidarScans(Dataset):
         """The largest range of the first scan, rounded up to tens of metres."""
         return self.reach_m
 
+    def stamps(self) -> Sequence[float]:
+        """When each frame was taken, in seconds."""
+        return [scan.stamp for scan in self.scans]
+
     def read(self, index: int) -> Frame:
         """Read one scan.
 

@@ -75,6 +75,10 @@ class RosBag(Dataset):
         """The number that each image has in its topic, from 0."""
         return self.names
 
+    def stamps(self) -> Sequence[float]:
+        """When each frame was taken, in seconds."""
+        return [entry.stamp for entry in self.entries]
+
     def read(self, index: int) -> Frame:
         """Decode one image.
 

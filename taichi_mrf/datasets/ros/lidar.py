@@ -58,6 +58,10 @@ class LidarBag(Dataset):
         """The largest range of the first cloud, rounded up to tens of metres."""
         return self.reach_m
 
+    def stamps(self) -> Sequence[float]:
+        """When each frame was taken, in seconds."""
+        return [entry.stamp for entry in self.entries]
+
     def read(self, index: int) -> Frame:
         """Decode one cloud.
 

@@ -64,6 +64,10 @@ class StereoPairs(Dataset):
         """The left camera and the baseline."""
         return StereoRig(self.camera, self.baseline_m)
 
+    def stamps(self) -> Sequence[float]:
+        """When each frame was taken, in seconds."""
+        return [pair.stamp for pair in self.pairs]
+
     def read(self, index: int) -> Frame:
         """Read and match one pair.
 

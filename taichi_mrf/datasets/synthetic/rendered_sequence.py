@@ -112,6 +112,10 @@ class RenderedSequence(Dataset):
         in a solid."""
         return self.scene.signed_distance(points)
 
+    def stamps(self) -> Sequence[float]:
+        """When each frame was taken, in seconds."""
+        return [self.stamp_at(index) for index in range(self.options.frames)]
+
     def read(self, index: int) -> Frame:
         """Render one frame, with the noise that the options ask for."""
         depth_m, color = self._render(index, self.color)

@@ -1,0 +1,235 @@
+"""Several sensors as one recording, described by a YAML file: ``taichi-mrf map robot.yaml``.
+
+::
+
+    sensors:
+      - name: depth
+        source: walk.mcap?depth=/camera/depth/image_raw     # relative to this file
+        max_depth: 4.0
+        reading: {image_scale: 0.5}
+      - name: lidar
+        source: walk.mcap?points=/points
+        sigma: [0.02]
+
+The fields of :class:`SensorEntry` are those of a sensor. Frames come in the order of their stamps, which all
+sensors must count from one beginning, at poses in one world. Each frame states the noise of its sensor.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.config.files import read_yaml
+from taichi_mrf.config.schema import SensorConfig
+from taichi_mrf.config.values import check_field, from_dict
+from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.options import ReadOptions
+from taichi_mrf.datasets.source_flags import SourceFlags
+from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeError
+from taichi_mrf.geometry.poses import Pose, as_pose
+from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.noise import PolynomialNoise
+from taichi_mrf.system.files import is_file
+
+SUFFIXES = (".yaml", ".yml")
+_SOURCE = re.compile(r"[a-z][a-z0-9_]+:")
+
+
+@dataclass(frozen=True)
+class SensorEntry:
+    """One sensor of the file."""
+
+    source: str
+    """Its recording, as ``taichi-mrf map`` takes it; a path is relative to the file."""
+
+    name: str = ""
+    """What its frames' names begin with; sensor-1, sensor-2, ... by default."""
+
+    sigma: tuple[float, ...] | None = None
+    """Standard deviation of its depth in metres, coefficients in ascending powers of depth. By default the
+    recording's own, or the configuration's."""
+
+    bias: tuple[float, ...] = (0.0,)
+    """Mean of measured minus true depth, likewise."""
+
+    min_depth: float = 0.0
+    """Nearer measurements are left out (metres)."""
+
+    max_depth: float | None = None
+    """Farther measurements are left out (metres). By default what a lidar reaches, else 10 m."""
+
+    every: int = 1
+    """Take every n-th frame."""
+
+    T_poses_sensor: tuple[float, ...] = ()
+    """The sensor in the frame that the recording's poses are of: the 12 or 16 numbers of a matrix, row by
+    row."""
+
+    reading: SourceFlags = field(default_factory=SourceFlags)
+    """How the source is read: fields of the command line's flags, such as depth_scale and image_scale."""
+
+    def __post_init__(self) -> None:
+        check_field(self.every >= 1, "every", "must be at least 1")
+        check_field(self.min_depth >= 0, "min_depth", "must not be negative")
+        far_enough = self.max_depth is None or self.max_depth > self.min_depth
+        check_field(far_enough, "max_depth", "must be more than min_depth")
+        check_field(len(self.T_poses_sensor) in (0, 12, 16), "T_poses_sensor", "must have 12 or 16 numbers")
+
+
+@dataclass(frozen=True)
+class SensorsFile:
+    """The content of the file."""
+
+    sensors: tuple[SensorEntry, ...]
+
+
+@dataclass(frozen=True)
+class RecordedSensor:
+    """A sensor and its recording. ``noise`` is None for the configuration's."""
+
+    name: str
+    dataset: Dataset
+    noise: PolynomialNoise | None
+    T_poses_sensor: Pose
+    range_m: tuple[float, float]
+
+
+@dataclass
+class SeveralSensors(Dataset):
+    """The frames of several sensors in the order of their stamps. ``places`` has for each the number of its
+    sensor and its index there; ``camera`` is the first sensor's."""
+
+    sensors: Sequence[RecordedSensor] = field(kw_only=True)
+    places: NDArray[np.int64] = field(kw_only=True)
+    frame_stamps: NDArray[np.float64] = field(kw_only=True)
+
+    def __post_init__(self) -> None:
+        self._names = [
+            f"{self.sensors[sensor].name}-{self.sensors[sensor].dataset.frame_names[index]}"
+            for sensor, index in self.places
+        ]
+
+    @property
+    def frame_names(self) -> Sequence[str]:
+        """The sensor's name and that of its frame."""
+        return self._names
+
+    @property
+    def recorded_reach(self) -> float | None:
+        """That of the sensor that reaches farthest."""
+        return max(sensor.range_m[1] for sensor in self.sensors)
+
+    def stamps(self) -> NDArray[np.float64]:
+        """When each frame was taken, in seconds."""
+        return self.frame_stamps
+
+    def sensor_of(self, index: int) -> str:
+        """The name of the sensor that took a frame."""
+        return self.sensors[self.places[index, 0]].name
+
+    def read(self, index: int) -> Frame:
+        """The frame of its sensor. Raises FrameError, which names the frame, if that is broken; IndexError
+        outside 0 to len - 1."""
+        if not 0 <= index < len(self.places):
+            raise IndexError(f"{self.name} has {len(self.places)} frames, there is no frame {index}")
+        sensor, name = self.sensors[self.places[index, 0]], self._names[index]
+        try:
+            frame = sensor.dataset.read(int(self.places[index, 1]))
+        except FrameError as error:
+            raise FrameError(f"frame {name}: {sensor.name}: {error}") from error
+        least, most = sensor.range_m
+        inside = (frame.depth_m >= least) & (frame.depth_m <= most)
+        return replace(
+            frame,
+            depth_m=np.where(inside, frame.depth_m, np.float32(0)),
+            T_world_camera=frame.T_world_camera @ sensor.T_poses_sensor,
+            name=name,
+            noise=frame.noise or sensor.noise,
+            sensor=sensor.name,
+        )
+
+
+def recognises(path: Path) -> bool:
+    """Whether a YAML file has an entry ``sensors``."""
+    if path.suffix not in SUFFIXES or not is_file(path):
+        return False
+    try:
+        values = read_yaml(path)
+    except ConfigError:
+        return False
+    return isinstance(values, dict) and "sensors" in values
+
+
+def format_of(open_source: Callable[..., Dataset]) -> Format:
+    """The entry in the registry; ``open_source`` opens the recording of one sensor."""
+
+    def open_file(path: Path, options: ReadOptions) -> SeveralSensors:
+        return _open_file(path, options, open_source)
+
+    return Format("several sensors", "a .yaml file with a list of sensors", recognises, open_file)
+
+
+def _open_file(path: Path, options: ReadOptions, open_source: Callable[..., Dataset]) -> SeveralSensors:
+    """Open the recordings of all sensors. Raises DatasetError, which names the file and the sensor."""
+    _refuse(path, options)
+    try:
+        described = from_dict(SensorsFile, read_yaml(path), str(path))
+    except ConfigError as error:
+        raise DatasetError(str(error)) from error
+    if not described.sensors:
+        raise DatasetError(f"{path}: lists no sensor")
+    names = [entry.name or f"sensor-{number}" for number, entry in enumerate(described.sensors, start=1)]
+    if len(set(names)) < len(names):
+        raise DatasetError(f"{path}: two sensors have one name; the names are {', '.join(names)}")
+    sensors, places, stamps = [], [], []
+    for number, (entry, name) in enumerate(zip(described.sensors, names, strict=True)):
+        try:
+            sensor = _open_sensor(path, entry, name, options, open_source)
+        except (ConfigError, DatasetError, KeyframeError) as error:
+            raise DatasetError(f"{path}: {name}: {error}") from error
+        indices = np.arange(0, len(sensor.dataset), entry.every)
+        sensors.append(sensor)
+        places.append(np.column_stack([np.full(len(indices), number), indices]))
+        stamps.append(np.asarray(sensor.dataset.stamps(), np.float64)[indices])
+    order = np.argsort(np.concatenate(stamps), kind="stable")
+    return SeveralSensors(
+        path.stem,
+        sensors[0].dataset.camera,
+        [f"{sensor.name}: {note}" for sensor in sensors for note in sensor.dataset.notes],
+        sum(sensor.dataset.dropped for sensor in sensors),
+        sensors=sensors,
+        places=np.concatenate(places)[order],
+        frame_stamps=np.concatenate(stamps)[order],
+    )
+
+
+def _open_sensor(
+    path: Path, entry: SensorEntry, name: str, options: ReadOptions, open_source: Callable[..., Dataset]
+) -> RecordedSensor:
+    source = entry.source
+    if not Path(source).is_absolute() and not _SOURCE.match(source):
+        source = str(path.parent / source)
+    keywords = entry.reading.keywords()
+    if keywords["max_time_gap"] is None:
+        keywords["max_time_gap"] = options.max_time_gap
+    dataset = open_source(source, color=options.color, **keywords)
+    if dataset.endless or dataset.tracked:
+        raise DatasetError("only recordings with poses can be put together")
+    sigma = entry.sigma or dataset.recorded_sigma
+    most = entry.max_depth or dataset.recorded_reach or SensorConfig().max_depth
+    T = as_pose(np.reshape(entry.T_poses_sensor, (-1, 4))) if entry.T_poses_sensor else np.eye(4)
+    noise = None if sigma is None else PolynomialNoise(sigma, entry.bias)
+    return RecordedSensor(name, dataset, noise, T, (entry.min_depth, most))
+
+
+def _refuse(path: Path, options: ReadOptions) -> None:
+    """Raise DatasetError for options that each sensor has its own of."""
+    own = (options.camera, options.intrinsics, options.depth_scale, options.undistort)
+    if any(value is not None for value in own) or options.image_scale != 1.0:
+        raise DatasetError(f"{path}: lists several sensors; set how each is read there, as reading: {{...}}")
+    if options.track:
+        raise DatasetError(f"{path}: lists several sensors, whose poses cannot be found by tracking")
