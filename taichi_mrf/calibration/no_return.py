@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf.calibration.pairs import PairSource
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.sensor.no_return import no_return_chance
 
@@ -16,6 +17,9 @@ BINS = 60
 """Of equally many pixels each."""
 
 LEAST_PIXELS = 1000
+PIXELS_OF_AN_IMAGE = 20_000
+"""More of one image tell hardly more."""
+
 LARGEST_SHARE = 0.49
 """The configuration's share lies below 0.5."""
 
@@ -41,6 +45,19 @@ class NoReturnFit:
             "no_return_depth": self.depth_m,
             "no_return_width": self.width_m,
         }
+
+
+def learn_no_return(source: PairSource) -> NoReturnFit:
+    """Fit q to pairs of measured and true depth: a pixel with a true depth and no measured one got no return.
+    Raises DatasetError, ConfigError."""
+    true, missing = [], []
+    for name in source.names:
+        pair = source.read(name)
+        known = pair.true_m > 0
+        some = slice(None, None, max(1, int(known.sum()) // PIXELS_OF_AN_IMAGE))
+        true.append(pair.true_m[known][some])
+        missing.append(pair.measured_m[known][some] <= 0)
+    return fit_no_return(np.concatenate(true), np.concatenate(missing))
 
 
 def fit_no_return(true_m: ArrayLike, no_return: ArrayLike) -> NoReturnFit:

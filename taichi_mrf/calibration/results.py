@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from taichi_mrf.calibration.coverage import Coverage
 from taichi_mrf.calibration.fit import LearntNoise
 from taichi_mrf.calibration.frustum_picture import frustum_picture
+from taichi_mrf.calibration.no_return import NoReturnFit
 from taichi_mrf.calibration.noise_pictures import curves_picture, maps_picture
 from taichi_mrf.system.atomic import atomic_path, write_npz, write_text
 
@@ -19,12 +20,13 @@ SIGMA_FILE, BIAS_FILE, NOISE_FILE, CONFIG_FILE = "sigma.npy", "bias.npy", "noise
 _DPI = 110
 
 
-def write_noise(folder: Path, noise: LearntNoise) -> list[Path]:
+def write_noise(folder: Path, noise: LearntNoise, no_return: NoReturnFit | None = None) -> list[Path]:
     """Write the tables, ``noise.npz`` for PatchNoise.load, and last a ``sensor.yaml`` that names the tables.
 
     ``noise.npz`` also holds the covariances of the coefficients, (patches, degree + 1, degree + 1), and
     which patches needed no neighbour, and the samples of each patch and depth bin, (patches, bins), with the
-    bins' limits. Returns the paths. Raises MapFileError.
+    bins' limits. ``sensor.yaml`` has the chance of no return, if it was learnt. Returns the paths. Raises
+    MapFileError.
     """
     _write_table(folder / SIGMA_FILE, noise.sigma.coefficients)
     _write_table(folder / BIAS_FILE, noise.bias.coefficients)
@@ -39,7 +41,9 @@ def write_noise(folder: Path, noise: LearntNoise) -> list[Path]:
             "depth_edges": noise.cells.edges,
         },
     )
-    write_text(folder / CONFIG_FILE, _sensor_yaml(noise))
+    fields = {} if no_return is None else {"no_return": "model", **no_return.fields()}
+    lines = "".join(f"  {name}: {value}\n" for name, value in fields.items())
+    write_text(folder / CONFIG_FILE, _sensor_yaml(noise) + lines)
     return [folder / name for name in (CONFIG_FILE, SIGMA_FILE, BIAS_FILE, NOISE_FILE)]
 
 

@@ -9,6 +9,7 @@ from rich.table import Table
 from taichi_mrf.calibration.coverage import Coverage
 from taichi_mrf.calibration.depth_files import DepthFiles
 from taichi_mrf.calibration.learning import calibrate
+from taichi_mrf.calibration.no_return import learn_no_return
 from taichi_mrf.calibration.report import calibration_report, remarks
 from taichi_mrf.calibration.results import CONFIG_FILE, write_noise, write_pictures
 from taichi_mrf.calibration.truth_sources import (
@@ -45,7 +46,8 @@ def run_calibrate(options: Calibrate) -> int:
                 truth.source, camera, options.settings, lambda done: bar.advance("Learning", done, total)
             )
             coverage = Coverage(calibration.noise.cells, calibration.noise.covered)
-            written = write_noise(options.out, calibration.noise)
+            no_return = learn_no_return(truth.source) if options.no_returns else None
+            written = write_noise(options.out, calibration.noise, no_return)
             if options.pictures:
                 bar.advance("Drawing", 0, 1)
                 written += write_pictures(options.out, calibration.noise, coverage)
@@ -53,6 +55,7 @@ def run_calibrate(options: Calibrate) -> int:
             "depth": str(options.depth),
             "ground_truth": truth.facts,
             **calibration_report(calibration, coverage),
+            **({} if no_return is None else no_return.fields()),
             "notes": [*notes, *truth.notes, *remarks(calibration)],
         }
         write_text(options.out / REPORT_FILE, json.dumps(report, indent=2, allow_nan=False) + "\n")
@@ -151,6 +154,9 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         ("patches", f"{patches}, {borrowed} of them with too little data of their own"),
         ("covered", f"{depths}; {report['covered_cells']:.0%} of all cells"),
     ]
+    if "no_return_share" in report:
+        law = f"{report['no_return_share']:.1%} near, half at {report['no_return_depth']:.1f} m"
+        rows.append(("no return", f"{law}, width {report['no_return_width']:.1f} m"))
     if report["misfit"] is not None:
         rows.append(("misfit", f"{report['misfit']:.2f} (1 if independent samples follow the polynomials)"))
     return rows

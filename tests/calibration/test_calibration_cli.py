@@ -18,6 +18,7 @@ from taichi_mrf.config import schema as config
 from taichi_mrf.config.schema import load
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.no_return import no_return_chance
 from taichi_mrf.sensor.noise import PatchNoise, noise_from_config
 
 NOISE_FILES = {"sigma.npy", "bias.npy", "noise.npz", "sensor.yaml", "report.json"}
@@ -115,6 +116,27 @@ def test_true_depth_gives_tables_and_a_report(planes_run: tuple[Path, str], tabl
         assert words in said
     for name in NOISE_FILES | PICTURES:
         assert str(out / name) in said.replace("\n", "")
+
+
+def test_the_chance_of_no_return_is_learnt_too(recording: Path, tmp_path: Path) -> None:
+    true, rng = np.load(recording / "true.npz")["depth_m"], np.random.default_rng(3)
+    (tmp_path / "depth").mkdir()
+    for number, path in enumerate(sorted((recording / "depth").glob("*.png"))):
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        image[rng.random(image.shape) < no_return_chance(true[number], 0.1, 2.5, 0.3)] = 0
+        cv2.imwrite(str(tmp_path / "depth" / path.name), image)
+    arguments = (tmp_path / "depth", "--depth-scale", "5000", "--out", tmp_path / "out", "--no-returns")
+    said = calibrated(*arguments, "--no-pictures", "--true-depth", recording / "true.npz")
+    sensor = load(tmp_path / "out" / "sensor.yaml").sensor
+    assert sensor.no_return == "model"
+    assert sensor.no_return_share == pytest.approx(0.1, abs=0.01)
+    assert sensor.no_return_depth == pytest.approx(2.5, abs=0.05)
+    assert sensor.no_return_width == pytest.approx(0.3, abs=0.03)
+    assert report_of(tmp_path / "out")["no_return_depth"] == sensor.no_return_depth
+    assert "no return" in said
+    assert_refused(
+        taichi_mrf("calibrate", *arguments, "--images", tmp_path), "--no-returns needs --true-depth"
+    )
 
 
 def test_the_map_takes_what_was_learnt(planes_run: tuple[Path, str], tmp_path: Path) -> None:

@@ -54,6 +54,10 @@ class Calibrate:
     true_depth_scale: float | None = None
     """The same for the true depth, where it differs."""
 
+    no_returns: bool = False
+    """Learn the chance that a surface gives no return too (``sensor.no_return: model``), from pixels that
+    have a true depth and no measured one. Needs --true-depth."""
+
     pictures: bool = True
     """Draw bias and sigma against depth and over the image, and what was covered."""
 
@@ -66,6 +70,8 @@ class Calibrate:
     def __post_init__(self) -> None:
         if (self.camera_poses is None) != (self.board_poses is None):
             raise ConfigError("--camera-poses and --board-poses go together")
+        if self.no_returns and self.true_depth is None:
+            raise ConfigError("--no-returns needs --true-depth: a board hides what is behind it")
         if (self.true_depth is None) == (self.images is None):
             raise ConfigError(
                 "the true depth comes either from --true-depth or from a chessboard in --images"
