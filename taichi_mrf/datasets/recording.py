@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.color_camera import ColorCamera, without_black
 from taichi_mrf.datasets.depth_scale import PLAUSIBLE_MEDIAN_M, USUAL, Evidence, gather
-from taichi_mrf.datasets.images import read_color, read_depth
+from taichi_mrf.datasets.images import read_color, read_depth, read_grey
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.noise import PolynomialNoise
+from taichi_mrf.sensor.own_evidence import sigma_of_confidence
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,18 @@ class RecordedFrame:
     read_pose: Callable[[], Pose]
     pose_source: str
     color_file: Path | None = None
+    confidence_file: Path | None = None
+
+
+@dataclass(frozen=True)
+class Confidence:
+    """What images of confidence mean: levels from 0, no measurement, to ``top_level``, which stands for the
+    ``sigma``, coefficients in ascending powers of depth; half the level doubles it. ``origin`` is where that
+    comes from."""
+
+    top_level: int
+    sigma: tuple[float, ...]
+    origin: str
 
 
 @dataclass
@@ -43,7 +57,7 @@ class Recording(Dataset):
     ``steps_per_metre`` is the scale of the depth images and ``scale_source`` where it comes from; if it is
     ``scale_assumed``, no file says so and :meth:`check_scale` may find another. ``sentinel`` is a value of
     the images that means no measurement (beside 0). ``color_camera`` took the colour images, unless they are
-    registered to depth.
+    registered to depth. ``confidence`` tells what images of confidence mean, where there are some.
     """
 
     camera: PinholeCamera
@@ -54,6 +68,7 @@ class Recording(Dataset):
     sentinel: int | None = None
     color: bool = True
     color_camera: ColorCamera | None = None
+    confidence: Confidence | None = None
     _names: list[str] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -63,6 +78,21 @@ class Recording(Dataset):
     def frame_names(self) -> Sequence[str]:
         """The names of the frames in order, for errors and reports."""
         return self._names
+
+    @property
+    def recorded_sigma(self) -> tuple[float, ...] | None:
+        """What the confidence is relative to, None without."""
+        return None if self.confidence is None else self.confidence.sigma
+
+    @property
+    def sigma_origin(self) -> str:
+        """Where the confidence's comes from."""
+        return super().sigma_origin if self.confidence is None else self.confidence.origin
+
+    @property
+    def states_pixel_sigma(self) -> bool:
+        """Whether frames have images of confidence."""
+        return any(frame.confidence_file is not None for frame in self.frames)
 
     def stamps(self) -> Sequence[float]:
         """When each frame was taken, in seconds."""
@@ -84,14 +114,30 @@ class Recording(Dataset):
             raise FrameError(f"frame {recorded.name}: {recorded.pose_source}: {error}") from error
         except DatasetError as error:
             raise FrameError(f"frame {recorded.name}: {error}") from error
-        color = None
+        color = sigma_m = None
         try:
             depth_m = read_depth(recorded.depth_file, self.steps_per_metre, self.sentinel, self.camera)
             if self.color and recorded.color_file is not None:
                 color = self._read_color(recorded.color_file, depth_m)
+            if self.confidence is not None and recorded.confidence_file is not None:
+                sigma_m = self._read_sigma(recorded.confidence_file, depth_m, self.confidence)
         except DatasetError as error:
             raise FrameError(f"frame {recorded.name}: {error}") from error
-        return Frame(depth_m, T_world_camera, self.camera, recorded.stamp, recorded.name, color)
+        parts = (self.camera, recorded.stamp, recorded.name, color, sigma_m)
+        return Frame(depth_m, T_world_camera, *parts)
+
+    def _read_sigma(
+        self, path: Path, depth_m: NDArray[np.float32], confidence: Confidence
+    ) -> NDArray[np.float32]:
+        """The sigma of each pixel, from an image of its confidence. Raises DatasetError."""
+        levels = read_grey(path)
+        if levels.shape != depth_m.shape or levels.max() > confidence.top_level:
+            raise DatasetError(
+                f"{path}: has {levels.shape[1]} x {levels.shape[0]} pixels with levels up to {levels.max()}; "
+                f"expected {self.camera.width} x {self.camera.height} and at most {confidence.top_level}"
+            )
+        shares, noise = levels / confidence.top_level, PolynomialNoise(confidence.sigma)
+        return sigma_of_confidence(shares, depth_m, noise, self.camera)
 
     def _read_color(self, path: Path, depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
         """The colours of the depth image's pixels. Raises DatasetError."""

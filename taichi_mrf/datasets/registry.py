@@ -10,7 +10,15 @@ from pathlib import Path
 
 from taichi_mrf.datasets import several_sensors
 from taichi_mrf.datasets.base import BuiltIn, Dataset, Format
-from taichi_mrf.datasets.formats import frames_npz, numbered_depth, replica, scannet, seven_scenes, tum_rgbd
+from taichi_mrf.datasets.formats import (
+    frames_npz,
+    numbered_depth,
+    replica,
+    scannet,
+    seven_scenes,
+    stray_scanner,
+    tum_rgbd,
+)
 from taichi_mrf.datasets.hints import hint_for
 from taichi_mrf.datasets.lidar import kitti_velodyne, ouster, pcd_viewpoints, scan_folder
 from taichi_mrf.datasets.options import ReadOptions
@@ -29,6 +37,7 @@ FORMATS: tuple[Format, ...] = (
     tum_rgbd.FORMAT,
     scannet.FORMAT,
     replica.FORMAT,
+    stray_scanner.FORMAT,
     numbered_depth.FORMAT,
     kitti.FORMAT,
     bag.FORMAT,

@@ -147,6 +147,21 @@ def write_scannet(folder: Path, content: Content, color: bool = False) -> Path:
     return folder
 
 
+def write_stray(folder: Path, content: Content) -> Path:
+    """Stray Scanner's layout; the images' levels of confidence are 0, 1, 2 from column to column."""
+    lines = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
+    for i in range(content.count):
+        levels = np.broadcast_to(np.arange(256, dtype=np.uint8) % 3, (192, 256))
+        depth = np.resize(content.depth[i], (192, 256))
+        write_image(folder / f"depth/{i:06d}.png", depth)
+        write_image(folder / f"confidence/{i:06d}.png", np.ascontiguousarray(levels))
+        stamp, *pose = stamped_line(100 + 0.1 * i, content.poses[i]).split()
+        lines.append(", ".join([stamp, f"{i:06d}", *pose]))
+    (folder / "odometry.csv").write_text("\n".join(lines))
+    (folder / "camera_matrix.csv").write_text("1500.0, 0.0, 959.5\n0.0, 1500.0, 719.5\n0.0, 0.0, 1.0\n")
+    return folder
+
+
 def write_replica(folder: Path, content: Content, parameters: Path) -> Path:
     for i in range(content.count):
         write_image(folder / f"results/depth{i:06d}.png", content.depth[i])

@@ -30,6 +30,7 @@ from datasets_recordings import (
     write_replica,
     write_scannet,
     write_seven_scenes,
+    write_stray,
     write_tum,
 )
 from inputs_bags import Bag, Kind, plain, writing
@@ -281,6 +282,10 @@ def _replica(folder: Path) -> Path:
     return write_replica(folder, _content(), folder / "cam_params.json")
 
 
+def _stray(folder: Path) -> Path:
+    return write_stray(folder, _content())
+
+
 def _npz(folder: Path) -> Path:
     return write_npz(folder / "walk.npz", arrays(_content()))
 
@@ -490,6 +495,7 @@ LOADERS = [
     Loader("Open3D JSON", _open3d, _dataset),
     Loader("ScanNet", _scannet, _dataset),
     Loader("Replica", _replica, _dataset),
+    Loader("Stray Scanner", _stray, _dataset),
     Loader("frames npz", _npz, _dataset, sealed=True),
     Loader("frames npz, folder", _npz_folder, _dataset, sealed=True),
     Loader("KITTI stereo", _kitti, _dataset),

@@ -1,0 +1,121 @@
+"""Recordings of the app Stray Scanner: an iPhone's or iPad's lidar, with ARKit's poses and confidence.
+
+- ``depth/NNNNNN.png``: 16-bit millimetres, 256 x 192
+- ``confidence/NNNNNN.png``: 8-bit, ARKit's levels 0 (low), 1 and 2 (high)
+- ``camera_matrix.csv``: the 3 x 3 matrix of the colour camera at 1920 x 1440 pixels, to which depth is
+registered
+- ``odometry.csv``: with a header; the columns timestamp, frame, x, y, z, qx, qy, qz, qw are T_world_camera
+
+Level 2 leaves the sigma, level 1 doubles it, and pixels of level 0 are no measurements. The colour images are
+a film, which is not read.
+"""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.options import ReadOptions
+from taichi_mrf.datasets.recording import Confidence, RecordedFrame, Recording
+from taichi_mrf.datasets.trajectories import RecordedPose
+from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system.files import is_file, is_folder, read_text
+
+DEPTH, CONFIDENCE, MATRIX, ODOMETRY = "depth", "confidence", "camera_matrix.csv", "odometry.csv"
+COLOR_SIZE, DEPTH_WIDTH = (1920, 1440), 256
+ARKIT = Confidence(top_level=2, sigma=(0.01,), origin="assumed for a phone's lidar")
+"""Luetzenburg, Kroon and Bjork (Scientific Reports, 2021) found errors of 1 cm."""
+
+_COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
+
+
+def recognises(folder: Path) -> bool:
+    """Whether there are depth images, a camera matrix and odometry, damaged or not."""
+    return is_folder(folder / DEPTH) and is_file(folder / MATRIX) and is_file(folder / ODOMETRY)
+
+
+def open_folder(folder: Path, options: ReadOptions) -> Dataset:
+    """List the images that have a pose, in the order of their numbers. Raises DatasetError, which names the
+    file and the line."""
+    images = {int(p.stem): p for p in (folder / DEPTH).iterdir() if p.suffix == ".png" and p.stem.isdecimal()}
+    poses = _read_odometry(folder / ODOMETRY)
+    frames = []
+    for number in sorted(images.keys() & poses.keys()):
+        path, pose = images[number], poses[number]
+        confidence = folder / CONFIDENCE / path.name
+        frames.append(
+            RecordedFrame(
+                path.stem,
+                pose.key,
+                path,
+                pose.T_world_camera,
+                pose.source,
+                confidence_file=confidence if is_file(confidence) else None,
+            )
+        )
+    if not frames:
+        raise DatasetError(f"{folder / ODOMETRY}: has a pose for none of the {len(images)} images in {DEPTH}")
+    dropped = len(images) - len(frames)
+    notes = [f"{dropped} of {len(images)} images dropped: {ODOMETRY} has no pose for them"] if dropped else []
+    return Recording(
+        name=folder.name,
+        camera=options.camera or _camera(folder / MATRIX),
+        notes=notes,
+        dropped=dropped,
+        frames=frames,
+        steps_per_metre=options.depth_scale or 1000.0,
+        scale_source="--depth-scale" if options.depth_scale else "Stray Scanner",
+        color=False,
+        confidence=ARKIT,
+    )
+
+
+def _camera(path: Path) -> PinholeCamera:
+    """The depth camera, from the matrix of the colour camera."""
+    try:
+        rows = [
+            [float(word) for word in row]
+            for row in csv.reader(read_text(path, DatasetError).splitlines())
+            if row
+        ]
+        matrix = np.array(rows)
+        if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+            raise ValueError
+    except ValueError:
+        raise DatasetError(f"{path}: expected a 3 x 3 matrix of numbers, with commas between them") from None
+    try:
+        return PinholeCamera.from_matrix(*COLOR_SIZE, matrix).scaled(DEPTH_WIDTH / COLOR_SIZE[0])
+    except ConfigError as error:
+        raise DatasetError(f"{path}: {error}") from error
+
+
+def _read_odometry(path: Path) -> dict[int, RecordedPose]:
+    """The pose of each frame by its number."""
+    lines = list(csv.reader(read_text(path, DatasetError).splitlines()))
+    names = [name.strip() for name in lines[0]] if lines else []
+    missing = [name for name in _COLUMNS if name not in names]
+    if missing:
+        raise DatasetError(f"{path}: its first line names no column {', '.join(missing)}")
+    places = [names.index(name) for name in _COLUMNS]
+    poses = {}
+    for number, words in enumerate(lines[1:], start=2):
+        if not words:
+            continue
+        try:
+            stamp, frame, *values = (float(words[place]) for place in places)
+            poses[int(frame)] = RecordedPose(stamp, np.array(values), f"{path} line {number}")
+            if not np.isfinite(stamp):
+                raise ValueError
+        except (ValueError, IndexError, OverflowError):
+            raise DatasetError(f"{path} line {number}: expected {len(names)} numbers") from None
+    return poses
+
+
+FORMAT = Format(
+    name="Stray Scanner",
+    looks_for=f"{DEPTH}/NNNNNN.png with {MATRIX} and {ODOMETRY}",
+    recognises=recognises,
+    open=open_folder,
+)
