@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,8 @@ import taichi_mrf  # noqa: E402
 
 IMAGES = REPOSITORY / "docs" / "images"
 ROOM = "synthetic:room"
+BUILDING = REPOSITORY.parent / "shared" / "data" / "lidar_building"
+FEW_SCANS = ("--keyframes.translation", "2.5", "--keyframes.rotation", "0")
 WIDTH = 1280
 MOST_BYTES = 140_000
 QUALITIES = range(80, 40, -4)
@@ -53,6 +55,9 @@ OF_THE_LIVE_PAGE: dict[str, Draw] = {
     "live_images.jpg": page_pictures.live_images,
     "live_baseline.jpg": page_pictures.live_baseline,
 }
+OF_THE_BUILDING: dict[str, Draw] = {"live_lidar.jpg": page_pictures.live_lidar}
+"""Of the live page with a recording of ../shared/data."""
+
 OF_THE_TUNING_PAGE: dict[str, Draw] = {
     "tune.jpg": page_pictures.tune_noise,
     "tune_panels.jpg": page_pictures.tune_panels,
@@ -62,7 +67,7 @@ OF_THE_TUNING_PAGE: dict[str, Draw] = {
 
 def main() -> None:
     """Make what the arguments name, or everything."""
-    known = [*OF_A_MAP, *OF_THE_LIVE_PAGE, *OF_THE_TUNING_PAGE]
+    known = [*OF_A_MAP, *OF_THE_LIVE_PAGE, *OF_THE_BUILDING, *OF_THE_TUNING_PAGE]
     wanted = sys.argv[1:] or known
     strange = sorted(set(wanted) - set(known))
     if strange:
@@ -70,6 +75,7 @@ def main() -> None:
     for pictures, source in (
         (OF_A_MAP, a_map),
         (OF_THE_LIVE_PAGE, the_live_page),
+        (OF_THE_BUILDING, the_building),
         (OF_THE_TUNING_PAGE, the_tuning_page),
     ):
         if not set(wanted) & set(pictures):
@@ -90,11 +96,20 @@ def a_map() -> Iterator[Path]:
         yield Path(folder)
 
 
-@contextmanager
-def the_live_page() -> Iterator[LivePage]:
+def the_live_page() -> AbstractContextManager[LivePage]:
     """The live page of the whole room."""
+    return _live_page(ROOM, "--voxel-size", "0.05")
+
+
+def the_building() -> AbstractContextManager[LivePage]:
+    """The live page of a real building by lidar."""
+    return _live_page(str(BUILDING), "--voxel-size", "0.2", "--sensor.sigma", "0.12", *FEW_SCANS)
+
+
+@contextmanager
+def _live_page(*arguments: str) -> Iterator[LivePage]:
     with (
-        LiveProgram(ROOM, "--voxel-size", "0.05") as program,
+        LiveProgram(*arguments) as program,
         chromium() as browser,
         LivePage(browser, program.address, WIDTH, 800) as page,
     ):

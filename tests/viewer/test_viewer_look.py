@@ -13,7 +13,7 @@ from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, KeyframeInfo, RayAnswer, pack_log_odds
 from taichi_mrf.viewer.scene.coloring import legend_html, scale_of, voxel_colors
-from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, Placement
+from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, RING_M, Placement
 from taichi_mrf.viewer.scene.look import look_of
 from taichi_mrf.viewer.scene.options import UNPAINTED, ColorBy, ViewOptions
 from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
@@ -171,7 +171,7 @@ LIDAR = SphericalCamera(np.linspace(0.5, -0.5, 12), np.linspace(3.0, -3.0, 60))
 def test_a_click_on_a_ring_finds_the_pixel_on_its_near_side() -> None:
     T = look_at((1.0, 2.0, 0.5), (2.0, 3.0, 0.5))
     ray = LIDAR.rays()[4, 45]
-    point = T[:3, :3] @ (FRUSTUM_M * ray) + T[:3, 3]
+    point = T[:3, :3] @ (RING_M * ray) + T[:3, 3]
     eye = point + T[:3, :3] @ (2.0 * ray + (0.1, -0.2, 0.1))
     hit = first_pixel(eye, point - eye, [keyframe(3, T, LIDAR)])
     assert hit is not None

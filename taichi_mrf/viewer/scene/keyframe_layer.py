@@ -17,6 +17,9 @@ from taichi_mrf.viewer.scene.shown_keyframes import ShownKeyframes
 FRUSTUM_M = 0.15
 """Distance of a frustum's picture from its camera, metres."""
 
+RING_M = 0.4
+"""Radius of the rings of a lidar, whose maps are of larger places, metres."""
+
 _COLORS = {"on": (38, 130, 142), "off": (170, 170, 170), "frozen": (70, 100, 190)}
 _CHOSEN = (230, 0, 126)
 _WAY = (230, 0, 126)
@@ -167,9 +170,9 @@ class KeyframeLayer:
         else:
             self._on_spheres[id] = self._scene.add_point_cloud(
                 f"{name}/picture",
-                points=on_sphere(keyframe.camera, FRUSTUM_M).reshape(-1, 3),
+                points=on_sphere(keyframe.camera, RING_M).reshape(-1, 3),
                 colors=picture.reshape(-1, 3),
-                point_size=FRUSTUM_M / max(keyframe.camera.pixels_per_radian, 1.0),
+                point_size=RING_M / max(keyframe.camera.pixels_per_radian, 1.0),
                 point_shape="square",
                 precision="float16",
             )
@@ -193,7 +196,7 @@ class KeyframeLayer:
         if not isinstance(camera, PinholeCamera):
             return self._scene.add_line_segments(
                 name,
-                border(camera, enlarged * FRUSTUM_M),
+                border(camera, enlarged * RING_M),
                 color,
                 thickness=thickness,
                 thickness_units="screen",

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.viewer.messages import KeyframeInfo
-from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M
+from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, RING_M
 from taichi_mrf.viewer.scene.rings import hits_of_sphere
 
 
@@ -57,7 +57,7 @@ def first_pixel(origin: ArrayLike, direction: ArrayLike, keyframes: Iterable[Key
 
 def _pixel(start: NDArray[np.float64], along: NDArray[np.float64], keyframe: KeyframeInfo) -> Pixel | None:
     """The pixel where the ray crosses the picture, which stands FRUSTUM_M in front of the keyframe's
-    camera, or lies on the sphere of that radius."""
+    camera, or lies on a sphere of radius RING_M around it."""
     R, t = keyframe.T_world_camera[:3, :3], keyframe.T_world_camera[:3, 3]
     origin, direction = R.T @ (start - t), R.T @ along
     if not isinstance(keyframe.camera, PinholeCamera):
@@ -76,7 +76,7 @@ def _pixel_on_sphere(
     keyframe: KeyframeInfo, origin: NDArray[np.float64], direction: NDArray[np.float64]
 ) -> Pixel | None:
     """The nearer of the sphere's sides that has a pixel where the ray, in the camera frame, crosses it."""
-    for range_m in hits_of_sphere(origin, direction, FRUSTUM_M):
+    for range_m in hits_of_sphere(origin, direction, RING_M):
         point = origin + range_m * direction
         u, v, _ = keyframe.camera.project(point[None])[0]
         if not np.isnan(u):
