@@ -135,6 +135,19 @@ def test_poses_of_another_file(tmp_path: Path) -> None:
         open_dataset(f"{folder}?pose=x")
 
 
+@pytest.mark.parametrize("write", [write_pcd, write_ply])
+def test_clouds_whose_poses_are_elsewhere(tmp_path: Path, write: Callable[[Path, np.ndarray], Path]) -> None:
+    folder = tmp_path / "walk"
+    folder.mkdir()
+    for i, cloud in enumerate(WALK.clouds):
+        write(folder / f"{i}.{'pcd' if write is write_pcd else 'ply'}", cloud)
+    rows_of_poses(tmp_path / "elsewhere.txt")
+    dataset = open_dataset(f"{folder}?poses={tmp_path / 'elsewhere.txt'}")
+    np.testing.assert_allclose(dataset.read(1).T_world_camera, WALK.poses[1], atol=1e-6)
+    said = refused(folder)
+    assert "poses are not known" in said if write is write_pcd else "no poses for its 3 scans" in said
+
+
 def without_pose(folder: Path, kind: str) -> Path:
     """A recording in which the last scan has no pose."""
     if kind == "npz":

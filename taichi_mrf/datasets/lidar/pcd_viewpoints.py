@@ -1,6 +1,7 @@
 """PCD files with points in the world's frame, whose VIEWPOINT is the sensor's pose: one, or a folder of them.
 
-A folder with a file of poses beside the clouds has points in the sensor's frame instead (scan_folder.py).
+A folder with a file of poses beside the clouds, or after a question mark, has points in the sensor's frame
+instead (scan_folder.py).
 """
 
 from functools import partial
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.lidar.clouds import natural
 from taichi_mrf.datasets.lidar.pcd_file import read_pcd, read_pcd_header
+from taichi_mrf.datasets.lidar.scan_folder import open_folder
 from taichi_mrf.datasets.lidar.scans import SECONDS_PER_SCAN, RecordedScan, lidar_scans
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.errors import DatasetError
@@ -77,4 +79,5 @@ FORMAT = Format(
     looks_for="*.pcd with VIEWPOINT",
     recognises=recognises,
     open=open_pcd,
+    open_with_query=open_folder,
 )

@@ -33,12 +33,14 @@ class FolderOptions:
 
 
 def recognises(path: Path) -> bool:
-    """Whether a folder holds clouds of one kind, and poses beside them. PCDs know where they were taken
-    (pcd_viewpoints.py)."""
+    """Whether a folder holds clouds with poses beside them, or several clouds without. PCDs without know
+    where they were taken (pcd_viewpoints.py)."""
     if not is_folder(path):
         return False
     clouds = clouds_of(path)
-    return bool(clouds) and is_cloud(clouds[0]) and _poses_beside(path)
+    if not clouds or not is_cloud(clouds[0]):
+        return False
+    return _poses_beside(path) or (len(clouds) > 1 and clouds[0].suffix.lower() != ".pcd")
 
 
 def open_folder(path: Path, query: str, options: ReadOptions) -> Dataset:
@@ -48,7 +50,10 @@ def open_folder(path: Path, query: str, options: ReadOptions) -> Dataset:
     clouds = clouds_of(path)
     poses = Path(chosen.poses) if chosen.poses else find_poses(path)
     if poses is None:
-        raise DatasetError(f"{path}: no poses for its {len(clouds)} scans; add {POSES_NPZ} or ?poses=FILE")
+        raise DatasetError(
+            f"{path}: no poses for its {len(clouds)} scans; add {POSES_NPZ} or a file of poses, or name one: "
+            "?poses=FILE"
+        )
     found, notes = poses_of(poses, clouds, options)
     scans = [_scan(cloud, found[cloud]) for cloud in clouds if cloud in found]
     if not scans:

@@ -43,7 +43,7 @@ def find_poses(folder: Path) -> Path | None:
         return folder / POSES_NPZ
     found = [path for path in sorted(folder.iterdir()) if path.suffix in _TEXTS and is_trajectory(path)]
     if len(found) > 1:
-        names = ", ".join(path.name for path in found)
+        names = ", ".join(path.name for path in found[:8])
         raise DatasetError(f"{folder}: contains several files of poses, {names}; choose one by ?poses=FILE")
     return found[0] if found else None
 
