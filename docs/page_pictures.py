@@ -71,7 +71,7 @@ def live_lidar(page: LivePage) -> Image.Image:
     for _ in range(4):
         page.page.mouse.wheel(0, -240)
         page.pause(0.3)
-    return shot(page).crop((0, 220, 940, 790)).resize((705, 428), Image.Resampling.LANCZOS)
+    return shot(page).crop((0, 220, 940, 790)).resize((564, 342), Image.Resampling.LANCZOS)
 
 
 def live_keyframes(page: LivePage) -> Image.Image:
