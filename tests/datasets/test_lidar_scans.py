@@ -101,7 +101,7 @@ def test_a_layout_is_read_rightly(tmp_path: Path, layout: Callable[[Path], Path]
     ("layout", "stamps"),
     [
         (npz_scans, [5.0, 6.0, 7.0]),
-        (plies_with_rows, [0.8, 0.9, 1.0]),
+        (plies_with_rows, [0.0, 0.1, 0.2]),
         (plies_named_by_time, [1_600_000_000.5, 1_600_000_001.5, 1_600_000_002.5]),
         (pcds_with_viewpoints, [0.0, 0.1, 0.2]),
         (velodyne, [0.0, 0.25, 0.5]),
@@ -146,6 +146,30 @@ def test_clouds_whose_poses_are_elsewhere(tmp_path: Path, write: Callable[[Path,
     np.testing.assert_allclose(dataset.read(1).T_world_camera, WALK.poses[1], atol=1e-6)
     said = refused(folder)
     assert "poses are not known" in said if write is write_pcd else "no poses for its 3 scans" in said
+
+
+def test_rows_of_poses_go_by_the_order_of_names_or_by_their_numbers(tmp_path: Path) -> None:
+    """Of three scans with one number twice the poses are clear if there are three."""
+    for name, cloud in zip(("a1", "b1", "c2"), WALK.clouds, strict=True):
+        write_ply(tmp_path / f"{name}.ply", cloud)
+    rows_of_poses(tmp_path / "poses.txt")
+    for frame, pose in zip(open_dataset(tmp_path), WALK.poses, strict=True):
+        np.testing.assert_allclose(frame.T_world_camera, pose, atol=1e-6)
+    (tmp_path / "poses.txt").write_text("\n".join([row_of(WALK.poses[0][:3])] * 5))
+    assert "go by the numbers of scans, but names such as a1.ply" in refused(tmp_path)
+    (tmp_path / "b1.ply").rename(tmp_path / "b4.ply")
+    assert open_dataset(tmp_path).frame_names == ["a1", "c2", "b4"]
+
+
+def test_scans_come_in_the_order_of_their_times(tmp_path: Path) -> None:
+    lines = []
+    for name, pose, cloud in zip(("1.5", "1.25", "1.125"), WALK.poses, WALK.clouds, strict=True):
+        write_ply(tmp_path / f"{name}.ply", cloud)
+        lines.append(stamped_line(float(name), pose))
+    (tmp_path / "poses.txt").write_text("\n".join(lines))
+    dataset = open_dataset(tmp_path)
+    assert dataset.frame_names == ["1.125", "1.25", "1.5"]
+    np.testing.assert_allclose(dataset.read(0).T_world_camera, WALK.poses[2], atol=1e-6)
 
 
 def without_pose(folder: Path, kind: str) -> Path:

@@ -185,6 +185,25 @@ def test_what_cannot_be_opened_is_named(
     assert str(recording) in str(caught.value)
 
 
+def test_the_reach_is_that_of_the_first_scan_with_returns(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = Source([STILL, STILL])
+    source.frames[0].field = lambda name: np.zeros((ROWS, COLUMNS), np.uint32)
+    source.frames[1].field = lambda name: np.full((ROWS, COLUMNS), 23_000, np.uint32)
+    install(monkeypatch, source)
+    assert open_dataset(recording).recorded_reach == 30.0
+
+
+def test_a_sensor_that_moves_between_scans_does_not_stand_still(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moved = STILL.copy()
+    moved[:, 0, 3] = 2.0
+    install(monkeypatch, Source([STILL, moved]))
+    assert not any("stand still" in note for note in open_dataset(recording).notes)
+
+
 def test_a_scan_without_returns_is_named(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = Source([STILL, STILL])
     install(monkeypatch, source)

@@ -200,22 +200,25 @@ def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
     gap = INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
     source, count = _open(path, chosen)
     beams = _beams(path, source, chosen.sensor)
-    scans, notes, dropped, moves = [], [], 0, False
+    scans, notes, dropped, reach_m = [], [], 0, None
+    poses = []
     for number in range(count):
         try:
             columns = columns_of(source, number, chosen.sensor)
-        except DatasetError:  # reading the scan reports it
+        except DatasetError:
             columns = None
         if columns is None:
             dropped += 1
             continue
         first, last = columns.stamps[columns.valid][[0, -1]]
         stamp = 0.5 * (first + last)
-        moves = moves or not np.array_equal(columns.poses.poses[0], columns.poses.poses[-1])
         if trajectory is not None and trajectory.at(stamp, gap) is None:
             dropped += 1
             continue
         scans.append(RecordedColumns(number, stamp))
+        poses += [columns.poses.poses[0], columns.poses.poses[-1]]
+        if reach_m is None and columns.range_m.any():
+            reach_m = reach_of(columns.range_m)
     if not scans:
         why = (
             f"has poses within {gap:g} s on both sides" if trajectory is not None and count else "can be read"
@@ -225,9 +228,9 @@ def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
         notes.append(
             f"{dropped} of {count} scans dropped: damaged, or no poses within {gap:g} s on both sides"
         )
-    if trajectory is None and not moves and not tracked:
+    if trajectory is None and not tracked and all(np.array_equal(pose, poses[0]) for pose in poses):
         notes.append(STANDS_STILL)
-    found = OusterScans(
+    return OusterScans(
         path.stem,
         beams.camera,
         notes,
@@ -241,11 +244,8 @@ def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
         gap=gap,
         deskew=chosen.deskew,
         tracked=tracked,
+        reach_m=reach_m,
     )
-    columns = columns_of(source, scans[0].number, chosen.sensor)
-    assert columns is not None, "it was read above"
-    found.reach_m = reach_of(columns.range_m)
-    return found
 
 
 def _open(path: Path, chosen: OusterOptions) -> tuple[Any, int]:

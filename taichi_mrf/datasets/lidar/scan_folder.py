@@ -44,7 +44,7 @@ def recognises(path: Path) -> bool:
 
 
 def open_folder(path: Path, query: str, options: ReadOptions) -> Dataset:
-    """List the clouds in the order of the numbers in their names. Raises DatasetError, which names the folder
+    """List the clouds in the order of their stamps. Raises DatasetError, which names the folder
     or the file."""
     chosen = parse_options(FolderOptions, query, str(path))
     clouds = clouds_of(path)
@@ -56,6 +56,7 @@ def open_folder(path: Path, query: str, options: ReadOptions) -> Dataset:
         )
     found, notes = poses_of(poses, clouds, options)
     scans = [_scan(cloud, found[cloud]) for cloud in clouds if cloud in found]
+    scans.sort(key=lambda scan: scan.stamp)
     if not scans:
         raise DatasetError(f"{poses}: has a pose for none of the {len(clouds)} scans in {path}")
     dropped = len(clouds) - len(scans)

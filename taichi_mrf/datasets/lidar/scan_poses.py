@@ -70,24 +70,28 @@ def poses_of(
             cloud: ScanPose(pose.key, pose.T_world_camera, pose.source)
             for cloud, pose in zip(clouds, trajectory.poses, strict=True)
         }, []
-    by_number = {int(pose.key): pose for pose in trajectory.poses}
     if trajectory.layout == "rows" and len(trajectory.poses) == len(clouds):
-        by_number = {
-            _order(cloud, i): pose
-            for i, (cloud, pose) in enumerate(zip(clouds, trajectory.poses, strict=True))
-        }
-    found = {}
-    for i, cloud in enumerate(clouds):
-        number = _order(cloud, i)
-        if number in by_number:
-            pose = by_number[number]
-            found[cloud] = ScanPose(SECONDS_PER_SCAN * number, pose.T_world_camera, pose.source)
+        numbers = list(range(len(clouds)))
+    else:
+        numbers = _numbers_of(path, clouds)
+    by_number = {int(pose.key): pose for pose in trajectory.poses}
+    found = {
+        cloud: ScanPose(SECONDS_PER_SCAN * number, pose.T_world_camera, pose.source)
+        for cloud, number in zip(clouds, numbers, strict=True)
+        if (pose := by_number.get(number)) is not None
+    }
     return found, [f"no stamps in {path.name}: assumed {SECONDS_PER_SCAN:g} s from one scan to the next"]
 
 
-def _order(cloud: Path, index: int) -> int:
-    number = number_of(cloud)
-    return index if number is None else number
+def _numbers_of(path: Path, clouds: Sequence[Path]) -> list[int]:
+    """The numbers in the names of scans, by which they find their poses in a file."""
+    numbers = [number for cloud in clouds if (number := number_of(cloud)) is not None]
+    if len(set(numbers)) < len(clouds):
+        raise DatasetError(
+            f"{path}: its poses go by the numbers of scans, but names such as {clouds[0].name} have no number, "
+            "or one number twice"
+        )
+    return numbers
 
 
 def _from_npz(path: Path, clouds: Sequence[Path]) -> tuple[dict[Path, ScanPose], list[str]]:
@@ -111,9 +115,10 @@ def _from_npz(path: Path, clouds: Sequence[Path]) -> tuple[dict[Path, ScanPose],
         stamps = SECONDS_PER_SCAN * (np.arange(count) if numbers is None else numbers)
     rows = range(count) if numbers is None else numbers.tolist()
     row_of = {int(number): row for row, number in enumerate(rows)}
+    wanted = list(range(count)) if numbers is None else _numbers_of(path, clouds)
     found = {}
-    for i, cloud in enumerate(clouds):
-        row = row_of.get(i if numbers is None else _order(cloud, i))
+    for cloud, number in zip(clouds, wanted, strict=True):
+        row = row_of.get(number)
         if row is not None:
             read = partial(as_pose, poses[row])
             found[cloud] = ScanPose(float(stamps[row]), read, f"{path}: {name} {row}")
