@@ -70,8 +70,8 @@ class StoredKeyframe:
 
     @property
     def image_bytes(self) -> int:
-        """Bytes of the depth image."""
-        return self.depth_m.nbytes
+        """Bytes of the depth image and of what the keyframe states of it."""
+        return self.depth_m.nbytes + self.own.nbytes
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,21 @@
+"""Thin posts are not carved away by the rays that pass beside them, nor do they fill the gaps."""
+
+import fence
+import numpy as np
+import pytest
+
+from taichi_mrf.queries.points import FREE, OCCUPIED
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_posts_of_a_fence_stay_and_gaps_stay_open() -> None:
+    m = fence.mapped(fence.lidar(np.arange(65.0, 115.0, 0.35), 32), 12.0, 0.05, fence.FIRST, scans=8)
+    posts, gaps = (m.state(fence.post_points(12.0, aside)) for aside in (0.0, 0.5 * fence.GAP_M))
+    assert (posts == OCCUPIED).mean() > 0.5
+    assert (gaps == FREE).mean() > 0.5
+    assert (gaps == OCCUPIED).mean() < 0.02
+    read = m.reading("calibrated")
+    posts, gaps = (read.state(fence.post_points(12.0, aside)) for aside in (0.0, 0.5 * fence.GAP_M))
+    assert (posts == OCCUPIED).mean() > 0.7
+    assert (posts == FREE).mean() < 0.15
+    assert (gaps == OCCUPIED).mean() < 0.02
