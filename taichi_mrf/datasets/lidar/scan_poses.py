@@ -88,8 +88,8 @@ def _numbers_of(path: Path, clouds: Sequence[Path]) -> list[int]:
     numbers = [number for cloud in clouds if (number := number_of(cloud)) is not None]
     if len(set(numbers)) < len(clouds):
         raise DatasetError(
-            f"{path}: its poses go by the numbers of scans, but names such as {clouds[0].name} have no number, "
-            "or one number twice"
+            f"{path}: its poses go by the numbers of scans, but names such as {clouds[0].name} have no "
+            "number, or one number twice"
         )
     return numbers
 
