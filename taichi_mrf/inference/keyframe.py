@@ -97,9 +97,10 @@ class DepthImage:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of depth, colour and sigmas."""
+        """Bytes of depth, colour and sigmas, and of rays without a pattern, which no other image shares."""
         color = 0 if self.color is None else self.color.nbytes
-        return self.depth.shape[0] * 4 + color + self.own.nbytes
+        per_pixel = 4 if self.camera.pixels_per_radian > 0 else 4 + 12
+        return self.depth.shape[0] * per_pixel + color + self.own.nbytes
 
     def to_numpy(self) -> NDArray[np.float32]:
         """(H, W) axial depth in metres, 0 where there is no measurement."""

@@ -12,41 +12,42 @@ _CELLS = 64
 _MORTON_BITS = 10
 
 
-class DirectionCounts:
-    """Counts of the directions (H, W, 3) of an image's pixels, of any length."""
+def largest_turn(directions: NDArray[np.float64]) -> float:
+    """The largest angle between neighbouring pixels of directions (H, W, 3) of any length, in radians."""
+    units = _units(directions)
+    chords = [np.linalg.norm(np.diff(units, axis=axis), axis=-1).max(initial=0.0) for axis in (0, 1)]
+    return 2.0 * math.asin(min(1.0, 0.5 * max(chords)))
 
-    def __init__(self, directions: NDArray[np.float64]) -> None:
-        units = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-        chords = [np.linalg.norm(np.diff(units, axis=axis), axis=-1).max(initial=0.0) for axis in (0, 1)]
-        self.largest_turn = 2.0 * math.asin(min(1.0, 0.5 * max(chords)))
-        """The largest angle between neighbouring pixels, in radians."""
-        self._number = units.size // 3
-        cells = _in_steps(units.reshape(-1, 3), _CELLS)
-        flat = np.ravel_multi_index(tuple(cells.T), (_CELLS,) * 3)
-        counts = np.bincount(flat, minlength=_CELLS**3).reshape((_CELLS,) * 3)
-        # Sums from the first cell on along all axes, with a layer of zeros before it.
-        sums = counts.cumsum(axis=0).cumsum(axis=1).cumsum(axis=2)
-        self._sums = np.pad(sums, ((1, 0),) * 3)
-        self._most: dict[int, int] = {}
 
-    def most_in_cone(self, half_angle: float) -> int:
-        """A bound on the directions within ``half_angle`` radians of any axis.
+def cone_span(half_angle: float) -> int | None:
+    """How many cells along each side a cone of ``half_angle`` radians can touch at most, for
+    :func:`most_in_span`; None if that may be all.
 
-        These lie in a ball around the axis' end on the unit sphere, hence in a cube, and hence in the cells
-        that it can touch. The sum over those is taken for every place of the cube.
-        """
-        if half_angle >= math.pi / 2:
-            return self._number
-        side = 4.0 * math.sin(half_angle / 2)
-        span = min(_CELLS, math.ceil(side * _CELLS / 2) + 1)
-        if span not in self._most:
-            sums = self._sums
-            for axis in range(3):
-                upper, lower = slice(span, None), slice(None, -span)
-                index = (slice(None),) * axis
-                sums = sums[(*index, upper)] - sums[(*index, lower)]
-            self._most[span] = int(sums.max())
-        return self._most[span]
+    The directions in a cone lie in a ball around its axis' end on the unit sphere, hence in a cube, and hence
+    in the cells that the cube can touch.
+    """
+    if half_angle >= math.pi / 2:
+        return None
+    span = math.ceil(2.0 * math.sin(half_angle / 2) * _CELLS) + 1
+    return span if span < _CELLS else None
+
+
+def most_in_span(directions: NDArray[np.float64], span: int) -> int:
+    """The most directions (H, W, 3) that lie in any cube of ``span`` cells a side. Nothing is kept: the sums
+    are larger than the directions of a scan."""
+    cells = _in_steps(_units(directions).reshape(-1, 3), _CELLS)
+    flat = np.ravel_multi_index(tuple(cells.T), (_CELLS,) * 3)
+    sums = np.bincount(flat, minlength=_CELLS**3).reshape((_CELLS,) * 3)
+    for axis in range(3):
+        # From the first cell on, with a zero before it; then differences over the span.
+        sums = np.insert(sums.cumsum(axis=axis), 0, 0, axis=axis)
+        index = (slice(None),) * axis
+        sums = sums[(*index, slice(span, None))] - sums[(*index, slice(None, -span))]
+    return int(sums.max())
+
+
+def _units(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
 
 
 def morton_order(units: NDArray[np.float64]) -> NDArray[np.intp]:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import array
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.sensor.directions import DirectionCounts, morton_order
+from taichi_mrf.sensor.directions import cone_span, largest_turn, morton_order, most_in_span
 
 if TYPE_CHECKING:
     from taichi_mrf.sensor.rays import TableRays
@@ -52,6 +52,7 @@ class RayTable:
         """Whether depth is range: all directions have the length 1."""
         self._table.flags.writeable = False
         self._hulls: dict[int, NDArray[np.float64]] = {}
+        self._most: dict[int, int] = {}
 
     @classmethod
     def of_points(cls, points_m: ArrayLike) -> "tuple[RayTable, NDArray[np.float32]]":
@@ -164,7 +165,7 @@ class RayTable:
         """Half the diagonal of the largest pixel, in radians; of rays without a pattern the whole one if they
         were spread evenly over the sphere."""
         if self.has_pattern and self._table.size > 3:
-            return 0.75 * self._counts.largest_turn
+            return 0.75 * self._largest_turn
         return math.sqrt(4 * math.pi / (self._table.size / 3))
 
     def thinned(self, step: int) -> "RayTable":
@@ -175,33 +176,41 @@ class RayTable:
     def tile_hulls(self, tile: int) -> NDArray[np.float64]:
         """For each square of ``tile`` pixels, (rows, columns, 8, 3): the corners of the box around its
         directions and half a pixel more."""
+        if not self.has_pattern:  # each scan has a table of its own, whose hulls are needed once
+            return self._hulls_of(tile)
         if tile not in self._hulls:
-            rays = self.rays()
-            margin = np.zeros(rays.shape)
-            for axis in (0, 1) if self.has_pattern else ():
-                if rays.shape[axis] > 1:
-                    half = 0.5 * np.abs(np.diff(rays, axis=axis))
-                    margin += np.concatenate([half, half.take([-1], axis=axis)], axis=axis)
-            sides = np.stack(
-                [_by_tile(np.minimum, rays - margin, tile), _by_tile(np.maximum, rays + margin, tile)]
-            )
-            corners = [
-                [sides[c, ..., axis] for axis, c in enumerate(corner)] for corner in np.ndindex(2, 2, 2)
-            ]
-            self._hulls[tile] = np.moveaxis(np.array(corners), (0, 1), (2, 3))
+            self._hulls[tile] = self._hulls_of(tile)
         return self._hulls[tile]
+
+    def _hulls_of(self, tile: int) -> NDArray[np.float64]:
+        rays = self.rays()
+        margin = np.zeros(rays.shape)
+        for axis in (0, 1) if self.has_pattern else ():
+            if rays.shape[axis] > 1:
+                half = 0.5 * np.abs(np.diff(rays, axis=axis))
+                margin += np.concatenate([half, half.take([-1], axis=axis)], axis=axis)
+        sides = np.stack(
+            [_by_tile(np.minimum, rays - margin, tile), _by_tile(np.maximum, rays + margin, tile)]
+        )
+        corners = [[sides[c, ..., axis] for axis, c in enumerate(sign)] for sign in np.ndindex(2, 2, 2)]
+        return np.moveaxis(np.array(corners), (0, 1), (2, 3))
 
     def most_pixels_in_cone(self, half_angle: float, block: int) -> float:
         """A bound on the pixels in a cone of ``half_angle`` radians, wherever it points, and in the square
         blocks of ``block`` pixels a side whose middle lies in it: all pixels of a cone wider by half a
         block's diagonal, counted."""
         if block > 1:
-            half_angle += (block - 1) * self._counts.largest_turn
-        return float(self._counts.most_in_cone(half_angle))
+            half_angle += (block - 1) * self._largest_turn
+        span = cone_span(half_angle)
+        if span is None:
+            return float(self.width * self.height)
+        if span not in self._most:
+            self._most[span] = most_in_span(self.rays(), span)
+        return float(self._most[span])
 
     @cached_property
-    def _counts(self) -> DirectionCounts:
-        return DirectionCounts(self.rays())
+    def _largest_turn(self) -> float:
+        return largest_turn(self.rays())
 
     @cached_property
     def _in_kernels(self) -> "TableRays":

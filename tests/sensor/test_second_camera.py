@@ -178,6 +178,14 @@ def test_normals_are_those_of_the_walls(fine: RayTable) -> None:
 
 
 @ONE_BACKEND
+def test_the_table_of_free_rays_counts_as_part_of_its_image() -> None:
+    for camera, bytes_per_pixel in ((CAMERA, 4), (free(500), 16)):
+        range_m = np.ones(camera.shape, np.float32)
+        image = DepthImage.upload(range_m, camera, PolynomialNoise((SIGMA,)))
+        assert image.nbytes == bytes_per_pixel * range_m.size
+
+
+@ONE_BACKEND
 @pytest.mark.parametrize("camera", [lidar(512, 96), free(30_000)], ids=["lidar", "free rays"])
 def test_a_misplaced_keyframe_is_put_right(camera: RayTable) -> None:
     m = mapped(MRFMap(VOXEL, PolynomialNoise((SIGMA,))), camera)
