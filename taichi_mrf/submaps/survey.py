@@ -37,7 +37,8 @@ class SurveyTask:
 @dataclass(frozen=True)
 class SurveyedFrame:
     """A frame's pose, the chunks (n, 3) that its rays cross, and whether it holds any measurement, even one
-    that no ray is cast for; ``problem``: why it could not be read; ``up``: its upward axis."""
+    that no ray is cast for; ``problem``: why it could not be read; ``up``: its upward axis; ``sensor``:
+    Frame.sensor."""
 
     index: int
     name: str
@@ -46,6 +47,7 @@ class SurveyedFrame:
     measured: bool = False
     problem: str | None = None
     up: Up = Z_UP
+    sensor: str = ""
 
 
 def survey_frames(task: SurveyTask) -> list[SurveyedFrame]:
@@ -73,7 +75,7 @@ def survey_frames(task: SurveyTask) -> list[SurveyedFrame]:
             chunks = np.unique(bricks // CHUNK, axis=0)
             m.remove_keyframe(id)
         up = up_of(T_world_camera, frame.camera.up)
-        found.append(SurveyedFrame(index, name, T_world_camera, chunks, measured, up=up))
+        found.append(SurveyedFrame(index, name, T_world_camera, chunks, measured, up=up, sensor=frame.sensor))
     return found
 
 
@@ -120,8 +122,8 @@ def _chosen(
             if not skip_bad_frames:
                 raise FrameError(str(frame.problem))
             skipped[frame.name] = str(frame.problem)
-        elif selector.objection(frame.T_world_camera, frame.measured) is None:
-            selector.accept(frame.T_world_camera)
+        elif selector.objection(frame.T_world_camera, frame.measured, frame.sensor) is None:
+            selector.accept(frame.T_world_camera, frame.sensor)
             if len(frame.chunks):  # else no ray is cast for it
                 T = frame.T_world_camera
                 x, y, z = T[:3, 3].tolist()

@@ -1,6 +1,9 @@
 """Several sensors in one recording: order, noise, extrinsics, ranges, and what is wrong with the file."""
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +20,9 @@ from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.pipeline import FrameOffered, map_sequence
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
+from taichi_mrf.submaps.job import Sequence as Recorded
+from taichi_mrf.submaps.survey import find_keyframes
+from taichi_mrf.system import runtime
 
 TEXT = """
 sensors:
@@ -95,6 +101,25 @@ def test_keyframes_are_chosen_for_each_sensor(robot: Path) -> None:
         dataset.read(0).camera.shape,
         (6, 8),
     ]
+
+
+class InTurn:
+    """Runs tasks one after the other, in this process."""
+
+    def run(
+        self, function: Callable[[Any], Any], tasks: Sequence[Any], done: Callable[..., None]
+    ) -> list[Any]:
+        return [function(task) for task in tasks]
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_submaps_choose_keyframes_for_each_sensor_too(robot: Path) -> None:
+    config = Config(voxel_size=0.5, keyframes=KeyframeConfig(translation=100.0))
+    active = runtime.active()
+    assert active is not None
+    config = replace(config, runtime=replace(config.runtime, arch=active))
+    keyframes, _ = find_keyframes(Recorded(str(robot), {}), config, InTurn())  # type: ignore[arg-type]
+    assert [keyframe.index for keyframe in keyframes] == [0, 1]
 
 
 def refused(path: Path, **options: object) -> str:
