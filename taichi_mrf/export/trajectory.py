@@ -7,12 +7,15 @@ from taichi_mrf.datasets.timed_poses import quaternion
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.system.atomic import write_text
 
-HEADER = "# stamp tx ty tz qx qy qz qw (T_world_camera, metres; camera axes x right, y down, z forward)"
+HEADER = "# stamp tx ty tz qx qy qz qw (T_world_camera, metres; {axes})"
+CAMERA_AXES = "camera axes x right, y down, z forward"
+LIDAR_AXES = "sensor axes x forward, y left, z up"
 
 
-def write_trajectory(path: Path, poses: Iterable[tuple[float, Pose]]) -> None:
-    """Write stamps in seconds with their poses, (4, 4) T_world_camera. Raises MapFileError."""
-    lines = [HEADER]
+def write_trajectory(path: Path, poses: Iterable[tuple[float, Pose]], axes: str = CAMERA_AXES) -> None:
+    """Write stamps in seconds with their poses, (4, 4) T_world_camera; ``axes`` describes the camera frame.
+    Raises MapFileError."""
+    lines = [HEADER.format(axes=axes)]
     for stamp, T_world_camera in poses:
         numbers = (*T_world_camera[:3, 3], *quaternion(T_world_camera[:3, :3]))
         lines.append(" ".join([f"{stamp:.6f}", *(f"{number:.9f}" for number in numbers)]))

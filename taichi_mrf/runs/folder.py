@@ -18,7 +18,7 @@ from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
 from taichi_mrf.export.formats import export_map, export_note
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.export.ply import photo_at, write_voxels
-from taichi_mrf.export.trajectory import write_trajectory
+from taichi_mrf.export.trajectory import CAMERA_AXES, LIDAR_AXES, write_trajectory
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.methods.capabilities import has_layers, window_of
 from taichi_mrf.methods.chunked_part import ChunkedViews, in_chunks
@@ -199,7 +199,9 @@ def _write_map(
         if window_of(result.map) is not None:
             written.append(folder / WINDOW_FOLDER)
         if result.track is not None:
-            write_trajectory(folder / TRAJECTORY_FILE, result.track.trajectory(result.map))
+            z_up = any(k.camera.up[2] > 0 for k in result.map.keyframes.values())
+            poses = result.track.trajectory(result.map)
+            write_trajectory(folder / TRAJECTORY_FILE, poses, LIDAR_AXES if z_up else CAMERA_AXES)
             written.append(folder / TRAJECTORY_FILE)
     return written, occupied, shown
 

@@ -14,7 +14,7 @@ from taichi_mrf.config.schema import KeyframeConfig, PoseConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.timed_poses import read_timed_poses
 from taichi_mrf.errors import ConfigError, LostFrameError
-from taichi_mrf.export.trajectory import write_trajectory
+from taichi_mrf.export.trajectory import LIDAR_AXES, write_trajectory
 from taichi_mrf.geometry.poses import tangent_norms
 from taichi_mrf.mapping.intake import Added, Lost
 from taichi_mrf.mapping.pipeline import Event, FrameOffered, map_sequence
@@ -189,6 +189,8 @@ def test_a_trajectory_comes_back(tmp_path: Path) -> None:
     read = read_timed_poses(path)
     np.testing.assert_allclose(read.stamps, [f.stamp for f in frames()])
     np.testing.assert_allclose(read.poses, [f.T_world_camera for f in frames()], atol=1e-8)
+    write_trajectory(path, [(0.0, np.eye(4))], LIDAR_AXES)
+    assert "x forward, y left, z up" in path.read_text(encoding="utf-8")
 
 
 def test_the_command_line_tracks_and_leaves_the_trajectory(tmp_path: Path) -> None:

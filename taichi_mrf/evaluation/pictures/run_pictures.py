@@ -37,6 +37,10 @@ _DEPTH_ROWS = 3
 _DIFFERENCE_RANGE_CM = 10.0
 _NO_DEPTH_GREY = "0.88"
 
+_LABELS = "depth (m); grey: none", "rendered − measured (cm)"
+_LOW = 0.5
+"""Height over width of pictures beside which the labels have no room."""
+
 
 class ShownMap(Protocol):
     """What is drawn of a map."""
@@ -140,10 +144,9 @@ def depth_comparison(m: OccupancyMap, held_out: Sequence[Frame]) -> "Figure":
         axes[2].set_title(
             f"median error {100 * error.median_abs:.1f} cm, signed {100 * error.median:+.1f} cm"
         )
-        figure.colorbar(shown, ax=axes[:2], label="depth (m); grey: none", shrink=0.93, pad=0.01)
-        figure.colorbar(
-            difference, ax=axes[2], label="rendered − measured (cm)", extend="both", shrink=0.93, pad=0.02
-        )
+        depth_label, difference_label = ("m", "cm") if aspect < _LOW else _LABELS
+        figure.colorbar(shown, ax=axes[:2], label=depth_label, shrink=0.93, pad=0.01)
+        figure.colorbar(difference, ax=axes[2], label=difference_label, extend="both", shrink=0.93, pad=0.02)
         for ax in axes:
             ax.set(xticks=[], yticks=[])
     return figure
