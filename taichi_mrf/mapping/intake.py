@@ -105,6 +105,7 @@ class Intake:
         self._hold_out, self._sweep = hold_out, sweep
         self._remembers, self._before_adding = remember_frames, before_adding
         self._expects_color = True  # until a frame without colour was named
+        self._expects_no_return = self.map.sensor.no_return != "ignore"  # until one that names no such pixels
 
     def passes_unread(self, number: int, index: int) -> bool:
         """Whether the ``number``-th frame (from 1) is held out without being read, which the result notes by
@@ -180,6 +181,13 @@ class Intake:
                 warnings.warn(f"frame {frame.name} has no colour image", stacklevel=2)
             parts = (frame.T_world_camera, frame.camera, frame.name, frame.stamp, color)
             own = frame.own_for(self.map.sensor)
+            if self._expects_no_return and own.no_return is None:
+                self._expects_no_return = False
+                warnings.warn(
+                    f"frame {frame.name} does not name the pixels that got no return: sensor.no_return is "
+                    f'"{self.map.sensor.no_return}" and changes nothing for it',
+                    stacklevel=2,
+                )
             keyframe = self.map.add_keyframe(frame.depth_m, *parts, **own.arguments())
         try:
             if self.refiner is not None:

@@ -1,5 +1,6 @@
 """The answers of the intake: what it says to each kind of frame, and what is left of the map then."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -78,3 +79,18 @@ def test_lost_frames_are_counted_in_a_row() -> None:
     assert taken.result.track is not None
     assert (list(taken.result.track.frames), taken.result.track.lost) == ([0, 1], 2)
     assert np.isfinite(taken.result.track.frames[1].T_world_camera).all()
+
+
+def test_frames_that_do_not_name_pixels_without_a_return_are_reported_once() -> None:
+    config = replace(ALL_FRAMES, sensor=replace(ALL_FRAMES.sensor, no_return="model"))
+    taken = Intake(MRFMap.from_config(config, sequence().camera), config)
+    frames = [sequence().read(index) for index in range(3)]
+    named = replace(frames[0], no_return=frames[0].depth_m > 2.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert isinstance(taken.offer(named), Added)
+    with pytest.warns(UserWarning, match="frame 1 does not name the pixels that got no return"):
+        taken.offer(frames[1])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        taken.offer(frames[2])
