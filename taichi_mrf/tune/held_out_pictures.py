@@ -7,9 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.evaluation.accuracy import RIGHT, JudgedView
+from taichi_mrf.evaluation.accuracy import NOT_JUDGED, RIGHT, JudgedView
 from taichi_mrf.live.pictures import ACCURACY_COLORS, IMAGE_WIDTH, depth_colors
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.unrolled import unrolled
 from taichi_mrf.tune.history import History
 from taichi_mrf.viewer.tune.messages import HeldOutView, Residuals
 
@@ -36,7 +37,9 @@ class HeldOutPictures:
 
     def keep(self, number: int, views: Sequence[JudgedView], pixel_stride: int, pinned: int) -> None:
         """Keep the pictures of a try."""
-        self._verdicts[number] = [_packed(view, pixel_stride) for view in views]
+        self._verdicts[number] = [
+            _packed(view, frame, pixel_stride) for view, frame in zip(views, self._frames, strict=True)
+        ]
         for old in list(self._verdicts):
             if len(self._verdicts) > _MOST_TRIES and old not in (number, pinned):
                 del self._verdicts[old]
@@ -55,10 +58,11 @@ class HeldOutPictures:
             better, worse = (now == RIGHT) & (then != RIGHT), (now != RIGHT) & (then == RIGHT)
             change = np.where(better[..., None], BETTER, np.where(worse[..., None], WORSE, SAME))
             change_title = f"from A to B: {better.mean():.1%} became right, {worse.mean():.1%} wrong"
-        step = _step(frame.depth_m)
+        measured = unrolled(frame.camera).image(frame.depth_m)
+        step = _step(measured)
         return HeldOutView(
             name=frame.name,
-            measured=depth_colors(frame.depth_m[::step, ::step]),
+            measured=depth_colors(measured[::step, ::step]),
             accuracy=ACCURACY_COLORS[now],
             title=_title(number, shown),
             reference=None if then is None else ACCURACY_COLORS[then],
@@ -102,12 +106,13 @@ def residuals_of(number: int, views: Sequence[JudgedView]) -> Residuals:
     )
 
 
-def _packed(view: JudgedView, pixel_stride: int) -> tuple[bytes, float, float]:
+def _packed(view: JudgedView, frame: Frame, pixel_stride: int) -> tuple[bytes, float, float]:
     judged = view.accuracy("1.5sigma")
-    step = max(_step(view.depth_m), pixel_stride)
+    picture = unrolled(frame.camera).image(judged.image, NOT_JUDGED)
+    step = max(_step(picture), pixel_stride)
     # Where only some pixels were judged the picture is of these.
-    first = pixel_stride // 2
-    small = np.ascontiguousarray(judged.image[first::step, first::step])
+    first = min(pixel_stride // 2, min(picture.shape) - 1)
+    small = np.ascontiguousarray(picture[first::step, first::step])
     return cv2.imencode(".png", small.astype(np.uint8))[1].tobytes(), judged.score, judged.unanswered
 
 
@@ -121,5 +126,5 @@ def _title(number: int, shown: tuple[bytes, float, float]) -> str:
     return f"try {number}: right {shown[1]:.1%} within 1.5 sigma, no surface {shown[2]:.1%}"
 
 
-def _step(depth_m: NDArray[np.float32]) -> int:
-    return -(-depth_m.shape[1] // IMAGE_WIDTH)
+def _step(image: NDArray[np.generic]) -> int:
+    return -(-image.shape[1] // IMAGE_WIDTH)

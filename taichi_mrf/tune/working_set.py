@@ -85,8 +85,9 @@ def read_working_set(dataset: Dataset, choice: FrameChoice, keep_unseen: bool = 
 
 
 def coarse_stride(camera: Camera) -> int:
-    """The pixel stride of a first look: about 160 columns."""
-    return max(1, camera.width // FIRST_LOOK_COLUMNS)
+    """The pixel stride of a first look: about 160 columns. Rays without a pattern have no columns, and all of
+    them are looked at."""
+    return max(1, camera.width // FIRST_LOOK_COLUMNS) if camera.pixels_per_radian > 0 else 1
 
 
 def thinned(frame: Frame, pixel_stride: int) -> Frame:
