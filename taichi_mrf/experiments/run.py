@@ -54,6 +54,7 @@ EXPERIMENTS = {
     "submaps": Entry("submaps.corridor:run_submaps", (0.05,), needs_data=False),
     "surface": Entry("surface:run_surface", (0.05, 0.02, 0.01)),
     "lidar": Entry("lidar:run_lidar", (0.2, 0.1, 0.05)),
+    "sensors": Entry("sensors:run_sensors", (0.05,), needs_data=False),
     "window": Entry("window:run_window", (0.1,), needs_data=False),
 }
 

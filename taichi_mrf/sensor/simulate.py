@@ -13,7 +13,7 @@ from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import FrameError
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.depth_effects import at_a_jump, in_disparity_steps, incidence, sampled_beside
 from taichi_mrf.sensor.noise import NoiseModel
 
@@ -102,7 +102,7 @@ def simulate(
 
 
 def simulate_model(
-    depth_m: NDArray[np.float32], camera: PinholeCamera, noise: NoiseModel, seed: Seed = 0
+    depth_m: NDArray[np.float32], camera: Camera, noise: NoiseModel, seed: Seed = 0
 ) -> NDArray[np.float32]:
     """Draw a measured depth image, (H, W) float32, from the ``noise`` of each pixel.
 
@@ -119,7 +119,7 @@ def simulate_model(
     return np.where((true > 0) & (measured > 0), measured, 0).astype(np.float32)
 
 
-def _clean(depth_m: NDArray[np.float32], camera: PinholeCamera) -> NDArray[np.float64]:
+def _clean(depth_m: NDArray[np.float32], camera: Camera) -> NDArray[np.float64]:
     """Clean depth as float64, 0 where there is none."""
     depth_m = np.asarray(depth_m)
     if depth_m.shape != camera.shape:

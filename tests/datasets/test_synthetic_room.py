@@ -20,6 +20,7 @@ from taichi_mrf.datasets.synthetic.room_furniture import (
 from taichi_mrf.errors import BackendError, DatasetError
 from taichi_mrf.geometry.poses import as_pose, look_at, tangent_norms
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.system import runtime
 
 SMALL = "synthetic:room?width=160&height=120&frames=60"
@@ -134,6 +135,20 @@ def test_pictures_of_random_scenes_agree_with_sphere_tracing(backend: str, seed:
     off = np.abs(rendered - expected)[both]
     assert (off > 1e-4).sum() <= 2
     assert np.median(off) < 1e-6
+
+
+def test_any_camera_sees_the_same_scene(backend: str) -> None:
+    from taichi_mrf.datasets.synthetic.analytic_render import ray_depths, render
+
+    scene = room_scene()
+    T = look_at((0.1, -0.2, 1.4), (1.0, 0.5, 1.2))
+    depth, _ = render(scene, CAMERA, T, color=False)
+    off = np.abs(ray_depths(scene, CAMERA, T) - depth)
+    assert (off > 1e-4).sum() <= 2  # at edges rounding decides
+    lidar = SphericalCamera(np.radians([20.0, 0.0, -25.0]), np.radians(np.arange(0.0, 360.0, 6.0)))
+    rays = lidar.rays().reshape(-1, 3) @ T[:3, :3].T
+    off = np.abs(ray_depths(scene, lidar, T).ravel() - sphere_traced(scene, T[:3, 3], rays))
+    assert (off > 1e-4).sum() <= 1
 
 
 @pytest.mark.parametrize("index", range(0, 60, 7))

@@ -29,7 +29,8 @@ class Eval:
     person walks through, submaps, which maps the built-in corridor in parts and compares that with the map of
     a single machine, window, which keeps only what is near the camera in memory, surface, which compares the
     surface of maps with that of Open3D (extra bench), cells, which judges the probabilities of cells, balls
-    and paths, lidar, which maps a building and judges the map by other scans, or all."""
+    and paths, lidar, which maps a building and judges the map by other scans, sensors, which
+    maps the built-in corridor by a depth camera, by a lidar and by both, or all."""
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("runs/eval")
     """Folder for the results; created if needed."""

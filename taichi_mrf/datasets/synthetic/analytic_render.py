@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.synthetic.analytic_scene import KINDS, Scene
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.types import F32, I32, AnyArray, Mat3, Template, Vec3, Vec4
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera, PinholeCamera
 
 BOX, SPHERE = KINDS.index("box"), KINDS.index("sphere")
 NOTHING = 1e30
@@ -38,6 +38,16 @@ def render(
         shaded,
     )
     return depth_m, np.clip(np.round(255 * shaded), 0, 255).astype(np.uint8) if color else None
+
+
+def ray_depths(scene: Scene, camera: Camera, T_world_camera: Pose) -> NDArray[np.float32]:
+    """Depth along the rays of any camera, (H, W) float32 in metres (range for a lidar), 0 where a ray meets
+    nothing. As for :func:`render`, Taichi has to run, and the camera has to be outside of every solid."""
+    directions = camera.rays().reshape(-1, 3) @ T_world_camera[:3, :3].T
+    depth_m = np.zeros(len(directions), dtype=np.float32)
+    eye = ti.Vector(T_world_camera[:3, 3].tolist())
+    _cast_rays(scene.geometry, directions.astype(np.float32), eye, depth_m)
+    return depth_m.reshape(camera.shape)
 
 
 def _may_be_seen(
@@ -207,3 +217,16 @@ def _cast(
                 paint = brightness * _paint(materials, i, point, normal)
             for channel in ti.static(range(3)):
                 shaded[row, column, channel] = paint[channel]
+
+
+@ti.kernel
+def _cast_rays(
+    geometry: AnyArray,  # (solids, 10), as Scene.geometry
+    directions: AnyArray,  # (N, 3) in the world
+    camera_in_world: Vec3,
+    depth_m: AnyArray,  # (N,)
+):
+    for ray in depth_m:
+        direction = ti.Vector([directions[ray, 0], directions[ray, 1], directions[ray, 2]])
+        t, i = _nearest(geometry, camera_in_world, direction)
+        depth_m[ray] = ti.select(i >= 0, t, 0.0)
