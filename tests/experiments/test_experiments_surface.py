@@ -17,12 +17,15 @@ class _Wall:
 
     def __init__(self, scene: object, voxel_size: float, truncation: float, images: int) -> None:
         self.images = images
+        # So many that the largest truncation is left out.
+        self.blocks = surface.MOST_BLOCKS if truncation == max(surface.TRUNCATIONS) else 1
 
     def fuse(self, images: list) -> float:
         assert len(images) == self.images
         return 2.0
 
     def mesh(self, least_weight: float) -> surface.Mesh:
+        assert self.blocks < surface.MOST_BLOCKS
         return np.array([[50.0, 0, 0], [51, 0, 0], [50, 1, 0]]), np.array([[0, 1, 2]]), None
 
 

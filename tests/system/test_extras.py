@@ -27,7 +27,9 @@ COMMANDS = {
     "auto": ("optuna", ["tune", ROOM, "--auto", "2", "--no-viewer", "--out", "out"]),
     "bench": ("pyoctomap", ["eval", "fig10", "--data", "data", "--out", "out", "--voxel-sizes", "0.2"]),
     "cluster": ("distributed", ["map", ROOM, "--scheduler", "local", "--out", "out"]),
+    "las": ("laspy", ["map", "clouds", "--out", "out"]),
     "mesh": ("embreex.rtcore_scene", ["map", "mesh:corner.obj?poses=poses.txt", "--out", "out"]),
+    "ouster": ("ouster.sdk", ["map", "drive.osf", "--out", "out"]),
     "realsense": ("pyrealsense2", ["map", "realsense:", "--out", "out"]),
     "ros": ("rosbags.highlevel", ["map", "drive.bag", "--out", "out"]),
     "store": ("zarr", ["map", ROOM, "--submap-size", "5", "--out", "out"]),
@@ -44,6 +46,11 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "corner.obj").write_text(TRIANGLE)
     (tmp_path / "poses.txt").write_text(POSES)
     (tmp_path / "drive.bag").touch()
+    (tmp_path / "drive.osf").touch()
+    (tmp_path / "clouds").mkdir()
+    (tmp_path / "clouds" / "poses.txt").write_text(POSES)
+    for number in (0, 1):
+        (tmp_path / "clouds" / f"scan-{number}.las").touch()
     (tmp_path / "data").mkdir()
 
 
