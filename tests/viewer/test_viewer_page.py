@@ -289,3 +289,25 @@ def test_a_lidars_keyframe_is_drawn_as_rings_with_its_picture(handled: HandledPa
     handled.take(m.CurrentCamera("a scan", np.eye(4), lidar))
     handled.page.keyframes.clear()
     assert nodes(handled) == set()
+
+
+def test_a_browser_begins_behind_the_camera_that_is_followed(handled: HandledPage) -> None:
+    viewpoint, start = handled.page.viewpoint, handled.server.initial_camera
+    viewpoint.map_grew(np.zeros(3), np.ones(3))
+    whole = start.position, start.look_at
+
+    viewpoint.set_following(True)
+    for x in (2.0, 3.0):
+        T = np.eye(4)
+        T[0, 3] = x
+        handled.take(m.CurrentCamera("a frame", T, CAMERA))
+        assert start.position[0] == start.look_at[0] == x
+        assert start.position[2] < 0 < start.look_at[2]  # z is forwards
+    viewpoint.map_grew(np.zeros(3), np.full(3, 9.0))
+    assert start.position[0] == 3.0
+
+    viewpoint.set_following(False)
+    assert not np.allclose(start.position, whole[0])
+    viewpoint.look_at_everything()
+    viewpoint.map_grew(np.zeros(3), np.ones(3))
+    np.testing.assert_array_equal((start.position, start.look_at), whole)

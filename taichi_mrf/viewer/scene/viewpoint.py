@@ -42,9 +42,7 @@ class ViewpointController:
         if handle is None:
             return
         self._placed[client] = handle.camera.position
-        view = self._behind_camera() if self._following else None
-        if view is None:
-            view = self._view
+        view = self._shared_view()
         if view is not None:
             self._point(handle, *view)
 
@@ -52,12 +50,15 @@ class ViewpointController:
         """Store the pose of a camera that looks ``forwards`` (3,) in its own frame, and follow it if
         following is on."""
         self._camera, self._forwards = T_world_camera, T_world_camera[:3, :3] @ forwards
+        if self._following:
+            self._begin_there()
         self._follow()
 
     def set_following(self, on: bool) -> None:
         """Keep every browser's view behind the camera from now on, or leave it to the user."""
         if on != self._following:
             self._following = on
+            self._begin_there()
             self._follow()
 
     def look_at_everything(self) -> None:
@@ -83,8 +84,7 @@ class ViewpointController:
         target = centre + _PANEL_SHARE * size * right
         eye = target + 0.5 * size * aside / np.linalg.norm(aside) + 0.7 * size * up
         self._view = eye, target
-        start = self._server.initial_camera
-        start.position, start.look_at = eye, target
+        self._begin_there()
         if self._following:
             return
         for id, client in self._server.get_clients().items():
@@ -96,6 +96,19 @@ class ViewpointController:
         if view is not None:
             for client in self._server.get_clients().values():
                 self._point(client, *view)
+
+    def _shared_view(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        """The view that new browsers get; None before the first frame and keyframe."""
+        behind = self._behind_camera() if self._following else None
+        return self._view if behind is None else behind
+
+    def _begin_there(self) -> None:
+        """Let new browsers begin with the shared view. Pointing them alone is not enough: one that loads
+        slowly takes its first view after it was pointed elsewhere."""
+        view = self._shared_view()
+        if view is not None:
+            start = self._server.initial_camera
+            start.position, start.look_at = view
 
     def _behind_camera(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Eye and target that look over the camera's shoulder; None before the first frame."""
