@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.color_camera import ColorCamera, without_black
+from taichi_mrf.datasets.confidence import Confidence
 from taichi_mrf.datasets.depth_scale import PLAUSIBLE_MEDIAN_M, USUAL, Evidence, gather
 from taichi_mrf.datasets.images import read_color, read_depth, read_grey
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.sensor.noise import PolynomialNoise
-from taichi_mrf.sensor.own_evidence import sigma_of_confidence
 
 
 @dataclass(frozen=True)
@@ -37,17 +36,6 @@ class RecordedFrame:
     pose_source: str
     color_file: Path | None = None
     confidence_file: Path | None = None
-
-
-@dataclass(frozen=True)
-class Confidence:
-    """What images of confidence mean: levels from 0, no measurement, to ``top_level``, which stands for the
-    ``sigma``, coefficients in ascending powers of depth; half the level doubles it. ``origin`` is where that
-    comes from."""
-
-    top_level: int
-    sigma: tuple[float, ...]
-    origin: str
 
 
 @dataclass
@@ -131,13 +119,10 @@ class Recording(Dataset):
     ) -> NDArray[np.float32]:
         """The sigma of each pixel, from an image of its confidence. Raises DatasetError."""
         levels = read_grey(path)
-        if levels.shape != depth_m.shape or levels.max() > confidence.top_level:
-            raise DatasetError(
-                f"{path}: has {levels.shape[1]} x {levels.shape[0]} pixels with levels up to {levels.max()}; "
-                f"expected {self.camera.width} x {self.camera.height} and at most {confidence.top_level}"
-            )
-        shares, noise = levels / confidence.top_level, PolynomialNoise(confidence.sigma)
-        return sigma_of_confidence(shares, depth_m, noise, self.camera)
+        try:
+            return confidence.sigma_m(levels, depth_m, self.camera)
+        except DatasetError as error:
+            raise DatasetError(f"{path}: {error}") from error
 
     def _read_color(self, path: Path, depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
         """The colours of the depth image's pixels. Raises DatasetError."""

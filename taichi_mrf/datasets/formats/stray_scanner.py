@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.confidence import ARKIT
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.datasets.recording import Confidence, RecordedFrame, Recording
+from taichi_mrf.datasets.recording import RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -25,9 +26,6 @@ from taichi_mrf.system.files import is_file, is_folder, read_text
 
 DEPTH, CONFIDENCE, MATRIX, ODOMETRY = "depth", "confidence", "camera_matrix.csv", "odometry.csv"
 COLOR_SIZE, DEPTH_WIDTH = (1920, 1440), 256
-ARKIT = Confidence(top_level=2, sigma=(0.01,), origin="assumed for a phone's lidar")
-"""Luetzenburg, Kroon and Bjork (Scientific Reports, 2021) found errors of 1 cm."""
-
 _COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 
 

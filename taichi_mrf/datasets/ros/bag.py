@@ -15,10 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.confidence import L515
 from taichi_mrf.datasets.lidar.scans import refuse_image_options
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.color import BagColors, find_colors
+from taichi_mrf.datasets.ros.confidence import BagConfidence, find_confidence
 from taichi_mrf.datasets.ros.lidar import LidarBag
 from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.point_cloud import POINT_CLOUD
@@ -49,6 +51,9 @@ class BagOptions(PoseChoice):
     color: str = ""
     """The topic of colour images, by default the only one."""
 
+    confidence: str = ""
+    """The topic of images of confidence, by default the one beside that of depth."""
+
     points: str = ""
     """The topic of a lidar's point clouds, in place of depth images; of a bag without depth images by default
     the only one."""
@@ -69,6 +74,22 @@ class RosBag(Dataset):
     names: Sequence[str] = field(kw_only=True)
     depth_scale: float | None = None
     colors: BagColors | None = None
+    confidence: BagConfidence | None = None
+
+    @property
+    def recorded_sigma(self) -> tuple[float, ...] | None:
+        """What the confidence is relative to, None without."""
+        return None if self.confidence is None else L515.sigma
+
+    @property
+    def sigma_origin(self) -> str:
+        """Where the confidence's comes from."""
+        return super().sigma_origin if self.confidence is None else L515.origin
+
+    @property
+    def states_pixel_sigma(self) -> bool:
+        """Whether there are images of confidence."""
+        return self.confidence is not None
 
     @property
     def frame_names(self) -> Sequence[str]:
@@ -101,13 +122,15 @@ class RosBag(Dataset):
                 f"frame {name}: {where}: the image has {depth_m.shape[1]} x {depth_m.shape[0]} pixels, "
                 f"the camera {self.camera.width} x {self.camera.height}"
             )
-        color = None
-        if self.colors is not None:
-            try:
+        color = sigma_m = None
+        try:
+            if self.colors is not None:
                 color = self.colors.read(index, depth_m, self.camera)
-            except DatasetError as error:
-                raise FrameError(f"frame {name}: {error}") from error
-        return Frame(depth_m, self.poses[index], self.camera, self.entries[index].stamp, name, color)
+            if self.confidence is not None:
+                sigma_m = self.confidence.read(index, depth_m, self.camera)
+        except DatasetError as error:
+            raise FrameError(f"frame {name}: {error}") from error
+        return Frame(depth_m, self.poses[index], self.camera, self.entries[index].stamp, name, color, sigma_m)
 
 
 def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
@@ -145,11 +168,12 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
     entries = sorted((entry for entry, _ in reader.messages(depth.name)), key=lambda entry: entry.stamp)
     posed, notes = _posed(reader, depth.name, "images", entries, found, options)
     dropped = len(entries) - len(posed)
-    colors = None
+    stamps, colors = [entry.stamp for _, entry, _ in posed], None
     if options.color:
-        stamps = [entry.stamp for _, entry, _ in posed]
         colors, said = find_colors(reader, chosen.color, depth, camera, stamps, options.max_time_gap)
         notes += said
+    confidence, said = find_confidence(reader, chosen.confidence, depth, camera, stamps, options.max_time_gap)
+    notes += said
     return RosBag(
         name=reader.path.stem,
         camera=camera,
@@ -164,6 +188,7 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
         depth_scale=options.depth_scale,
         tracked=chosen.poses == TRACK,
         colors=colors,
+        confidence=confidence,
     )
 
 

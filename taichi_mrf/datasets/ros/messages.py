@@ -35,6 +35,9 @@ PNG = "png"
 ENCODINGS = f"{MILLIMETRES[0]} (millimetres), {METRES} (metres), or compressedDepth of the two as PNG"
 STEPS_PER_METRE = 1000.0
 
+GREY = ("mono8", "8UC1")
+"""Encodings of grey images of 8 bits."""
+
 _COLOR_CHANNELS = {"rgb8": [0, 1, 2], "rgba8": [0, 1, 2], "bgr8": [2, 1, 0], "bgra8": [2, 1, 0]}
 """Where red, green and blue are in the pixels of an encoding."""
 
@@ -75,15 +78,21 @@ def _raw(message: Any) -> tuple[NDArray, float]:
     if message.encoding not in kinds:
         raise DatasetError(f"encoding {message.encoding!r} is not depth; supported are {ENCODINGS}")
     kind, steps = kinds[message.encoding]
-    height, width, step = int(message.height), int(message.width), int(message.step)
     dtype = np.dtype(f"{'>' if message.is_bigendian else '<'}{kind}")
+    return _rows(message, dtype.itemsize).view(dtype), steps
+
+
+def _rows(message: Any, pixel_bytes: int) -> NDArray[np.uint8]:
+    """The bytes of an Image, (H, W * pixel_bytes), without what pads its rows. Raises DatasetError if they
+    are too few."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.asarray(message.data, np.uint8)
-    if step < width * dtype.itemsize or len(data) < height * step:
+    if step < width * pixel_bytes or len(data) < height * step:
         raise DatasetError(
             f"{len(data)} bytes are too few for {width} x {height} pixels of {message.encoding}"
         )
-    rows = data[: height * step].reshape(height, step)[:, : width * dtype.itemsize]
-    return np.ascontiguousarray(rows).view(dtype), steps
+    rows = data[: height * step].reshape(height, step)[:, : width * pixel_bytes]
+    return np.ascontiguousarray(rows)
 
 
 def _compressed(message: Any) -> tuple[NDArray, float]:
@@ -120,14 +129,16 @@ def color_image(message: Any) -> NDArray[np.uint8]:
         raise DatasetError(f"encoding {message.encoding!r} is not colour")
     order = _COLOR_CHANNELS[message.encoding]
     pixel_bytes = 4 if "a" in message.encoding else 3
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    data = np.asarray(message.data, np.uint8)
-    if step < width * pixel_bytes or len(data) < height * step:
-        raise DatasetError(
-            f"{len(data)} bytes are too few for {width} x {height} pixels of {message.encoding}"
-        )
-    rows = data[: height * step].reshape(height, step)[:, : width * pixel_bytes]
-    return np.ascontiguousarray(rows.reshape(height, width, pixel_bytes)[..., order])
+    pixels = _rows(message, pixel_bytes).reshape(int(message.height), int(message.width), pixel_bytes)
+    return np.ascontiguousarray(pixels[..., order])
+
+
+def grey_image(message: Any) -> NDArray[np.uint8]:
+    """The (H, W) grey values of an Image of 8 bits. Raises DatasetError, which does not name the topic, for
+    another encoding and for data that do not fit it."""
+    if encoding(message) not in GREY:
+        raise DatasetError(f"encoding {encoding(message)!r} is not grey of 8 bits ({' or '.join(GREY)})")
+    return _rows(message, 1)
 
 
 def camera_of(info: Any, rectified: bool) -> tuple[PinholeCamera, tuple[float, ...]]:

@@ -1,0 +1,145 @@
+"""Images of confidence in bags: grades of 4 bits as a sigma for each pixel, and those that cannot be used."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from inputs_bags import CAMERA, COUNT, FRAME, Bag, Kind, plain, stamp, steps, writing
+
+from taichi_mrf.config.schema import Config, SensorConfig
+from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets.confidence import L515
+from taichi_mrf.datasets.recorded_noise import with_recorded_noise
+from taichi_mrf.errors import DatasetError, FrameError
+
+TOPIC = "/camera/confidence/image_rect_raw"
+
+
+def grades(i: int) -> np.ndarray:
+    image = np.random.default_rng(200 + i).integers(0, 16, CAMERA.shape).astype(np.uint8)
+    image[0, :3] = 0, 1, 15
+    return image
+
+
+def confidence(
+    bag: Bag, topic: str = TOPIC, shift: int = 4, encoding: str = "mono8", skip: int | None = None
+) -> None:
+    for i in range(COUNT):
+        if i != skip:
+            bag.image(topic, stamp(i) + 0.01, FRAME, grades(i) << shift, encoding)
+
+
+def expected(i: int) -> np.ndarray:
+    """sigma / max(share, 0.1), infinite for the grade 0."""
+    depth_m = np.where(steps(i) > 0, steps(i) / 1000, 0.0)
+    sigma = L515.sigma[0] + L515.sigma[1] * depth_m
+    return np.where(grades(i) > 0, sigma / np.maximum(grades(i) / 15, 0.1), np.inf)
+
+
+@pytest.fixture
+def opened(tmp_path: Path) -> Callable[..., Dataset]:
+    """Writes a bag of the parts with depth and poses, and opens it."""
+
+    def write(*parts: Callable[[Bag], None], kind: Kind = "ros1", query: str = "") -> Dataset:
+        path = tmp_path / ("walk.bag" if kind == "ros1" else "walk")
+        with writing(path, kind) as bag:
+            for part in (plain, *parts):
+                part(bag)
+        return open_dataset(f"{path}{query}", color=False)
+
+    return write
+
+
+@pytest.mark.parametrize(("kind", "shift", "encoding"), [("mcap", 4, "mono8"), ("ros1", 0, "8UC1")])
+def test_grades_are_a_sigma(opened: Callable[..., Dataset], kind: Kind, shift: int, encoding: str) -> None:
+    dataset = opened(lambda bag: confidence(bag, shift=shift, encoding=encoding), kind=kind)
+    for i in (2, 0, 4):
+        sigma_m = dataset.read(i).sigma_m
+        assert sigma_m is not None
+        np.testing.assert_allclose(sigma_m, expected(i), rtol=1e-6)
+    assert with_recorded_noise(Config(), dataset).sensor == SensorConfig(sigma=L515.sigma)
+    assert f"confidence: {TOPIC}, as a sigma for each pixel" in dataset.notes
+
+
+def test_a_bag_without_confidence_states_no_sigma(opened: Callable[..., Dataset]) -> None:
+    dataset = opened(lambda bag: confidence(bag, "/other/confidence/image_rect_raw"))
+    assert dataset.read(0).sigma_m is None
+    assert not dataset.states_pixel_sigma
+    assert dataset.recorded_sigma is None
+    assert not any(note.startswith("confidence") for note in dataset.notes)
+
+
+def test_the_sigma_of_the_l515_is_the_makers_error_and_noise_together() -> None:
+    for depth_m, error_mm, noise_mm in ((1.0, 5.0, 2.5), (9.0, 14.0, 15.5)):
+        assert L515.sigma[0] + L515.sigma[1] * depth_m == pytest.approx(
+            np.hypot(error_mm, noise_mm) / 1000, abs=1e-4
+        )
+
+
+def test_an_image_without_confidence_has_the_same_sigma_everywhere(opened: Callable[..., Dataset]) -> None:
+    dataset = opened(lambda bag: confidence(bag, skip=3))
+    assert dataset.read(3).sigma_m is None
+    assert dataset.read(4).sigma_m is not None
+    assert any(note.endswith("; 1 of 5 images have none") for note in dataset.notes)
+
+
+def half(bag: Bag) -> None:
+    bag.image(TOPIC, 1.0, FRAME, grades(0)[::2, ::2], "mono8")
+
+
+WRONG = [
+    (half, "its images have 8 x 6 pixels, those of depth 16 x 12"),
+    (
+        lambda bag: bag.image(TOPIC, 1.0, FRAME, grades(0).astype(np.uint16), "mono16"),
+        "'mono16' is not grey of 8 bits",
+    ),
+]
+
+
+@pytest.mark.parametrize(("write", "problem"), WRONG)
+def test_confidence_that_does_not_fit_is_named(
+    opened: Callable[..., Dataset], write: Callable[[Bag], None], problem: str
+) -> None:
+    dataset = opened(write, query="?depth=/camera/depth/image_raw")
+    assert not dataset.states_pixel_sigma
+    (note,) = [note for note in dataset.notes if note.startswith("confidence: ")]
+    assert f"{TOPIC} is not used: " in note
+    assert problem in note
+    path = str(dataset.reader.path)  # type: ignore[attr-defined]
+    with pytest.raises(DatasetError, match=problem) as caught:
+        open_dataset(f"{path}?depth=/camera/depth/image_raw&confidence={TOPIC}")
+    assert f"{path}: topic {TOPIC}: " in str(caught.value)
+
+
+def test_a_topic_of_another_name_can_be_named(opened: Callable[..., Dataset]) -> None:
+    dataset = opened(lambda bag: confidence(bag, "/trust"), query="?confidence=/trust")
+    np.testing.assert_allclose(dataset.read(1).sigma_m, expected(1), rtol=1e-6)
+    path = str(dataset.reader.path)  # type: ignore[attr-defined]
+    with pytest.raises(DatasetError, match=r"is of type nav_msgs/msg/Odometry, not"):
+        open_dataset(f"{path}?confidence=/odom")
+    with pytest.raises(DatasetError, match=r"there is no topic /nothing; topics of confidence: none"):
+        open_dataset(f"{path}?confidence=/nothing")
+
+
+def test_of_two_topics_one_must_be_chosen(opened: Callable[..., Dataset]) -> None:
+    other = "/camera/confidence/image_raw"
+    dataset = opened(confidence, lambda bag: confidence(bag, other))
+    assert dataset.read(0).sigma_m is None
+    assert f"confidence: choose one with ?confidence={other} or ?confidence={TOPIC}" in dataset.notes
+
+
+def test_a_later_image_that_is_damaged_is_a_bad_frame(opened: Callable[..., Dataset]) -> None:
+    def write(bag: Bag) -> None:
+        bag.image(TOPIC, stamp(0), FRAME, grades(0), "mono8")
+        bag.image(TOPIC, stamp(1), FRAME, np.full(CAMERA.shape, 200, np.uint8), "mono8")
+        bag.image(TOPIC, stamp(2), FRAME, grades(2)[1:], "mono8")
+
+    dataset = opened(write)
+    assert dataset.read(0).sigma_m is not None
+    with pytest.raises(
+        FrameError, match=rf"^frame 000001: .*topic {TOPIC}: has values up to 200, which are no"
+    ):
+        dataset.read(1)
+    with pytest.raises(FrameError, match=r"frame 000002: .* has 16 x 11 pixels .* expected 16 x 12"):
+        dataset.read(2)
