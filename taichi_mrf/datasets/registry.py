@@ -13,6 +13,7 @@ from taichi_mrf.datasets.base import BuiltIn, Dataset, Format
 from taichi_mrf.datasets.formats import (
     frames_npz,
     numbered_depth,
+    record3d,
     replica,
     scannet,
     seven_scenes,
@@ -38,6 +39,7 @@ FORMATS: tuple[Format, ...] = (
     scannet.FORMAT,
     replica.FORMAT,
     stray_scanner.FORMAT,
+    record3d.FORMAT,
     numbered_depth.FORMAT,
     kitti.FORMAT,
     bag.FORMAT,

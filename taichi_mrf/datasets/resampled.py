@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.derived import Derived
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
-from taichi_mrf.sensor.camera import PinholeCamera, pinhole
+from taichi_mrf.sensor.camera import Camera, PinholeCamera, pinhole
 from taichi_mrf.sensor.frame import Frame
 
 
@@ -25,11 +25,14 @@ class Resampled(Derived):
     """The frames of ``source``, each pixel of them picked from the recorded image.
 
     ``rows`` and ``columns`` (H, W) int64 say which pixel each of this camera's pixels takes, -1 where its ray
-    did not meet the recorded image, which is no measurement.
+    did not meet the recorded image, which is no measurement. One in ``stride`` of them is kept; if they are
+    not ``distorted``, frames may have cameras of their own.
     """
 
     rows: NDArray[np.int64] = field(kw_only=True)
     columns: NDArray[np.int64] = field(kw_only=True)
+    stride: int = field(kw_only=True)
+    distorted: bool = field(kw_only=True)
 
     def read(self, index: int) -> Frame:
         """Read the source's frame and pick its pixels. Raises what the source raises."""
@@ -46,8 +49,21 @@ class Resampled(Derived):
         sigma_m = None if frame.sigma_m is None else frame.sigma_m[self.rows, self.columns]
         no_return = None if frame.no_return is None else frame.no_return[self.rows, self.columns] & ~outside
         return replace(
-            frame, depth_m=depth_m, camera=self.camera, color=color, sigma_m=sigma_m, no_return=no_return
+            frame,
+            depth_m=depth_m,
+            camera=self._camera(frame),
+            color=color,
+            sigma_m=sigma_m,
+            no_return=no_return,
         )
+
+    def _camera(self, frame: Frame) -> Camera:
+        """The camera of the pixels that are kept of a frame."""
+        if frame.camera == self.source.camera:
+            return self.camera
+        if self.distorted:
+            raise FrameError(f"frame {frame.name}: has intrinsics of its own; --undistort needs --camera too")
+        return strided(pinhole(frame.camera, "--image-scale"), self.stride)[0]
 
 
 def resampled(dataset: Dataset, distortion: Sequence[float], stride: int) -> Dataset:
@@ -91,6 +107,8 @@ def resampled(dataset: Dataset, distortion: Sequence[float], stride: int) -> Dat
         source=dataset,
         rows=rows,
         columns=columns,
+        stride=stride,
+        distorted=distorted,
     )
 
 

@@ -36,6 +36,7 @@ from taichi_mrf.sensor.noise import PatchNoise
 OPENERS: list[tuple[Callable[[Path], object], str]] = [
     (open_dataset, ".npz"),
     (open_dataset, ".mcap"),
+    (open_dataset, ".r3d"),
     (open_dataset, ".yaml"),
     (open_scans, ".log"),
     (open_scans, ".npz"),

@@ -1,6 +1,8 @@
 """Writes small recordings in every folder format, for the tests of their readers."""
 
 import json
+import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -160,6 +162,42 @@ def write_stray(folder: Path, content: Content) -> Path:
     (folder / "odometry.csv").write_text("\n".join(lines))
     (folder / "camera_matrix.csv").write_text("1500.0, 0.0, 959.5\n0.0, 1500.0, 719.5\n0.0, 0.0, 1.0\n")
     return folder
+
+
+def write_record3d(
+    path: Path, content: Content, pack: Callable[[bytes], bytes] = bytes, **changes: object
+) -> Path:
+    """A .r3d, or a folder if ``path`` ends in nothing, of frames of 16 x 12 pixels of depth and 32 x 24 of
+    colour; levels are 0, 1, 2 from column to column. ``changes`` replace entries of the metadata, and None
+    leaves them out."""
+    height, width = content.size
+    K_color = np.array([[28.0, 0, 2 * 7.5 + 0.5], [0, 30.0, 2 * 5.5 + 0.5], [0, 0, 1]])
+    metadata: dict[str, object] = {
+        "w": 2 * width,
+        "h": 2 * height,
+        "dw": width,
+        "dh": height,
+        "fps": 10,
+        "K": column_by_column(K_color),
+        "poses": [[*quaternion_of(T[:3, :3] @ np.diag([1.0, -1.0, -1.0])), *T[:3, 3]] for T in content.poses],
+    }
+    metadata = {name: value for name, value in (metadata | changes).items() if value is not None}
+    levels = np.ascontiguousarray(np.broadcast_to(np.arange(width, dtype=np.uint8) % 3, content.size))
+    members = {"metadata": json.dumps(metadata).encode()}
+    for i in range(content.count):
+        color = np.repeat(np.repeat(content.color[i], 2, axis=0), 2, axis=1)
+        members[f"rgbd/{i}.depth"] = pack((content.depth[i] / np.float32(1000)).astype("<f4").tobytes())
+        members[f"rgbd/{i}.conf"] = pack(levels.tobytes())
+        members[f"rgbd/{i}.jpg"] = cv2.imencode(".png", color[..., ::-1])[1].tobytes()  # comes back exactly
+    if path.suffix:
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, data in members.items():
+                archive.writestr(name, data)
+        return path
+    for name, data in members.items():
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        (path / name).write_bytes(data)
+    return path
 
 
 def write_replica(folder: Path, content: Content, parameters: Path) -> Path:

@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, fields
 from functools import cache, partial
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from datasets_recordings import (
     write_log,
     write_npz,
     write_numbered,
+    write_record3d,
     write_replica,
     write_scannet,
     write_seven_scenes,
@@ -113,7 +115,8 @@ def frames_of(dataset: Dataset) -> bytes:
             name,
             repr(frame.camera),
         )
-        found.append((*parts, None if frame.color is None else frame.color.tobytes()))
+        images = (frame.color, frame.sigma_m, frame.no_return)
+        found.append((*parts, *(None if image is None else image.tobytes() for image in images)))
     assert all(f"frame {name}: " in said for name, said in refused)
     if refused:
         raise FramesRefusedError(refused[0][1])
@@ -284,6 +287,16 @@ def _replica(folder: Path) -> Path:
 
 def _stray(folder: Path) -> Path:
     return write_stray(folder, _content())
+
+
+def _record3d(folder: Path) -> Path:
+    """Packed where the library is there."""
+    lzfse = import_module("lzfse") if find_spec("lzfse") else None
+    return write_record3d(folder / "walk", _content(), bytes if lzfse is None else lzfse.compress)
+
+
+def _record3d_zip(folder: Path) -> Path:
+    return write_record3d(folder / "walk.r3d", _content())
 
 
 def _npz(folder: Path) -> Path:
@@ -496,6 +509,8 @@ LOADERS = [
     Loader("ScanNet", _scannet, _dataset),
     Loader("Replica", _replica, _dataset),
     Loader("Stray Scanner", _stray, _dataset),
+    Loader("Record3D", _record3d, _dataset),
+    Loader("Record3D .r3d", _record3d_zip, _dataset),
     Loader("frames npz", _npz, _dataset, sealed=True),
     Loader("frames npz, folder", _npz_folder, _dataset, sealed=True),
     Loader("KITTI stereo", _kitti, _dataset),

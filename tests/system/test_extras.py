@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from datasets_recordings import Content, write_record3d
 from tune_scene import ROOM
 
 from taichi_mrf.cli import main as cli
@@ -31,6 +32,7 @@ COMMANDS = {
     "mesh": ("embreex.rtcore_scene", ["map", "mesh:corner.obj?poses=poses.txt", "--out", "out"]),
     "ouster": ("ouster.sdk", ["map", "drive.osf", "--out", "out"]),
     "realsense": ("pyrealsense2", ["map", "realsense:", "--out", "out"]),
+    "record3d": ("lzfse", ["map", "walk", "--out", "out"]),
     "ros": ("rosbags.highlevel", ["map", "drive.bag", "--out", "out"]),
     "store": ("zarr", ["map", ROOM, "--submap-size", "5", "--out", "out"]),
 }
@@ -49,6 +51,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "drive.osf").touch()
     (tmp_path / "clouds").mkdir()
     (tmp_path / "clouds" / "poses.txt").write_text(POSES)
+    write_record3d(tmp_path / "walk", Content(1), pack=lambda data: b"bvx-" + data)
     for number in (0, 1):
         (tmp_path / "clouds" / f"scan-{number}.las").touch()
     (tmp_path / "data").mkdir()
