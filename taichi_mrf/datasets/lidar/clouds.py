@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,9 @@ _STEPS = re.compile(r"(?:xyz|points)_(\d+)mm")
 _VELODYNE_BYTES = 16
 _LAZ_RATIO = 100
 """LAZ packs points five to ten times."""
+
+_READ_BYTES = 32
+"""Of a point's coordinates and time, beside what is in the file."""
 
 
 def read_cloud(path: Path) -> NDArray[np.float64]:
@@ -75,8 +79,24 @@ def _pcd_points(path: Path) -> NDArray[np.float64]:
     return read_pcd(path)[0]
 
 
+def read_timed_las(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The points of a LAS or LAZ file, (N, 3) in metres, and the seconds (N,) at which they were measured, by
+    its own clock. Raises DatasetError, which names the file, if it is damaged or has no times."""
+    points = _las_file(path)
+    if "gps_time" not in points.point_format.dimension_names:
+        raise DatasetError(
+            f"{path}: its points have no gps_time (point format {points.point_format.id}), so that it is not "
+            "known from where they were measured"
+        )
+    return np.array(points.xyz, np.float64), np.array(points.gps_time, np.float64)
+
+
 def _las_points(path: Path) -> NDArray[np.float64]:
-    """LAS and LAZ, by the library laspy (extra ``las``)."""
+    return np.array(_las_file(path).xyz, np.float64)
+
+
+def _las_file(path: Path) -> Any:
+    """A LAS or LAZ file as the library laspy has it (extra ``las``)."""
     laspy = library("laspy", "LAS and LAZ files need", "las", DatasetError)
     size = check_regular(path, DatasetError)
     try:
@@ -85,8 +105,8 @@ def _las_points(path: Path) -> NDArray[np.float64]:
             largest = _LAZ_RATIO * size if path.suffix.lower() == ".laz" else size
             if count * point_bytes > largest:
                 raise ValueError(f"it claims {count} points of {point_bytes} bytes, more than it can hold")
-            check_memory(count * (point_bytes + 24), f"{path}")
-            return np.array(file.read().xyz, np.float64)
+            check_memory(count * (point_bytes + _READ_BYTES), f"{path}")
+            return file.read()
     except CapacityError:
         raise
     except Exception as error:  # the library raises many kinds of errors

@@ -22,7 +22,7 @@ from taichi_mrf.system.files import is_file
 from taichi_mrf.system.npz_file import open_npz
 
 POSES_NPZ = "poses.npz"
-_TEXTS = (".txt", ".log", ".tum", ".csv", ".freiburg")
+TEXTS = (".txt", ".log", ".tum", ".csv", ".freiburg")
 _MATRICES = ("T_world_lidar", "T_world_sensor", "T_world_camera")
 _YEAR_2000_NS = 946_684_800 * 10**9
 
@@ -41,7 +41,7 @@ def find_poses(folder: Path) -> Path | None:
     """The file with the poses of a folder's scans. Raises DatasetError if there are several."""
     if is_file(folder / POSES_NPZ):
         return folder / POSES_NPZ
-    found = [path for path in sorted(folder.iterdir()) if path.suffix in _TEXTS and is_trajectory(path)]
+    found = [path for path in sorted(folder.iterdir()) if path.suffix in TEXTS and is_trajectory(path)]
     if len(found) > 1:
         names = ", ".join(path.name for path in found[:8])
         raise DatasetError(f"{folder}: contains several files of poses, {names}; choose one by ?poses=FILE")

@@ -1,0 +1,141 @@
+"""A LAS or LAZ file of a whole survey with the path of the lidar: ``survey.laz?poses=FILE``.
+
+Points are in the world's frame, and each has the time at which it was measured (``gps_time``). They are
+grouped into scans of ``seconds`` (a tenth of one). The rays of a scan go from where the lidar was at its
+middle, which is interpolated in a file of ``stamp tx ty tz qx qy qz qw`` lines, by the clock of the points. A
+file beside the points with their name is found by itself.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.config.values import check_field
+from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.lidar.clouds import read_timed_las
+from taichi_mrf.datasets.lidar.scan_poses import TEXTS
+from taichi_mrf.datasets.lidar.scans import SECONDS_PER_SCAN, RecordedScan, lidar_scans
+from taichi_mrf.datasets.options import ReadOptions, parse_options
+from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
+from taichi_mrf.datasets.trajectories import is_trajectory
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.geometry.poses import Pose, inverse
+from taichi_mrf.system.files import is_file
+
+SUFFIXES = (".las", ".laz")
+NEAR_ORIGIN_M = 10_000.0
+"""Up to here the 32-bit numbers of maps are exact to a millimetre. Coordinates of a country are not."""
+
+_MOST_SCANS = 1 << 40
+
+
+@dataclass(frozen=True)
+class SurveyOptions:
+    """The options after the name of a file."""
+
+    poses: str = ""
+    """The file of the lidar's poses in TUM's layout."""
+
+    seconds: float = SECONDS_PER_SCAN
+    """The length of a scan."""
+
+    def __post_init__(self) -> None:
+        check_field(self.seconds > 0, "seconds", f"must be positive, not {self.seconds:g}")
+
+
+def recognises(path: Path) -> bool:
+    """Whether it is a file with one of these endings."""
+    return path.suffix.lower() in SUFFIXES and is_file(path)
+
+
+def open_survey(path: Path, query: str, options: ReadOptions) -> Dataset:
+    """Read the points and put them into scans, in the order of time. Raises DatasetError, which names the
+    file, if it cannot be read, its points have no times, or none of them has a pose."""
+    chosen = parse_options(SurveyOptions, query, str(path))
+    poses_path = Path(chosen.poses) if chosen.poses else _poses_beside(path)
+    if poses_path is None:
+        raise DatasetError(
+            f"{path}: contains lidar point clouds without poses; ?poses=FILE names the path of the lidar, "
+            "lines of stamp tx ty tz qx qy qz qw by the clock of its gps_time"
+        )
+    trajectory = read_timed_poses(poses_path)
+    points_m, times = read_timed_las(path)
+    origin_m = _origin(trajectory)
+    gap = INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
+    scans, dropped = [], 0
+    for number, members in _groups(path, times, chosen.seconds):
+        stamp = 0.5 * float(times[members[0]] + times[members[-1]])
+        T_world_lidar = trajectory.at(stamp, gap)
+        if T_world_lidar is None:
+            dropped += 1
+            continue
+        T_world_lidar[:3, 3] -= origin_m
+        read = partial(_in_lidar_frame, points_m, members, origin_m, T_world_lidar)
+        scans.append(RecordedScan(f"{number:06d}", stamp, read, str(path), str(poses_path)))
+    if not scans:
+        raise DatasetError(
+            f"{path}: none of its {dropped} scans ({times.min():.3f} to {times.max():.3f} s) has poses "
+            f"within {gap:g} s on both sides in {poses_path} ({trajectory.stamps[0]:.3f} to "
+            f"{trajectory.stamps[-1]:.3f} s)"
+        )
+    notes = [f"{len(times)} points in {len(scans)} scans of {chosen.seconds:g} s"]
+    if dropped:
+        notes.append(f"{dropped} scans dropped: no poses within {gap:g} s on both sides")
+    if origin_m.any():
+        notes.append("the origin of the world is moved to {:.0f} {:.0f} {:.0f}".format(*origin_m))
+    return lidar_scans(path.stem, scans, notes, dropped, options)
+
+
+def _poses_beside(path: Path) -> Path | None:
+    """The file of poses that is called as the points are."""
+    beside = (path.with_suffix(suffix) for suffix in TEXTS)
+    return next((file for file in beside if is_file(file) and is_trajectory(file)), None)
+
+
+def _origin(trajectory: TimedPoses) -> NDArray[np.float64]:
+    """What to subtract from coordinates, (3,): the first position in whole metres if it is far, else 0."""
+    first = np.rint(trajectory.poses[0, :3, 3])
+    return first if np.abs(first).max() > NEAR_ORIGIN_M else np.zeros(3)
+
+
+def _groups(
+    path: Path, times: NDArray[np.float64], seconds: float
+) -> Sequence[tuple[int, NDArray[np.int64]]]:
+    """The points of each scan that has some, in the order of time, and its number. Raises DatasetError for
+    times that are none."""
+    if len(times) == 0:
+        raise DatasetError(f"{path}: contains no point")
+    if not np.isfinite(times).all() or (times.max() - times.min()) / seconds > _MOST_SCANS:
+        raise DatasetError(
+            f"{path}: its gps_time goes from {times.min():g} to {times.max():g} s, which is no time"
+        )
+    order = np.argsort(times, kind="stable")
+    numbers = ((times[order] - times[order[0]]) / seconds).astype(np.int64)
+    ends = np.flatnonzero(np.diff(numbers)) + 1
+    groups = np.split(order, ends)
+    return [(int(numbers[i]), members) for i, members in zip([0, *ends], groups, strict=True)]
+
+
+def _in_lidar_frame(
+    points_m: NDArray[np.float64],
+    members: NDArray[np.int64],
+    origin_m: NDArray[np.float64],
+    T_world_lidar: Pose,
+) -> tuple[NDArray[np.float64], Pose]:
+    """The points of a scan in the lidar's frame, and the lidar's pose in the world that begins at
+    ``origin_m``."""
+    T_lidar_world = inverse(T_world_lidar)
+    return (points_m[members] - origin_m) @ T_lidar_world[:3, :3].T + T_lidar_world[:3, 3], T_world_lidar
+
+
+FORMAT = Format(
+    name="LAS survey",
+    looks_for="*.las or *.laz, with the file of the lidar's poses",
+    recognises=recognises,
+    open=lambda path, options: open_survey(path, "", options),
+    open_with_query=open_survey,
+)
