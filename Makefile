@@ -50,4 +50,6 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[octomap]" 2>/dev/null \
 		|| echo "OctoMap (extra: octomap) has no wheel for this Python: its comparison is left out."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps "ouster-sdk>=1.0" 2>/dev/null \
+		|| echo "ouster-sdk (extra: ouster) has no wheel for this Python: tests of real recordings are left out."
 	@touch $@

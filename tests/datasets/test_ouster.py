@@ -1,6 +1,10 @@
 """Ouster's recordings: the geometry of their beams, poses, and what is said without ouster-sdk."""
 
+import random
+import struct
 import sys
+import zlib
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -109,8 +113,14 @@ def driving() -> NDArray:
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    (tmp_path / "walk.osf").write_bytes(b"scans")
+    (tmp_path / "walk.osf").write_bytes(osf(b"OSF$", b"OSF!", b"OSF#"))
     return tmp_path / "walk.osf"
+
+
+def osf(*names: bytes) -> bytes:
+    """An OSF file of blocks with these names, which hold a few bytes."""
+    blocks = (struct.pack("<II", 28, 20) + name + bytes(range(20)) for name in names)
+    return b"".join(block + struct.pack("<I", zlib.crc32(block)) for block in blocks)
 
 
 def install(monkeypatch: pytest.MonkeyPatch, source: object) -> None:
@@ -217,6 +227,99 @@ def test_without_the_library_the_extra_is_named(recording: Path, monkeypatch: py
     monkeypatch.setitem(sys.modules, "ouster.sdk", None)
     with pytest.raises(DatasetError, match=r"need ouster, .*: pip install 'taichi-mrf\[ouster\]'"):
         open_dataset(recording)
+
+
+WHOLE = osf(b"OSF$", b"OSF!", b"OSF#")
+
+
+@pytest.mark.parametrize(
+    ("data", "problem"),
+    [
+        (b"", "is empty"),
+        (b"scans", "is no OSF file"),
+        (b"x" * 100, "is no OSF file"),
+        (osf(b"OSF$", b"OSF!"), "is cut short: its metadata are missing"),
+        (WHOLE[:-1], "is cut short or damaged: 28 bytes at byte 72 do not fit"),
+        (WHOLE[:80], "is cut short at byte 80"),
+        (WHOLE[:36] + b"\xff\xff\xff\xff" + WHOLE[40:], "4,294,967,295 bytes at byte 36 do not fit"),
+        (WHOLE[:36] + bytes(4) + WHOLE[40:], "is cut short or damaged: 0 bytes at byte 36"),
+        *(
+            (WHOLE[:i] + bytes([WHOLE[i] ^ 4]) + WHOLE[i + 1 :], "checksum of the block")
+            for i in (20, 50, 71, 107)
+        ),
+    ],
+)
+def test_a_damaged_osf_is_refused_before_the_library_reads_it(
+    recording: Path, monkeypatch: pytest.MonkeyPatch, data: bytes, problem: str
+) -> None:
+    install(monkeypatch, AssertionError("the library read it"))
+    recording.write_bytes(data)
+    with pytest.raises(DatasetError, match=problem) as caught:
+        open_dataset(recording)
+    assert str(caught.value).startswith(f"{recording}: ")
+
+
+def pcap(*sizes: tuple[int, int], order: str = "<") -> bytes:
+    """Packets of these sizes, captured and sent."""
+    head = struct.pack(f"{order}IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1)
+    return head + b"".join(struct.pack(f"{order}IIII", 1, 2, *size) + bytes(size[0]) for size in sizes)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_packets_that_are_cut_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, order: str) -> None:
+    install(monkeypatch, Source([STILL]))
+    path = tmp_path / "walk.pcap"
+    whole = pcap((90, 90), (60, 60), order=order)
+    path.write_bytes(whole)
+    assert len(open_dataset(path)) == 1
+    for data, problem in (
+        (b"", "is empty"),
+        (whole[:-1], "is cut short in packet 1"),
+        (whole[:135], "is cut short in packet 1"),
+        (pcap((90, 90), (42, 60), order=order), "packet 1 holds 42 of its 60 bytes"),
+    ):
+        path.write_bytes(data)
+        with pytest.raises(DatasetError, match=problem):
+            open_dataset(path)
+
+
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "empty": lambda data: b"",
+    "cut short": lambda data: data[: len(data) // 2],
+    "noise": lambda data: random.Random(0).randbytes(5000),
+    "no header": lambda data: bytes(100) + data[100:],
+    "a stretch of ones": lambda data: data[:3000] + b"\xff" * 500 + data[3500:],
+    "a bit": lambda data: data[:-50] + bytes([data[-50] ^ 1]) + data[-49:],
+}
+
+
+@pytest.mark.shared_data
+@pytest.mark.parametrize("suffix", [".osf", ".pcap", ".json"])
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_real_recordings_that_are_damaged(
+    shared_data: Path, tmp_path: Path, suffix: str, damage: str
+) -> None:
+    """ouster-sdk ends the process on more than half of all damaged OSF files."""
+    pytest.importorskip("ouster.sdk", reason="reading real recordings needs ouster-sdk")
+    folder, stem = shared_data / "ouster", "OS-0-128-U1_v2.3.0_1024x10"
+    sources = [folder / "osf_fw_3.2_10scans.osf", folder / f"{stem}.pcap", folder / f"{stem}.json"]
+    for source in sources:
+        data = source.read_bytes()
+        (tmp_path / source.name).write_bytes(DAMAGES[damage](data) if source.suffix == suffix else data)
+    path = tmp_path / (sources[0].name if suffix == ".osf" else f"{stem}.pcap")
+    said = None
+    try:
+        dataset = open_dataset(path)
+        for index in range(len(dataset)):
+            dataset.read(index)
+    except DatasetError as error:
+        said = str(error)
+    if said is not None:
+        assert str(path) in said
+        assert "\n" not in said
+    else:  # packets that are damaged are left out, and some words of the metadata do not count
+        assert suffix != ".osf"
+        assert damage in ("cut short", "a stretch of ones", "a bit")
 
 
 @pytest.mark.shared_data

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.lidar.beams import Beams
 from taichi_mrf.datasets.lidar.motion import PoseAt, without_motion
+from taichi_mrf.datasets.lidar.ouster_files import OSF, check_recording
 from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M, SIGMA_ORIGIN, reach_of, refuse_image_options
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
@@ -28,7 +29,7 @@ from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.system.files import check_regular, is_file
 from taichi_mrf.system.libraries import library
 
-SUFFIXES = (".osf", ".pcap")
+SUFFIXES = (OSF, ".pcap")
 STANDS_STILL = "contains no poses: the lidar is assumed to stand still; for one that moves add ?poses=FILE"
 _LONGEST_GAP_S = 1.0
 
@@ -251,6 +252,7 @@ def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
 def _open(path: Path, chosen: OusterOptions) -> tuple[Any, int]:
     sdk = library("ouster.sdk", "recordings of Ouster's lidars need", "ouster", DatasetError)
     more: dict[str, Any] = {"meta": [chosen.meta]} if chosen.meta else {}
+    check_recording(path)
     try:
         source = sdk.open_source(str(path), index=True, **more)
         return source, len(source)
