@@ -11,6 +11,7 @@ from taichi_mrf.inference.keyframe import DepthImage
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import I32, F32Array, F32Array2
 from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.sensor.origins import starts_at
 from taichi_mrf.system import runtime
 
 STRIDE = 2
@@ -70,18 +71,18 @@ def oriented_points(image: DepthImage, max_depth: float) -> OrientedPoints:
     runtime.settle()
     found = np.flatnonzero((depth > 0) & (depth <= max_depth))
     places = np.stack([found % columns, found // columns], axis=1).astype(np.int32)
-    rays = camera.directions(places[:, 0] * STRIDE, places[:, 1] * STRIDE)
-    points = (rays * depth[found, None]).astype(np.float32)
-    return OrientedPoints(points, normals[found], sigmas[found], places)
+    u, v = STRIDE * places.T
+    points = camera.directions(u, v) * depth[found, None] + starts_at(camera, u, v)
+    return OrientedPoints(points.astype(np.float32), normals[found], sigmas[found], places)
 
 
 def _of_free_rays(image: DepthImage, max_depth: float) -> OrientedPoints:
-    rays, depth, sigmas, normals, found = fit_free_planes(image, LARGEST_JUMP, LEAST_SHARE)
+    rays, starts, depth, sigmas, normals, found = fit_free_planes(image, LARGEST_JUMP, LEAST_SHARE)
     cosine = -(normals * rays).sum(axis=-1)
     found &= (depth > 0) & (depth <= max_depth) & (cosine > STEEPEST * np.linalg.norm(rays, axis=-1))
     v, u = np.nonzero(found)
     return OrientedPoints(
-        (rays * depth[..., None])[found].astype(np.float32),
+        (rays * depth[..., None] + starts)[found].astype(np.float32),
         normals[found].astype(np.float32),
         (cosine * sigmas)[found].astype(np.float32),
         np.stack([u, v], axis=1).astype(np.int32),

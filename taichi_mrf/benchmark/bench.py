@@ -158,7 +158,7 @@ def octomap_inserter(voxel_size: float) -> Callable[[Frame], Seconds]:
 
     def insert(frame: Frame) -> Seconds:
         T = frame.T_world_camera
-        points = (frame.camera.rays() * frame.depth_m[..., None].astype(np.float64))[frame.depth_m > 0]
+        points = frame.points_m[frame.depth_m > 0]
         points = np.ascontiguousarray(points @ T[:3, :3].T + T[:3, 3])
         origin = np.ascontiguousarray(T[:3, 3])
         # No largest range, no lazy evaluation, no discretised end points: one ray for each point.

@@ -20,6 +20,7 @@ from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.summary import summarise
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
+from taichi_mrf.sensor.origins import origins_of
 from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.system import runtime
 
@@ -91,9 +92,10 @@ def _camera_words(camera: Camera) -> str:
     size = f"{camera.width} x {camera.height}"
     if isinstance(camera, PinholeCamera):
         return f"{size}, fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g}"
+    moving = "" if origins_of(camera) is None else ", of a sensor that moves during a scan"
     if isinstance(camera, RayTable) and not camera.has_pattern:
-        return f"{camera.width} rays without a pattern"
-    return f"{type(camera).__name__}, {size} rays"
+        return f"{camera.width} rays without a pattern{moving}"
+    return f"{type(camera).__name__}, {size} rays{moving}"
 
 
 def _print_backends(console: Terminal, arch: Arch) -> None:

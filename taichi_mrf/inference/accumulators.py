@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.types import F32, I32, Template
 from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.origins import ball_of
 from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.window import Window
 
@@ -62,16 +63,20 @@ def finest_scale(
     """The largest power of two by which lengths can be scaled before a sum could overflow 31 bits.
 
     A voxel at a distance of D voxels lies in the cone of the sphere around it, and the camera bounds the
-    pixels in a cone.
+    pixels in a cone. If rays start at several places, a ray that meets the sphere is turned from the way
+    between the middles of sphere and places by no more than if both radii were the sphere's.
     ``bricks`` (n, 3) are those that the rays may meet; ``rays`` are counted as the pixels that they stand
     for, squares of ``widest`` pixels a side at most.
     """
-    centre = window.to_voxels(T_world_camera[:3, 3]) + np.asarray(window.lowest) * BRICK
+    middle_m, spread_m = ball_of(camera)
+    centre_m = T_world_camera[:3, :3] @ middle_m + T_world_camera[:3, 3]
+    centre = window.to_voxels(centre_m) + np.asarray(window.lowest) * BRICK
     low = bricks.astype(np.float64) * BRICK
     beside = np.maximum(np.maximum(low - centre, centre - (low + BRICK)), 0.0)
     nearest = float(np.sqrt((beside**2).sum(axis=1)).min()) if len(bricks) else 0.0
     most = float(rays)
-    if nearest > 2.0:
-        radius = math.asin(HALF_VOXEL / (nearest + HALF_VOXEL))  # the distance is that of the voxel's centre
+    sphere = HALF_VOXEL + spread_m / window.voxel_size
+    if nearest > max(2.0, sphere):
+        radius = math.asin(sphere / (nearest + HALF_VOXEL))  # the distance is that of the voxel's centre
         most = min(most, camera.most_pixels_in_cone(radius, widest))
     return 2.0 ** math.floor(math.log2(2**31 / (LONGEST * max(most, 1.0) + 1)))

@@ -19,6 +19,7 @@ from taichi_mrf.inference.ray_list import listed_ray
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.sensor.origins import widened
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat
@@ -106,7 +107,7 @@ def _check_size(crossed: int, surface: int, voxel_size: float, limit_gb: float) 
 def visible_box(
     image: DepthImage, T_world_camera: Pose, max_depth: float, end_sigmas: float, beyond_m: float = 0.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Two corners, in metres, of an upright box around the camera and the ends of all its rays."""
+    """Two corners, in metres, of an upright box around the beginnings and the ends of all rays."""
     farthest = image.farthest.astype(np.float64)
     # Generous: the end of a ray is never further than depth_of_deviation() lets it be, and no patch of
     # the table is worse than the worst.
@@ -120,7 +121,7 @@ def visible_box(
         points = (hulls[:, :, k] * ends[..., None]).reshape(-1, 3)
         corners.append(points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3])
     cloud = np.concatenate(corners)
-    return cloud.min(axis=0), cloud.max(axis=0)
+    return widened(image.camera, T_world_camera, cloud.min(axis=0), cloud.max(axis=0))
 
 
 @dataclass(frozen=True)

@@ -97,10 +97,13 @@ class DepthImage:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of depth, colour and sigmas, and of rays without a pattern, which no other image shares."""
+        """Bytes of depth, colour and sigmas, and of rays that no other image shares: those without a pattern
+        and those of a moving sensor."""
         color = 0 if self.color is None else self.color.nbytes
-        per_pixel = 4 if self.camera.pixels_per_radian > 0 else 4 + 12
-        return self.depth.shape[0] * per_pixel + color + self.own.nbytes
+        origins = getattr(self.camera, "origins_m", None)
+        shared = self.camera.pixels_per_radian > 0 and origins is None
+        starts = 0 if origins is None else origins.nbytes
+        return self.depth.shape[0] * (4 if shared else 4 + 12) + starts + color + self.own.nbytes
 
     def to_numpy(self) -> NDArray[np.float32]:
         """(H, W) axial depth in metres, 0 where there is no measurement."""

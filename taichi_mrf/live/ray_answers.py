@@ -12,6 +12,7 @@ from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel
+from taichi_mrf.sensor.origins import starts_at
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.viewer.messages import RayAnswer
 
@@ -95,7 +96,8 @@ def _answer(
         sigma, bias = image.noise_model(m.noise).table(image.camera).at_pixel(column, row, depth)
         noise = PixelNoise(depth * range_per_depth, bias * range_per_depth, sigma * range_per_depth)
     title = f"{image.name}, pixel ({column}, {row})"
-    start, turned = image.T_world_camera[:3, 3], image.T_world_camera[:3, :3] @ along
+    T = image.T_world_camera
+    start, turned = T[:3, :3] @ starts_at(image.camera, u, v) + T[:3, 3], T[:3, :3] @ along
     answer = _profiled(m, title, start, turned, noise)
     return dataclasses.replace(answer, keyframe=image.keyframe, pixel=(column, row))
 

@@ -54,7 +54,11 @@ def _arrays(camera: Camera) -> dict[str, NDArray]:
     if isinstance(camera, DistortedCamera):
         return {"pinhole": np.array(_row(camera.pinhole)), "distortion": camera.coefficients}
     if isinstance(camera, RayTable):
-        return {"directions" if camera.has_pattern else "free_directions": camera.table}
+        name = "directions" if camera.has_pattern else "free_directions"
+        if camera.origins_m is None:
+            return {name: camera.table}
+        # Another name, so that versions without origins do not read the directions alone.
+        return {f"moving_{name}": camera.table, "origins_m": camera.origins_m}
     raise MapFileError(f"a keyframe's camera of type {type(camera).__name__} cannot be saved")
 
 
@@ -69,7 +73,14 @@ def _read(file: NpzFile, prefix: str) -> Camera:
         return SphericalCamera(*(file.array(prefix + name, "f", (None,)) for name in names))
     if f"{prefix}directions" in file:
         return RayTable(file.array(f"{prefix}directions", "f", (None, None, 3)))
-    return RayTable(file.array(f"{prefix}free_directions", "f", (1, None, 3))[0])
+    if f"{prefix}origins_m" not in file:
+        return RayTable(file.array(f"{prefix}free_directions", "f", (1, None, 3))[0])
+    if f"{prefix}moving_free_directions" in file:
+        free = (f"{prefix}moving_free_directions", f"{prefix}origins_m")
+        return RayTable(*(file.array(name, "f", (1, None, 3))[0] for name in free))
+    directions = file.array(f"{prefix}moving_directions", "f", (None, None, 3))
+    origins_m = file.array(f"{prefix}origins_m", "f", (None, None, 3))
+    return RayTable(directions, origins_m[0] if len(origins_m) == 1 else origins_m)
 
 
 def _row(camera: PinholeCamera) -> list[float]:

@@ -24,6 +24,7 @@ from taichi_mrf.queries.points import checked_points
 from taichi_mrf.queries.view import View
 from taichi_mrf.queries.within import occupied_within, path_collision
 from taichi_mrf.sensor.camera import Camera, check_camera
+from taichi_mrf.sensor.origins import widened
 from taichi_mrf.system import runtime
 from taichi_mrf.system.owner import owned_attribute
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, by_chunk, grid_keys
@@ -184,7 +185,7 @@ class ChunkedViews:
         ends = camera.rays().reshape(-1, 3).astype(np.float64) * max_depth @ T[:3, :3].T + T[:3, 3]
         corners = np.concatenate([ends, T[None, :3, 3]])
         try:
-            part = take_part(self.source, corners.min(axis=0), corners.max(axis=0))
+            part = take_part(self.source, *widened(camera, T, corners.min(axis=0), corners.max(axis=0)))
         except ConfigError:  # there is no surface in view
             return np.full(camera.shape, np.nan, np.float32)
         return part.view.render_depth(camera, T, max_depth)

@@ -27,6 +27,7 @@ from taichi_mrf.queries.survey import SurfaceSurvey
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.noise import NoiseModel
+from taichi_mrf.sensor.origins import points_at
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 
 OUTLIERS = 0.01
@@ -106,5 +107,5 @@ def _passed_surface(survey: SurfaceSurvey, surface_m: NDArray[np.float64]) -> ND
 
 def _points(camera: Camera, T_world_camera: Pose, depth_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """The points in the world, (H, W, 3), at (H, W) depths of a camera's pixels."""
-    points: NDArray[np.float64] = camera.rays() * depth_m[..., None]
+    points = points_at(camera, depth_m)
     return points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]

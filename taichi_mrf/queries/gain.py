@@ -26,6 +26,7 @@ from taichi_mrf.queries.occlusion import occlusion, stopped_share
 from taichi_mrf.queries.ray_space import RaySpace
 from taichi_mrf.queries.survey import OPAQUE
 from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.origins import widened
 from taichi_mrf.sensor.rays import CameraRays
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.traversal import FAR, Space, Viewpoint, clip, pixel_ray, walk_voxels
@@ -70,7 +71,8 @@ def _gain(space: RaySpace, camera: Camera, T_world_camera: Pose, max_depth: floa
     centre_m = T_world_camera[:3, 3]
     ends = camera.rays().reshape(-1, 3) * max_depth
     points = np.concatenate([ends @ T_world_camera[:3, :3].T + centre_m, centre_m[None]])
-    with space.indexed(points.min(axis=0), points.max(axis=0)) as window:
+    box = widened(camera, T_world_camera, points.min(axis=0), points.max(axis=0))
+    with space.indexed(*box) as window:
         view = m.view
         _gain_rays(
             camera.in_kernels(), window.viewpoint(T_world_camera), view.index.space(window), view.pool.belief,

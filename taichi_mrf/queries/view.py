@@ -15,6 +15,7 @@ from taichi_mrf.queries.profile import ProfileArrays, RayProfile, profile_ray
 from taichi_mrf.queries.survey import Answers, Medium, SurfaceSurvey, survey_rays
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseTable
+from taichi_mrf.sensor.origins import widened
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.pool import BrickPool
@@ -79,7 +80,8 @@ class View:
         points = (
             np.concatenate([corners @ T_world_camera[:3, :3].T, np.zeros((1, 3))]) + T_world_camera[:3, 3]
         )
-        window = self.fill(points)
+        box = widened(camera, T_world_camera, points.min(axis=0), points.max(axis=0))
+        window = self.fill(np.stack(box))
         if window is None:
             return survey
         judged = measured_m is not None

@@ -28,6 +28,10 @@ class Camera(Protocol):
     A camera is immutable, equal to another that maps pixels to the same rays, and so is its ``repr``.
     Depth is the parameter of a ray along its direction: axial depth if directions have z = 1, range if they
     have the length 1.
+
+    Rays start at the camera's centre. Those of a camera that moves while it measures start at ``origins_m``
+    and ``origins(u, v)``, which it has as RayTable has them, and its ``in_kernels`` is ``moving`` (rays.py).
+    Such a camera's ``project`` counts depth from there.
     """
 
     @property
@@ -66,7 +70,8 @@ class Camera(Protocol):
 
     def tile_hulls(self, tile: int) -> NDArray[np.float64]:
         """For each square of ``tile`` pixels, (rows, columns, k, 3): directions for one metre of depth whose
-        convex hull, with the camera's centre, holds all points of its rays up to that depth."""
+        convex hull, with the camera's centre, holds all points of its rays up to that depth, if they start
+        there."""
 
     def most_pixels_in_cone(self, half_angle: float, block: int) -> float:
         """A bound on the pixels in a cone of ``half_angle`` radians, wherever it points, and in the square

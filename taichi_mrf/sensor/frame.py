@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.origins import points_at
 from taichi_mrf.sensor.own_evidence import OwnEvidence
 
 if TYPE_CHECKING:
@@ -40,6 +41,12 @@ class Frame:
     noise: "NoiseModel | None" = None
     no_return: NDArray[np.bool_] | None = None
     sensor: str = ""
+
+    @property
+    def points_m(self) -> NDArray[np.float64]:
+        """The points of its pixels in the camera frame, (H, W, 3) metres; those without a depth lie where
+        their ray starts."""
+        return points_at(self.camera, self.depth_m)
 
     @property
     def own(self) -> OwnEvidence:

@@ -3,8 +3,9 @@ measurements.
 
 A kernel takes a ``Sensor`` and asks nothing else about cameras or noise. What can be plugged in:
 
-- a camera: a subclass of ``CameraRays`` with ``direction`` and ``plane`` (rays.py). On the host it is a class
-  that serves ``Camera`` (camera.py), whose ``in_kernels`` makes the bundle;
+- a camera: a subclass of ``CameraRays`` with ``direction`` and ``plane`` (rays.py), and ``origin`` if its
+  rays do not start at its centre. On the host it is a class that serves ``Camera`` (camera.py), whose
+  ``in_kernels`` makes the bundle;
 - noise: a subclass of ``SensorNoise`` with ``at_pixel``, the noise of a pixel (polynomials.py): its ``sigma``
   and ``bias`` at a depth, and their derivatives;
 - another law of measurements: a subclass of ``Sensor`` with its own ``likelihood`` and ``likelihood_beyond``.
@@ -34,10 +35,20 @@ class Sensor(Bundle):
     camera: CameraRays
     noise: SensorNoise
 
+    @property
+    def moving(self) -> bool:
+        """Whether rays have an ``origin`` (CameraRays.moving)."""
+        return self.camera.moving
+
     @ti.func
     def pixel(self, number: I32):
         """Column and row of a pixel from its number, row by row."""
         return self.camera.pixel(number)
+
+    @ti.func
+    def origin(self, u: F32, v: F32):
+        """Where the ray through (u, v) of a moving camera starts, in metres in the camera frame."""
+        return self.camera.origin(u, v)
 
     @ti.func
     def direction(self, u: F32, v: F32):

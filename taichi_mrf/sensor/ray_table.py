@@ -10,7 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import array
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.directions import cone_span, largest_turn, morton_order, most_in_span
+from taichi_mrf.sensor.origins import origins_of, turned
 
 if TYPE_CHECKING:
     from taichi_mrf.sensor.rays import TableRays
@@ -30,12 +32,17 @@ class RayTable:
     those with z = 1. Between pixels directions are linear in column and row, and keep the length 1 if all
     have it. Rays without a pattern, such as those of a point cloud, are an image of one row, and each is cast
     alone, since neighbours in the row may be far from each other.
+
+    A sensor that moves while it measures has ``origins_m``: where its rays start, in the frame of the image's
+    pose. Directions are in that frame too (:meth:`moving`).
     """
 
-    def __init__(self, directions: ArrayLike) -> None:
-        """``directions`` are (H, W, 3), or (N, 3) for rays without a pattern, in the camera frame, kept as
-        float32. Raises ConfigError for other shapes, and for a direction that is not finite or has no
-        length."""
+    def __init__(self, directions: ArrayLike, origins_m: ArrayLike | None = None) -> None:
+        """``directions`` are (H, W, 3), or (N, 3) for rays without a pattern, in the camera frame.
+        ``origins_m``, in metres in the camera frame, are (W, 3) where the rays of a column start at one
+        place, otherwise (H, W, 3), and (N, 3) for rays without a pattern; without them all rays start at the
+        camera's centre, and origins that are all zero are left out. Both are kept as float32. Raises
+        ConfigError for other shapes, for a value that is not finite, and for a direction without a length."""
         given = array(directions, "directions")
         if given.ndim not in (2, 3) or given.shape[-1] != 3 or given.size == 0:
             raise ConfigError(f"directions must be of shape (H, W, 3) or (N, 3), not {given.shape}")
@@ -51,14 +58,52 @@ class RayTable:
         self.measures_range = bool((np.abs(lengths - 1.0) < _UNIT).all())
         """Whether depth is range: all directions have the length 1."""
         self._table.flags.writeable = False
+        self._origins = None if origins_m is None else self._checked_origins(origins_m)
         self._hulls: dict[int, NDArray[np.float64]] = {}
         self._most: dict[int, int] = {}
 
+    def _checked_origins(self, origins_m: ArrayLike) -> NDArray[np.float32] | None:
+        given = array(origins_m, "origins_m")
+        shapes = ((self.width, 3), self._table.shape) if self.has_pattern else ((self.width, 3),)
+        if given.shape not in shapes:
+            expected = " or ".join(map(str, shapes))
+            raise ConfigError(f"origins_m must be of shape {expected}, not {given.shape}")
+        with np.errstate(over="ignore"):
+            origins = np.array(given, np.float32).reshape(-1, self.width, 3)
+        wrong = ~np.isfinite(origins).all(axis=-1)
+        if wrong.any():
+            v, u = np.argwhere(wrong)[0]
+            raise ConfigError(f"the origin of column {u}, row {v} is not finite")
+        origins.flags.writeable = False
+        return origins if origins.any() else None
+
     @classmethod
-    def of_points(cls, points_m: ArrayLike) -> "tuple[RayTable, NDArray[np.float32]]":
+    def moving(cls, camera: Camera, T_camera_column: ArrayLike) -> "RayTable":
+        """The rays of a camera that moves while it measures. ``T_camera_column`` takes points of the frame in
+        which the camera stood when it measured a column to that of the image's pose: (W, 4, 4), or
+        (H, W, 4, 4) where the rows of a column are not measured together. Raises ConfigError for other shapes
+        and for poses that are none."""
+        poses = array(T_camera_column, "T_camera_column")
+        height, width = camera.shape
+        if poses.shape not in ((width, 4, 4), (height, width, 4, 4)):
+            raise ConfigError(
+                f"T_camera_column must be of shape {(width, 4, 4)} or {(height, width, 4, 4)}, "
+                f"not {poses.shape}"
+            )
+        directions, origins = turned(poses, camera.rays(), origins_of(camera))
+        if isinstance(camera, RayTable) and not camera.has_pattern:
+            return RayTable(directions[0], origins.reshape(-1, 3))
+        return RayTable(directions, origins.reshape(-1, 3) if origins.size == 3 * width else origins)
+
+    @classmethod
+    def of_points(
+        cls, points_m: ArrayLike, T_camera_point: ArrayLike | None = None
+    ) -> "tuple[RayTable, NDArray[np.float32]]":
         """The rays to the points (N, 3) of a cloud of unknown pattern, in metres from the sensor, and their
         ranges as an image (1, N). Rays near each other come one after the other; points that are not finite,
-        or at the sensor, are left out. Raises ConfigError if none is left."""
+        or at the sensor, are left out. ``T_camera_point`` (N, 4, 4) are the poses at which a sensor that
+        moves has measured them, in the frame of the image's pose. Raises ConfigError if no point is left, and
+        for poses that are none."""
         points = array(points_m, "points_m")
         if points.ndim != 2 or points.shape[1] != 3:
             raise ConfigError(f"points_m must be of shape (N, 3), not {points.shape}")
@@ -67,8 +112,15 @@ class RayTable:
         if not seen.any():
             raise ConfigError("no point of the cloud has a finite distance from the sensor")
         directions, ranges = points[seen] / ranges[seen, None], ranges[seen]
+        origins = None
+        if T_camera_point is not None:
+            poses = array(T_camera_point, "T_camera_point")
+            if poses.shape != (len(points), 4, 4):
+                raise ConfigError(f"T_camera_point must be of shape {(len(points), 4, 4)}, not {poses.shape}")
+            directions, origins = turned(poses[seen], directions)
         order = morton_order(directions)
-        return RayTable(directions[order]), ranges[order].astype(np.float32)[None]
+        table = RayTable(directions[order], None if origins is None else origins[order])
+        return table, ranges[order].astype(np.float32)[None]
 
     @property
     def width(self) -> int:
@@ -90,16 +142,25 @@ class RayTable:
         """The directions of all pixels as kernels read them, (H, W, 3), read-only."""
         return self._table
 
+    @property
+    def origins_m(self) -> NDArray[np.float32] | None:
+        """Where rays start, (1, W, 3) if all rows share them, otherwise (H, W, 3), in metres in the camera
+        frame, read-only; None if all start at the camera's centre."""
+        return self._origins
+
     @cached_property
     def digest(self) -> str:
         """A text that tells these rays from all others."""
         content = hashlib.blake2b(repr((self.shape, self.has_pattern)).encode(), digest_size=16)
         content.update(self._table.tobytes())
+        if self._origins is not None:
+            content.update(np.broadcast_to(self._origins, self._table.shape).tobytes())
         return content.hexdigest()
 
     def __repr__(self) -> str:
         pattern = "" if self.has_pattern else " without a pattern"
-        return f"<{self.height} x {self.width} rays{pattern}, {self.digest}>"
+        moving = "" if self._origins is None else " of a moving sensor"
+        return f"<{self.height} x {self.width} rays{pattern}{moving}, {self.digest}>"
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, RayTable) and self.digest == other.digest
@@ -108,7 +169,9 @@ class RayTable:
         return hash(self.digest)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return RayTable, (self._table if self.has_pattern else self._table[0],)
+        directions = self._table if self.has_pattern else self._table[0]
+        origins = self._origins
+        return RayTable, (directions, origins if origins is None or len(origins) > 1 else origins[0])
 
     @property
     def up(self) -> tuple[float, float, float]:
@@ -121,7 +184,8 @@ class RayTable:
         without a pattern, which are never taken together."""
         if not self.has_pattern or self._table.size == 3:
             return 0.0
-        return 1.0 / max(_largest_step(self.rays()), 1e-6)
+        at_one_metre = self.rays() if self._origins is None else self._origins + self.rays()
+        return 1.0 / max(_largest_step(at_one_metre), 1e-6)
 
     def rays(self) -> NDArray[np.float64]:
         """Directions of all pixels, (H, W, 3)."""
@@ -130,20 +194,17 @@ class RayTable:
     def directions(self, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
         """Rays through columns and rows that broadcast with each other, (..., 3); those outside the image are
         those of its edge."""
-        columns, lines = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
-        columns, lines = np.clip(columns, 0, self.width - 1), np.clip(lines, 0, self.height - 1)
-        left, top = np.floor(columns).astype(np.intp), np.floor(lines).astype(np.intp)
-        right, bottom = np.minimum(left + 1, self.width - 1), np.minimum(top + 1, self.height - 1)
-        a, b = (columns - left)[..., None], (lines - top)[..., None]
-        rows = [
-            (1 - a) * self._table[row, left].astype(np.float64) + a * self._table[row, right]
-            for row in (top, bottom)
-        ]
-        between = (1 - b) * rows[0] + b * rows[1]
+        between, exact = _interpolated(self._table, u, v)
         if self.measures_range:
             lengths = np.linalg.norm(between, axis=-1, keepdims=True)
-            between = np.where((a > 0) | (b > 0), between / np.maximum(lengths, _SHORTEST), between)
+            between = np.where(exact, between, between / np.maximum(lengths, _SHORTEST))
         return between
+
+    def origins(self, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
+        """Where the rays through columns and rows start, (..., 3) metres in the camera frame; the arguments
+        are those of :meth:`directions`."""
+        origins = np.zeros((1, self.width, 3), np.float32) if self._origins is None else self._origins
+        return _interpolated(np.broadcast_to(origins, self._table.shape), u, v)[0]
 
     def project(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Column, row and depth of the pixels whose rays pass nearest to points (N, 3) of the camera frame,
@@ -151,10 +212,16 @@ class RayTable:
         rays = self.rays().reshape(-1, 3)
         units = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         found = np.full(points_m.shape, np.nan)
+        starts = None if self._origins is None else np.broadcast_to(self._origins, self._table.shape)
         for i, point in enumerate(points_m):
-            along = units @ point
-            pixel = int(np.argmax(along))
-            range_m = float(np.linalg.norm(point))
+            if starts is None:
+                along = units @ point
+                pixel, range_m = int(np.argmax(along)), float(np.linalg.norm(point))
+            else:
+                way = point - starts.reshape(-1, 3)
+                along, ranges = (units * way).sum(axis=1), np.linalg.norm(way, axis=1)
+                pixel = int(np.argmax(along / np.maximum(ranges, _SHORTEST)))
+                range_m = float(ranges[pixel])
             if along[pixel] > range_m * math.cos(self._pixel_radius):
                 v, u = divmod(pixel, self.width)
                 found[i] = u, v, along[pixel] / np.linalg.norm(rays[pixel])
@@ -170,8 +237,10 @@ class RayTable:
 
     def thinned(self, step: int) -> "RayTable":
         """The camera of every ``step``-th column and row."""
-        thin = self._table[::step, ::step]
-        return RayTable(thin if self.has_pattern else thin[0])
+        thin, origins = self._table[::step, ::step], self._origins
+        if origins is not None:
+            origins = origins[::step, ::step] if len(origins) > 1 else origins[0, ::step]
+        return RayTable(thin if self.has_pattern else thin[0], origins)
 
     def tile_hulls(self, tile: int) -> NDArray[np.float64]:
         """For each square of ``tile`` pixels, (rows, columns, 8, 3): the corners of the box around its
@@ -215,14 +284,31 @@ class RayTable:
     @cached_property
     def _in_kernels(self) -> "TableRays":
         from taichi_mrf.kernels.resident import resident
-        from taichi_mrf.sensor.rays import TableRays
+        from taichi_mrf.sensor.rays import MovingTableRays, TableRays
 
-        table = resident(self._table.reshape(-1, 3))
-        return TableRays(self.width, self.height, int(self.measures_range), table)
+        table = self.width, self.height, int(self.measures_range), resident(self._table.reshape(-1, 3))
+        if self._origins is None:
+            return TableRays(*table)
+        return MovingTableRays(*table, resident(self._origins.reshape(-1, 3)), int(len(self._origins) > 1))
 
     def in_kernels(self) -> "TableRays":
         """The camera as kernels take it: a rays.TableRays."""
         return self._in_kernels
+
+
+def _interpolated(
+    table: NDArray[np.float32], u: ArrayLike, v: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """What an (H, W, 3) table has at columns and rows that broadcast with each other, (..., 3), linear
+    between pixels, and which of these are pixels, (..., 1)."""
+    height, width = table.shape[:2]
+    columns, lines = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))
+    columns, lines = np.clip(columns, 0, width - 1), np.clip(lines, 0, height - 1)
+    left, top = np.floor(columns).astype(np.intp), np.floor(lines).astype(np.intp)
+    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    a, b = (columns - left)[..., None], (lines - top)[..., None]
+    rows = [(1 - a) * table[row, left].astype(np.float64) + a * table[row, right] for row in (top, bottom)]
+    return (1 - b) * rows[0] + b * rows[1], (a == 0) & (b == 0)
 
 
 def _largest_step(rays: NDArray[np.float64]) -> float:

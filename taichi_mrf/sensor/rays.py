@@ -22,6 +22,13 @@ class CameraRays(Bundle):
     plane: ClassVar[Any]
     """A ti.func, as PinholeRays has it."""
 
+    origin: ClassVar[Any]
+    """A ti.func, as MovingTableRays has it, if the camera is ``moving``."""
+
+    moving: ClassVar[bool] = False
+    """Whether rays start at places of their own, which ``origin`` gives. Otherwise all start at the camera's
+    centre, and kernels are compiled without ``origin``."""
+
     @ti.func
     def pixel(self, number: I32):
         """Column and row of a pixel from its number, row by row."""
@@ -101,9 +108,50 @@ class TableRays(CameraRays):
         top, bottom = ti.max(0.0, v - 0.5), ti.min(self.height - 1.0, v + 0.5)
         across = (self.direction(right, v) - self.direction(left, v)) / ti.max(right - left, 0.5)
         down = (self.direction(u, bottom) - self.direction(u, top)) / ti.max(bottom - top, 0.5)
+        if ti.static(self.moving):
+            # A step of the origin moves the point of one metre of depth by that much times the inverse depth.
+            shift_u = (self.origin(right, v) - self.origin(left, v)) / ti.max(right - left, 0.5)
+            shift_v = (self.origin(u, bottom) - self.origin(u, top)) / ti.max(bottom - top, 0.5)
+            across += inverse * shift_u
+            down += inverse * shift_v
         normal = across.cross(down)
         volume = ray.dot(normal)
         n = ray * (inverse / ray.dot(ray))
         if ti.abs(volume) > 1e-4 * across.norm() * down.norm() * ray.norm():
             n = (inverse * normal + along_u * down.cross(ray) + along_v * ray.cross(across)) / volume
         return n
+
+
+@dataclass(frozen=True)
+class MovingTableRays(TableRays):
+    """Rays that start at places of their own (ray_table.RayTable with origins). The plane that ``plane``
+    returns is seen from the origin of its pixel."""
+
+    moving: ClassVar[bool] = True
+
+    origins: F32Array2
+    """(W, 3) metres in the camera frame, or (H * W, 3)."""
+
+    of_rows: I32
+    """1 if each row has origins of its own, 0 if they are those of the columns."""
+
+    @ti.func
+    def origin(self, u: F32, v: F32):
+        """Where the ray through column u and row v starts, in metres in the camera frame; between pixels
+        linear in both."""
+        left, top = ti.cast(ti.floor(u), ti.i32), ti.cast(ti.floor(v), ti.i32)
+        a, b = u - left, v - top
+        start = self._start(left, top)
+        if a > 0.0 or b > 0.0:
+            above = start + a * (self._start(left + 1, top) - start)
+            first, second = self._start(left, top + 1), self._start(left + 1, top + 1)
+            below = first + a * (second - first)
+            start = above + b * (below - above)
+        return start
+
+    @ti.func
+    def _start(self, u: I32, v: I32):
+        """The origin of the pixel (u, v), or of the nearest one at the image's edge."""
+        column, row = ti.max(0, ti.min(u, self.width - 1)), ti.max(0, ti.min(v, self.height - 1))
+        i = self.of_rows * row * self.width + column
+        return Vec3(self.origins[i, 0], self.origins[i, 1], self.origins[i, 2])

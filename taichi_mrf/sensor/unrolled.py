@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.sensor.camera import Camera, forwards
+from taichi_mrf.sensor.origins import ball_of, origins_of
 from taichi_mrf.sensor.ray_table import RayTable
 
 RAYS_PER_PIXEL = 3
@@ -23,8 +24,9 @@ ValueT = TypeVar("ValueT", bound=np.generic)
 
 @dataclass(frozen=True)
 class Unrolled:
-    """A picture of a camera's image. ``camera`` has its pixels; ``source`` (H, W) is the number, row by row,
-    of the pixel of the image that each shows, -1 for none."""
+    """A picture of a camera's image. ``camera`` has its pixels, with their origins if the image's camera
+    moves; ``source`` (H, W) is the number, row by row, of the pixel of the image that each shows, -1 for
+    none."""
 
     camera: Camera
     source: NDArray[np.intp]
@@ -44,9 +46,13 @@ def unrolled(camera: Camera) -> Unrolled:
     if camera.pixels_per_radian > 0 or pixels == 1:
         return Unrolled(camera, np.arange(pixels).reshape(camera.shape))
     grid = _Grid.of(camera, max(1, pixels // RAYS_PER_PIXEL))
-    source = np.full(grid.rows * grid.columns, -1, np.intp)
-    source[grid.cells_of(camera.rays().reshape(-1, 3))] = np.arange(pixels)
-    return Unrolled(grid.camera(), source.reshape(grid.rows, grid.columns))
+    shown = np.full(grid.rows * grid.columns, -1, np.intp)
+    shown[grid.cells_of(camera.rays().reshape(-1, 3))] = np.arange(pixels)
+    source, origins = shown.reshape(grid.rows, grid.columns), origins_of(camera)
+    if origins is None:
+        return Unrolled(grid.camera(), source)
+    starts = np.where(source[..., None] >= 0, origins.reshape(-1, 3)[source], ball_of(camera)[0])
+    return Unrolled(RayTable(grid.camera().rays(), starts), source)
 
 
 def covering(camera: Camera, pixels: int) -> RayTable:

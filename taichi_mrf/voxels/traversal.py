@@ -47,7 +47,8 @@ class Viewpoint(Bundle):
     """Where a camera stands in a window (Window.viewpoint)."""
 
     centre: Vec3
-    """The camera's centre, in voxels from the window's corner."""
+    """The camera's centre, in voxels from the window's corner. Rays start there unless the camera is
+    moving."""
 
     to_voxels: Mat3
     """Turns a direction of the camera frame, in metres, into one of the window, in voxels."""
@@ -85,11 +86,27 @@ def make_ray(origin: Vec3, direction: Vec3) -> Ray:
 
 
 @ti.func
+def ray_start(sensor: Template, view: Template, u: F32, v: F32) -> Vec3:
+    """Where the ray of pixel (u, v) starts: the camera's centre, unless the camera moves while it measures
+    (sensor/rays.py)."""
+    start = view.centre
+    if ti.static(sensor.moving):
+        origin = sensor.origin(u, v)
+        start = view.centre + view.to_voxels @ origin
+    return start
+
+
+@ti.func
 def pixel_ray(sensor: Template, view: Template, u: F32, v: F32) -> Ray:
     """The ray of pixel (u, v) of a sensor (sensor/model.py) in a window; t is depth in metres."""
     # A vector with a name of its own: a product with the bare call is compiled to other roundings.
     direction = sensor.direction(u, v)
-    return make_ray(view.centre, view.to_voxels @ direction)
+    # Without origins nothing is left of them, not even a name: copies are compiled to other roundings too.
+    if ti.static(sensor.moving):
+        start = ray_start(sensor, view, u, v)
+        return make_ray(start, view.to_voxels @ direction)
+    else:
+        return make_ray(view.centre, view.to_voxels @ direction)
 
 
 @ti.func

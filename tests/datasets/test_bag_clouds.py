@@ -13,6 +13,7 @@ from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.ros.lidar import LidarBag
 from taichi_mrf.datasets.ros.point_cloud import decode
 from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.sensor.origins import starts_at
 from taichi_mrf.sensor.ray_table import RayTable
 
 
@@ -50,7 +51,7 @@ def test_rings_make_an_image_and_other_points_free_rays(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("unit", ["t", "time", "timestamp"])
-def test_motion_during_a_scan_is_undone(tmp_path: Path, unit: str) -> None:
+def test_each_column_of_a_scan_has_its_pose(tmp_path: Path, unit: str) -> None:
     """Walls that stand still are seen from where the lidar is at the time of each column."""
     seconds = np.tile(np.linspace(-0.04, 0.04, 24), (4, 1))
     where = np.array([pose(stamp(0) + s) @ T_BODY_LIDAR for s in seconds[0]])
@@ -67,15 +68,35 @@ def test_motion_during_a_scan_is_undone(tmp_path: Path, unit: str) -> None:
         send(bag, first, seen, **{unit: times[unit]})
         drive(bag)
     frame = open_dataset(tmp_path / "walk").read(0)
-    found = (frame.camera.rays() * frame.depth_m[..., None]).reshape(-1, 3)
-    T = frame.T_world_camera
-    found = found @ T[:3, :3].T + T[:3, 3]
-    expected = still[~LOST]
-    nearest = np.linalg.norm(found[:, None] - expected[None], axis=-1).min(axis=1)
-    assert nearest.max() < 0.02, "poses are interpolated on chords"
+    T, camera = frame.T_world_camera, frame.camera
+    assert isinstance(camera, RayTable)
+    assert camera.has_pattern
+    np.testing.assert_array_equal(frame.no_return, LOST)
+    found = frame.points_m @ T[:3, :3].T + T[:3, 3]
+    off = np.linalg.norm(found - still, axis=-1)[~LOST]
+    assert off.max() < 0.02, "poses are interpolated on chords"
+    starts = starts_at(camera, np.arange(24), 0) @ T[:3, :3].T + T[:3, 3]
+    np.testing.assert_allclose(starts, where[:, :3, 3], atol=1e-3)
     skewed = open_dataset(f"{tmp_path / 'walk'}?deskew=false").read(0)
     assert skewed.no_return is not None
     np.testing.assert_allclose(skewed.depth_m[~LOST], np.linalg.norm(seen, axis=-1)[~LOST], rtol=1e-5)
+
+
+def test_free_rays_start_where_their_points_were_measured(tmp_path: Path) -> None:
+    flat = points(0)[~LOST][None]
+    seconds = np.linspace(-0.04, 0.04, flat.shape[1], dtype=np.float32)
+    with writing(tmp_path / "walk", "mcap") as bag:
+        send(bag, stamp(0), flat, time=seconds[None])
+        drive(bag)
+    frame = open_dataset(tmp_path / "walk").read(0)
+    assert isinstance(frame.camera, RayTable)
+    assert not frame.camera.has_pattern
+    poses = np.array([pose(stamp(0) + s) @ T_BODY_LIDAR for s in seconds])
+    T, expected = frame.T_world_camera, (poses[:, :3, :3] @ flat[0][..., None])[..., 0] + poses[:, :3, 3]
+    found = (frame.points_m @ T[:3, :3].T + T[:3, 3])[0]
+    off = np.linalg.norm(found[:, None] - expected[None], axis=-1).min(axis=1)
+    assert off.max() < 0.02
+    assert np.ptp(frame.camera.origins_m[..., 0]) > 0.05
 
 
 def test_a_lidar_that_stands_still_keeps_its_image(tmp_path: Path) -> None:

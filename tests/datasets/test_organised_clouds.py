@@ -30,8 +30,10 @@ def test_all_rays_come_back(nothing: float, offsets: NDArray | None) -> None:
     camera = lidar(offsets)
     found = organised(scan(camera, nothing))
     assert found is not None
-    table, range_m, no_return = found
-    np.testing.assert_array_equal(no_return, LOST)
+    image, numbers = found
+    table, range_m = image.camera, image.range_m
+    np.testing.assert_array_equal(image.no_return, LOST)
+    np.testing.assert_array_equal(numbers, np.arange(LOST.size).reshape(LOST.shape))
     np.testing.assert_array_equal(range_m > 0, ~LOST)
     np.testing.assert_allclose(table.rays(), camera.rays(), atol=1e-6)
     np.testing.assert_allclose((table.rays() * range_m[..., None])[~LOST], scan(camera)[~LOST], atol=1e-5)
@@ -46,11 +48,17 @@ def test_rows_that_are_whole_columns_ahead_are_shifted_back() -> None:
     found, plain = organised(staggered), organised(scan(camera))
     assert found is not None
     assert plain is not None
-    rays = found[0].rays()
+    rays = found[0].camera.rays()
     across = np.diff(np.unwrap(np.arctan2(rays[..., 1], rays[..., 0]), axis=0), axis=0)
     assert np.abs(across).max() < 1e-5, "a column has one azimuth"
-    np.testing.assert_array_equal(found[2].sum(axis=1), LOST.sum(axis=1))
-    np.testing.assert_allclose(np.sort(found[1], axis=None), np.sort(plain[1], axis=None))
+    assert found[0].no_return is not None
+    np.testing.assert_array_equal(found[0].no_return.sum(axis=1), LOST.sum(axis=1))
+    ranges = (np.sort(each.range_m, axis=None) for each, _ in (found, plain))
+    np.testing.assert_allclose(*ranges)
+    points, measured = staggered.reshape(-1, 3)[found[1]], found[0].range_m > 0
+    np.testing.assert_allclose(
+        np.linalg.norm(points, axis=-1)[measured], found[0].range_m[measured], rtol=1e-6
+    )
 
 
 def test_a_row_without_a_return_lies_between_its_neighbours() -> None:
@@ -58,7 +66,7 @@ def test_a_row_without_a_return_lies_between_its_neighbours() -> None:
     points[2] = np.nan
     found = organised(points)
     assert found is not None
-    np.testing.assert_allclose(found[0].rays()[2], lidar().rays()[2], atol=1e-6)
+    np.testing.assert_allclose(found[0].camera.rays()[2], lidar().rays()[2], atol=1e-6)
 
 
 def test_points_in_no_order_are_no_image() -> None:
@@ -78,7 +86,8 @@ def test_rings_make_an_image_if_they_are_equally_long() -> None:
     points = scan(lidar())
     ring = np.repeat(np.array([5, 4, 3, 2, 1, 0]), 32)
     order = np.argsort(np.tile(np.arange(32), 6), kind="stable")  # column by column, as drivers write
-    image = by_ring(points.reshape(-1, 3)[order], ring[order])
-    np.testing.assert_array_equal(image, points)
+    numbers = by_ring(points.reshape(-1, 3)[order], ring[order])
+    assert numbers is not None
+    np.testing.assert_array_equal(points.reshape(-1, 3)[order][numbers], points)
     assert by_ring(points.reshape(-1, 3)[1:], ring[1:]) is None
     assert by_ring(points.reshape(-1, 3), np.zeros(192, int)) is None

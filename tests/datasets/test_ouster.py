@@ -18,6 +18,7 @@ from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.lidar.beams import NOMINAL_M, Beams
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import look_at
+from taichi_mrf.sensor.origins import starts_at
 from taichi_mrf.sensor.ray_table import RayTable
 
 ROWS, COLUMNS, N_M = 3, 32, 0.0277
@@ -148,18 +149,25 @@ def test_a_sensor_that_stands_still_gives_images(recording: Path, monkeypatch: p
     assert any("assumed to stand still" in note for note in dataset.notes)
 
 
-def test_poses_of_columns_undo_the_motion(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_columns_start_where_the_sensor_was(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = Source([driving()])
     install(monkeypatch, source)
     frame = open_dataset(recording).read(0)
-    assert isinstance(frame.camera, RayTable)
-    assert not frame.camera.has_pattern
-    T = frame.T_world_camera
-    found = (frame.camera.rays() * frame.depth_m[..., None]).reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
+    T, camera = frame.T_world_camera, frame.camera
+    assert isinstance(camera, RayTable)
+    assert camera.has_pattern
+    assert frame.depth_m.shape == (ROWS, COLUMNS + max(SHIFTS)), "no row has a seam inside"
     expected = points(np.full((ROWS, COLUMNS), 5.0)) @ TURNED[:3, :3].T + [0, 0, 0.04]
     expected += driving()[None, :, :3, 3]
-    nearest = np.linalg.norm(found[:, None] - expected.reshape(1, -1, 3), axis=-1).min(axis=1)
-    assert nearest.max() < N_M
+    found = frame.points_m @ T[:3, :3].T + T[:3, 3]
+    assert frame.no_return is not None
+    assert not frame.no_return.any()
+    for row, shift in enumerate(SHIFTS):
+        own = slice(shift, shift + COLUMNS)
+        assert (frame.depth_m[row] > 0).sum() == (frame.depth_m[row, own] > 0).sum() == COLUMNS
+        assert np.linalg.norm(found[row, own] - expected[row], axis=-1).max() < N_M
+        starts = starts_at(camera, np.arange(COLUMNS) + shift, row) @ T[:3, :3].T + T[:3, 3]
+        np.testing.assert_allclose(starts, driving()[:, :3, 3] + [0, 0, 0.04], atol=2e-3)
     rigid = open_dataset(f"{recording}?deskew=false").read(0)
     assert rigid.no_return is not None
     np.testing.assert_allclose(rigid.T_world_camera[:3, 3], [0.5, 0, 0.04], atol=1e-6)

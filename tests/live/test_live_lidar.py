@@ -9,6 +9,7 @@ from live_scene import FakeLink, finished, session_of
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.origins import points_at, starts_at
 from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.viewer.messages import (
@@ -37,13 +38,22 @@ class Scans(Dataset):
     def read(self, index: int) -> Frame:
         T = np.eye(4)
         T[:3, 3] = 0.5 * index, 0.1, 0.0
-        rays = self.camera.rays()
+        rays, starts = self.camera.rays(), points_at(self.camera, np.zeros(self.camera.shape)) + T[:3, 3]
         with np.errstate(divide="ignore"):
-            range_m = ((np.copysign(HALF_M, rays) - T[:3, 3]) / rays).min(axis=-1).astype(np.float32)
+            range_m = ((np.copysign(HALF_M, rays) - starts) / rays).min(axis=-1).astype(np.float32)
         return Frame(range_m, T, self.camera, float(index), self.frame_names[index])
 
 
-@pytest.mark.parametrize("camera", [LIDAR, RayTable(LIDAR.rays().reshape(-1, 3))], ids=["lidar", "free rays"])
+MOVES = np.tile(np.eye(4), (160, 1, 1))
+MOVES[:, 0, 3] = np.linspace(-0.2, 0.3, 160)
+CAMERAS = {
+    "lidar": LIDAR,
+    "free rays": RayTable(LIDAR.rays().reshape(-1, 3)),
+    "moving lidar": RayTable.moving(LIDAR, MOVES),
+}
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 def test_keyframes_are_shown_unrolled_and_answer_clicks(camera: Camera) -> None:
     link = FakeLink()
     session = session_of(link, Scans("scans", camera))
@@ -62,9 +72,10 @@ def test_keyframes_are_shown_unrolled_and_answer_clicks(camera: Camera) -> None:
     assert images.measured.shape[1] > 2 * images.measured.shape[0]
     assert images.score.startswith("right ")
 
-    u, v = (55, 20) if camera is LIDAR else (20 * 160 + 55, 0)
+    u, v = (55, 20) if camera.height > 1 else (20 * 160 + 55, 0)
     frame = session_scan(camera, 1)
-    point = frame.T_world_camera[:3, 3] + 0.15 * camera.rays()[v, u]
+    start = frame.T_world_camera[:3, 3] + starts_at(camera, u, v)
+    point = start + 0.15 * camera.rays()[v, u]
     link.ask(PixelRay(1, float(u), float(v)), RayThrough(tuple(point.tolist()), (0.0, 0.0, 3.0), 1))
     finished(session)
     by_number, by_place = link.of_type(RayAnswer)
@@ -72,6 +83,7 @@ def test_keyframes_are_shown_unrolled_and_answer_clicks(camera: Camera) -> None:
         assert answer.pixel == (u, v)
         assert answer.measured_m == pytest.approx(float(frame.depth_m[v, u]))
         np.testing.assert_allclose(answer.direction, camera.rays()[v, u], atol=1e-6)
+        np.testing.assert_allclose(answer.origin, start, atol=1e-6)
 
 
 def session_scan(camera: Camera, index: int) -> Frame:

@@ -28,7 +28,12 @@ PINHOLE = PinholeCamera(16, 12, 14.0, 14.0, 7.5, 5.5)
 TABLE = RayTable(PinholeCamera(12, 10, 9.0, 9.0, 5.0, 5.0).rays())
 FREE = RayTable(LIDAR.rays().reshape(-1, 3)[::3])
 BENT = DistortedCamera(PINHOLE, (0.05, -0.01, 0.002, 0.001, 0.0))
-CAMERAS: tuple[Camera, ...] = (LIDAR, PINHOLE, TABLE, FREE, LIDAR, BENT)
+MOVES = np.tile(np.eye(4), (12, 40, 1, 1))
+MOVES[..., 0, 3] = np.linspace(-0.2, 0.2, 40) + 0.001 * np.arange(12)[:, None]
+MOVING = RayTable.moving(LIDAR, MOVES[0])
+STAGGERED = RayTable.moving(LIDAR, MOVES)
+MOVING_FREE = RayTable.moving(FREE, MOVES.reshape(-1, 4, 4)[::3])
+CAMERAS: tuple[Camera, ...] = (LIDAR, PINHOLE, TABLE, FREE, LIDAR, BENT, MOVING, STAGGERED, MOVING_FREE)
 
 
 def build(m: Any, cameras: tuple[Camera, ...] = CAMERAS) -> Any:
@@ -81,7 +86,13 @@ def test_a_map_of_pinholes_is_readable_by_earlier_versions(tmp_path: Path) -> No
         ("camera_0_azimuths_rad", np.full(40, np.nan), "camera_0_azimuths_rad holds a value"),
         ("camera_2_directions", np.zeros((10, 12, 3), np.float32), "column 0, row 0"),
         ("camera_3_free_directions", np.ones((1, 5, 3), np.float32), "keyframe_depth_3"),
-        ("keyframe_camera_numbers", np.array([0, 1, 2, 9, 0, 0]), "camera_9_free_directions is missing"),
+        (
+            "keyframe_camera_numbers",
+            np.array([0, 1, 2, 9, 0, 0, 5, 6, 7]),
+            "camera_9_free_directions is missing",
+        ),
+        ("camera_5_origins_m", np.zeros((2, 40, 3), np.float32), "origins_m must be of shape"),
+        ("camera_7_origins_m", np.zeros((0, 160, 3), np.float32), "camera_7_origins_m is"),
     ],
 )
 def test_a_damaged_camera_is_named(tmp_path: Path, name: str, value: NDArray[Any], words: str) -> None:

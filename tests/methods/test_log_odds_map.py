@@ -129,7 +129,7 @@ def counted(
     window, cells = footprint.window, footprint.crossed
     integrator.index.fill(window, cells, np.arange(len(cells), dtype=np.int32))
     count_rays(
-        footprint.ends, window.viewpoint(T).centre, integrator.index.space(window), integrator.tally,
+        footprint.ends, footprint.starts, integrator.index.space(window), integrator.tally,
         every_ray,
     )  # fmt: skip
     tally = integrator.tally.to_numpy()

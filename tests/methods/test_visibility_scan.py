@@ -271,8 +271,8 @@ def follow_row(
     noise = PolynomialNoise((sigma,), (bias,)).table(camera)
     scan.follow(
         np.array([measured], np.float32), noise.sensor(camera),
-        window.viewpoint(T), index.space(window), scan.RayLimits(VOXEL, max_depth, max_range, *RULES),
-        scan.SeenVoxels(hidden, visible, inside),
+        window.viewpoint(T), index.space(window), scan.OccludedFromCentre(hidden),
+        scan.RayLimits(VOXEL, max_depth, max_range, *RULES), scan.SeenVoxels(hidden, visible, inside),
     )  # fmt: skip
     out = np.zeros(length * VOXELS, np.float32), np.zeros(length * VOXELS, np.float32)
     _floats(visible, out[0])

@@ -10,6 +10,8 @@ import pytest
 from taichi_mrf.geometry.poses import as_pose, look_at
 from taichi_mrf.geometry.up import up_of, up_vector
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
+from taichi_mrf.sensor.origins import points_at
+from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.sensor.spherical import SphericalCamera
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, KeyframeInfo, RayAnswer, pack_log_odds
 from taichi_mrf.viewer.scene.coloring import legend_html, scale_of, voxel_colors
@@ -181,6 +183,23 @@ def test_a_click_on_a_ring_finds_the_pixel_on_its_near_side() -> None:
     above = T[:3, 3] + T[:3, :3] @ (0.0, 0.0, 1.0)  # no ray goes straight up or down
     assert first_pixel(above, T[:3, 3] - above, [keyframe(3, T, LIDAR)]) is None
     assert first_pixel(eye, eye - point, [keyframe(3, T, LIDAR)]) is None
+
+
+def test_a_click_on_what_a_moving_lidar_saw_finds_the_pixel() -> None:
+    T, poses = look_at((1.0, 2.0, 0.5), (2.0, 3.0, 0.5)), np.tile(np.eye(4), (60, 1, 1))
+    poses[:, 0, 3] = np.linspace(-0.3, 0.5, 60)
+    moving = RayTable.moving(LIDAR, poses)
+    at = points_at(moving, np.full(moving.shape, RING_M))[4, 45]
+    point = T[:3, :3] @ at + T[:3, 3]
+    eye = point + T[:3, :3] @ (2.0 * LIDAR.rays()[4, 45] + (0.1, -0.2, 0.1))
+    hit = first_pixel(eye, point - eye, [keyframe(3, T, moving)])
+    assert hit is not None
+    assert (hit.keyframe, hit.u, hit.v) == (3, 45, 4)
+    assert hit.point is not None
+    np.testing.assert_allclose(hit.point, point, atol=1e-6)
+    seen = moving.project((T[:3, :3].T @ (hit.point - T[:3, 3]))[None])[0]
+    np.testing.assert_allclose(seen, [45, 4, RING_M], atol=1e-5)
+    assert first_pixel(eye, eye - point, [keyframe(3, T, moving)]) is None
 
 
 @pytest.mark.parametrize(("reach", "ends"), [(np.pi, 0), (1.0, 2)])

@@ -7,6 +7,7 @@ follows from the others: the elevation of its row, and the azimuth of its column
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.lidar.motion import Scan
 from taichi_mrf.datasets.lidar.scans import measured_points
 from taichi_mrf.sensor.ray_table import RayTable
 
@@ -17,11 +18,10 @@ _NEIGHBOURS = 1.5
 """How many columns nine tenths of the pixels may lie from where row and column say."""
 
 
-def organised(
-    points_m: NDArray[np.floating],
-) -> tuple[RayTable, NDArray[np.float32], NDArray[np.bool_]] | None:
-    """The camera of points (H, W, 3) in the sensor's frame, their ranges (H, W), 0 for none, and the pixels
-    (H, W) that got nothing back. None if neighbours in the image are no neighbours in space.
+def organised(points_m: NDArray[np.floating]) -> tuple[Scan, NDArray[np.intp]] | None:
+    """The image of points (H, W, 3) in the sensor's frame, where pixels without a point got nothing back, and
+    the number, row by row, of each pixel's point, (H, W). None if neighbours in the image are no neighbours
+    in space.
 
     Rows that are ahead of others by whole columns, as some drivers write them, are shifted back.
     """
@@ -39,6 +39,7 @@ def organised(
     if found is None:
         return None
     columns, ahead, step = found
+    number = np.arange(height * width).reshape(height, width)
     shifts = np.rint(ahead / step).astype(int)
     if np.any(shifts != shifts[0]):
         if abs(abs(step) * width - 2 * np.pi) > 0.5 * abs(step) * np.abs(shifts).max() + 0.05:
@@ -46,7 +47,7 @@ def organised(
         place = (np.arange(width)[None, :] - shifts[:, None]) % width
         picked = np.arange(height)[:, None], place
         measured, range_m, directions = measured[picked], range_m[picked], directions[picked]
-        elevation, azimuth = elevation[picked], azimuth[picked]
+        elevation, azimuth, number = elevation[picked], azimuth[picked], number[picked]
         found = _azimuths(azimuth)
         if found is None:
             return None
@@ -62,19 +63,20 @@ def organised(
         -1,
     )
     rays[measured] = directions[measured]
-    return RayTable(rays), np.where(measured, range_m, 0.0).astype(np.float32), ~measured
+    return Scan(RayTable(rays), np.where(measured, range_m, 0.0).astype(np.float32), ~measured), number
 
 
-def by_ring(points_m: NDArray[np.floating], ring: NDArray[np.integer]) -> NDArray[np.floating] | None:
-    """Points (N, 3) as an image (H, W, 3) with a row for each ring, the highest first; None if the rings have
-    different numbers of points."""
+def by_ring(points_m: NDArray[np.floating], ring: NDArray[np.integer]) -> NDArray[np.intp] | None:
+    """The numbers of points (N, 3) as an image (H, W) with a row for each ring, the highest first; None if
+    the rings have different numbers of points."""
     rings, counts = np.unique(ring, return_counts=True)
     if len(rings) < 2 or np.any(counts != counts[0]):
         return None
-    image = points_m[np.argsort(ring, kind="stable")].reshape(len(rings), counts[0], 3)
+    numbers = np.argsort(ring, kind="stable").reshape(len(rings), counts[0])
+    image = points_m[numbers]
     with np.errstate(invalid="ignore", divide="ignore"):
         height = np.nanmedian(image[..., 2] / np.linalg.norm(image, axis=-1), axis=1)
-    return image[np.argsort(-height, kind="stable")]
+    return numbers[np.argsort(-height, kind="stable")]
 
 
 def _azimuths(azimuth: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], float] | None:

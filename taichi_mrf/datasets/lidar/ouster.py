@@ -3,8 +3,7 @@
 The fields of :class:`OusterOptions` are the options. Poses are those in the recording (OSF files that a SLAM
 has written have one for each column) or in a file of ``stamp tx ty tz qx qy qz qw`` lines, by the stamps of
 the sensor; without either the sensor is assumed to stand still. A scan is an image of beams and columns; if
-the sensor moved meanwhile, its points are taken to where they were measured (motion.py) and become free rays.
-Reading needs the extra ``ouster``.
+the sensor moved meanwhile, each column has a pose of its own (motion.py). Reading needs the extra ``ouster``.
 """
 
 from collections.abc import Sequence
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.lidar.beams import Beams
-from taichi_mrf.datasets.lidar.motion import PoseAt, without_motion
+from taichi_mrf.datasets.lidar.motion import Motion, PoseAt, Scan
 from taichi_mrf.datasets.lidar.ouster_files import OSF, check_recording
 from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M, SIGMA_ORIGIN, reach_of, refuse_image_options
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
@@ -25,7 +24,6 @@ from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError, said
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.system.files import check_regular, is_file
 from taichi_mrf.system.libraries import library
 
@@ -49,7 +47,7 @@ class OusterOptions:
     """Which sensor of a recording with several, from 0."""
 
     deskew: bool = True
-    """Undo the motion of the sensor during a scan."""
+    """Give each column of a scan the sensor's pose at its time."""
 
 
 @dataclass(frozen=True)
@@ -125,21 +123,17 @@ class OusterScans(Dataset):
         measured = range_m > 0
         if not measured.any():
             raise DatasetError("none of its pixels is a measurement")
+        looked = self.beams.shifted(np.broadcast_to(columns.valid, range_m.shape))
+        image = Scan(self.beams.camera, range_m, looked & ~measured)
         if self.deskew and not self.tracked:
-            points_m = self.beams.camera.rays()[measured] * range_m[measured, None]
-            stamps = self.beams.shifted(np.broadcast_to(columns.stamps, range_m.shape))[measured]
 
             def lidar_at(stamp: float) -> Pose | None:
                 T = at(stamp)
                 return None if T is None else T @ self.beams.T_sensor_lidar
 
-            moved = without_motion(points_m, stamps - scan.stamp, scan.stamp, T_world_lidar, lidar_at)
-            if moved is not None:
-                table, range_m = RayTable.of_points(moved)
-                return Frame(range_m, T_world_lidar, table, scan.stamp, name)
-        looked = self.beams.shifted(np.broadcast_to(columns.valid, range_m.shape))
-        no_return = looked & ~measured
-        return Frame(range_m, T_world_lidar, self.beams.camera, scan.stamp, name, no_return=no_return)
+            seconds = self.beams.shifted(np.broadcast_to(columns.stamps - scan.stamp, range_m.shape))
+            image = Motion(scan.stamp, T_world_lidar, lidar_at).of_image(image, seconds, looked) or image
+        return Frame(image.range_m, T_world_lidar, image.camera, scan.stamp, name, no_return=image.no_return)
 
     def _poses(self, columns: "Columns") -> PoseAt:
         """The sensor's pose at any time of a scan."""

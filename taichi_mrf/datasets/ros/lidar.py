@@ -2,8 +2,7 @@
 
 A cloud that is an image of beams and columns, or whose rings can be put together to one, becomes an image,
 whose pixels without a return are known; any other becomes free rays. Where each point has a time, and the
-lidar moved meanwhile, points are taken to where they were measured, by the poses at their times, and back
-into the lidar's frame at the stamp of the scan.
+lidar moved meanwhile, each ray starts where the lidar was at that time.
 """
 
 from collections.abc import Sequence
@@ -13,14 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
-from taichi_mrf.datasets.lidar.motion import PoseAt, without_motion
+from taichi_mrf.datasets.lidar.motion import Motion, PoseAt, Scan
 from taichi_mrf.datasets.lidar.organised import by_ring, organised
 from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M, SIGMA_ORIGIN, measured_points, reach_of
 from taichi_mrf.datasets.ros.point_cloud import Cloud, decode
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.ray_table import RayTable
 
@@ -83,12 +81,9 @@ class LidarBag(Dataset):
         if not measured.any():
             raise FrameError(f"frame {name}: {where}: none of {measured.size} points is a measurement")
         pose = self.poses[index]
-        moved = None
-        if self.at is not None and cloud.seconds is not None:
-            parts = cloud.points_m[measured], cloud.seconds[measured]
-            moved = without_motion(*parts, entry.stamp, pose, self.at)
-        camera, range_m, no_return = _rays(cloud) if moved is None else _free(moved)
-        return Frame(range_m, pose, camera, entry.stamp, name, no_return=no_return)
+        motion = None if self.at is None else Motion(entry.stamp, pose, self.at)
+        scan = _image(cloud, motion) or _free(cloud, motion)
+        return Frame(scan.range_m, pose, scan.camera, entry.stamp, name, no_return=scan.no_return)
 
     def look_at_first(self) -> None:
         """Set camera, reach and notes from the first cloud that can be read. Raises DatasetError, which says
@@ -108,19 +103,26 @@ class LidarBag(Dataset):
         raise DatasetError(f"{self.name}: no cloud can be read: {problem}") from problem
 
 
-Rays = tuple[Camera, NDArray[np.float32], "NDArray[np.bool_] | None"]
+def _image(cloud: Cloud, motion: Motion | None) -> Scan | None:
+    """The image of a cloud with rows or rings, None for any other."""
+    points = cloud.points_m.reshape(-1, 3)
+    numbers: NDArray[np.intp] = np.arange(len(points)).reshape(cloud.points_m.shape[:2])
+    if len(cloud.points_m) == 1 and cloud.ring is not None:
+        rings = by_ring(points, cloud.ring[0])
+        numbers = numbers if rings is None else rings
+    found = organised(points[numbers])
+    if found is None:
+        return None
+    scan, order = found
+    if motion is None or cloud.seconds is None:
+        return scan
+    seconds = cloud.seconds.reshape(-1)[numbers.reshape(-1)[order]]
+    return motion.of_image(scan, seconds, (scan.range_m > 0) & np.isfinite(seconds)) or scan
 
 
-def _rays(cloud: Cloud) -> Rays:
-    """The image of a cloud, or its free rays."""
-    image: NDArray[np.floating] = cloud.points_m
-    if image.shape[0] == 1 and cloud.ring is not None:
-        rings = by_ring(image[0], cloud.ring[0])
-        image = image if rings is None else rings
-    found = organised(image)
-    return _free(cloud.points_m.reshape(-1, 3)) if found is None else found
-
-
-def _free(points_m: NDArray[np.float64]) -> Rays:
-    table, range_m = RayTable.of_points(points_m[measured_points(points_m)])
-    return table, range_m, None
+def _free(cloud: Cloud, motion: Motion | None) -> Scan:
+    """A cloud as free rays."""
+    measured, poses = measured_points(cloud.points_m), None
+    if motion is not None and cloud.seconds is not None:
+        poses = motion.poses(cloud.seconds[measured])
+    return Scan(*RayTable.of_points(cloud.points_m[measured], poses), None)

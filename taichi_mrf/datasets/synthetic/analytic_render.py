@@ -8,6 +8,7 @@ from taichi_mrf.datasets.synthetic.analytic_scene import KINDS, Scene
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.types import F32, I32, AnyArray, Mat3, Template, Vec3, Vec4
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
+from taichi_mrf.sensor.origins import origins_of
 
 BOX, SPHERE = KINDS.index("box"), KINDS.index("sphere")
 NOTHING = 1e30
@@ -45,8 +46,10 @@ def ray_depths(scene: Scene, camera: Camera, T_world_camera: Pose) -> NDArray[np
     nothing. As for :func:`render`, Taichi has to run, and the camera has to be outside of every solid."""
     directions = camera.rays().reshape(-1, 3) @ T_world_camera[:3, :3].T
     depth_m = np.zeros(len(directions), dtype=np.float32)
-    eye = ti.Vector(T_world_camera[:3, 3].tolist())
-    _cast_rays(scene.geometry, directions.astype(np.float32), eye, depth_m)
+    origins = origins_of(camera)
+    starts = np.zeros((1, 3)) if origins is None else np.broadcast_to(origins, (*camera.shape, 3))
+    eyes = starts.reshape(-1, 3) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    _cast_rays(scene.geometry, directions.astype(np.float32), eyes.astype(np.float32), depth_m)
     return depth_m.reshape(camera.shape)
 
 
@@ -223,10 +226,12 @@ def _cast(
 def _cast_rays(
     geometry: AnyArray,  # (solids, 10), as Scene.geometry
     directions: AnyArray,  # (N, 3) in the world
-    camera_in_world: Vec3,
+    eyes: AnyArray,  # (N, 3) in the world, or (1, 3) for all
     depth_m: AnyArray,  # (N,)
 ):
     for ray in depth_m:
         direction = ti.Vector([directions[ray, 0], directions[ray, 1], directions[ray, 2]])
-        t, i = _nearest(geometry, camera_in_world, direction)
+        at = ti.min(ray, eyes.shape[0] - 1)
+        eye = ti.Vector([eyes[at, 0], eyes[at, 1], eyes[at, 2]])
+        t, i = _nearest(geometry, eye, direction)
         depth_m[ray] = ti.select(i >= 0, t, 0.0)

@@ -54,7 +54,7 @@ class LogOddsMap(RecursiveMap[RayFootprint]):
         return self._integrator.reach(image, T_world_camera)
 
     def _integrate(self, scan: Scan[RayFootprint]) -> None:
-        self._integrator.integrate(scan.footprint, scan.T_world_camera, scan.slots, self._pool)
+        self._integrator.integrate(scan.footprint, scan.slots, self._pool)
 
     @property
     def _scratch_bytes(self) -> int:

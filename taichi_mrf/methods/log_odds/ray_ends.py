@@ -1,19 +1,52 @@
 """The ends of a scan's rays: at the measured points, at the end of the range, or once per voxel."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import taichi as ti
+from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import DepthImage
-from taichi_mrf.kernels.bundles import kernel
+from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, Template, Vec3, Vec4
 from taichi_mrf.sensor.model import Sensor
-from taichi_mrf.voxels.traversal import Viewpoint
+from taichi_mrf.sensor.origins import origins_of
+from taichi_mrf.voxels.traversal import Viewpoint, ray_start
 from taichi_mrf.voxels.window import Window
 
 NO_RAY, FREE_END, HIT = -1.0, 0.0, 1.0
 """Fourth component of a ray's end: no measurement; the ray was cut off and only marks free space; a surface
 was measured here."""
+
+
+@dataclass(frozen=True)
+class OneStart(Bundle):
+    """All rays start at the camera's centre."""
+
+    centre: Vec3
+    """Voxels from the window's corner."""
+
+    @ti.func
+    def of(self, ray: I32) -> Vec3:
+        """Where a ray starts."""
+        return self.centre
+
+
+@dataclass(frozen=True)
+class OwnStarts(Bundle):
+    """Each ray starts at a place of its own, since the camera moves while it measures."""
+
+    places: F32Array2
+    """(n, 3) voxels from the window's corner."""
+
+    @ti.func
+    def of(self, ray: I32) -> Vec3:
+        """Where a ray starts."""
+        return Vec3(self.places[ray, 0], self.places[ray, 1], self.places[ray, 2])
+
+
+Starts = OneStart | OwnStarts
 
 
 def ray_ends(
@@ -25,40 +58,54 @@ def ray_ends(
     max_range: float = 0.0,
     discretise: bool = False,
     correct_bias: bool = False,
-) -> "ti.Ndarray":
+) -> "tuple[ti.Ndarray, Starts]":
     """The ends of an image's rays, (n, 4) float32: the place in voxels from the window's corner, and the kind
-    of end.
+    of end; and where the rays start.
 
     ``correct_bias`` subtracts the sensor's bias. Measurements beyond the axial ``max_depth`` (metres) are cut
     off there. ``discretise`` keeps one ray to the centre of each voxel that contains an end (OctoMap's
-    computeDiscreteUpdate); otherwise there is one ray per pixel. Rays longer than the Euclidean ``max_range``
-    (metres, 0 for no limit) are then cut off there.
+    computeDiscreteUpdate), from where the first of its rays starts; otherwise there is one ray per pixel.
+    Rays longer than the Euclidean ``max_range`` (metres, 0 for no limit) are then cut off there.
     """
     view = window.viewpoint(T_world_camera)
+    starts: Starts = OneStart(view.centre)
     ends = ti.ndarray(ti.f32, (image.camera.width * image.camera.height, 4))
     _find_ends(image.depth, image.sensor, view, max_depth, ends, correct_bias)
+    origins = origins_of(image.camera)
+    if origins is not None:
+        places = origins @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+        starts = OwnStarts(ti.ndarray(ti.f32, (ends.shape[0], 3)))
+        every = np.broadcast_to(window.to_voxels(places), (*image.camera.shape, 3)).reshape(-1, 3)
+        starts.places.from_numpy(every.astype(np.float32))
     if discretise:
-        ends = _once_a_voxel(ends)
+        ends, kept = _once_a_voxel(ends)
+        if isinstance(starts, OwnStarts):
+            every = starts.places.to_numpy()[kept]
+            starts = OwnStarts(ti.ndarray(ti.f32, every.shape))
+            starts.places.from_numpy(every)
     if max_range > 0:
-        _cut_off(ends, view.centre, max_range / window.voxel_size)
-    return ends
+        _cut_off(ends, starts, max_range / window.voxel_size)
+    return ends, starts
 
 
-def _once_a_voxel(ends: "ti.Ndarray") -> "ti.Ndarray":
-    """The centres of the voxels that contain ends, (n, 4): each once for hits and once for cut-off rays."""
+def _once_a_voxel(ends: "ti.Ndarray") -> "tuple[ti.Ndarray, NDArray[np.intp]]":
+    """The centres of the voxels that contain ends, (n, 4): each once for hits and once for cut-off rays; and
+    the number of the first ray of each, (n,)."""
     every = ends.to_numpy()
-    every = every[every[:, 3] >= 0]
-    once = np.array([[0.0, 0.0, 0.0, NO_RAY]], np.float32)
+    rays = np.flatnonzero(every[:, 3] >= 0)
+    every = every[rays]
+    once, kept = np.array([[0.0, 0.0, 0.0, NO_RAY]], np.float32), np.zeros(1, np.intp)
     if len(every):
         voxels = np.floor(every).astype(np.int64)
         lowest = voxels.min(axis=0)
         shape = tuple((voxels.max(axis=0) - lowest + 1).tolist())
-        keys = np.unique(np.ravel_multi_index(tuple((voxels - lowest).T), shape))
+        keys, first = np.unique(np.ravel_multi_index(tuple((voxels - lowest).T), shape), return_index=True)
+        kept = rays[first]
         once = (np.stack(np.unravel_index(keys, shape), axis=1) + lowest).astype(np.float32)
         once[:, :3] += 0.5
     result = ti.ndarray(ti.f32, once.shape)
     result.from_numpy(once)
-    return result
+    return result, kept
 
 
 @ti.func
@@ -93,17 +140,17 @@ def _find_ends(
                 surface = sensor.surface_depth(surface, sensor.noise_at(u, v))
             kind = HIT if surface <= max_depth else FREE_END
         direction = sensor.direction(u, v)  # with a name, as in traversal.pixel_ray
-        end = view.centre + view.to_voxels @ direction * ti.min(surface, max_depth)
+        start = ray_start(sensor, view, u, v)
+        end = start + view.to_voxels @ direction * ti.min(surface, max_depth)
         put_end(ends, pixel, end, kind)
 
 
-@ti.kernel
-def _cut_off(ends: F32Array2, centre: Vec3, longest: F32):
-    """Cut off rays that are longer than ``longest`` voxels. ``ends`` (n, 4) as in :func:`_find_ends`;
-    ``centre`` is the camera's, in voxels."""
+@kernel
+def _cut_off(ends: F32Array2, starts: Starts, longest: F32) -> None:
+    """Cut off rays that are longer than ``longest`` voxels. ``ends`` (n, 4) as in :func:`_find_ends`."""
     for i in range(ends.shape[0]):
-        end = end_of(ends, i)
-        way = Vec3(end[0], end[1], end[2]) - centre
+        end, start = end_of(ends, i), starts.of(i)
+        way = Vec3(end[0], end[1], end[2]) - start
         if end[3] >= 0.0 and way.norm() > longest:
-            near = centre + way * (longest / way.norm())
+            near = start + way * (longest / way.norm())
             put_end(ends, i, near, FREE_END)

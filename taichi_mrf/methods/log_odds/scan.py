@@ -33,8 +33,9 @@ from taichi_mrf.kernels.types import (
     Vec4,
 )
 from taichi_mrf.methods.log_odds.plug import LogOddsConfig
-from taichi_mrf.methods.log_odds.ray_ends import HIT, end_of, ray_ends
+from taichi_mrf.methods.log_odds.ray_ends import HIT, OneStart, Starts, end_of, ray_ends
 from taichi_mrf.methods.recursive_update import updated
+from taichi_mrf.sensor.origins import widened
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, VOXELS
@@ -46,9 +47,10 @@ from taichi_mrf.voxels.window import Window, WindowIndex
 
 @dataclass(frozen=True)
 class RayFootprint(Footprint):
-    """A footprint with the ends of the rays that made it (see ray_ends.py)."""
+    """A footprint with the ends and starts of the rays that made it (see ray_ends.py)."""
 
     ends: ti.Ndarray
+    starts: Starts
 
 
 class ScanIntegrator:
@@ -72,35 +74,36 @@ class ScanIntegrator:
         config, centre_m = self.config, T_world_camera[:3, 3]
         lower_m, upper_m = visible_box(image, T_world_camera, self.max_depth, end_sigmas=0.0)
         if config.max_range > 0:
-            lower_m = np.maximum(lower_m, centre_m - config.max_range)
-            upper_m = np.minimum(upper_m, centre_m + config.max_range)
+            reach = widened(
+                image.camera, T_world_camera, centre_m - config.max_range, centre_m + config.max_range
+            )
+            lower_m, upper_m = np.maximum(lower_m, reach[0]), np.minimum(upper_m, reach[1])
         # One voxel more: the centre of a voxel may lie further out than the measurement in it.
         lower_m, upper_m = lower_m - self.voxel_size, upper_m + self.voxel_size
         window = window_around(lower_m, upper_m, self.voxel_size, self.volume)
         if window is None or image.rays == 0:
             window, nothing = Window.covering(centre_m, centre_m, self.voxel_size), np.zeros(0, np.int32)
-            return RayFootprint(window, nothing, nothing, 1, ti.ndarray(ti.f32, (1, 4)))
-        ends = ray_ends(
+            start = OneStart(window.viewpoint(T_world_camera).centre)
+            return RayFootprint(window, nothing, nothing, 1, ti.ndarray(ti.f32, (1, 4)), start)
+        ends, starts = ray_ends(
             image, T_world_camera, window, max_depth=self.max_depth, max_range=config.max_range,
             discretise=config.discretise, correct_bias=config.correct_bias,
         )  # fmt: skip
         marks = np.zeros(window.cells, np.int32)
         box = window.clip_box(self.volume.lower, self.volume.upper)
-        _mark(ends, window.viewpoint(T_world_camera).centre, window.shape_vector, *box, marks)
+        _mark(ends, starts, window.shape_vector, *box, marks)
         crossed = np.flatnonzero(marks).astype(np.int32)
         self._reserve(len(crossed))
-        return RayFootprint(window, crossed, crossed, 1, ends)
+        return RayFootprint(window, crossed, crossed, 1, ends, starts)
 
-    def integrate(
-        self, footprint: RayFootprint, T_world_camera: Pose, slots: NDArray[np.int32], pool: BrickPool
-    ) -> None:
+    def integrate(self, footprint: RayFootprint, slots: NDArray[np.int32], pool: BrickPool) -> None:
         """Update the log-odds of the voxels that a scan's rays cross; ``slots`` (n,) are the crossed
         bricks."""
         config, window, n = self.config, footprint.window, len(slots)
         every_ray = config.update == "ray"
         self.index.fill(window, footprint.crossed, np.arange(n, dtype=np.int32))
         count_rays(
-            footprint.ends, window.viewpoint(T_world_camera).centre,
+            footprint.ends, footprint.starts,
             self.index.space(window, self.volume.lower, self.volume.upper), self.tally, every_ray,
         )  # fmt: skip
         self.index.clear(window, footprint.crossed)
@@ -153,9 +156,9 @@ def _mark_brick(state: Template, marked: Template, ray: Template, brick: IVec3, 
     return 1
 
 
-@ti.kernel
-def _mark(ends: F32Array2, centre: Vec3, shape: IVec3, lower: Vec3, upper: Vec3, marks: I32Array):
-    """Mark the bricks that rays cross, from the camera's ``centre`` to their ``ends`` (n, 4) (ray_ends.py).
+@kernel
+def _mark(ends: F32Array2, starts: Starts, shape: IVec3, lower: Vec3, upper: Vec3, marks: I32Array) -> None:
+    """Mark the bricks that rays cross, from their ``starts`` to their ``ends`` (n, 4) (ray_ends.py).
 
     ``shape`` is the window's size in bricks; ``lower`` and ``upper`` bound the mapped volume in voxels.
     ``marks`` (bricks of the window) is 1 for a brick that is crossed.
@@ -163,7 +166,8 @@ def _mark(ends: F32Array2, centre: Vec3, shape: IVec3, lower: Vec3, upper: Vec3,
     for i in range(ends.shape[0]):
         end = end_of(ends, i)
         if end[3] >= 0.0:
-            ray = make_ray(centre, Vec3(end[0], end[1], end[2]) - centre)
+            start = starts.of(i)
+            ray = make_ray(start, Vec3(end[0], end[1], end[2]) - start)
             t_begin, t_end = 0.0, 1.0
             clip(ray, t_begin, t_end, lower, upper)
             nothing = 0
@@ -206,17 +210,18 @@ def _count(tally: Template, voxel: I32, one: ti.i64, every_ray: Template):
 
 
 @kernel
-def count_rays(ends: F32Array2, centre: Vec3, space: Space, tally: I64Array, every_ray: Template) -> None:
+def count_rays(ends: F32Array2, starts: Starts, space: Space, tally: I64Array, every_ray: Template) -> None:
     """Count hits (upper half of the ``tally``) and misses (lower half) of each voxel, or with ``every_ray``
     off only whether there were any.
 
-    A ray goes from the camera's ``centre`` to its end in ``ends`` (n, 4), both in voxels (ray_ends.py).
+    A ray goes from one of ``starts`` to its end in ``ends`` (n, 4), both in voxels (ray_ends.py).
     ``tally`` is (crossed bricks * 512).
     """
     for i in range(ends.shape[0]):
         end = end_of(ends, i)
         if end[3] >= 0.0:
-            ray = make_ray(centre, Vec3(end[0], end[1], end[2]) - centre)
+            start = starts.of(i)
+            ray = make_ray(start, Vec3(end[0], end[1], end[2]) - start)
             t_begin, t_end = 0.0, 1.0
             clip(ray, t_begin, t_end, space.lower, space.upper)
             voxel = _end_voxel(end)

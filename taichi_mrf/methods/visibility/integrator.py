@@ -40,7 +40,7 @@ class VisibilityIntegrator:
             voxel_size, self.sensor.max_depth, self.max_range,
             visibility.visible_if_occluded, visibility.visible_if_clear, visibility.q_min, visibility.q_max,
         )  # fmt: skip
-        self.index = WindowIndex()
+        self.index, self.crossed = WindowIndex(), WindowIndex()
         self.bundler = RayBundler(voxel_size, InferenceConfig(ray_density=0.0))  # every pixel
         self.occluded = ti.ndarray(ti.f32, VOXELS)
         self.visible = ti.ndarray(ti.i32, VOXELS)
@@ -49,7 +49,8 @@ class VisibilityIntegrator:
     @property
     def nbytes(self) -> int:
         """Bytes of the scratch."""
-        return self.occluded.shape[0] * SCRATCH_BYTES + self.index.bricks.shape[0] * 4
+        cells = self.index.bricks.shape[0] + self.crossed.bricks.shape[0]
+        return self.occluded.shape[0] * SCRATCH_BYTES + cells * 4
 
     def reach(self, image: DepthImage, T_world_camera: Pose) -> Footprint:
         """The bricks that a scan's rays cross if everything up to their ends is visible. ``surface`` equals
@@ -90,13 +91,16 @@ class VisibilityIntegrator:
         self.index.fill(window, all_cells[there], in_use[there])
         space = self.index.space(window, self.volume.lower, self.volume.upper)
         visibility_scan.hide(cells, view.centre, space, pool.belief, seen)
-        self.index.clear(window, all_cells[there])
+        occluded: visibility_scan.Occluded = visibility_scan.OccludedFromCentre(self.occluded)
+        if image.sensor.moving:
+            occluded = visibility_scan.OccludedFromRay(space, pool.belief)
 
         # Eqs. 2, 3 and 7: each ray's visibility, and its probability of being inside the measured obstacle.
-        self.index.fill(window, cells, np.arange(len(cells), dtype=np.int32))
-        space = self.index.space(window, self.volume.lower, self.volume.upper)
-        visibility_scan.follow(image.depth, image.sensor, view, space, self.limits, seen)
-        self.index.clear(window, cells)
+        self.crossed.fill(window, cells, np.arange(len(cells), dtype=np.int32))
+        crossed = self.crossed.space(window, self.volume.lower, self.volume.upper)
+        visibility_scan.follow(image.depth, image.sensor, view, crossed, occluded, self.limits, seen)
+        self.crossed.clear(window, cells)
+        self.index.clear(window, all_cells[there])
 
         # Eqs. 4 to 6 and 8: the update of each voxel.
         visibility_scan.update(

@@ -100,9 +100,43 @@ class RayLimits(Bundle):
 
 
 @dataclass(frozen=True)
+class OccludedFromCentre(Bundle):
+    """P(C_v) where all rays start at one place: :func:`hide` has computed it."""
+
+    occluded: F32Array
+    """(crossed bricks * 512)"""
+
+    @ti.func
+    def of(self, voxel: I32, ray: Template, depth: F32) -> F32:
+        """That of a voxel that a ray crosses at a depth."""
+        return self.occluded[voxel]
+
+
+@dataclass(frozen=True)
+class OccludedFromRay(Bundle):
+    """P(C_v) where each ray starts at a place of its own. ``space`` and ``belief`` are those of
+    :func:`hide`."""
+
+    space: Space
+    belief: F32Array
+
+    @ti.func
+    def of(self, voxel: I32, ray: Template, depth: F32) -> F32:
+        """That of a voxel that a ray crosses at a depth."""
+        place = ray.origin + depth * ray.direction
+        cell, start = ti.floor(place, ti.i32), ti.floor(ray.origin, ti.i32)
+        return local_occlusion(cell, start, self.space, self.belief)
+
+
+Occluded = OccludedFromCentre | OccludedFromRay
+
+
+@dataclass(frozen=True)
 class _Followed(Bundle):
     """What a step along a ray reads and writes."""
 
+    ray: Template
+    occluded: Template
     seen: SeenVoxels
     limits: RayLimits
 
@@ -163,8 +197,9 @@ def occupancy(voxel: IVec3, space: Template, belief: Template) -> F32:
 
 @kernel
 def follow(
-    depth: F32Array, sensor: Sensor, view: Viewpoint, space: Space, limits: RayLimits, seen: SeenVoxels
-) -> None:
+    depth: F32Array, sensor: Sensor, view: Viewpoint, space: Space, occluded: Occluded, limits: RayLimits,
+    seen: SeenVoxels,
+) -> None:  # fmt: skip
     """Follow each ray until it is no longer visible, or surely inside the measured obstacle.
 
     ``depth`` is (H * W) metres, 0 without a measurement.
@@ -186,7 +221,7 @@ def follow(
             clip(ray, begin, end, space.lower, space.upper)
 
             beam = Beam(measured, sigma, GRAZED / voxels_per_depth, 1.0, 0)
-            walk_voxels(ray, begin, end, space, _come_through, beam, _Followed(seen, limits))
+            walk_voxels(ray, begin, end, space, _come_through, beam, _Followed(ray, occluded, seen, limits))
 
 
 @ti.func
@@ -195,9 +230,8 @@ def _come_through(beam: Template, followed: Template, voxel: I32, near: F32, far
     seen, limits = followed.seen, followed.limits
     go = 1
     if far - near > beam.grazed:
-        beam.visible = visibility(
-            beam.visible, seen.occluded[voxel], limits.if_occluded, limits.if_clear, limits.q_max
-        )
+        occluded = followed.occluded.of(voxel, followed.ray, 0.5 * (near + far))
+        beam.visible = visibility(beam.visible, occluded, limits.if_occluded, limits.if_clear, limits.q_max)
         if beam.visible < limits.q_min:
             go = 0
         else:

@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.origins import origins_of
 from taichi_mrf.viewer.messages import KeyframeInfo
 from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, RING_M
-from taichi_mrf.viewer.scene.rings import hits_of_sphere
+from taichi_mrf.viewer.scene.rings import hits_of_sphere, on_sphere
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,8 @@ def _pixel_on_sphere(
     keyframe: KeyframeInfo, origin: NDArray[np.float64], direction: NDArray[np.float64]
 ) -> Pixel | None:
     """The nearer of the sphere's sides that has a pixel where the ray, in the camera frame, crosses it."""
+    if origins_of(keyframe.camera) is not None:
+        return _pixel_of_moving(keyframe, origin, direction)
     for range_m in hits_of_sphere(origin, direction, RING_M):
         point = origin + range_m * direction
         u, v, _ = keyframe.camera.project(point[None])[0]
@@ -83,3 +86,22 @@ def _pixel_on_sphere(
             R, t = keyframe.T_world_camera[:3, :3], keyframe.T_world_camera[:3, 3]
             return Pixel(keyframe.id, float(u), float(v), range_m, R @ point + t)
     return None
+
+
+def _pixel_of_moving(
+    keyframe: KeyframeInfo, origin: NDArray[np.float64], direction: NDArray[np.float64]
+) -> Pixel | None:
+    """The pixel that the ray, in the camera frame, passes at no more than about a pixel's width, on the
+    nearer side of what is a sphere if the camera does not move."""
+    points = on_sphere(keyframe.camera, RING_M).reshape(-1, 3).astype(np.float64)
+    range_m = (points - origin) @ direction
+    aside = np.linalg.norm(points - origin - range_m[:, None] * direction, axis=1)
+    width_m = RING_M * np.sqrt(4 * np.pi / len(points))
+    met = np.flatnonzero((range_m > 0) & (aside < width_m))
+    if not len(met):
+        return None
+    near = met[range_m[met] < range_m[met].min() + width_m]
+    best = int(near[np.argmin(aside[near])])
+    v, u = divmod(best, keyframe.camera.width)
+    R, t = keyframe.T_world_camera[:3, :3], keyframe.T_world_camera[:3, 3]
+    return Pixel(keyframe.id, float(u), float(v), float(range_m[best]), R @ points[best] + t)

@@ -4,15 +4,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.origins import origins_of
 
 CLOSED = 3.0
 """The first and the last column meet if their directions differ by less than so many columns."""
 
 
 def on_sphere(camera: Camera, radius_m: float) -> NDArray[np.float32]:
-    """Where the pixels of a camera lie on a sphere around it, (H, W, 3), metres, camera frame."""
-    rays = camera.rays()
-    return (radius_m * rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+    """Where the pixels of a camera lie on a sphere around it, (H, W, 3), metres, camera frame. Each pixel of
+    a moving camera lies as far from where its ray starts."""
+    rays, origins = camera.rays(), origins_of(camera)
+    points = radius_m * rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    return (points if origins is None else points + origins).astype(np.float32)
 
 
 def border(camera: Camera, radius_m: float) -> NDArray[np.float32]:
