@@ -13,6 +13,7 @@ from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.timed_poses import interpolate
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import look_at
+from taichi_mrf.sensor.origins import points_at
 
 COUNT, START = 60, 1000.0
 FIRST, LAST = look_at([0.0, 0, 1], [5.0, 0, 1]), look_at([2.0, 1, 1], [5.0, 3, 2])
@@ -69,8 +70,7 @@ def survey(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 def world_points(dataset: Dataset, index: int) -> np.ndarray:
     """The points of a scan in the world, sorted."""
     frame = dataset.read(index)
-    points = (frame.camera.rays() * frame.depth_m[..., None]).reshape(-1, 3)
-    T = frame.T_world_camera
+    points, T = frame.points_m.reshape(-1, 3), frame.T_world_camera
     world = points @ T[:3, :3].T + T[:3, 3]
     return world[np.lexsort(world.T)]
 
@@ -92,6 +92,10 @@ def test_points_become_scans_from_where_they_were_measured(
         np.testing.assert_allclose(frame.T_world_camera, expected, atol=1e-6)
         world = POINTS[members] + offset_m - origin
         np.testing.assert_allclose(world_points(dataset, i), world[np.lexsort(world.T)], atol=1e-5)
+        starts = points_at(frame.camera, 0 * frame.depth_m)[0] @ expected[:3, :3].T + expected[:3, 3]
+        share = (TIMES[members] - START + 0.05) / 0.45
+        path = (1 - share)[:, None] * FIRST[:3, 3] + share[:, None] * LAST[:3, 3] + offset_m - origin
+        np.testing.assert_allclose(starts[np.argsort(starts[:, 0])], path, atol=1e-5)
     moved = [note for note in dataset.notes if "origin of the world" in note]
     assert bool(moved) == bool(offset_m[0])
 

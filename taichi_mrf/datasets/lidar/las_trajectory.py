@@ -1,9 +1,10 @@
 """A LAS or LAZ file of a whole survey with the path of the lidar: ``survey.laz?poses=FILE``.
 
 Points are in the world's frame, and each has the time at which it was measured (``gps_time``). They are
-grouped into scans of ``seconds`` (a tenth of one). The rays of a scan go from where the lidar was at its
-middle, which is interpolated in a file of ``stamp tx ty tz qx qy qz qw`` lines, by the clock of the points. A
-file beside the points with their name is found by itself.
+grouped into scans of ``seconds`` (a tenth of one). The pose of a scan is that at its middle, and each ray
+goes from where the lidar was at the time of its point, interpolated in a file of
+``stamp tx ty tz qx qy qz qw`` lines, by the clock of the points. A file beside the points with their name is
+found by itself.
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ from taichi_mrf.config.values import check_field
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.lidar.clouds import read_timed_las
 from taichi_mrf.datasets.lidar.scan_poses import TEXTS
-from taichi_mrf.datasets.lidar.scans import SECONDS_PER_SCAN, RecordedScan, lidar_scans
+from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M, SECONDS_PER_SCAN, RecordedScan, lidar_scans
 from taichi_mrf.datasets.options import ReadOptions, parse_options
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
 from taichi_mrf.datasets.trajectories import is_trajectory
@@ -75,7 +76,8 @@ def open_survey(path: Path, query: str, options: ReadOptions) -> Dataset:
             continue
         T_world_lidar[:3, 3] -= origin_m
         read = partial(_in_lidar_frame, points_m, members, origin_m, T_world_lidar)
-        scans.append(RecordedScan(f"{number:06d}", stamp, read, str(path), str(poses_path)))
+        starts = partial(_starts, trajectory, times, members, origin_m, T_world_lidar, gap)
+        scans.append(RecordedScan(f"{number:06d}", stamp, read, str(path), str(poses_path), starts))
     if not scans:
         raise DatasetError(
             f"{path}: none of its {dropped} scans ({times.min():.3f} to {times.max():.3f} s) has poses "
@@ -130,6 +132,23 @@ def _in_lidar_frame(
     ``origin_m``."""
     T_lidar_world = inverse(T_world_lidar)
     return (points_m[members] - origin_m) @ T_lidar_world[:3, :3].T + T_lidar_world[:3, 3], T_world_lidar
+
+
+def _starts(
+    trajectory: TimedPoses,
+    times: NDArray[np.float64],
+    members: NDArray[np.int64],
+    origin_m: NDArray[np.float64],
+    T_world_lidar: Pose,
+    gap: float,
+) -> NDArray[np.float64]:
+    """Where the lidar was when it measured each point of a scan, (n, 3) in its frame at the scan's pose; that
+    pose itself where it was not known, and for all if it moved less than its noise."""
+    poses, known = trajectory.between(times[members], gap)
+    T_lidar_world = inverse(T_world_lidar)
+    starts = (poses[:, :3, 3] - origin_m) @ T_lidar_world[:3, :3].T + T_lidar_world[:3, 3]
+    moved = known & (np.ptp(starts[known], axis=0).max(initial=0.0) > LIDAR_SIGMA_M)
+    return np.where(moved[:, None], starts, 0.0)
 
 
 FORMAT = Format(

@@ -14,7 +14,6 @@ from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.ray_table import RayTable
 
@@ -37,13 +36,15 @@ ScanReader = Callable[[], tuple[NDArray[np.float64], Pose]]
 @dataclass(frozen=True)
 class RecordedScan:
     """One scan of a recording; ``source`` is the file of its points, ``pose_source`` the file, or file and
-    line, of its pose."""
+    line, of its pose. ``starts`` gives the places (N, 3) in the sensor's frame from which the points that it
+    reads were measured, None if that is its pose."""
 
     name: str
     stamp: float
     read: ScanReader
     source: str
     pose_source: str
+    starts: Callable[[], NDArray[np.float64]] | None = None
 
 
 @dataclass
@@ -86,24 +87,28 @@ class LidarScans(Dataset):
         if not 0 <= index < len(self.scans):
             raise IndexError(f"{self.name} has {len(self.scans)} frames, there is no frame {index}")
         scan = self.scans[index]
-        points_m, T_world_sensor = read_scan(scan)
-        table, range_m = RayTable.of_points(points_m)
+        table, range_m, T_world_sensor = read_scan(scan)
         return Frame(range_m, T_world_sensor, table, scan.stamp, scan.name)
 
 
-def read_scan(scan: RecordedScan) -> tuple[NDArray[np.float64], Pose]:
-    """The measured points of a scan in the sensor's frame, (N, 3) with N > 0, and T_world_sensor. Raises
-    FrameError, which names frame and file."""
+def read_scan(scan: RecordedScan) -> tuple[RayTable, NDArray[np.float32], Pose]:
+    """The rays of a scan's measured points, of which there is one, their ranges (1, N), and T_world_sensor.
+    Raises FrameError, which names frame and file."""
     try:
         points_m, T_world_sensor = scan.read()
+        starts_m = np.zeros((1, 3)) if scan.starts is None else scan.starts()
     except KeyframeError as error:
         raise FrameError(f"frame {scan.name}: {scan.pose_source}: {error}") from error
     except DatasetError as error:
         raise FrameError(f"frame {scan.name}: {error}") from error
-    measured = measured_points(points_m)
+    measured = measured_points(points_m - starts_m)
     if not measured.any():
         raise FrameError(f"frame {scan.name}: {scan.source}: none of {len(points_m)} points is a measurement")
-    return points_m[measured], T_world_sensor
+    if scan.starts is None:
+        return *RayTable.of_points(points_m[measured]), T_world_sensor
+    T_sensor_then = np.tile(np.eye(4), (int(measured.sum()), 1, 1))
+    T_sensor_then[:, :3, 3] = starts_m[measured]
+    return *RayTable.of_points((points_m - starts_m)[measured], T_sensor_then), T_world_sensor
 
 
 def measured_points(points_m: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -122,12 +127,11 @@ def lidar_scans(
     problem: FrameError | None = None
     for scan in scans:
         try:
-            points_m, _ = read_scan(scan)
+            camera, range_m, _ = read_scan(scan)
         except FrameError as error:
             problem = problem or error
             continue
-        camera: Camera = RayTable.of_points(points_m)[0]
-        reach_m = reach_of(np.linalg.norm(points_m, axis=1))
+        reach_m = reach_of(range_m)
         return LidarScans(name, camera, list(notes), dropped, scans=scans, reach_m=reach_m)
     raise DatasetError(f"{name}: no scan can be read: {problem}") from problem
 
