@@ -87,6 +87,51 @@ def test_planes_have_the_inverse_depth_that_they_are_made_of(camera: Camera) -> 
     np.testing.assert_allclose(out, normals, atol=1e-4)
 
 
+@kernel
+def _starts(camera: CameraRays, places: F32Array2, out: F32Array2) -> None:
+    for i in range(out.shape[0]):
+        start = camera.origin(places[i, 0], places[i, 1])
+        for axis in ti.static(range(3)):
+            out[i, axis] = start[axis]
+
+
+ORIGINS_M = np.random.default_rng(5).normal(size=(9, 13, 3)).cumsum(axis=1) * 0.0005
+MOVING = pytest.mark.parametrize(
+    "camera",
+    [RayTable(LIDAR.rays(), ORIGINS_M[0]), RayTable(LIDAR.rays(), ORIGINS_M)],
+    ids=["columns", "pixels"],
+)
+
+
+@MOVING
+def test_rays_of_a_moving_camera_start_where_it_says(camera: RayTable) -> None:
+    places = np.random.default_rng(0).uniform((0, 0), (12, 8), (60, 2)).astype(np.float32)
+    places[:30] = places[:30].round()
+    out = np.zeros((60, 3), np.float32)
+    _starts(camera.in_kernels(), places, out)
+    np.testing.assert_allclose(out, camera.origins(*places.T), atol=1e-6)
+
+
+@MOVING
+def test_planes_of_a_moving_camera_are_seen_from_the_pixels_origin(camera: RayTable) -> None:
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(50, 3))
+    u, v = rng.integers(1, 12, 50), rng.integers(1, 8, 50)
+
+    def inverse(du: float, dv: float) -> NDArray[np.float64]:
+        """n . (o + d / inverse) = 1, where o is the way from the pixel's origin."""
+        way = camera.origins(u + du, v + dv) - camera.origins(u, v)
+        return (normals * camera.directions(u + du, v + dv)).sum(axis=1) / (1 - (normals * way).sum(axis=1))
+
+    along_u, along_v = inverse(0.5, 0) - inverse(-0.5, 0), inverse(0, 0.5) - inverse(0, -0.5)
+    slopes = np.stack([u, v, along_u, along_v, inverse(0, 0)], axis=1)
+    out = np.zeros((50, 3), np.float32)
+    _planes(camera.in_kernels(), slopes.astype(np.float32), out)
+    np.testing.assert_allclose(out, normals, atol=6e-3)
+    _planes(LIDAR.in_kernels(), slopes.astype(np.float32), out)
+    assert np.abs(out - normals).max() > 1.8e-2
+
+
 def test_where_directions_do_not_change_a_plane_faces_its_ray() -> None:
     camera = RayTable(np.broadcast_to([0.6, 0.0, 0.8], (2, 3, 3)))
     out = np.zeros((1, 3), np.float32)
