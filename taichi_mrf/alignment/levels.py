@@ -37,8 +37,10 @@ def bounds(
     return world.min(axis=0) - margin, world.max(axis=0) + margin
 
 
-def grids_of(surface: Surfels, coarsest_m: float = COARSEST_M) -> list[SurfelGrid]:
-    """The surface at each level, in cells from at least ``coarsest_m`` metres to the surface's own."""
+def grids_of(surface: Surfels, coarsest_m: float = COARSEST_M, finest_m: float = 0.0) -> list[SurfelGrid]:
+    """The surface at each level, in cells from at least ``coarsest_m`` metres to the surface's own, or the
+    multiple of those that is nearest to ``finest_m``."""
+    surface = surface.coarser(max(1, round(finest_m / surface.cell_size)))
     doublings = max(0, int(np.ceil(np.log2(coarsest_m / surface.cell_size))))
     factors = (2**doublings, 2 ** (doublings // 2), 1)
     return [SurfelGrid(surface.coarser(factor)) for factor in factors]

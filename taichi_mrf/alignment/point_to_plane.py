@@ -70,6 +70,11 @@ class NormalEquations:
         return self.matched / max(1, self.total)
 
     @property
+    def fit(self) -> float:
+        """Share of the points that lie on a surface, by Tukey's measure."""
+        return 1.0 - self.cost / (LARGEST_COST * max(1, self.total))
+
+    @property
     def worth(self) -> float:
         """The factor that turns all points into one measurement with the sigma of a surface, less where few
         of them overlap."""

@@ -1,8 +1,9 @@
 """Tracking a camera without poses: each frame is aligned with the map of the frames before it.
 
 The first frame fixes the map's frame. Each later one is aligned with what the keyframes have measured
-(alignment/locate.py), from two guesses: that the camera stands still, and that it moves on as it did. A
-frame that fits neither is lost; the next one is searched around the last pose that was found, and around the
+(alignment/locate.py), from two guesses: that the camera stands still, and that it moves on as it did. If
+neither fits, the scan of a sensor that sees around is searched for in all headings and metres around. A
+frame that fits nowhere is lost; the next one is searched around the last pose that was found, and around the
 first. There is no loop closure: errors of alignment add up along the way, until the camera sees again what
 it has mapped at the beginning. Poses are kept relative to the keyframe of the moment, so that they follow
 when it is moved.
@@ -13,6 +14,7 @@ from dataclasses import dataclass, field, replace
 
 from taichi_mrf.alignment.locate import Locator
 from taichi_mrf.alignment.se3 import moved, twist
+from taichi_mrf.alignment.wide_search import Around
 from taichi_mrf.config.registry import methods_with
 from taichi_mrf.config.schema import KeyframeConfig, PoseConfig
 from taichi_mrf.errors import ConfigError, LostFrameError
@@ -20,6 +22,7 @@ from taichi_mrf.geometry.poses import Pose, as_pose, inverse
 from taichi_mrf.inference.keyframe import DepthImage, checked_depth
 from taichi_mrf.methods.capabilities import AligningMap, can_refine_poses
 from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.sensor.camera import Camera, sees_around
 from taichi_mrf.sensor.frame import Frame
 
 STEPS = KeyframeConfig(rotation=0.2, translation=0.2)
@@ -32,6 +35,14 @@ REACH_M, REACH_RAD = 0.4, 0.4
 GUESS_M, GUESS_RAD = 0.03, 0.03
 """Standard deviations of guesses along and about each axis. Where depth determines a direction badly, the
 pose is a compromise; with 0.1 the camera's way in the built-in room is wrong by 4.6 cm instead of 2.8."""
+
+AROUND_M, AROUND_LOST_M, MOST_AROUND_M = 4.0, 2.0, 10.0
+"""How far from the last place a sensor that sees around is searched for, how much further for each frame that
+was lost, and at most. A lidar that is carried through a building moves by up to 2.3 m in 1.5 s."""
+
+EXPECTED_M = 1.0
+"""Standard deviation of a place that follows from constant motion, for one frame. A walker who stops or turns
+is 1 to 2 m from there after 1.5 s."""
 
 LONGEST_AHEAD = 3.0
 """A motion is continued for this many times as long as it was observed, at most."""
@@ -113,7 +124,8 @@ class Tracker:
             )
         depth_m = checked_depth(frame.depth_m, frame.camera, m.sensor.min_depth)
         image = DepthImage.upload(depth_m, frame.camera, m.noise, own=frame.own_for(m.sensor))
-        located = self._locator.locate(image, self._guesses(frame.stamp), m.keyframes, self._config)
+        around = self._around(frame.camera, frame.stamp) if sees_around(frame.camera) else None
+        located = self._locator.locate(image, self._guesses(frame.stamp), m.keyframes, self._config, around)
         if located.T_world_camera is None:
             self._lost += 1
             raise LostFrameError(f"{frame.name}: tracking lost: {located.reason}")
@@ -154,15 +166,32 @@ class Tracker:
     def _pose(self, tracked: TrackedFrame) -> Pose:
         return tracked.pose_in(self._map)
 
+    def _ahead(self, stamp: float) -> float | None:
+        """For how many times as long as it was observed the last motion is continued, if it is."""
+        if self._last is None or self._before is None:
+            return None
+        ahead = _ratio(stamp - self._last.stamp, self._last.stamp - self._before.stamp)
+        return ahead if ahead <= LONGEST_AHEAD else None
+
+    def _around(self, camera: Camera, stamp: float) -> Around:
+        """Where a sensor that sees around may be by now."""
+        assert self._last is not None
+        reach_m = min(AROUND_M + AROUND_LOST_M * self._lost, MOST_AROUND_M)
+        T_last = self._pose(self._last)
+        expected_m = T_last[:3, 3]
+        ahead = self._ahead(stamp)
+        if self._before is not None and ahead is not None:
+            expected_m = expected_m + ahead * (expected_m - self._pose(self._before)[:3, 3])
+        return Around(T_last, camera.up, reach_m, expected_m, EXPECTED_M * (1 + self._lost))
+
     def _guesses(self, stamp: float) -> list[Pose]:
         assert self._last is not None
         T_last = self._pose(self._last)
         guesses = [T_last]
-        if self._before is not None:
+        ahead = self._ahead(stamp)
+        if self._before is not None and ahead is not None:
             step = twist(inverse(self._pose(self._before)) @ T_last)
-            ahead = _ratio(stamp - self._last.stamp, self._last.stamp - self._before.stamp)
-            if ahead <= LONGEST_AHEAD:
-                guesses.append(moved(T_last, ahead * step))
+            guesses.append(moved(T_last, ahead * step))
         if self._lost and self._first is not None:
             guesses.append(self._pose(self._first))
         return guesses

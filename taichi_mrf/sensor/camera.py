@@ -227,6 +227,19 @@ def forwards(camera: Camera) -> NDArray[np.float64]:
     return np.array([1.0, 0.0, 0.0] if camera.up[2] else [0.0, 0.0, 1.0])
 
 
+def sees_around(camera: Camera) -> bool:
+    """Whether a camera sees more than about 220 of the 360 degrees around it."""
+    u, v = (np.unique(np.linspace(0, n - 1, 256).round()) for n in (camera.width, camera.height))
+    rays, up = (
+        camera.directions(u[None, :], v[:: max(1, len(v) // 16), None]).reshape(-1, 3),
+        np.array(camera.up),
+    )
+    level = rays - np.outer(rays @ up, up)
+    level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-9)
+    # The mean of directions that fill a sector of the angle w has the length sin(w / 2) / (w / 2).
+    return bool(np.linalg.norm(level.mean(axis=0)) < 0.5)
+
+
 def check_camera(camera: object) -> None:
     """Raise ArgumentTypeError for an argument ``camera`` that is none."""
     instance(camera, Camera, "camera", "a camera such as PinholeCamera")

@@ -1,0 +1,110 @@
+"""Where a scan of a sensor that sees around was taken, if nothing near the guesses will do.
+
+The poses that a wide search proposes are aligned from coarse to fine, fewer at each level. The one that fits
+best counts, unless another place fits almost as well: in a corridor of equal doors a scan may lie at any.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from taichi_mrf.alignment.levels import grids_of, levels_of
+from taichi_mrf.alignment.levenberg import Aligned, align
+from taichi_mrf.alignment.oriented_points import OrientedPoints
+from taichi_mrf.alignment.recorded import Recorded
+from taichi_mrf.alignment.surfels import Surfels
+from taichi_mrf.alignment.wide_search import APART_M, APART_RAD, Around, candidates
+from taichi_mrf.config.schema import PoseConfig
+from taichi_mrf.geometry.poses import Pose, tangent_norms
+
+FIRST_CELLS_M = 0.8
+"""Width of the first level's cells. Surfaces are found up to 1.2 m away, about as far as the search leaves
+points from where they belong."""
+
+FINEST_CELLS_M = 0.2
+"""Width of the last level's cells, unless voxels are wider. A lidar's points are 10 to 40 cm apart at 10 to
+20 m: with cells of 10 cm fewer have a surface near them, and 7 of 59 scans of a real building were lost."""
+
+FREE_M, FREE_RAD = 0.5, 0.2
+"""Standard deviations of the poses that are aligned, along and about each axis: they count only where depth
+tells nothing."""
+
+UNMAPPED = 0.25
+"""What a point without a surface near it counts against a pose, of what one beside a surface does. A scan
+around the corner sees much that is not mapped yet; if that counts as much, places where nothing is new seem
+better: a scan of the building was put 6.5 m from where it was taken."""
+
+SURPRISE = 0.02
+"""By how much better a pose has to fit for each squared spread between it and where it is expected. Without
+it 4 of 51 scans fit two places of that building alike, which are 1 to 6.5 m apart as its doors are; with it
+1."""
+
+CLEARLY = 0.03
+"""By how much the best pose has to fit better than any other."""
+
+LEAST_FIT = 0.35
+"""Share of the points that have to lie on the map. The worst of those 51 scans has 0.59, and of scans up to
+4.5 m ahead of the map 0.39."""
+
+NEAR_M = 0.4
+"""Poses closer than this are one between levels. From 0.5 m off, the second level may end at the next
+door."""
+
+FINER, FINEST = 8, 3
+"""How many poses the second and the third level take."""
+
+
+def found_around(
+    points: OrientedPoints,
+    surface: Surfels,
+    around: Around,
+    guesses: Sequence[Pose],
+    config: PoseConfig,
+    observable: float,
+) -> tuple[Aligned, str]:
+    """The pose in a ``surface`` at which a scan fits best of all ``around``, and why it cannot be relied on,
+    or "". ``guesses`` are tried as well; ``observable`` is that of levenberg.align."""
+    levels = levels_of(points, grids_of(surface, FIRST_CELLS_M, FINEST_CELLS_M))
+    lever_m = float(np.median(np.linalg.norm(points.points, axis=1)))
+    free = replace(config, translation_sigma=FREE_M, rotation_sigma=FREE_RAD)
+
+    def aligned_at(level: int, poses: Sequence[Pose]) -> list[Aligned]:
+        return [align(levels[level], T, Recorded(T, free), lever_m, observable) for T in poses]
+
+    ends = aligned_at(0, candidates(points, surface.planes(), around))
+    # Where depth tells little of the position, what is expected tells more: the same turned, but there.
+    turned = [end.T_world_camera.copy() for end in distinct(ends, around, NEAR_M)[:2]]
+    for T in turned:
+        T[:3, 3] = around.expected_m
+    ends += aligned_at(0, [*turned, *guesses])
+    ends = aligned_at(1, [end.T_world_camera for end in distinct(ends, around, NEAR_M)[:FINER]])
+    ends = aligned_at(2, [end.T_world_camera for end in distinct(ends, around, NEAR_M)[:FINEST]])
+    best, *others = distinct(ends, around, APART_M)
+    fit = best.equations.fit
+    if fit < LEAST_FIT:
+        return best, f"{100 * fit:.0f}% of its points fit the map where it fits best, of all places around"
+    if best.directions < 6:
+        return best, f"its points determine {best.directions} of the six directions of its pose"
+    if others and value(others[0], around) > value(best, around) - CLEARLY:
+        apart_rad, apart_m = tangent_norms(best.T_world_camera, others[0].T_world_camera)
+        return best, f"it fits alike at two places, {apart_m:.1f} m and {apart_rad:.1f} radians apart"
+    return best, ""
+
+
+def value(end: Aligned, around: Around) -> float:
+    """Share of the points that lie on the map, less for a pose that is far from the expected one; points
+    where nothing is mapped count for the most part."""
+    away = np.linalg.norm(end.T_world_camera[:3, 3] - around.expected_m) / around.spread_m
+    unmapped = 1.0 - end.equations.overlap
+    return end.equations.fit + (1.0 - UNMAPPED) * unmapped - SURPRISE * float(away) ** 2
+
+
+def distinct(ends: Sequence[Aligned], around: Around, apart_m: float) -> list[Aligned]:
+    """The best first, without those that are within ``apart_m`` metres of a better one and turned like it."""
+    found: list[Aligned] = []
+    for end in sorted(ends, key=lambda end: -value(end, around)):
+        norms = [tangent_norms(better.T_world_camera, end.T_world_camera) for better in found]
+        if all(turned > APART_RAD or shifted > apart_m for turned, shifted in norms):
+            found.append(end)
+    return found
