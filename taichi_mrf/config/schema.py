@@ -59,7 +59,8 @@ class SensorConfig:
     no_return: Literal["ignore", "free", "model"] = "ignore"
     """What MRFMap concludes where frames name the pixels that got no return: nothing; that the way up to
     ``no_return_depth`` is free; or that each surface on the way has given none by chance, which ``model``
-    gives by ``no_return_share``, ``no_return_depth`` and ``no_return_width``."""
+    gives by ``no_return_share``, ``no_return_depth`` and ``no_return_width``. A log-odds map knows ``free``
+    alone."""
 
     no_return_share: float = 0.3
     """Chance that a near surface gives no return, below 0.5: the share of dark, wet and shiny ones."""

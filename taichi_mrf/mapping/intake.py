@@ -131,8 +131,8 @@ class Intake:
             if is_held_out(number, self._hold_out):
                 self.result.held_out.append(index)
                 return Passed(HELD_OUT.reason, frame)
-        measured = bool((frame.depth_m > 0).any())
-        objection = self._selector.objection(frame.T_world_camera, measured, frame.sensor)
+        tells = frame.tells_anything(self.map.sensor)
+        objection = self._selector.objection(frame.T_world_camera, tells, frame.sensor)
         if objection is not None:
             return Passed(objection, frame)
         self._before_adding(frame)

@@ -37,7 +37,7 @@ class KeyframeSelector:
 
     def objection(self, T_world_camera: Pose, measured: bool, sensor: str = "") -> str | None:
         """Why a frame with this pose, (4, 4), does not become a keyframe; None if it does. ``measured``: its
-        image holds a measurement."""
+        image holds a measurement, or a missing one that counts (Frame.tells_anything)."""
         if not self.wants(T_world_camera, sensor):
             return "too near to a keyframe"
         return None if measured else "no pixel holds a measurement"

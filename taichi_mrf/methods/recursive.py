@@ -105,6 +105,11 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         """Update the log-odds of the voxels that a scan observes (recursive_update.updated)."""
 
     @property
+    def _takes_no_return(self) -> bool:
+        """Whether pixels that got no return change the map."""
+        return False
+
+    @property
     @abstractmethod
     def _scratch_bytes(self) -> int:
         """Bytes of the memory that integration needs besides the voxels."""
@@ -146,7 +151,8 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
         ``T_world_camera`` is (4, 4); ``stamp_s`` is when it was taken, in seconds, by default the number of
         keyframes added before; ``noise`` and ``sigma_m`` are those of MRFMap.add_keyframe, and
-        ``no_return`` is checked and ignored. Returns the keyframe's id.
+        ``no_return`` is checked, and ignored but by a log-odds map with ``sensor.no_return: free``. Returns
+        the keyframe's id.
         Raises KeyframeError for a wrong shape or pose, CapacityError if the map would not fit, ConfigError
         for a ``color`` image: the map has no colours.
         """
@@ -155,7 +161,9 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         T, name = as_pose(T_world_camera), instance(name, str, "name", "a string")
         depth = checked_depth(depth_m, camera, self.sensor.min_depth)
         depth, own = checked_evidence(depth, camera, noise, sigma_m)
-        checked_no_return(no_return, depth_m, camera)
+        missing = checked_no_return(no_return, depth_m, camera)
+        if self._takes_no_return:
+            own = dataclasses.replace(own, no_return=missing)
         if not self._keyframes:
             table = own.noise_model(self.noise, depth).table(camera)
             warn_of_bad_sigma(table, self.sensor.min_depth, self.sensor.max_depth)

@@ -57,3 +57,8 @@ class Frame:
         """The part of it that a map with this configuration takes."""
         sigma_m = self.sigma_m if sensor.pixel_sigma else None
         return OwnEvidence(self.noise, sigma_m, self.no_return if sensor.no_return != "ignore" else None)
+
+    def tells_anything(self, sensor: SensorConfig) -> bool:
+        """Whether it holds a measurement, or a pixel without a return that such a map takes notice of."""
+        missing = self.own_for(sensor).no_return
+        return bool((self.depth_m > 0).any() or (missing is not None and missing.any()))

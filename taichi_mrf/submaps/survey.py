@@ -65,7 +65,7 @@ def survey_frames(task: SurveyTask) -> list[SurveyedFrame]:
             found.append(SurveyedFrame(index, name, None, nowhere, problem=str(error)))
             continue
         T_world_camera, chunks = as_pose(frame.T_world_camera), nowhere
-        measured = bool((frame.depth_m > 0).any())
+        measured = frame.tells_anything(m.sensor)
         if measured:
             parts = (frame.depth_m, T_world_camera, frame.camera, name, frame.stamp)
             id = m.add_keyframe(*parts, **frame.own_for(m.sensor).arguments())

@@ -12,6 +12,8 @@ from taichi_mrf.config.schema import KeyframeConfig
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.mapping.intake import Added, Full, Intake, Lost, Passed, Skipped, UnreadableFrame
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.registry import create_map
+from taichi_mrf.queries.points import FREE
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 
@@ -94,3 +96,21 @@ def test_frames_that_do_not_name_pixels_without_a_return_are_reported_once() -> 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         taken.offer(frames[2])
+
+
+@pytest.mark.parametrize("method", ["mrf", "log_odds"])
+def test_a_frame_of_missing_returns_alone_frees_space_where_they_count(method: str) -> None:
+    frame = sequence().read(0)
+    nothing, everywhere = np.zeros_like(frame.depth_m), np.ones(frame.depth_m.shape, bool)
+    frame = replace(frame, depth_m=nothing, no_return=everywhere)
+    sensor = replace(ALL_FRAMES.sensor, no_return="free", no_return_depth=2.0)
+    config = replace(ALL_FRAMES, method=method)
+    answer = Intake(create_map(config, frame.camera), config).offer(frame)
+    assert isinstance(answer, Passed)
+    assert answer.reason == "no pixel holds a measurement"
+    config = replace(config, sensor=sensor)
+    m = create_map(config, frame.camera)
+    assert isinstance(Intake(m, config).offer(frame), Added)
+    m.infer()
+    ways = frame.camera.rays()[::10, ::10].reshape(-1, 3) @ frame.T_world_camera[:3, :3].T
+    assert (m.state(frame.T_world_camera[:3, 3] + 1.5 * ways) == FREE).all()

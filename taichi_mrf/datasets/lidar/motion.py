@@ -75,11 +75,11 @@ class Motion:
             return None
         order = _in_time(seconds, known)
         if order is None:
-            measured = scan.range_m > 0
-            poses = self.poses(seconds[measured & known])
+            measured = (scan.range_m > 0) & known
+            poses = self.poses(seconds[measured]) if measured.any() else None
             if poses is None:
                 return None
-            points = scan.camera.rays()[measured & known] * scan.range_m[measured & known, None]
+            points = scan.camera.rays()[measured] * scan.range_m[measured, None]
             return Scan(*RayTable.of_points(points, poses), None)
         poses = self.poses(order.seconds)
         if poses is None:

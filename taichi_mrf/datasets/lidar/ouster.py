@@ -100,7 +100,7 @@ class OusterScans(Dataset):
 
     def read(self, index: int) -> Frame:
         """Decode one scan. Raises FrameError, which names frame and file, if it is damaged, has no
-        measurement or no valid pose. Raises IndexError outside 0 to len - 1."""
+        column or no valid pose. Raises IndexError outside 0 to len - 1."""
         if not 0 <= index < len(self.scans):
             raise IndexError(f"{self.name} has {len(self.scans)} frames, there is no frame {index}")
         scan, name = self.scans[index], self.frame_names[index]
@@ -121,8 +121,6 @@ class OusterScans(Dataset):
     ) -> Frame:
         range_m = self.beams.from_centre(self.beams.shifted(columns.range_m))
         measured = range_m > 0
-        if not measured.any():
-            raise DatasetError("none of its pixels is a measurement")
         looked = self.beams.shifted(np.broadcast_to(columns.valid, range_m.shape))
         image = Scan(self.beams.camera, range_m, looked & ~measured)
         if self.deskew and not self.tracked:

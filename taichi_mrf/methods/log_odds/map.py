@@ -15,6 +15,7 @@ from taichi_mrf.methods.brick_map import own_parameters, own_section
 from taichi_mrf.methods.log_odds.plug import METHOD, LogOddsConfig
 from taichi_mrf.methods.log_odds.scan import RayFootprint, ScanIntegrator
 from taichi_mrf.methods.recursive import RecursiveMap, Scan
+from taichi_mrf.sensor.no_return import NoReturnLaw
 from taichi_mrf.sensor.noise import NoiseModel
 
 
@@ -46,9 +47,14 @@ class LogOddsMap(RecursiveMap[RayFootprint]):
 
     def _set_up(self, config: Config, noise: NoiseModel | None) -> None:
         super()._set_up(config, noise)
+        law = NoReturnLaw.of(self.sensor) if self._takes_no_return else None
         self._integrator = ScanIntegrator(
-            self.voxel_size, self.sensor.max_depth, config.log_odds, config.volume
+            self.voxel_size, self.sensor.max_depth, config.log_odds, config.volume, law
         )
+
+    @property
+    def _takes_no_return(self) -> bool:
+        return self.sensor.no_return == "free"
 
     def _reach(self, image: DepthImage, T_world_camera: Pose) -> RayFootprint:
         return self._integrator.reach(image, T_world_camera)

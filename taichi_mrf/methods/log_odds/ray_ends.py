@@ -1,4 +1,8 @@
-"""The ends of a scan's rays: at the measured points, at the end of the range, or once per voxel."""
+"""The ends of a scan's rays: at the measured points, at the end of the range, or once per voxel.
+
+A pixel that got no return has a ray that is free from the sensor's minimum range on, up to where missing
+returns count.
+"""
 
 from dataclasses import dataclass
 
@@ -7,17 +11,19 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.inference.footprint import visible_box
 from taichi_mrf.inference.keyframe import DepthImage
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, Template, Vec3, Vec4
 from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.sensor.no_return import NoReturnLaw
 from taichi_mrf.sensor.origins import origins_of
 from taichi_mrf.voxels.traversal import Viewpoint, ray_start
 from taichi_mrf.voxels.window import Window
 
 NO_RAY, FREE_END, HIT = -1.0, 0.0, 1.0
 """Fourth component of a ray's end: no measurement; the ray was cut off and only marks free space; a surface
-was measured here."""
+was measured here. Between the last two: it marks free space from this share of its length on."""
 
 
 @dataclass(frozen=True)
@@ -58,34 +64,80 @@ def ray_ends(
     max_range: float = 0.0,
     discretise: bool = False,
     correct_bias: bool = False,
+    free: float = FREE_END,
 ) -> "tuple[ti.Ndarray, Starts]":
     """The ends of an image's rays, (n, 4) float32: the place in voxels from the window's corner, and the kind
     of end; and where the rays start.
 
     ``correct_bias`` subtracts the sensor's bias. Measurements beyond the axial ``max_depth`` (metres) are cut
-    off there. ``discretise`` keeps one ray to the centre of each voxel that contains an end (OctoMap's
-    computeDiscreteUpdate), from where the first of its rays starts; otherwise there is one ray per pixel.
-    Rays longer than the Euclidean ``max_range`` (metres, 0 for no limit) are then cut off there.
+    off there, with ends of the kind ``free``. ``discretise`` keeps one ray to the centre of each voxel that
+    contains an end (OctoMap's computeDiscreteUpdate), from where the first of its rays starts; otherwise
+    there is one ray per pixel. Rays longer than the Euclidean ``max_range`` (metres, 0 for no limit) are then
+    cut off there.
     """
     view = window.viewpoint(T_world_camera)
     starts: Starts = OneStart(view.centre)
     ends = ti.ndarray(ti.f32, (image.camera.width * image.camera.height, 4))
-    _find_ends(image.depth, image.sensor, view, max_depth, ends, correct_bias)
+    _find_ends(image.depth, image.sensor, view, max_depth, free, ends, correct_bias)
     origins = origins_of(image.camera)
     if origins is not None:
         places = origins @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-        starts = OwnStarts(ti.ndarray(ti.f32, (ends.shape[0], 3)))
         every = np.broadcast_to(window.to_voxels(places), (*image.camera.shape, 3)).reshape(-1, 3)
-        starts.places.from_numpy(every.astype(np.float32))
+        starts = OwnStarts(_array(every.astype(np.float32)))
     if discretise:
         ends, kept = _once_a_voxel(ends)
         if isinstance(starts, OwnStarts):
-            every = starts.places.to_numpy()[kept]
-            starts = OwnStarts(ti.ndarray(ti.f32, every.shape))
-            starts.places.from_numpy(every)
+            starts = OwnStarts(_array(starts.places.to_numpy()[kept]))
     if max_range > 0:
         _cut_off(ends, starts, max_range / window.voxel_size)
     return ends, starts
+
+
+@dataclass(frozen=True)
+class MissingReturns:
+    """The pixels of an image that got no return, and the law of where that counts. ``image`` gives them a
+    depth beyond its reach."""
+
+    image: DepthImage
+    law: NoReturnLaw
+
+    @staticmethod
+    def of(image: DepthImage, law: NoReturnLaw | None) -> "MissingReturns | None":
+        """Those of an image, None if there are none, or they do not count."""
+        if law is None or image.own.no_return is None:
+            return None
+        depth = np.where(image.own.no_return, np.float32(2 * law.reach_m), np.float32(0.0))
+        return MissingReturns(DepthImage.upload(depth, image.camera, law), law)
+
+    def box(self, T_world_camera: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Two corners, in metres, of a box around the beginnings and the ends of their rays."""
+        return visible_box(self.image, T_world_camera, self.law.reach_m, end_sigmas=0.0)
+
+    def added_to(
+        self, ends: "ti.Ndarray", starts: Starts, T_world_camera: Pose, window: Window, max_range: float
+    ) -> "tuple[ti.Ndarray, Starts]":
+        """The ends and starts of rays, (n, 4), and those of these pixels, (n + m, 4), whose rays are free
+        from the minimum range to the reach of the law, at most to ``max_range``."""
+        law = self.law
+        more, own = ray_ends(
+            self.image, T_world_camera, window, max_depth=law.reach_m, max_range=max_range,
+            free=law.begin_m / law.reach_m,
+        )  # fmt: skip
+        rows = more.to_numpy()
+        kept = rows[:, 3] != NO_RAY
+        both = _array(np.concatenate([ends.to_numpy(), rows[kept]]))
+        if isinstance(starts, OwnStarts) and isinstance(own, OwnStarts):
+            starts = OwnStarts(
+                _array(np.concatenate([starts.places.to_numpy(), own.places.to_numpy()[kept]]))
+            )
+        return both, starts
+
+
+def _array(rows: NDArray[np.float32]) -> "ti.Ndarray":
+    """Rows where kernels can reach them."""
+    array = ti.ndarray(ti.f32, rows.shape)
+    array.from_numpy(rows)
+    return array
 
 
 def _once_a_voxel(ends: "ti.Ndarray") -> "tuple[ti.Ndarray, NDArray[np.intp]]":
@@ -103,15 +155,19 @@ def _once_a_voxel(ends: "ti.Ndarray") -> "tuple[ti.Ndarray, NDArray[np.intp]]":
         kept = rays[first]
         once = (np.stack(np.unravel_index(keys, shape), axis=1) + lowest).astype(np.float32)
         once[:, :3] += 0.5
-    result = ti.ndarray(ti.f32, once.shape)
-    result.from_numpy(once)
-    return result, kept
+    return _array(once), kept
 
 
 @ti.func
 def end_of(ends: Template, ray: I32) -> Vec4:
     """The place and kind of a ray's end."""
     return Vec4(ends[ray, 0], ends[ray, 1], ends[ray, 2], ends[ray, 3])
+
+
+@ti.func
+def free_from(end: Vec4) -> F32:
+    """From which share of its length on a ray counts."""
+    return end[3] if end[3] < HIT else 0.0
 
 
 @ti.func
@@ -124,11 +180,13 @@ def put_end(ends: Template, ray: I32, place: Vec3, kind: F32):
 
 @kernel
 def _find_ends(
-    depth: F32Array, sensor: Sensor, view: Viewpoint, max_depth: F32, ends: F32Array2, correct_bias: Template
-) -> None:
+    depth: F32Array, sensor: Sensor, view: Viewpoint, max_depth: F32, free: F32, ends: F32Array2,
+    correct_bias: Template,
+) -> None:  # fmt: skip
     """The end of each pixel's ray.
 
-    ``depth`` is (H * W) metres, 0 without a measurement. ``ends`` (H * W, 4) receives voxels from the
+    ``depth`` is (H * W) metres, 0 without a measurement. ``free`` is the kind of the ends of rays that are
+    cut off at ``max_depth``. ``ends`` (H * W, 4) receives voxels from the
     window's corner, and the kind of end.
     """
     for pixel in range(depth.shape[0]):
@@ -138,7 +196,7 @@ def _find_ends(
         if surface > 0.0:
             if ti.static(correct_bias):
                 surface = sensor.surface_depth(surface, sensor.noise_at(u, v))
-            kind = HIT if surface <= max_depth else FREE_END
+            kind = HIT if surface <= max_depth else free
         direction = sensor.direction(u, v)  # with a name, as in traversal.pixel_ray
         start = ray_start(sensor, view, u, v)
         end = start + view.to_voxels @ direction * ti.min(surface, max_depth)
@@ -153,4 +211,5 @@ def _cut_off(ends: F32Array2, starts: Starts, longest: F32) -> None:
         way = Vec3(end[0], end[1], end[2]) - start
         if end[3] >= 0.0 and way.norm() > longest:
             near = start + way * (longest / way.norm())
-            put_end(ends, i, near, FREE_END)
+            begin = free_from(end) * (way.norm() / longest)  # the same place on a shorter ray
+            put_end(ends, i, near, begin if begin < 1.0 else NO_RAY)

@@ -1,9 +1,10 @@
 """One scan integrated into independent log-odds, as OctoMap does it (Hornung et al. 2013, section 3.2).
 
 A ray is a miss for every voxel from the camera's up to, but not including, the one in which it ends, and a
-hit for that one if it ends at a measured surface. First the scan's hits and misses are counted for each
-voxel, in the halves of one integer; then they are turned into one change of its log-odds. The result does not
-depend on the order of the rays.
+hit for that one if it ends at a measured surface. With ``sensor.no_return: free`` the ray of a pixel that got
+no return is a miss from the minimum range to ``no_return_depth``. First the scan's hits and misses are
+counted for each voxel, in the halves of one integer; then they are turned into one change of its log-odds.
+The result does not depend on the order of the rays.
 """
 
 import math
@@ -33,8 +34,17 @@ from taichi_mrf.kernels.types import (
     Vec4,
 )
 from taichi_mrf.methods.log_odds.plug import LogOddsConfig
-from taichi_mrf.methods.log_odds.ray_ends import HIT, OneStart, Starts, end_of, ray_ends
+from taichi_mrf.methods.log_odds.ray_ends import (
+    HIT,
+    MissingReturns,
+    OneStart,
+    Starts,
+    end_of,
+    free_from,
+    ray_ends,
+)
 from taichi_mrf.methods.recursive_update import updated
+from taichi_mrf.sensor.no_return import NoReturnLaw
 from taichi_mrf.sensor.origins import widened
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import check_memory
@@ -57,9 +67,12 @@ class ScanIntegrator:
     """Integrates scans. They share one scratch memory, which grows to the largest of them."""
 
     def __init__(
-        self, voxel_size: float, max_depth: float, config: LogOddsConfig, volume: VolumeConfig
-    ) -> None:
+        self, voxel_size: float, max_depth: float, config: LogOddsConfig, volume: VolumeConfig,
+        law: NoReturnLaw | None = None,
+    ) -> None:  # fmt: skip
+        """``law`` says where missing returns are misses, None for nowhere."""
         self.voxel_size, self.max_depth, self.config, self.volume = voxel_size, max_depth, config, volume
+        self.law = law
         self.index = WindowIndex()
         self.tally = ti.ndarray(ti.i64, VOXELS)
         self.tally.fill(0)
@@ -73,6 +86,10 @@ class ScanIntegrator:
         """The bricks that a scan's rays cross. Raises CapacityError if there is not enough memory."""
         config, centre_m = self.config, T_world_camera[:3, 3]
         lower_m, upper_m = visible_box(image, T_world_camera, self.max_depth, end_sigmas=0.0)
+        missing = MissingReturns.of(image, self.law)
+        if missing is not None:
+            free = missing.box(T_world_camera)
+            lower_m, upper_m = np.minimum(lower_m, free[0]), np.maximum(upper_m, free[1])
         if config.max_range > 0:
             reach = widened(
                 image.camera, T_world_camera, centre_m - config.max_range, centre_m + config.max_range
@@ -81,7 +98,7 @@ class ScanIntegrator:
         # One voxel more: the centre of a voxel may lie further out than the measurement in it.
         lower_m, upper_m = lower_m - self.voxel_size, upper_m + self.voxel_size
         window = window_around(lower_m, upper_m, self.voxel_size, self.volume)
-        if window is None or image.rays == 0:
+        if window is None or (image.rays == 0 and missing is None):
             window, nothing = Window.covering(centre_m, centre_m, self.voxel_size), np.zeros(0, np.int32)
             start = OneStart(window.viewpoint(T_world_camera).centre)
             return RayFootprint(window, nothing, nothing, 1, ti.ndarray(ti.f32, (1, 4)), start)
@@ -89,6 +106,8 @@ class ScanIntegrator:
             image, T_world_camera, window, max_depth=self.max_depth, max_range=config.max_range,
             discretise=config.discretise, correct_bias=config.correct_bias,
         )  # fmt: skip
+        if missing is not None:
+            ends, starts = missing.added_to(ends, starts, T_world_camera, window, config.max_range)
         marks = np.zeros(window.cells, np.int32)
         box = window.clip_box(self.volume.lower, self.volume.upper)
         _mark(ends, starts, window.shape_vector, *box, marks)
@@ -168,7 +187,7 @@ def _mark(ends: F32Array2, starts: Starts, shape: IVec3, lower: Vec3, upper: Vec
         if end[3] >= 0.0:
             start = starts.of(i)
             ray = make_ray(start, Vec3(end[0], end[1], end[2]) - start)
-            t_begin, t_end = 0.0, 1.0
+            t_begin, t_end = free_from(end), 1.0
             clip(ray, t_begin, t_end, lower, upper)
             nothing = 0
             walk_bricks(ray, t_begin, t_end, shape, marks, False, _mark_brick, nothing, _Marks(shape, marks))
@@ -222,7 +241,7 @@ def count_rays(ends: F32Array2, starts: Starts, space: Space, tally: I64Array, e
         if end[3] >= 0.0:
             start = starts.of(i)
             ray = make_ray(start, Vec3(end[0], end[1], end[2]) - start)
-            t_begin, t_end = 0.0, 1.0
+            t_begin, t_end = free_from(end), 1.0
             clip(ray, t_begin, t_end, space.lower, space.upper)
             voxel = _end_voxel(end)
             state = _Pass(-1)
