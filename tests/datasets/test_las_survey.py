@@ -111,6 +111,15 @@ def test_the_length_of_a_scan_and_the_poses_can_be_named(survey: Any) -> None:
         open_dataset(path)
 
 
+def test_poses_that_are_far_apart_are_enough_near_the_middle_between_them(survey: Any) -> None:
+    """Those of points farther from them than the gap are the scan's."""
+    path = survey(POINTS, np.where(np.arange(COUNT) < 30, START + 0.1749, START + 0.1751))
+    frame = open_dataset(path, max_time_gap=0.226).read(0)
+    assert frame.camera == open_dataset(path, max_time_gap=0.3).read(0).camera
+    world = world_points(open_dataset(path, max_time_gap=0.226), 0)
+    np.testing.assert_allclose(world, POINTS[np.lexsort(POINTS.T)], atol=1e-5)
+
+
 def test_scans_without_a_pose_are_dropped(survey: Any) -> None:
     times = TIMES.copy()
     times[-3:] += 5

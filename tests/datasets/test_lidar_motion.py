@@ -103,6 +103,8 @@ def test_columns_in_no_order_of_time_become_free_rays() -> None:
     every = np.ones(STILL.shape, bool)
     found = check(MOTION.of_image(Scan(STILL, RANGES, None), seconds, every), seconds, every, 2e-2)
     assert not found.camera.has_pattern
+    seconds[:, 1] = 1e9  # a clock that jumps
+    assert not MOTION.of_image(Scan(STILL, RANGES, None), seconds, every).camera.has_pattern  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(

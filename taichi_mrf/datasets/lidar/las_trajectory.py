@@ -144,10 +144,12 @@ def _starts(
 ) -> NDArray[np.float64]:
     """Where the lidar was when it measured each point of a scan, (n, 3) in its frame at the scan's pose; that
     pose itself where it was not known, and for all if it moved less than its noise."""
-    poses, known = trajectory.between(times[members], gap)
+    poses, known = trajectory.between(times[members], 2 * gap)  # a pose within the gap on both sides
+    if not known.any():
+        return np.zeros((len(members), 3))
     T_lidar_world = inverse(T_world_lidar)
     starts = (poses[:, :3, 3] - origin_m) @ T_lidar_world[:3, :3].T + T_lidar_world[:3, 3]
-    moved = known & (np.ptp(starts[known], axis=0).max(initial=0.0) > LIDAR_SIGMA_M)
+    moved = known & (np.ptp(starts[known], axis=0).max() > LIDAR_SIGMA_M)
     return np.where(moved[:, None], starts, 0.0)
 
 

@@ -122,8 +122,10 @@ def _in_time(seconds: NDArray[np.float64], known: NDArray[np.bool_]) -> _Order |
             row[:] = row[nearest] + step * (column - nearest)
         else:
             row[:] = begin + step * column
-    turns = np.rint((times - begin - step * column) / (step * width)).astype(np.intp)
-    place = column + turns * width
+    turns = np.rint((times - begin - step * column) / (step * width))
+    if np.abs(turns).max() > 1:
+        return None
+    place = column + turns.astype(np.intp) * width
     first, last = int(place.min()), int(place.max())
     if last - first + 1 > _WIDEST * width:
         return None
