@@ -15,6 +15,7 @@ from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import DepthImage
 from taichi_mrf.methods.log_odds.map import LogOddsMap
+from taichi_mrf.methods.log_odds.plug import LogOddsConfig
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.visibility.map import VisibilityMap
 from taichi_mrf.queries.contradiction import ray_scores
@@ -38,7 +39,9 @@ LOST = np.random.default_rng(0).random(STILL.shape) < 0.1
 
 MAPS: dict[str, Callable[[], Any]] = {
     "mrf": lambda: MRFMap.from_config(Config(voxel_size=VOXEL, sensor=SENSOR), STILL),
-    "log-odds": lambda: LogOddsMap(VOXEL, NOISE, max_range=2.5),
+    "log-odds": lambda: LogOddsMap.from_config(
+        Config(voxel_size=VOXEL, sensor=SENSOR, log_odds=LogOddsConfig(max_range=2.5)), STILL
+    ),
     "log-odds, discretised": lambda: LogOddsMap(VOXEL, NOISE, discretise=True),
     "visibility": lambda: VisibilityMap(VOXEL, NOISE),
 }
