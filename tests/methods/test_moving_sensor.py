@@ -147,7 +147,7 @@ def test_a_map_moves_rigidly_with_scans_in_motion(
 
 
 def test_what_a_moving_sensor_would_see_is_asked_along_its_rays() -> None:
-    """Rendering, contradictions and gains of a scan that the map does not hold."""
+    """Rendering, contradictions and gains of a scan that the map does not hold, and the surface."""
     still = lidar(64, 256)
     moving = RayTable.moving(still, motion(256))
     m = MRFMap(VOXEL, NOISE)
@@ -161,6 +161,9 @@ def test_what_a_moving_sensor_would_see_is_asked_along_its_rays() -> None:
     assert np.nanmean(np.abs(ray_scores(m, expected, new, moving)) > 3.0) < 0.02
     assert np.nanmean(np.abs(ray_scores(m, expected, new, still)) > 3.0) > 0.1
     assert 0.0 < float(view_gain(m, moving, new, 4.0)) < 1e4
+    off = off_the_walls(m.surface().vertices_m)
+    assert len(off) > 1000
+    assert np.median(off) < 0.01
 
 
 @pytest.mark.parametrize("free", [False, True], ids=["columns", "free rays"])
