@@ -201,7 +201,7 @@ def test_a_misplaced_scan_in_motion_is_put_right() -> None:
 
 
 def test_poses_of_columns_make_a_better_map_than_points_moved_to_one_centre() -> None:
-    scans = [scan(number, 3, lidar(48, 512), 1.0) for number in range(3)]
+    scans = [scan(number, 2, lidar(48, 512), 1.0) for number in range(2)]
     found = {known: score(mapped(scans, known, 0.05), 1) for known in WAYS}
     assert found["columns"].right > found["points"].right > found["nothing"].right + 0.3
     assert found["columns"].wrongly_free < 0.5 * found["points"].wrongly_free
