@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from datasets_recordings import stamped_line
+from point_clouds import las_head
 
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.timed_poses import interpolate
@@ -29,8 +30,7 @@ class LasFile:
 
     def __init__(self, points_m: np.ndarray, times: np.ndarray | None) -> None:
         names = ["X", "Y", "Z", *([] if times is None else ["gps_time"])]
-        self.point_format = SimpleNamespace(size=1, id=0 if times is None else 1, dimension_names=names)
-        self.header = SimpleNamespace(point_count=len(points_m), point_format=self.point_format)
+        self.point_format = SimpleNamespace(id=0 if times is None else 1, dimension_names=names)
         self.xyz, self.gps_time = points_m, times
 
     def __enter__(self) -> "LasFile":
@@ -54,8 +54,8 @@ def survey(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
         poses: str = "walk.txt",
     ) -> Path:
         file = LasFile(points_m + offset_m, times)
-        monkeypatch.setitem(sys.modules, "laspy", SimpleNamespace(open=lambda path: file))
-        (tmp_path / "walk.las").write_bytes(bytes(len(points_m)))
+        monkeypatch.setitem(sys.modules, "laspy", SimpleNamespace(open=lambda stream, closefd: file))
+        (tmp_path / "walk.las").write_bytes(las_head(len(points_m)))
         lines = []
         for stamp, pose in ((START - 0.05, FIRST), (START + 0.4, LAST)):
             T = pose.copy()

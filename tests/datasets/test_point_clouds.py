@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from point_clouds import Walk, lzf, write_pcd, write_ply
+from point_clouds import Walk, las_head, lzf, write_pcd, write_ply
 
 from taichi_mrf.datasets.lidar.clouds import is_cloud, natural, read_cloud
 from taichi_mrf.datasets.lidar.lzf import unpack
@@ -163,10 +163,9 @@ def test_an_npz_without_points_is_refused(
 
 
 class LasFile:
-    """A stand-in for an open file of laspy's, with a header and points."""
+    """A stand-in for an open file of laspy's, and for its points."""
 
-    def __init__(self, count: int) -> None:
-        self.header = SimpleNamespace(point_count=count, point_format=SimpleNamespace(size=20))
+    xyz = POINTS
 
     def __enter__(self) -> "LasFile":
         return self
@@ -174,19 +173,59 @@ class LasFile:
     def __exit__(self, *error: object) -> None:
         pass
 
-    def read(self) -> SimpleNamespace:
-        return SimpleNamespace(xyz=POINTS)
+    def read(self) -> "LasFile":
+        return self
 
 
-@pytest.mark.parametrize(("suffix", "size"), [(".las", 20 * 42), (".laz", 100)])
-def test_las(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, size: int) -> None:
-    monkeypatch.setitem(sys.modules, "laspy", SimpleNamespace(open=lambda path: LasFile(42)))
+@pytest.fixture
+def laspy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "laspy", SimpleNamespace(open=lambda stream, closefd: LasFile()))
+
+
+@pytest.mark.usefixtures("laspy")
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_las(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
-    path.write_bytes(bytes(size))
+    path.write_bytes(las_head(42, suffix == ".laz"))
     np.testing.assert_array_equal(read_cloud(path), POINTS)
-    path.write_bytes(bytes(8))
-    with pytest.raises(DatasetError, match=r"a\.la[sz]: cannot be read: it claims 42 points of 20 bytes"):
+
+
+@pytest.mark.usefixtures("laspy")
+@pytest.mark.parametrize(
+    ("data", "problem"),
+    [
+        (b"", "it is no LAS file, or its header is cut short"),
+        (bytes(500), "it is no LAS file"),
+        (las_head(42)[:100], "its header is cut short"),
+        (las_head(42)[:-1], "it claims 42 points of 28 bytes, more than it can hold"),
+        (las_head(42, count=2**32 - 1), "it claims 4,294,967,295 points"),
+        (las_head(42, records=2**31), "it claims 2,147,483,648 records before its points"),
+        (las_head(42, begin=2**31), "before its points, more than there is room for"),
+        (las_head(42, True, table=2**40), "the table of its chunks is not in the file"),
+        (las_head(42, True, chunks=2**31), "it claims 2,147,483,648 chunks of points"),
+        (las_head(42, True, chunk_points=2**31), "it claims chunks of 2,147,483,648 points"),
+        (las_head(42, True, count=2**30), "it claims 1,073,741,824 points of 28 bytes"),
+    ],
+)
+def test_a_las_that_claims_what_it_cannot_hold_is_refused(tmp_path: Path, data: bytes, problem: str) -> None:
+    path = tmp_path / "a.laz"
+    path.write_bytes(data)
+    with pytest.raises(DatasetError, match=problem) as caught:
         read_cloud(path)
+    assert str(caught.value).startswith(f"{path}: cannot be read: ")
+
+
+def test_a_panic_of_the_unpacker_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class PanicException(BaseException):
+        """What extensions in Rust raise."""
+
+    def panic(stream: object, closefd: bool) -> None:
+        raise PanicException("capacity overflow")
+
+    monkeypatch.setitem(sys.modules, "laspy", SimpleNamespace(open=panic))
+    (tmp_path / "a.las").write_bytes(las_head(3))
+    with pytest.raises(DatasetError, match=r"a\.las: cannot be read, it is damaged: capacity overflow"):
+        read_cloud(tmp_path / "a.las")
 
 
 def test_las_without_its_library_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

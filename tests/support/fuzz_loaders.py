@@ -327,6 +327,18 @@ def _pcds(encoding: str, folder: Path) -> Path:
     return folder
 
 
+def _survey(folder: Path) -> Path:
+    """Not packed: the unpacker of LAZ ends the process on some files whose packed points are damaged."""
+    laspy = import_module("laspy")
+    file = laspy.create(point_format=6, file_version="1.4")
+    file.x, file.y, file.z = WALK.clouds[0].T
+    file.gps_time = np.linspace(0.0, 0.3, len(WALK.clouds[0]))
+    file.write(folder / "walk.las")
+    lines = [stamped_line(stamp, WALK.poses[0]) for stamp in (-0.05, 0.05, 0.15, 0.25, 0.35)]
+    (folder / "walk.txt").write_text("\n".join(lines))
+    return folder / "walk.las"
+
+
 def _velodyne(folder: Path) -> Path:
     return write_velodyne(folder / "walk", WALK, WALK.poses[2])
 
@@ -523,6 +535,7 @@ LOADERS = [
         for each in ("ascii", "binary", "binary_compressed")
     ),
     Loader("KITTI velodyne", _velodyne, _dataset),
+    *([Loader("LAS survey", _survey, _dataset)] if find_spec("laspy") else []),
     Loader("ROS 1 bag", partial(_bag, "ros1"), _dataset),
     Loader("ROS 2 bag, sqlite", partial(_bag, "sqlite"), _dataset),
     Loader("MCAP", partial(_bag, "mcap"), _dataset),

@@ -134,3 +134,22 @@ def write_velodyne(folder: Path, walk: Walk, T_camera_lidar: Pose, times: bool =
     if times:
         (folder / "times.txt").write_text("".join(f"{0.25 * i:e}\n" for i in range(walk.count)))
     return folder
+
+
+def las_head(number: int, packed: bool = False, /, **changes: int) -> bytes:
+    """The bytes of a LAS or LAZ file of points of 28 bytes, which are zeros; of LAZ with one empty chunk.
+    ``changes`` replace what the header, or ``chunks`` and ``chunk_points``, say."""
+    values = {"header": 227, "begin": 227, "records": 0, "kind": 1, "point_bytes": 28, "count": number}
+    values |= {"begin": 227 + 54 + 46, "records": 1, "kind": 0x81} if packed else {}
+    values |= {name: value for name, value in changes.items() if name in values}
+    head = b"LASF" + bytes(20) + bytes([1, 2]) + bytes(68)
+    head += struct.pack("<HIIBHI", *values.values())
+    head += bytes(227 - len(head))
+    if not packed:
+        return head + bytes(number * 28)
+    packing = struct.pack("<2x16sHH32x", b"laszip encoded", 22204, 46)
+    packing += struct.pack("<12xI30x", changes.get("chunk_points", 50_000))
+    begin = len(head) + len(packing)
+    table = changes.get("table", begin + 8 + 100)
+    chunks = struct.pack("<II", 0, changes.get("chunks", 1))
+    return head + packing + struct.pack("<q", table) + bytes(100) + chunks + bytes(20)

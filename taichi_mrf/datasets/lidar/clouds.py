@@ -3,17 +3,15 @@
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.lidar.las_file import read_las
 from taichi_mrf.datasets.lidar.pcd_file import read_pcd
 from taichi_mrf.datasets.lidar.ply_file import read_ply_header, read_ply_points
-from taichi_mrf.errors import CapacityError, DatasetError, said
-from taichi_mrf.system.files import check_regular, read_bytes
-from taichi_mrf.system.libraries import library
-from taichi_mrf.system.memory import check_memory
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.system.files import read_bytes
 from taichi_mrf.system.npz_file import NpzFile, open_npz
 
 ARRAYS = ("points_m", "points", "xyz")
@@ -21,11 +19,6 @@ ARRAYS = ("points_m", "points", "xyz")
 
 _STEPS = re.compile(r"(?:xyz|points)_(\d+)mm")
 _VELODYNE_BYTES = 16
-_LAZ_RATIO = 100
-"""LAZ packs points five to ten times."""
-
-_READ_BYTES = 32
-"""Of a point's coordinates and time, beside what is in the file."""
 
 
 def read_cloud(path: Path) -> NDArray[np.float64]:
@@ -79,47 +72,13 @@ def _pcd_points(path: Path) -> NDArray[np.float64]:
     return read_pcd(path)[0]
 
 
-def read_timed_las(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The points of a LAS or LAZ file, (N, 3) in metres, and the seconds (N,) at which they were measured, by
-    its own clock. Raises DatasetError, which names the file, if it is damaged or has no times."""
-    points = _las_file(path)
-    if "gps_time" not in points.point_format.dimension_names:
-        raise DatasetError(
-            f"{path}: its points have no gps_time (point format {points.point_format.id}), so that it is not "
-            "known from where they were measured"
-        )
-    return np.array(points.xyz, np.float64), np.array(points.gps_time, np.float64)
-
-
-def _las_points(path: Path) -> NDArray[np.float64]:
-    return np.array(_las_file(path).xyz, np.float64)
-
-
-def _las_file(path: Path) -> Any:
-    """A LAS or LAZ file as the library laspy has it (extra ``las``)."""
-    laspy = library("laspy", "LAS and LAZ files need", "las", DatasetError)
-    size = check_regular(path, DatasetError)
-    try:
-        with laspy.open(path) as file:
-            count, point_bytes = int(file.header.point_count), int(file.header.point_format.size)
-            largest = _LAZ_RATIO * size if path.suffix.lower() == ".laz" else size
-            if count * point_bytes > largest:
-                raise ValueError(f"it claims {count} points of {point_bytes} bytes, more than it can hold")
-            check_memory(count * (point_bytes + _READ_BYTES), f"{path}")
-            return file.read()
-    except CapacityError:
-        raise
-    except Exception as error:  # the library raises many kinds of errors
-        raise DatasetError(f"{path}: cannot be read: {said(error)}") from error
-
-
 READERS: dict[str, Callable[[Path], NDArray[np.float64]]] = {
     ".npz": _npz_points,
     ".ply": read_ply_points,
     ".pcd": _pcd_points,
     ".bin": _velodyne_points,
-    ".las": _las_points,
-    ".laz": _las_points,
+    ".las": read_las,
+    ".laz": read_las,
 }
 """What reads a file, by its ending."""
 
