@@ -1,11 +1,11 @@
 """Where a scan of a sensor that sees around was taken, if nothing near the guesses will do.
 
 The poses that a wide search proposes are aligned from coarse to fine, fewer at each level. The one that fits
-best counts, unless another place fits almost as well: in a corridor of equal doors a scan may lie at any.
+best counts, unless another place fits almost as well: in a hall of equal bays a scan may lie in any.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,8 +13,9 @@ from taichi_mrf.alignment.levels import grids_of, levels_of
 from taichi_mrf.alignment.levenberg import Aligned, align
 from taichi_mrf.alignment.oriented_points import OrientedPoints
 from taichi_mrf.alignment.recorded import Recorded
+from taichi_mrf.alignment.seen_through import Sightlines
 from taichi_mrf.alignment.surfels import Surfels
-from taichi_mrf.alignment.wide_search import APART_M, APART_RAD, Around, candidates
+from taichi_mrf.alignment.wide_search import APART_RAD, Around, candidates
 from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 
@@ -32,31 +33,49 @@ tells nothing."""
 
 UNMAPPED = 0.25
 """What a point without a surface near it counts against a pose, of what one beside a surface does. A scan
-around the corner sees much that is not mapped yet; if that counts as much, places where nothing is new seem
-better: a scan of the building was put 6.5 m from where it was taken."""
+around the corner sees much that is not mapped yet. If that counted as much, one of 50 scans of a real
+building, two steps ahead of the map, would fit two places 6.5 m apart alike."""
 
 SURPRISE = 0.02
 """By how much better a pose has to fit for each squared spread between it and where it is expected. Without
-it 4 of 51 scans fit two places of that building alike, which are 1 to 6.5 m apart as its doors are; with it
-1."""
+what scans look through, 4 of 51 scans of that building are ambiguous at 0 and 1 at 0.02; with it, none
+are."""
 
 CLEARLY = 0.03
 """By how much the best pose has to fit better than any other."""
+
+MOST_THROUGH = 0.1
+"""Share of the map that a scan may look through. At right poses it is at most 0.06, at wrong ones 0.01 to 0.7
+and always more than at the right one of the same scan; it counts in full against a pose."""
 
 LEAST_FIT = 0.35
 """Share of the points that have to lie on the map. The worst of those 51 scans has 0.59, and of scans up to
 4.5 m ahead of the map 0.39."""
 
 NEAR_M = 0.4
-"""Poses closer than this are one between levels. From 0.5 m off, the second level may end at the next
-door."""
+"""Poses closer than this are one between levels. From 0.5 m off, the second level may end in another
+pattern of the walls."""
+
+APART_M = 1.0
+"""Poses further apart than this are different places."""
 
 FINER, FINEST = 8, 3
 """How many poses the second and the third level take."""
 
 
+@dataclass(frozen=True)
+class Place:
+    """Where an alignment ended, the share of the map that the scan looks ``through`` from there, and what the
+    place is ``worth``, at most 1."""
+
+    end: Aligned
+    through: float
+    worth: float
+
+
 def found_around(
     points: OrientedPoints,
+    sight: Sightlines,
     surface: Surfels,
     around: Around,
     guesses: Sequence[Pose],
@@ -66,33 +85,42 @@ def found_around(
     """The pose in a ``surface`` at which a scan fits best of all ``around``, and why it cannot be relied on,
     or "". ``guesses`` are tried as well; ``observable`` is that of levenberg.align."""
     levels = levels_of(points, grids_of(surface, FIRST_CELLS_M, FINEST_CELLS_M))
+    planes = surface.coarser(max(1, round(FINEST_CELLS_M / surface.cell_size))).planes()
     lever_m = float(np.median(np.linalg.norm(points.points, axis=1)))
     free = replace(config, translation_sigma=FREE_M, rotation_sigma=FREE_RAD)
 
-    def aligned_at(level: int, poses: Sequence[Pose]) -> list[Aligned]:
-        return [align(levels[level], T, Recorded(T, free), lever_m, observable) for T in poses]
+    def aligned_at(level: int, poses: Sequence[Pose]) -> list[Place]:
+        places = []
+        for T in poses:
+            end = align(levels[level], T, Recorded(T, free), lever_m, observable)
+            through = sight.seen_through(planes, end.T_world_camera) if level > 0 else 0.0
+            places.append(Place(end, through, worth(end, around) - through))
+        return places
 
-    ends = aligned_at(0, candidates(points, surface.planes(), around))
+    places = aligned_at(0, candidates(points, surface.planes(), around))
     # Where depth tells little of the position, what is expected tells more: the same turned, but there.
-    turned = [end.T_world_camera.copy() for end in distinct(ends, around, NEAR_M)[:2]]
+    turned = [place.end.T_world_camera.copy() for place in distinct(places, NEAR_M)[:2]]
     for T in turned:
         T[:3, 3] = around.expected_m
-    ends += aligned_at(0, [*turned, *guesses])
-    ends = aligned_at(1, [end.T_world_camera for end in distinct(ends, around, NEAR_M)[:FINER]])
-    ends = aligned_at(2, [end.T_world_camera for end in distinct(ends, around, NEAR_M)[:FINEST]])
-    best, *others = distinct(ends, around, APART_M)
-    fit = best.equations.fit
+    places += aligned_at(0, [*turned, *guesses])
+    places = aligned_at(1, [place.end.T_world_camera for place in distinct(places, NEAR_M)[:FINER]])
+    places = aligned_at(2, [place.end.T_world_camera for place in distinct(places, NEAR_M)[:FINEST]])
+    best, *others = distinct(places, APART_M)
+    fit = best.end.equations.fit
+    reason = ""
     if fit < LEAST_FIT:
-        return best, f"{100 * fit:.0f}% of its points fit the map where it fits best, of all places around"
-    if best.directions < 6:
-        return best, f"its points determine {best.directions} of the six directions of its pose"
-    if others and value(others[0], around) > value(best, around) - CLEARLY:
-        apart_rad, apart_m = tangent_norms(best.T_world_camera, others[0].T_world_camera)
-        return best, f"it fits alike at two places, {apart_m:.1f} m and {apart_rad:.1f} radians apart"
-    return best, ""
+        reason = f"{100 * fit:.0f}% of its points fit the map where it fits best, of all places around"
+    elif best.end.directions < 6:
+        reason = f"its points determine {best.end.directions} of the six directions of its pose"
+    elif best.through > MOST_THROUGH:
+        reason = f"it looks through {100 * best.through:.0f}% of the map where it fits best"
+    elif others and others[0].worth > best.worth - CLEARLY:
+        apart_rad, apart_m = tangent_norms(best.end.T_world_camera, others[0].end.T_world_camera)
+        reason = f"it fits alike at two places, {apart_m:.1f} m and {apart_rad:.1f} radians apart"
+    return best.end, reason
 
 
-def value(end: Aligned, around: Around) -> float:
+def worth(end: Aligned, around: Around) -> float:
     """Share of the points that lie on the map, less for a pose that is far from the expected one; points
     where nothing is mapped count for the most part."""
     away = np.linalg.norm(end.T_world_camera[:3, 3] - around.expected_m) / around.spread_m
@@ -100,11 +128,12 @@ def value(end: Aligned, around: Around) -> float:
     return end.equations.fit + (1.0 - UNMAPPED) * unmapped - SURPRISE * float(away) ** 2
 
 
-def distinct(ends: Sequence[Aligned], around: Around, apart_m: float) -> list[Aligned]:
+def distinct(places: Sequence[Place], apart_m: float) -> list[Place]:
     """The best first, without those that are within ``apart_m`` metres of a better one and turned like it."""
-    found: list[Aligned] = []
-    for end in sorted(ends, key=lambda end: -value(end, around)):
-        norms = [tangent_norms(better.T_world_camera, end.T_world_camera) for better in found]
+    found: list[Place] = []
+    for place in sorted(places, key=lambda place: -place.worth):
+        T = place.end.T_world_camera
+        norms = [tangent_norms(better.end.T_world_camera, T) for better in found]
         if all(turned > APART_RAD or shifted > apart_m for turned, shifted in norms):
-            found.append(end)
+            found.append(place)
     return found

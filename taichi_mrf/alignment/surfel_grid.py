@@ -33,10 +33,11 @@ class SurfelPlanes(Bundle):
 
 
 class SurfelGrid:
-    """The planes of some surfels in a window of bricks of cells; :attr:`planes` has them on the device."""
+    """The planes of some surfels in a window of bricks of cells; :attr:`planes` has them on the device, and
+    :attr:`surface` as they are."""
 
     def __init__(self, surfels: Surfels) -> None:
-        surface = surfels.planes()
+        self.surface = surface = surfels.planes()
         cells = surface.cells
         self.cell_size = surfels.cell_size
         self.count = len(cells)

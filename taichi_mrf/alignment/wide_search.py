@@ -20,20 +20,24 @@ from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import I32, I32Array
 from taichi_mrf.system import runtime
 
-CELL_M = 0.5
-"""Width of the grid's cells, and the distance between places."""
+FINEST_CELL_M, WIDEST_CELL_M = 0.25, 0.5
+"""Widths of the grid's cells, and the distance between places: in rooms and corridors, and in halls."""
+
+CELLS_TO_MEDIAN = 12
+"""Cells that the median of a scan's ranges is long, within those bounds."""
 
 HEADINGS = 96
 """Headings that are tried, 3.75 degrees apart."""
 
-FARTHEST_M = 20.0
-"""Points further away are left out: half a step between headings moves them by more than a cell."""
+FARTHEST = 40
+"""Points further away than so many cells are left out: half a step between headings moves them by more than a
+cell."""
 
 MOST_POINTS = 500
 """Points that count. There is one for each cell that holds any, so that near ones are not the most."""
 
-APART_M, APART_RAD = 1.0, 0.3
-"""A pose that is closer than both to a better one is no candidate of its own."""
+APART, APART_RAD = 2.0, 0.3
+"""A pose that is closer than so many cells and radians to a better one is no candidate of its own."""
 
 CANDIDATES = 8
 """How many poses come out of a search. The right one was among the best three for all scans of a real
@@ -90,9 +94,10 @@ class CoarseGrid:
         normals: NDArray[np.float64],
         lowest: NDArray[np.int64],
         shape: NDArray[np.int64],
+        cell_m: float,
     ) -> "CoarseGrid":
         """The grid of some points (N, 3) and unit normals in a level frame."""
-        places = np.floor(points_m / CELL_M).astype(np.int64) - lowest
+        places = np.floor(points_m / cell_m).astype(np.int64) - lowest
         inside = ((places >= 0) & (places < shape)).all(axis=1)
         alike = normals[inside] @ _SIDES.T
         found_by = (alike > _FOUND_BY) | (alike == alike.max(axis=1, keepdims=True))
@@ -120,7 +125,9 @@ def candidates(points: OrientedPoints, surface: Planes, around: Around) -> list[
     up_world = upright(surface.normals, T_last[:3, :3] @ np.asarray(around.up))
     up_camera = upright(points.normals.astype(np.float64), T_last[:3, :3].T @ up_world)
     R_level_world, R_level_camera = level_frame(up_world), level_frame(up_camera)
-    chosen = spread(points)
+    ranges_m = np.linalg.norm(points.points, axis=1)
+    cell_m = float(np.clip(np.median(ranges_m) / CELLS_TO_MEDIAN, FINEST_CELL_M, WIDEST_CELL_M))
+    chosen = spread(points.points, cell_m)
     if len(chosen) == 0:
         return [T_last]
     level_points = points.points[chosen] @ R_level_camera.T
@@ -128,24 +135,23 @@ def candidates(points: OrientedPoints, surface: Planes, around: Around) -> list[
     # The cells of all points under each heading, and the steps from place to place.
     headings = np.linspace(0.0, 2 * np.pi, HEADINGS, endpoint=False)
     turns = np.stack([turn_about_z(heading) for heading in headings])
-    cells = np.floor(np.einsum("hab,nb->hna", turns, level_points) / CELL_M).astype(np.int64)
+    cells = np.floor(np.einsum("hab,nb->hna", turns, level_points) / cell_m).astype(np.int64)
     sides = np.argmax(np.einsum("hab,nb->hna", turns, level_normals) @ _SIDES.T, axis=-1)
-    reach = int(np.ceil(around.reach_m / CELL_M))
+    reach = int(np.ceil(around.reach_m / cell_m))
     steps = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2, [0], indexing="ij"), -1).reshape(-1, 3)
     steps = steps[np.hypot(steps[:, 0], steps[:, 1]) <= reach]
     margin = np.array([reach, reach, 0])
     lowest = cells.min(axis=(0, 1)) - margin
     shape = cells.max(axis=(0, 1)) + margin + 1 - lowest
-    grid = CoarseGrid.of(
-        (surface.points_m - T_last[:3, 3]) @ R_level_world.T, surface.normals @ R_level_world.T, lowest, shape
-    )
+    surface_m = (surface.points_m - T_last[:3, 3]) @ R_level_world.T
+    grid = CoarseGrid.of(surface_m, surface.normals @ R_level_world.T, lowest, shape, cell_m)
     counts = scores(grid, cells, sides, steps)
     # The best poses that are apart from each other.
     found = []
-    for heading, place in peaks(counts, headings, steps * CELL_M):
+    for heading, place in peaks(counts, headings, steps * cell_m, APART * cell_m):
         T = np.eye(4)
         T[:3, :3] = R_level_world.T @ turns[heading] @ R_level_camera
-        T[:3, 3] = T_last[:3, 3] + R_level_world.T @ (steps[place] * CELL_M)
+        T[:3, 3] = T_last[:3, 3] + R_level_world.T @ (steps[place] * cell_m)
         found.append(T)
     return found or [T_last]
 
@@ -180,10 +186,10 @@ def turn_about_z(angle: float) -> NDArray[np.float64]:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def spread(points: OrientedPoints) -> NDArray[np.intp]:
-    """Numbers of at most MOST_POINTS points, not beyond FARTHEST_M, none two in one cell."""
-    near = np.flatnonzero(np.linalg.norm(points.points, axis=1) < FARTHEST_M)
-    _, first = np.unique(np.floor(points.points[near] / CELL_M).astype(np.int64), axis=0, return_index=True)
+def spread(points_m: NDArray[np.float32], cell_m: float) -> NDArray[np.intp]:
+    """Numbers of at most MOST_POINTS points (N, 3), not too far away, none two in one cell."""
+    near = np.flatnonzero(np.linalg.norm(points_m, axis=1) < FARTHEST * cell_m)
+    _, first = np.unique(np.floor(points_m[near] / cell_m).astype(np.int64), axis=0, return_index=True)
     chosen = near[np.sort(first)]
     some = np.linspace(0, len(chosen) - 1, min(MOST_POINTS, len(chosen))).round().astype(np.intp)
     return chosen[some]
@@ -219,7 +225,10 @@ def count_matches(
 
 
 def peaks(
-    counts: NDArray[np.int32], headings: NDArray[np.float64], places_m: NDArray[np.float64]
+    counts: NDArray[np.int32],
+    headings: NDArray[np.float64],
+    places_m: NDArray[np.float64],
+    apart_m: float,
 ) -> list[tuple[int, int]]:
     """The numbers of the headings and places of the CANDIDATES highest counts that are apart from higher
     ones."""
@@ -230,6 +239,6 @@ def peaks(
             break
         found.append((heading, place))
         turned = np.abs((headings - headings[heading] + np.pi) % (2 * np.pi) - np.pi) < APART_RAD
-        shifted = np.linalg.norm(places_m - places_m[place], axis=1) < APART_M
+        shifted = np.linalg.norm(places_m - places_m[place], axis=1) < apart_m
         left[np.ix_(turned, shifted)] = 0
     return found

@@ -125,7 +125,8 @@ class Tracker:
         depth_m = checked_depth(frame.depth_m, frame.camera, m.sensor.min_depth)
         image = DepthImage.upload(depth_m, frame.camera, m.noise, own=frame.own_for(m.sensor))
         around = self._around(frame.camera, frame.stamp) if sees_around(frame.camera) else None
-        located = self._locator.locate(image, self._guesses(frame.stamp), m.keyframes, self._config, around)
+        guesses = self._guesses(frame.stamp, back=around is None)
+        located = self._locator.locate(image, guesses, m.keyframes, self._config, around)
         if located.T_world_camera is None:
             self._lost += 1
             raise LostFrameError(f"{frame.name}: tracking lost: {located.reason}")
@@ -184,7 +185,9 @@ class Tracker:
             expected_m = expected_m + ahead * (expected_m - self._pose(self._before)[:3, 3])
         return Around(T_last, camera.up, reach_m, expected_m, EXPECTED_M * (1 + self._lost))
 
-    def _guesses(self, stamp: float) -> list[Pose]:
+    def _guesses(self, stamp: float, back: bool) -> list[Pose]:
+        """Where the camera may be; after lost frames also where it began, if it may be ``back`` there. A
+        sensor that sees around is searched for anyway, and corridors have two ends that look alike."""
         assert self._last is not None
         T_last = self._pose(self._last)
         guesses = [T_last]
@@ -192,7 +195,7 @@ class Tracker:
         if self._before is not None and ahead is not None:
             step = twist(inverse(self._pose(self._before)) @ T_last)
             guesses.append(moved(T_last, ahead * step))
-        if self._lost and self._first is not None:
+        if back and self._lost and self._first is not None:
             guesses.append(self._pose(self._first))
         return guesses
 

@@ -2,15 +2,19 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from taichi_mrf.alignment.se3 import moved
-from taichi_mrf.alignment.wide_search import CELL_M, CoarseGrid, peaks, scores, upright
+from taichi_mrf.alignment.seen_through import Sightlines
+from taichi_mrf.alignment.surfels import Planes
+from taichi_mrf.alignment.wide_search import CoarseGrid, peaks, scores, upright
 from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.datasets.synthetic.analytic_render import ray_depths
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene, Solid
 from taichi_mrf.datasets.synthetic.room_furniture import room_scene
 from taichi_mrf.errors import LostFrameError
 from taichi_mrf.geometry.poses import Pose, tangent_norms
+from taichi_mrf.inference.keyframe import DepthImage
 from taichi_mrf.mapping.tracking import Tracker
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera, sees_around
@@ -20,6 +24,7 @@ from taichi_mrf.sensor.spherical import SphericalCamera
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 
+CELL_M = 0.5
 LIDAR = SphericalCamera(np.radians(np.linspace(45.0, -45.0, 90)), np.radians(np.arange(0.0, 360.0, 1.0)))
 SIGMA_M, REACH_M = 0.01, 25.0
 
@@ -66,7 +71,7 @@ def test_counts_follow_the_definition() -> None:
     steps = np.array([[0, 0, 0], [2, -1, 0], [-2, 2, 0]])
     lowest = cells.min(axis=(0, 1)) - (2, 2, 0)
     shape = cells.max(axis=(0, 1)) + (2, 2, 0) + 1 - lowest
-    found = scores(CoarseGrid.of(surface, normals, lowest, shape), cells, sides, steps)
+    found = scores(CoarseGrid.of(surface, normals, lowest, shape, CELL_M), cells, sides, steps)
     expected = np.zeros((2, 3), int)
     # Eight headings, up and down; a normal belongs to the nearest, and to those within 40 degrees.
     axes = [(np.cos(a), np.sin(a), 0) for a in np.radians(np.arange(0, 360, 45))] + [(0, 0, 1), (0, 0, -1)]
@@ -89,7 +94,7 @@ def test_peaks_are_apart() -> None:
     )
     counts = np.zeros((36, 17), np.int32)
     counts[0, 8], counts[35, 8], counts[1, 9], counts[18, 8], counts[0, 12] = 90, 89, 88, 70, 60
-    assert peaks(counts, headings, places) == [(0, 8), (18, 8), (0, 12)]
+    assert peaks(counts, headings, places, 1.0) == [(0, 8), (18, 8), (0, 12)]
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.5])
@@ -126,3 +131,20 @@ def test_a_corridor_that_is_the_same_everywhere_is_no_place() -> None:
         LostFrameError, match=r"scan 1: tracking lost: .* (alike at two places|six directions)"
     ):
         followed(corridor(), place(0, 0.3, 0), place(1.5, -0.4, 1.5))
+
+
+def test_a_scan_that_looks_through_the_map_gives_a_wrong_pose_away() -> None:
+    frame = scan(corridor(), place(0, 0, 0))
+    sight = Sightlines.of(DepthImage.upload(frame.depth_m, LIDAR, PolynomialNoise((SIGMA_M,))))
+
+    def planes(points: NDArray[np.float64]) -> Planes:
+        return Planes(np.zeros(points.shape, np.int32), np.ones(len(points)), points, points)
+
+    # What would stand across the corridor, where rays pass to its sides and floor; and a side of it.
+    y, z = (a.ravel() for a in np.meshgrid(np.arange(-0.8, 0.85, 0.1), np.arange(-0.5, 0.55, 0.1)))
+    across = planes(np.stack([np.full(y.shape, 2.0), y, z], axis=1))
+    assert sight.seen_through(across, place(0, 0, 0)) == 1.0
+    sides = np.stack([np.linspace(-3, 3, 61), np.full(61, 1.5), np.zeros(61)], axis=1)
+    side = planes(sides)
+    assert sight.seen_through(side, place(0, 0, 0)) == 0
+    assert sight.seen_through(side, place(0, 0.8, 0)) == 1.0

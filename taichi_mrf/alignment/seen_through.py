@@ -1,0 +1,69 @@
+"""How much of a mapped surface a scan looks through: what gives away a pose that fits by chance.
+
+In a hall of equal bays the walls of a scan may lie on those of the next bay. What stands only there is then
+in the way of rays that went on.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.alignment.surfels import Planes
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.inference.keyframe import DepthImage
+
+BIN_RAD = np.radians(2.0)
+"""Side of the bins of azimuth and elevation in which the nearest and the farthest measurement are kept."""
+
+MARGIN_M, MARGIN = 0.3, 0.03
+"""By how much a measurement has to be beyond a surface, in metres and as a share of range."""
+
+NEAREST_M, FARTHEST_M = 0.5, 12.0
+"""Ranges of the surfaces that count. Further away errors of a heading matter, and bins hold much."""
+
+_ROWS, _COLUMNS = 90, 180
+
+
+@dataclass(frozen=True)
+class Sightlines:
+    """The ranges, in metres, of the nearest and the farthest measurement of a scan in each bin; infinite and
+    0 where it has none."""
+
+    nearest_m: NDArray[np.float64]
+    farthest_m: NDArray[np.float64]
+
+    @staticmethod
+    def of(image: DepthImage) -> "Sightlines":
+        """Those of a scan."""
+        depth = image.to_numpy().astype(np.float64).ravel()
+        points = (image.camera.rays().reshape(-1, 3) * depth[:, None])[depth > 0]
+        ranges_m = np.linalg.norm(points, axis=1)
+        nearest_m, farthest_m = np.full(_ROWS * _COLUMNS, np.inf), np.zeros(_ROWS * _COLUMNS)
+        bins = _bins(points, ranges_m)
+        np.minimum.at(nearest_m, bins, ranges_m)
+        np.maximum.at(farthest_m, bins, ranges_m)
+        return Sightlines(nearest_m, farthest_m)
+
+    def seen_through(self, surface: Planes, T_world_camera: Pose) -> float:
+        """The share of a mapped surface that a scan taken at a pose (4, 4) looks through, of what it sees or
+        looks through."""
+        points = (surface.points_m - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+        ranges_m = np.linalg.norm(points, axis=1)
+        counts = (ranges_m > NEAREST_M) & (ranges_m < FARTHEST_M)
+        points, ranges_m = points[counts], ranges_m[counts]
+        bins = _bins(points, ranges_m)
+        nearest_m, farthest_m = self.nearest_m[bins], self.farthest_m[bins]
+        margin_m = MARGIN_M + MARGIN * ranges_m
+        measured = farthest_m > 0
+        through = measured & (nearest_m > ranges_m + margin_m)
+        met = measured & ~through & (farthest_m > ranges_m - margin_m)
+        return float(through.sum() / max(1, through.sum() + met.sum()))
+
+
+def _bins(points: NDArray[np.float64], ranges_m: NDArray[np.float64]) -> NDArray[np.intp]:
+    """The number of the bin that each point (N, 3) of the camera frame is in, by its direction."""
+    elevation = np.arcsin(np.clip(points[:, 2] / ranges_m, -1.0, 1.0)) + np.pi / 2
+    azimuth = np.arctan2(points[:, 1], points[:, 0]) + np.pi
+    row = np.minimum((elevation / BIN_RAD).astype(np.intp), _ROWS - 1)
+    return row * _COLUMNS + np.minimum((azimuth / BIN_RAD).astype(np.intp), _COLUMNS - 1)
