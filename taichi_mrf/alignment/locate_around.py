@@ -42,7 +42,9 @@ what scans look through, 4 of 51 scans of that building are ambiguous at 0 and 1
 are."""
 
 CLEARLY = 0.03
-"""By how much the best pose has to fit better than any other."""
+"""By how much the best pose has to fit better than any other, for each metre of the spread: after lost frames
+many rooms are searched. With 0.03 whatever the spread, at least 6 of 28 scans of 16 rows that were found in
+the built-in corridor were in the wrong room; so 14 are found and none is."""
 
 MOST_THROUGH = 0.1
 """Share of the map that a scan may look through. At right poses it is at most 0.06, at wrong ones 0.01 to 0.7
@@ -114,7 +116,7 @@ def found_around(
         reason = f"its points determine {best.end.directions} of the six directions of its pose"
     elif best.through > MOST_THROUGH:
         reason = f"it looks through {100 * best.through:.0f}% of the map where it fits best"
-    elif others and others[0].worth > best.worth - CLEARLY:
+    elif others and others[0].worth > best.worth - CLEARLY * around.spread_m:
         apart_rad, apart_m = tangent_norms(best.end.T_world_camera, others[0].end.T_world_camera)
         reason = f"it fits alike at two places, {apart_m:.1f} m and {apart_rad:.1f} radians apart"
     return best.end, reason
