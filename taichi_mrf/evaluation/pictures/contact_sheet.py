@@ -22,6 +22,9 @@ _DPI = 120
 _LETTERS = 44
 """That fit beside each other on a tile."""
 
+_LINES = 10
+"""Of text that fit below each other on a tile; the first ones say what went wrong."""
+
 
 @dataclass(frozen=True)
 class Tile:
@@ -49,7 +52,7 @@ def write_contact_sheet(path: Path, tiles: Sequence[Tile]) -> None:
         axes.set_title(f"{name}\n{tile.caption}", fontsize=10)
         picture = None if tile.picture is None else _read(tile.picture)
         if picture is None:
-            text = textwrap.fill(tile.instead or "no picture", _LETTERS)
+            text = textwrap.fill(tile.instead or "no picture", _LETTERS, max_lines=_LINES, placeholder=" ...")
             axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes, fontsize=9)
         else:
             axes.imshow(picture)
