@@ -1,5 +1,6 @@
 """What the rays of a sweep (sum_product.py) share: their model, the voxels, and the trace."""
 
+import math
 from dataclasses import dataclass
 
 from taichi_mrf.kernels.bundles import Bundle
@@ -25,6 +26,12 @@ class RayModel(Bundle):
     clamp: F32
     """Largest log-odds of a message."""
 
+    pass_through: F32
+    """Chance that a ray passes through an occupied voxel."""
+
+    passes: Template
+    """Whether that is more than 0."""
+
     likelihood: Template
     """AUTO, SEGMENT or CENTRE of sensor/forward.py."""
 
@@ -43,7 +50,7 @@ class SweptVoxels(Bundle):
     """The voxels that a keyframe sees, as its rays read and write them. Arrays (visible bricks * 512)."""
 
     log_free: F32Array
-    """log(1 - m) of the cavity belief, at most 0."""
+    """log(1 - m) of the cavity belief, or log(1 - (1 - s) m) (sum_product.py), at most 0."""
 
     sums: I64Array
     """Lengths and messages summed over rays (accumulators.py)."""
@@ -68,3 +75,8 @@ class Trace(Bundle):
 
     steps: I32Array
     """(workers): receives the number of voxels that each worker's rays have crossed."""
+
+
+def log_pass(pass_through: float) -> float:
+    """The logarithm of ``RayModel.pass_through``; of 0, which kernels leave out, 0."""
+    return math.log(pass_through) if pass_through > 0 else 0.0

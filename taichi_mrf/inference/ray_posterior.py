@@ -21,11 +21,11 @@ import taichi as ti
 
 from taichi_mrf.inference.keyframe import RayList
 from taichi_mrf.inference.ray_list import listed_ray
-from taichi_mrf.inference.ray_model import RayModel
+from taichi_mrf.inference.ray_model import RayModel, log_pass
 from taichi_mrf.inference.sum_product import crossing
 from taichi_mrf.inference.workers import Workers
 from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.log_odds import exp_of_negative, softplus
+from taichi_mrf.kernels.log_odds import exp_of_negative, log_let_through
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Struct, Template, Vec4
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.voxels.layout import VOXELS
@@ -48,25 +48,30 @@ class FreeLogs(Bundle):
     """The voxels that rays cross."""
 
     log_free: F32Array
-    """log(1 - m) of each, at most 0; (bricks * 512)."""
+    """log(1 - m) of each, or log(1 - (1 - s) m), at most 0; (bricks * 512)."""
 
     closed: I32Array
     """Whether any voxel of a brick is likelier occupied than by the prior; (bricks). In front of the depths
     that can have made its measurement, a ray passes through others as through empty space."""
 
     @staticmethod
-    def of(pool: BrickPool | PoolPart) -> "FreeLogs":
+    def of(pool: BrickPool | PoolPart, model: RayModel) -> "FreeLogs":
         """Those of the marginals of a whole map, in the pool's order."""
         log_free = ti.ndarray(ti.f32, max(1, pool.capacity) * VOXELS)
-        _find_free_logs(pool.in_use, pool.belief, log_free, strip_length())
-        return FreeLogs.with_bricks(log_free, pool.capacity, pool.prior_log_odds)
+        share = log_pass(model.pass_through)
+        _find_free_logs(pool.in_use, pool.belief, share, model.passes, log_free, strip_length())
+        return FreeLogs.with_bricks(log_free, pool.capacity, pool.prior_log_odds, model)
 
     @staticmethod
-    def with_bricks(log_free: "ti.Ndarray", bricks: int, prior_log_odds: float) -> "FreeLogs":
+    def with_bricks(
+        log_free: "ti.Ndarray", bricks: int, prior_log_odds: float, model: RayModel
+    ) -> "FreeLogs":
         """With the first ``bricks`` of an array."""
         closed = ti.ndarray(ti.i32, max(1, bricks))
+        prior = math.exp(prior_log_odds)
+        let_through = math.log1p(model.pass_through * prior) - math.log1p(prior)
         # A little more than the prior, which voxels that nothing is known of have but for rounding.
-        _find_closed(bricks, log_free, -1.01 * math.log1p(math.exp(prior_log_odds)), closed)
+        _find_closed(bricks, log_free, 1.01 * let_through, closed)
         return FreeLogs(log_free, closed)
 
 
@@ -211,13 +216,15 @@ def _see(ahead: Template, visited: Template, voxel: I32, near: F32, far: F32):
 
 
 @kernel
-def _find_free_logs(slots: I32Array, belief: F32Array, log_free: F32Array, strip: Template) -> None:
-    """log(1 - m) of the bricks in ``slots`` (n) from their log-odds. ``belief`` and ``log_free`` are (pool *
-    512)."""
+def _find_free_logs(
+    slots: I32Array, belief: F32Array, share: F32, passes: Template, log_free: F32Array, strip: Template
+) -> None:
+    """``log_free`` of the bricks in ``slots`` (n) from their log-odds, as sum_product.cavity has it.
+    ``belief`` and ``log_free`` are (pool * 512); ``share`` is the logarithm of what passes."""
     for part in range(slots.shape[0] * (VOXELS // strip)):
         _, j = strip_begin(part, slots, strip)
         for k in range(strip):
-            log_free[j + k] = -softplus(belief[j + k])
+            log_free[j + k] = log_let_through(belief[j + k], share, passes)
 
 
 @ti.kernel

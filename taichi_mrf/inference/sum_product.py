@@ -19,11 +19,15 @@ Messages and beliefs are log-odds. A voxel counts by the length l (in voxel size
 lets the ray pass with probability (1 - m)^l where m is its probability of being occupied. In the symbols of
 section III, for the voxels 1 .. N of one ray, ordered from the camera:
 
-    m_i         cavity probability of occupied              exp(log_free) = 1 - m_i
+    m_i         cavity probability of occupied      exp(log_free) = 1 - m_i, or 1 - (1 - s) m_i
     nu_i        likelihood of the measurement if voxel i is the first surface                   (4)
     vis_i       prod_{k<i} (1 - m_k)^l_k                                        ForwardPass.visibility
     before_i    sum_{j<i} nu_j m_j vis_j                                         ForwardPass.explained
     behind_i    sum_{j>i} nu_j m_j vis_j, and what lies beyond the map
+
+What is in a voxel may fill only a part of it. With the chance s that a ray passes through an occupied voxel
+(``pass_through``), m becomes (1 - s) m in all of these, and a voxel's message for occupied has the share s of
+that for empty. In the paper s is 0.
 
 With ``maximise`` sums over explanations become maxima: max_product.py.
 """
@@ -40,7 +44,7 @@ from taichi_mrf.inference.ray_list import listed_ray
 from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
 from taichi_mrf.inference.workers import Workers
 from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.log_odds import clamped_log_odds, exp_of_negative, logistic, softplus
+from taichi_mrf.kernels.log_odds import clamped_log_odds, exp_of_negative, log_let_through, logistic
 from taichi_mrf.kernels.types import (
     F32,
     I32,
@@ -92,20 +96,22 @@ class Cast(Bundle):
 @kernel
 def cavity(
     slots: I32Array, belief: F32Array, messages: AnyArray, lowest: F32, highest: F32,
-    log_free: F32Array, sums: I64Array, strip: Template,
+    log_pass: F32, passes: Template, log_free: F32Array, sums: I64Array, strip: Template,
 ) -> None:  # fmt: skip
     """Eq. 6: the belief of each voxel without this keyframe's own message.
 
     ``slots`` (n) are the visible bricks' places in the pool, ``belief`` (pool * 512) log-odds and
-    ``messages`` (n * 512) log-odds, float16 or float32. Writes log(1 - m) to ``log_free`` (n * 512), with
-    log-odds bounded by ``lowest`` and ``highest``, and sets the ``sums`` (n * 512) to zero. ``strip`` is the
+    ``messages`` (n * 512) log-odds, float16 or float32. Writes log(1 - (1 - s) m) to ``log_free`` (n * 512),
+    with log-odds bounded by ``lowest`` and ``highest`` and the logarithm ``log_pass`` of s
+    (kernels/log_odds.py), and sets the ``sums`` (n * 512) to zero. ``strip`` is the
     number of voxels for an iteration (voxels/strips.py), here and below.
     """
     for part in range(slots.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, slots, strip)
         for k in range(strip):
             log_odds = belief[j + k] - ti.cast(messages[i + k], ti.f32)
-            log_free[i + k] = -softplus(ti.max(lowest, ti.min(highest, log_odds)))
+            bounded = ti.max(lowest, ti.min(highest, log_odds))
+            log_free[i + k] = log_let_through(bounded, log_pass, passes)
             sums[i + k] = 0
 
 
@@ -279,6 +285,8 @@ def _message(model: Template, before: F32, here: F32, behind: F32, free: F32, la
     """Eqs. 13 and 14 as one number in [0, 1] for the accumulators. ``largest`` is e^clamp."""
     occupied = occupied_message(before, here, model.floor)
     empty = empty_message(before, behind, free, model.floor)
+    if ti.static(model.passes):
+        occupied += model.pass_through * (empty - occupied)
     message = occupied / (occupied + empty)
     if ti.static(model.log_average):
         message = clamped_log_odds(occupied, empty, model.clamp, largest)

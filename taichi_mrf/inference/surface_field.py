@@ -45,7 +45,7 @@ class SurfaceRays:
         self.pool, self.model, self.volume = pool, replace(model, end_sigmas=BAND_SIGMAS), volume
         self.band = Band(BAND_VOXELS, BAND_SIGMAS, model.max_depth)
         self._index, self._field_index = WindowIndex(), WindowIndex()
-        self._free_logs = FreeLogs.of(pool)
+        self._free_logs = FreeLogs.of(pool, model)
 
     def field(
         self,

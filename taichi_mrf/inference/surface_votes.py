@@ -102,7 +102,7 @@ def count_votes(
     index = WindowIndex()
     votes = ti.ndarray(ti.i32, pool.belief.shape)
     votes.fill(0)
-    free_logs, vote = FreeLogs.of(pool), _Vote(pool.belief, learnt, votes)
+    free_logs, vote = FreeLogs.of(pool, model), _Vote(pool.belief, learnt, votes)
     for keyframe, visible in keyframes:
         if len(visible.slots) > 0:
             window = keyframe.footprint.window

@@ -14,7 +14,7 @@ from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.accumulators import finest_scale
 from taichi_mrf.inference.keyframe import Keyframe, RayList
 from taichi_mrf.inference.no_returns import send_no_returns, take_where_unmeasured
-from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
+from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace, log_pass
 from taichi_mrf.inference.workers import Workers, workers_for
 from taichi_mrf.kernels.resident import on_host, vec4_array
 from taichi_mrf.sensor.forward import AUTO, CENTRE, SEGMENT
@@ -156,6 +156,7 @@ class Sweeper:
         sum_product.cavity(
             bricks.slots, belief, messages,
             least_log_odds(self.inference, prior_log_odds), self.inference.cavity_clamp,
+            log_pass(self.inference.pass_through), self.inference.pass_through > 0,
             swept.log_free, swept.sums, strip_length(),
         )  # fmt: skip
         self.index.fill(window, bricks.cells, self.order)
@@ -177,6 +178,8 @@ class Sweeper:
             end_sigmas=config.end_sigmas,
             floor=config.outlier_floor,
             clamp=config.message_clamp,
+            pass_through=config.pass_through,
+            passes=config.pass_through > 0,
             likelihood=LIKELIHOODS[config.likelihood],
             segment_lengths=config.segment_lengths,
             log_average=config.average == "log_odds",

@@ -77,7 +77,8 @@ class ColorPass:
         )
         with s.casting(keyframe, pool.belief, messages, pool.prior_log_odds) as cast:
             scale = cast.swept.scale * COLOR_SHARE
-            free_logs = FreeLogs.with_bricks(cast.swept.log_free, n, pool.prior_log_odds)
+            model = replace(s.model(), maximise=False)
+            free_logs = FreeLogs.with_bricks(cast.swept.log_free, n, pool.prior_log_odds, model)
             spread = _Spread(
                 _pixels(color), image.camera.width, cast.swept.sums, self._bw, scale, cast.trace,
                 (s.voxel_size * image.camera.pixels_per_radian) ** 2,
@@ -85,8 +86,7 @@ class ColorPass:
             )  # fmt: skip
             follow_rays(
                 keyframe.ray_list, keyframe.entry_depths, int(keyframe.entry_depths_known),
-                image.sensor, cast.view, cast.space,
-                replace(s.model(), maximise=False), free_logs, cast.workers, spread,
+                image.sensor, cast.view, cast.space, model, free_logs, cast.workers, spread,
             )  # fmt: skip
         weigh(n * VOXELS, cast.swept.sums, self._bw, scale)
         runtime.settle()

@@ -2,7 +2,7 @@
 
 import taichi as ti
 
-from taichi_mrf.kernels.types import F32
+from taichi_mrf.kernels.types import F32, Template
 
 
 @ti.func
@@ -19,6 +19,16 @@ def softplus(x: F32) -> F32:
     if grown >= 1e-2:
         tail = ti.log(1.0 + grown)
     return ti.max(x, 0.0) + tail
+
+
+@ti.func
+def log_let_through(x: F32, log_pass: F32, passes: Template) -> F32:
+    """log(1 - (1 - s) m) for log-odds ``x`` of m: a voxel lets a ray through if it is free, and with the
+    chance s, whose logarithm is ``log_pass``, if it is occupied. Without ``passes`` s is 0."""
+    let_through = -softplus(x)
+    if ti.static(passes):
+        let_through += softplus(x + log_pass)
+    return let_through
 
 
 @ti.func
