@@ -72,10 +72,13 @@ def _followed(m: MRFMap, enough: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @settings(max_examples=10, suppress_health_check=[HealthCheck.filter_too_much])
-@given(seed=st.integers(0, 2**32 - 1), sigma=st.floats(0.04, 0.2), enough=st.sampled_from([0.2, 1e9]))
-def test_rays_find_what_numpy_finds(seed: int, sigma: float, enough: float) -> None:
+@given(
+    seed=st.integers(0, 2**32 - 1), sigma=st.floats(0.04, 0.2), enough=st.sampled_from([0.2, 1e9]),
+    pass_through=st.sampled_from([0.0, 0.2]),
+)  # fmt: skip
+def test_rays_find_what_numpy_finds(seed: int, sigma: float, enough: float, pass_through: float) -> None:
     rng = np.random.default_rng(seed)
-    config = InferenceConfig(ray_density=0.0)
+    config = InferenceConfig(ray_density=0.0, pass_through=pass_through)
     m = MRFMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=MAX_DEPTH)
     T = look_along(rng.uniform(-1, 1, 3), rng.normal(size=3), rng)
     depth = rng.uniform(0.5, 0.8, CAMERA.shape).astype(np.float32)
@@ -94,7 +97,7 @@ def test_rays_find_what_numpy_finds(seed: int, sigma: float, enough: float) -> N
         for segment, density in zip(ray.segments, ray.densities, strict=True):
             if segment.voxel in p and number % 2 == 0 and explained < enough:
                 assume(abs(explained - enough) > 1e-3)
-                free = (1 - p[segment.voxel]) ** segment.length
+                free = (1 - (1 - pass_through) * p[segment.voxel]) ** segment.length
                 one = (1 - free) * density * visibility
                 expected[segment.voxel] = expected.get(segment.voxel, 0.0) + one
                 explained += one

@@ -43,6 +43,7 @@ priors = st.floats(0.02, 0.6)
     bias=st.floats(-0.05, 0.05),
     method=st.sampled_from(["sum-product", "max-product"]),
     return_pass=st.sampled_from(["replay", "retrace"]),
+    pass_through=st.sampled_from([0.0, 0.3]),
 )
 def test_one_ray_equals_enumeration(
     seed: int,
@@ -52,16 +53,21 @@ def test_one_ray_equals_enumeration(
     bias: float,
     method: Method,
     return_pass: Literal["replay", "retrace"],
+    pass_through: float,
 ) -> None:
     rng = np.random.default_rng(seed)
     T = random_pose(rng)
-    sensor, config = Noise((sigma,), (bias,)), InferenceConfig(prior=prior, return_pass=return_pass, **EXACT)
+    maximise = method == "max-product"
+    config = InferenceConfig(
+        prior=prior, return_pass=return_pass, pass_through=0.0 if maximise else pass_through, **EXACT
+    )
+    sensor = Noise((sigma,), (bias,))
     rays = reference.cast(image(depth), T, ONE_PIXEL, VOXEL, sensor, config, max_depth=0.75)
     assume(well_cut(rays, 12))
     m = MRFMap(VOXEL, PolynomialNoise((sigma,), (bias,)), inference=config, max_depth=0.75)
     m.add_keyframe(image(depth), T, ONE_PIXEL)
     m.infer(sweeps=2, method=method)
-    exact = reference.enumerate_marginals(rays, prior, config.outlier_floor, method == "max-product")
+    exact = reference.enumerate_marginals(rays, prior, config.outlier_floor, maximise, config.pass_through)
     np.testing.assert_allclose(marginals(m, list(exact)), list(exact.values()), atol=1e-4)
 
 
@@ -98,14 +104,15 @@ def test_two_rays_that_share_one_voxel_equal_enumeration(
 
 
 COMPILED_VARIANTS = [
-    ("auto", "probability", False, "sum-product", 1.0),
-    ("segment", "log_odds", True, "sum-product", 0.3),
-    ("centre", "probability", True, "max-product", 1.0),
-    ("segment", "probability", False, "max-product", 0.5),
-    ("centre", "log_odds", False, "sum-product", 1.0),
+    ("auto", "probability", False, "sum-product", 1.0, 0.0),
+    ("segment", "log_odds", True, "sum-product", 0.3, 0.2),
+    ("centre", "probability", True, "max-product", 1.0, 0.0),
+    ("segment", "probability", False, "max-product", 0.5, 0.0),
+    ("centre", "log_odds", False, "sum-product", 1.0, 0.0),
 ]
-"""Likelihood, average, lengths, method and the correlation of rays (1 or less), each of which means a kernel
-of its own: every pair of values is there at least once but for a few."""
+"""Likelihood, average, lengths, method, the correlation of rays (1 or less) and what passes an occupied voxel
+(0 or more), each of which means a kernel of its own: every pair of values is there at least once but for a
+few."""
 
 
 @settings(max_examples=30)
@@ -128,12 +135,12 @@ def test_loops_equal_the_numpy_schedule(
     pixels: tuple[int, int],
     count: int,
     sigma: float,
-    compiled: tuple[Likelihood, Average, bool, Method, float],
+    compiled: tuple[Likelihood, Average, bool, Method, float, float],
     damping: float,
     sweeps: int,
     free_share: float,
 ) -> None:
-    likelihood, average, lengths, method, ray_correlation = compiled
+    likelihood, average, lengths, method, ray_correlation, pass_through = compiled
     rng = np.random.default_rng(seed)
     camera = PinholeCamera(pixels[0], pixels[1], 8.0, 8.0, (pixels[0] - 1) / 2, (pixels[1] - 1) / 2)
     config = InferenceConfig(
@@ -143,6 +150,7 @@ def test_loops_equal_the_numpy_schedule(
         average=average,
         segment_lengths=lengths,
         ray_correlation=ray_correlation,
+        pass_through=pass_through,
         damping=damping,
         message_precision="float32",
         min_length=0.0,

@@ -1,8 +1,8 @@
 """A fence of thin posts before a wall, seen by a lidar whose beams are cones.
 
 A beam that is partly blocked returns from the fence if that share of its light is enough, else from the wall.
-As a program it prints how much of the posts is left in maps of single rays, and of several rays through each
-cone.
+As a program it prints how much of the posts is left in maps of single rays, of several rays through each
+cone, and of single rays that may pass through an occupied voxel.
 """
 
 import sys
@@ -66,10 +66,12 @@ def ranges(
 
 
 def mapped(
-    camera: SphericalCamera, fence_m: float, voxel_size: float, enough: float, scans: int, rays: int = 1
-) -> MRFMap:
+    camera: SphericalCamera, fence_m: float, voxel_size: float, enough: float, scans: int, rays: int = 1,
+    pass_through: float = 0.0,
+) -> MRFMap:  # fmt: skip
     """The map of scans along the fence, with one ray for each beam, or ``rays`` through its cone."""
-    rng, m = np.random.default_rng(0), MRFMap(voxel_size, PolynomialNoise((SIGMA_M,)), max_depth=60.0)
+    noise = PolynomialNoise((SIGMA_M,))
+    rng, m = np.random.default_rng(0), MRFMap(voxel_size, noise, max_depth=60.0, pass_through=pass_through)
     of_map: RayTable = camera
     if rays > 1:
         some = cone(camera.rays(), ((0.0, 1), (0.7, rays - 1)))
@@ -98,8 +100,8 @@ def main() -> None:
         for voxel_size in (0.1, 0.05):
             for fence_m in (12.0, 20.0, 30.0):
                 said = []
-                for rays in (1, 5):
-                    m = mapped(camera, fence_m, voxel_size, enough, 8, rays)
+                for rays, pass_through in ((1, 0.0), (5, 0.0), (1, 0.1)):
+                    m = mapped(camera, fence_m, voxel_size, enough, 8, rays, pass_through)
                     for view in (m, m.reading("calibrated")):
                         posts, gaps = (view.state(post_points(fence_m, a)) for a in (0.0, 0.5 * GAP_M))
                         shares = (posts == OCCUPIED).mean(), (posts == FREE).mean(), (gaps == OCCUPIED).mean()

@@ -99,7 +99,7 @@ def ray_messages(
     for segment, density in zip(ray.segments, ray.densities, strict=True):
         if segment.voxel not in incoming:
             continue
-        m = logistic(incoming[segment.voxel])
+        m = (1 - config.pass_through) * logistic(incoming[segment.voxel])
         length = segment.length if config.segment_lengths else 1.0
         free = (1 - m) ** length
         steps.append((segment, free, density * visibility, explained))
@@ -110,6 +110,7 @@ def ray_messages(
     for segment, free, here, before in reversed(steps):
         occupied = before + here + config.outlier_floor
         empty = before + behind / free + config.outlier_floor
+        occupied += config.pass_through * (empty - occupied)
         weight = segment.length if config.segment_lengths else 1.0
         out.append((segment.voxel, weight, occupied / (occupied + empty)))
         behind += (1 - free) * here
@@ -202,13 +203,13 @@ def infer(
 
 
 def enumerate_marginals(
-    rays: list[Ray], prior: float, floor: float, maximise: bool = False
+    rays: list[Ray], prior: float, floor: float, maximise: bool = False, pass_through: float = 0.0
 ) -> dict[Voxel, float]:
     """Eq. 1 summed over every assignment of the voxels: exact marginals of occupied.
 
     With ``maximise`` of the likeliest assignment of either state, as odds. A ray's factor is eq. 3 with the
     depth variable summed out: the density of the measurement at the first occupied voxel, or beyond, plus
-    the outlier floor.
+    the outlier floor. With ``pass_through`` that is the first one in which the ray, by chance, stops.
     """
     voxels = sorted({s.voxel for ray in rays for s in ray.segments})
     column = {v: i for i, v in enumerate(voxels)}
@@ -218,7 +219,8 @@ def enumerate_marginals(
         factor = np.full(len(states), ray.beyond)
         # From the far end, so that the nearest occupied voxel has the last word.
         for segment, density in zip(reversed(ray.segments), reversed(ray.densities), strict=True):
-            factor = np.where(states[:, column[segment.voxel]] == 1, density, factor)
+            stopped = (1 - pass_through) * density + pass_through * factor
+            factor = np.where(states[:, column[segment.voxel]] == 1, stopped, factor)
         weight = weight * (factor + floor)
     if maximise:
         best = {
