@@ -11,7 +11,7 @@ import taichi_mrf
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "Starting": ("init",),
-    "Maps": ("MRFMap", "LogOddsMap", "VisibilityMap"),
+    "Maps": ("MRFMap", "LogOddsMap", "VisibilityMap", "WavemapMap"),
     "Sensors": (
         "PinholeCamera",
         "DistortedCamera",

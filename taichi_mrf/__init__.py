@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from taichi_mrf.methods.mrf.map import MRFMap as MRFMap
     from taichi_mrf.methods.registry import load_map as load_map
     from taichi_mrf.methods.visibility.map import VisibilityMap as VisibilityMap
+    from taichi_mrf.methods.wavemap.map import WavemapMap as WavemapMap
     from taichi_mrf.queries.box import read_box as read_box
     from taichi_mrf.queries.cast import cast_rays as cast_rays
     from taichi_mrf.queries.change import compare_maps as compare_maps
@@ -57,6 +58,7 @@ _PUBLIC = {
     "MRFMap": "taichi_mrf.methods.mrf.map",
     "LogOddsMap": "taichi_mrf.methods.log_odds.map",
     "VisibilityMap": "taichi_mrf.methods.visibility.map",
+    "WavemapMap": "taichi_mrf.methods.wavemap.map",
     "load_map": "taichi_mrf.methods.registry",
     "ChunkedMap": "taichi_mrf.methods.chunked",
     "take_part": "taichi_mrf.methods.chunked_part",

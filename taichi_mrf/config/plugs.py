@@ -9,5 +9,6 @@ PLUGS = [
     "taichi_mrf.methods.mrf.plug",
     "taichi_mrf.methods.log_odds.plug",
     "taichi_mrf.methods.visibility.plug",
+    "taichi_mrf.methods.wavemap.plug",
 ]
 """In the order of YAML and help texts. The first is the default."""

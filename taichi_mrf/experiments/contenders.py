@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from taichi_mrf import LogOddsMap, MRFMap, VisibilityMap
+from taichi_mrf import LogOddsMap, MRFMap, VisibilityMap, WavemapMap
 from taichi_mrf.config.schema import to_yaml
 from taichi_mrf.experiments.scenes import Scene
 from taichi_mrf.methods.protocol import OccupancyMap
@@ -65,6 +65,17 @@ def visibility(name: str = "visibility map") -> Contender:
     def make(scene: Scene, voxel_size: float) -> OccupancyMap:
         return VisibilityMap(
             voxel_size, scene.noise, volume=scene.volume, max_depth=scene.max_depth, **VISIBILITY_TABLE_I
+        )
+
+    return Contender(name, make, BOTH)
+
+
+def wavemap(name: str = "wavemap-style", **parameters: Any) -> Contender:
+    """The measurement model of wavemap, read with and without the voxels that are more likely free."""
+
+    def make(scene: Scene, voxel_size: float) -> OccupancyMap:
+        return WavemapMap(
+            voxel_size, scene.noise, volume=scene.volume, max_depth=scene.max_depth, **parameters
         )
 
     return Contender(name, make, BOTH)

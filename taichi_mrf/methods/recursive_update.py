@@ -6,6 +6,8 @@ It is then moved to LEAST_LOG_ODDS, up rather than down, because a voxel whose l
 counts as occupied (OctoMap).
 """
 
+import math
+
 import taichi as ti
 
 from taichi_mrf.kernels.log_odds import faded
@@ -19,6 +21,11 @@ UNKNOWN_LOG_ODDS = 0.0
 LEAST_LOG_ODDS = 1e-6
 """The smallest magnitude of a known voxel's log-odds: small compared to any update, and large enough for the
 probability, a float32 near 0.5, to differ from 0.5."""
+
+
+def log_odds(probability: float) -> float:
+    """ln(p / (1 - p))."""
+    return math.log(probability / (1 - probability))
 
 
 @ti.func

@@ -20,8 +20,8 @@ from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.inference.keyframe import DepthImage, checked_depth
 from taichi_mrf.methods.log_odds.map import LogOddsMap
 from taichi_mrf.methods.log_odds.plug import LogOddsConfig
-from taichi_mrf.methods.log_odds.scan import ScanIntegrator, count_rays, log_odds, weigh
-from taichi_mrf.methods.recursive_update import LEAST_LOG_ODDS
+from taichi_mrf.methods.log_odds.scan import ScanIntegrator, count_rays, weigh
+from taichi_mrf.methods.recursive_update import LEAST_LOG_ODDS, log_odds
 from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame

@@ -53,7 +53,7 @@ def test_plugs_load_without_taichi() -> None:
     )
 
 
-def test_a_fourth_method_needs_its_folder_and_one_line(tmp_path: Path, repository: Path) -> None:
+def test_another_method_needs_its_folder_and_one_line(tmp_path: Path, repository: Path) -> None:
     support = repository / "tests" / "support"
     path = os.pathsep.join([str(support), str(repository), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
@@ -66,7 +66,7 @@ def test_a_fourth_method_needs_its_folder_and_one_line(tmp_path: Path, repositor
     found = json.loads(done.stdout.splitlines()[-1])
     keys = found.pop("yaml_keys")
     assert keys[:2] == ["voxel_size", "method"]
-    assert keys.index("toy") == keys.index("visibility") + 1
+    assert keys.index("toy") == keys.index("wavemap") + 1
     assert found == {
         "yaml": "toy",
         "method": "toy",

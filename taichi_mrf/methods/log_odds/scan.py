@@ -7,7 +7,6 @@ counted for each voxel, in the halves of one integer; then they are turned into 
 The result does not depend on the order of the rays.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,7 +42,7 @@ from taichi_mrf.methods.log_odds.ray_ends import (
     free_from,
     ray_ends,
 )
-from taichi_mrf.methods.recursive_update import updated
+from taichi_mrf.methods.recursive_update import log_odds, updated
 from taichi_mrf.sensor.no_return import NoReturnLaw
 from taichi_mrf.sensor.origins import widened
 from taichi_mrf.system import runtime
@@ -138,11 +137,6 @@ class ScanIntegrator:
             runtime.settle()
             self.tally = ti.ndarray(ti.i64, bricks * VOXELS)
             self.tally.fill(0)
-
-
-def log_odds(probability: float) -> float:
-    """ln(p / (1 - p))."""
-    return math.log(probability / (1 - probability))
 
 
 @ti.func

@@ -1,7 +1,6 @@
 """Integration of one scan into a visibility map: host code and scratch memory for the kernels of scan.py."""
 
 import dataclasses
-import math
 
 import numpy as np
 import taichi as ti
@@ -13,6 +12,7 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.footprint import find_footprint
 from taichi_mrf.inference.keyframe import DepthImage, Footprint
 from taichi_mrf.inference.ray_list import RayBundler
+from taichi_mrf.methods.recursive_update import log_odds
 from taichi_mrf.methods.visibility import scan as visibility_scan
 from taichi_mrf.methods.visibility.plug import VisibilityConfig
 from taichi_mrf.system import runtime
@@ -106,7 +106,7 @@ class VisibilityIntegrator:
         visibility_scan.update(
             slots, pool.belief, self.visible, self.inside,
             config.hit_if_occupied, config.hit_if_free, config.hit_if_hidden,
-            _log_odds(config.lowest), _log_odds(config.highest),
+            log_odds(config.lowest), log_odds(config.highest),
         )  # fmt: skip
 
     def _reserve(self, voxels: int) -> None:
@@ -115,7 +115,3 @@ class VisibilityIntegrator:
             self.occluded = ti.ndarray(ti.f32, voxels)
             self.visible = ti.ndarray(ti.i32, voxels)
             self.inside = ti.ndarray(ti.i32, voxels)
-
-
-def _log_odds(probability: float) -> float:
-    return math.log(probability / (1 - probability))

@@ -1,4 +1,4 @@
-"""A fourth mapping method, as a newcomer would add it: this folder, and its name in the list of plugs."""
+"""Another mapping method, as a newcomer would add it: this folder, and its name in the list of plugs."""
 
 from dataclasses import dataclass
 

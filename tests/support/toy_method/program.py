@@ -1,4 +1,4 @@
-"""Run with a fourth method among the plugs; prints what the rest of the program makes of it, as JSON."""
+"""Run with another method among the plugs; prints what the rest of the program makes of it, as JSON."""
 
 import json
 import sys
