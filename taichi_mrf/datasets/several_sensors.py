@@ -50,8 +50,8 @@ class SensorEntry:
     """What its frames' names begin with; sensor-1, sensor-2, ... by default."""
 
     sigma: tuple[float, ...] | None = None
-    """Standard deviation of its depth in metres, coefficients in ascending powers of depth. By default the
-    recording's own, or the configuration's."""
+    """Standard deviation of its depth in metres, coefficients in ascending powers of depth, for all pixels.
+    By default the recording's own, which may be one for each pixel, or the configuration's."""
 
     bias: tuple[float, ...] = (0.0,)
     """Mean of measured minus true depth, likewise."""
@@ -89,11 +89,13 @@ class SensorsFile:
 
 @dataclass(frozen=True)
 class RecordedSensor:
-    """A sensor and its recording. ``noise`` is None for the configuration's."""
+    """A sensor and its recording. ``noise`` is None for the configuration's; if it is ``given`` in the file,
+    it is that of all pixels."""
 
     name: str
     dataset: Dataset
     noise: PolynomialNoise | None
+    given: bool
     T_poses_sensor: Pose
     range_m: tuple[float, float]
 
@@ -149,6 +151,7 @@ class SeveralSensors(Dataset):
             T_world_camera=frame.T_world_camera @ sensor.T_poses_sensor,
             name=name,
             noise=frame.noise or sensor.noise,
+            sigma_m=None if sensor.given else frame.sigma_m,
             sensor=sensor.name,
         )
 
@@ -223,7 +226,7 @@ def _open_sensor(
     most = entry.max_depth or dataset.recorded_reach or SensorConfig().max_depth
     T = as_pose(np.reshape(entry.T_poses_sensor, (-1, 4))) if entry.T_poses_sensor else np.eye(4)
     noise = None if sigma is None else PolynomialNoise(sigma, entry.bias)
-    return RecordedSensor(name, dataset, noise, T, (entry.min_depth, most))
+    return RecordedSensor(name, dataset, noise, entry.sigma is not None, T, (entry.min_depth, most))
 
 
 def _refuse(path: Path, options: ReadOptions) -> None:

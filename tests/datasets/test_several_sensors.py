@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from datasets_recordings import Content, arrays, write_npz
+from datasets_recordings import Content, arrays, write_npz, write_stray
 from point_clouds import Walk, write_scans
 
 from taichi_mrf.config.schema import Config, KeyframeConfig, SensorConfig
@@ -71,6 +71,18 @@ def test_each_sensor_has_its_own_noise_range_and_place(robot: Path) -> None:
     alone = open_dataset(robot.parent / "depth.npz", image_scale=0.5).read(0)
     assert (alone.depth_m > 3.0).any()
     np.testing.assert_array_equal(depth.depth_m, np.where(alone.depth_m <= 3.0, alone.depth_m, 0))
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_a_sigma_in_the_file_holds_for_all_pixels(tmp_path: Path, given: bool) -> None:
+    write_stray(tmp_path / "phone", Content(1))
+    (tmp_path / "robot.yaml").write_text(
+        "sensors: [{source: phone" + (", sigma: [0.03]" if given else "") + "}]"
+    )
+    frame = open_dataset(tmp_path / "robot.yaml").read(0)
+    assert (frame.sigma_m is None) == given
+    assert isinstance(frame.noise, PolynomialNoise)
+    assert frame.noise.sigma[0, 0] == (0.03 if given else 0.01)
 
 
 def test_a_lidars_sigma_and_reach_are_the_defaults(robot: Path) -> None:
