@@ -57,10 +57,11 @@ class InferenceConfig:
     """Minimum rays cast at a voxel facing the camera, per centimetre of voxel size: 12.5 rays at 5 cm, 2.5 at
     1 cm. Pixels beyond that share rays. 0 casts a ray for every pixel."""
 
-    pass_through: float = 0.0
+    pass_through: float | None = None
     """Chance that a ray passes through an occupied voxel, below 1, because what is in it fills only a part.
-    0 is the paper's model, in which one ray that passes clears a voxel; with 0.1 thin things such as posts
-    and legs stay in the map. sum-product only."""
+    With 0, the paper's model, a few rays that pass clear a voxel; with 0.1 thin things such as posts and legs
+    stay in the map. By default 0.1 for a lidar's recording and 0 for all others. max-product and
+    factor_graph() take it as 0."""
 
     ray_choice: Literal["bundle", "thin"] = "bundle"
     """How pixels share rays: bundle casts one ray with the mean depth of neighbouring pixels that agree, with
@@ -111,9 +112,8 @@ class InferenceConfig:
         check_field(self.outlier_floor >= 0, "inference.outlier_floor", "must not be negative")
         check_field(self.end_sigmas > 0, "inference.end_sigmas", "must be positive")
         check_field(self.ray_density >= 0, "inference.ray_density", "must not be negative")
-        check_field(0 <= self.pass_through < 1, "inference.pass_through", "must lie in 0 to below 1")
-        opaque = self.pass_through == 0 or self.method == "sum-product"
-        check_field(opaque, "inference.pass_through", "must be 0 for max-product")
+        share = self.pass_through or 0.0
+        check_field(0 <= share < 1, "inference.pass_through", "must be at least 0 and less than 1")
         check_field(0 <= self.ray_correlation <= 1, "inference.ray_correlation", "must lie between 0 and 1")
         check_field(self.min_length >= 0, "inference.min_length", "must not be negative")
         check_field(0 < self.message_clamp <= 30, "inference.message_clamp", "must lie between 0 and 30")

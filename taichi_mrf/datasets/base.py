@@ -87,13 +87,18 @@ class Dataset(ABC):
 
     @property
     def sigma_origin(self) -> str:
-        """Where :attr:`recorded_sigma` comes from, in the words of a note."""
+        """Where :attr:`recorded_sigma` and the like come from, in the words of a note."""
         return "the recording's own"
 
     @property
     def recorded_reach(self) -> float | None:
         """How far the sensor measures, in metres, if that is further than depth cameras do; None if it is not
         known."""
+        return None
+
+    @property
+    def recorded_pass_through(self) -> float | None:
+        """Chance that a ray of this kind of sensor passes an occupied voxel; None for the default's 0."""
         return None
 
     def check_scale(self, poses_are_used: bool) -> list[str]:

@@ -43,6 +43,11 @@ class Derived(Dataset):
         """The source's."""
         return self.source.recorded_reach
 
+    @property
+    def recorded_pass_through(self) -> float | None:
+        """The source's."""
+        return self.source.recorded_pass_through
+
     def stamps(self) -> Sequence[float] | NDArray[np.float64]:
         """The source's."""
         return self.source.stamps()

@@ -1,20 +1,21 @@
 """What a recording itself says of its sensor, put into the parameters: the noise of depth that a stereo
-calibration gives, the reach of a lidar."""
+calibration gives, the reach of a lidar, and that its beams pass what fills only a part of a voxel."""
 
 from dataclasses import replace
+from typing import Any
 
+from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.datasets.base import Dataset
 
 
 def with_recorded_noise(settings: Config, dataset: Dataset) -> Config:
-    """The parameters with the recording's own sigma and reach in place of the defaults; adds notes to the
-    dataset.
+    """The parameters with the recording's own sigma, reach and ``pass_through`` in place of the defaults;
+    adds notes to the dataset.
 
-    A sigma, a sigma table or a largest depth that the user has set stays, and such a sigma is that of all
-    pixels.
+    What the user has set stays, and a sigma or sigma table that is set is that of all pixels.
     """
-    return _with_reach(_with_sigma(settings, dataset), dataset)
+    return _with_pass_through(_with_reach(_with_sigma(settings, dataset), dataset), dataset)
 
 
 def _with_sigma(settings: Config, dataset: Dataset) -> Config:
@@ -48,3 +49,19 @@ def _with_reach(settings: Config, dataset: Dataset) -> Config:
     reach = f"{own:g} m, as far as the first scan reaches"
     dataset.notes.append(f"sensor.max_depth is {reach}; setting sensor.max_depth overrides it")
     return replace(settings, sensor=replace(sensor, max_depth=own))
+
+
+def _with_pass_through(settings: Config, dataset: Dataset) -> Config:
+    own = dataset.recorded_pass_through
+    if own is None:
+        return settings
+    for method in METHODS.values():  # all of them: the tuning page may change to another
+        section = getattr(settings, method.section)
+        if getattr(section, "pass_through", own) is not None:
+            continue
+        name = f"{method.section}.pass_through"
+        if method.name == settings.method:
+            dataset.notes.append(f"{name} is {own:g}, {dataset.sigma_origin}; setting {name} overrides it")
+        changed: dict[str, Any] = {method.section: replace(section, pass_through=own)}
+        settings = replace(settings, **changed)
+    return settings

@@ -96,6 +96,13 @@ class Sweeper:
         )
 
     @property
+    def pass_through(self) -> float:
+        """Chance that a ray passes through an occupied voxel."""
+        if self.inference.method == "max-product":
+            return 0.0
+        return self.inference.pass_through or 0.0
+
+    @property
     def voxel_steps(self) -> int:
         """Voxels that the measured rays of the last sweep crossed, each ray's counted."""
         return int(self.steps.to_numpy()[: self._workers].sum(dtype=np.int64))
@@ -156,7 +163,7 @@ class Sweeper:
         sum_product.cavity(
             bricks.slots, belief, messages,
             least_log_odds(self.inference, prior_log_odds), self.inference.cavity_clamp,
-            log_pass(self.inference.pass_through), self.inference.pass_through > 0,
+            log_pass(self.pass_through), self.pass_through > 0,
             swept.log_free, swept.sums, strip_length(),
         )  # fmt: skip
         self.index.fill(window, bricks.cells, self.order)
@@ -178,8 +185,8 @@ class Sweeper:
             end_sigmas=config.end_sigmas,
             floor=config.outlier_floor,
             clamp=config.message_clamp,
-            pass_through=config.pass_through,
-            passes=config.pass_through > 0,
+            pass_through=self.pass_through,
+            passes=self.pass_through > 0,
             likelihood=LIKELIHOODS[config.likelihood],
             segment_lengths=config.segment_lengths,
             log_average=config.average == "log_odds",

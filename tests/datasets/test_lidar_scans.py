@@ -9,9 +9,11 @@ import pytest
 from datasets_recordings import row_of, stamped_line
 from point_clouds import Walk, write_pcd, write_ply, write_scans, write_velodyne
 
+from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.datasets import Dataset, open_dataset
-from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M, LidarScans, reach_of
+from taichi_mrf.datasets.lidar.recording import LIDAR_PASS_THROUGH, LIDAR_SIGMA_M, reach_of
+from taichi_mrf.datasets.lidar.scans import LidarScans
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import inverse
@@ -310,13 +312,20 @@ def test_no_scan_that_can_be_read(tmp_path: Path) -> None:
     assert "scan-000.npz: none of 4 points is a measurement" in said
 
 
-def test_sigma_and_reach_of_a_lidar_take_the_place_of_the_defaults(tmp_path: Path) -> None:
+def test_what_is_known_of_a_lidar_takes_the_place_of_the_defaults(tmp_path: Path) -> None:
     dataset = open_dataset(npz_scans(tmp_path / "walk"))
-    assert with_recorded_noise(Config(), dataset).sensor == SensorConfig(sigma=(LIDAR_SIGMA_M,))
+    filled = with_recorded_noise(Config(), dataset)
+    assert filled.sensor == SensorConfig(sigma=(LIDAR_SIGMA_M,))
+    assert filled.inference == InferenceConfig(pass_through=LIDAR_PASS_THROUGH)
+    assert dataset.notes[-1] == (
+        "inference.pass_through is 0.1, assumed for a lidar; setting inference.pass_through overrides it"
+    )
     assert isinstance(dataset, LidarScans)
     dataset.reach_m = 40.0
     assert with_recorded_noise(Config(), dataset).sensor.max_depth == 40.0
-    chosen = Config(sensor=SensorConfig(sigma=(0.01,), max_depth=25.0))
+    chosen = Config(
+        sensor=SensorConfig(sigma=(0.01,), max_depth=25.0), inference=InferenceConfig(pass_through=0.0)
+    )
     assert with_recorded_noise(chosen, dataset) == chosen
     assert [reach_of(np.array([0.0, x])) for x in (3.0, 10.0, 44.2, 1e30)] == [10.0, 10.0, 50.0, 500.0]
     assert reach_of(np.append(np.full(5000, 22.0), 1e9)) == 30.0, "a damaged point says nothing"

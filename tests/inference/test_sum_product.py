@@ -58,16 +58,15 @@ def test_one_ray_equals_enumeration(
     rng = np.random.default_rng(seed)
     T = random_pose(rng)
     maximise = method == "max-product"
-    config = InferenceConfig(
-        prior=prior, return_pass=return_pass, pass_through=0.0 if maximise else pass_through, **EXACT
-    )
+    config = InferenceConfig(prior=prior, return_pass=return_pass, pass_through=pass_through, **EXACT)
     sensor = Noise((sigma,), (bias,))
     rays = reference.cast(image(depth), T, ONE_PIXEL, VOXEL, sensor, config, max_depth=0.75)
     assume(well_cut(rays, 12))
     m = MRFMap(VOXEL, PolynomialNoise((sigma,), (bias,)), inference=config, max_depth=0.75)
     m.add_keyframe(image(depth), T, ONE_PIXEL)
     m.infer(sweeps=2, method=method)
-    exact = reference.enumerate_marginals(rays, prior, config.outlier_floor, maximise, config.pass_through)
+    passes = 0.0 if maximise else pass_through
+    exact = reference.enumerate_marginals(rays, prior, config.outlier_floor, maximise, passes)
     np.testing.assert_allclose(marginals(m, list(exact)), list(exact.values()), atol=1e-4)
 
 

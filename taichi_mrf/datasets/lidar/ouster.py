@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.base import Format
 from taichi_mrf.datasets.lidar.beams import Beams
 from taichi_mrf.datasets.lidar.motion import Motion, PoseAt, Scan
 from taichi_mrf.datasets.lidar.ouster_files import OSF, check_recording
-from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M, SIGMA_ORIGIN, reach_of, refuse_image_options
+from taichi_mrf.datasets.lidar.recording import LidarRecording, reach_of
+from taichi_mrf.datasets.lidar.scans import refuse_image_options
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError, said
@@ -60,7 +61,7 @@ class RecordedColumns:
 
 
 @dataclass
-class OusterScans(Dataset):
+class OusterScans(LidarRecording):
     """The scans of one sensor. ``source`` is ouster.sdk's; ``trajectory`` are poses of the sensor,
     T_world_sensor, from a file, None for those in the recording."""
 
@@ -72,27 +73,11 @@ class OusterScans(Dataset):
     trajectory: TimedPoses | None = None
     gap: float = INTERPOLATION_GAP
     deskew: bool = True
-    reach_m: float | None = None
 
     @property
     def frame_names(self) -> Sequence[str]:
         """The number of each scan in the recording, from 0."""
         return [f"{scan.number:06d}" for scan in self.scans]
-
-    @property
-    def recorded_sigma(self) -> tuple[float, ...] | None:
-        """The same at every range."""
-        return (LIDAR_SIGMA_M,)
-
-    @property
-    def sigma_origin(self) -> str:
-        """It is assumed."""
-        return SIGMA_ORIGIN
-
-    @property
-    def recorded_reach(self) -> float | None:
-        """The largest range of the first scan, rounded up to tens of metres."""
-        return self.reach_m
 
     def stamps(self) -> Sequence[float]:
         """When each frame was taken, in seconds."""

@@ -10,23 +10,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.lidar.recording import LidarRecording, reach_of
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.ray_table import RayTable
 
-LIDAR_SIGMA_M = 0.03
-"""Standard deviation of range that is assumed: spinning lidars are specified with 2 to 3 cm at all ranges."""
-
-SIGMA_ORIGIN = "assumed for a lidar"
-"""What reports say of it."""
-
 SECONDS_PER_SCAN = 0.1
 """Assumed where nothing tells: most lidars turn ten times a second."""
-
-_REACH_STEP_M, MOST_REACH_M = 10.0, 500.0
 
 ScanReader = Callable[[], tuple[NDArray[np.float64], Pose]]
 """Points (N, 3) in metres in the sensor's frame, NaN and 0 where nothing came back, and T_world_sensor,
@@ -48,31 +40,15 @@ class RecordedScan:
 
 
 @dataclass
-class LidarScans(Dataset):
+class LidarScans(LidarRecording):
     """Scans of free rays. ``camera`` and ``reach_m`` are those of the first scan that can be read."""
 
     scans: Sequence[RecordedScan] = field(kw_only=True)
-    reach_m: float = field(kw_only=True)
 
     @property
     def frame_names(self) -> Sequence[str]:
         """The names of the scans in order."""
         return [scan.name for scan in self.scans]
-
-    @property
-    def recorded_sigma(self) -> tuple[float, ...] | None:
-        """The same at every range."""
-        return (LIDAR_SIGMA_M,)
-
-    @property
-    def sigma_origin(self) -> str:
-        """It is assumed."""
-        return SIGMA_ORIGIN
-
-    @property
-    def recorded_reach(self) -> float | None:
-        """The largest range of the first scan, rounded up to tens of metres."""
-        return self.reach_m
 
     def stamps(self) -> Sequence[float]:
         """When each frame was taken, in seconds."""
@@ -134,13 +110,6 @@ def lidar_scans(
         reach_m = reach_of(range_m)
         return LidarScans(name, camera, list(notes), dropped, scans=scans, reach_m=reach_m)
     raise DatasetError(f"{name}: no scan can be read: {problem}") from problem
-
-
-def reach_of(range_m: NDArray[np.floating]) -> float:
-    """How far ranges, 0 for none, go: all but the thousandth of them that may be damaged, rounded up to tens
-    of metres, and at most MOST_REACH_M."""
-    reach_m = np.quantile(range_m[range_m > 0], 0.999)
-    return float(min(max(1.0, np.ceil(reach_m / _REACH_STEP_M)) * _REACH_STEP_M, MOST_REACH_M))
 
 
 def refuse_image_options(name: str, options: ReadOptions) -> None:

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.lidar.motion import Motion, PoseAt, Scan
 from taichi_mrf.datasets.lidar.organised import by_ring, organised
-from taichi_mrf.datasets.lidar.scans import LIDAR_SIGMA_M, SIGMA_ORIGIN, measured_points, reach_of
+from taichi_mrf.datasets.lidar.recording import LidarRecording, reach_of
+from taichi_mrf.datasets.lidar.scans import measured_points
 from taichi_mrf.datasets.ros.point_cloud import Cloud, decode
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.errors import DatasetError, FrameError
@@ -24,7 +24,7 @@ from taichi_mrf.sensor.ray_table import RayTable
 
 
 @dataclass
-class LidarBag(Dataset):
+class LidarBag(LidarRecording):
     """The point clouds of one topic, each with its pose. ``at`` gives the lidar's pose at a time in seconds,
     or None; if it is None itself, points are left where they are."""
 
@@ -34,27 +34,11 @@ class LidarBag(Dataset):
     poses: Sequence[Pose] = field(kw_only=True)
     names: Sequence[str] = field(kw_only=True)
     at: PoseAt | None = None
-    reach_m: float | None = None
 
     @property
     def frame_names(self) -> Sequence[str]:
         """The number that each cloud has in its topic, from 0."""
         return self.names
-
-    @property
-    def recorded_sigma(self) -> tuple[float, ...] | None:
-        """The same at every range."""
-        return (LIDAR_SIGMA_M,)
-
-    @property
-    def sigma_origin(self) -> str:
-        """It is assumed."""
-        return SIGMA_ORIGIN
-
-    @property
-    def recorded_reach(self) -> float | None:
-        """The largest range of the first cloud, rounded up to tens of metres."""
-        return self.reach_m
 
     def stamps(self) -> Sequence[float]:
         """When each frame was taken, in seconds."""

@@ -29,6 +29,9 @@ METHOD = Method(
         Slider("outlier_floor", Range(-9.0, 0.0, 0.25), "per m", decades=True, searched=True),
         Slider("message_clamp", Range(0.5, 14.0, 0.1), "log-odds", searched=True),
         Slider("cavity_clamp", Range(0.5, 20.0, 0.1), "log-odds"),
+        Slider(
+            "pass_through", Range(0.0, 0.5, 0.01), counts=lambda section: section.pass_through is not None
+        ),
         Slider("free_share", Range(0.0, 1.0, 0.01), searched=True),
         Slider("ray_density", Range(0.0, 10.0, 0.5), "per cm"),
     ),

@@ -99,7 +99,7 @@ def ray_messages(
     for segment, density in zip(ray.segments, ray.densities, strict=True):
         if segment.voxel not in incoming:
             continue
-        m = (1 - config.pass_through) * logistic(incoming[segment.voxel])
+        m = (1 - (config.pass_through or 0.0)) * logistic(incoming[segment.voxel])
         length = segment.length if config.segment_lengths else 1.0
         free = (1 - m) ** length
         steps.append((segment, free, density * visibility, explained))
@@ -110,7 +110,7 @@ def ray_messages(
     for segment, free, here, before in reversed(steps):
         occupied = before + here + config.outlier_floor
         empty = before + behind / free + config.outlier_floor
-        occupied += config.pass_through * (empty - occupied)
+        occupied += (config.pass_through or 0.0) * (empty - occupied)
         weight = segment.length if config.segment_lengths else 1.0
         out.append((segment.voxel, weight, occupied / (occupied + empty)))
         behind += (1 - free) * here

@@ -1,0 +1,51 @@
+"""What every recording of a lidar says of its sensor, whatever its format."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.datasets.base import Dataset
+
+LIDAR_SIGMA_M = 0.03
+"""Standard deviation of range that is assumed: spinning lidars are specified with 2 to 3 cm at all ranges."""
+
+LIDAR_PASS_THROUGH = 0.1
+"""Chance that a beam passes an occupied voxel. A lidar's voxels are wide, so posts and legs fill only a part
+of one (docs/decisions.md)."""
+
+_REACH_STEP_M, MOST_REACH_M = 10.0, 500.0
+
+
+@dataclass
+class LidarRecording(Dataset):
+    """The scans of a lidar. ``reach_m`` is the largest range of the first one, None until that is read."""
+
+    reach_m: float | None = field(default=None, kw_only=True)
+
+    @property
+    def recorded_sigma(self) -> tuple[float, ...] | None:
+        """The same at every range."""
+        return (LIDAR_SIGMA_M,)
+
+    @property
+    def sigma_origin(self) -> str:
+        """It is assumed."""
+        return "assumed for a lidar"
+
+    @property
+    def recorded_reach(self) -> float | None:
+        """The largest range of the first scan, rounded up to tens of metres."""
+        return self.reach_m
+
+    @property
+    def recorded_pass_through(self) -> float | None:
+        """The same for all lidars."""
+        return LIDAR_PASS_THROUGH
+
+
+def reach_of(range_m: NDArray[np.floating]) -> float:
+    """How far ranges, 0 for none, go: all but the thousandth of them that may be damaged, rounded up to tens
+    of metres, and at most MOST_REACH_M."""
+    reach_m = np.quantile(range_m[range_m > 0], 0.999)
+    return float(min(max(1.0, np.ceil(reach_m / _REACH_STEP_M)) * _REACH_STEP_M, MOST_REACH_M))
