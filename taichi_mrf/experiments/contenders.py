@@ -7,6 +7,7 @@ from typing import Any
 
 from taichi_mrf import LogOddsMap, MRFMap, VisibilityMap, WavemapMap
 from taichi_mrf.config.schema import to_yaml
+from taichi_mrf.datasets.lidar.recording import LIDAR_PASS_THROUGH
 from taichi_mrf.experiments.scenes import Scene
 from taichi_mrf.methods.protocol import OccupancyMap
 
@@ -46,6 +47,11 @@ def mrf(name: str = "MRFMap", **parameters: Any) -> Contender:
         return MRFMap(voxel_size, scene.noise, volume=scene.volume, max_depth=scene.max_depth, **parameters)
 
     return Contender(name, make)
+
+
+def lidar_mrf(name: str = "MRFMap") -> Contender:
+    """The same with the chance that a lidar's beam passes an occupied voxel."""
+    return mrf(name, pass_through=LIDAR_PASS_THROUGH)
 
 
 def log_odds(name: str, **parameters: Any) -> Contender:

@@ -15,7 +15,7 @@ from taichi_mrf import PolynomialNoise, open_dataset
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.evaluation.accuracy import judge_view
 from taichi_mrf.evaluation.tables import Entry, Spread, Table, write_table
-from taichi_mrf.experiments.contenders import Contender, log_odds, mrf, wavemap
+from taichi_mrf.experiments.contenders import Contender, lidar_mrf, log_odds, mrf, wavemap
 from taichi_mrf.experiments.folds import Experiment, Scored, flatten, fold_key, require_views
 from taichi_mrf.experiments.judging import build, judge_all
 from taichi_mrf.experiments.ledger import Result
@@ -26,6 +26,8 @@ from taichi_mrf.experiments.tuning import MOST_KEYFRAMES, tuned_contender
 from taichi_mrf.methods.wavemap.plug import WavemapConfig
 
 MAX_RANGE_M = 60.0
+
+OPAQUE = "MRFMap, no beam passes"
 
 EVERY, FIRST = 5, 2
 """Every fifth scan is held out, from the third on."""
@@ -80,7 +82,8 @@ def run_lidar(experiment: Experiment) -> tuple[list[Table], list[Path]]:
         beams = _tuned_beams(experiment, judged_scene, voxel_size, keyframes)
         tuned.append(f"{voxel_size * 100:g} cm: {in_words(beams)}")
         contenders = [
-            mrf(),
+            lidar_mrf(),
+            mrf(OPAQUE),
             log_odds("OctoMap-style"),
             tuned_contender(experiment, judged_scene, 0, voxel_size, keyframes),
             wavemap(),
@@ -134,7 +137,7 @@ def _learnt_sigma(experiment: Experiment, scene: Scene, voxel_size: float, keyfr
     for number, sigma_m in enumerate(SIGMAS_M):
         experiment.report(f"learning sigma, {voxel_size * 100:g} cm", number, len(SIGMAS_M))
         assumed = replace(scene, noise=PolynomialNoise((sigma_m,)))
-        (scored,) = _scored(experiment, assumed, mrf(f"sigma {sigma_m:g}"), voxel_size, some, [check])
+        (scored,) = _scored(experiment, assumed, lidar_mrf(f"sigma {sigma_m:g}"), voxel_size, some, [check])
         found[sigma_m] = scored.figures["log_likelihood"]
     return max(found, key=lambda sigma_m: found[sigma_m])
 

@@ -18,7 +18,7 @@ from taichi_mrf import UNKNOWN, PolynomialNoise, open_dataset
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.evaluation.occupancy_scores import score_occupancy
 from taichi_mrf.evaluation.tables import Entry, Spread, Table
-from taichi_mrf.experiments.contenders import Contender, log_odds, mrf, row_name, wavemap
+from taichi_mrf.experiments.contenders import Contender, lidar_mrf, log_odds, row_name, wavemap
 from taichi_mrf.experiments.folds import Experiment, fold_key, require_views
 from taichi_mrf.experiments.judging import build
 from taichi_mrf.experiments.lidar_rivals import TUNED, contender_of, in_words, tuned_parameters
@@ -140,11 +140,11 @@ def _fold_areas(
         found = _areas(experiment, assumed, contender, voxel_size, fold.others, [fold.check])
         return found[AS_IT_IS][0]["area"]
 
-    sigma_m = max(SIGMAS_M, key=lambda sigma_m: score(mrf(f"sigma {sigma_m:g}"), sigma_m))
+    sigma_m = max(SIGMAS_M, key=lambda sigma_m: score(lidar_mrf(f"sigma {sigma_m:g}"), sigma_m))
     weights = max(GRID, key=lambda weights: score(weights.contender()))
     beams = tuned_parameters(voxel_size, score)
     contenders: list[tuple[Contender, Sequence[Reading]]] = [
-        (mrf(), READINGS),
+        (lidar_mrf(), READINGS),
         (log_odds("OctoMap-style"), ()),
         (replace(weights.contender(), name=NAME), ()),
         (wavemap(), ()),
