@@ -35,7 +35,7 @@ EVERY, FIRST = 5, 2
 RUN = 15
 """Neighbouring keyframes by which wavemap's model is tuned."""
 
-SIGMAS_M = (0.03, 0.05, 0.08, 0.12, 0.18)
+SIGMAS_M = (0.03, 0.04, 0.06, 0.08, 0.12, 0.18)
 """The standard deviations of range that are tried."""
 
 NEAR_M = 0.2
