@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.calibration.no_return import NoReturnFit, fit_no_return
+from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.queries.points import FREE, OCCUPIED
@@ -117,8 +118,11 @@ def scans(seed: int = 0, eyes: Sequence[NDArray[np.float64]] = tuple(EYES)) -> l
     return found
 
 
-def mapped(sensor: SensorConfig, voxel_size: float, taken: Sequence[Scan]) -> MRFMap:
-    m = MRFMap.from_config(Config(voxel_size=voxel_size, sensor=sensor), CAMERA)
+def mapped(
+    sensor: SensorConfig, voxel_size: float, taken: Sequence[Scan], pass_through: float = 0.0
+) -> MRFMap:
+    inference = InferenceConfig(pass_through=pass_through)
+    m = MRFMap.from_config(Config(voxel_size=voxel_size, sensor=sensor, inference=inference), CAMERA)
     for scan in taken:
         m.add_keyframe(scan.range_m, scan.T_world_camera, CAMERA, no_return=scan.no_return)
     m.infer()
@@ -164,7 +168,7 @@ def learnt(seed: int = 1) -> NoReturnFit:
     return fit_no_return(true, np.concatenate([scan.no_return.reshape(-1) for scan in taken]))
 
 
-def main(voxel_size: float) -> None:
+def main(voxel_size: float, pass_through: float) -> None:
     """Print the figures of docs/sensors.md."""
     runtime.init("cpu")
     taken, fit = scans(), learnt()
@@ -178,7 +182,7 @@ def main(voxel_size: float) -> None:
     before = None
     for name, sensor in sensors.items():
         begin = time.perf_counter()
-        m = mapped(sensor, voxel_size, taken)
+        m = mapped(sensor, voxel_size, taken, pass_through)
         seconds = time.perf_counter() - begin
         found, surface = judged(m, taken, 40.0), m.voxels(0.5)[0]
         before = surface if before is None else before
@@ -189,4 +193,4 @@ def main(voxel_size: float) -> None:
 
 
 if __name__ == "__main__":
-    main(float(sys.argv[1]))
+    main(float(sys.argv[1]), float(sys.argv[2]))
