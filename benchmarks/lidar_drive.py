@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 
 from taichi_mrf import MRFMap, PolynomialNoise, SphericalCamera
 from taichi_mrf.config.schema import Arch, VolumeConfig
+from taichi_mrf.datasets.lidar.recording import LIDAR_PASS_THROUGH, LIDAR_SIGMA_M
 from taichi_mrf.datasets.synthetic.analytic_render import ray_depths
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene, Solid
 from taichi_mrf.mapping.selection import surplus
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import peak_memory_mb, reset_peak_memory
 
-SIGMA_M, REACH_M, STEP_M, EYE_M = 0.03, 50.0, 1.0, 1.9
+REACH_M, STEP_M, EYE_M = 50.0, 1.0, 1.9
 
 BLOCK_M = 18.0
 """Length of the street that has a house and a parked car on either side."""
@@ -62,7 +63,8 @@ def main() -> None:
         np.radians(np.linspace(15.0, -25.0, 64)), np.linspace(math.pi, -math.pi, 1025)[:-1]
     )
     volume = VolumeConfig(window_m=options.window_m)
-    m = MRFMap(options.voxel_size, PolynomialNoise((SIGMA_M,)), volume=volume, max_depth=REACH_M)
+    noise, passes = PolynomialNoise((LIDAR_SIGMA_M,)), LIDAR_PASS_THROUGH
+    m = MRFMap(options.voxel_size, noise, volume=volume, max_depth=REACH_M, pass_through=passes)
     draw = np.random.default_rng(0)
     with tempfile.TemporaryDirectory() as folder:
         parked = Path(folder) / "map_window.zarr"
@@ -101,7 +103,7 @@ def _scan(
     ground = Solid("box", (x, 0.0, -0.5), (2 * REACH_M, 2 * REACH_M, 0.5))
     solids = [ground, *(solid for block in range(first, last + 1) for solid in _block(block))]
     true_m = ray_depths(Scene(tuple(solids), (x, 0.0, 50.0)), lidar, T_world_lidar)
-    noisy = true_m + draw.normal(0, SIGMA_M, true_m.shape)
+    noisy = true_m + draw.normal(0, LIDAR_SIGMA_M, true_m.shape)
     return np.where((true_m > 0) & (true_m < REACH_M), noisy, 0.0).astype(np.float32), T_world_lidar
 
 
