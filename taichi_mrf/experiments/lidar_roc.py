@@ -21,6 +21,8 @@ from taichi_mrf.evaluation.tables import Entry, Spread, Table
 from taichi_mrf.experiments.contenders import Contender, lidar_mrf, log_odds, row_name, wavemap
 from taichi_mrf.experiments.folds import Experiment, fold_key, require_views
 from taichi_mrf.experiments.judging import build
+from taichi_mrf.experiments.kernel_inference import KernelMap, KernelModel
+from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.lidar_rivals import TUNED, contender_of, in_words, tuned_parameters
 from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.experiments.tuning import GRID, NAME
@@ -39,6 +41,9 @@ SIGMAS_M = (0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.18)
 
 READINGS: tuple[Reading, ...] = ("marginal", "calibrated", "surface")
 """Of an MRFMap."""
+
+KERNEL = "BGK-style"
+"""Rows of kernel inference."""
 
 AS_IT_IS = ""
 """A map without another reading."""
@@ -140,9 +145,14 @@ def _fold_areas(
         found = _areas(experiment, assumed, contender, voxel_size, fold.others, [fold.check])
         return found[AS_IT_IS][0]["area"]
 
+    def kernel_score(model: KernelModel) -> float:
+        (check,) = _kernel_areas(experiment, scene, model, voxel_size, fold.others, [fold.check])
+        return check["area"]
+
     sigma_m = max(SIGMAS_M, key=lambda sigma_m: score(lidar_mrf(f"sigma {sigma_m:g}"), sigma_m))
     weights = max(GRID, key=lambda weights: score(weights.contender()))
     beams = tuned_parameters(voxel_size, score)
+    kernel = max(KernelModel().candidates(), key=kernel_score)
     contenders: list[tuple[Contender, Sequence[Reading]]] = [
         (lidar_mrf(), READINGS),
         (log_odds("OctoMap-style"), ()),
@@ -155,7 +165,28 @@ def _fold_areas(
     for contender, readings in contenders:
         found = _areas(experiment, assumed, contender, voxel_size, fold.mapped, fold.held_out, readings)
         rows |= {row_name(contender.name, reading): scans for reading, scans in found.items()}
-    return rows, f"sigma {sigma_m * 100:g} cm; log-odds {weights.name}; wavemap-style {in_words(beams)}"
+    for name, model in ((KERNEL, KernelModel()), (f"{KERNEL}, tuned", kernel)):
+        rows[name] = _kernel_areas(experiment, scene, model, voxel_size, fold.mapped, fold.held_out)
+    return rows, (
+        f"sigma {sigma_m * 100:g} cm; log-odds {weights.name}; wavemap-style {in_words(beams)}; "
+        f"{KERNEL} {kernel.in_words()}"
+    )
+
+
+def _kernel_areas(
+    experiment: Experiment, scene: Scene, model: KernelModel, voxel_size: float,
+    mapped: Sequence[int], judged: Sequence[int],
+) -> list[Figures]:  # fmt: skip
+    """The figures of each judged scan under kernel inference from the mapped ones."""
+
+    def compute() -> Result:
+        m = KernelMap(model, voxel_size, [scene.views[i] for i in mapped])
+        rays, _ = build(log_odds(""), scene, voxel_size, mapped)
+        return {AS_IT_IS: [scan_figures(m, rays, scene.views[i], seed=i) for i in judged]}
+
+    key = f"{scene.name} | {model} | {voxel_size:g} m | ROC of {list(judged)} by {list(mapped)}"
+    scans: list[Figures] = experiment.ledger.result(key, compute)[AS_IT_IS]
+    return scans
 
 
 def _areas(

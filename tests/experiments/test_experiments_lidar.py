@@ -92,7 +92,7 @@ def test_a_building_is_mapped_by_all_contenders(tmp_path: Path, monkeypatch: pyt
 def check_areas(areas: Table, rivals: set[str]) -> None:
     by_name = {str(row[1]): row for row in areas.rows}
     assert len(by_name) == len(areas.rows)
-    assert {name.split(",")[0] for name in by_name} == {"MRFMap"} | rivals
+    assert {name.split(",")[0] for name in by_name} == {"MRFMap", lidar_roc.KERNEL} | rivals
     assert {name for name in by_name if "MRFMap" in name} == {
         f"MRFMap, {each}" for each in lidar_roc.READINGS
     }
