@@ -155,7 +155,8 @@ def time_taichi(problem: Path, threads: int) -> None:
     )  # fmt: skip
     model = RayModel(
         voxel_size=VOXEL_SIZE, max_depth=1e3, end_sigmas=SIGMAS, floor=FLOOR, clamp=CLAMP,
-        likelihood=CENTRE, segment_lengths=True, log_average=True, maximise=False,
+        pass_through=0.0, passes=False, likelihood=CENTRE,
+        segment_lengths=True, log_average=True, maximise=False,
     )  # fmt: skip
     steps = np.zeros(workers.number, np.int32)
     rays = RayList(data["pixels"] << BITS, data["depth"], count, 1)

@@ -64,3 +64,9 @@ def test_first_scores_come_before_full_ones(repository: Path) -> None:
 def test_the_rates_of_balls_and_paths(repository: Path) -> None:
     said = run(repository / "benchmarks" / "within_rate.py", "--voxel-size", "0.2", "--queries", "100")
     assert said.count("a second") == 5
+
+
+def test_a_drive_down_a_street(repository: Path) -> None:
+    flags = ("--scans", "4", "--every", "2", "--voxel-size", "1", "--window-m", "2", "--arch", "cpu")
+    said = run(repository / "benchmarks" / "lidar_drive.py", *flags)
+    assert [row.split()[0] for row in said.splitlines()] == ["scans", "2", "4"]

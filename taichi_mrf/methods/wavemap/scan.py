@@ -248,11 +248,14 @@ def _update(
     ``cells`` (n) are bricks of the window, ``slots`` (n) their places in the pool, ``belief`` (pool * 512)
     log-odds, which stay within [lowest, highest].
     """
-    for part in range(cells.shape[0] * BRICK):  # a slab of a brick: divisions are slow
-        brick = _cell(cells[part // BRICK], place.shape)
-        first = slots[part // BRICK] * VOXELS + part % BRICK * BRICK * BRICK
-        for number in range(BRICK * BRICK):
-            voxel = brick * BRICK + IVec3(part % BRICK, number // BRICK, number % BRICK)
+    # A row of a brick, because divisions are slow. Not more: Mesa's lavapipe ends the loops of a thread after
+    # 65,535 rounds in all, and a voxel takes one for each beam that it looks at.
+    for part in range(cells.shape[0] * BRICK * BRICK):
+        in_brick = part % (BRICK * BRICK)
+        brick = _cell(cells[part // (BRICK * BRICK)], place.shape)
+        first = slots[part // (BRICK * BRICK)] * VOXELS + in_brick * BRICK
+        for number in range(BRICK):
+            voxel = brick * BRICK + IVec3(in_brick // BRICK, in_brick % BRICK, number)
             centre = ti.cast(voxel, ti.f32) + 0.5
             if (centre - place.lower).min() > 0.0 and (place.upper - centre).min() > 0.0:
                 way = place.to_beams @ (centre - place.centre)
