@@ -3,7 +3,7 @@
 The class manages keyframes, bricks and messages. The computation itself is inference/sum_product.py.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.alignment.keyframe_surfels import KeyframeSurfels
-from taichi_mrf.alignment.refine import Aligner, RefinedPose
+from taichi_mrf.alignment.refine import Aligner
 from taichi_mrf.config.arguments import instance, real
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.method import Method
-from taichi_mrf.config.schema import Config, PoseConfig, SensorConfig, VolumeConfig
+from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
 from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.config.values import overridden
 from taichi_mrf.errors import KeyframeError
@@ -39,7 +39,7 @@ from taichi_mrf.methods.mrf.keyframe_allocator import KeyframeAllocator
 from taichi_mrf.methods.mrf.memory_budget import MemoryBudget
 from taichi_mrf.methods.mrf.moving_window import MovingWindow
 from taichi_mrf.methods.mrf.plug import METHOD
-from taichi_mrf.methods.mrf.reading import ReadableMRF
+from taichi_mrf.methods.mrf.posed import PosedMRF
 from taichi_mrf.methods.mrf.storage import contents_of, read_contents, write_contents
 from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.sensor.camera import Camera
@@ -48,7 +48,7 @@ from taichi_mrf.sensor.own_evidence import checked_evidence, checked_no_return
 from taichi_mrf.voxels.layout import VOXELS
 
 
-class MRFMap(ReadableMRF):
+class MRFMap(PosedMRF):
     """A probabilistic occupancy map of any set of depth keyframes.
 
     Keyframes can be added, removed, moved and frozen in any order; after :meth:`infer` the map depends only
@@ -160,36 +160,6 @@ class MRFMap(ReadableMRF):
         self._allocator.take_out(keyframe)
         del self._keyframes[id]
         self._settled = False
-
-    def move_keyframe(self, id: int, T_world_camera: ArrayLike) -> None:
-        """Move a keyframe to another pose, (4, 4), as a SLAM back-end does. Its messages are dropped. Raises
-        KeyframeError, or CapacityError if there is not enough memory; the map is then unchanged."""
-        keyframe = self._find(id)
-        T = as_pose(T_world_camera)
-        self._restore_messages()
-        self._allocator.take_out(keyframe)
-        self._settled = False
-        try:
-            parts = (keyframe.name, keyframe.image, T, keyframe.stamp_s)
-            self._keyframes[id] = self._allocator.place(id, *parts)
-        except Exception:
-            self._keyframes[id] = self._allocator.put_back(keyframe)
-            raise
-
-    def refine_pose(
-        self, id: int, config: PoseConfig | None = None, guesses: Sequence[ArrayLike] = ()
-    ) -> RefinedPose:
-        """Move a keyframe to the pose near by under which its depth is most likely in the map of the others.
-        The search starts at its pose or at one of ``guesses``, (4, 4) each. Raises KeyframeError."""
-        keyframe = self._find(id)
-        self._restore_messages()
-        if keyframe.messages is not None:
-            self._allocator.refresh(keyframe)
-        poses = [as_pose(T) for T in guesses]
-        refined = self.aligner.refine(keyframe, self._keyframes, config or PoseConfig(), poses)
-        if refined.accepted:
-            self.move_keyframe(id, refined.T_world_camera)
-        return refined
 
     def freeze_keyframe(self, id: int) -> None:
         """Add a keyframe's messages to the evidence that inference starts from, and drop its image.

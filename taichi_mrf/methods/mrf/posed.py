@@ -1,0 +1,153 @@
+"""The poses of an MRFMap's keyframes: one that is moved or refined, and a whole trajectory that changes while
+the map lives, as a pose graph does when a loop closes."""
+
+import math
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from taichi_mrf.alignment.refine import Aligner, RefinedPose
+from taichi_mrf.config.arguments import real
+from taichi_mrf.config.schema import PoseConfig
+from taichi_mrf.errors import KeyframeError
+from taichi_mrf.geometry.poses import Pose, as_pose, inverse
+from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.inference.schedule import InferReport, Progress
+from taichi_mrf.methods.mrf.keyframe_allocator import KeyframeAllocator
+from taichi_mrf.methods.mrf.reading import ReadableMRF
+from taichi_mrf.voxels.layout import BRICK
+
+LEAST_MOTION = 0.1
+"""Motion of what a keyframe sees, in voxels, up to which a new pose is left out."""
+
+
+@dataclass(frozen=True)
+class PoseUpdate:
+    """What :meth:`PosedMRF.update_poses` has done: the keyframes that it ``moved``, those that it ``kept``
+    where they were because their pose has hardly changed, and the new poses (4, 4) for which time was over,
+    which are ``left`` for the next call. ``report`` is that of the sweeps after all motions."""
+
+    moved: tuple[int, ...]
+    kept: tuple[int, ...]
+    left: Mapping[int, Pose]
+    report: InferReport
+
+    @property
+    def complete(self) -> bool:
+        """Whether all poses are in the map, and no keyframe's evidence is out of date."""
+        return not self.left and self.report.complete
+
+
+class PosedMRF(ReadableMRF):
+    """The part of an MRFMap that changes poses."""
+
+    aligner: Aligner
+    _allocator: KeyframeAllocator
+    _settled: bool
+
+    def renew(
+        self,
+        keyframes: Iterable[int] = (),
+        tolerance: float | None = None,
+        seconds: float | None = None,
+        progress: Progress | None = None,
+    ) -> InferReport:
+        """As MRFMap.renew."""
+        raise NotImplementedError
+
+    def move_keyframe(self, id: int, T_world_camera: ArrayLike) -> None:
+        """Move a keyframe to another pose, (4, 4), as a SLAM back-end does. Its messages are dropped. Raises
+        KeyframeError, or CapacityError if there is not enough memory; the map is then unchanged."""
+        keyframe = self._find(id)
+        T = as_pose(T_world_camera)
+        self._restore_messages()
+        self._allocator.take_out(keyframe)
+        self._settled = False
+        try:
+            parts = (keyframe.name, keyframe.image, T, keyframe.stamp_s)
+            self._keyframes[id] = self._allocator.place(id, *parts)
+        except Exception:
+            self._keyframes[id] = self._allocator.put_back(keyframe)
+            raise
+
+    def update_poses(
+        self,
+        poses: Mapping[int, ArrayLike],
+        least: float = LEAST_MOTION,
+        tolerance: float | None = None,
+        seconds: float | None = None,
+    ) -> PoseUpdate:
+        """Take in the poses, id -> (4, 4), of a trajectory that was corrected, as after a closed loop.
+
+        Keyframes move one after the other, those that move most first. Each is swept at once at its new pose,
+        so that the map is usable after every one of them. Then those whose evidence has changed are swept
+        again, as by :meth:`renew`, whose ``tolerance`` this is. A keyframe stays where it is if nothing in
+        its view would move by more than ``least`` voxels; the pose at which it was placed still counts.
+
+        After ``seconds`` no further keyframe is begun, but one is moved in any case: give ``left`` of the
+        result to the next call.
+        Afterwards :meth:`infer` makes, with ``least`` 0, the map that is made anew with these poses, bit for
+        bit. Raises KeyframeError for an unknown id or an impossible pose, before anything moves, and
+        CapacityError if there is not enough memory for a keyframe's new pose; those before it have then
+        moved.
+        """
+        begin = time.perf_counter()
+        least_m = real(least, "least", least=0) * self.voxel_size
+        if seconds is not None:
+            real(seconds, "seconds", least=0)
+        wanted = {self._find(id).id: _pose_of(id, T) for id, T in poses.items()}
+        motions_m = {id: _largest_motion_m(self._keyframes[id], T) for id, T in wanted.items()}
+        moving = sorted((id for id in wanted if motions_m[id] > least_m), key=lambda id: (-motions_m[id], id))
+        kept = tuple(id for id in wanted if motions_m[id] <= least_m)
+
+        def time_left() -> float | None:
+            return None if seconds is None else max(0.0, seconds - (time.perf_counter() - begin))
+
+        moved: list[int] = []
+        for id in moving:
+            if moved and time_left() == 0.0:
+                break
+            self.move_keyframe(id, wanted[id])
+            self.renew([id], tolerance=1.0)  # no share is larger, so that no other is swept
+            moved.append(id)
+        left = {id: wanted[id] for id in moving[len(moved) :]}
+        report = self.renew((), tolerance, 0.0 if left else time_left())
+        return PoseUpdate(tuple(moved), kept, left, report)
+
+    def refine_pose(
+        self, id: int, config: PoseConfig | None = None, guesses: Sequence[ArrayLike] = ()
+    ) -> RefinedPose:
+        """Move a keyframe to the pose near by under which its depth is most likely in the map of the others.
+        The search starts at its pose or at one of ``guesses``, (4, 4) each. Raises KeyframeError."""
+        keyframe = self._find(id)
+        self._restore_messages()
+        if keyframe.messages is not None:
+            self._allocator.refresh(keyframe)
+        poses = [as_pose(T) for T in guesses]
+        refined = self.aligner.refine(keyframe, self._keyframes, config or PoseConfig(), poses)
+        if refined.accepted:
+            self.move_keyframe(id, refined.T_world_camera)
+        return refined
+
+
+def _pose_of(id: int, T_world_camera: ArrayLike) -> Pose:
+    try:
+        return as_pose(T_world_camera)
+    except KeyframeError as error:
+        raise KeyframeError(f"the new pose of keyframe {id}: {error}") from error
+
+
+def _largest_motion_m(keyframe: Keyframe, T_world_camera: Pose) -> float:
+    """How far anything in a keyframe's view moves, at most, in metres, if it is moved to another pose: one of
+    the corners of the box around its bricks moves furthest."""
+    footprint = keyframe.footprint
+    bricks = footprint.window.bricks_of(footprint.crossed)
+    if len(bricks) == 0:
+        return math.inf
+    lower, upper = bricks.min(axis=0), bricks.max(axis=0) + 1
+    corners_m = np.where(list(np.ndindex(2, 2, 2)), upper, lower) * (BRICK * footprint.window.voxel_size)
+    step = T_world_camera @ inverse(keyframe.T_world_camera) - np.eye(4)
+    return float(np.linalg.norm(corners_m @ step[:3, :3].T + step[:3, 3], axis=1).max())

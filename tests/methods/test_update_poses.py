@@ -1,0 +1,119 @@
+"""A trajectory that changes under a map: which keyframes move, in which order, and what map it becomes."""
+
+import cv2
+import numpy as np
+import pytest
+import small_room
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from taichi_mrf.errors import ConfigError, KeyframeError
+from taichi_mrf.methods.mrf.map import MRFMap
+
+pytestmark = pytest.mark.usefixtures("backend")
+
+COUNT = 5
+
+
+def built() -> MRFMap:
+    return small_room.build(list(range(COUNT)))
+
+
+def shifted(number: int, *tangent: float) -> np.ndarray:
+    """The recorded pose of a frame, moved by a rotation vector and a translation."""
+    step = np.eye(4)
+    step[:3, :3], step[:3, 3] = cv2.Rodrigues(np.array(tangent[:3], np.float64))[0], tangent[3:]
+    return step @ small_room.frames()[number].T_world_camera
+
+
+def anew(poses: dict[int, np.ndarray]) -> MRFMap:
+    """The map of the frames with some poses replaced."""
+    m = MRFMap(small_room.VOXEL_SIZE)
+    for number in range(COUNT):
+        frame = small_room.frames()[number]
+        T = poses.get(number, frame.T_world_camera)
+        m.add_keyframe(frame.depth_m, T, frame.camera, frame.name)
+    m.infer()
+    return m
+
+
+def near_share(a: MRFMap, b: MRFMap) -> float:
+    """Share of the voxels of ``b`` whose probability in ``a`` differs by no more than 0.02."""
+    centres, p = b.voxels(0.0)
+    return float((np.abs(a.occupancy(centres) - p) <= 0.02).mean())
+
+
+small = st.floats(-0.05, 0.05)
+
+
+@settings(max_examples=8)
+@given(
+    motions=st.dictionaries(st.integers(0, COUNT - 1), st.tuples(*[small] * 6), min_size=1),
+    at_once=st.booleans(),
+)
+def test_inference_afterwards_makes_the_map_that_is_made_anew(
+    motions: dict[int, tuple[float, ...]], at_once: bool
+) -> None:
+    m = built()
+    poses = {number: shifted(number, *motion) for number, motion in motions.items()}
+    if at_once:
+        assert not m.update_poses(poses, least=0.0).left
+    else:
+        left = poses
+        while left:
+            left = dict(m.update_poses(left, least=0.0, seconds=0.0).left)
+    m.infer()
+    new = anew(poses)
+    (centres, p), (others, q) = m.voxels(0.0), new.voxels(0.0)
+    order, other_order = np.lexsort(centres.T), np.lexsort(others.T)
+    np.testing.assert_array_equal(centres[order], others[other_order])
+    np.testing.assert_array_equal(p[order], q[other_order])
+
+
+def test_a_map_is_nearly_the_one_made_anew_without_inference_over_all() -> None:
+    m = built()
+    poses = {number: shifted(number, 0.0, 0.0, 0.05, 0.3, 0.0, 0.0) for number in (1, 3)}
+    before = near_share(m, anew(poses))
+    update = m.update_poses(poses, tolerance=0.02)
+    after = near_share(m, anew(poses))
+    assert update.complete
+    assert set(update.moved) == {1, 3}
+    assert after > max(0.95, before + 0.03)
+
+
+def test_those_that_move_most_come_first_and_time_that_is_over_leaves_the_others() -> None:
+    m = built()
+    poses = {i: shifted(i, 0.0, 0.0, 0.0, 0.1 * (1 + (i + 2) % COUNT), 0.0, 0.0) for i in range(COUNT)}
+    first = m.update_poses(poses, seconds=0.0)
+    assert first.moved == (2,)
+    assert set(first.left) == {0, 1, 3, 4}
+    assert not first.complete
+    second = m.update_poses(first.left)
+    assert second.moved == (1, 0, 4, 3)
+    for number, T in poses.items():
+        np.testing.assert_array_equal(m.keyframes[number].T_world_camera, T)
+
+
+def test_a_pose_that_hardly_changes_leaves_the_keyframe_where_it_is() -> None:
+    m = built()
+    revision = m.keyframes[0]
+    update = m.update_poses({0: shifted(0, 0, 0, 0, 1e-4, 0, 0), 1: shifted(1, 0, 0, 0, 0.1, 0, 0)})
+    assert (update.moved, update.kept) == ((1,), (0,))
+    assert m.keyframes[0] is revision
+    # A turn counts by what it does to the far end of the view.
+    turned = m.update_poses({0: shifted(0, 0, 0, 0.01, 0, 0, 0)})
+    assert turned.moved == (0,)
+
+
+def test_a_wrong_pose_or_id_is_refused_before_anything_moves() -> None:
+    m = built()
+    before = {id: keyframe.T_world_camera.copy() for id, keyframe in m.keyframes.items()}
+    good = shifted(0, 0, 0, 0, 0.2, 0, 0)
+    with pytest.raises(KeyframeError, match="the new pose of keyframe 2: "):
+        m.update_poses({0: good, 2: np.zeros((4, 4))})
+    with pytest.raises(KeyframeError, match="17"):
+        m.update_poses({0: good, 17: good})
+    with pytest.raises(ConfigError, match="least"):
+        m.update_poses({0: good}, least=-1.0)
+    for id, T in before.items():
+        np.testing.assert_array_equal(m.keyframes[id].T_world_camera, T)
