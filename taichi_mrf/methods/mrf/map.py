@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.alignment.keyframe_surfels import KeyframeSurfels
 from taichi_mrf.alignment.refine import Aligner
-from taichi_mrf.config.arguments import instance, real
+from taichi_mrf.config.arguments import instance
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
@@ -241,30 +241,6 @@ class MRFMap(PosedMRF):
             if self._dated is not None and chosen_ids is None:
                 self._dated.outdate()
         return report
-
-    def renew(
-        self,
-        keyframes: Iterable[int] = (),
-        tolerance: float | None = None,
-        seconds: float | None = None,
-        progress: Progress | None = None,
-    ) -> InferReport:
-        """Bring the marginals up to date without starting over. Sweeps ``keyframes`` (ids) first, then those
-        whose cavity changed, most changed first, until each has had at most the share ``tolerance`` of its
-        voxels' marginals moved since its last sweep (default: ``inference.renew_tolerance``).
-
-        Starts no sweep after ``seconds``; the next call continues. The report's ``residual`` is the largest
-        share left, its ``sweeps`` count keyframes. The result depends slightly on the order of changes;
-        that of :meth:`infer` does not.
-        """
-        first = [self._find(id).id for id in check_inference(None, tolerance, keyframes) or ()]
-        if seconds is not None:
-            real(seconds, "seconds", least=0)
-        self._restore_messages()
-        if tolerance is None:
-            tolerance = self.config.inference.renew_tolerance
-        self._settled = False
-        return self._incremental.run(self._keyframes, first, tolerance, seconds, progress)
 
     def factor_graph(self, every: int = 1, memory_limit_gb: float = 0.0) -> FactorGraph:
         """The factor graph without average messages, for factor_graph.solve: a factor for the ray of every

@@ -1,5 +1,5 @@
 """The poses of an MRFMap's keyframes: one that is moved or refined, and a whole trajectory that changes while
-the map lives, as a pose graph does when a loop closes."""
+the map lives, as a pose graph does when a loop closes; and the sweeps that bring the marginals up to date."""
 
 import math
 import time
@@ -14,8 +14,10 @@ from taichi_mrf.config.arguments import real
 from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose, inverse
+from taichi_mrf.inference.incremental import IncrementalInference
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.schedule import InferReport, Progress
+from taichi_mrf.methods.brick_map import check_inference
 from taichi_mrf.methods.mrf.keyframe_allocator import KeyframeAllocator
 from taichi_mrf.methods.mrf.reading import ReadableMRF
 from taichi_mrf.voxels.layout import BRICK
@@ -42,21 +44,12 @@ class PoseUpdate:
 
 
 class PosedMRF(ReadableMRF):
-    """The part of an MRFMap that changes poses."""
+    """The part of an MRFMap that changes poses, and renews what follows from them."""
 
     aligner: Aligner
     _allocator: KeyframeAllocator
+    _incremental: IncrementalInference
     _settled: bool
-
-    def renew(
-        self,
-        keyframes: Iterable[int] = (),
-        tolerance: float | None = None,
-        seconds: float | None = None,
-        progress: Progress | None = None,
-    ) -> InferReport:
-        """As MRFMap.renew."""
-        raise NotImplementedError
 
     def move_keyframe(self, id: int, T_world_camera: ArrayLike) -> None:
         """Move a keyframe to another pose, (4, 4), as a SLAM back-end does. Its messages are dropped. Raises
@@ -116,6 +109,30 @@ class PosedMRF(ReadableMRF):
         left = {id: wanted[id] for id in moving[len(moved) :]}
         report = self.renew((), tolerance, 0.0 if left else time_left())
         return PoseUpdate(tuple(moved), kept, left, report)
+
+    def renew(
+        self,
+        keyframes: Iterable[int] = (),
+        tolerance: float | None = None,
+        seconds: float | None = None,
+        progress: Progress | None = None,
+    ) -> InferReport:
+        """Bring the marginals up to date without starting over. Sweeps ``keyframes`` (ids) first, then those
+        whose cavity changed, most changed first, until each has had at most the share ``tolerance`` of its
+        voxels' marginals moved since its last sweep (default: ``inference.renew_tolerance``).
+
+        Starts no sweep after ``seconds``; the next call continues. The report's ``residual`` is the largest
+        share left, its ``sweeps`` count keyframes. The result depends slightly on the order of changes;
+        that of :meth:`infer` does not.
+        """
+        first = [self._find(id).id for id in check_inference(None, tolerance, keyframes) or ()]
+        if seconds is not None:
+            real(seconds, "seconds", least=0)
+        self._restore_messages()
+        if tolerance is None:
+            tolerance = self.config.inference.renew_tolerance
+        self._settled = False
+        return self._incremental.run(self._keyframes, first, tolerance, seconds, progress)
 
     def refine_pose(
         self, id: int, config: PoseConfig | None = None, guesses: Sequence[ArrayLike] = ()
