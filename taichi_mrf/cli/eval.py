@@ -77,5 +77,6 @@ def _run(laboratory: Any, name: str, options: Eval, console: Terminal, should_st
             progress.advance(name, done, total, note=what)
 
         return laboratory.run_experiment(
-            name, options.data, options.out, options.voxel_sizes, options.seeds, options.limit, report
-        )
+            name, options.data, options.out, options.voxel_sizes, options.seeds, options.limit, report,
+            options.only,
+        )  # fmt: skip

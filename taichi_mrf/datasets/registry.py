@@ -27,7 +27,7 @@ from taichi_mrf.datasets.realsense import device
 from taichi_mrf.datasets.resampled import resampled
 from taichi_mrf.datasets.ros import bag
 from taichi_mrf.datasets.stereo import kitti, rig_file
-from taichi_mrf.datasets.synthetic import corridor, mesh_sequence, room
+from taichi_mrf.datasets.synthetic import corridor, mesh_sequence, ring, room
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera, pinhole
 from taichi_mrf.system.files import exists, is_folder
@@ -53,7 +53,8 @@ FORMATS: tuple[Format, ...] = (
 )
 
 BUILT_IN: dict[str, BuiltIn] = {
-    each.name: each for each in (room.BUILT_IN, corridor.BUILT_IN, mesh_sequence.BUILT_IN, device.BUILT_IN)
+    each.name: each
+    for each in (room.BUILT_IN, corridor.BUILT_IN, ring.BUILT_IN, mesh_sequence.BUILT_IN, device.BUILT_IN)
 }
 
 

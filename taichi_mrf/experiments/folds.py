@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,13 @@ class Experiment:
     """Use no more than this many views or folds of a scene."""
 
     report: Report = field(default=lambda what, done, total: None)
+
+    only: Sequence[str] = ()
+    """Patterns of the parts to run, as ``room, 10 Hz`` or ``kitchen*``; empty for all."""
+
+    def wants(self, part: str) -> bool:
+        """Whether a part is to be run."""
+        return not self.only or any(fnmatchcase(part, pattern) for pattern in self.only)
 
 
 @dataclass(frozen=True)

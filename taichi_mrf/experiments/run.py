@@ -15,6 +15,7 @@ import yaml
 import taichi_mrf
 from taichi_mrf import Config
 from taichi_mrf.config.schema import to_yaml
+from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.tables import Table
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Ledger
@@ -27,11 +28,13 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Entry:
-    """One experiment: "module:function", its own voxel sizes in metres, whether it reads the scenes."""
+    """One experiment: "module:function", its own voxel sizes in metres, whether it reads the scenes, and
+    whether parts of it can be run alone."""
 
     function: str
     voxel_sizes: tuple[float, ...]
     needs_data: bool = True
+    has_parts: bool = False
 
 
 _HERE = __name__.rpartition(".")[0]
@@ -55,6 +58,7 @@ EXPERIMENTS = {
     "surface": Entry("surface:run_surface", (0.05, 0.02, 0.01)),
     "lidar": Entry("lidar:run_lidar", (0.2, 0.1, 0.05)),
     "sensors": Entry("sensors:run_sensors", (0.05,), needs_data=False),
+    "trajectory": Entry("trajectory.tables:run_trajectory", (0.05,), has_parts=True),
     "window": Entry("window:run_window", (0.1,), needs_data=False),
 }
 
@@ -67,18 +71,22 @@ def run_experiment(
     seeds: tuple[int, ...],
     limit: int | None,
     progress: Progress,
+    only: tuple[str, ...] = (),
 ) -> tuple[list[Table], list[Path]]:
     """Run one of EXPERIMENTS and write its files into ``out``; returns its tables and the files.
 
-    Without ``voxel_sizes`` the experiment's own are used. What an earlier run with the same ``out`` has found
-    is not computed again. Raises TaichiMRFError, and what ``progress`` raises.
+    Without ``voxel_sizes`` the experiment's own are used, without ``only`` all of its parts. What an earlier
+    run with the same ``out`` has found is not computed again. Raises TaichiMRFError, and what ``progress``
+    raises.
     """
     entry = EXPERIMENTS[name]
+    if only and not entry.has_parts:
+        raise ConfigError(f"--only: eval {name} has no parts that can be run alone")
     sizes = voxel_sizes or entry.voxel_sizes
     configuration = out / f"{name}_config.yaml"
     write_text(configuration, _configuration(name, sizes, seeds, limit))
     experiment = Experiment(
-        data, out, Ledger(out / f"{name}.jsonl", _made_with(data)), sizes, seeds, limit, progress
+        data, out, Ledger(out / f"{name}.jsonl", _made_with(data)), sizes, seeds, limit, progress, only
     )
     module, _, function = entry.function.partition(":")
     run = getattr(importlib.import_module(f"{_HERE}.{module}"), function)

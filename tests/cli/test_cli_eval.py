@@ -111,9 +111,20 @@ def test_ctrl_c_keeps_what_was_found(table3: tuple[Path, str], data: Path, tmp_p
         assert {**row, "map (s)": ""} == {**whole, "map (s)": ""}
 
 
+def test_a_part_of_an_experiment(data: Path, tmp_path: Path) -> None:
+    part = ("trajectory", "--only", "room, 5 Hz", "--limit", "3", "--voxel-sizes", "0.1")
+    printed = evaluated(data, tmp_path, *part)
+    assert "room, 5 Hz" in printed
+    assert "kitchen, 3 Hz" not in printed
+    with open(tmp_path / "trajectory.csv", newline="") as file:
+        assert {row["frames"] for row in csv.DictReader(file)} == {"3"}
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (["table3", "--only", "room"], ["--only: eval table3 has no parts"]),
+        (["trajectory", "--only", "attic"], ["--only leaves none of: room, 30 Hz"]),
         (["table3", "--data", "no/such"], ["no/such", "no such folder", "--data"]),
         (["table1", "--data", "."], ["coffin_world/clean_depth.npz", "No such file"]),
         (["table3", "--limit", "0"], ["--limit must be at least 1, not 0"]),

@@ -30,7 +30,8 @@ class Eval:
     a single machine, window, which keeps only what is near the camera in memory, surface, which compares the
     surface of maps with that of Open3D (extra bench), cells, which judges the probabilities of cells, balls
     and paths, lidar, which maps a building and judges the map by other scans, sensors, which
-    maps the built-in corridor by a depth camera, by a lidar and by both, or all."""
+    maps the built-in corridor by a depth camera, by a lidar and by both, trajectory, which tracks cameras
+    without poses and measures their drift, or all."""
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("runs/eval")
     """Folder for the results; created if needed."""
@@ -46,6 +47,9 @@ class Eval:
 
     limit: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Use at most N views or folds, for a quick look."""
+
+    only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="PART ...")] = ()
+    """Run only these parts of the experiment trajectory, such as 'room, 10 Hz' or 'kitchen*'."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
     """How much is printed."""
