@@ -12,10 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.intrinsics import PRIMESENSE
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene
+from taichi_mrf.datasets.synthetic.texture import pattern
 from taichi_mrf.errors import BackendError, ConfigError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.origins import points_at
 from taichi_mrf.sensor.simulate import KINECT_1, simulate
 from taichi_mrf.system import runtime
 
@@ -38,6 +40,9 @@ class RenderOptions:
 
     noise: Literal["kinect", "none"] = "kinect"
     """Noise of the depth images: that of a Kinect 1, or none."""
+
+    texture: Literal["plain", "mottled"] = "plain"
+    """Paint of the colour images: plain, or with a pattern of spots of 4 to 40 cm on everything."""
 
     seed: int = 0
     """Starts the random numbers of the noise; a frame's noise depends on this and its index alone."""
@@ -132,4 +137,10 @@ class RenderedSequence(Dataset):
         from taichi_mrf.datasets.synthetic.analytic_render import render
 
         scene = self.scene_at(index)
-        return render(self.lit(scene, T_world_camera) if color else scene, self.camera, T_world_camera, color)
+        lit = self.lit(scene, T_world_camera) if color else scene
+        depth_m, picture = render(lit, self.camera, T_world_camera, color)
+        if picture is not None and self.options.texture == "mottled":
+            points_m = points_at(self.camera, depth_m) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+            shaded = picture * pattern(points_m, depth_m / self.camera.fx)[..., None]
+            picture = np.clip(np.round(shaded), 0, 255).astype(np.uint8)
+        return depth_m, picture
