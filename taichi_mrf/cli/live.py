@@ -54,6 +54,8 @@ def run_live(options: Live) -> int:
             loop=options.loop,
             reading=options.reading,
             track=options.poses.track_poses,
+            poses=options.poses.file,
+            follow=options.poses.follow,
         )
         for note in notes:
             print_line(note)

@@ -133,7 +133,17 @@ class PoseConfig:
     """Do not move a keyframe if less than this share of its points lies near surfaces that other keyframes
     measured."""
 
+    follow_budget_s: float = 0.2
+    """Move keyframes for about this long, at most, between two frames, while poses follow a file (--follow;
+    seconds)."""
+
+    follow_quiet_s: float = 10.0
+    """Poses that follow a file are final once the recording is over and the file has not changed for this
+    long (seconds)."""
+
     def __post_init__(self) -> None:
+        check_field(self.follow_budget_s >= 0, "poses.follow_budget_s", "must not be negative")
+        check_field(self.follow_quiet_s >= 0, "poses.follow_quiet_s", "must not be negative")
         check_field(self.rounds >= 0, "poses.rounds", "must not be negative")
         check_field(self.translation_sigma > 0, "poses.translation_sigma", "must be positive")
         check_field(self.rotation_sigma > 0, "poses.rotation_sigma", "must be positive")

@@ -5,7 +5,7 @@ quick, but the map depends on the order of events. Settling runs full inference,
 only on its keyframes and their poses, bit for bit.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -121,6 +121,19 @@ class Mapper:
             self.unsettled = self.edited = self.cavities_changed = True
         entry.T_world_camera, entry.moved_by_hand = T, True
         return entry
+
+    def placed_by_hand(self) -> list[int]:
+        """The keyframes, by their numbers in the map, that a user has moved: nothing else moves them."""
+        return [self._map_id(entry) for entry in self.roster.with_state("on") if entry.moved_by_hand]
+
+    def follow(self, moved: Collection[int]) -> list[LiveKeyframe]:
+        """Note that the map has moved some keyframes, given by their numbers there, with the poses of a file,
+        and swept them; returns them."""
+        entries = [entry for entry in self.roster.with_state("on") if entry.map_id in moved]
+        for entry in entries:
+            entry.T_world_camera = entry.T_home = self._keyframe(entry).T_world_camera
+            self.unsettled = self.cavities_changed = True
+        return entries
 
     def align(self, entry: LiveKeyframe, T_world_camera: Pose) -> bool:
         """Move a keyframe that is on to its aligned pose, and sweep it once; returns whether it moved."""

@@ -14,6 +14,7 @@ from taichi_mrf.live.replay import Replay
 from taichi_mrf.live.session_core import SessionCore
 from taichi_mrf.live.shown_map import time_span
 from taichi_mrf.live.source import Source, saved_unsettled
+from taichi_mrf.mapping.follow import follower_of
 from taichi_mrf.mapping.intake import Intake
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.methods.capabilities import can_freeze, window_of
@@ -38,7 +39,7 @@ class Policy:
 
 class Run(SessionCore):
     """One live run. ``mapper`` holds the map, ``intake`` takes frames into it; ``replay`` has the frames,
-    None if there are none to come.
+    None if there are none to come; ``follower`` moves keyframes with poses that change, None if they do not.
 
     ``stepping``: take frames until one more keyframe is added, at any pace. ``current`` is the frame
     that was read last. ``version`` changes with the map that is shown and with the current camera. ``full``
@@ -76,6 +77,8 @@ class Run(SessionCore):
             replay.set_speed(self.replay.speed)
         self.intake, self.replay = intake, replay
         self.mapper = Mapper(intake.map, first_id, intake.refiner)
+        self.follower = follower_of(m, source.dataset, source.config.poses)
+        intake.result.followed = None if self.follower is None else self.follower.done
         self.progress = Progress()
         self.current: Frame | None = None
         self.stepping, self.full = False, None
@@ -188,7 +191,8 @@ class Run(SessionCore):
         """Whether all frames are in the map, or as many as there is room for, and it is the one that they
         give."""
         frames_left = self.has_frames_left and self.full is None
-        return not (frames_left or self.mapper.unsettled or self.mapper.unaligned)
+        poses_may_change = self.follower is not None and not self.follower.is_final
+        return not (frames_left or poses_may_change or self.mapper.unsettled or self.mapper.unaligned)
 
     @property
     def idle_activity(self) -> str:
@@ -196,7 +200,8 @@ class Run(SessionCore):
         if self.replay is None:
             return "waiting: the map is up to date"
         if self.replay.finished:
-            return self.replay.problem or "done: the map is up to date"
+            doing = "done" if self.follower is None else f"following {self.follower.name}"
+            return self.replay.problem or f"{doing}: the map is up to date"
         return "waiting: paused" if self.replay.paused else "waiting for the next frame"
 
     def _send_layers(self, layers: list[Bricks]) -> bool:

@@ -3,6 +3,7 @@
 One thread does all of it, one piece of work after the other, because Taichi may be used by one thread only:
 
     requests that have arrived
+    keyframes whose poses have changed         if poses follow a file: move and show some of them
     a frame, if one is due                     track its pose if it has none, add it, align it if poses are
                                                refined, sweep it once, then the keyframes whose cavity has
                                                changed; publish the changes
@@ -13,6 +14,7 @@ One thread does all of it, one piece of work after the other, because Taichi may
     else wait
 """
 
+import math
 import time
 from collections.abc import Callable
 
@@ -21,6 +23,7 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.schedule import InferProgress, InferSteps
 from taichi_mrf.live.extras import Extras
 from taichi_mrf.live.link import Link
+from taichi_mrf.live.live_keyframes import LiveKeyframe
 from taichi_mrf.live.progress import sweeping
 from taichi_mrf.live.replay import Replay
 from taichi_mrf.live.requests import Requests, resumes_replay
@@ -98,11 +101,14 @@ class Session:
     def _work(self) -> bool:
         """Do the next piece of work; returns whether there was any."""
         state, mapper = self.state, self.state.mapper
+        moved = self._follow()
         if mapper.stale and mapper.unsettled:
             return self._settle()
         if state.replay is not None and state.is_replaying and self._is_due(state.replay):
             self._take_frame(state.replay)
             self._extras.work(self._go_on)
+            return True
+        if moved:
             return True
         if mapper.cavities_changed and state.is_replaying:
             state.show_activity("sweeping keyframes whose evidence has changed", 0.0)
@@ -112,8 +118,41 @@ class Session:
         if mapper.unaligned and mapper.refiner is not None and not state.has_frames_left:
             return self._align(mapper.refiner)
         if mapper.unsettled and not state.is_replaying:
-            return self._settle()
+            return self._follow(exactly=True) or self._settle()
         return self._extras.work(self._go_on)
+
+    def _follow(self, exactly: bool = False) -> bool:
+        """Move keyframes whose poses have changed, for a limited time, and show them; returns whether any
+        moved. ``exactly``: also those that the change moves hardly at all."""
+        state, mapper, follower = self.state, self.state.mapper, self.state.follower
+        if follower is None or mapper.lacks_messages:
+            return False
+        moved: list[LiveKeyframe] = []
+
+        def follow() -> None:
+            looks = follower.look_exactly if exactly else lambda: follower.look(self._time_s())
+            if not looks():
+                return
+            if follower.left > 1:
+                state.show_activity(f"moving keyframes to new poses: {follower.left} left", 0.0)
+            budget_s, least = follower.config.follow_budget_s, 0.0 if exactly else None
+            ids = follower.move(budget_s, least, mapper.placed_by_hand())
+            moved.extend(mapper.follow(ids))
+            for entry in moved:
+                state.send(mapper.describe(entry))
+            if moved:
+                state.publish()
+
+        with state.intake.result.timed("following"):
+            state.guarded(follow)
+        for text in follower.news():
+            state.send(Notice(text, "warning"))
+        return bool(moved)
+
+    def _time_s(self) -> float:
+        """The recording's time in seconds, for poses that change; infinite after its last frame."""
+        current = self.state.current
+        return math.inf if current is None or not self.state.has_frames_left else current.stamp
 
     def _is_due(self, replay: Replay) -> bool:
         return self.state.stepping or replay.due_in() == 0
@@ -189,7 +228,7 @@ class Session:
         def align() -> None:
             mapper.unaligned = False  # or a failure would be repeated without end
             mover = _ShowingMover(state)
-            rounds = AlignmentRounds(refiner, mover, mover.placed_by_hand())
+            rounds = AlignmentRounds(refiner, mover, mapper.placed_by_hand())
             with state.intake.result.timed("refining"), rounds:
                 for step in rounds:
                     if not self._go_on_aligning(step):
@@ -229,6 +268,8 @@ class Session:
                 self._requests.carry_out(request)
                 go_on = not state.is_over
         state.inbox.put_back(kept)
+        if go_on and state.follower is not None:
+            go_on = not state.follower.look(self._time_s())
         if go_on:
             self._extras.answer()
         return go_on
@@ -245,10 +286,6 @@ class _ShowingMover:
         self._state = state
         entries = state.mapper.roster.with_state("on")
         self._entries = {entry.map_id: entry for entry in entries if entry.map_id is not None}
-
-    def placed_by_hand(self) -> list[int]:
-        """The keyframes, by their numbers in the map, that a user has moved: they stay."""
-        return [id for id, entry in self._entries.items() if entry.moved_by_hand]
 
     def move(self, id: int, T_world_camera: Pose) -> None:
         entry, mapper = self._entries[id], self._state.mapper

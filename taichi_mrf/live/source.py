@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from taichi_mrf.config.schema import Config
-from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.formats import frames_npz
+from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.source_flags import SourceFlags
+from taichi_mrf.errors import ConfigError
 from taichi_mrf.live.replay import Replay
 from taichi_mrf.mapping.intake import hold_out_of
 from taichi_mrf.methods.map_file import open_map_file, read_header
@@ -62,15 +64,22 @@ def open_source(
     loop: bool,
     reading: SourceFlags | None = None,
     track: bool = False,
+    poses: str | None = None,
+    follow: bool = False,
 ) -> tuple[Source, list[str]]:
     """Start Taichi and open a source, read as ``reading`` says; returns it with notes for the user. With
-    ``track`` the poses of its frames are found by tracking.
+    ``track`` the poses of its frames are found by tracking, with ``poses`` they come from that file, and
+    ``follow`` it as it changes.
 
     Raises TaichiMRFError: DatasetError, MapFileError, BackendError, ConfigError.
     """
     runtime.init(config.runtime.arch, config.runtime.threads, config.runtime.debug)
     path = Path(name)
     if path.suffix == ".npz" and is_file(path) and not frames_npz.FORMAT.recognises(path):
+        if poses is not None:
+            raise ConfigError(
+                f"{path}: is a saved map, whose keyframes have poses: --poses is for a recording"
+            )
         with open_map_file(path) as file:
             header, parked = read_header(path, file), "parked" in file
         parameters = dataclasses.replace(header.config, runtime=config.runtime)
@@ -83,7 +92,7 @@ def open_source(
             )
         return Source(path.name, parameters, lambda: load_map(path)), notes
     keywords = (reading or SourceFlags()).keywords()
-    dataset = open_dataset(name, color=config.color, track=track, **keywords)
+    dataset = open_posed(name, poses, follow=follow, track=track, color=config.color, **keywords)
     config = with_recorded_noise(config, dataset)
     # Held-out frames of a tracked source are read, so that their poses are known when the map is checked.
     unread = 0 if dataset.tracked else hold_out_of(dataset, config)
@@ -92,5 +101,6 @@ def open_source(
         return Replay(dataset, every=every, limit=limit, loop=loop, hold_out=unread, speed=speed)
 
     new_map = partial(create_map, config, dataset.camera)
-    choice = {"every": every, "limit": limit, "track_poses": track}
+    chosen = {"every": every, "limit": limit}
+    choice = {**chosen, "track_poses": track, "poses_from": poses, "follow": follow or None}
     return Source(name, config, new_map, new_replay, dataset.tracked, dataset, choice), dataset.notes

@@ -3,7 +3,11 @@
 Whoever wants to watch (a progress bar, a log) is a listener: a function that is called with each event.
 """
 
-from collections.abc import Callable
+import math
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +18,7 @@ from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import CapacityError, DatasetError, FrameError
 from taichi_mrf.inference.keyframe import checked_depth
 from taichi_mrf.inference.schedule import InferProgress
+from taichi_mrf.mapping.follow import PoseFollower, follower_of
 from taichi_mrf.mapping.intake import (
     HELD_OUT,
     Added,
@@ -43,8 +48,21 @@ class FrameOffered:
     answer: Answer
 
 
-Event = FrameOffered | RoundStep | InferProgress
-"""A frame was offered, one more keyframe was moved by a round of alignment, or one more was swept."""
+@dataclass(frozen=True)
+class WaitingForPoses:
+    """All frames are in, and poses that change are waited for: they have been unchanged for ``quiet_s`` of
+    ``final_s`` seconds."""
+
+    quiet_s: float
+    final_s: float
+
+
+Event = FrameOffered | WaitingForPoses | RoundStep | InferProgress
+"""A frame was offered, poses are waited for, one more keyframe was moved by a round of alignment, or one more
+was swept."""
+
+LOOK_AGAIN_S = 0.1
+"""Time between two looks at poses that change once all frames are in."""
 
 Listener = Callable[[Event], None]
 
@@ -75,6 +93,8 @@ def map_sequence(
     what there is for such a run. ``map_path`` is where the map will be saved: what leaves its window is
     written beside it.
     A frame for which there is not enough memory ends the adding: the map of those before it is inferred.
+    If the dataset's poses change meanwhile (datasets/pose_sources), keyframes follow them between frames, and
+    after the last frame until the poses are final.
 
     Raises FrameError for an unreadable frame unless ``skip_bad_frames``, DatasetError if no frame became a
     keyframe or the map to resume is of another recording, ConfigError if poses are to be refined
@@ -92,10 +112,15 @@ def map_sequence(
     intake = Intake(m, config, tracked=dataset.tracked, hold_out=hold_out_of(dataset, config))
     if intake.refiner is not None and resume_from is not None:
         intake.refiner.repeat(resume_from.keyframes.values())
-    run = _BatchRun(dataset, indices, intake, listener, should_stop, out_of_time, keep, skip_bad_frames)
+    follower = follower_of(m, dataset, config.poses)
+    intake.result.followed = None if follower is None else follower.done
+    run = _BatchRun(
+        dataset, indices, intake, listener, should_stop, out_of_time, keep, skip_bad_frames, follower
+    )
     run.add_keyframes()
     if not m.keyframes:
         raise DatasetError(_why_empty(dataset, intake.result))
+    run.follow_until_final()
     run.align()
     run.infer()
     return intake.result
@@ -113,6 +138,7 @@ class _BatchRun:
     out_of_time: Callable[[], bool]
     keep: Callable[[MappingResult], None]
     skip_bad_frames: bool
+    follower: PoseFollower | None
 
     @property
     def result(self) -> MappingResult:
@@ -144,6 +170,44 @@ class _BatchRun:
             self.listener(FrameOffered(name, number, len(self.indices), answer))
             if isinstance(answer, Added):
                 self.keep(self.result)
+                self._follow(answer.frame.stamp)
+                if self.result.full:
+                    return
+
+    def follow_until_final(self) -> None:
+        """Let keyframes follow poses that change until these have been unchanged for the configured time,
+        then put each exactly where its frame was taken."""
+        follower = self.follower
+        if follower is None:
+            return
+        final_s = follower.config.follow_quiet_s
+        self._follow(math.inf)
+        while not (follower.is_final or self._is_stopped() or self.result.full):
+            self.listener(WaitingForPoses(min(follower.quiet_s, final_s), final_s))
+            if not follower.left:
+                time.sleep(LOOK_AGAIN_S)
+            self._follow(math.inf)
+        with self._following():
+            follower.place_exactly()
+
+    def _follow(self, stamp_s: float) -> None:
+        """Move keyframes whose poses have changed, as many as there is time for between two frames."""
+        follower = self.follower
+        if follower is None or self.result.full:
+            return
+        with self._following():
+            if follower.look(stamp_s):
+                follower.move(follower.config.follow_budget_s)
+        for text in follower.news():
+            warnings.warn(text, stacklevel=2)
+
+    @contextmanager
+    def _following(self) -> Iterator[None]:
+        with self.result.timed("following"):
+            try:
+                yield
+            except CapacityError as error:
+                self.result.full = f"moving keyframes to their new poses does not fit: {error}"
 
     def align(self) -> None:
         """Align all keyframes with each other, if poses are refined."""

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from taichi_mrf.mapping.follow import Followed
 from taichi_mrf.mapping.refinement import PoseChange
 from taichi_mrf.mapping.step_check import StepCheck, check_steps
 from taichi_mrf.mapping.tracking import Track
@@ -21,7 +22,7 @@ class MappingResult:
     ``poses`` are, if they were refined, the recorded and the refined pose of every keyframe; ``track`` has,
     if poses were tracked, the pose of each frame. ``full`` names the frame that did not fit into memory and
     says why; the map holds those before it. ``steps``: whether depth and recorded poses agree, if that was
-    checked.
+    checked. ``followed``: what became of poses that changed, if there were any to follow.
     """
 
     map: OccupancyMap
@@ -36,6 +37,7 @@ class MappingResult:
     track: Track | None = None
     full: str | None = None
     steps: StepCheck | None = None
+    followed: Followed | None = None
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:

@@ -17,6 +17,7 @@ from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.schedule import InferReport, Progress
 from taichi_mrf.methods.mrf.checkpoint import Checkpoint
 from taichi_mrf.methods.mrf.moving_window import MovingWindow
+from taichi_mrf.methods.mrf.posed import PoseUpdate
 from taichi_mrf.methods.mrf.reading import Layer, MapReading, Reading
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.queries.change import MapChange
@@ -37,6 +38,16 @@ class MessageMap(OccupancyMap, Protocol):
         progress: Progress | None = None,
     ) -> InferReport:
         """Bring the marginals up to date without starting over."""
+        ...
+
+    def update_poses(
+        self,
+        poses: Mapping[int, ArrayLike],
+        least: float = ...,
+        tolerance: float | None = None,
+        seconds: float | None = None,
+    ) -> PoseUpdate:
+        """Take in corrected poses, id -> (4, 4), within a time."""
         ...
 
     def checkpoint(self) -> Checkpoint:

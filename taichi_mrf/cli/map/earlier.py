@@ -7,7 +7,6 @@ from typing import Any
 from taichi_mrf.cli.map.task import MapTask
 from taichi_mrf.config.schema import load
 from taichi_mrf.config.text import differences
-from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.runs.files import CONFIG_FILE, MAP_FILE, REPORT_FILE, VOXEL_FILE, holds_run
@@ -53,8 +52,7 @@ def _changed_parameters(task: MapTask) -> list[str]:
     held = load(task.out / CONFIG_FILE)
     changed = differences(held, task.settings)
     if "sensor.sigma" in changed:  # the run may have had it from the recording
-        dataset = open_dataset(task.source, color=False, track=task.track_poses, **task.reading.keywords())
-        changed = differences(held, with_recorded_noise(task.settings, dataset))
+        changed = differences(held, with_recorded_noise(task.settings, task.open(color=False)))
     return changed
 
 
@@ -66,7 +64,8 @@ def finished_report(task: MapTask) -> dict[str, Any] | None:
     if report.get("source") != task.source:
         raise MapFileError(f"{task.out}: holds the map of {report.get('source')}")
     changed = _changed_parameters(task)
-    same = task.choice().items() <= report.items() and all(name.startswith("runtime.") for name in changed)
+    chosen = all(report.get(name) == value for name, value in task.choice().items())
+    same = chosen and all(name.startswith("runtime.") for name in changed)
     return report if same and not report.get("interrupted") else None
 
 

@@ -1,5 +1,6 @@
 """What ``taichi-mrf map`` does: map a sequence, check the map, write the files, print the report."""
 
+import math
 import time
 import warnings
 from collections.abc import Iterator
@@ -16,10 +17,9 @@ from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.terminal import Terminal, print_problem
-from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.mapping.intake import Added
-from taichi_mrf.mapping.pipeline import Event, FrameOffered, Listener, map_sequence
+from taichi_mrf.mapping.pipeline import Event, FrameOffered, Listener, WaitingForPoses, map_sequence
 from taichi_mrf.mapping.rounds import RoundStep
 from taichi_mrf.runs.files import MAP_FILE
 from taichi_mrf.runs.folder import RunFacts, write_run
@@ -80,9 +80,7 @@ def map_to_folder(
     start = time.perf_counter()
     settings = task.settings
     runtime.init(settings.runtime.arch, settings.runtime.threads, settings.runtime.debug)
-    dataset = open_dataset(
-        task.source, color=settings.color, track=task.track_poses, **task.reading.keywords()
-    )
+    dataset = task.open(settings.color)
     settings = with_recorded_noise(settings, dataset)
     previous = resumed_map(task.out, settings) if task.resume else None
     skipped = skipped_before(task.out) if task.resume else {}
@@ -116,6 +114,8 @@ def listener_of(progress: ProgressBar) -> Listener:
     def listen(event: Event) -> None:
         if isinstance(event, FrameOffered):
             progress.advance("Adding", event.number, event.frames, int(isinstance(event.answer, Added)))
+        elif isinstance(event, WaitingForPoses):
+            progress.advance("Waiting for poses", round(event.quiet_s), math.ceil(event.final_s))
         elif isinstance(event, RoundStep):
             done = (event.round - 1) * event.keyframes + event.moved
             progress.advance("Aligning", done, event.rounds * event.keyframes, 1)

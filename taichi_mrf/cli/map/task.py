@@ -1,11 +1,14 @@
 """One sequence to map into one folder: what `taichi-mrf map` does once or for several sources."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from taichi_mrf.cli.options.map import Map
+from taichi_mrf.cli.options.pose_flags import PoseFlags
 from taichi_mrf.config.schema import Config, with_absolute_tables
+from taichi_mrf.datasets import Dataset
+from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.methods.mrf.reading import Reading
 
@@ -28,7 +31,7 @@ class MapTask:
     skip_bad_frames: bool = False
     resume: bool = False
     pictures: bool = True
-    track_poses: bool = False
+    poses: PoseFlags = field(default_factory=PoseFlags)
     keep_every: float = Map.keep_every
     overwrite: bool = False
     shown_reading: Reading = "marginal"
@@ -39,7 +42,13 @@ class MapTask:
 
     def choice(self) -> dict[str, Any]:
         """What was asked for besides the parameters; the report says it too."""
-        return {"every": self.every, "limit": self.limit, "track_poses": self.track_poses}
+        return {"every": self.every, "limit": self.limit, **self.poses.choice()}
+
+    def open(self, color: bool) -> Dataset:
+        """Open the sequence. Raises DatasetError."""
+        flags = self.poses
+        how = {"follow": flags.follow, "track": flags.track_poses, "color": color}
+        return open_posed(self.source, flags.file, **how, **self.reading.keywords())
 
 
 def map_task(options: Map, source: str, out: Path) -> MapTask:
@@ -56,7 +65,7 @@ def map_task(options: Map, source: str, out: Path) -> MapTask:
         options.skip_bad_frames,
         options.resume,
         options.pictures,
-        options.poses.track_poses,
+        options.poses,
         options.keep_every,
         options.overwrite,
         options.shown_reading,

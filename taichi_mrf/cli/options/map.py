@@ -110,6 +110,8 @@ class Map:
             raise ConfigError("map needs a SOURCE")
         if self.resume and self.overwrite:
             raise ConfigError("--resume and --overwrite do not go together")
+        if self.poses.file is not None and (len(self.sources) > 1 or self.submap_size is not None):
+            raise ConfigError("--poses takes one SOURCE, and does not work with --submap-size")
         if self.shown_reading != "marginal":
             whole = self.submap_size is None and self.settings.volume.window_m == 0
             if not METHODS[self.settings.method].has_layers or not whole:

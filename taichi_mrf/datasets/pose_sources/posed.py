@@ -1,0 +1,142 @@
+"""A recording whose poses come from a source of poses, once or for as long as it is mapped."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.derived import Derived
+from taichi_mrf.datasets.pose_sources.base import PoseSource
+from taichi_mrf.datasets.pose_sources.matching import FramePoses
+from taichi_mrf.datasets.pose_sources.registry import open_pose_source
+from taichi_mrf.datasets.pose_sources.watched import WatchedFile
+from taichi_mrf.datasets.registry import open_dataset
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.sensor.frame import Frame
+
+
+@dataclass
+class PosedFrames(Derived):
+    """The frames of ``source`` at the poses of ``poses``; one without a pose there keeps the recorded one.
+    ``follows``: the poses change while the frames are mapped. ``kept`` are the source's indices of the
+    frames."""
+
+    poses: FramePoses = field(kw_only=True)
+    follows: bool = False
+    kept: Sequence[int] = field(kw_only=True)
+
+    def __post_init__(self) -> None:
+        names = self.source.frame_names
+        self._names = [names[index] for index in self.kept]
+
+    @property
+    def frame_names(self) -> Sequence[str]:
+        """The source's, of the frames that are kept."""
+        return self._names
+
+    def stamps(self) -> Sequence[float] | NDArray:
+        """The source's, of the frames that are kept."""
+        stamps = self.source.stamps()
+        return [stamps[index] for index in self.kept]
+
+    def sensor_of(self, index: int) -> str:
+        """The source's."""
+        return self.source.sensor_of(self.kept[index])
+
+    def read(self, index: int) -> Frame:
+        """The source's frame at its present pose. Raises what the source raises."""
+        if not 0 <= index < len(self.kept):
+            raise IndexError(f"{self.name} has {len(self.kept)} frames, there is no frame {index}")
+        frame = self.source.read(self.kept[index])
+        T_world_camera = self.poses.of(frame.name, frame.stamp)
+        return frame if T_world_camera is None else replace(frame, T_world_camera=T_world_camera)
+
+
+def posed_by(
+    dataset: Dataset,
+    source: PoseSource,
+    *,
+    follow: bool = False,
+    largest_gap_s: float | None = None,
+    has_poses: bool = True,
+) -> PosedFrames:
+    """The frames of a dataset at the poses of a source.
+
+    Frames that the source has no pose for keep the recorded one, or are left out if the recording has none
+    (``has_poses``). With ``follow`` mapping asks the source again and again, and moves keyframes
+    (mapping/follow.py); it may then begin without any pose. Between two stamps a pose is interpolated, if
+    both are at most ``largest_gap_s`` seconds away. Raises DatasetError if the source cannot be read or has a
+    pose for no frame, and for frames whose poses are found while mapping or are those of several sensors.
+    """
+    if dataset.tracked or dataset.endless:
+        raise DatasetError(
+            f"{dataset.name}: has no poses that those of {source.name} could take the place of"
+        )
+    names = dataset.frame_names
+    if len(names) and dataset.sensor_of(0):
+        raise DatasetError(f"{dataset.name}: has several sensors, and {source.name} the poses of one")
+    poses = FramePoses(source, names, largest_gap_s)
+    if isinstance(source, WatchedFile) and not follow:
+        poses.take(source.read_now())
+    else:
+        poses.renew(float("-inf") if follow else float("inf"))
+    kept: Sequence[int] = range(len(names))
+    notes = []
+    if not follow:
+        stamps = dataset.stamps()
+        posed = [i for i, name in enumerate(names) if poses.of(name, float(stamps[i])) is not None]
+        if not posed:
+            raise DatasetError(
+                f"{source.name}: has a pose for none of the {len(names)} frames of {dataset.name}"
+            )
+        others = len(names) - len(posed)
+        notes = [f"poses of {len(posed)} frames from {source.name}"]
+        notes += [] if poses.warning is None else [poses.warning]
+        if others and has_poses:
+            notes.append(f"{others} of {len(names)} frames have no pose there, and keep the recorded one")
+        elif others:
+            notes.append(f"{others} of {len(names)} frames dropped: no pose in {source.name}")
+            kept = posed
+    return PosedFrames(
+        dataset.name,
+        dataset.camera,
+        [*dataset.notes, *notes],
+        dataset.dropped + len(names) - len(kept),
+        tracked=dataset.tracked,
+        source=dataset,
+        poses=poses,
+        follows=follow,
+        kept=kept,
+    )
+
+
+def open_posed(
+    source: str | Path,
+    poses: str | Path | None,
+    *,
+    follow: bool = False,
+    track: bool = False,
+    max_time_gap: float | None = None,
+    **reading: Any,
+) -> Dataset:
+    """Open a recording, with the poses of a file if one is given; without ``follow`` it then need not have
+    poses of its own. ``track`` and ``reading`` are keywords of :func:`open_dataset`. Raises DatasetError."""
+    if poses is None:
+        return open_dataset(source, track=track, max_time_gap=max_time_gap, **reading)
+    opened = open_pose_source(poses)
+    keywords = {"max_time_gap": max_time_gap, **reading}
+    has_poses = True
+    try:
+        dataset = open_dataset(source, **keywords)
+    except DatasetError as problem:
+        try:  # it may only lack poses
+            dataset = open_dataset(source, track=True, **keywords)
+        except DatasetError:
+            raise problem from None
+        if follow:
+            raise DatasetError(f"poses that change need some to begin with: {problem}") from problem
+        dataset.tracked = has_poses = False
+    return posed_by(dataset, opened, follow=follow, largest_gap_s=max_time_gap, has_poses=has_poses)

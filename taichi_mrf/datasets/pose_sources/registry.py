@@ -1,0 +1,86 @@
+"""Every kind of file that poses can come from, and which of them opens a given file.
+
+A new kind is a module that ends with ``KIND = PoseKind(...)`` and its line in KINDS; the first entry that
+recognises a file opens it.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from taichi_mrf.datasets.formats.open3d_json import is_trajectory_json, read_trajectory_json
+from taichi_mrf.datasets.pose_sources.base import ChangedPoses, FrameKey, PoseKind, PoseSource
+from taichi_mrf.datasets.pose_sources.graph_file import SUFFIXES, is_pose_graph, read_pose_graph
+from taichi_mrf.datasets.pose_sources.watched import WatchedFile
+from taichi_mrf.datasets.trajectories import Trajectory, read_trajectory
+from taichi_mrf.errors import DatasetError, KeyframeError
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.system.files import exists, is_folder
+
+
+def _poses_in(trajectory: Trajectory) -> ChangedPoses:
+    """The poses of a trajectory by stamp, or by number. Raises DatasetError, which names the line."""
+    poses: dict[FrameKey, Pose] = {}
+    for pose in trajectory.poses:
+        key: FrameKey = float(pose.key) if trajectory.layout == "stamped" else int(pose.key)
+        try:
+            poses[key] = pose.T_world_camera()
+        except KeyframeError as error:
+            raise DatasetError(f"{pose.source}: {error}") from error
+    return poses
+
+
+def _watched(read: Callable[[Path], ChangedPoses]) -> Callable[[Path, str], PoseSource]:
+    """What opens a text file that ``read`` reads."""
+
+    def open_file(path: Path, query: str) -> WatchedFile:
+        if query:
+            raise DatasetError(f"{path}: takes no options after a question mark; bags do")
+        return WatchedFile(path, read)
+
+    return open_file
+
+
+def _graph_poses(path: Path) -> ChangedPoses:
+    return {int(number): T for number, T in read_pose_graph(path).poses.items()}
+
+
+GRAPH = PoseKind(
+    "pose graph",
+    f"VERTEX_SE3:QUAT or VERTEX3 lines ({', '.join(SUFFIXES)})",
+    is_pose_graph,
+    _watched(_graph_poses),
+)
+OPEN3D = PoseKind(
+    "Open3D trajectory",
+    "a PinholeCameraTrajectory or a PoseGraph (.json)",
+    lambda path: path.suffix == ".json",
+    _watched(lambda path: _poses_in(_open3d(path))),
+)
+TRAJECTORY = PoseKind(
+    "trajectory",
+    "lines of stamp tx ty tz qx qy qz qw (TUM), of 12 or 16 numbers (KITTI), or a .log",
+    lambda path: not is_folder(path),
+    _watched(lambda path: _poses_in(read_trajectory(path))),
+)
+
+KINDS: tuple[PoseKind, ...] = (GRAPH, OPEN3D, TRAJECTORY)
+
+
+def open_pose_source(name: str | Path) -> PoseSource:
+    """Open a file of poses, which may follow later if its name says of which kind it is; options of a bag
+    follow a question mark. Raises DatasetError, whose text names the file."""
+    text, query = str(name), ""
+    if not exists(text) and "?" in text:
+        text, _, query = text.rpartition("?")
+    path = Path(text)
+    kind = next((kind for kind in KINDS if kind.recognises(path)), None)
+    if kind is None:
+        looked_for = "; ".join(f"{each.name}: {each.looks_for}" for each in KINDS)
+        raise DatasetError(f"{path}: holds no poses that can be read; looked for {looked_for}")
+    return kind.open(path, query)
+
+
+def _open3d(path: Path) -> Trajectory:
+    if not is_trajectory_json(path):
+        raise DatasetError(f"{path}: is no {OPEN3D.looks_for}")
+    return read_trajectory_json(path)[0]
