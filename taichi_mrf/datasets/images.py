@@ -14,6 +14,9 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import read_bytes
 from taichi_mrf.system.npz_file import DEFLATE_RATIO
 
+MOST_PIXELS = 1 << 27
+"""Far more than a camera has; a packed image of a few megabytes may claim a hundred times as many."""
+
 
 def read_depth(
     path: Path, steps_per_metre: float, sentinel: int | None = None, camera: PinholeCamera | None = None
@@ -60,6 +63,12 @@ def decode_16_bit(data: bytes, where: str, camera: PinholeCamera | None = None) 
     return image
 
 
+def decode_unchanged(data: bytes, where: str) -> NDArray:
+    """The values of an encoded image with all its channels, as OpenCV orders them. Raises DatasetError, whose
+    text begins with ``where``, if it is damaged."""
+    return _decode(data, where, cv2.IMREAD_UNCHANGED)
+
+
 def decode_color(data: bytes, where: str, camera: PinholeCamera | None = None) -> NDArray[np.uint8]:
     """An (H, W, 3) uint8 RGB image from an encoded one. Raises DatasetError, whose text begins with
     ``where``, if it is damaged, or of another size than the camera's."""
@@ -95,8 +104,8 @@ def _check_size(where: str, width: int, height: int, camera: PinholeCamera | Non
         raise DatasetError(
             f"{where}: the image has {width} x {height} pixels, the camera {camera.width} x {camera.height}"
         )
-    if width * height > _MOST_PIXELS:
-        raise DatasetError(f"{where}: {width} x {height} pixels; at most {_MOST_PIXELS:,} are read")
+    if width * height > MOST_PIXELS:
+        raise DatasetError(f"{where}: {width} x {height} pixels; at most {MOST_PIXELS:,} are read")
 
 
 def _png_damage(data: bytes) -> str | None:
@@ -148,9 +157,6 @@ def _png_content_damage(data: bytes, packed: bytes) -> str | None:
         return f"the image is {than} than {width} x {height}"
     return None
 
-
-_MOST_PIXELS = 1 << 27
-"""Far more than a camera has; a packed image of a few megabytes may claim a hundred times as many."""
 
 _CHUNK_BYTES = 12
 _PIECE = 1 << 20

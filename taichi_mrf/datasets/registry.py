@@ -26,6 +26,7 @@ from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.realsense import device
 from taichi_mrf.datasets.resampled import resampled
 from taichi_mrf.datasets.ros import bag
+from taichi_mrf.datasets.rtabmap import recording as rtabmap
 from taichi_mrf.datasets.stereo import kitti, rig_file
 from taichi_mrf.datasets.synthetic import corridor, mesh_sequence, ring, room
 from taichi_mrf.errors import ConfigError, DatasetError
@@ -48,6 +49,7 @@ FORMATS: tuple[Format, ...] = (
     pcd_viewpoints.FORMAT,
     las_trajectory.FORMAT,
     ouster.FORMAT,
+    rtabmap.FORMAT,
     frames_npz.FORMAT,
     rig_file.FORMAT,
 )

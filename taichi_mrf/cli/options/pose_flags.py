@@ -22,8 +22,8 @@ class PoseFlags:
     ignored except for the first. realsense:?poses=track does the same."""
 
     file: Annotated[str | None, tyro.conf.arg(name="poses", metavar="FILE")] = None
-    """Poses of SOURCE's frames, in place of its own: a trajectory (TUM, KITTI, .log) or a pose graph (g2o,
-    TORO). Frames that it does not name keep their own."""
+    """Poses of SOURCE's frames, in place of its own: a trajectory (TUM, KITTI, .log), a pose graph (g2o,
+    TORO) or a database of RTAB-Map. Frames that it does not name keep their own."""
 
     follow: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """The file of --poses changes while SOURCE is mapped: keyframes follow it. map ends when the recording is

@@ -1,0 +1,1 @@
+"""Databases of RTAB-Map: recordings, and poses that change while it runs."""
