@@ -1,6 +1,7 @@
 """``eval trajectory`` on the first frames of small walks."""
 
 import itertools
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from small_scenes import experiment
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.experiments.folds import Experiment
-from taichi_mrf.experiments.trajectory import following, tables, walks
+from taichi_mrf.experiments.trajectory import following, lost, tables, walks
 from taichi_mrf.experiments.trajectory.walks import SHAKE_M, SHAKE_RAD, Source, walk_name
 from taichi_mrf.geometry.poses import tangent_norms
 
@@ -42,16 +43,18 @@ def test_a_few_frames_of_the_room(tmp_path: Path) -> None:
 def test_parts_are_chosen_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names: list[str] = []
 
-    def results(experiment: Experiment, source: Source, rate: float, voxel_size: float) -> list[Any]:
+    def walked(experiment: Experiment, source: Source, rate: float, voxel_size: float) -> list[Any]:
         names.append(walk_name(source, rate))
         return []
 
-    monkeypatch.setattr(tables, "_results", results)
+    monkeypatch.setattr(tables, "_walked", walked)
+    monkeypatch.setattr(tables, "_lost", lambda experiment, case, voxel_size: names.append(case) or [])
     tables.run_trajectory(chosen(tmp_path, only=("house, 5 Hz", "kitchen*")))
     assert names == ["kitchen, 3 Hz", "house, 5 Hz"]
     names.clear()
     tables.run_trajectory(chosen(tmp_path))
     assert len(names) == len(set(names)) > 15
+    assert lost.SEEN in names
     with pytest.raises(ConfigError, match=r"--only leaves none of: room, 30 Hz; .*kitchen"):
         tables.run_trajectory(chosen(tmp_path, only=("attic",)))
 
@@ -65,7 +68,7 @@ def test_an_unsure_frame_is_told_from_the_others(tmp_path: Path, monkeypatch: py
     poses[2][0, 3] += 0.1
     stub = following.Followed(_Mapped(), poses, {2}, 0.4)  # type: ignore[arg-type]
     monkeypatch.setattr(following, "followed", lambda *rest, **options: stub)
-    result = following.tracked_result(walk, following.configuration(0.1, False), judge=False)
+    result = following.tracked_result(walk, following.configurations(0.1)["tracking"], judge=False)
     assert (result["of"], result["frames"], result["lost"], result["unsure"]) == (4, 3, 1, 1)
     assert result["unsure_step_m"] == pytest.approx(0.1)
     assert result["sure_step_m"] == pytest.approx(0.0, abs=1e-9)
@@ -86,3 +89,44 @@ def test_a_hand_shakes_a_little_and_smoothly() -> None:
     assert 0.5 * SHAKE_M < shifts.max() < 2 * SHAKE_M
     assert 0.5 * SHAKE_RAD < turns.max() < 2 * SHAKE_RAD
     assert max(tangent_norms(a, b)[1] for a, b in itertools.pairwise(poses)) < 0.01
+
+
+def test_a_covered_camera_leaves_the_map_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lost, "BEFORE", 12)
+    monkeypatch.setattr(lost, "COVERED", 4)
+    monkeypatch.setattr(lost, "AFTER", 3)
+    monkeypatch.setitem(lost.PLACES, lost.SAME, (walks.room_walk, 1.2))
+    run = chosen(tmp_path, only=(f"lost, {lost.SAME}", f"lost, {lost.UNSEEN}"))
+    (table,), _ = tables.run_trajectory(run)
+    for row in table.rows:
+        figures = dict(zip(table.columns, row, strict=True))
+        assert (figures["found covered"], figures["map kept"]) == (0, "yes")
+        assert figures["5cm before"] > 0.8
+        assert 0 < figures["error before (cm)"] < 8
+        if lost.SAME in row[0]:
+            assert (figures["found after"], figures["of these wrong"]) == (3, 0)
+            assert figures["error after (cm)"] < 8
+            assert figures["5cm after"] > figures["5cm before"] - 0.02
+        else:
+            assert figures["found after"] == figures["of these wrong"]
+
+
+def test_without_open3d_its_rows_are_left_out_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    run = chosen(tmp_path, limit=3, only=("room, 5 Hz",))
+    (table,), _ = tables.run_trajectory(run)
+    assert not any("Open3D" in row[2] for row in table.rows)
+    assert table.notes[-1].startswith("Open3D's rows are left out: the comparison needs open3d")
+    assert table.notes[-1].endswith("pip install 'taichi-mrf[bench]'.")
+
+
+def test_open3d_follows_the_room(tmp_path: Path) -> None:
+    pytest.importorskip("open3d", reason="the peer needs the extra bench")
+    run = chosen(tmp_path, limit=8, only=("room in colour, 10 Hz",))
+    tables_, _ = tables.run_trajectory(run)
+    rows = {row[2]: dict(zip(tables_[0].columns, row, strict=True)) for row in tables_[0].rows}
+    for name in (tables.OPEN3D, tables.OPEN3D_GRAPH):
+        assert (rows[name]["frames"], rows[name]["unsure"]) == (8, None)
+        assert rows[name]["RMS (cm)"] < 10

@@ -12,12 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.intrinsics import PRIMESENSE
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene
-from taichi_mrf.datasets.synthetic.texture import pattern
+from taichi_mrf.datasets.synthetic.texture import mottled
 from taichi_mrf.errors import BackendError, ConfigError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.sensor.origins import points_at
 from taichi_mrf.sensor.simulate import KINECT_1, simulate
 from taichi_mrf.system import runtime
 
@@ -140,7 +139,5 @@ class RenderedSequence(Dataset):
         lit = self.lit(scene, T_world_camera) if color else scene
         depth_m, picture = render(lit, self.camera, T_world_camera, color)
         if picture is not None and self.options.texture == "mottled":
-            points_m = points_at(self.camera, depth_m) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-            shaded = picture * pattern(points_m, depth_m / self.camera.fx)[..., None]
-            picture = np.clip(np.round(shaded), 0, 255).astype(np.uint8)
+            picture = mottled(picture, depth_m, self.camera, T_world_camera)
         return depth_m, picture

@@ -9,6 +9,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.origins import points_at
+
 CUBES_M = (0.4, 0.13, 0.045)
 """Sides of the cubes in metres."""
 
@@ -17,6 +21,15 @@ CONTRAST = 0.35
 
 _PERIOD = 64
 """The numbers repeat after so many cubes."""
+
+
+def mottled(
+    picture: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: PinholeCamera, T_world_camera: Pose
+) -> NDArray[np.uint8]:
+    """A colour picture, (H, W, 3), with the pattern on all surfaces at their axial depth, (H, W) metres."""
+    points_m = points_at(camera, depth_m) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    shaded = picture * pattern(points_m, depth_m / camera.fx)[..., None]
+    return np.clip(np.round(shaded), 0, 255).astype(np.uint8)
 
 
 def pattern(points_m: NDArray[np.floating], pixel_m: NDArray[np.floating]) -> NDArray[np.float32]:

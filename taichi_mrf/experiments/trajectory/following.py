@@ -1,7 +1,7 @@
 """One walk, tracked and mapped as ``taichi-mrf map --track-poses`` does: its errors, its time, its map."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
 
@@ -25,22 +25,25 @@ from taichi_mrf.methods.protocol import OccupancyMap
 
 CLOSES_LOOPS = "close_loops" in {field.name for field in fields(PoseConfig)}
 
+TRACKING, LOOPS_CLOSED = "tracking", "tracking, loops closed"
+
 WARM_UP = 8
 """Frames that are tracked before the first walk, so that compiling kernels is not part of its time."""
+
+MOST_VIEWS = 12
+"""Held-out views that judge a map, at most."""
 
 FIGURES = ("1.5sigma", "5cm", "log_likelihood")
 """Of the held-out views."""
 
 
-def configuration(voxel_size: float, close_loops: bool) -> Config:
-    """Of a map whose camera is tracked: the one place where loop closure is switched."""
-    switch = {"close_loops": close_loops} if CLOSES_LOOPS else {}
-    return Config(
-        voxel_size=voxel_size,
-        keyframes=STEPS,
-        poses=PoseConfig(**switch),
-        evaluation=EvaluationConfig(hold_out=HOLD_OUT),
-    )
+def configurations(voxel_size: float) -> dict[str, Config]:
+    """Of maps whose camera is tracked, without loop closure and with it, by the name of the way."""
+    base = Config(voxel_size=voxel_size, keyframes=STEPS, evaluation=EvaluationConfig(hold_out=HOLD_OUT))
+    if not CLOSES_LOOPS:
+        return {TRACKING: base}
+    switched = {TRACKING: False, LOOPS_CLOSED: True}
+    return {name: replace(base, poses=PoseConfig(**{"close_loops": on})) for name, on in switched.items()}
 
 
 @dataclass(frozen=True)
@@ -76,23 +79,29 @@ def tracked_result(walk: Walk, config: Config, judge: bool) -> Result:
     """Errors of a tracked walk, and with ``judge`` figures of its map at held-out views."""
     followed(replace(walk, frames=walk.frames[:WARM_UP]), config, infer=False)
     run = followed(walk, config, infer=judge)
-    estimated = {float(index): T for index, T in run.poses.items()}
-    steps = step_errors(estimated, walk.true_poses)
-    turns_rad, moves_m = largest_step(walk)
-    result: Result = asdict(trajectory_error(estimated, walk.true_poses)) | {
-        "moves_m": moves_m,
-        "turns_rad": turns_rad,
-        "of": len(walk.frames),
-        "lost": len(walk.frames) - len(run.poses),
-        "keyframes": len(run.result.map.keyframes),
-        "unsure": len(run.unsure),
-        "unsure_step_m": _rms([error for index, error in steps.items() if index in run.unsure]),
-        "sure_step_m": _rms([error for index, error in steps.items() if index not in run.unsure]),
-        "cpu_s": run.cpu_s / len(walk.frames),
-    }
+    result = error_result(walk, run.poses, run.unsure, run.cpu_s)
     if judge:
         result["map"] = map_figures(run.result.map, walk, run.poses)
     return result
+
+
+def error_result(walk: Walk, poses: Mapping[int, Pose], unsure: set[int] | None, cpu_s: float) -> Result:
+    """Errors of a walk's poses by index, of which ``unsure`` ones are said to be so; None if nothing is said
+    of that. ``cpu_s``: the processor's seconds."""
+    estimated = {float(index): T for index, T in poses.items()}
+    steps = step_errors(estimated, walk.true_poses)
+    turns_rad, moves_m = largest_step(walk)
+    doubted = unsure or set()
+    return asdict(trajectory_error(estimated, walk.true_poses)) | {
+        "moves_m": moves_m,
+        "turns_rad": turns_rad,
+        "of": len(walk.frames),
+        "lost": len(walk.frames) - len(poses),
+        "unsure": None if unsure is None else len(unsure),
+        "unsure_step_m": _rms([error for index, error in steps.items() if index in doubted]),
+        "sure_step_m": _rms([error for index, error in steps.items() if index not in doubted]),
+        "cpu_s": cpu_s / len(walk.frames),
+    }
 
 
 def recorded_result(walk: Walk, config: Config) -> Result:
@@ -102,13 +111,14 @@ def recorded_result(walk: Walk, config: Config) -> Result:
     return {"map": map_figures(result.map, walk, poses)}
 
 
-def map_figures(m: OccupancyMap, walk: Walk, poses: dict[int, Pose]) -> dict[str, float]:
-    """Means over the held-out views that have a pose, each aligned with the map first; empty without any."""
+def map_figures(m: OccupancyMap, walk: Walk, poses: Mapping[int, Pose]) -> dict[str, float]:
+    """Means over held-out views that have a pose, each aligned with the map first; empty without any."""
     assert can_refine_poses(m)
+    known = [i for i in walk.clean_m if i in poses]
     views = [
-        SceneView(walk.frame_names[i], poses[i], walk.frames[i].depth_m, clean_m, clean_m > 0)
-        for i, clean_m in walk.clean_m.items()
-        if i in poses
+        SceneView(frame.name, poses[i], frame.depth_m, walk.clean_m[i], walk.clean_m[i] > 0)
+        for i in known[:: -(-len(known) // MOST_VIEWS) or 1]
+        for frame in (walk.frames[i],)
     ]
     if not views:
         return {}

@@ -13,12 +13,17 @@ from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.trajectory.following import (
-    CLOSES_LOOPS,
     FIGURES,
-    configuration,
+    TRACKING,
+    configurations,
+    error_result,
     recorded_result,
     tracked_result,
 )
+from taichi_mrf.experiments.trajectory.lost import COLUMNS as LOST_COLUMNS
+from taichi_mrf.experiments.trajectory.lost import NOTES as LOST_NOTES
+from taichi_mrf.experiments.trajectory.lost import PLACES, lost_entries, lost_result
+from taichi_mrf.experiments.trajectory.peers import Open3DTracker, Peer, PeerMissingError
 from taichi_mrf.experiments.trajectory.walks import (
     HEIGHT,
     HOLD_OUT,
@@ -36,11 +41,14 @@ COLUMNS = [
 ]  # fmt: skip
 MAP_COLUMNS = ["walk", "voxels", "poses by", "1.5sigma", "5cm", "log-likelihood", "views"]
 
-TRACKING, LOOPS_CLOSED = "tracking", "tracking, loops closed"
 TRUE, RECORDED = "true", "recorded"
+OPEN3D, OPEN3D_GRAPH = "Open3D odometry", "Open3D odometry, pose graph"
 
 JUDGED_HZ = 10.0
 """The maps of walks at this rate and of slower ones are judged."""
+
+_Way = tuple[str, Config, Callable[[], Result]]
+"""What found the poses, the map's configuration, and what computes the result."""
 
 NOTES = (
     f"Images of {WIDTH} x {HEIGHT} pixels, with a Kinect 1's noise where they are simulated. Moves, turns: "
@@ -50,6 +58,8 @@ NOTES = (
     "Unsure: frames of which tracking says that their points do not determine all six degrees of freedom. "
     "Steps: RMS error of the motion to such a frame, and to others.",
     "CPU: processor time for tracking and adding keyframes, for each frame.",
+    "Open3D: odometry from image to image, by depth alone or, in colour, by both, to 4.5 m; its pose graph "
+    "connects every fifth image with those that the odometry places within 1 m and 0.6 radians.",
 )
 MAP_NOTES = (
     f"Mean over held-out views (one frame in {HOLD_OUT}), each aligned with the map first. 1.5sigma = within "
@@ -59,51 +69,85 @@ MAP_NOTES = (
 
 def run_trajectory(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     """A row for each walk and each way to come by its poses. Raises ConfigError if ``only`` leaves none."""
-    walks = [(source, rate) for source in sources() for rate in source.rates]
-    chosen = [each for each in walks if experiment.wants(walk_name(*each))]
+    walks = {walk_name(source, rate): (source, rate) for source in sources() for rate in source.rates}
+    cases = {f"lost, {case}": case for case in PLACES}
+    chosen = [part for part in (*walks, *cases) if experiment.wants(part)]
     if not chosen:
-        raise ConfigError(f"--only leaves none of: {'; '.join(walk_name(*each) for each in walks)}")
+        raise ConfigError(f"--only leaves none of: {'; '.join((*walks, *cases))}")
     rows: list[list[Entry]] = []
     map_rows: list[list[Entry]] = []
+    lost_rows: list[list[Entry]] = []
+    missing = ""
     for voxel_size in experiment.voxel_sizes:
-        for number, (source, rate) in enumerate(chosen):
-            name = walk_name(source, rate)
-            experiment.report(f"{name}, {voxel_size * 100:g} cm", number, len(chosen))
-            for poses_by, result in _results(experiment, source, rate, voxel_size):
-                head: list[Entry] = [name, f"{voxel_size * 100:g} cm", poses_by]
+        for number, part in enumerate(chosen):
+            experiment.report(f"{part}, {voxel_size * 100:g} cm", number, len(chosen))
+            ways = (
+                _walked(experiment, *walks[part], voxel_size)
+                if part in walks
+                else _lost(experiment, cases[part], voxel_size)
+            )
+            for poses_by, config, compute in ways:
+                try:
+                    result = experiment.ledger.result(_key(experiment, part, poses_by, config), compute)
+                except PeerMissingError as error:
+                    missing = str(error)
+                    continue
+                head: list[Entry] = [part, f"{voxel_size * 100:g} cm", poses_by]
+                if part in cases:
+                    lost_rows.append([*head, *lost_entries(result)])
                 if "frames" in result:
                     rows.append([*head, *_entries(result)])
                 if figures := result.get("map"):
                     map_rows.append([*head, *(figures[key] for key in FIGURES), figures["views"]])
-    tables = [Table("trajectory", "Tracked walks", COLUMNS, rows, NOTES, digits=2)]
-    if map_rows:
-        tables.append(Table("trajectory_maps", "Maps of tracked walks", MAP_COLUMNS, map_rows, MAP_NOTES))
+    left_out = [f"Open3D's rows are left out: {missing}."] if missing else []
+    tables = [
+        Table("trajectory", "Tracked walks", COLUMNS, rows, [*NOTES, *left_out], digits=2),
+        Table("trajectory_maps", "Maps of tracked walks", MAP_COLUMNS, map_rows, MAP_NOTES),
+        Table("trajectory_lost", "Cameras that are covered", LOST_COLUMNS, lost_rows, LOST_NOTES),
+    ]
+    tables = [table for table in tables if table.rows]
     return tables, [path for table in tables for path in write_table(experiment.out, table)]
 
 
-def _results(
-    experiment: Experiment, source: Source, rate: float, voxel_size: float
-) -> Iterator[tuple[str, Result]]:
-    """What is known of one walk, or is computed, by the name of what found its poses."""
+def _key(experiment: Experiment, part: str, poses_by: str, config: Config) -> str:
+    signature = hashlib.sha256(to_yaml(config).encode()).hexdigest()[:12]
+    frames = "all" if experiment.limit is None else experiment.limit
+    return f"{part} | {frames} frames | noise {experiment.seeds[0]} | {poses_by} ({signature})"
+
+
+def _walked(experiment: Experiment, source: Source, rate: float, voxel_size: float) -> Iterator[_Way]:
+    """The ways to come by the poses of a walk."""
 
     @cache
     def walk() -> Walk:  # taken only if something is not known yet
         return source.take(experiment, rate)
 
+    @cache
+    def open3d() -> tuple[Open3DTracker, Peer]:
+        tracker = Open3DTracker(walk())
+        return tracker, tracker.odometry()
+
+    def peer(graph: bool) -> Result:
+        tracker, found = open3d()
+        found = tracker.pose_graph(found) if graph else found
+        return error_result(walk(), found.poses, None, found.cpu_s)
+
     judged = rate <= JUDGED_HZ
-    ways: dict[str, tuple[Config, Callable[[], Result]]] = {}
-    for name, close_loops in ((TRACKING, False), *([(LOOPS_CLOSED, True)] if CLOSES_LOOPS else [])):
-        config = configuration(voxel_size, close_loops)
-        ways[name] = config, lambda c=config: tracked_result(walk(), c, judged)  # type: ignore[misc]
+    configs = configurations(voxel_size)
+    for name, config in configs.items():
+        yield name, config, lambda c=config: tracked_result(walk(), c, judged)  # type: ignore[misc]
     if judged:
-        config = configuration(voxel_size, close_loops=False)
-        ways[RECORDED if source.name == KITCHEN else TRUE] = config, lambda: recorded_result(walk(), config)
-    for name, (config, compute) in ways.items():
-        signature = hashlib.sha256(to_yaml(config).encode()).hexdigest()[:12]
-        frames = "all" if experiment.limit is None else experiment.limit
-        head = f"{walk_name(source, rate)} | {frames} frames | noise {experiment.seeds[0]}"
-        key = f"{head} | {name} ({signature})"
-        yield name, experiment.ledger.result(key, compute)
+        config = configs[TRACKING]
+        yield RECORDED if source.name == KITCHEN else TRUE, config, lambda: recorded_result(walk(), config)
+
+    yield OPEN3D, configs[TRACKING], lambda: peer(False)
+    yield OPEN3D_GRAPH, configs[TRACKING], lambda: peer(True)
+
+
+def _lost(experiment: Experiment, case: str, voxel_size: float) -> Iterator[_Way]:
+    """The same for a camera that is covered."""
+    for name, config in configurations(voxel_size).items():
+        yield name, config, lambda c=config: lost_result(experiment, case, c)  # type: ignore[misc]
 
 
 def _entries(result: Result) -> list[Entry]:

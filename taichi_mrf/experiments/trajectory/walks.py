@@ -25,12 +25,13 @@ from taichi_mrf.datasets.synthetic.ring import LAMP_OVER_EYE_M
 from taichi_mrf.datasets.synthetic.ring_plan import ring_scene, ring_way
 from taichi_mrf.datasets.synthetic.room_furniture import camera_pose, room_scene
 from taichi_mrf.datasets.synthetic.smooth_way import SmoothWay
+from taichi_mrf.datasets.synthetic.texture import mottled
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.mapping.selection import is_held_out
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.sensor.simulate import KINECT_1, simulate
+from taichi_mrf.sensor.simulate import KINECT_1, Seed, simulate
 
 WIDTH, HEIGHT = 160, 120
 RATES = (30.0, 10.0, 5.0)
@@ -97,6 +98,15 @@ class Way:
     pose_at: Callable[[float], Pose]
     seconds: float
 
+    def frame(
+        self, seconds: float, name: str, seed: Seed, color: bool = False
+    ) -> tuple[Frame, NDArray[np.float32]]:
+        """What a Kinect 1 measures at that time, and the clean depth, (H, W) in metres."""
+        T, camera = self.pose_at(seconds), small_camera()
+        clean_m, rgb = self.picture(T, color)
+        depth_m = simulate(clean_m, camera, KINECT_1, seed)
+        return Frame(depth_m, T, camera, seconds, name, rgb), clean_m
+
 
 @dataclass(frozen=True)
 class Source:
@@ -115,13 +125,13 @@ def walk_name(source: Source, rate: float) -> str:
 def sources() -> list[Source]:
     """All walks, the cheap ones first."""
     simulated = {
-        ROOM: (_room, False),
-        ROOM_COLOR: (_room, True),
+        ROOM: (room_walk, False),
+        ROOM_COLOR: (room_walk, True),
         HOUSE: (_house, False),
         OFFICE: (_office, False),
-        RING: (partial(_ring, False), False),
-        RING_COLOR: (partial(_ring, False), True),
-        RING_BARE: (partial(_ring, True), False),
+        RING: (partial(ring_walk, False), False),
+        RING_COLOR: (partial(ring_walk, False), True),
+        RING_BARE: (partial(ring_walk, True), False),
     }
     taken = [
         Source(name, RATES, lambda e, rate, n=name, w=way, c=color: simulated_walk(e, n, w(e.data), rate, c))  # type: ignore[misc]
@@ -132,17 +142,13 @@ def sources() -> list[Source]:
 
 def simulated_walk(experiment: Experiment, name: str, way: Way, rate: float, color: bool) -> Walk:
     """The frames of a way at ``rate`` images a second, with a Kinect 1's noise."""
-    camera = small_camera()
-    count = range(round(way.seconds * rate))[: experiment.limit]
-    seed, frames, clean = experiment.seeds[0], [], {}
-    for index in count:
-        T = way.pose_at(index / rate)
-        true_m, rgb = way.picture(T, color)
-        depth_m = simulate(true_m, camera, KINECT_1, seed=(seed, index))
-        frames.append(Frame(depth_m, T, camera, index / rate, f"{name}-{index:04d}", rgb))
+    frames, clean = [], {}
+    for index in range(round(way.seconds * rate))[: experiment.limit]:
+        frame, true_m = way.frame(index / rate, f"{name}-{index:04d}", (experiment.seeds[0], index), color)
+        frames.append(frame)
         if is_held_out(index + 1, HOLD_OUT):
             clean[index] = true_m
-    return Walk(f"{name}, {rate:g} Hz", camera, frames=frames, clean_m=clean)
+    return Walk(f"{name}, {rate:g} Hz", small_camera(), frames=frames, clean_m=clean)
 
 
 def kitchen_walk(experiment: Experiment, rate: float) -> Walk:
@@ -160,11 +166,13 @@ def small_camera() -> PinholeCamera:
     return RenderOptions(width=WIDTH, height=HEIGHT).camera()
 
 
-def _room(data: Path) -> Way:
+def room_walk(data: Path) -> Way:
+    """Once around the built-in room."""
     return _rendered(room_scene(), lambda seconds: camera_pose(seconds / ROOM_SECONDS), ROOM_SECONDS)
 
 
-def _ring(bare: bool, data: Path) -> Way:
+def ring_walk(bare: bool, data: Path) -> Way:
+    """Once around the ring corridor."""
     way = ring_way(RING_M)
     return _rendered(
         ring_scene(RING_M, bare), lambda seconds: way.pose_at(seconds * SPEED), way.length_m / SPEED
@@ -197,9 +205,11 @@ def shaken(T_world_camera: Pose, seconds: float) -> Pose:
 
 
 def _rendered(scene: Scene, pose_at: Callable[[float], Pose], seconds: float) -> Way:
+    camera = small_camera()
+
     def picture(T: Pose, color: bool) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
         x, y, z = T[:3, 3].tolist()
-        lit = replace(scene, light=(x, y, z + LAMP_OVER_EYE_M)) if color else scene
-        return render(lit, small_camera(), T, color)
+        depth_m, rgb = render(replace(scene, light=(x, y, z + LAMP_OVER_EYE_M)), camera, T, color)
+        return depth_m, None if rgb is None else mottled(rgb, depth_m, camera, T)
 
     return Way(picture, pose_at, seconds)
