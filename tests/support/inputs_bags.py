@@ -1,7 +1,7 @@
 """Writes ROS 1 bags, ROS 2 bags and MCAP files with rosbags, for the tests of their reader."""
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -163,6 +163,12 @@ class Bag:
     def pose_stamped(self, topic: str, stamp: float, frame: str, T: Pose) -> None:
         name = "geometry_msgs/msg/PoseStamped"
         self.send(topic, name, stamp, header=self.header(stamp, frame), pose=self.pose(T))
+
+    def path(self, topic: str, stamp: float, frame: str, poses: Mapping[float, Pose]) -> None:
+        """All poses of a body so far, by their stamps."""
+        name = "geometry_msgs/msg/PoseStamped"
+        each = [self.message(name, header=self.header(s, frame), pose=self.pose(T)) for s, T in poses.items()]
+        self.send(topic, "nav_msgs/msg/Path", stamp, header=self.header(stamp, frame), poses=each)
 
     def tf(self, topic: str, stamp: float, parent: str, child: str, T: Pose) -> None:
         x, y, z, w = quaternion_of(T[:3, :3])

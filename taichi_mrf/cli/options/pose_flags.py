@@ -23,7 +23,8 @@ class PoseFlags:
 
     file: Annotated[str | None, tyro.conf.arg(name="poses", metavar="FILE")] = None
     """Poses of SOURCE's frames, in place of its own: a trajectory (TUM, KITTI, .log), a pose graph (g2o,
-    TORO) or a database of RTAB-Map. Frames that it does not name keep their own."""
+    TORO), a database of RTAB-Map, or a bag (walk.bag?pose=/PATH). Frames that it does not name keep their
+    own."""
 
     follow: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """The file of --poses changes while SOURCE is mapped: keyframes follow it. map ends when the recording is

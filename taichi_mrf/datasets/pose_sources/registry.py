@@ -11,6 +11,7 @@ from taichi_mrf.datasets.formats.open3d_json import is_trajectory_json, read_tra
 from taichi_mrf.datasets.pose_sources.base import ChangedPoses, FrameKey, PoseKind, PoseSource
 from taichi_mrf.datasets.pose_sources.graph_file import SUFFIXES, is_pose_graph, read_pose_graph
 from taichi_mrf.datasets.pose_sources.watched import WatchedFile
+from taichi_mrf.datasets.ros.pose_history import KIND as BAG
 from taichi_mrf.datasets.rtabmap.recording import KIND as RTABMAP
 from taichi_mrf.datasets.trajectories import Trajectory, read_trajectory
 from taichi_mrf.errors import DatasetError, KeyframeError
@@ -64,7 +65,7 @@ TRAJECTORY = PoseKind(
     _watched(lambda path: _poses_in(read_trajectory(path))),
 )
 
-KINDS: tuple[PoseKind, ...] = (RTABMAP, GRAPH, OPEN3D, TRAJECTORY)
+KINDS: tuple[PoseKind, ...] = (BAG, RTABMAP, GRAPH, OPEN3D, TRAJECTORY)
 
 
 def open_pose_source(name: str | Path) -> PoseSource:

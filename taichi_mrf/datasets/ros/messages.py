@@ -24,6 +24,9 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TRANSFORM_STAMPED = "geometry_msgs/msg/TransformStamped"
+PATH = "nav_msgs/msg/Path"
+"""All poses of a body so far."""
+
 POSES = (ODOMETRY, POSE_STAMPED, POSE_WITH_COVARIANCE, TRANSFORM_STAMPED)
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 

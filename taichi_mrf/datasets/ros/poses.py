@@ -93,7 +93,7 @@ def _from_tree(reader: RosReader, tree: TransformTree, optical: str, choice: Pos
     if optical not in tree.frames:
         raise _unknown_frame(reader, tree, optical)
     fixed = choice.frame or tree.ancestors(optical)[-1]
-    _must_connect(reader, tree, fixed, optical)
+    must_connect(reader, tree, fixed, optical)
     note = f"poses in {fixed} from tf, of {optical}"
     moving = [edge.stamps for edge in tree.between(fixed, optical) if isinstance(edge, TimedPoses)]
     first, last = (max(s[0] for s in moving), min(s[-1] for s in moving)) if moving else (0.0, float("inf"))
@@ -110,11 +110,11 @@ def _from_topic(
 ) -> BagPoses:
     timed, parent, child, notes = _read_poses(reader, name)
     if choice.body:
-        _must_connect(reader, tree, choice.body, optical)
-    body, body_note = _body(tree, optical, choice.body or child)
+        must_connect(reader, tree, choice.body, optical)
+    body, body_note = body_of(tree, optical, choice.body or child)
     fixed = choice.frame or parent
     if choice.frame:
-        _must_connect(reader, tree, fixed, parent)
+        must_connect(reader, tree, fixed, parent)
     notes.append(f"poses in {fixed or 'an unnamed frame'} from {name}{body_note}")
 
     def at(stamp: float, largest_gap: float) -> Pose | None:
@@ -152,7 +152,7 @@ def _read_poses(reader: RosReader, name: str) -> tuple[TimedPoses, str, str, lis
     return TimedPoses(stamps, poses), parent, child, notes
 
 
-def _body(tree: TransformTree, optical: str, named: str) -> tuple[str, str]:
+def body_of(tree: TransformTree, optical: str, named: str) -> tuple[str, str]:
     """The frame that a topic's poses are of, so that it is connected to the camera's, and a note."""
     if not named:
         body = tree.body(optical)
@@ -170,7 +170,8 @@ def _body(tree: TransformTree, optical: str, named: str) -> tuple[str, str]:
     return named, f", of {named}" + (f", from there to {optical} by tf" if named != optical else "")
 
 
-def _must_connect(reader: RosReader, tree: TransformTree, a: str, b: str) -> None:
+def must_connect(reader: RosReader, tree: TransformTree, a: str, b: str) -> None:
+    """Raise DatasetError, which lists the frames, unless the tree connects two frames."""
     for frame in (a, b):
         if a != b and frame not in tree.frames:
             raise _unknown_frame(reader, tree, frame)
