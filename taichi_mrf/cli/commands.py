@@ -60,8 +60,18 @@ class Command:
 
 
 _COMMON = ("out", "voxel-size", "method", "config", "every", "limit")
-_MAP_FLAGS = (*_COMMON, "resume", "overwrite", "jobs", "track-poses")
-_LIVE_FLAGS = (*_COMMON, "overwrite", "speed", "track-poses", "time.half-life-s", "port", "open")
+_MAP_FLAGS = (*_COMMON, "resume", "overwrite", "jobs", "track-poses", "poses", "follow")
+_LIVE_FLAGS = (
+    *_COMMON,
+    "overwrite",
+    "speed",
+    "track-poses",
+    "poses",
+    "follow",
+    "time.half-life-s",
+    "port",
+    "open",
+)
 _TUNE_FLAGS = ("out", "voxel-size", "config", "frames", "first", "stride", "auto", "search", "port", "open")
 _BENCH_FLAGS = (
     "voxel-sizes",

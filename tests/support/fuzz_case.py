@@ -19,7 +19,7 @@ from fuzz_loaders import LOADERS, Loader, map_last_dataset
 
 from taichi_mrf.errors import TaichiMRFError
 
-TEXT_SUFFIXES = (".txt", ".json", ".yaml", ".log", ".freiburg", ".ply", ".pcd", ".csv")
+TEXT_SUFFIXES = (".txt", ".json", ".yaml", ".log", ".freiburg", ".ply", ".pcd", ".csv", ".g2o")
 LONGEST_LINE = 2000
 BY_NAME = {loader.name: loader for loader in LOADERS}
 

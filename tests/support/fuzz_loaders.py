@@ -45,6 +45,7 @@ from point_clouds import write_scans as write_lidar_scans
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
+from rtabmap_database import Database, calibration, encoded, rvl
 from stereo_rig import write as write_stereo_file
 
 from taichi_mrf.calibration.depth_files import DepthFiles
@@ -55,6 +56,8 @@ from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.images import read_grey
 from taichi_mrf.datasets.laser.plan_image import read_floor_plan
 from taichi_mrf.datasets.laser.readers import open_scans
+from taichi_mrf.datasets.pose_sources.graph_file import read_pose_graph
+from taichi_mrf.datasets.rtabmap.recording import RtabmapRecording
 from taichi_mrf.datasets.synthetic.mesh_scene import load_mesh
 from taichi_mrf.datasets.timed_poses import read_timed_poses
 from taichi_mrf.errors import FrameError, TaichiMRFError
@@ -101,7 +104,8 @@ def frames_of(dataset: Dataset) -> bytes:
             refused.append((name, str(error)))
             continue
         assert frame.depth_m.shape == frame.camera.shape
-        if isinstance(frame.camera, PinholeCamera) and not frame.sensor:
+        own_cameras = isinstance(dataset, RtabmapRecording)
+        if isinstance(frame.camera, PinholeCamera) and not frame.sensor and not own_cameras:
             assert frame.camera == dataset.camera
         assert frame.depth_m.dtype == np.float32
         assert np.isfinite(frame.depth_m).all()
@@ -220,6 +224,13 @@ def _noise(path: Path) -> bytes:
 def _stream(path: Path) -> bytes:
     stream = read_timed_poses(path)
     return _arrays_of(stream.stamps, stream.poses)
+
+
+def _pose_graph(path: Path) -> bytes:
+    graph = read_pose_graph(path)
+    edges = [(e.first, e.second, e.T_first_second, e.information) for e in graph.edges]
+    assert all(np.isfinite(T).all() for T in graph.poses.values())
+    return _arrays_of(dict(graph.poses), edges)
 
 
 def _plan(path: Path) -> bytes:
@@ -476,6 +487,28 @@ def _noise_npz(folder: Path) -> Path:
     return folder / "noise.npz"
 
 
+def _pose_graph_file(folder: Path) -> Path:
+    lines = [f"VERTEX3 {i} {i} 0 1 0.1 {i} 0.2" for i in range(3)]
+    lines += ["VERTEX_SE3:QUAT 7 1 2 3 0 0 0 1", "EDGE_SE3:QUAT 0 7 1 2 3 0 0 0 1 " + "1 " * 21]
+    path = folder / "graph.g2o"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def _rtabmap_file(folder: Path) -> Path:
+    path, content = folder / "walk.db", _content()
+    database = Database(path)
+    height, width = content.size
+    camera = calibration(PinholeCamera(width, height, 14.0, 15.0, 7.5, 5.5))
+    for i in range(content.count):
+        depth = (rvl, encoded)[i % 2](content.depth[i])
+        database.add(i + 1, float(i), content.poses[i], depth, camera, encoded(content.color[i]))
+    database.optimise({i + 1: T for i, T in enumerate(content.poses)})
+    database.link(1, 2, 0, content.poses[0], np.eye(6))
+    database.connection.close()
+    return path
+
+
 def _stream_file(folder: Path) -> Path:
     lines = [stamped_line(0.1 * i, pose) for i, pose in enumerate(_content().poses)]
     (folder / "poses.txt").write_text("\n".join(lines))
@@ -560,6 +593,8 @@ LOADERS = [
     Loader("configuration YAML", _yaml, _config),
     Loader("noise.npz", _noise_npz, _noise, sealed=True),
     Loader("pose stream", _stream_file, _stream),
+    Loader("pose graph", _pose_graph_file, _pose_graph),
+    Loader("RTAB-Map database", _rtabmap_file, _dataset),
     Loader("stamps", _stamps_file, _stamps),
     Loader("depth stack npy", partial(_stack, ".npy"), _depth_images),
     Loader("depth stack npz", partial(_stack, ".npz"), _depth_images, sealed=True),

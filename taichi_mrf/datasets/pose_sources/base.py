@@ -61,7 +61,7 @@ class PoseKind:
 @dataclass(frozen=True)
 class CallbackPoses:
     """Poses that a function gives: ``function(stamp_s)`` returns all poses that are known, or None if they
-    have not changed. What it raises ends the run."""
+    have not changed. What it raises ends a run of ``map_sequence``."""
 
     function: Callable[[float], ChangedPoses | None]
     name: str = "the callback's poses"

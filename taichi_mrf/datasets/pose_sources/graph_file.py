@@ -61,9 +61,10 @@ def is_pose_graph(path: Path) -> bool:
     return bool(words) and words[0].startswith((b"VERTEX", b"EDGE"))
 
 
-def read_pose_graph(path: Path) -> PoseGraph:
-    """Read a graph. Raises DatasetError, whose text names the file and the line, if it cannot be read, holds
-    no pose in space, or a line does not hold the numbers that its first word promises."""
+def read_pose_graph(path: Path, with_edges: bool = True) -> PoseGraph:
+    """Read a graph, or its vertices alone. Raises DatasetError, whose text names the file and the line, if it
+    cannot be read, holds no pose in space, or a line does not hold the numbers that its first word
+    promises."""
     poses: dict[int, Pose] = {}
     keys: dict[int, int] = {}
     edges: list[PoseEdge] = []
@@ -79,7 +80,7 @@ def read_pose_graph(path: Path) -> PoseGraph:
             if keys.setdefault(vertex, key) != key:
                 raise DatasetError(f"{where}: the number {vertex} stands for another vertex already")
             poses[vertex] = _pose(_numbers(words, 2, _VERTICES[tag], where), where)
-        elif tag in _EDGES:
+        elif tag in _EDGES and with_edges:
             count = _EDGES[tag]
             ends = _key(words, 1, where)[1], _key(words, 2, where)[1]
             T_first_second = _pose(_numbers(words, 3, count, where), where)

@@ -43,7 +43,7 @@ def _watched(read: Callable[[Path], ChangedPoses]) -> Callable[[Path, str], Pose
 
 
 def _graph_poses(path: Path) -> ChangedPoses:
-    return {int(number): T for number, T in read_pose_graph(path).poses.items()}
+    return {int(number): T for number, T in read_pose_graph(path, with_edges=False).poses.items()}
 
 
 GRAPH = PoseKind(
