@@ -133,6 +133,10 @@ class PoseConfig:
     """Do not move a keyframe if less than this share of its points lies near surfaces that other keyframes
     measured."""
 
+    carry_unnamed: bool = False
+    """Frames without a pose in the file of --poses move with the last frame before them that has one, instead
+    of staying where they were recorded."""
+
     follow_budget_s: float = 0.2
     """Move keyframes for about this long, at most, between two frames, while poses follow a file (--follow;
     seconds)."""

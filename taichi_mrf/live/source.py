@@ -92,7 +92,8 @@ def open_source(
             )
         return Source(path.name, parameters, lambda: load_map(path)), notes
     keywords = (reading or SourceFlags()).keywords()
-    dataset = open_posed(name, poses, follow=follow, track=track, color=config.color, **keywords)
+    keywords |= {"follow": follow, "carry": config.poses.carry_unnamed}
+    dataset = open_posed(name, poses, track=track, color=config.color, **keywords)
     config = with_recorded_noise(config, dataset)
     # Held-out frames of a tracked source are read, so that their poses are known when the map is checked.
     unread = 0 if dataset.tracked else hold_out_of(dataset, config)

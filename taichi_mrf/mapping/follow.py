@@ -43,7 +43,7 @@ class PoseFollower:
         if config.refine:
             raise ConfigError("poses.refine and poses that follow a file both move keyframes: choose one")
         self.map, self.config, self.done = m, config, Followed()
-        self._poses, self._clock = dataset.poses, clock
+        self._dataset, self._poses, self._clock = dataset, dataset.poses, clock
         self._left: dict[int, Pose] = {}
         self._changed_at = clock()
         self._said: set[str] = set()
@@ -131,7 +131,7 @@ class PoseFollower:
         """The keyframes that are not at their frames' poses, by id, with these poses."""
         found = {}
         for id, keyframe in self.map.keyframes.items():
-            T = self._poses.of(keyframe.name, keyframe.stamp_s)
+            T = self._dataset.pose_now(keyframe.name, keyframe.stamp_s)
             if T is not None and not np.array_equal(T, keyframe.T_world_camera):
                 found[id] = T
         return found

@@ -232,7 +232,7 @@ def test_frames_take_the_poses_of_a_file_and_the_others_keep_theirs(tmp_path: Pa
     for index, wanted in enumerate([sequence(4).read(0).T_world_camera, POSES[1], None, POSES[3]]):
         T = sequence(4).read(index).T_world_camera if wanted is None else wanted
         np.testing.assert_allclose(posed.read(index).T_world_camera, T, atol=1e-12)
-    assert "2 of 4 frames have no pose there, and keep the recorded one" in posed.notes
+    assert posed.notes[-1].startswith("2 of 4 frames have no pose there, and keep the recorded one; --poses.")
     path.write_text(g2o({1: POSES[1], 17: POSES[2], 18: POSES[2], 19: POSES[2], 20: POSES[2]}))
     (warning,) = (note for note in posed_by(sequence(4), open_pose_source(path)).notes if "lacks" in note)
     assert warning.endswith("has poses of 4 frames that the recording lacks: 17, 18, 19, ...")
@@ -244,6 +244,22 @@ def test_frames_take_the_poses_of_a_file_and_the_others_keep_theirs(tmp_path: Pa
         posed_by(sequence(4), open_pose_source(path))
     with pytest.raises(DatasetError, match="no such file"):
         posed_by(sequence(4), open_pose_source(tmp_path / "missing.txt"))
+
+
+def test_unnamed_frames_may_be_carried_along(tmp_path: Path) -> None:
+    path = tmp_path / "graph.g2o"
+    path.write_text(g2o({1: POSES[1], 3: POSES[3]}))
+    frames = sequence(6, broken=(4,))
+    posed = posed_by(frames, open_pose_source(path), carry=True)
+    recorded = [sequence(6).read(index).T_world_camera for index in range(6)]
+    for index, carrier in ((0, None), (1, 1), (2, 1), (3, 3), (5, 3)):
+        T = recorded[index]
+        if carrier is not None:
+            T = POSES[carrier] @ np.linalg.inv(recorded[carrier]) @ T
+        np.testing.assert_allclose(posed.read(index).T_world_camera, T, atol=1e-12)
+    path.write_text(g2o({4: POSES[2]}))  # which cannot be read: nothing says where it was recorded
+    posed = posed_by(frames, open_pose_source(path), carry=True)
+    np.testing.assert_array_equal(posed.read(5).T_world_camera, recorded[5])
 
 
 def test_an_impossible_pose_of_a_callback_is_named() -> None:

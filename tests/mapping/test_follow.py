@@ -87,6 +87,20 @@ def test_the_map_is_that_made_anew_with_the_last_poses(versions: list[dict | Non
     assert_same_map(followed([*told, {f"frame {i}": T for i, T in last.items()}]), anew(last))
 
 
+def test_keyframes_that_are_not_named_stay_or_are_carried() -> None:
+    for carry in (False, True):
+        source = CallbackPoses(
+            Versions([None, None, None, {1: shifted(1, 0.0, 0.1, 0.0)}, {1: shifted(1, 0.0, 0.2)}])
+        )
+        dataset = posed_by(sequence(), source, follow=True, carry=carry)
+        m = map_sequence(dataset, AT_ONCE).map
+        last = {index: shifted(index, 0.0, 0.2) for index in (range(1, 6) if carry else (1,))}
+        places = [keyframe.T_world_camera for keyframe in m.keyframes.values()]
+        for index, T in enumerate(places):
+            np.testing.assert_allclose(T, last.get(index, shifted(index)), atol=1e-12)
+        assert_same_map(m, anew(dict(enumerate(places))))
+
+
 @pytest.mark.parametrize("method", ["log_odds", "visibility"])
 def test_every_method_follows(method: str) -> None:
     config = replace(AT_ONCE, method=method)

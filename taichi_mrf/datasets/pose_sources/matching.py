@@ -37,6 +37,8 @@ class FramePoses:
         self._by_own_number = {n: name for name in frame_names if (n := number_in(name)) is not None}
         self._poses: dict[str, Pose] = {}
         self._timed = TimedPoses([], [])
+        self.changes = 0
+        """How often poses were taken in."""
         self.unknown: list[str] = []
         """Names and numbers of the source that no frame has."""
 
@@ -82,6 +84,7 @@ class FramePoses:
         self.unknown += [str(number) for number in numbered if number not in name_of]
         self._poses = named | {name_of[n]: pose for n, pose in numbered.items() if n in name_of}
         self._timed = TimedPoses(stamps, timed)
+        self.changes += 1
 
     def of(self, name: str, stamp_s: float) -> Pose | None:
         """The pose (4, 4) of the frame with this name that was taken at this time; None if the source has

@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
@@ -14,23 +16,28 @@ from taichi_mrf.datasets.pose_sources.matching import FramePoses
 from taichi_mrf.datasets.pose_sources.registry import open_pose_source
 from taichi_mrf.datasets.pose_sources.watched import WatchedFile
 from taichi_mrf.datasets.registry import open_dataset
-from taichi_mrf.errors import DatasetError
+from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.frame import Frame
 
 
 @dataclass
 class PosedFrames(Derived):
-    """The frames of ``source`` at the poses of ``poses``; one without a pose there keeps the recorded one.
-    ``follows``: the poses change while the frames are mapped. ``kept`` are the source's indices of the
-    frames."""
+    """The frames of ``source`` at the poses of ``poses``. One without a pose there keeps the recorded one; if
+    frames are ``carried``, it moves with the last frame before it that has one. ``follows``: the poses change
+    while the frames are mapped. ``kept`` are the source's indices of the frames."""
 
     poses: FramePoses = field(kw_only=True)
     follows: bool = False
+    carried: bool = False
     kept: Sequence[int] = field(kw_only=True)
 
     def __post_init__(self) -> None:
         names = self.source.frame_names
         self._names = [names[index] for index in self.kept]
+        self._index_of = {name: index for index, name in enumerate(names)}
+        self._recorded: dict[int, Pose] = {}
+        self._carriers: tuple[int, NDArray[np.int64]] = (-1, np.zeros(0, np.int64))
 
     @property
     def frame_names(self) -> Sequence[str]:
@@ -51,8 +58,48 @@ class PosedFrames(Derived):
         if not 0 <= index < len(self.kept):
             raise IndexError(f"{self.name} has {len(self.kept)} frames, there is no frame {index}")
         frame = self.source.read(self.kept[index])
-        T_world_camera = self.poses.of(frame.name, frame.stamp)
+        if self.carried:
+            self._recorded[self.kept[index]] = frame.T_world_camera
+        T_world_camera = self.pose_now(frame.name, frame.stamp)
         return frame if T_world_camera is None else replace(frame, T_world_camera=T_world_camera)
+
+    def pose_now(self, name: str, stamp_s: float) -> Pose | None:
+        """The present pose (4, 4) of the frame with this name that was taken at this time; None if it is
+        the recorded one."""
+        T_world_camera = self.poses.of(name, stamp_s)
+        index = self._index_of.get(name)
+        if T_world_camera is not None or not self.carried or index is None:
+            return T_world_camera
+        carrier = int(self._carrier_of()[index])
+        T_recorded, T_carrier = self._recorded_pose(index), self._recorded_pose(carrier)
+        if T_recorded is None or T_carrier is None:
+            return None
+        T_carrier_now = self.poses.of(self.source.frame_names[carrier], float(self._stamps[carrier]))
+        assert T_carrier_now is not None, "a carrier has a pose"
+        return T_carrier_now @ inverse(T_carrier) @ T_recorded
+
+    @cached_property
+    def _stamps(self) -> Sequence[float] | NDArray[np.float64]:
+        return self.source.stamps()
+
+    def _carrier_of(self) -> NDArray[np.int64]:
+        """For each frame of the source the last one before it that has a pose now, -1 without."""
+        version, carriers = self._carriers
+        if version != self.poses.changes:
+            names, stamps = self.source.frame_names, self._stamps
+            posed = [self.poses.of(name, float(s)) is not None for name, s in zip(names, stamps, strict=True)]
+            carriers = np.maximum.accumulate(np.where(posed, np.arange(len(posed)), -1))
+            self._carriers = self.poses.changes, carriers
+        return carriers
+
+    def _recorded_pose(self, index: int) -> Pose | None:
+        """The recorded pose of one of the source's frames, None if it is broken or -1."""
+        if index not in self._recorded and index >= 0:
+            try:
+                self._recorded[index] = self.source.read(index).T_world_camera
+            except FrameError:
+                return None
+        return self._recorded.get(index)
 
 
 def posed_by(
@@ -60,16 +107,20 @@ def posed_by(
     source: PoseSource,
     *,
     follow: bool = False,
+    carry: bool = False,
     largest_gap_s: float | None = None,
     has_poses: bool = True,
 ) -> PosedFrames:
     """The frames of a dataset at the poses of a source.
 
-    Frames that the source has no pose for keep the recorded one, or are left out if the recording has none
-    (``has_poses``). With ``follow`` mapping asks the source again and again, and moves keyframes
-    (mapping/follow.py); it may then begin without any pose. Between two stamps a pose is interpolated, if
-    both are at most ``largest_gap_s`` seconds away. Raises DatasetError if the source cannot be read or has a
-    pose for no frame, and for frames whose poses are found while mapping or are those of several sensors.
+    Frames that the source has no pose for keep the recorded one, or with ``carry`` move with the last frame
+    before them that has one; they are left out if the recording has none (``has_poses``). With ``follow``
+    mapping asks the source again and again, and moves keyframes (mapping/follow.py); it may then begin
+    without any pose. Between two stamps a pose is interpolated, if both are at most ``largest_gap_s`` seconds
+    away.
+
+    Raises DatasetError if the source cannot be read or has a pose for no frame, and for frames whose poses
+    are found while mapping or are those of several sensors.
     """
     if dataset.tracked or dataset.endless:
         raise DatasetError(
@@ -96,7 +147,9 @@ def posed_by(
         notes = [f"poses of {len(posed)} frames from {source.name}"]
         notes += [] if poses.warning is None else [poses.warning]
         if others and has_poses:
-            notes.append(f"{others} of {len(names)} frames have no pose there, and keep the recorded one")
+            keep = "keep the recorded one; --poses.carry-unnamed moves them with the last one before them"
+            keep = "move with the last one before them" if carry else keep
+            notes.append(f"{others} of {len(names)} frames have no pose there, and {keep}")
         elif others:
             notes.append(f"{others} of {len(names)} frames dropped: no pose in {source.name}")
             kept = posed
@@ -109,6 +162,7 @@ def posed_by(
         source=dataset,
         poses=poses,
         follows=follow,
+        carried=carry,
         kept=kept,
     )
 
@@ -118,12 +172,14 @@ def open_posed(
     poses: str | Path | None,
     *,
     follow: bool = False,
+    carry: bool = False,
     track: bool = False,
     max_time_gap: float | None = None,
     **reading: Any,
 ) -> Dataset:
     """Open a recording, with the poses of a file if one is given; without ``follow`` it then need not have
-    poses of its own. ``track`` and ``reading`` are keywords of :func:`open_dataset`. Raises DatasetError."""
+    poses of its own. ``follow`` and ``carry`` are those of :func:`posed_by`, ``track`` and ``reading`` are
+    keywords of :func:`open_dataset`. Raises DatasetError."""
     if poses is None:
         return open_dataset(source, track=track, max_time_gap=max_time_gap, **reading)
     opened = open_pose_source(poses)
@@ -139,4 +195,6 @@ def open_posed(
         if follow:
             raise DatasetError(f"poses that change need some to begin with: {problem}") from problem
         dataset.tracked = has_poses = False
-    return posed_by(dataset, opened, follow=follow, largest_gap_s=max_time_gap, has_poses=has_poses)
+    return posed_by(
+        dataset, opened, follow=follow, carry=carry, largest_gap_s=max_time_gap, has_poses=has_poses
+    )
