@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.alignment.keyframe_pictures import ColorLevel
 from taichi_mrf.alignment.levenberg import OBSERVABLE, Aligned, align
 from taichi_mrf.alignment.oriented_points import OrientedPoints
 from taichi_mrf.alignment.point_to_plane import PointToPlane
@@ -62,4 +63,20 @@ def aligned(
     found = align(levels[0], T_world_camera, recorded, lever_m, observable)
     for level in levels[1:]:
         found = align(level, found.T_world_camera, recorded, lever_m, observable)
+    return found
+
+
+def aligned_with_color(
+    levels: Sequence[PointToPlane],
+    colors: Sequence[ColorLevel],
+    T_world_camera: Pose,
+    recorded: Recorded,
+    lever_m: float,
+    observable: float,
+) -> Aligned:
+    """The same with colour, coarse and fine, on the finer levels."""
+    found = Aligned(T_world_camera, levels[-1].linearised(T_world_camera), 0)
+    for level, color in zip(levels[1:], colors, strict=True):
+        T = found.T_world_camera
+        found = align(level, T, recorded, lever_m, observable, color.seen_from(T))
     return found

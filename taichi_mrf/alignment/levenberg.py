@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.alignment.photometric import NO_COLOR, ColorEquations, Photometric
 from taichi_mrf.alignment.point_to_plane import NormalEquations, PointToPlane
 from taichi_mrf.alignment.recorded import Recorded
 from taichi_mrf.alignment.se3 import moved
@@ -41,23 +42,28 @@ def align(
     recorded: Recorded,
     lever_m: float,
     observable: float = OBSERVABLE,
+    color: Photometric | None = None,
 ) -> Aligned:
-    """Steps from a pose while they lower the cost: of the residuals, and of leaving where it was recorded.
+    """Steps from a pose while they lower the cost: of the residuals, of leaving where it was recorded, and of
+    ``color``.
 
     ``lever_m`` is the distance of a typical point, ``observable`` the least share of the largest eigenvalue
     that a direction needs to be moved in.
     """
     T, here = T_world_camera, problem.linearised(T_world_camera)
+    shown = NO_COLOR if color is None else color.linearised(T)
     worth = here.worth
     damping, directions = 1e-3, 0
     for _ in range(MOST_STEPS):
-        step, directions = solve(here, worth, recorded, T, lever_m, damping, observable)
+        step, directions = solve(here, worth, recorded, T, lever_m, damping, observable, shown)
         if np.linalg.norm(step * _scale(lever_m)) < SMALLEST_STEP_M:
             break
         tried_T = moved(T, step)
         tried = problem.linearised(tried_T)
-        if worth * tried.cost + recorded.cost(tried_T) < worth * here.cost + recorded.cost(T):
-            T, here, damping = tried_T, tried, max(1e-4, damping / 10)
+        tried_shown = NO_COLOR if color is None else color.linearised(tried_T)
+        before = worth * here.cost + recorded.cost(T) + shown.cost
+        if worth * tried.cost + recorded.cost(tried_T) + tried_shown.cost < before:
+            T, here, shown, damping = tried_T, tried, tried_shown, max(1e-4, damping / 10)
         elif damping > 1:
             break
         else:
@@ -73,14 +79,16 @@ def solve(
     lever_m: float,
     damping: float,
     observable: float = OBSERVABLE,
+    color: ColorEquations = NO_COLOR,
 ) -> tuple[NDArray[np.float64], int]:
-    """The damped step (6,) from the pose T, 0 along directions that the points do not determine, and the
-    number of those that they do."""
+    """The damped step (6,) from the pose T, 0 along directions that neither the points nor colour determine,
+    and the number of those that they do."""
     scale = _scale(lever_m)
-    values, vectors = np.linalg.eigh(equations.H / np.outer(scale, scale))
+    known = equations.H + color.H / worth if worth > 0 else equations.H
+    values, vectors = np.linalg.eigh(known / np.outer(scale, scale))
     told = vectors[:, values > observable * max(values[-1], 1e-12)]
-    H = told.T @ ((worth * equations.H + recorded.H) / np.outer(scale, scale)) @ told
-    g = told.T @ ((worth * equations.g + recorded.gradient(T)) / scale)
+    H = told.T @ ((worth * equations.H + recorded.H + color.H) / np.outer(scale, scale)) @ told
+    g = told.T @ ((worth * equations.g + recorded.gradient(T) + color.g) / scale)
     H[np.diag_indices_from(H)] *= 1 + damping
     return (told @ np.linalg.solve(H, -g)) / scale, told.shape[1]
 

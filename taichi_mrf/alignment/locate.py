@@ -1,13 +1,22 @@
 """Where a depth image that is no keyframe was taken: where it fits what keyframes have measured."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.alignment.keyframe_pictures import ColorLevel
 from taichi_mrf.alignment.keyframe_surfels import KeyframeSurfels
-from taichi_mrf.alignment.levels import LEAST_POINTS, aligned, bounds, grids_of, levels_of, margin_m
+from taichi_mrf.alignment.levels import (
+    LEAST_POINTS,
+    aligned,
+    aligned_with_color,
+    bounds,
+    grids_of,
+    levels_of,
+    margin_m,
+)
 from taichi_mrf.alignment.levenberg import Aligned
 from taichi_mrf.alignment.locate_around import FINEST_CELLS_M, found_around
 from taichi_mrf.alignment.oriented_points import OrientedPoints, oriented_points
@@ -39,6 +48,9 @@ that are right 0.76 and more. Depth cameras, which are not searched for, keep wh
 LITTLE = 0.03
 """Share of the map that such a scan may look through. Without this test 2 of 60 scans of the built-in
 corridor are put 1.6 m from where they were taken, at the door before, with fits of 0.8."""
+
+WORSE_BY_COLOR = 0.02
+"""How much fewer of its points may agree with the map where its colours fit than where its depth does."""
 
 AHEAD_M = 1.0
 """Metres by which the surface's grids reach beyond the points, so that they serve more than one image."""
@@ -77,17 +89,19 @@ class Locator:
         keyframes: Mapping[int, Keyframe],
         config: PoseConfig,
         around: Around | None = None,
+        colors: Callable[[Pose], Sequence[ColorLevel]] | None = None,
     ) -> Located:
         """The pose of an image in what some keyframes have measured. A search begins at each of the guesses;
         the end that fits best and is nearest to its guess counts. ``config`` bounds how far from a guess, and
         how much overlap is needed. If that finds nothing, or nothing that fits WELL, the image of a sensor
-        that sees around is searched for ``around``, and the outcome of that counts."""
+        that sees around is searched for ``around``, and the outcome of that counts. ``colors``, of a camera
+        that does not, is what the image can be compared with at a pose."""
         points = oriented_points(image, self._surface.max_depth)
         if len(points.points) < LEAST_POINTS:
             return Located(None, "too few points on smooth surfaces")
         self._surface.update(keyframes)
         if around is None:
-            return self._near(points, guesses, config, 0.0)
+            return self._near(points, guesses, config, 0.0, colors)
         near, sight = self._near(points, guesses, config, FINEST_CELLS_M), Sightlines.of(image)
         begin = [] if near.T_world_camera is None else [near.T_world_camera]
         well = bool(begin) and near.overlap * near.agreement > WELL
@@ -98,9 +112,15 @@ class Locator:
         return _judged(end, reason, config)
 
     def _near(
-        self, points: OrientedPoints, guesses: Sequence[Pose], config: PoseConfig, finest_m: float
+        self,
+        points: OrientedPoints,
+        guesses: Sequence[Pose],
+        config: PoseConfig,
+        finest_m: float,
+        colors: Callable[[Pose], Sequence[ColorLevel]] | None = None,
     ) -> Located:
-        """The best of the ends of searches from some guesses, in cells of ``finest_m`` metres at the end."""
+        """The best of the ends of searches from some guesses, in cells of ``finest_m`` metres at the end, and
+        from there on with colour, unless depth would fit worse."""
         levels = levels_of(points, self._grids_around(points, guesses, finest_m))
         lever_m = float(np.median(np.linalg.norm(points.points, axis=1)))
         priors = [Recorded(T, config) for T in guesses]
@@ -115,6 +135,13 @@ class Locator:
         ]
         best = int(np.argmin(costs))
         guess, end = guesses[best], ends[best]
+        compared = colors(end.T_world_camera) if colors is not None else ()
+        if compared:
+            T = end.T_world_camera
+            colored = aligned_with_color(levels, compared, T, priors[best], lever_m, OBSERVABLE)
+            least = max(LEAST_AGREEMENT, _agreement(end.equations) - WORSE_BY_COLOR)
+            if colored.equations.overlap >= config.min_overlap and _agreement(colored.equations) > least:
+                end = colored
         turned, shifted = tangent_norms(guess, end.T_world_camera)
         reason = ""
         if shifted > config.max_translation or turned > config.max_rotation:

@@ -129,6 +129,9 @@ class PoseConfig:
     max_rotation: float = 0.1
     """Do not turn a keyframe by more than this (radians)."""
 
+    use_color: bool = True
+    """Track a camera without poses by its colour images too, where it has any."""
+
     min_overlap: float = 0.3
     """Do not move a keyframe if less than this share of its points lies near surfaces that other keyframes
     measured."""

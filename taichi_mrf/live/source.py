@@ -16,6 +16,7 @@ from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.live.replay import Replay
 from taichi_mrf.mapping.intake import hold_out_of
+from taichi_mrf.mapping.tracking import wants_color
 from taichi_mrf.methods.map_file import open_map_file, read_header
 from taichi_mrf.methods.mrf.parked_chunks import folder_beside
 from taichi_mrf.methods.protocol import OccupancyMap
@@ -92,8 +93,9 @@ def open_source(
             )
         return Source(path.name, parameters, lambda: load_map(path)), notes
     keywords = (reading or SourceFlags()).keywords()
+    color = wants_color(config, name, track)
     keywords |= {"follow": follow, "carry": config.poses.carry_unnamed}
-    dataset = open_posed(name, poses, track=track, color=config.color, **keywords)
+    dataset = open_posed(name, poses, track=track, color=color, **keywords)
     config = with_recorded_noise(config, dataset)
     # Held-out frames of a tracked source are read, so that their poses are known when the map is checked.
     unread = 0 if dataset.tracked else hold_out_of(dataset, config)

@@ -11,12 +11,15 @@ when it is moved.
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import partial
 
+from taichi_mrf.alignment.keyframe_pictures import KeyframePictures
 from taichi_mrf.alignment.locate import Locator
 from taichi_mrf.alignment.se3 import moved, twist
 from taichi_mrf.alignment.wide_search import Around
 from taichi_mrf.config.registry import methods_with
-from taichi_mrf.config.schema import KeyframeConfig, PoseConfig
+from taichi_mrf.config.schema import Config, KeyframeConfig, PoseConfig
+from taichi_mrf.datasets.options import TRACK
 from taichi_mrf.errors import ConfigError, LostFrameError
 from taichi_mrf.geometry.poses import Pose, as_pose, inverse
 from taichi_mrf.inference.keyframe import DepthImage, checked_depth
@@ -101,6 +104,8 @@ class Tracker:
             max_rotation=REACH_RAD,
         )
         self._locator = Locator(m.aligner.surface)
+        self._pictures = KeyframePictures()
+        self._frame: Frame | None = None
         self._keyframe: int | None = None
         self._first: TrackedFrame | None = None
         self._before: TrackedFrame | None = None
@@ -126,7 +131,8 @@ class Tracker:
         image = DepthImage.upload(depth_m, frame.camera, m.noise, own=frame.own_for(m.sensor))
         around = self._around(frame.camera, frame.stamp) if sees_around(frame.camera) else None
         guesses = self._guesses(frame.stamp, back=around is None)
-        located = self._locator.locate(image, guesses, m.keyframes, self._config, around)
+        colors = partial(self._pictures.compared_with, frame, m.keyframes) if self._config.use_color else None
+        located = self._locator.locate(image, guesses, m.keyframes, self._config, around, colors)
         if located.T_world_camera is None:
             self._lost += 1
             raise LostFrameError(f"{frame.name}: tracking lost: {located.reason}")
@@ -140,6 +146,8 @@ class Tracker:
         assert self._last is not None
         T_world_camera = self._map.keyframes[keyframe].T_world_camera
         self._keyframe = keyframe
+        if self._frame is not None and self._config.use_color:
+            self._pictures.keep(keyframe, self._frame)
         self._last = self._tracked(self._last.name, self._last.stamp, T_world_camera, self._last.directions)
         self._first = self._first or self._last
         return self._last
@@ -154,7 +162,7 @@ class Tracker:
     def _found(self, frame: Frame, T_world_camera: Pose, directions: int) -> tuple[Frame, TrackedFrame]:
         T_world_camera = as_pose(T_world_camera)  # or rounding errors would add up over the frames
         tracked = self._tracked(frame.name, frame.stamp, T_world_camera, directions)
-        self._before, self._last, self._lost = self._last, tracked, 0
+        self._before, self._last, self._lost, self._frame = self._last, tracked, 0, frame
         return replace(frame, T_world_camera=T_world_camera), tracked
 
     def _tracked(self, name: str, stamp: float, T_world_camera: Pose, directions: int) -> TrackedFrame:
@@ -220,3 +228,9 @@ def keyframe_steps(config: KeyframeConfig) -> KeyframeConfig:
     if config.rotation == 0 and config.translation == 0:
         return replace(config, rotation=STEPS.rotation, translation=STEPS.translation)
     return config
+
+
+def wants_color(config: Config, source: str, track: bool) -> bool:
+    """Whether the colour images of a source are to be read: for the map, or to ``track`` the camera."""
+    tracked = track or f"poses={TRACK}" in source.partition("?")[2]
+    return config.color or (tracked and config.poses.use_color)

@@ -21,6 +21,7 @@ from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.pipeline import Event, FrameOffered, Listener, WaitingForPoses, map_sequence
 from taichi_mrf.mapping.rounds import RoundStep
+from taichi_mrf.mapping.tracking import wants_color
 from taichi_mrf.runs.files import MAP_FILE
 from taichi_mrf.runs.folder import RunFacts, write_run
 from taichi_mrf.runs.report import report_json
@@ -80,7 +81,7 @@ def map_to_folder(
     start = time.perf_counter()
     settings = task.settings
     runtime.init(settings.runtime.arch, settings.runtime.threads, settings.runtime.debug)
-    dataset = task.open(settings.color)
+    dataset = task.open(wants_color(settings, task.source, task.poses.track_poses))
     settings = with_recorded_noise(settings, dataset)
     previous = resumed_map(task.out, settings) if task.resume else None
     skipped = skipped_before(task.out) if task.resume else {}
