@@ -40,7 +40,8 @@ def log_likelihood(view: View, keyframe: Keyframe, T_world_camera: Pose, max_dep
     asked = measured > 0
     if not asked.any():
         return float("nan")
-    survey = view.survey(keyframe.camera, T_world_camera, max_depth, measured, keyframe.image.noise_table)
+    noise = keyframe.image.at_certain_pose.noise_table  # the pose is given here
+    survey = view.survey(keyframe.camera, T_world_camera, max_depth, measured, noise)
     anywhere = 1.0 / max_depth
     explained = survey.likelihood[asked] + anywhere * survey.visibility[asked].astype(np.float64)
     return float(np.mean(np.log((1.0 - OUTLIERS) * explained + OUTLIERS * anywhere)))

@@ -58,8 +58,9 @@ class OrientedPoints:
 
 
 def oriented_points(image: DepthImage, max_depth: float) -> OrientedPoints:
-    """The points of a depth image, up to ``max_depth`` metres, around which the surface is smooth."""
-    camera = image.camera
+    """The points of a depth image, up to ``max_depth`` metres, around which the surface is smooth. Their
+    sigmas leave out that of the pose, which is what they are aligned for."""
+    image, camera = image.at_certain_pose, image.camera
     if camera.pixels_per_radian == 0:
         return _of_free_rays(image, max_depth)
     columns, rows = -(-camera.width // STRIDE), -(-camera.height // STRIDE)

@@ -148,6 +148,15 @@ class PoseConfig:
     """Poses that follow a file are final once the recording is over and the file has not changed for this
     long (seconds)."""
 
+    doubt_translation: float = 0.0
+    """Standard deviation of each keyframe's position along each axis, against the keyframes that see the same
+    surfaces (metres). With it and ``doubt_rotation`` rays say less where a wrong pose would change what they
+    meet. 0 takes positions as exact."""
+
+    doubt_rotation: float = 0.0
+    """Standard deviation of each keyframe's orientation about each axis (radians). 0 takes orientations as
+    exact."""
+
     def __post_init__(self) -> None:
         check_field(self.follow_budget_s >= 0, "poses.follow_budget_s", "must not be negative")
         check_field(self.follow_quiet_s >= 0, "poses.follow_quiet_s", "must not be negative")
@@ -157,6 +166,9 @@ class PoseConfig:
         check_field(self.max_translation > 0, "poses.max_translation", "must be positive")
         check_field(0 < self.max_rotation <= math.pi, "poses.max_rotation", "must lie between 0 and pi")
         check_field(0 <= self.min_overlap <= 1, "poses.min_overlap", "must lie between 0 and 1")
+        for name in ("doubt_translation", "doubt_rotation"):
+            sigma = getattr(self, name)
+            check_field(0 <= sigma < math.inf, f"poses.{name}", "must be finite and not negative")
 
 
 @dataclass(frozen=True)

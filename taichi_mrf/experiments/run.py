@@ -48,6 +48,7 @@ EXPERIMENTS = {
     "stereo": Entry("stereo.maps:run_stereo", (0.2,)),
     "exact": Entry("exact:run_exact", (0.05,)),
     "poses": Entry("poses:run_poses", (0.05,)),
+    "doubt": Entry("doubtful_poses:run_doubt", (0.05,)),
     "rays": Entry("rays:run_rays", (0.05, 0.02, 0.01)),
     "readings": Entry("readings:run_readings", (0.05, 0.02)),
     "cells": Entry("cells:run_cells", (0.05, 0.02)),

@@ -1,6 +1,6 @@
 """A keyframe: a depth image, its pose, the bricks that its rays cross, and its messages to their voxels."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import taichi as ti
@@ -15,6 +15,7 @@ from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import NoiseModel, NoiseTable
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
+from taichi_mrf.sensor.pose_doubt import Covariance, beside_edges, doubtful_table
 from taichi_mrf.voxels.window import Window
 
 Cells = NDArray[np.int32]
@@ -67,7 +68,8 @@ class DepthImage:
     ``depth`` is (H * W) float32 in metres along each pixel's ray (axial depth for a pinhole), 0 where there
     is no measurement; ``farthest`` the largest in each tile (rows, columns). ``sensor`` is camera and noise
     as kernels take them, ``rays`` the number of measurements. ``color`` is (H, W, 3) RGB in host memory, 0
-    0 0 where a pixel has no colour, or None. ``own`` is what the keyframe states of its measurements.
+    0 0 where a pixel has no colour, or None. ``own`` is what the keyframe states of its measurements. If its
+    pose is uncertain, ``certain`` is the image as it was measured.
     """
 
     depth: Resident
@@ -78,6 +80,7 @@ class DepthImage:
     farthest: NDArray[np.float32]
     color: NDArray[np.uint8] | None = None
     own: OwnEvidence = NOTHING
+    certain: "DepthImage | None" = None
 
     @staticmethod
     def upload(
@@ -90,10 +93,37 @@ class DepthImage:
         """Put :func:`checked_depth` (H, W), which must not change from now on, where kernels can reach it.
         ``noise`` is the map's, for what the keyframe does not state itself. Raises ConfigError if the noise
         model does not fit the camera."""
+        pose_covariance, own = own.pose_covariance, replace(own, pose_covariance=None)
         table = own.noise_model(noise, depth_m).table(camera)
         depth, sensor = resident(depth_m.reshape(-1)), table.sensor(camera)
         rays = int(np.count_nonzero(depth_m))
-        return DepthImage(depth, camera, sensor, table, rays, _farthest(depth_m), color, own)
+        image = DepthImage(depth, camera, sensor, table, rays, _farthest(depth_m), color, own)
+        return image.doubting(pose_covariance)
+
+    def doubting(self, pose_covariance: Covariance | None) -> "DepthImage":
+        """The same image from a pose of another covariance (6, 6), None for an exact one: with the noise of
+        sensor and pose, and without the pixels that an edge may cross (sensor/pose_doubt.py). Raises
+        ConfigError if the noise is not made of polynomials."""
+        image = self.at_certain_pose
+        if pose_covariance is None:
+            return image
+        depth_m = image.to_numpy()
+        table = doubtful_table(image.noise_table, depth_m, image.camera, pose_covariance)
+        depth_m[beside_edges(depth_m, image.camera, pose_covariance)] = 0.0
+        return replace(
+            image,
+            depth=resident(depth_m.reshape(-1)),
+            sensor=table.sensor(image.camera),
+            noise_table=table,
+            rays=int(np.count_nonzero(depth_m)),
+            own=replace(image.own, pose_covariance=pose_covariance),
+            certain=image,
+        )
+
+    @property
+    def at_certain_pose(self) -> "DepthImage":
+        """The image as it was measured, with the sensor's noise alone."""
+        return self if self.certain is None else self.certain
 
     @property
     def nbytes(self) -> int:
@@ -103,11 +133,12 @@ class DepthImage:
         origins = getattr(self.camera, "origins_m", None)
         shared = self.camera.pixels_per_radian > 0 and origins is None
         starts = 0 if origins is None else origins.nbytes
-        return self.depth.shape[0] * (4 if shared else 4 + 12) + starts + color + self.own.nbytes
+        doubt = 0 if self.certain is None else self.depth.shape[0] * 8
+        return self.depth.shape[0] * (4 if shared else 4 + 12) + starts + color + self.own.nbytes + doubt
 
     def to_numpy(self) -> NDArray[np.float32]:
         """(H, W) axial depth in metres, 0 where there is no measurement."""
-        return np.array(on_host(self.depth)).reshape(self.camera.shape)
+        return np.array(on_host(self.at_certain_pose.depth)).reshape(self.camera.shape)
 
 
 def _farthest(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -244,7 +275,7 @@ class Keyframe:
     @property
     def rays(self) -> int:
         """Number of pixels that hold a measurement."""
-        return self.image.rays
+        return self.image.at_certain_pose.rays
 
     @property
     def depth_m(self) -> NDArray[np.float32]:

@@ -180,7 +180,7 @@ class Intake:
                 self._expects_color = False
                 warnings.warn(f"frame {frame.name} has no colour image", stacklevel=2)
             parts = (frame.T_world_camera, frame.camera, frame.name, frame.stamp, color)
-            own = frame.own_for(self.map.sensor)
+            own = frame.own_in(self.map.config)
             if self._expects_no_return and own.no_return is None:
                 self._expects_no_return = False
                 warnings.warn(

@@ -9,6 +9,7 @@ from taichi_mrf.errors import MapFileError
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
 from taichi_mrf.sensor.own_evidence import OwnEvidence
+from taichi_mrf.sensor.pose_doubt import checked_covariance
 from taichi_mrf.system.npz_file import NpzFile
 
 
@@ -42,6 +43,8 @@ def evidence_arrays(own: OwnEvidence, prefix: str) -> dict[str, NDArray[Any]]:
         arrays[f"{prefix}sigma_m"] = own.sigma_m
     if own.no_return is not None:
         arrays[f"{prefix}no_return"] = own.no_return
+    if own.pose_covariance is not None:
+        arrays[f"{prefix}pose_covariance"] = own.pose_covariance
     return arrays
 
 
@@ -54,4 +57,7 @@ def read_evidence(file: NpzFile, prefix: str, camera: Camera) -> OwnEvidence:
     no_return = None
     if f"{prefix}no_return" in file:
         no_return = file.array(f"{prefix}no_return", "b", camera.shape)
-    return OwnEvidence(noise, sigma_m, no_return)
+    covariance = None
+    if f"{prefix}pose_covariance" in file:
+        covariance = checked_covariance(file.array(f"{prefix}pose_covariance", "f", (6, 6)))
+    return OwnEvidence(noise, sigma_m, no_return, covariance)

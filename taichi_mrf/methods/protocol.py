@@ -110,21 +110,26 @@ class OccupancyMap(Protocol):
         noise: NoiseModel | None = None,
         sigma_m: ArrayLike | None = None,
         no_return: ArrayLike | None = None,
+        pose_covariance: ArrayLike | None = None,
     ) -> int:
         """Add a depth image, (H, W) axial depth in metres, taken at a pose (4, 4) and a time in seconds, by
         default the number of keyframes added before; returns its id. ``color`` (H, W, 3) uint8 RGB is for
         maps that have colours (``METHOD.has_colors``); others raise ConfigError. ``noise`` is the keyframe's
         own noise model, ``sigma_m`` (H, W) its own standard deviation of each pixel's depth in metres (0 and
         NaN: the noise model's), ``no_return`` (H, W) bool the pixels that got no return, which count as
-        ``sensor.no_return`` says in maps that take notice of them."""
+        ``sensor.no_return`` says in maps that take notice of them, ``pose_covariance`` (6, 6) how uncertain
+        the pose is (MRFMap.add_keyframe)."""
         ...
 
     def remove_keyframe(self, id: int) -> None:
         """Remove a keyframe. Raises KeyframeError if there is none of this id."""
         ...
 
-    def move_keyframe(self, id: int, T_world_camera: ArrayLike) -> None:
-        """Move a keyframe to another pose, (4, 4). Raises KeyframeError."""
+    def move_keyframe(
+        self, id: int, T_world_camera: ArrayLike, pose_covariance: ArrayLike | None = None
+    ) -> None:
+        """Move a keyframe to another pose, (4, 4), with another covariance (6, 6) or that of before. Raises
+        KeyframeError."""
         ...
 
     def infer(

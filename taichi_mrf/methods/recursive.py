@@ -40,6 +40,7 @@ from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
 from taichi_mrf.sensor.own_evidence import checked_evidence, checked_no_return
+from taichi_mrf.sensor.pose_doubt import checked_covariance
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.strips import strip_length
@@ -145,14 +146,15 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         noise: NoiseModel | None = None,
         sigma_m: ArrayLike | None = None,
         no_return: ArrayLike | None = None,
+        pose_covariance: ArrayLike | None = None,
     ) -> int:
         """Add a depth image and integrate it at once; in a stale map the next :meth:`infer` does.
 
         ``depth_m`` is (H, W) axial depth in metres, where 0, NaN and negative mean no measurement;
         ``T_world_camera`` is (4, 4); ``stamp_s`` is when it was taken, in seconds, by default the number of
-        keyframes added before; ``noise`` and ``sigma_m`` are those of MRFMap.add_keyframe, and
-        ``no_return`` is checked, and ignored but by a log-odds map with ``sensor.no_return: free``. Returns
-        the keyframe's id.
+        keyframes added before; ``noise``, ``sigma_m`` and ``pose_covariance`` are those of
+        MRFMap.add_keyframe, and ``no_return`` is checked, and ignored but by a log-odds map with
+        ``sensor.no_return: free``. Returns the keyframe's id.
         Raises KeyframeError for a wrong shape or pose, CapacityError if the map would not fit, ConfigError
         for a ``color`` image: the map has no colours.
         """
@@ -160,7 +162,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
             raise ConfigError(f"a map of the method {self.METHOD.name} has no colours: pass no color")
         T, name = as_pose(T_world_camera), instance(name, str, "name", "a string")
         depth = checked_depth(depth_m, camera, self.sensor.min_depth)
-        depth, own = checked_evidence(depth, camera, noise, sigma_m)
+        depth, own = checked_evidence(depth, camera, noise, sigma_m, pose_covariance)
         missing = checked_no_return(no_return, depth_m, camera)
         if self._takes_no_return:
             own = dataclasses.replace(own, no_return=missing)
@@ -182,9 +184,16 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
         del self._keyframes[id]
         self._stale = True
 
-    def move_keyframe(self, id: int, T_world_camera: ArrayLike) -> None:
-        """Move a keyframe to another pose, (4, 4). The map changes with the next :meth:`infer`."""
-        self._keyframes[id] = dataclasses.replace(self._find(id), T_world_camera=as_pose(T_world_camera))
+    def move_keyframe(
+        self, id: int, T_world_camera: ArrayLike, pose_covariance: ArrayLike | None = None
+    ) -> None:
+        """Move a keyframe to another pose, (4, 4), with another covariance (6, 6) or that of before. The map
+        changes with the next :meth:`infer`."""
+        keyframe, T = self._find(id), as_pose(T_world_camera)
+        own = keyframe.own
+        if pose_covariance is not None:
+            own = dataclasses.replace(own, pose_covariance=checked_covariance(pose_covariance))
+        self._keyframes[id] = dataclasses.replace(keyframe, T_world_camera=T, own=own)
         self._stale = True
 
     def infer(

@@ -1,16 +1,17 @@
 """One measurement of a depth camera or a lidar, whatever it was recorded with."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config.schema import SensorConfig
+from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.origins import points_at
 from taichi_mrf.sensor.own_evidence import OwnEvidence
+from taichi_mrf.sensor.pose_doubt import checked_covariance, covariance_of
 
 if TYPE_CHECKING:
     from taichi_mrf.sensor.noise import NoiseModel
@@ -57,6 +58,12 @@ class Frame:
         """The part of it that a map with this configuration takes."""
         sigma_m = self.sigma_m if sensor.pixel_sigma else None
         return OwnEvidence(self.noise, sigma_m, self.no_return if sensor.no_return != "ignore" else None)
+
+    def own_in(self, config: Config) -> OwnEvidence:
+        """What a map with this configuration takes: the same, and how uncertain the frame's pose is."""
+        poses = config.poses
+        covariance = checked_covariance(covariance_of(poses.doubt_translation, poses.doubt_rotation))
+        return replace(self.own_for(config.sensor), pose_covariance=covariance)
 
     def tells_anything(self, sensor: SensorConfig) -> bool:
         """Whether it holds a measurement, or a pixel without a return that such a map takes notice of."""

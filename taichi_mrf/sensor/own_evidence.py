@@ -1,7 +1,7 @@
 """What one keyframe states of its own measurements, in place of what its map assumes of all."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -13,40 +13,49 @@ from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.limits import LEAST_SIGMA_M
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.pixel_sigma import PixelSigma
+from taichi_mrf.sensor.pose_doubt import Covariance, DoubtfulPose, checked_covariance
 
 
 @dataclass(frozen=True)
 class OwnEvidence:
-    """A keyframe's own noise model and its own sigma for each pixel, None for what its map assumes; and its
-    pixels that got no return, None if they are not known or do not count.
+    """A keyframe's own noise model and its own sigma for each pixel, None for what its map assumes; its
+    pixels that got no return, None if they are not known or do not count; and how uncertain its pose is, None
+    if it is taken as exact.
 
     ``sigma_m`` is (H, W) float32, the standard deviation of each pixel's depth in metres; 0 stands for that
-    of the noise model. ``no_return`` is (H, W) bool.
+    of the noise model. ``no_return`` is (H, W) bool. ``pose_covariance`` is (6, 6), of a twist in the
+    camera's frame (pose_doubt.py).
     """
 
     noise: NoiseModel | None = None
     sigma_m: NDArray[np.float32] | None = None
     no_return: NDArray[np.bool_] | None = None
+    pose_covariance: Covariance | None = None
 
     def noise_model(self, default: NoiseModel, depth_m: NDArray[np.floating]) -> NoiseModel:
         """The noise of a depth image (H, W) whose map has the noise ``default``."""
         noise = default if self.noise is None else self.noise
-        return noise if self.sigma_m is None else PixelSigma(noise, self.sigma_m, depth_m)
+        if self.sigma_m is not None:
+            noise = PixelSigma(noise, self.sigma_m, depth_m)
+        if self.pose_covariance is not None:
+            noise = DoubtfulPose(noise, self.pose_covariance, depth_m)
+        return noise
 
     def arguments(self) -> Mapping[str, Any]:
         """The arguments of ``add_keyframe`` that state this again."""
-        return {"noise": self.noise, "sigma_m": self.sigma_m, "no_return": self.no_return}
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def content(self) -> bytes:
         """What it states, as bytes to sort by; empty if it states nothing."""
         noise = self.noise
         parts = [] if noise is None else [type(noise).__name__.encode(), *map(_bytes, vars(noise).values())]
-        images = (image.tobytes() for image in (self.sigma_m, self.no_return) if image is not None)
+        arrays = (self.sigma_m, self.no_return, self.pose_covariance)
+        images = (array.tobytes() for array in arrays if array is not None)
         return b"".join([*parts, *images])
 
     @property
     def nbytes(self) -> int:
-        """Bytes of its images in host memory and of what kernels read of them."""
+        """Bytes of its images in host memory, and of a sigma of its own that kernels read."""
         sigma = 0 if self.sigma_m is None else 2 * self.sigma_m.nbytes
         return sigma + (0 if self.no_return is None else self.no_return.nbytes)
 
@@ -56,17 +65,22 @@ NOTHING = OwnEvidence()
 
 
 def checked_evidence(
-    depth_m: NDArray[np.float32], camera: Camera, noise: NoiseModel | None, sigma_m: ArrayLike | None
+    depth_m: NDArray[np.float32],
+    camera: Camera,
+    noise: NoiseModel | None,
+    sigma_m: ArrayLike | None,
+    pose_covariance: ArrayLike | None = None,
 ) -> tuple[NDArray[np.float32], OwnEvidence]:
     """A keyframe's depth (H, W), 0 for no measurement, and what it states of it: copies of the arguments of
     ``add_keyframe``. A pixel of infinite sigma is no measurement. Raises KeyframeError for a wrong shape or
-    type."""
+    type, and for a matrix that is no covariance."""
     if noise is not None and not isinstance(noise, NoiseModel):
         raise KeyframeError(
             f"noise must be a noise model such as PolynomialNoise, not {type(noise).__name__}"
         )
+    covariance = checked_covariance(pose_covariance)
     if sigma_m is None:
-        return depth_m, OwnEvidence(noise)
+        return depth_m, OwnEvidence(noise, pose_covariance=covariance)
     given = np.asarray(sigma_m)
     if given.shape != camera.shape or not np.issubdtype(given.dtype, np.floating):
         raise KeyframeError(
@@ -77,7 +91,8 @@ def checked_evidence(
         sigma = given.astype(np.float32)
     depth_m = np.where(np.isposinf(sigma), np.float32(0.0), depth_m)
     stated = (depth_m > 0) & (sigma > 0)  # NaN is not
-    return depth_m, OwnEvidence(noise, np.where(stated, np.maximum(sigma, LEAST_SIGMA_M), np.float32(0.0)))
+    sigma = np.where(stated, np.maximum(sigma, LEAST_SIGMA_M), np.float32(0.0))
+    return depth_m, OwnEvidence(noise, sigma, pose_covariance=covariance)
 
 
 def checked_no_return(

@@ -160,7 +160,7 @@ def _with_keyframes(job: Job, submap: int) -> tuple[PartialMap, dict[int, int]]:
     for index in job.plan.submaps[submap].keyframes:
         frame = dataset.read(index)
         parts = (frame.depth_m, frame.T_world_camera, frame.camera, frame.name, frame.stamp)
-        id_of[index] = m.add_keyframe(*parts, color=frame.color, **frame.own_for(m.sensor).arguments())
+        id_of[index] = m.add_keyframe(*parts, color=frame.color, **frame.own_in(m.config).arguments())
     return m, id_of
 
 

@@ -12,18 +12,15 @@ from numpy.typing import NDArray
 from taichi_mrf.config.schema import Config, PoseConfig, without_window
 from taichi_mrf.evaluation.accuracy import JudgedView, judge_view
 from taichi_mrf.evaluation.depth_error import pooled_depth_error
+from taichi_mrf.evaluation.depth_intervals import interval_error, view_below
 from taichi_mrf.mapping.intake import Full, Intake
 from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.tune.depth_intervals import interval_error, probability_below
 from taichi_mrf.tune.voxel_truth import VoxelTruth
 from taichi_mrf.tune.working_set import WorkingSet, thinned
 from taichi_mrf.viewer.tune.scores import Scores
-
-INTERVAL_PIXELS = 5_000
-"""Measurements of a view from which the calibration of depths is computed."""
 
 GoOn = Callable[[str, float], bool]
 """Called between two keyframes with the present activity and the share that is done (0 to 1); returns
@@ -71,7 +68,7 @@ def run_trial(
             return None
         view = judge(m, frame, pixel_stride)
         views.append(view)
-        below.append(_probability_below(m, view, frame))
+        below.append(view_below(m.view, view, frame.T_world_camera, frame.camera))
     truth = frames.truth if pixel_stride == 1 else None
     scores = _score(m, views, below, seconds, pixel_stride, truth)
     said = tuple(dict.fromkeys(str(each.message) for each in caught if each.category is UserWarning))
@@ -103,15 +100,6 @@ def _build(config: Config, frames: WorkingSet, pixel_stride: int, go_on: GoOn) -
             if not go_on(f"sweep {step.sweep} of {step.sweeps}", done / (step.sweeps * step.keyframes)):
                 inference.stop(at_once=True)
     return m if inference.outcome is not None and inference.outcome.complete else None
-
-
-def _probability_below(m: OccupancyMap, view: JudgedView, frame: Frame) -> NDArray[np.float32]:
-    """Probabilities of some of a view's measurements, evenly spread over its rows."""
-    pixels = np.flatnonzero(view.measured_m)
-    some = np.zeros_like(view.measured_m)
-    kept = pixels[:: max(1, len(pixels) // INTERVAL_PIXELS)]
-    some.flat[kept] = view.measured_m.flat[kept]
-    return probability_below(m.view, some, frame.T_world_camera, frame.camera, view.noise, view.max_depth)
 
 
 def _score(

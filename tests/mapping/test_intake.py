@@ -8,12 +8,13 @@ import pytest
 from sliding_camera import ALL_FRAMES, sequence
 from tracked_room import CONFIG, nowhere, walk
 
-from taichi_mrf.config.schema import KeyframeConfig
-from taichi_mrf.errors import CapacityError
+from taichi_mrf.config.schema import KeyframeConfig, PoseConfig
+from taichi_mrf.errors import CapacityError, ConfigError
 from taichi_mrf.mapping.intake import Added, Full, Intake, Lost, Passed, Skipped, UnreadableFrame
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.queries.points import FREE
+from taichi_mrf.sensor.pose_doubt import covariance_of
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 
@@ -38,6 +39,19 @@ def test_each_frame_gets_the_answer_that_fits_it() -> None:
     assert broken == Skipped("frame 9: damaged")
     assert taken.result.skipped == {"frame 9": "frame 9: damaged"}
     assert list(taken.map.keyframes) == [0, 1]
+
+
+def test_keyframes_get_the_covariance_of_the_configuration() -> None:
+    doubtful = replace(ALL_FRAMES, poses=PoseConfig(doubt_translation=0.02, doubt_rotation=0.01))
+    for config, expected in ((ALL_FRAMES, None), (doubtful, covariance_of(0.02, 0.01))):
+        taken = Intake(MRFMap.from_config(config, sequence().camera), config)
+        taken.offer(sequence().read(0))
+        covariance = taken.map.keyframes[0].own.pose_covariance
+        assert (covariance is None) == (expected is None)
+        if covariance is not None:
+            np.testing.assert_array_equal(covariance, expected)
+    with pytest.raises(ConfigError, match=r"poses\.doubt_rotation must be finite and not negative"):
+        PoseConfig(doubt_rotation=-0.1)
 
 
 def test_held_out_frames_are_not_even_read_where_poses_are_recorded() -> None:

@@ -11,10 +11,10 @@ from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 from taichi_mrf.evaluation.accuracy import OUTLIERS, judge_view
 from taichi_mrf.evaluation.depth_error import pooled_depth_error
+from taichi_mrf.evaluation.depth_intervals import interval_error, probability_below
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.tune.depth_intervals import interval_error, probability_below
 from taichi_mrf.tune.held_out_pictures import residuals_of
 from taichi_mrf.tune.trial import run_trial
 from taichi_mrf.tune.working_set import coarse_stride, read_working_set, thinned

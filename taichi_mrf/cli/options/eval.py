@@ -24,7 +24,8 @@ class Eval:
     experiment: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERIMENT")]
     """table1, table2, table3, fig7 and fig10 of MRFMap (Shankar and Michael 2020), stereo of Schauwecker and
     Zell 2014, exact, which compares MRFMap with the factor graph that it approximates, poses, which disturbs
-    poses and takes the error back, rays, which asks how many rays a voxel needs,
+    poses and takes the error back, doubt, which maps such poses with their covariance, rays, which asks how
+    many rays a voxel needs,
     endless, which freezes what has left the view for an hour, changes, in which things come and go and a
     person walks through, submaps, which maps the built-in corridor in parts and compares that with the map of
     a single machine, window, which keeps only what is near the camera in memory, surface, which compares the

@@ -127,6 +127,7 @@ class MRFMap(PosedMRF):
         noise: NoiseModel | None = None,
         sigma_m: ArrayLike | None = None,
         no_return: ArrayLike | None = None,
+        pose_covariance: ArrayLike | None = None,
     ) -> int:
         """Add a depth image. It takes part in the next :meth:`infer`.
 
@@ -136,13 +137,15 @@ class MRFMap(PosedMRF):
         which :meth:`colors` follow; ``noise`` is its own noise model; ``sigma_m`` is (H, W), the standard
         deviation of each pixel's depth in metres, in place of the noise model's: 0, negative and NaN stand
         for the model's, and an infinite one means no measurement; ``no_return`` is (H, W) bool, the pixels
-        that got no return, which count as ``sensor.no_return`` says. Returns the keyframe's id.
-        Raises KeyframeError for a wrong shape or pose, CapacityError if the map would not fit,
-        ConfigError for noise that does not fit the camera.
+        that got no return, which count as ``sensor.no_return`` says; ``pose_covariance`` is (6, 6), that of
+        the twist xi, metres along and then radians about the camera's own axes, by which the true pose
+        T_world_camera exp(xi) may differ, None for an exact pose (sensor/pose_doubt.py). Returns the id.
+        Raises KeyframeError for a wrong shape or pose and for a matrix that is no covariance, CapacityError
+        if the map would not fit, ConfigError for noise that does not fit the camera.
         """
         T, stamp_s = as_pose(T_world_camera), self._stamp(stamp_s)
         name = instance(name, str, "name", "a string") or f"keyframe {self._next_id}"
-        image = self._upload(depth_m, camera, color, noise, sigma_m, no_return)
+        image = self._upload(depth_m, camera, color, noise, sigma_m, no_return, pose_covariance)
         keyframe = self._allocator.place(self._next_id, name, image, T, stamp_s)
         self._keyframes[keyframe.id] = keyframe
         self._note_up(T, camera)
@@ -317,9 +320,10 @@ class MRFMap(PosedMRF):
     def _upload(
         self, depth_m: ArrayLike, camera: Camera, color: ArrayLike | None,
         noise: NoiseModel | None, sigma_m: ArrayLike | None, no_return: ArrayLike | None,
+        pose_covariance: ArrayLike | None,
     ) -> DepthImage:  # fmt: skip
         depth = checked_depth(depth_m, camera, self.sensor.min_depth)
-        depth, own = checked_evidence(depth, camera, noise, sigma_m)
+        depth, own = checked_evidence(depth, camera, noise, sigma_m, pose_covariance)
         if self.sensor.no_return != "ignore":
             own = replace(own, no_return=checked_no_return(no_return, depth_m, camera))
         image = DepthImage.upload(depth, camera, self.noise, checked_color(color, camera), own)

@@ -20,7 +20,11 @@ from taichi_mrf.inference.schedule import InferReport, Progress
 from taichi_mrf.methods.brick_map import check_inference
 from taichi_mrf.methods.mrf.keyframe_allocator import KeyframeAllocator
 from taichi_mrf.methods.mrf.reading import ReadableMRF
+from taichi_mrf.sensor.pose_doubt import Covariance, checked_covariance
 from taichi_mrf.voxels.layout import BRICK
+
+EXACT = np.zeros((6, 6))
+"""The covariance of a pose that is taken as exact."""
 
 LEAST_MOTION = 0.1
 """Motion of what a keyframe sees, in voxels, up to which a new pose is left out."""
@@ -51,16 +55,24 @@ class PosedMRF(ReadableMRF):
     _incremental: IncrementalInference
     _settled: bool
 
-    def move_keyframe(self, id: int, T_world_camera: ArrayLike) -> None:
-        """Move a keyframe to another pose, (4, 4), as a SLAM back-end does. Its messages are dropped. Raises
-        KeyframeError, or CapacityError if there is not enough memory; the map is then unchanged."""
+    def move_keyframe(
+        self, id: int, T_world_camera: ArrayLike, pose_covariance: ArrayLike | None = None
+    ) -> None:
+        """Move a keyframe to another pose, (4, 4), as a SLAM back-end does. Its messages are dropped.
+
+        ``pose_covariance`` (6, 6) is that of the new pose, as in :meth:`add_keyframe`, zeros if it is exact.
+        Without it the keyframe keeps the covariance that it has. Raises KeyframeError, or CapacityError if
+        there is not enough memory; the map is then unchanged.
+        """
         keyframe = self._find(id)
-        T = as_pose(T_world_camera)
+        T, image = as_pose(T_world_camera), keyframe.image
+        if pose_covariance is not None:
+            image = image.doubting(checked_covariance(pose_covariance))
         self._restore_messages()
         self._allocator.take_out(keyframe)
         self._settled = False
         try:
-            parts = (keyframe.name, keyframe.image, T, keyframe.stamp_s)
+            parts = (keyframe.name, image, T, keyframe.stamp_s)
             self._keyframes[id] = self._allocator.place(id, *parts)
         except Exception:
             self._keyframes[id] = self._allocator.put_back(keyframe)
@@ -72,13 +84,16 @@ class PosedMRF(ReadableMRF):
         least: float = LEAST_MOTION,
         tolerance: float | None = None,
         seconds: float | None = None,
+        covariances: Mapping[int, ArrayLike] | None = None,
     ) -> PoseUpdate:
         """Take in the poses, id -> (4, 4), of a trajectory that was corrected, as after a closed loop.
+        ``covariances``, id -> (6, 6), are those of some of these poses, as :meth:`move_keyframe` takes them.
 
         Keyframes move one after the other, those that move most first. Each is swept at once at its new pose,
         so that the map is usable after every one of them. Then those whose evidence has changed are swept
         again, as by :meth:`renew`, whose ``tolerance`` this is. A keyframe stays where it is if nothing in
-        its view would move by more than ``least`` voxels; the pose at which it was placed still counts.
+        its view would move by more than ``least`` voxels, unless it is given another covariance; the pose at
+        which it was placed still counts.
 
         After ``seconds`` no further keyframe is begun, but one is moved in any case: give ``left`` of the
         result to the next call.
@@ -92,9 +107,13 @@ class PosedMRF(ReadableMRF):
         if seconds is not None:
             real(seconds, "seconds", least=0)
         wanted = {self._find(id).id: _pose_of(id, T) for id, T in poses.items()}
+        stated = {} if covariances is None else covariances
+        doubts = {id: _covariance_of(id, stated[id]) for id in wanted if id in stated}
         motions_m = {id: _largest_motion_m(self._keyframes[id], T) for id, T in wanted.items()}
-        moving = sorted((id for id in wanted if motions_m[id] > least_m), key=lambda id: (-motions_m[id], id))
-        kept = tuple(id for id in wanted if motions_m[id] <= least_m)
+        kept = tuple(
+            id for id in wanted if motions_m[id] <= least_m and self._has_covariance(id, doubts.get(id))
+        )
+        moving = sorted(wanted.keys() - set(kept), key=lambda id: (-motions_m[id], id))
 
         def time_left() -> float | None:
             return None if seconds is None else max(0.0, seconds - (time.perf_counter() - begin))
@@ -103,12 +122,17 @@ class PosedMRF(ReadableMRF):
         for id in moving:
             if moved and time_left() == 0.0:
                 break
-            self.move_keyframe(id, wanted[id])
+            self.move_keyframe(id, wanted[id], doubts.get(id))
             self.renew([id], tolerance=1.0)  # no share is larger, so that no other is swept
             moved.append(id)
         left = {id: wanted[id] for id in moving[len(moved) :]}
         report = self.renew((), tolerance, 0.0 if left else time_left())
         return PoseUpdate(tuple(moved), kept, left, report)
+
+    def _has_covariance(self, id: int, pose_covariance: Covariance | None) -> bool:
+        """Whether a keyframe's covariance is this one already; True for None."""
+        own = self._keyframes[id].own.pose_covariance
+        return pose_covariance is None or np.array_equal(EXACT if own is None else own, pose_covariance)
 
     def renew(
         self,
@@ -155,6 +179,15 @@ def _pose_of(id: int, T_world_camera: ArrayLike) -> Pose:
         return as_pose(T_world_camera)
     except KeyframeError as error:
         raise KeyframeError(f"the new pose of keyframe {id}: {error}") from error
+
+
+def _covariance_of(id: int, pose_covariance: ArrayLike) -> Covariance:
+    """A covariance (6, 6), zeros for that of an exact pose."""
+    try:
+        covariance = checked_covariance(pose_covariance)
+    except KeyframeError as error:
+        raise KeyframeError(f"the new pose of keyframe {id}: {error}") from error
+    return EXACT if covariance is None else covariance
 
 
 def _largest_motion_m(keyframe: Keyframe, T_world_camera: Pose) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf.evaluation.accuracy import OUTLIERS
+from taichi_mrf.evaluation.accuracy import OUTLIERS, JudgedView
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import exp_of_negative
@@ -35,6 +35,9 @@ from taichi_mrf.voxels.window import Window
 
 LEVELS = np.linspace(0.05, 0.95, 19)
 """Probabilities of the central intervals that are compared."""
+
+INTERVAL_PIXELS = 5_000
+"""Measurements of a view from which the calibration of depths is computed."""
 
 
 @ti.dataclass
@@ -80,6 +83,15 @@ def probability_below(
     if not len(slots):
         below = anywhere
     return ((1.0 - OUTLIERS) * below + OUTLIERS * anywhere).astype(np.float32)
+
+
+def view_below(view: View, judged: JudgedView, T_world_camera: Pose, camera: Camera) -> NDArray[np.float32]:
+    """The same, (n,), for some of the measurements of a judged view, evenly spread over its rows."""
+    pixels = np.flatnonzero(judged.measured_m)
+    some = np.zeros_like(judged.measured_m)
+    kept = pixels[:: max(1, len(pixels) // INTERVAL_PIXELS)]
+    some.flat[kept] = judged.measured_m.flat[kept]
+    return probability_below(view, some, T_world_camera, camera, judged.noise, judged.max_depth)
 
 
 def interval_error(below: Sequence[NDArray[np.float32]]) -> float:
