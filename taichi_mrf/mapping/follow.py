@@ -116,6 +116,15 @@ class PoseFollower:
             self.map.move_keyframe(id, T)
             self.done.moves += 1
 
+    def unnamed(self) -> str | None:
+        """What a user should know of keyframes that the source has never named; None if it names all."""
+        keyframes = self.map.keyframes.values()
+        count = sum(self._dataset.pose_now(each.name, each.stamp_s) is None for each in keyframes)
+        if not count:
+            return None
+        of = f"{count} of {len(keyframes)} keyframes"
+        return f"{of} have no pose in {self.name}, and stay where they were recorded"
+
     def news(self) -> list[str]:
         """What a user should be told and was not: a file that cannot be read, poses of unknown frames."""
         found = []

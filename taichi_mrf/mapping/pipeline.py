@@ -189,6 +189,9 @@ class _BatchRun:
             self._follow(math.inf)
         with self._following():
             follower.place_exactly()
+        unnamed = follower.unnamed()
+        if unnamed is not None:
+            warnings.warn(unnamed, stacklevel=2)
 
     def _follow(self, stamp_s: float) -> None:
         """Move keyframes whose poses have changed, as many as there is time for between two frames."""

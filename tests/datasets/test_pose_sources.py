@@ -263,7 +263,7 @@ def test_unnamed_frames_may_be_carried_along(tmp_path: Path) -> None:
 
 
 def test_an_impossible_pose_of_a_callback_is_named() -> None:
-    with pytest.raises(DatasetError, match=r"the callback's poses: the pose of frame 1: .* shape"):
+    with pytest.raises(DatasetError, match=r"the callback: the pose of frame 1: .* shape"):
         posed_by(sequence(4), CallbackPoses(lambda stamp_s: {"frame 1": np.eye(3)}))
 
 

@@ -64,7 +64,7 @@ class CallbackPoses:
     have not changed. What it raises ends a run of ``map_sequence``."""
 
     function: Callable[[float], ChangedPoses | None]
-    name: str = "the callback's poses"
+    name: str = "the callback"
     problem: str | None = None
 
     def poll(self, stamp_s: float) -> ChangedPoses | None:
