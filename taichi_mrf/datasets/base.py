@@ -15,9 +15,19 @@ from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.frame import Frame
 
 
-def start_pose() -> Pose:
-    """The first pose of a camera without recorded poses: at the origin, level, looking along x."""
-    return look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+def start_pose(up: NDArray[np.float64] | None = None) -> Pose:
+    """The first pose of a camera without recorded poses: at the origin, looking along x. It is level, unless
+    upwards in the camera frame, a unit vector ``up`` (3,), is known."""
+    if up is None:
+        return look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    ahead, upper_edge = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0])
+    # What looks straight down or up has the upper or lower edge of its images ahead.
+    ahead = ahead if abs(up[2]) < 0.95 else -np.sign(up[2]) * upper_edge
+    x = ahead - up * (up @ ahead)
+    x = x / np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(up, x), up])
+    return T
 
 
 @dataclass(frozen=True)

@@ -1,17 +1,20 @@
 """Tracking a camera without poses: each frame is aligned with the map of the frames before it.
 
 The first frame fixes the map's frame. Each later one is aligned with what the keyframes have measured
-(alignment/locate.py), from two guesses: that the camera stands still, and that it moves on as it did. If
-neither fits, the scan of a sensor that sees around is searched for in all headings and metres around. A
-frame that fits nowhere is lost; the next one is searched around the last pose that was found, and around the
-first. There is no loop closure: errors of alignment add up along the way, until the camera sees again what
-it has mapped at the beginning. Poses are kept relative to the keyframe of the moment, so that they follow
-when it is moved.
+(alignment/locate.py), from two guesses: that the camera stands still, and that it moves on as it did. Both
+have turned as the gyroscope says, where there is one (turning.py). If neither fits, the scan of a sensor that
+sees around is searched for in all headings and metres around. A frame that fits nowhere is lost; the next one
+is searched around the last pose that was found, and around the first. There is no loop closure: errors of
+alignment add up along the way, until the camera sees again what it has mapped at the beginning. Poses are
+kept relative to the keyframe of the moment, so that they follow when it is moved.
 """
 
 import math
 from dataclasses import dataclass, field, replace
 from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
 
 from taichi_mrf.alignment.keyframe_pictures import KeyframePictures
 from taichi_mrf.alignment.locate import Locator
@@ -23,6 +26,7 @@ from taichi_mrf.datasets.options import TRACK
 from taichi_mrf.errors import ConfigError, LostFrameError
 from taichi_mrf.geometry.poses import Pose, as_pose, inverse
 from taichi_mrf.inference.keyframe import DepthImage, checked_depth
+from taichi_mrf.mapping.turning import GYRO_RAD, GyroTurns, turned
 from taichi_mrf.methods.capabilities import AligningMap, can_refine_poses
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.sensor.camera import Camera, sees_around
@@ -104,6 +108,8 @@ class Tracker:
             max_rotation=REACH_RAD,
         )
         self._locator = Locator(m.aligner.surface)
+        self._gyro_config = replace(self._config, rotation_sigma=GYRO_RAD)
+        self._turns = GyroTurns()
         self._pictures = KeyframePictures()
         self._frame: Frame | None = None
         self._keyframe: int | None = None
@@ -130,12 +136,16 @@ class Tracker:
         depth_m = checked_depth(frame.depth_m, frame.camera, m.sensor.min_depth)
         image = DepthImage.upload(depth_m, frame.camera, m.noise, own=frame.own_for(m.sensor))
         around = self._around(frame.camera, frame.stamp) if sees_around(frame.camera) else None
-        guesses = self._guesses(frame.stamp, back=around is None)
+        turn = self._turns.since(frame, self._last.stamp)
+        guesses = self._guesses(frame.stamp, back=around is None, turn=turn)
+        config = self._config if turn is None or self._lost else self._gyro_config
         colors = partial(self._pictures.compared_with, frame, m.keyframes) if self._config.use_color else None
-        located = self._locator.locate(image, guesses, m.keyframes, self._config, around, colors)
+        located = self._locator.locate(image, guesses, m.keyframes, config, around, colors)
         if located.T_world_camera is None:
             self._lost += 1
             raise LostFrameError(f"{frame.name}: tracking lost: {located.reason}")
+        if located.directions == 6:
+            self._turns.note(frame, self._last.stamp, self._pose(self._last), located.T_world_camera)
         if self._lost:
             self._last = None  # the motion since then is unknown
         return self._found(frame, located.T_world_camera, located.directions)
@@ -193,9 +203,10 @@ class Tracker:
             expected_m = expected_m + ahead * (expected_m - self._pose(self._before)[:3, 3])
         return Around(T_last, camera.up, reach_m, expected_m, EXPECTED_M * (1 + self._lost))
 
-    def _guesses(self, stamp: float, back: bool) -> list[Pose]:
-        """Where the camera may be; after lost frames also where it began, if it may be ``back`` there. A
-        sensor that sees around is searched for anyway, and corridors have two ends that look alike."""
+    def _guesses(self, stamp: float, back: bool, turn: NDArray[np.float64] | None = None) -> list[Pose]:
+        """Where the camera may be, with the ``turn`` (3, 3) since the last frame if it was measured; after
+        lost frames also where it began, if it may be ``back`` there. A sensor that sees around is searched
+        for anyway, and corridors have two ends that look alike."""
         assert self._last is not None
         T_last = self._pose(self._last)
         guesses = [T_last]
@@ -203,6 +214,7 @@ class Tracker:
         if self._before is not None and ahead is not None:
             step = twist(inverse(self._pose(self._before)) @ T_last)
             guesses.append(moved(T_last, ahead * step))
+        guesses = turned(guesses, T_last, turn)
         if back and self._lost and self._first is not None:
             guesses.append(self._pose(self._first))
         return guesses

@@ -14,6 +14,7 @@ from taichi_mrf.sensor.own_evidence import OwnEvidence
 from taichi_mrf.sensor.pose_doubt import checked_covariance, covariance_of
 
 if TYPE_CHECKING:
+    from taichi_mrf.sensor.gyro import GyroSamples
     from taichi_mrf.sensor.noise import NoiseModel
 
 
@@ -29,7 +30,8 @@ class Frame:
     The other fields are None where the sensor's configuration answers for all frames: ``sigma_m``, (H, W)
     float32, the standard deviation in metres of each pixel's depth; ``noise``, a noise model for this frame;
     ``no_return``, (H, W) bool, the pixels that looked and got nothing back. ``sensor`` names the sensor of a
-    recording of several.
+    recording of several. ``gyro`` has the camera's angular rates up to this frame and for at least the time
+    since the one before.
     """
 
     depth_m: NDArray[np.float32]
@@ -42,6 +44,7 @@ class Frame:
     noise: "NoiseModel | None" = None
     no_return: NDArray[np.bool_] | None = None
     sensor: str = ""
+    gyro: "GyroSamples | None" = None
 
     @property
     def points_m(self) -> NDArray[np.float64]:

@@ -14,13 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.base import Dataset, Format, start_pose
 from taichi_mrf.datasets.confidence import L515
 from taichi_mrf.datasets.lidar.scans import refuse_image_options
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.color import BagColors, find_colors
 from taichi_mrf.datasets.ros.confidence import BagConfidence, find_confidence
+from taichi_mrf.datasets.ros.imu import BagImu, find_imu
 from taichi_mrf.datasets.ros.lidar import LidarBag
 from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.point_cloud import POINT_CLOUD
@@ -32,6 +33,7 @@ from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.gyro import GyroSamples
 from taichi_mrf.sensor.ray_table import RayTable
 
 REALSENSE = "/device_0/sensor_"
@@ -54,6 +56,10 @@ class BagOptions(PoseChoice):
     confidence: str = ""
     """The topic of images of confidence, by default the one beside that of depth."""
 
+    imu: str = ""
+    """The topic of an IMU whose angular rates help to track the camera (``poses=track``), by default the only
+    one; ``none`` for tracking without."""
+
     points: str = ""
     """The topic of a lidar's point clouds, in place of depth images; of a bag without depth images by default
     the only one."""
@@ -75,6 +81,7 @@ class RosBag(Dataset):
     depth_scale: float | None = None
     colors: BagColors | None = None
     confidence: BagConfidence | None = None
+    gyro: GyroSamples | None = None
 
     @property
     def recorded_sigma(self) -> tuple[float, ...] | None:
@@ -130,7 +137,8 @@ class RosBag(Dataset):
                 sigma_m = self.confidence.read(index, depth_m, self.camera)
         except DatasetError as error:
             raise FrameError(f"frame {name}: {error}") from error
-        return Frame(depth_m, self.poses[index], self.camera, self.entries[index].stamp, name, color, sigma_m)
+        parts = (self.poses[index], self.camera, self.entries[index].stamp, name, color, sigma_m)
+        return Frame(depth_m, *parts, gyro=self.gyro)
 
 
 def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
@@ -174,6 +182,12 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
         notes += said
     confidence, said = find_confidence(reader, chosen.confidence, depth, camera, stamps, options.max_time_gap)
     notes += said
+    tracked, imu = chosen.poses == TRACK, BagImu()
+    poses = [pose for _, _, pose in posed]
+    if tracked:
+        imu = find_imu(reader, chosen.imu, chosen.optical or depth.frame, stamps[0])
+        poses = [start_pose(imu.up)] * len(posed)
+        notes += imu.notes
     return RosBag(
         name=reader.path.stem,
         camera=camera,
@@ -183,12 +197,13 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
         reader=reader,
         topic=depth.name,
         entries=[entry for _, entry, _ in posed],
-        poses=[pose for _, _, pose in posed],
+        poses=poses,
         names=[f"{i:06d}" for i, _, _ in posed],
         depth_scale=options.depth_scale,
-        tracked=chosen.poses == TRACK,
+        tracked=tracked,
         colors=colors,
         confidence=confidence,
+        gyro=imu.gyro,
     )
 
 

@@ -12,9 +12,8 @@ from taichi_mrf.datasets.formats.tum_rgbd import associate
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
-from taichi_mrf.datasets.ros.topics import DepthTopic, choose, described, read_tree
+from taichi_mrf.datasets.ros.topics import DepthTopic, choose, described, placed
 from taichi_mrf.errors import DatasetError
-from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 
 COLOR_GAP = 0.035
@@ -115,7 +114,7 @@ def _own_camera(
     own_infos = [info for info in infos if info and frame_name(info.header.frame_id) == topic.frame]
     if not own_infos:
         return "its CameraInfo is not known"
-    T_color_depth = _placed(reader, topic.frame, depth.frame)
+    T_color_depth = placed(reader, topic.frame, depth.frame)
     if T_color_depth is None:
         return f"tf has no fixed transform from {depth.frame!r} to {topic.frame!r}"
     try:
@@ -123,12 +122,3 @@ def _own_camera(
     except DatasetError as error:
         return f"its CameraInfo {error}"
     return ColorCamera(own, T_color_depth), distortion
-
-
-def _placed(reader: RosReader, color_frame: str, depth_frame: str) -> Pose | None:
-    """T_color_depth, None if tf has none or one that moves."""
-    tree = read_tree(reader)
-    known = {color_frame, depth_frame} <= set(tree.frames)
-    if not known or not tree.connects(color_frame, depth_frame) or tree.moves(color_frame, depth_frame):
-        return None
-    return tree.lookup(color_frame, depth_frame, 0.0, 0.0)

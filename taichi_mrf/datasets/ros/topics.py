@@ -145,3 +145,11 @@ def read_tree(reader: RosReader) -> TransformTree:
         child: (parent, TimedPoses(stamps, poses)) for child, (parent, stamps, poses) in moving.items()
     }
     return TransformTree(edges | fixed)
+
+
+def placed(reader: RosReader, to: str, of: str) -> Pose | None:
+    """T_to_of between two frames, (4, 4), None if tf has none or one that moves."""
+    tree = read_tree(reader)
+    if not {to, of} <= set(tree.frames) or not tree.connects(to, of) or tree.moves(to, of):
+        return None
+    return tree.lookup(to, of, 0.0, 0.0)

@@ -1,0 +1,97 @@
+"""The IMU of a bag: how the camera turns, by its gyroscope, and which way is up at the beginning."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.datasets.ros import messages
+from taichi_mrf.datasets.ros.messages import frame_name
+from taichi_mrf.datasets.ros.reader import RosReader
+from taichi_mrf.datasets.ros.topics import choose, placed
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.sensor.gyro import GyroSamples
+
+NONE = "none"
+"""The value of the option ``imu`` for a camera that is tracked without."""
+
+GRAVITY = 9.81
+"""Metres per square second."""
+
+AT_REST_S = 0.3
+"""Seconds before and after the first image in which accelerations say which way is up."""
+
+AT_REST = 0.4
+"""Largest departure of the mean from GRAVITY, and largest standard deviation along an axis, of a camera that
+is held still: then up is right to about 2 degrees."""
+
+LEAST_SAMPLES = 10
+
+
+@dataclass(frozen=True)
+class BagImu:
+    """The angular rates of the camera, and upwards in its frame, (3,), at the first image; None for what is
+    not known. ``notes`` are for the user: which topic is used, or why none is although there are some."""
+
+    gyro: GyroSamples | None = None
+    up: NDArray[np.float64] | None = None
+    notes: list[str] = field(default_factory=list)
+
+
+def find_imu(reader: RosReader, wanted: str, optical: str, first_s: float) -> BagImu:
+    """The IMU beside a camera whose images are in the frame ``optical`` and begin at ``first_s``. ``wanted``
+    is the topic, if the user named it. Raises DatasetError if that has no angular rates."""
+    if wanted == NONE:
+        return BagImu()
+    topics = [
+        t.name for t in reader.topics.values() if t.type == messages.IMU and _turns(reader.first(t.name))
+    ]
+    if not wanted and len(topics) != 1:
+        return BagImu(notes=[f"imu: choose one with ?imu={' or ?imu='.join(topics)}"] if topics else [])
+    name = choose(reader, "imu", wanted, topics, "topics of an IMU's angular rates")
+    if name not in topics:
+        raise DatasetError(f"{reader.path}: topic {name} has no angular rates ({messages.IMU})")
+    stamps, rates, accelerations, frame = [], [], [], ""
+    for entry, message in reader.messages(name):
+        rate, force = message.angular_velocity, message.linear_acceleration
+        stamps.append(entry.stamp)
+        rates.append((rate.x, rate.y, rate.z))
+        accelerations.append((force.x, force.y, force.z) if _accelerates(message) else (np.nan,) * 3)
+        frame = frame or frame_name(message.header.frame_id)
+    T_optical_imu = np.eye(4) if frame == optical else placed(reader, optical, frame)
+    if T_optical_imu is None:
+        why = f"tf has no fixed transform from {frame!r} to {optical!r}"
+        return BagImu(notes=[f"imu: {name} is not used: {why}"])
+    to_optical = T_optical_imu[:3, :3].T
+    times, first = np.unique(stamps, return_index=True)
+    rates_imu = np.array(rates)[first]
+    valid = np.isfinite(rates_imu).all(axis=1)
+    near = np.abs(times - first_s) <= AT_REST_S
+    up = upwards(np.array(accelerations)[first][near] @ to_optical)
+    level = "the first image is level by it" if up is not None else "which way is up it does not say"
+    gyro = GyroSamples(times[valid], rates_imu[valid] @ to_optical)
+    return BagImu(gyro, up, [f"imu: {name} measures turns; {level}"])
+
+
+def upwards(accelerations: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Upwards, a unit vector (3,), by what an accelerometer measures (N, 3) in metres per square second; None
+    if it does not rest."""
+    measured = accelerations[np.isfinite(accelerations).all(axis=1)]
+    if len(measured) < LEAST_SAMPLES:
+        return None
+    mean = measured.mean(axis=0)
+    size = float(np.linalg.norm(mean))
+    if abs(size - GRAVITY) > AT_REST or measured.std(axis=0).max() > AT_REST:
+        return None
+    return np.asarray(mean / size)
+
+
+def _turns(message: Any | None) -> bool:
+    """Whether a message has angular rates: the first covariance is -1 if it has none."""
+    return message is not None and message.angular_velocity_covariance[0] != -1
+
+
+def _accelerates(message: Any) -> bool:
+    """The same for accelerations."""
+    return bool(message.linear_acceleration_covariance[0] != -1)
