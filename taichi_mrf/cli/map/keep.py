@@ -21,7 +21,13 @@ from taichi_mrf.runs.files import CONFIG_FILE, MAP_FILE, REPORT_FILE
 from taichi_mrf.runs.report import report_json
 from taichi_mrf.system.atomic import write_text
 
-MAY_CHANGE = ("inference.sweeps", "inference.tolerance", "runtime.", "volume.memory_limit_gb")
+MAY_CHANGE = (
+    "inference.sweeps",
+    "inference.tolerance",
+    "poses.follow_",
+    "runtime.",
+    "volume.memory_limit_gb",
+)
 """Parameters (or groups) in which a resumed run may differ."""
 
 MOST_OF_THE_TIME = 0.05
