@@ -124,7 +124,7 @@ def test_a_part_of_an_experiment(data: Path, tmp_path: Path) -> None:
     ("arguments", "words"),
     [
         (["table3", "--only", "room"], ["--only: eval table3 has no parts"]),
-        (["trajectory", "--only", "attic"], ["--only leaves none of: room, 30 Hz"]),
+        (["trajectory", "--only", "attic"], ["--only leaves none of: kitchen, 3 Hz"]),
         (["table3", "--data", "no/such"], ["no/such", "no such folder", "--data"]),
         (["table1", "--data", "."], ["coffin_world/clean_depth.npz", "No such file"]),
         (["table3", "--limit", "0"], ["--limit must be at least 1, not 0"]),

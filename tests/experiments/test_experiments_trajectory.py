@@ -50,12 +50,12 @@ def test_parts_are_chosen_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(tables, "_walked", walked)
     monkeypatch.setattr(tables, "_lost", lambda experiment, case, voxel_size: names.append(case) or [])
     tables.run_trajectory(chosen(tmp_path, only=("house, 5 Hz", "kitchen*")))
-    assert names == ["kitchen, 3 Hz", "house, 5 Hz"]
+    assert names == ["kitchen, 3 Hz", "kitchen in colour, 3 Hz", "house, 5 Hz"]
     names.clear()
     tables.run_trajectory(chosen(tmp_path))
     assert len(names) == len(set(names)) > 15
     assert lost.SEEN in names
-    with pytest.raises(ConfigError, match=r"--only leaves none of: room, 30 Hz; .*kitchen"):
+    with pytest.raises(ConfigError, match=r"--only leaves none of: kitchen, 3 Hz; .*room, 30 Hz"):
         tables.run_trajectory(chosen(tmp_path, only=("attic",)))
 
 

@@ -44,8 +44,10 @@ HOLD_OUT = 10
 """One frame in so many is tracked but not mapped, and judges the map."""
 
 ROOM, ROOM_COLOR = "room", "room in colour"
-RING, RING_COLOR, RING_BARE = "corridor", "corridor in colour", "bare corridor"
-HOUSE, OFFICE, KITCHEN = "house", "handheld", "kitchen"
+RING, RING_COLOR = "corridor", "corridor in colour"
+BARE, BARE_COLOR = "bare corridor", "bare corridor in colour"
+HOUSE, OFFICE, OFFICE_COLOR = "house", "handheld", "handheld in colour"
+KITCHEN, KITCHEN_COLOR = "kitchen", "kitchen in colour"
 
 ROOM_SECONDS = 10.0
 """Once around the room: 7.8 m and 450 degrees."""
@@ -123,21 +125,27 @@ def walk_name(source: Source, rate: float) -> str:
 
 
 def sources() -> list[Source]:
-    """All walks, the cheap ones first."""
+    """All walks."""
     simulated = {
         ROOM: (room_walk, False),
         ROOM_COLOR: (room_walk, True),
         HOUSE: (_house, False),
         OFFICE: (_office, False),
+        OFFICE_COLOR: (_office, True),
         RING: (partial(ring_walk, False), False),
         RING_COLOR: (partial(ring_walk, False), True),
-        RING_BARE: (partial(ring_walk, True), False),
+        BARE: (partial(ring_walk, True), False),
+        BARE_COLOR: (partial(ring_walk, True), True),
     }
     taken = [
         Source(name, RATES, lambda e, rate, n=name, w=way, c=color: simulated_walk(e, n, w(e.data), rate, c))  # type: ignore[misc]
         for name, (way, color) in simulated.items()
     ]
-    return [taken[0], Source(KITCHEN, (3.0,), kitchen_walk), *taken[1:]]
+    recorded = [
+        Source(name, (3.0,), lambda e, rate, c=color: kitchen_walk(e, rate, c))  # type: ignore[misc]
+        for name, color in ((KITCHEN, False), (KITCHEN_COLOR, True))
+    ]
+    return [*recorded, *taken]
 
 
 def simulated_walk(experiment: Experiment, name: str, way: Way, rate: float, color: bool) -> Walk:
@@ -151,11 +159,11 @@ def simulated_walk(experiment: Experiment, name: str, way: Way, rate: float, col
     return Walk(f"{name}, {rate:g} Hz", small_camera(), frames=frames, clean_m=clean)
 
 
-def kitchen_walk(experiment: Experiment, rate: float) -> Walk:
+def kitchen_walk(experiment: Experiment, rate: float, color: bool) -> Walk:
     """The recording, every tenth image at 30 a second, with the poses that it brings along."""
     folder = experiment.data / "seven_scenes_redkitchen"
     width = open_dataset(folder, color=False).camera.width
-    dataset = open_dataset(folder, image_scale=min(1.0, WIDTH / width))
+    dataset = open_dataset(folder, color=color, image_scale=min(1.0, WIDTH / width))
     frames = [replace(dataset.read(i), stamp=i / rate) for i in range(len(dataset))[: experiment.limit]]
     clean = {i: f.depth_m for i, f in enumerate(frames) if is_held_out(i + 1, HOLD_OUT)}
     return Walk(f"{KITCHEN}, {rate:g} Hz", dataset.camera, frames=frames, clean_m=clean)
@@ -168,7 +176,9 @@ def small_camera() -> PinholeCamera:
 
 def room_walk(data: Path) -> Way:
     """Once around the built-in room."""
-    return _rendered(room_scene(), lambda seconds: camera_pose(seconds / ROOM_SECONDS), ROOM_SECONDS)
+    return _rendered(
+        room_scene(), lambda seconds: camera_pose(seconds / ROOM_SECONDS), ROOM_SECONDS, carried_lamp=False
+    )
 
 
 def ring_walk(bare: bool, data: Path) -> Way:
@@ -204,12 +214,17 @@ def shaken(T_world_camera: Pose, seconds: float) -> Pose:
     return moved(T_world_camera, (np.sin(phases) * [[SHAKE_M], [SHAKE_RAD]]).ravel())
 
 
-def _rendered(scene: Scene, pose_at: Callable[[float], Pose], seconds: float) -> Way:
+def _rendered(
+    scene: Scene, pose_at: Callable[[float], Pose], seconds: float, carried_lamp: bool = True
+) -> Way:
+    """A way through an analytic scene. Its lamp, or one over the camera, lights the colour images, in which
+    everything is mottled."""
     camera = small_camera()
 
     def picture(T: Pose, color: bool) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
         x, y, z = T[:3, 3].tolist()
-        depth_m, rgb = render(replace(scene, light=(x, y, z + LAMP_OVER_EYE_M)), camera, T, color)
+        lit = replace(scene, light=(x, y, z + LAMP_OVER_EYE_M)) if carried_lamp else scene
+        depth_m, rgb = render(lit, camera, T, color)
         return depth_m, None if rgb is None else mottled(rgb, depth_m, camera, T)
 
     return Way(picture, pose_at, seconds)
