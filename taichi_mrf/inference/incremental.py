@@ -18,6 +18,7 @@ from taichi_mrf.inference.messages import places_of
 from taichi_mrf.inference.schedule import InferProgress, InferReport, NoteSweep, Progress
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.system import runtime
+from taichi_mrf.system.interrupts import interrupts_wait
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 
@@ -85,20 +86,35 @@ class IncrementalInference:
         rays = swept = 0
         queue = list(first)
         largest = 0.0
+        shares: dict[int, float] = {}  # of those that wait, as of when they were last examined
+        outdated = set(self._waiting)
         while True:
-            self._waiting |= self.bounds.near(self.pool.take_changed())
+            near = self.bounds.near(self.pool.take_changed())
+            self._waiting |= near
+            outdated |= near
             if queue:
                 id = queue.pop(0)
             else:
-                shares = self._shares(keyframes, tolerance)
-                if not shares:
+                self._examine(keyframes, outdated, shares, tolerance)
+                outdated.clear()
+                largest = max(shares.values(), default=0.0)
+                if largest <= tolerance:
                     largest = 0.0
                     break
                 id = max(shares, key=lambda each: (shares[each], -each))
-                largest = shares[id]
                 if seconds is not None and time.perf_counter() - begin >= seconds:
                     break
-            keyframe = keyframes[id]
+            self.sweep(keyframes[id])
+            outdated.add(id)
+            rays, swept = rays + keyframes[id].rays, swept + 1
+            if progress is not None and not progress(InferProgress(1, 1, swept, swept, keyframes[id].rays)):
+                break
+        runtime.settle()
+        return InferReport(time.perf_counter() - begin, largest, swept, rays, largest <= tolerance)
+
+    def sweep(self, keyframe: Keyframe) -> None:
+        """Sweep one keyframe. Those whose cavity it changes are found by the next :meth:`run`."""
+        with interrupts_wait():
             self.refresh(keyframe)
             self.pool.touch(keyframe.visible.slots)
             if self.sweeper.sweep(keyframe, self.pool):
@@ -107,18 +123,20 @@ class IncrementalInference:
                     self._note_sweep(keyframe, moved)
             else:
                 keyframe.change_count_at_last_sweep = np.zeros(0, np.int64)  # it sees no brick
-            rays, swept = rays + keyframe.rays, swept + 1
-            if progress is not None and not progress(InferProgress(1, 1, swept, swept, keyframe.rays)):
-                break
-        runtime.settle()
-        return InferReport(time.perf_counter() - begin, largest, swept, rays, largest <= tolerance)
 
-    def _shares(self, keyframes: Mapping[int, Keyframe], tolerance: float) -> dict[int, float]:
-        """The share of each waiting keyframe's cavity that is out of date, if it is too large; the other
-        keyframes wait no longer."""
-        shares = {}
-        for id in self._waiting & keyframes.keys():
+    def _examine(
+        self,
+        keyframes: Mapping[int, Keyframe],
+        outdated: set[int],
+        shares: dict[int, float],
+        tolerance: float,
+    ) -> None:
+        """Find the share of each waiting keyframe's cavity that is out of date, where ``shares`` are
+        ``outdated``. Keyframes whose share is small enough wait no longer, nor do withdrawn ones."""
+        for id in outdated & self._waiting & keyframes.keys():
             self.look_again(keyframes[id])
-            shares[id] = moved_share(keyframes[id], self.pool)
-        self._waiting = {id for id, share in shares.items() if share > min(tolerance, self.usual)}
-        return {id: share for id, share in shares.items() if share > tolerance}
+            shares[id] = 0.0 if keyframes[id].withdrawn else moved_share(keyframes[id], self.pool)
+        least = min(tolerance, self.usual)
+        for id in [id for id, share in shares.items() if share <= least]:
+            del shares[id]
+        self._waiting = set(shares)

@@ -266,6 +266,7 @@ class Keyframe:
     change_count_at_last_sweep: NDArray[np.int64] | None = None
     pending_visible: VisibleBricks | None = None
     no_returns: NoReturnRays | None = None
+    withdrawn: bool = False
 
     @property
     def camera(self) -> Camera:

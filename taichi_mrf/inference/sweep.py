@@ -114,6 +114,7 @@ class Sweeper:
         next sweep over the same keyframe.
         """
         config, visible = self.inference, keyframe.visible
+        keyframe.withdrawn = False
         if len(visible.slots) == 0:
             return False
         messages, bricks, model = keyframe.messages, visible.on_device(), self.model()

@@ -80,8 +80,8 @@ class PoseFollower:
     def move(
         self, seconds: float | None = None, least: float | None = None, fixed: Collection[int] = ()
     ) -> tuple[int, ...]:
-        """Move keyframes, those that move most first, for about ``seconds``; returns the ids of those that
-        moved. Those that are ``fixed`` stay, and those that would move by less than ``least`` voxels, by
+        """Move keyframes, in the order of ``update_poses``, for about ``seconds``; returns the ids of those
+        that moved. Those that are ``fixed`` stay, and those that would move by less than ``least`` voxels, by
         default ``update_poses``' own.
 
         Raises CapacityError if there is not enough memory; the others are then left where they are.

@@ -70,3 +70,10 @@ def test_a_drive_down_a_street(repository: Path) -> None:
     flags = ("--scans", "4", "--every", "2", "--voxel-size", "1", "--window-m", "2", "--arch", "cpu")
     said = run(repository / "benchmarks" / "lidar_drive.py", *flags)
     assert [row.split()[0] for row in said.splitlines()] == ["scans", "2", "4"]
+
+
+def test_a_loop_is_closed(repository: Path) -> None:
+    flags = ("--keyframes", "4", "--moved", "2", "--width", "32", "--height", "24", "--voxel-size", "0.4")
+    said = run(repository / "benchmarks" / "loop_closure.py", *flags, "--no-rivals", "--arch", "cpu")
+    assert "others swept again" in said
+    assert "bit for bit the map made anew: True" in said

@@ -1,14 +1,18 @@
 """A trajectory that changes under a map: which keyframes move, in which order, and what map it becomes."""
 
+import os
+import signal
+
 import cv2
 import numpy as np
 import pytest
 import small_room
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from taichi_mrf.errors import ConfigError, KeyframeError
+from taichi_mrf.errors import CapacityError, ConfigError, KeyframeError
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.mrf.memory_budget import MemoryBudget
 
 pytestmark = pytest.mark.usefixtures("backend")
 
@@ -43,10 +47,19 @@ def near_share(a: MRFMap, b: MRFMap) -> float:
     return float((np.abs(a.occupancy(centres) - p) <= 0.02).mean())
 
 
+def assert_same(a: MRFMap, b: MRFMap) -> None:
+    """The same voxels and the same probabilities, bit for bit."""
+    (centres, p), (others, q) = a.voxels(0.0), b.voxels(0.0)
+    order, other_order = np.lexsort(centres.T), np.lexsort(others.T)
+    np.testing.assert_array_equal(centres[order], others[other_order])
+    np.testing.assert_array_equal(p[order], q[other_order])
+
+
 small = st.floats(-0.05, 0.05)
 
 
 @settings(max_examples=8)
+@example(motions={1: (0.0,) * 6}, at_once=True)  # the same numbers, but some -0.0 become 0.0
 @given(
     motions=st.dictionaries(st.integers(0, COUNT - 1), st.tuples(*[small] * 6), min_size=1),
     at_once=st.booleans(),
@@ -63,11 +76,7 @@ def test_inference_afterwards_makes_the_map_that_is_made_anew(
         while left:
             left = dict(m.update_poses(left, least=0.0, seconds=0.0).left)
     m.infer()
-    new = anew(poses)
-    (centres, p), (others, q) = m.voxels(0.0), new.voxels(0.0)
-    order, other_order = np.lexsort(centres.T), np.lexsort(others.T)
-    np.testing.assert_array_equal(centres[order], others[other_order])
-    np.testing.assert_array_equal(p[order], q[other_order])
+    assert_same(m, anew(poses))
 
 
 def test_a_map_is_nearly_the_one_made_anew_without_inference_over_all() -> None:
@@ -81,17 +90,70 @@ def test_a_map_is_nearly_the_one_made_anew_without_inference_over_all() -> None:
     assert after > max(0.95, before + 0.03)
 
 
-def test_those_that_move_most_come_first_and_time_that_is_over_leaves_the_others() -> None:
+def test_the_furthest_viewpoint_comes_first_and_time_that_is_over_leaves_the_others() -> None:
     m = built()
-    poses = {i: shifted(i, 0.0, 0.0, 0.0, 0.1 * (1 + (i + 2) % COUNT), 0.0, 0.0) for i in range(COUNT)}
+    poses = {i: shifted(i, 0.0, 0.0, 0.0, 0.2, 0.0, 0.0) for i in range(1, COUNT)}
     first = m.update_poses(poses, seconds=0.0)
-    assert first.moved == (2,)
-    assert set(first.left) == {0, 1, 3, 4}
+    eyes = {i: np.concatenate([T[:3, 3], T[:3, 3] + 2.0 * T[:3, 2]]) for i, T in poses.items()}
+    stays = small_room.frames()[0].T_world_camera
+    start = np.concatenate([stays[:3, 3], stays[:3, 3] + 2.0 * stays[:3, 2]])
+    furthest = max(eyes, key=lambda i: np.linalg.norm(eyes[i] - start))
+    assert first.moved == (furthest,)
+    assert set(first.left) == set(poses) - {furthest}
     assert not first.complete
+    # Those that wait have no evidence in the map meanwhile, whatever else is brought up to date.
+    m.renew()
+    assert [m.keyframes[i].messages is None for i in range(COUNT)] == [i in first.left for i in range(COUNT)]
     second = m.update_poses(first.left)
-    assert second.moved == (1, 0, 4, 3)
+    assert set(second.moved) == set(first.left)
     for number, T in poses.items():
         np.testing.assert_array_equal(m.keyframes[number].T_world_camera, T)
+
+
+def test_a_pose_that_is_taken_back_brings_the_evidence_back() -> None:
+    m = built()
+    poses = {i: shifted(i, 0.0, 0.0, 0.0, 0.2, 0.0, 0.0) for i in range(1, COUNT)}
+    left = m.update_poses(poses, seconds=0.0).left
+    m.update_poses({i: small_room.frames()[i].T_world_camera for i in left})
+    assert all(keyframe.messages is not None for keyframe in m.keyframes.values())
+
+
+def test_small_motions_keep_their_evidence_until_their_turn() -> None:
+    m = built()
+    poses = {i: shifted(i, 0, 0, 0, 0.02, 0, 0) for i in range(COUNT)}
+    first = m.update_poses(poses, seconds=0.0)
+    assert len(first.left) == COUNT - 1
+    assert all(keyframe.messages is not None for keyframe in m.keyframes.values())
+
+
+@pytest.mark.parametrize("error", [CapacityError, KeyboardInterrupt])
+def test_a_call_that_ends_early_leaves_a_map_that_infers_exactly(
+    error: type[BaseException], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    m = built()
+    poses = {i: shifted(i, 0.0, 0.0, 0.02, 0.2, 0.0, 0.0) for i in range(COUNT)}
+    check, calls = MemoryBudget.check, []
+
+    def fails(*arguments: object) -> None:
+        calls.append(arguments)
+        if len(calls) != 3:
+            check(*arguments)
+        elif error is CapacityError:
+            raise CapacityError("there is not enough memory")
+        else:
+            os.kill(os.getpid(), signal.SIGINT)  # takes effect after the keyframe
+
+    with monkeypatch.context() as patch:
+        patch.setattr(MemoryBudget, "check", fails)
+        with pytest.raises(error):
+            m.update_poses(poses)
+    there = {i for i, T in poses.items() if (m.keyframes[i].T_world_camera == T).all()}
+    assert len(there) == (2 if error is CapacityError else 3)
+    m.infer()
+    assert_same(m, anew({i: poses[i] for i in there}))
+    m.update_poses(poses, least=0.0)
+    m.infer()
+    assert_same(m, anew(poses))
 
 
 def test_a_pose_that_hardly_changes_leaves_the_keyframe_where_it_is() -> None:

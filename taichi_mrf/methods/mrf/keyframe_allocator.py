@@ -44,9 +44,23 @@ class KeyframeAllocator:
     def place(self, id: int, name: str, image: DepthImage, T_world_camera: Pose, stamp_s: float) -> Keyframe:
         """Find the bricks that a keyframe's rays cross and claim those near its surfaces. Raises
         CapacityError if there is not enough memory."""
-        rays, voxel_size = self.bundler.rays_of(image), self.registry.voxel_size
-        parts = (voxel_size, self.sensor, self.inference, self.volume)
-        no_returns = no_return_rays(image, self.sensor, self.bundler)
+        rays, no_returns = self.bundler.rays_of(image), no_return_rays(image, self.sensor, self.bundler)
+        return self._placed(id, name, image, rays, T_world_camera, stamp_s, no_returns)
+
+    def place_again(self, keyframe: Keyframe, image: DepthImage, T_world_camera: Pose) -> Keyframe:
+        """Place a keyframe at another pose, after :meth:`take_out`. Its rays stay the same if its image does.
+        Raises CapacityError if there is not enough memory."""
+        if image is not keyframe.image:
+            return self.place(keyframe.id, keyframe.name, image, T_world_camera, keyframe.stamp_s)
+        parts = (image, keyframe.ray_list, T_world_camera, keyframe.stamp_s)
+        return self._placed(keyframe.id, keyframe.name, *parts, keyframe.no_returns)
+
+    def _placed(
+        self, id: int, name: str, image: DepthImage, rays: RayList, T_world_camera: Pose, stamp_s: float,
+        no_returns: NoReturnRays | None,
+    ) -> Keyframe:  # fmt: skip
+        """Find the footprint of rays and claim it, if there is enough memory."""
+        parts = (self.registry.voxel_size, self.sensor, self.inference, self.volume)
         footprint = find_footprint(image, rays, T_world_camera, *parts, scouts=SCOUTS, no_returns=no_returns)
         of_no_returns = 0 if no_returns is None else no_returns.nbytes
         self.budget.check(footprint, image.nbytes + 4 * rays.blocks.shape[0] + rays.nbytes + of_no_returns)
@@ -74,19 +88,26 @@ class KeyframeAllocator:
 
     def take_out(self, keyframe: Keyframe) -> None:
         """Undo :meth:`place` and subtract the keyframe's messages from the beliefs."""
-        pool = self.registry.pool
-        if keyframe.messages is not None:
-            messages, slots = self.refresh(keyframe), keyframe.visible.slots
-            if len(slots):
-                pool.count_changes(slots, withdraw_messages(keyframe.visible, messages, pool.total))
-                pool.revision += 1
-                pool.touch(slots)
-                if self.dated is not None:
-                    self.dated.withdraw(keyframe)
+        self.withdraw(keyframe)
         self.registry.disclaim(keyframe.footprint)
         self.bounds.drop(keyframe.id)
         self.budget.give_back(keyframe.id)
         runtime.settle()  # before its arrays are dropped
+
+    def withdraw(self, keyframe: Keyframe) -> None:
+        """Subtract a keyframe's messages from the beliefs and drop them. It keeps its bricks, and is as one
+        that was never swept."""
+        if keyframe.messages is None:
+            return
+        pool, messages, slots = self.registry.pool, self.refresh(keyframe), keyframe.visible.slots
+        if len(slots):
+            pool.count_changes(slots, withdraw_messages(keyframe.visible, messages, pool.total))
+            pool.revision += 1
+            pool.touch(slots)
+            if self.dated is not None:
+                self.dated.withdraw(keyframe)
+        keyframe.messages = None
+        self.budget.mark_unallocated(keyframe.id)
 
     def freeze(self, keyframe: Keyframe) -> None:
         """Add a keyframe's messages to the evidence that inference starts from, and keep its bricks for
