@@ -1,6 +1,6 @@
 """The surface that all keyframes of one map have measured, kept up to date as they come, move and go."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +76,10 @@ class KeyframeSurfels:
         if self._frozen is not None:
             parts.append(self._frozen)
         return merged([surfels.within(lower_m, upper_m) for surfels in parts], self.cell_size)
+
+    def of(self, ids: Iterable[int]) -> Surfels:
+        """The surface that some keyframes have measured, those among them that are known."""
+        return merged([self._kept[id][1] for id in ids if id in self._kept], self.cell_size)
 
     def _measure(self, keyframe: Keyframe) -> None:
         known, T_world_camera = self._kept.get(keyframe.id), keyframe.T_world_camera

@@ -163,18 +163,19 @@ class Locator:
 def _judged(end: Aligned, reason: str, config: PoseConfig) -> Located:
     """What became of an image whose search ended at a pose that cannot be relied on for a ``reason``, if that
     is not "", and if too little of it fits, for that."""
-    overlap, agreement = end.equations.overlap, _agreement(end.equations)
+    overlap, agrees = end.equations.overlap, agreement(end.equations)
     if overlap < config.min_overlap:
         reason = (
             f"{100 * overlap:.0f}% of its points lie near what is mapped, "
             f"and {100 * config.min_overlap:.0f}% are needed"
         )
-    elif agreement < LEAST_AGREEMENT:
-        reason = f"{100 * agreement:.0f}% of its points agree with the map"
+    elif agrees < LEAST_AGREEMENT:
+        reason = f"{100 * agrees:.0f}% of its points agree with the map"
     pose = None if reason else end.T_world_camera
-    return Located(pose, reason, overlap, agreement, end.equations.rms_m, end.directions)
+    return Located(pose, reason, overlap, agrees, end.equations.rms_m, end.directions)
 
 
-def _agreement(equations: NormalEquations) -> float:
+def agreement(equations: NormalEquations) -> float:
+    """Share of the points with a surface near them that lie on it, by Tukey's measure."""
     beyond = LARGEST_COST * (equations.total - equations.matched)
     return 1.0 - (equations.cost - beyond) / (LARGEST_COST * max(1, equations.matched))

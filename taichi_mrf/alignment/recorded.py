@@ -1,14 +1,19 @@
-"""The weight of a keyframe's recorded pose, beside the evidence of its depth.
+"""The weight of what is known of keyframes' poses, beside the evidence of their depth.
 
 Recorded poses are wrong by PoseConfig's sigmas. Thousands of points err together, by whole surfaces, as
 sensors are bent and scaled a little: together they count no more than one measurement along each direction
-with the standard deviation SURFACE_SIGMA_M.
+with the standard deviation SURFACE_SIGMA_M. Of a tracked camera no pose is known, but each step from one
+keyframe to the next.
 """
+
+from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.alignment.se3 import twist
+from taichi_mrf.alignment.pose_equations import PoseEquations
+from taichi_mrf.alignment.se3 import adjoint, twist
 from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.geometry.poses import Pose, inverse
 
@@ -36,3 +41,45 @@ class Recorded:
     def cost(self, T_world_camera: Pose) -> float:
         """The cost of a pose."""
         return float(0.5 * self._information @ twist(self._T_recorded_world @ T_world_camera) ** 2)
+
+
+class KnownPoses(Protocol):
+    """What is known of the poses of some keyframes, in a fixed order, as a quadratic cost."""
+
+    def add_to(self, equations: PoseEquations, poses: Sequence[Pose]) -> None:
+        """Add the cost's derivatives at some poses."""
+        ...
+
+
+class RecordedPoses:
+    """Each pose was recorded."""
+
+    def __init__(self, T_recorded: Sequence[Pose], config: PoseConfig) -> None:
+        self._recorded = [Recorded(T, config) for T in T_recorded]
+
+    def add_to(self, equations: PoseEquations, poses: Sequence[Pose]) -> None:
+        """See :class:`KnownPoses`."""
+        H = np.stack([each.H for each in self._recorded])
+        g = np.stack([each.gradient(T) for each, T in zip(self._recorded, poses, strict=True)])
+        equations.add(np.arange(len(poses)), H, g)
+
+
+class TrackedSteps:
+    """The step from each pose to the next was tracked, with ``sigma_m`` metres and ``sigma_rad`` radians along
+    and about each axis."""
+
+    def __init__(self, T_tracked: Sequence[Pose], sigma_m: float, sigma_rad: float) -> None:
+        self._steps_back = [inverse(b) @ a for a, b in zip(T_tracked, T_tracked[1:], strict=False)]
+        self._information = np.diag(np.repeat([sigma_m, sigma_rad], 3) ** -2.0)
+
+    def add_to(self, equations: PoseEquations, poses: Sequence[Pose]) -> None:
+        """See :class:`KnownPoses`."""
+        count = len(self._steps_back)
+        if count == 0:
+            return
+        steps = [inverse(a) @ b for a, b in zip(poses, poses[1:], strict=False)]
+        errors = np.stack([twist(back @ step) for back, step in zip(self._steps_back, steps, strict=True)])
+        to_first = np.stack([-adjoint(inverse(step)) for step in steps])
+        H = np.repeat(self._information[None], count, axis=0)
+        g = errors @ self._information
+        equations.add_pairs(np.arange(1, count + 1), np.arange(count), to_first, H, g)

@@ -26,18 +26,20 @@ def twist(T: Pose) -> NDArray[np.float64]:
     return np.concatenate([np.linalg.solve(_left_jacobian(omega), T[:3, 3]), omega])
 
 
-def adjoint(T_a_b: Pose) -> NDArray[np.float64]:
-    """(6, 6): what takes a twist in frame b to the same one in frame a."""
-    R = T_a_b[:3, :3]
-    A = np.zeros((6, 6))
-    A[:3, :3] = A[3:, 3:] = R
-    A[:3, 3:] = cross_matrix(T_a_b[:3, 3]) @ R
+def adjoint(T_a_b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(..., 6, 6): what takes a twist in frame b to the same one in frame a, of poses (..., 4, 4)."""
+    R = T_a_b[..., :3, :3]
+    A = np.zeros((*T_a_b.shape[:-2], 6, 6))
+    A[..., :3, :3] = A[..., 3:, 3:] = R
+    A[..., :3, 3:] = cross_matrix(T_a_b[..., :3, 3]) @ R
     return A
 
 
 def cross_matrix(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3): what a cross product with v from the left does."""
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    """(..., 3, 3): what a cross product with v (..., 3) from the left does."""
+    K = np.zeros((*v.shape, 3))
+    K[..., 0, 1], K[..., 0, 2], K[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    return K - np.swapaxes(K, -1, -2)
 
 
 def _rotation_vector(R: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ in the way of rays that went on.
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +19,12 @@ BIN_RAD = np.radians(2.0)
 
 MARGIN_M, MARGIN = 0.3, 0.03
 """By how much a measurement has to be beyond a surface, in metres and as a share of range."""
+
+THROUGH_M = 0.1
+"""The same in metres for a camera, whose pixels are finer than those bins."""
+
+LEAST_FACING = 0.3
+"""Cosine of the largest angle at which a camera's rays meet a surface that counts."""
 
 NEAREST_M, FARTHEST_M = 0.5, 12.0
 """Ranges of the surfaces that count. Further away errors of a heading matter, and bins hold much."""
@@ -67,3 +74,22 @@ def _bins(points: NDArray[np.float64], ranges_m: NDArray[np.float64]) -> NDArray
     azimuth = np.arctan2(points[:, 1], points[:, 0]) + np.pi
     row = np.minimum((elevation / BIN_RAD).astype(np.intp), _ROWS - 1)
     return row * _COLUMNS + np.minimum((azimuth / BIN_RAD).astype(np.intp), _COLUMNS - 1)
+
+
+def looked_through(surface: Planes, image: DepthImage, T_world_camera: Pose) -> float:
+    """The share of a mapped surface that an image taken at a pose (4, 4) looks through, of what it sees or
+    looks through. Surfaces seen at a slant do not count, nor what stands beside the edge of something
+    nearer."""
+    points = (surface.points_m - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+    normals = surface.normals @ T_world_camera[:3, :3]
+    facing = -(points * normals).sum(axis=1) > LEAST_FACING * np.linalg.norm(points, axis=1)
+    seen = image.camera.project(points[facing])
+    seen = seen[(seen[:, 2] > NEAREST_M) & (seen[:, 2] < FARTHEST_M)]
+    u, v = np.rint(seen[:, :2]).astype(np.intp).T
+    depth_m = image.to_numpy()
+    nearest_m = cv2.erode(np.where(depth_m > 0, depth_m, np.inf), np.ones((5, 5)))[v, u]
+    margin_m = THROUGH_M + MARGIN * seen[:, 2]
+    measured = np.isfinite(nearest_m)
+    through = measured & (nearest_m > seen[:, 2] + margin_m)
+    met = measured & ~through & (nearest_m > seen[:, 2] - margin_m)
+    return float(through.sum() / max(1, through.sum() + met.sum()))

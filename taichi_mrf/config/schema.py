@@ -113,6 +113,10 @@ class PoseConfig:
     """Align each new keyframe with the earlier ones, and at the end all keyframes with each other. The first
     keyframe keeps its pose."""
 
+    close_loops: bool = True
+    """When poses are tracked: correct the whole trajectory when the camera comes back to a place that it has
+    seen, and at the end align all keyframes with each other."""
+
     rounds: int = 2
     """Maximum number of rounds in which all keyframes are aligned with each other at the end."""
 

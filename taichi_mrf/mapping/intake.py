@@ -12,6 +12,7 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import CapacityError, LostFrameError
 from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.mapping.loops import loop_closer_of
 from taichi_mrf.mapping.refinement import refiner_of
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.mapping.selection import KeyframeSelector, is_held_out
@@ -97,8 +98,10 @@ class Intake:
         Raises ConfigError if poses are to be refined or tracked in a map whose method cannot."""
         self.map = m
         self.result = MappingResult(m)
-        self.refiner = refiner_of(m, config.poses)
+        self.refiner = refiner_of(m, config.poses, tracked)
         self.tracker = tracker_of(m, config.poses) if tracked else None
+        self._loops = loop_closer_of(self.tracker, config.poses)
+        self._aligns = config.poses.refine
         if self.tracker is not None:
             self.result.track = Track()
         self._selector = KeyframeSelector(keyframe_steps(config.keyframes) if tracked else config.keyframes)
@@ -144,6 +147,10 @@ class Intake:
             tracked = self.tracker.took(keyframe)
             if self._remembers and self.result.track is not None:
                 self.result.track.frames[index] = tracked
+        if self._loops is not None:
+            with self.result.timed("closing loops"):
+                closure = self._loops.took(keyframe, frame)
+            if closure is not None: print(closure)
         self._selector.accept(frame.T_world_camera, frame.sensor)
         return Added(frame, keyframe, self.map.keyframes[keyframe].rays)
 
@@ -190,7 +197,7 @@ class Intake:
                 )
             keyframe = self.map.add_keyframe(frame.depth_m, *parts, **own.arguments())
         try:
-            if self.refiner is not None:
+            if self.refiner is not None and self._aligns:
                 with self.result.timed("refining"):
                     self.refiner.place(keyframe)
             elif self._sweep is not None:

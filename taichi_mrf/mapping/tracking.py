@@ -58,7 +58,8 @@ LONGEST_AHEAD = 3.0
 @dataclass(frozen=True)
 class TrackedFrame:
     """The pose of a frame: relative to the last keyframe at that time, and in the world as it was then.
-    ``directions``: how many of the six degrees of freedom its points determine."""
+    ``directions``: how many of the six degrees of freedom its points determine. If the frame became a
+    keyframe itself, ``before`` is what it was until then: relative to the keyframe before it."""
 
     name: str
     stamp: float
@@ -66,6 +67,7 @@ class TrackedFrame:
     keyframe: int | None
     T_keyframe_camera: Pose
     directions: int
+    before: "TrackedFrame | None" = None
 
     def pose_in(self, m: OccupancyMap) -> Pose:
         """(4, 4) in the present world frame; the original pose if its keyframe was removed or frozen."""
@@ -87,19 +89,31 @@ class Track:
         return sum(frame.directions < 6 for frame in self.frames.values())
 
     def poses(self, m: OccupancyMap) -> dict[int, Pose]:
-        """The pose of each frame, (4, 4), in the present world frame."""
-        return {index: frame.pose_in(m) for index, frame in self.frames.items()}
+        """The pose of each frame, (4, 4), in the present world frame. If the keyframes before and after a
+        frame have moved against each other, it takes a share of that."""
+        poses = {index: frame.pose_in(m) for index, frame in self.frames.items()}
+        passed: list[int] = []  # the frames since the last keyframe
+        for index, frame in self.frames.items():
+            if frame.before is None:
+                passed.append(index)
+                continue
+            drift = twist(inverse(frame.before.pose_in(m)) @ poses[index])
+            for n, between in enumerate(passed, start=1):
+                if self.frames[between].keyframe == frame.before.keyframe:
+                    poses[between] = moved(poses[between], n / (len(passed) + 1) * drift)
+            passed.clear()
+        return poses
 
     def trajectory(self, m: OccupancyMap) -> list[tuple[float, Pose]]:
         """The same with their stamps, in the order in which the frames came."""
-        return [(frame.stamp, frame.pose_in(m)) for frame in self.frames.values()]
+        return [(self.frames[index].stamp, T) for index, T in self.poses(m).items()]
 
 
 class Tracker:
     """Follows the camera through one map. It does not add keyframes itself."""
 
     def __init__(self, m: AligningMap, config: PoseConfig) -> None:
-        self._map = m
+        self.map = m
         self._config = replace(
             config,
             translation_sigma=GUESS_M,
@@ -128,7 +142,7 @@ class Tracker:
 
         Raises LostFrameError, which names the frame.
         """
-        m = self._map
+        m = self.map
         if self._last is None or not (m.keyframes or m.frozen):
             return self._found(
                 frame, frame.T_world_camera if self._last is None else self._pose(self._last), 6
@@ -154,17 +168,19 @@ class Tracker:
         """Note that the frame that was followed last has become this keyframe of the map, and may have been
         moved a little; returns its pose."""
         assert self._last is not None
-        T_world_camera = self._map.keyframes[keyframe].T_world_camera
+        T_world_camera, before = self.map.keyframes[keyframe].T_world_camera, self._last
         self._keyframe = keyframe
         if self._frame is not None and self._config.use_color:
             self._pictures.keep(keyframe, self._frame)
-        self._last = self._tracked(self._last.name, self._last.stamp, T_world_camera, self._last.directions)
+        self._last = replace(
+            self._tracked(before.name, before.stamp, T_world_camera, before.directions), before=before
+        )
         self._first = self._first or self._last
         return self._last
 
     def resume(self, keyframe: int) -> None:
         """Go on from a keyframe that was mapped in an earlier run."""
-        keyframes = self._map.keyframes
+        keyframes = self.map.keyframes
         self._keyframe = keyframe
         self._last = self._tracked(keyframes[keyframe].name, math.nan, keyframes[keyframe].T_world_camera, 6)
         self._first = self._first or self._last
@@ -176,14 +192,14 @@ class Tracker:
         return replace(frame, T_world_camera=T_world_camera), tracked
 
     def _tracked(self, name: str, stamp: float, T_world_camera: Pose, directions: int) -> TrackedFrame:
-        keyframe = self._keyframe if self._keyframe in self._map.keyframes else None
+        keyframe = self._keyframe if self._keyframe in self.map.keyframes else None
         T_keyframe_camera = T_world_camera
         if keyframe is not None:
-            T_keyframe_camera = inverse(self._map.keyframes[keyframe].T_world_camera) @ T_world_camera
+            T_keyframe_camera = inverse(self.map.keyframes[keyframe].T_world_camera) @ T_world_camera
         return TrackedFrame(name, stamp, T_world_camera, keyframe, T_keyframe_camera, directions)
 
     def _pose(self, tracked: TrackedFrame) -> Pose:
-        return tracked.pose_in(self._map)
+        return tracked.pose_in(self.map)
 
     def _ahead(self, stamp: float) -> float | None:
         """For how many times as long as it was observed the last motion is continued, if it is."""

@@ -80,7 +80,7 @@ def test_all_at_once_takes_back_more_than_half() -> None:
         for i, f in enumerate(true_frames())
     }
     start = dict(enumerate(disturbed(0)))
-    found = driven(align_jointly(points, start, start, PoseConfig()))
+    found = driven(align_jointly(points, start, recorded(start)))
     before, after = errors(list(start.values())), errors(list(found.values()))
     assert (after < 0.5 * before).all()
 
@@ -92,7 +92,7 @@ def test_poses_recorded_well_are_trusted() -> None:
     }
     start = dict(enumerate(disturbed(0)[:3]))
     sure = PoseConfig(translation_sigma=1e-5, rotation_sigma=1e-5)
-    found = driven(align_jointly(points, start, start, sure))
+    found = driven(align_jointly(points, start, recorded(start, sure)))
     for id, T in found.items():
         np.testing.assert_allclose(T, start[id], atol=1e-4)
 
@@ -106,7 +106,7 @@ def test_a_keyframe_without_partners_stays_where_it_was_recorded() -> None:
     away = frames[1].T_world_camera.copy()
     away[:3, 3] += 30.0
     poses = {0: frames[0].T_world_camera, 1: away}
-    np.testing.assert_allclose(driven(align_jointly(points, poses, poses, PoseConfig()))[1], away, atol=1e-9)
+    np.testing.assert_allclose(driven(align_jointly(points, poses, recorded(poses)))[1], away, atol=1e-9)
 
 
 def test_the_pipeline_corrects_poses_and_tells_both() -> None:

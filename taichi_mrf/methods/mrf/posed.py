@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf.alignment.likelihood import log_likelihood, map_of_others
 from taichi_mrf.alignment.refine import Aligner, RefinedPose
 from taichi_mrf.config.arguments import real
 from taichi_mrf.config.schema import PoseConfig
@@ -206,6 +207,17 @@ class PosedMRF(ReadableMRF):
         if refined.accepted:
             self.move_keyframe(id, refined.T_world_camera)
         return refined
+
+
+    def depth_log_likelihood(self, id: int) -> float:
+        """Mean log-likelihood, per metre, of a keyframe's depth in the map of all others; NaN if it has
+        none. Raises KeyframeError."""
+        keyframe = self._find(id)
+        self._restore_messages()
+        if keyframe.messages is not None:
+            self._allocator.refresh(keyframe)
+        with map_of_others(self.view, keyframe):
+            return log_likelihood(self.view, keyframe, keyframe.T_world_camera, self.sensor.max_depth)
 
 
 def _pose_of(id: int, T_world_camera: ArrayLike) -> Pose:

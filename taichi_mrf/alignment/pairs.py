@@ -1,0 +1,61 @@
+"""The measured step from one keyframe to another: where the depth of one fits the surface that the other has
+measured, and how well each direction is determined."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.alignment.levels import LEAST_POINTS, aligned, grids_of, levels_of
+from taichi_mrf.alignment.locate import OBSERVABLE, agreement
+from taichi_mrf.alignment.oriented_points import OrientedPoints
+from taichi_mrf.alignment.recorded import SURFACE_SIGMA_M, Recorded
+from taichi_mrf.alignment.surfels import Surfels
+from taichi_mrf.config.schema import PoseConfig
+from taichi_mrf.geometry.poses import Pose
+
+PAIR_SIGMA_M = 0.005
+"""What the alignment of two single images is worth along each direction that it determines, in metres.
+"""
+
+FEWEST_SURFELS = 50
+"""A surface of fewer cells aligns nothing."""
+
+
+@dataclass(frozen=True)
+class PairFit:
+    """Where an image fits a surface: ``T_world_camera`` (4, 4), with the ``information`` (6, 6) of its twist in
+    the camera's frame, guess included. ``overlap``, ``agreement`` and ``directions`` as in Located; ``cost``
+    by which ends of searches compare."""
+
+    T_world_camera: Pose
+    information: NDArray[np.float64]
+    overlap: float
+    agreement: float
+    directions: int
+    cost: float
+
+
+def fit_to(
+    points: OrientedPoints, surface: Surfels, guesses: Sequence[Pose], config: PoseConfig, first_cells_m: float
+) -> PairFit | None:
+    """The best of the ends of searches from some guesses, or None if there is too little to align.
+
+    ``config`` has the sigmas of the guesses. Surfaces further than about 1.5 times ``first_cells_m`` from
+    where a guess puts them are not found.
+    """
+    if len(points.points) < LEAST_POINTS or len(surface.keys) < FEWEST_SURFELS:
+        return None
+    levels = levels_of(points, grids_of(surface, first_cells_m))
+    lever_m = float(np.median(np.linalg.norm(points.points, axis=1)))
+    found = []
+    for T in guesses:
+        guess = Recorded(T, config)
+        end = aligned(levels, T, guess, lever_m, OBSERVABLE)
+        worth = end.equations.worth * (SURFACE_SIGMA_M / PAIR_SIGMA_M) ** 2
+        information = worth * end.equations.H + guess.H
+        overlap, agrees = end.equations.overlap, agreement(end.equations)
+        cost = end.equations.cost
+        found.append(PairFit(end.T_world_camera, information, overlap, agrees, end.directions, cost))
+    return min(found, key=lambda fit: fit.cost)
