@@ -6,8 +6,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.sensor.frame import Frame
-
 WIDTH, HEIGHT = 32, 24
 """Of the small pictures, in pixels."""
 
@@ -22,14 +20,13 @@ Picture = NDArray[np.float32]
 """(2, HEIGHT * WIDTH): inverse depth and brightness, each of mean 0 and length 1, or 0 if there is none."""
 
 
-def small_picture(frame: Frame) -> Picture:
-    """The small picture of a frame."""
-    depth_m = np.asarray(frame.depth_m, np.float32)
+def small_picture(depth_m: NDArray[np.float32], color: NDArray[np.uint8] | None) -> Picture:
+    """The small picture of a depth image (H, W) in metres and its colours (H, W, 3) RGB, if it has any."""
     measured = np.isfinite(depth_m) & (depth_m > 0)
     nearness = np.divide(1.0, depth_m, out=np.zeros_like(depth_m), where=measured)
     gray = np.zeros_like(depth_m)
-    if frame.color is not None:
-        gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    if color is not None:
+        gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY).astype(np.float32)
     return np.stack([_normalised(nearness, measured), _normalised(gray, gray > 0)])
 
 
@@ -50,20 +47,24 @@ class Appearances:
     """The small pictures of keyframes, by id."""
 
     def __init__(self) -> None:
-        self._ids: list[int] = []
-        self._pictures: list[Picture] = []
+        self._pictures: dict[int, Picture] = {}
 
     def add(self, id: int, picture: Picture) -> None:
         """Add a keyframe's picture."""
-        self._ids.append(id)
-        self._pictures.append(picture)
+        self._pictures[id] = picture
+
+    def like(self, id: int) -> dict[int, float]:
+        """How much each other keyframe looks like keyframe ``id``; see :meth:`likeness`."""
+        likeness = self.likeness(self._pictures[id])
+        del likeness[id]
+        return likeness
 
     def likeness(self, picture: Picture) -> dict[int, float]:
         """How much each keyframe looks like a picture, -1 to 1: the mean correlation of what both have."""
-        if not self._ids:
+        if not self._pictures:
             return {}
-        pictures = np.stack(self._pictures)
+        pictures = np.stack(list(self._pictures.values()))
         both = (np.abs(pictures).max(axis=2) > 0) & (np.abs(picture).max(axis=1) > 0)
         correlation = np.einsum("ncp,cp->nc", pictures, picture)
         mean = np.where(both, correlation, 0.0).sum(axis=1) / np.maximum(1, both.sum(axis=1))
-        return dict(zip(self._ids, mean.tolist(), strict=True))
+        return dict(zip(self._pictures, mean.tolist(), strict=True))

@@ -49,9 +49,9 @@ def align_jointly(
     known: KnownPoses,
     fixed: Collection[int] = (),
 ) -> Generator[None, None, dict[int, Pose]]:
-    """The poses, by keyframe, under which all points fit each other and what is ``known`` of the poses, in the
-    order of the ids; those that are ``fixed`` stay, and that with the lowest id. ``T_world_camera`` is where
-    the search begins. A generator: it yields once for each pair of keyframes in each step."""
+    """The poses, by keyframe, under which all points fit each other and what is ``known`` of the poses, in
+    the order of the ids; those that are ``fixed`` stay, and that with the lowest id. ``T_world_camera`` is
+    where the search begins. A generator: it yields once for each pair of keyframes in each step."""
     ids = sorted(points)
     free = np.array([i > 0 and id not in fixed for i, id in enumerate(ids)])
     poses = [T_world_camera[id] for id in ids]

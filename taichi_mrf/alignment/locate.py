@@ -22,7 +22,7 @@ from taichi_mrf.alignment.locate_around import FINEST_CELLS_M, found_around
 from taichi_mrf.alignment.oriented_points import OrientedPoints, oriented_points
 from taichi_mrf.alignment.point_to_plane import LARGEST_COST, NormalEquations
 from taichi_mrf.alignment.recorded import Recorded
-from taichi_mrf.alignment.seen_through import Sightlines
+from taichi_mrf.alignment.seen_through import Sightlines, looked_through
 from taichi_mrf.alignment.surfel_grid import SurfelGrid
 from taichi_mrf.alignment.wide_search import Around
 from taichi_mrf.config.schema import PoseConfig
@@ -111,6 +111,10 @@ class Locator:
         end, reason = found_around(points, sight, surface, around, begin, config, OBSERVABLE)
         return _judged(end, reason, config)
 
+    def looked_through(self, image: DepthImage, T_world_camera: Pose) -> float:
+        """The share of the surface that the image located last looks through from a pose (4, 4)."""
+        return looked_through(self._grids[-1].surface, image, T_world_camera)
+
     def _near(
         self,
         points: OrientedPoints,
@@ -139,8 +143,8 @@ class Locator:
         if compared:
             T = end.T_world_camera
             colored = aligned_with_color(levels, compared, T, priors[best], lever_m, OBSERVABLE)
-            least = max(LEAST_AGREEMENT, _agreement(end.equations) - WORSE_BY_COLOR)
-            if colored.equations.overlap >= config.min_overlap and _agreement(colored.equations) > least:
+            least = max(LEAST_AGREEMENT, agreement(end.equations) - WORSE_BY_COLOR)
+            if colored.equations.overlap >= config.min_overlap and agreement(colored.equations) > least:
                 end = colored
         turned, shifted = tangent_norms(guess, end.T_world_camera)
         reason = ""

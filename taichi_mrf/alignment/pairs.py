@@ -16,8 +16,7 @@ from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.geometry.poses import Pose
 
 PAIR_SIGMA_M = 0.005
-"""What the alignment of two single images is worth along each direction that it determines, in metres.
-"""
+"""What the alignment of two single images is worth along each direction that it determines, in metres."""
 
 FEWEST_SURFELS = 50
 """A surface of fewer cells aligns nothing."""
@@ -25,9 +24,9 @@ FEWEST_SURFELS = 50
 
 @dataclass(frozen=True)
 class PairFit:
-    """Where an image fits a surface: ``T_world_camera`` (4, 4), with the ``information`` (6, 6) of its twist in
-    the camera's frame, guess included. ``overlap``, ``agreement`` and ``directions`` as in Located; ``cost``
-    by which ends of searches compare."""
+    """Where an image fits a surface: ``T_world_camera`` (4, 4), with the ``information`` (6, 6) of its twist
+    in the camera's frame, guess included. ``overlap``, ``agreement`` and ``directions`` as in Located;
+    ``cost`` is what ends of searches are compared by."""
 
     T_world_camera: Pose
     information: NDArray[np.float64]
@@ -38,7 +37,11 @@ class PairFit:
 
 
 def fit_to(
-    points: OrientedPoints, surface: Surfels, guesses: Sequence[Pose], config: PoseConfig, first_cells_m: float
+    points: OrientedPoints,
+    surface: Surfels,
+    guesses: Sequence[Pose],
+    config: PoseConfig,
+    first_cells_m: float,
 ) -> PairFit | None:
     """The best of the ends of searches from some guesses, or None if there is too little to align.
 

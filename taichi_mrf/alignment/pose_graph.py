@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from taichi_mrf.alignment.pose_equations import PoseEquations
-from taichi_mrf.alignment.se3 import adjoint
+from taichi_mrf.alignment.se3 import adjoint, cross_matrix
 from taichi_mrf.geometry.poses import Pose
 
 Twists = NDArray[np.float64]
@@ -139,13 +139,22 @@ class _Problem:
 
     def _step(self, error: Twists, trust: NDArray[np.float64], damping: float) -> Twists:
         """The damped step of every pose, (n, 6), 0 for those that are fixed."""
-        # With T exp(xi), e changes by xi_second - Ad(inv(T_second) T_first) xi_first, but for terms in e.
+        # With T exp(xi), e changes by inv(J_r(e)) (xi_second - Ad(inv(T_second) T_first) xi_first).
         to_first = -adjoint(_inverse(self.T[self.second]) @ self.T[self.first])
-        H = trust[:, None, None] * self.information
-        g = np.einsum("nij,nj->ni", H, error)
+        J = _inverse_right_jacobian(error)
+        weighted = trust[:, None, None] * np.swapaxes(J, -1, -2) @ self.information
+        H, g = weighted @ J, np.einsum("nij,nj->ni", weighted, error)
         equations = PoseEquations(len(self.ids))
         equations.add_pairs(self.second, self.first, to_first, H, g)
         return equations.step(self.free, damping)
+
+
+def _inverse_right_jacobian(e: Twists) -> NDArray[np.float64]:
+    """(n, 6, 6): what a step behind exp(e) changes of e, but for terms of the fourth order."""
+    ad = np.zeros((len(e), 6, 6))
+    ad[:, :3, :3] = ad[:, 3:, 3:] = cross_matrix(e[:, 3:])
+    ad[:, :3, 3:] = cross_matrix(e[:, :3])
+    return np.asarray(np.eye(6) + 0.5 * ad + ad @ ad / 12)
 
 
 def _inverse(T: NDArray[np.float64]) -> NDArray[np.float64]:

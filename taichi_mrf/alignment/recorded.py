@@ -7,6 +7,7 @@ keyframe to the next.
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -65,11 +66,11 @@ class RecordedPoses:
 
 
 class TrackedSteps:
-    """The step from each pose to the next was tracked, with ``sigma_m`` metres and ``sigma_rad`` radians along
-    and about each axis."""
+    """The step from each pose to the next was tracked, with ``sigma_m`` metres and ``sigma_rad`` radians
+    along and about each axis."""
 
     def __init__(self, T_tracked: Sequence[Pose], sigma_m: float, sigma_rad: float) -> None:
-        self._steps_back = [inverse(b) @ a for a, b in zip(T_tracked, T_tracked[1:], strict=False)]
+        self._steps_back = [inverse(b) @ a for a, b in pairwise(T_tracked)]
         self._information = np.diag(np.repeat([sigma_m, sigma_rad], 3) ** -2.0)
 
     def add_to(self, equations: PoseEquations, poses: Sequence[Pose]) -> None:
@@ -77,7 +78,7 @@ class TrackedSteps:
         count = len(self._steps_back)
         if count == 0:
             return
-        steps = [inverse(a) @ b for a, b in zip(poses, poses[1:], strict=False)]
+        steps = [inverse(a) @ b for a, b in pairwise(poses)]
         errors = np.stack([twist(back @ step) for back, step in zip(self._steps_back, steps, strict=True)])
         to_first = np.stack([-adjoint(inverse(step)) for step in steps])
         H = np.repeat(self._information[None], count, axis=0)

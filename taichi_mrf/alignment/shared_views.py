@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-
 class SharedViews:
     """The cells (n,) that each keyframe has measured something in, by id."""
 
@@ -30,8 +29,8 @@ class SharedViews:
         return {id: count / len(cells) for id, count in counts.items()}
 
     def partners(self, cells: NDArray[np.int64], most: int, least: float, without: int) -> list[int]:
-        """Those keyframes that have seen most of some cells, ``most`` of them at most, each at least the share
-        ``least``; not keyframe ``without``."""
+        """Those keyframes that have seen most of some cells, ``most`` of them at most, each at least the
+        share ``least``; not keyframe ``without``."""
         shares = self.shares(cells)
         known = [id for id, share in shares.items() if id != without and share >= least]
         return sorted(known, key=lambda id: (-shares[id], -id))[:most]

@@ -68,7 +68,8 @@ def run_live(options: Live) -> int:
             state = session.state
             result = state.result()
             if result.track is not None:
-                print_line(f"tracking: {len(result.track.frames)} frames found, {result.track.lost} lost")
+                found, lost = len(result.track.frames), result.track.lost
+                print_line(f"tracking: {found} frames found, {lost} lost, {result.loops_closed} loops closed")
             # A user who stops the run does not wait for the check and the pictures.
             whole = request.signal is None and not result.interrupted
             _, written = write_run(

@@ -71,6 +71,7 @@ class Run(SessionCore):
             sweep=lambda id: self.mapper.sweep(id),
             remember_frames=self.policy.out is not None,
             before_adding=self._show_adding,
+            fixed=lambda: self.mapper.placed_by_hand(),
         )
         replay = source.new_replay() if source.new_replay else None
         if replay is not None and self.replay is not None:

@@ -31,6 +31,7 @@ from taichi_mrf.live.run import Policy, Run
 from taichi_mrf.live.session_core import EDITS, WAIT_SECONDS
 from taichi_mrf.live.source import Source
 from taichi_mrf.mapping.intake import Added, Full, Lost, Skipped, UnreadableFrame
+from taichi_mrf.mapping.loops import Closure
 from taichi_mrf.mapping.refinement import PoseRefiner
 from taichi_mrf.mapping.rounds import AlignmentRounds, RoundStep
 from taichi_mrf.sensor.frame import Frame
@@ -195,6 +196,8 @@ class Session:
         state.full = None
         state.progress.keyframe_taken()
         state.send(state.mapper.describe(entry))
+        if added.closure is not None:
+            self._show_closed(added.closure)
         state.mapper.renew()
         if state.policy.keep_live is not None:
             for each in state.mapper.surplus(entry, state.policy.keep_live):
@@ -203,6 +206,13 @@ class Session:
         if state.stepping and state.replay is not None:
             state.stepping = False
             state.replay.pause()
+
+    def _show_closed(self, closure: Closure) -> None:
+        state = self.state
+        for entry in state.mapper.follow(closure.moved):
+            state.send(state.mapper.describe(entry))
+        far = f"{100 * closure.off_m:.0f} cm"
+        state.send(Notice(f"loop closed: the camera was off by {far}, {len(closure.moved)} keyframes moved"))
 
     def _settle(self) -> bool:
         def settle() -> None:

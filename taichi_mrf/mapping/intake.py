@@ -5,14 +5,14 @@ follows from it (a progress bar, a notice, the end of the run) is up to them.
 """
 
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
 
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import CapacityError, LostFrameError
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.mapping.loops import loop_closer_of
+from taichi_mrf.mapping.loops import Closure, loop_closer_of
 from taichi_mrf.mapping.refinement import refiner_of
 from taichi_mrf.mapping.result import MappingResult
 from taichi_mrf.mapping.selection import KeyframeSelector, is_held_out
@@ -33,11 +33,13 @@ class UnreadableFrame:
 @dataclass(frozen=True)
 class Added:
     """The frame, at the pose that was found for it, is keyframe ``keyframe`` of the map, with ``rays``
-    measured pixels. Its marginals are not inferred yet, unless the intake sweeps or aligns it."""
+    measured pixels. Its marginals are not inferred yet, unless the intake sweeps or aligns it. ``closure`` is
+    the loop that it closes, which has moved other keyframes."""
 
     frame: Frame
     keyframe: int
     rays: int
+    closure: Closure | None = None
 
 
 @dataclass(frozen=True)
@@ -90,17 +92,19 @@ class Intake:
         sweep: Callable[[int], None] | None = None,
         remember_frames: bool = True,
         before_adding: Callable[[Frame], None] = lambda frame: None,
+        fixed: Callable[[], Collection[int]] = lambda: (),
     ) -> None:
         """``tracked``: the poses of frames are found by tracking. ``hold_out``: one frame in so many is held
         out. ``sweep`` is called with each new keyframe that is not aligned, which is swept anyway, so that
         the map can be looked at. ``remember_frames``: the result lists skipped frames and tracked poses,
         which grow with the run. ``before_adding`` is called with each frame that is about to be added.
+        ``fixed`` returns the ids of keyframes that no closed loop may move.
         Raises ConfigError if poses are to be refined or tracked in a map whose method cannot."""
         self.map = m
         self.result = MappingResult(m)
-        self.refiner = refiner_of(m, config.poses, tracked)
         self.tracker = tracker_of(m, config.poses) if tracked else None
-        self._loops = loop_closer_of(self.tracker, config.poses)
+        self.refiner = refiner_of(m, config.poses, tracked)
+        self._loops = loop_closer_of(self.tracker, config.poses, fixed)
         self._aligns = config.poses.refine
         if self.tracker is not None:
             self.result.track = Track()
@@ -143,23 +147,23 @@ class Intake:
             keyframe = self._added(frame)
         except CapacityError as error:
             return Full(f"frame {frame.name} does not fit: {error}", error)
+        closure = None
         if self.tracker is not None:
             tracked = self.tracker.took(keyframe)
             if self._remembers and self.result.track is not None:
                 self.result.track.frames[index] = tracked
-        if self._loops is not None:
-            with self.result.timed("closing loops"):
-                closure = self._loops.took(keyframe, frame)
-            if closure is not None: print(closure)
+            closure = self._close_loops(keyframe)
+            frame = replace(frame, T_world_camera=self.map.keyframes[keyframe].T_world_camera)
         self._selector.accept(frame.T_world_camera, frame.sensor)
-        return Added(frame, keyframe, self.map.keyframes[keyframe].rays)
+        return Added(frame, keyframe, self.map.keyframes[keyframe].rays, closure)
 
     def go_on_from(self, keyframe: int, T_recorded: Pose, sensor: str = "") -> None:
         """Go on after a keyframe of a sensor that the map of an earlier run has brought along."""
         T_world_camera = self.map.keyframes[keyframe].T_world_camera
         if self.tracker is not None:
             self.tracker.resume(keyframe)
-        if self.refiner is not None:
+            self._close_loops(keyframe)
+        if self.refiner is not None and self._aligns:
             T_world_camera = T_recorded
             self.refiner.note_recorded(keyframe, T_recorded)
         self._selector.accept(T_world_camera, sensor)
@@ -209,6 +213,20 @@ class Intake:
             self.map.remove_keyframe(keyframe)
             raise
         return keyframe
+
+    def _close_loops(self, keyframe: int) -> Closure | None:
+        """Enter a keyframe into the pose graph, which may move others."""
+        if self._loops is None:
+            return None
+        with self.result.timed("closing loops"):
+            try:
+                closure = self._loops.took(keyframe)
+            except CapacityError as error:
+                warnings.warn(f"closing a loop does not fit: {error}", stacklevel=2)
+                return None
+        if closure is not None:
+            self.result.loops_closed += 1
+        return closure
 
     def _note_skipped(self, name: str, problem: str) -> None:
         if self._remembers:

@@ -110,7 +110,7 @@ def map_sequence(
     if window is not None and map_path is not None:
         window.park_beside(map_path)
     intake = Intake(m, config, tracked=dataset.tracked, hold_out=hold_out_of(dataset, config))
-    if intake.refiner is not None and resume_from is not None:
+    if intake.refiner is not None and config.poses.refine and resume_from is not None:
         intake.refiner.repeat(resume_from.keyframes.values())
     follower = follower_of(m, dataset, config.poses)
     intake.result.followed = None if follower is None else follower.done

@@ -91,9 +91,12 @@ class PoseRefiner:
 
     def joint(self, fixed: Collection[int] = ()) -> Generator[None, None, dict[int, Pose]]:
         """The poses, by id, at which all keyframes fit each other and their recorded poses best; nothing is
-        moved. One that would go further than the configuration allows stays, as do those that are ``fixed``.
+        moved. One that would go further than the configuration allows stays, as do those that are ``fixed``,
+        and all that were tracked once some are frozen: these cannot follow.
         A generator: it yields for each pair of keyframes."""
         stood = {id: keyframe.T_world_camera for id, keyframe in self.map.keyframes.items()}
+        if self.tracked and self.map.frozen:
+            return stood
         found = yield from align_jointly(self._points(), stood, self._known(stood), fixed)
         return {id: T if self._is_near(stood[id], T) else stood[id] for id, T in found.items()}
 

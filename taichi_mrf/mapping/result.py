@@ -20,9 +20,10 @@ class MappingResult:
     frame by name, ``held_out`` the dataset indices of the frames that check the map, ``seconds`` the time of
     each stage. ``interrupted``: the run was stopped before its end; the map holds everything up to there.
     ``poses`` are, if they were refined, the recorded and the refined pose of every keyframe; ``track`` has,
-    if poses were tracked, the pose of each frame. ``full`` names the frame that did not fit into memory and
-    says why; the map holds those before it. ``steps``: whether depth and recorded poses agree, if that was
-    checked. ``followed``: what became of poses that changed, if there were any to follow.
+    if poses were tracked, the pose of each frame, and ``loops_closed`` counts the loops. ``full`` names the
+    frame that did not fit into memory and says why; the map holds those before it. ``steps``: whether depth
+    and recorded poses agree, if that was checked. ``followed``: what became of poses that changed, if there
+    were any to follow.
     """
 
     map: OccupancyMap
@@ -35,6 +36,7 @@ class MappingResult:
     interrupted: bool = False
     poses: list[PoseChange] = field(default_factory=list)
     track: Track | None = None
+    loops_closed: int = 0
     full: str | None = None
     steps: StepCheck | None = None
     followed: Followed | None = None

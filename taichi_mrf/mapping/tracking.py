@@ -4,9 +4,9 @@ The first frame fixes the map's frame. Each later one is aligned with what the k
 (alignment/locate.py), from two guesses: that the camera stands still, and that it moves on as it did. Both
 have turned as the gyroscope says, where there is one (turning.py). If neither fits, the scan of a sensor that
 sees around is searched for in all headings and metres around. A frame that fits nowhere is lost; the next one
-is searched around the last pose that was found, and around the first. There is no loop closure: errors of
-alignment add up along the way, until the camera sees again what it has mapped at the beginning. Poses are
-kept relative to the keyframe of the moment, so that they follow when it is moved.
+is searched around the last pose that was found, around the first, and around those of keyframes that look
+like it. Errors of alignment add up along the way, until a loop is closed (loops.py). Poses are kept relative
+to the keyframe of the moment, so that they follow when it is moved.
 """
 
 import math
@@ -16,6 +16,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.alignment.appearance import Appearances, Picture, small_picture
 from taichi_mrf.alignment.keyframe_pictures import KeyframePictures
 from taichi_mrf.alignment.locate import Locator
 from taichi_mrf.alignment.se3 import moved, twist
@@ -50,6 +51,14 @@ was lost, and at most. A lidar that is carried through a building moves by up to
 EXPECTED_M = 1.0
 """Standard deviation of a place that follows from constant motion, for one frame. A walker who stops or turns
 is 1 to 2 m from there after 1.5 s."""
+
+MOST_THROUGH, LITTLE_THROUGH = 0.3, 0.05
+"""Share of what is mapped that a camera's image may look through, and after lost frames: a camera that was
+carried elsewhere fits by chance at a wall, but not without looking through what stood there."""
+
+PLACES, ALIKE = 4, 0.5
+"""Keyframes at which a lost camera is searched for, at most, and how much they have to look like its image
+(alignment/appearance.py)."""
 
 LONGEST_AHEAD = 3.0
 """A motion is continued for this many times as long as it was observed, at most."""
@@ -125,6 +134,7 @@ class Tracker:
         self._gyro_config = replace(self._config, rotation_sigma=GYRO_RAD)
         self._turns = GyroTurns()
         self._pictures = KeyframePictures()
+        self.appearances = Appearances()
         self._frame: Frame | None = None
         self._keyframe: int | None = None
         self._first: TrackedFrame | None = None
@@ -151,18 +161,25 @@ class Tracker:
         image = DepthImage.upload(depth_m, frame.camera, m.noise, own=frame.own_for(m.sensor))
         around = self._around(frame.camera, frame.stamp) if sees_around(frame.camera) else None
         turn = self._turns.since(frame, self._last.stamp)
-        guesses = self._guesses(frame.stamp, back=around is None, turn=turn)
+        guesses = turned(self._guesses(frame.stamp), self._pose(self._last), turn)
+        if around is None and self._lost:
+            guesses += self._known_places(small_picture(depth_m, frame.color))
         config = self._config if turn is None or self._lost else self._gyro_config
         colors = partial(self._pictures.compared_with, frame, m.keyframes) if self._config.use_color else None
         located = self._locator.locate(image, guesses, m.keyframes, config, around, colors)
-        if located.T_world_camera is None:
+        T_world_camera, reason = located.T_world_camera, located.reason
+        if T_world_camera is not None and around is None:
+            through = self._locator.looked_through(image, T_world_camera)
+            if through > (LITTLE_THROUGH if self._lost else MOST_THROUGH):
+                T_world_camera, reason = None, f"it would look through {100 * through:.0f}% of what is mapped"
+        if T_world_camera is None:
             self._lost += 1
-            raise LostFrameError(f"{frame.name}: tracking lost: {located.reason}")
+            raise LostFrameError(f"{frame.name}: tracking lost: {reason}")
         if located.directions == 6:
-            self._turns.note(frame, self._last.stamp, self._pose(self._last), located.T_world_camera)
+            self._turns.note(frame, self._last.stamp, self._pose(self._last), T_world_camera)
         if self._lost:
             self._last = None  # the motion since then is unknown
-        return self._found(frame, located.T_world_camera, located.directions)
+        return self._found(frame, T_world_camera, located.directions)
 
     def took(self, keyframe: int) -> TrackedFrame:
         """Note that the frame that was followed last has become this keyframe of the map, and may have been
@@ -172,6 +189,8 @@ class Tracker:
         self._keyframe = keyframe
         if self._frame is not None and self._config.use_color:
             self._pictures.keep(keyframe, self._frame)
+        color = None if self._frame is None else self._frame.color
+        self._note_appearance(keyframe, color)
         self._last = replace(
             self._tracked(before.name, before.stamp, T_world_camera, before.directions), before=before
         )
@@ -184,6 +203,10 @@ class Tracker:
         self._keyframe = keyframe
         self._last = self._tracked(keyframes[keyframe].name, math.nan, keyframes[keyframe].T_world_camera, 6)
         self._first = self._first or self._last
+        self._note_appearance(keyframe, keyframes[keyframe].color)
+
+    def _note_appearance(self, keyframe: int, color: NDArray[np.uint8] | None) -> None:
+        self.appearances.add(keyframe, small_picture(self.map.keyframes[keyframe].depth_m, color))
 
     def _found(self, frame: Frame, T_world_camera: Pose, directions: int) -> tuple[Frame, TrackedFrame]:
         T_world_camera = as_pose(T_world_camera)  # or rounding errors would add up over the frames
@@ -219,10 +242,8 @@ class Tracker:
             expected_m = expected_m + ahead * (expected_m - self._pose(self._before)[:3, 3])
         return Around(T_last, camera.up, reach_m, expected_m, EXPECTED_M * (1 + self._lost))
 
-    def _guesses(self, stamp: float, back: bool, turn: NDArray[np.float64] | None = None) -> list[Pose]:
-        """Where the camera may be, with the ``turn`` (3, 3) since the last frame if it was measured; after
-        lost frames also where it began, if it may be ``back`` there. A sensor that sees around is searched
-        for anyway, and corridors have two ends that look alike."""
+    def _guesses(self, stamp: float) -> list[Pose]:
+        """Where the camera may be if it stands still, and if it moves on."""
         assert self._last is not None
         T_last = self._pose(self._last)
         guesses = [T_last]
@@ -230,10 +251,16 @@ class Tracker:
         if self._before is not None and ahead is not None:
             step = twist(inverse(self._pose(self._before)) @ T_last)
             guesses.append(moved(T_last, ahead * step))
-        guesses = turned(guesses, T_last, turn)
-        if back and self._lost and self._first is not None:
-            guesses.append(self._pose(self._first))
         return guesses
+
+    def _known_places(self, picture: Picture) -> list[Pose]:
+        """Where a lost camera may be: where it began, and where keyframes look like its picture."""
+        keyframes = self.map.keyframes
+        likeness = self.appearances.likeness(picture)
+        known = [id for id, how in likeness.items() if how > ALIKE and id in keyframes]
+        best = sorted(known, key=lambda id: -likeness[id])[:PLACES]
+        first = [] if self._first is None else [self._pose(self._first)]
+        return [*first, *(keyframes[id].T_world_camera for id in best)]
 
 
 def _ratio(ahead: float, observed: float) -> float:

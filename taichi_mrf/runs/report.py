@@ -48,7 +48,7 @@ def run_report(
         "residual": result.residual,
         "seconds": rounded(result.seconds),
         "accuracy": None if check is None else {"frames": check.frames, **dataclasses.asdict(check.error)},
-        "tracking": None if result.track is None else _tracking(result.track),
+        "tracking": None if result.track is None else _tracking(result.track, result.loops_closed),
         "followed": None if result.followed is None else dataclasses.asdict(result.followed),
         "steps": None if result.steps is None else _steps_report(result.steps),
         "poses": [_pose_report(change) for change in result.poses],
@@ -67,8 +67,9 @@ def rounded(seconds: dict[str, float]) -> dict[str, float]:
     return {stage: round(value, 3) for stage, value in seconds.items()}
 
 
-def _tracking(track: Track) -> dict[str, int]:
-    return {"frames": len(track.frames), "lost": track.lost, "unsure": track.unsure}
+def _tracking(track: Track, loops_closed: int) -> dict[str, int]:
+    frames = len(track.frames)
+    return {"frames": frames, "lost": track.lost, "unsure": track.unsure, "loops_closed": loops_closed}
 
 
 def unfinished_report(

@@ -12,6 +12,7 @@ from small_scenes import experiment, make_data
 
 from taichi_mrf.alignment.joint import align_jointly
 from taichi_mrf.alignment.oriented_points import oriented_points
+from taichi_mrf.alignment.recorded import RecordedPoses
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.config.schema import Config, EvaluationConfig, PoseConfig, VolumeConfig
 from taichi_mrf.datasets import Dataset, open_dataset
@@ -72,6 +73,10 @@ def errors(poses: Sequence[Pose]) -> np.ndarray:
     each = [tangent_norms(a, b) for a, b in zip(true, poses, strict=True)]
     assert np.array_equal(poses[0], true[0])
     return np.mean(each[1:], axis=0)
+
+
+def recorded(poses: dict[int, Pose], config: PoseConfig | None = None) -> RecordedPoses:
+    return RecordedPoses([poses[id] for id in sorted(poses)], config or PoseConfig())
 
 
 def test_all_at_once_takes_back_more_than_half() -> None:

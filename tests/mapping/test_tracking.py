@@ -202,7 +202,7 @@ def test_the_command_line_tracks_and_leaves_the_trajectory(tmp_path: Path) -> No
     done = taichi_mrf("map", path, "--out", out, "--voxel-size", "0.1", *flags)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
-    assert report["tracking"] == {"frames": 12, "lost": 0, "unsure": 0}
+    assert report["tracking"] == {"frames": 12, "lost": 0, "unsure": 0, "loops_closed": 0}
     assert report["accuracy"]["frames"] == 1
     assert any("drift" in note for note in report["notes"])
     found = read_timed_poses(out / "trajectory.txt")

@@ -54,9 +54,9 @@ def _keyframes_text(keyframes: int, frozen: int) -> str:
 
 def _tracking_text(tracking: dict[str, int]) -> str:
     text = f"{tracking['frames']} frames found, {tracking['lost']} lost"
-    return text + (
-        f", {tracking['unsure']} where depth constrained the pose too little" if tracking["unsure"] else ""
-    )
+    if tracking["unsure"]:
+        text += f", {tracking['unsure']} where depth constrained the pose too little"
+    return text + (f"; {tracking['loops_closed']} loops closed" if tracking["loops_closed"] else "")
 
 
 def _accuracy_text(accuracy: dict[str, Any] | None) -> str:

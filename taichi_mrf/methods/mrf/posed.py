@@ -208,7 +208,6 @@ class PosedMRF(ReadableMRF):
             self.move_keyframe(id, refined.T_world_camera)
         return refined
 
-
     def depth_log_likelihood(self, id: int) -> float:
         """Mean log-likelihood, per metre, of a keyframe's depth in the map of all others; NaN if it has
         none. Raises KeyframeError."""
