@@ -24,11 +24,16 @@ from taichi_mrf.alignment.surfel_grid import SurfelGrid
 from taichi_mrf.alignment.surfels import surfels_of
 from taichi_mrf.geometry.poses import Pose, inverse
 
-CELLS_M = (0.12, 0.06, 0.03)
-"""Widths of the surfels' cells in metres, from coarse to fine."""
+Levels = tuple[tuple[float, int], ...]
+"""From coarse to fine: the width of the surfels' cells in metres, and which of the points a level takes along
+rows and columns."""
 
-THINNED = (6, 3, 2)
-"""Which of the points each level takes along rows and columns."""
+LEVELS: Levels = ((0.12, 6), (0.06, 3))
+"""For poses that were recorded. With the third level eight views with little in common are left with twice
+the error."""
+
+TRACKED_LEVELS: Levels = (*LEVELS, (0.03, 2))
+"""For tracked poses, whose views have much in common: it takes the built-in room from 0.9 to 0.6 cm RMS."""
 
 STEPS = 6
 """Steps at each level, at most."""
@@ -48,6 +53,7 @@ def align_jointly(
     T_world_camera: Mapping[int, Pose],
     known: KnownPoses,
     fixed: Collection[int] = (),
+    levels: Levels = LEVELS,
 ) -> Generator[None, None, dict[int, Pose]]:
     """The poses, by keyframe, under which all points fit each other and what is ``known`` of the poses, in
     the order of the ids; those that are ``fixed`` stay, and that with the lowest id. ``T_world_camera`` is
@@ -56,7 +62,7 @@ def align_jointly(
     free = np.array([i > 0 and id not in fixed for i, id in enumerate(ids)])
     poses = [T_world_camera[id] for id in ids]
     pairs = _partners([points[id] for id in ids], poses)
-    for cell_size, every in zip(CELLS_M, THINNED, strict=True):
+    for cell_size, every in levels:
         # In the keyframes' own frames, so that surfels stay as they are when poses change.
         grids = [SurfelGrid(surfels_of(points[id], np.eye(4), cell_size)) for id in ids]
         thinned = [points[id].thinned(every) for id in ids]
@@ -90,6 +96,6 @@ def _equations(
 
 def _partners(points: Sequence[OrientedPoints], poses: Sequence[Pose]) -> list[tuple[int, int]]:
     """Pairs (i, k): the points of i are aligned with the surfels of k."""
-    cells = [surfels_of(p.thinned(4), T, 2 * CELLS_M[0]).keys for p, T in zip(points, poses, strict=True)]
+    cells = [surfels_of(p.thinned(4), T, 2 * LEVELS[0][0]).keys for p, T in zip(points, poses, strict=True)]
     views = SharedViews(dict(enumerate(cells)))
     return [(i, k) for i, mine in enumerate(cells) for k in views.partners(mine, PARTNERS, SHARED, i)]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taichi_mrf.alignment.joint import align_jointly
+from taichi_mrf.alignment.joint import LEVELS, TRACKED_LEVELS, align_jointly
 from taichi_mrf.alignment.oriented_points import OrientedPoints, oriented_points
 from taichi_mrf.alignment.recorded import KnownPoses, RecordedPoses, TrackedSteps
 from taichi_mrf.config.registry import methods_with
@@ -97,7 +97,8 @@ class PoseRefiner:
         stood = {id: keyframe.T_world_camera for id, keyframe in self.map.keyframes.items()}
         if self.tracked and self.map.frozen:
             return stood
-        found = yield from align_jointly(self._points(), stood, self._known(stood), fixed)
+        levels = TRACKED_LEVELS if self.tracked else LEVELS
+        found = yield from align_jointly(self._points(), stood, self._known(stood), fixed, levels)
         return {id: T if self._is_near(stood[id], T) else stood[id] for id, T in found.items()}
 
     def log_likelihood(self) -> Generator[None, None, float]:
