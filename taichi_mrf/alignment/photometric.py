@@ -32,9 +32,9 @@ ENOUGH_POINTS = 200
 TILES = 8
 """The image is divided into this many times as many tiles, to see how far the points are spread."""
 
-LEAST_SPREAD, ENOUGH_SPREAD = 0.15, 0.4
+LEAST_SPREAD, ENOUGH_SPREAD = 0.45, 0.65
 """Share of the tiles that hold a point, up to which colour does not count, and from which on it does in full.
-One line on a bare wall, which may be the edge of a shadow, must not move the camera."""
+Few lines on bare walls, which may be edges of shadows, must not move the camera."""
 
 LEAST_SIGMA, LARGEST_SIGMA = 0.02, 0.1
 """Bounds on the sigma of the contrast. Where residuals spread further, the pictures do not show the same."""

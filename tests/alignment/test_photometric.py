@@ -97,15 +97,22 @@ def test_all_points_together_are_one_measurement_of_the_direction(
         some = TexturedPoints(points.points[:count], points.contrast[:count])
         return Photometric.seen_from(image, some, AHEAD)
 
-    full, few = first(400), first(ENOUGH_POINTS // 4)
+    full, few = first(400), first(ENOUGH_POINTS // 2)
     assert full is not None
     assert few is not None
     turns = [np.trace(each.linearised(AHEAD).H[3:5, 3:5]) * COLOR_SIGMA_RAD**2 for each in (full, few)]
     assert turns[0] == pytest.approx(0.9, abs=0.05)  # a tenth looks different
-    assert turns[1] == pytest.approx(0.9 / 4, abs=0.05)
-    assert (
-        Photometric.seen_from(image, TexturedPoints(points.points[:19], points.contrast[:19]), AHEAD) is None
-    )
+    assert turns[1] == pytest.approx(0.9 / 2, abs=0.05)
+    assert first(19) is None
+
+
+def test_points_on_one_line_do_not_count(smooth: tuple[ContrastImage, TexturedPoints]) -> None:
+    image, points = smooth
+    across = AHEAD[:3, 3] + AHEAD[:3, 2] + np.linspace(-0.5, 0.5, 400)[:, None] * AHEAD[:3, 0]
+    line = Photometric.seen_from(image, TexturedPoints(across.astype(np.float32), points.contrast), AHEAD)
+    assert line is not None
+    assert line.worth == 0
+    assert not line.linearised(AHEAD).H.any()
 
 
 def test_a_textured_wall_gives_the_pose_back() -> None:
