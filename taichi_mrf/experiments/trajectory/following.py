@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -23,8 +23,6 @@ from taichi_mrf.mapping.tracking import STEPS
 from taichi_mrf.methods.capabilities import can_refine_poses
 from taichi_mrf.methods.protocol import OccupancyMap
 
-CLOSES_LOOPS = "close_loops" in {field.name for field in fields(PoseConfig)}
-
 TRACKING, LOOPS_CLOSED = "tracking", "tracking, loops closed"
 
 WARM_UP = 8
@@ -40,10 +38,8 @@ FIGURES = ("1.5sigma", "5cm", "log_likelihood")
 def configurations(voxel_size: float) -> dict[str, Config]:
     """Of maps whose camera is tracked, without loop closure and with it, by the name of the way."""
     base = Config(voxel_size=voxel_size, keyframes=STEPS, evaluation=EvaluationConfig(hold_out=HOLD_OUT))
-    if not CLOSES_LOOPS:
-        return {TRACKING: base}
     switched = {TRACKING: False, LOOPS_CLOSED: True}
-    return {name: replace(base, poses=PoseConfig(**{"close_loops": on})) for name, on in switched.items()}
+    return {name: replace(base, poses=PoseConfig(close_loops=on)) for name, on in switched.items()}
 
 
 @dataclass(frozen=True)
