@@ -35,8 +35,9 @@ def map_of_others(view: View, keyframe: Keyframe) -> Iterator[None]:
 def log_likelihood(view: View, keyframe: Keyframe, T_world_camera: Pose, max_depth: float) -> float:
     """Mean log density, per metre, of every STRIDE-th pixel's depth, measured from a pose."""
     measured = np.zeros(keyframe.camera.shape, np.float32)
-    every = slice(STRIDE // 2, None, STRIDE)
-    measured[every, every] = keyframe.depth_m[every, every]
+    # Rays without a pattern are rows of their own.
+    rows, columns = (slice(STRIDE // 2, None, STRIDE) if n > STRIDE else slice(None) for n in measured.shape)
+    measured[rows, columns] = keyframe.depth_m[rows, columns]
     asked = measured > 0
     if not asked.any():
         return float("nan")

@@ -56,6 +56,11 @@ MOST_THROUGH, LITTLE_THROUGH = 0.3, 0.05
 """Share of what is mapped that a camera's image may look through, and after lost frames: a camera that was
 carried elsewhere fits by chance at a wall, but not without looking through what stood there."""
 
+LONG_LOST, STRICT = 10, (0.8, 0.012)
+"""After so many lost frames: the least share of its points near what is mapped, and the most that its image
+may look through. Images of the room and the kitchen that were taken there have .96 and .011 at worst, those
+of two corridors that fit in the room all the same .47 to .99 and .014 to .045."""
+
 PLACES, ALIKE = 4, 0.5
 """Keyframes at which a lost camera is searched for, at most, and how much they have to look like its image
 (alignment/appearance.py)."""
@@ -169,10 +174,8 @@ class Tracker:
         located = self._locator.locate(image, guesses, m.keyframes, config, around, colors)
         T_world_camera, reason = located.T_world_camera, located.reason
         if T_world_camera is not None and around is None:
-            through = self._locator.looked_through(image, T_world_camera)
-            if through > (LITTLE_THROUGH if self._lost else MOST_THROUGH):
-                T_world_camera, reason = None, f"it would look through {100 * through:.0f}% of what is mapped"
-        if T_world_camera is None:
+            reason = self._objection(located.overlap, self._locator.looked_through(image, T_world_camera))
+        if T_world_camera is None or reason:
             self._lost += 1
             raise LostFrameError(f"{frame.name}: tracking lost: {reason}")
         if located.directions == 6:
@@ -180,6 +183,19 @@ class Tracker:
         if self._lost:
             self._last = None  # the motion since then is unknown
         return self._found(frame, T_world_camera, located.directions)
+
+    def _objection(self, overlap: float, through: float) -> str:
+        """Why a camera is not believed to be where its image fits, with these shares near what is mapped and
+        looking through it; empty if it is. The longer it was lost, the further it may be from there."""
+        least, most = (
+            STRICT if self._lost > LONG_LOST else (0.0, LITTLE_THROUGH if self._lost else MOST_THROUGH)
+        )
+        if through > most:
+            return f"it would look through {100 * through:.1f}% of what is mapped"
+        if overlap < least:
+            near, needed = 100 * overlap, 100 * least
+            return f"{near:.0f}% of its points lie near what is mapped, and {needed:.0f}% are needed"
+        return ""
 
     def took(self, keyframe: int) -> TrackedFrame:
         """Note that the frame that was followed last has become this keyframe of the map, and may have been
