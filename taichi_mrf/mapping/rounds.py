@@ -17,9 +17,9 @@ from taichi_mrf.mapping.settling import OutcomeT, Settling
 from taichi_mrf.methods.capabilities import AligningMap
 
 LOSS = 0.1
-"""Log-likelihood per pixel that a round may cost. Keyframes that were aligned one after the other fit each
-other a little better than all together, where recorded poses count too; if they do not fit, more is lost by
-far."""
+"""Log-likelihood per pixel that a round may cost if poses were recorded. Keyframes that were aligned one after
+the other fit each other a little better than all together, where recorded poses count too; if they do not fit,
+more is lost by far. Of a tracked camera nothing may be lost."""
 
 SETTLED = 0.02
 """Share of a voxel: rounds end when no keyframe was moved further."""
@@ -94,7 +94,7 @@ class AlignmentRounds(Settling[RoundStep, bool]):
                 if has_settled(self._map, stood):
                     break
                 after = yield from self._log_likelihood()
-                if is_worse(before, after):
+                if is_worse(before, after, 0.0 if self._refiner.tracked else LOSS):
                     self._move_all(stood)
                     break
                 before = after
@@ -134,6 +134,6 @@ def has_settled(m: AligningMap, stood: Mapping[int, Pose]) -> bool:
     return max(moved_m, default=0.0) < SETTLED * m.voxel_size
 
 
-def is_worse(before: float, after: float) -> bool:
+def is_worse(before: float, after: float, loss: float) -> bool:
     """Whether a round made the depth less likely by more than it may."""
-    return not after > before - LOSS
+    return not after > before - loss
