@@ -17,9 +17,9 @@ from taichi_mrf.mapping.settling import OutcomeT, Settling
 from taichi_mrf.methods.capabilities import AligningMap
 
 LOSS = 0.1
-"""Log-likelihood per pixel that a round may cost if poses were recorded. Keyframes that were aligned one after
-the other fit each other a little better than all together, where recorded poses count too; if they do not fit,
-more is lost by far. Of a tracked camera nothing may be lost."""
+"""Log-likelihood per pixel that a round may cost if poses were recorded. Keyframes that were aligned one
+after the other fit each other a little better than all together, where recorded poses count too; if they do
+not fit, more is lost by far. Of a tracked camera nothing may be lost."""
 
 SETTLED = 0.02
 """Share of a voxel: rounds end when no keyframe was moved further."""
