@@ -6,11 +6,13 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+import tracked_room
 from datasets_recordings import stamped_line
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import DatasetError, FrameError
-from taichi_mrf.geometry.poses import look_at
+from taichi_mrf.geometry.poses import inverse, look_at
+from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.sensor.camera import PinholeCamera
 
 COUNT = 6
@@ -152,7 +154,7 @@ def test_a_recording_is_a_sequence_that_ends(library: type[Pipeline], recording:
         frame = source.read(i)
         np.testing.assert_allclose(frame.depth_m, (STEPS + 10 * i) * 0.0005, rtol=1e-6)
         assert frame.stamp == pytest.approx(stamp(i))
-    assert any("stand still" in note and "?poses=FILE" in note for note in source.notes)
+    assert any("tracked" in note and "?poses=FILE" in note for note in source.notes)
     with pytest.raises(IndexError, match="6 frames"):
         source.read(COUNT)
     del source
@@ -222,16 +224,57 @@ def test_a_camera_can_be_thinned_out(library: type[Pipeline]) -> None:
     np.testing.assert_allclose(source.read(0).depth_m, STEPS[::2, ::2] * 0.0005, rtol=1e-6)
 
 
-def test_poses_can_be_left_to_be_tracked(library: type[Pipeline], recording: Path) -> None:
-    for name in ("realsense:?poses=track", f"realsense:{recording}?poses=track"):
+def test_without_a_file_poses_are_tracked(library: type[Pipeline], recording: Path) -> None:
+    for name in ("realsense:", "realsense:?poses=track", f"realsense:{recording}"):
         source = open_dataset(name)
         assert source.tracked
-        assert not any("stand still" in note for note in source.notes)
         assert source.read(0).T_world_camera.shape == (4, 4)
-    assert len(open_dataset(f"realsense:{recording}", track=True)) == COUNT
-    assert not open_dataset("realsense:").tracked
+    assert len(open_dataset(f"realsense:{recording}?poses=still", track=True)) == COUNT
+
+
+def test_a_camera_may_stand_still(library: type[Pipeline], recording: Path) -> None:
+    for name in ("realsense:?poses=still", f"realsense:{recording}?poses=still"):
+        source = open_dataset(name)
+        assert not source.tracked
+        np.testing.assert_array_equal(source.read(0).T_world_camera, source.read(1).T_world_camera)
 
 
 def test_poses_that_cannot_be_read_are_named(library: type[Pipeline], tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"nowhere\.txt"):
         open_dataset(f"realsense:?poses={tmp_path}/nowhere.txt")
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_a_recording_without_poses_is_mapped(
+    library: type[Pipeline], recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class CarriedCamera(library):  # type: ignore[misc, valid-type]
+        """Plays a walk through the built-in room."""
+
+        def start(self, config: SimpleNamespace) -> SimpleNamespace:
+            profile = super().start(config)
+            self.left = list(range(tracked_room.COUNT))
+            return profile
+
+        def wait_for_frames(self, timeout_ms: int) -> SimpleNamespace:
+            frames = super().wait_for_frames(timeout_ms)
+            depth_m = tracked_room.frames()[frames.number].depth_m
+            frames.get_depth_frame().get_data = lambda: np.rint(depth_m / 0.0005).astype(np.uint16)
+            return frames
+
+    class CarriedConfig(Config):
+        def profile(self) -> SimpleNamespace:
+            profile, camera = super().profile(), tracked_room.frames()[0].camera
+            intrinsics = profile.get_stream("depth").as_video_stream_profile().get_intrinsics()
+            intrinsics.__dict__.update(width=camera.width, height=camera.height, fx=camera.fx, fy=camera.fy)
+            intrinsics.__dict__.update(ppx=camera.cx, ppy=camera.cy)
+            return profile
+
+    monkeypatch.setattr(sys.modules["pyrealsense2"], "pipeline", CarriedCamera)
+    monkeypatch.setattr(sys.modules["pyrealsense2"], "config", CarriedConfig)
+    result = map_sequence(open_dataset(f"realsense:{recording}"), tracked_room.CONFIG)
+    assert result.track is not None
+    found = result.track.poses(result.map)
+    assert list(found) == list(range(tracked_room.COUNT))
+    start = inverse(found[0])
+    assert tracked_room.errors({i: start @ T for i, T in found.items()})[:, 1].max() < 0.08

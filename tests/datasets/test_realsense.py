@@ -99,7 +99,7 @@ def test_images_come_in_metres_with_the_cameras_own_intrinsics(library: type[Pip
     assert frame.depth_m.dtype == np.float32
     assert (frame.name, frame.stamp) == ("realsense-000007", 2.5)
     np.testing.assert_allclose(frame.T_world_camera[:3, 2], [1, 0, 0], atol=1e-12)
-    assert any("stand still" in note for note in source.notes)
+    assert any("?poses=still" in note for note in source.notes)
 
 
 def test_colours_come_aligned_to_depth_where_the_camera_has_them(library: type[Pipeline]) -> None:

@@ -68,7 +68,9 @@ def test_without_texture_poses_are_those_of_depth_bit_for_bit() -> None:
 
 def test_colours_are_read_where_they_are_tracked() -> None:
     assert wants_color(CONFIG, "recording", track=True)
-    assert wants_color(CONFIG, "realsense:?poses=track", track=False)
+    assert wants_color(CONFIG, "walk.bag?poses=track", track=False)
+    assert wants_color(CONFIG, "realsense:walk.bag", track=False)
+    assert not wants_color(CONFIG, "realsense:?poses=still", track=False)
     assert not wants_color(CONFIG, "recording", track=False)
     assert wants_color(replace(CONFIG, color=True), "recording", track=False)
     blind = replace(CONFIG, poses=PoseConfig(use_color=False))

@@ -19,7 +19,7 @@ class PoseFlags:
 
     track_poses: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Find the pose of each frame by aligning it with the map so far; SOURCE's own poses, if any, are
-    ignored except for the first. realsense:?poses=track does the same."""
+    ignored except for the first. realsense: does so unless it is given poses."""
 
     file: Annotated[str | None, tyro.conf.arg(name="poses", metavar="FILE")] = None
     """Poses of SOURCE's frames, in place of its own: a trajectory (TUM, KITTI, .log), a pose graph (g2o,

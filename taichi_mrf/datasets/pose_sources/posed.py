@@ -124,7 +124,8 @@ def posed_by(
     """
     if dataset.tracked or dataset.endless:
         raise DatasetError(
-            f"{dataset.name}: has no poses that those of {source.name} could take the place of"
+            f"{dataset.name}: its poses are found while it is mapped, and {source.name} cannot replace them; "
+            "a RealSense recording takes them as ?poses=FILE, or with ?poses=still"
         )
     names = dataset.frame_names
     if len(names) and dataset.sensor_of(0):

@@ -2,9 +2,8 @@
 
 ``realsense:width=848&height=480&fps=30`` is a camera, as long as it is plugged in; ``realsense:FILE`` is what
 its library has recorded (recorded.py). ``?poses=FILE`` gives the poses of the depth camera in TUM's
-layout, by the stamps of its images; ``?poses=track`` finds them from the images while mapping.
-Without either the camera is assumed to stand still: all frames have one pose, at the origin, level, looking
-along x.
+layout, by the stamps of its images. Without a file they are found from the images while mapping. With
+``?poses=still`` all frames have one pose, at the origin, level, looking along x.
 """
 
 import weakref
@@ -33,7 +32,10 @@ TIMEOUT_MS = 500
 
 MISSES = 4
 
-STANDS_STILL = "the camera is assumed to stand still; for one that moves add ?poses=FILE or ?poses=track"
+STILL = "still"
+"""In place of a file of poses: the camera stands still."""
+
+TRACKED = "the camera is tracked by its images; ?poses=FILE gives its poses, ?poses=still says that it stands"
 ENDLESS = "the camera never ends: --keep-live N bounds the memory, --keyframes.* selects fewer keyframes"
 
 
@@ -50,8 +52,9 @@ class RealSenseOptions:
     fps: int = 30
     """Images in a second."""
 
-    poses: str = ""
-    """A file of the camera's poses: stamp tx ty tz qx qy qz qw; or track, to find them from the images."""
+    poses: str = TRACK
+    """A file of the camera's poses: stamp tx ty tz qx qy qz qw; or track, to find them from the images; or
+    still, for a camera that stands still."""
 
 
 class _EndlessNames(Sequence[str]):
@@ -133,7 +136,8 @@ def open_realsense(text: str, options: ReadOptions) -> Dataset:
     if options.depth_scale is not None:
         raise DatasetError(f"{NAME} takes no depth_scale: the camera reports its own")
     tracked = options.track or wanted.poses == TRACK
-    trajectory = read_timed_poses(Path(wanted.poses)) if wanted.poses and not tracked else None
+    from_file = not tracked and wanted.poses != STILL
+    trajectory = read_timed_poses(Path(wanted.poses)) if from_file else None
     rs = library("pyrealsense2", f"{NAME} needs", "realsense", DatasetError)
     gap = INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
     source: RealSenseCamera | RealSenseRecording
@@ -142,8 +146,8 @@ def open_realsense(text: str, options: ReadOptions) -> Dataset:
     else:
         source = _open_camera(rs, wanted, trajectory, gap, options)
     source.tracked = tracked
-    if not tracked and trajectory is None:
-        source.notes.insert(0, STANDS_STILL)
+    if tracked:
+        source.notes.insert(0, TRACKED)
     return source
 
 

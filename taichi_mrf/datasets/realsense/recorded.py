@@ -1,5 +1,5 @@
 """A recording of Intel's RealSense library, played by that library: ``realsense:FILE?poses=FILE``, or
-``?poses=track``.
+without poses.
 
 The file is played once when it is opened, for the numbers and stamps of its depth images, and again as they
 are read: a recording can only be played forwards, so frames are best read in their order.
