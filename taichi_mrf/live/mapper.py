@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
-from taichi_mrf.inference.schedule import InferReport, InferSteps
+from taichi_mrf.inference.schedule import InferReport
 from taichi_mrf.live.live_keyframes import LiveKeyframe, LiveKeyframes
 from taichi_mrf.live.pictures import thumbnail
 from taichi_mrf.live.ray_answers import PosedDepthImage
@@ -87,11 +87,6 @@ class Mapper:
         """Sweep a keyframe once, by its number in the map, unless the map is about to be rebuilt."""
         if not self.stale:
             self.map.infer(sweeps=1, keyframes=[map_id])
-
-    def sweep_all(self) -> InferSteps:
-        """Sweep all keyframes that are on once, the oldest first, step by step."""
-        ids = [self._map_id(entry) for entry in self.roster.with_state("on")]
-        return self.map.infer_steps(sweeps=1, keyframes=ids)
 
     def switch(self, id: int, on: bool) -> LiveKeyframe:
         """Take a keyframe out of the map, keeping its image, or bring it back. Raises KeyframeError."""

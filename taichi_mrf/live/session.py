@@ -16,11 +16,11 @@ One thread does all of it, one piece of work after the other, because Taichi may
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.inference.schedule import InferProgress, InferSteps
+from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.live.extras import Extras
 from taichi_mrf.live.link import Link
 from taichi_mrf.live.live_keyframes import LiveKeyframe
@@ -34,6 +34,7 @@ from taichi_mrf.mapping.intake import Added, Full, Lost, Skipped, UnreadableFram
 from taichi_mrf.mapping.loops import Closure
 from taichi_mrf.mapping.refinement import PoseRefiner
 from taichi_mrf.mapping.rounds import AlignmentRounds, RoundStep
+from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.viewer.messages import Listening, Notice, Request
 
@@ -303,5 +304,11 @@ class _ShowingMover:
             self._state.send(mapper.describe(entry))
             self._state.publish()
 
-    def sweep(self) -> InferSteps:
-        return self._state.mapper.sweep_all()
+    def sweep(self) -> Generator[InferProgress, None, object]:
+        """From no messages, as in a batch run: what is found must not depend on how the map came about. Until
+        the end the page shows the map as it was."""
+        with FullInference(self._state.mapper.map, sweeps=1, keep_before=True) as inference:
+            for step in inference:
+                with inference.showing_before():
+                    yield step
+        return inference.outcome

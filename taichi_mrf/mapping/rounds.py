@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from taichi_mrf.geometry.poses import Pose, tangent_norms
-from taichi_mrf.inference.schedule import InferSteps, StopRequestedError
+from taichi_mrf.inference.schedule import InferProgress, InferSteps, StopRequestedError
 from taichi_mrf.mapping.refinement import PoseRefiner
 from taichi_mrf.mapping.settling import OutcomeT, Settling
 from taichi_mrf.methods.capabilities import AligningMap
@@ -45,8 +45,8 @@ class KeyframeMover(Protocol):
         """Give a keyframe of the map another pose, (4, 4)."""
         ...
 
-    def sweep(self) -> InferSteps:
-        """Sweep all keyframes once, step by step."""
+    def sweep(self) -> Generator[InferProgress, None, object]:
+        """Sweep all keyframes once, from no messages, step by step."""
         ...
 
 
@@ -62,7 +62,7 @@ class PlainMover:
             self._map.move_keyframe(id, T_world_camera)
 
     def sweep(self) -> InferSteps:
-        """Sweep all keyframes once, from no messages."""
+        """See :class:`KeyframeMover`."""
         return self._map.infer_steps(sweeps=1)
 
 

@@ -33,6 +33,7 @@ from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.live.replay import Replay
 from taichi_mrf.live.run import Policy
 from taichi_mrf.live.session import Session
+from taichi_mrf.mapping.loops import Closure, LoopCloser
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.runs.files import TRAJECTORY_FILE
@@ -268,3 +269,30 @@ def test_the_page_is_told_once_that_tracking_is_lost_and_that_it_goes_on() -> No
     cameras = [camera.name for camera in link.of_type(CurrentCamera)]
     assert "walk-004" not in cameras
     assert "walk-007" in cameras
+
+
+def test_keyframes_that_a_loop_moves_are_shown_where_they_stand(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed: list[Closure] = []
+
+    def close(self: LoopCloser, id: int) -> Closure | None:
+        m = self._map
+        if id != 2:
+            return None
+        T = {1: moved(m.keyframes[1].T_world_camera, [0.02, 0, 0, 0, 0, 0.01])}
+        closed.append(Closure(2, 0, 0.02, 0.01, m.update_poses(T).moved))
+        return closed[0]
+
+    monkeypatch.setattr(LoopCloser, "took", close)
+    link = FakeLink()
+    session = tracked_session(link, walk(range(12)))
+    session.run(never)
+    assert closed[0].moved == (1,)
+    notices = [m.text for m in link.sent if isinstance(m, Notice)]
+    assert "loop closed: the camera was off by 2 cm, 1 keyframes moved" in notices
+    last = {m.id: m for m in link.sent if isinstance(m, KeyframeInfo)}
+    for entry in session.state.mapper.roster.entries.values():
+        assert entry.map_id is not None
+        T = session.state.mapper.map.keyframes[entry.map_id].T_world_camera
+        np.testing.assert_array_equal(last[entry.id].T_world_camera, T)
+    assert session.state.result().loops_closed == 1
+    assert_shown_is(session, link)
