@@ -140,7 +140,7 @@ class PoseConfig:
     """Do not move a keyframe if less than this share of its points lies near surfaces that other keyframes
     measured."""
 
-    carry_unnamed: bool = False
+    carry_unnamed: bool = True
     """Frames without a pose in the file of --poses move with the last frame before them that has one, instead
     of staying where they were recorded."""
 

@@ -148,7 +148,7 @@ def posed_by(
         notes = [f"poses of {len(posed)} frames from {source.name}"]
         notes += [] if poses.warning is None else [poses.warning]
         if others and has_poses:
-            keep = "keep the recorded one; --poses.carry-unnamed moves them with the last one before them"
+            keep = "keep the recorded one"
             keep = "move with the last one before them" if carry else keep
             notes.append(f"{others} of {len(names)} frames have no pose there, and {keep}")
         elif others:
