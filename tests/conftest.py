@@ -8,6 +8,7 @@ import contextlib
 import importlib.util
 import multiprocessing.process
 import os
+import signal
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -133,6 +134,14 @@ def _take_fewer_examples(item: pytest.Item) -> None:
     if chosen is not None:
         fewer = settings(chosen, max_examples=max(3, chosen.max_examples // 6))
         setattr(getattr(test, "__func__", test), SETTINGS_OF_A_TEST, fewer)
+
+
+@pytest.fixture
+def own_interrupts() -> Iterator[None]:
+    """Python's own handler of SIGINT, which a run in the background inherits as ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="session")

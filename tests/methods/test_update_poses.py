@@ -126,6 +126,7 @@ def test_small_motions_keep_their_evidence_until_their_turn() -> None:
     assert all(keyframe.messages is not None for keyframe in m.keyframes.values())
 
 
+@pytest.mark.usefixtures("own_interrupts")
 @pytest.mark.parametrize("error", [CapacityError, KeyboardInterrupt])
 def test_a_call_that_ends_early_leaves_a_map_that_infers_exactly(
     error: type[BaseException], monkeypatch: pytest.MonkeyPatch

@@ -9,6 +9,7 @@ import pytest
 from taichi_mrf.system.interrupts import interrupts_wait
 
 
+@pytest.mark.usefixtures("own_interrupts")
 def test_an_interrupt_takes_effect_after_the_block() -> None:
     handler, done = signal.getsignal(signal.SIGINT), []
 
