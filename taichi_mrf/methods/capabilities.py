@@ -86,16 +86,6 @@ class AligningMap(FreezingMap, Protocol):
         """Move a keyframe to the pose near by under which its depth is most likely."""
         ...
 
-    def update_poses(
-        self,
-        poses: Mapping[int, ArrayLike],
-        least: float = ...,
-        tolerance: float | None = None,
-        seconds: float | None = None,
-    ) -> PoseUpdate:
-        """Take in the poses, by id, of a trajectory that was corrected."""
-        ...
-
     def depth_log_likelihood(self, id: int) -> float:
         """Mean log-likelihood of a keyframe's depth in the map of all others."""
         ...
