@@ -1,5 +1,6 @@
 """Points with normals from a depth image: planes fitted to small squares of pixels, on the backend."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,6 +56,10 @@ class OrientedPoints:
         """Those in every ``every``-th column and row."""
         kept = (self.places % every == 0).all(axis=1)
         return OrientedPoints(self.points[kept], self.normals[kept], self.sigmas[kept], self.places[kept])
+
+    def about(self, number: int) -> "OrientedPoints":
+        """About so many of them, evenly spread over the image."""
+        return self.thinned(max(1, round(math.sqrt(len(self.points) / number))))
 
 
 def oriented_points(image: DepthImage, max_depth: float) -> OrientedPoints:

@@ -10,7 +10,6 @@ loop disagrees with the poses, the graph is solved and the map's keyframes move.
 - if it makes the depth of the keyframes that it joins more likely, each in the map of all others.
 """
 
-import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -139,8 +138,7 @@ class LoopCloser:
         return self._map.keyframes[id].T_world_camera
 
     def _points(self, id: int) -> OrientedPoints:
-        points = oriented_points(self._map.keyframes[id].image, self._map.sensor.max_depth)
-        return points.thinned(max(1, round(math.sqrt(len(points.points) / POINTS))))
+        return oriented_points(self._map.keyframes[id].image, self._map.sensor.max_depth).about(POINTS)
 
     def _surface(self, ids: Sequence[int]) -> Surfels:
         surface = self._map.aligner.surface

@@ -125,10 +125,8 @@ def _median_depth(keyframe: PosedDepth) -> float:
 
 
 def _points(keyframe: PosedDepth, noise: NoiseModel, max_depth: float) -> OrientedPoints:
-    points = oriented_points(
-        DepthImage.upload(keyframe.depth_m, keyframe.camera, noise, own=keyframe.own), max_depth
-    )
-    return points.thinned(max(1, round(math.sqrt(len(points.points) / POINTS))))
+    image = DepthImage.upload(keyframe.depth_m, keyframe.camera, noise, own=keyframe.own)
+    return oriented_points(image, max_depth).about(POINTS)
 
 
 def _ratio(there: OrientedPoints, points: OrientedPoints, T_first_second: Pose, cell: float) -> float | None:
