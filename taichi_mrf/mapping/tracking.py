@@ -1,12 +1,13 @@
 """Tracking a camera without poses: each frame is aligned with the map of the frames before it.
 
 The first frame fixes the map's frame. Each later one is aligned with what the keyframes have measured
-(alignment/locate.py), from two guesses: that the camera stands still, and that it moves on as it did. Both
-have turned as the gyroscope says, where there is one (turning.py). If neither fits, the scan of a sensor that
-sees around is searched for in all headings and metres around. A frame that fits nowhere is lost; the next one
-is searched around the last pose that was found, around the first, and around those of keyframes that look
-like it. Errors of alignment add up along the way, until a loop is closed (loops.py). Poses are kept relative
-to the keyframe of the moment, so that they follow when it is moved.
+(alignment/locate.py), from where corners of the image before are seen now (alignment/optical_flow.py).
+Without colour, or where that fits nothing, there are two guesses: that the camera stands still, and that it
+moves on as it did. Both have turned as the gyroscope says, where there is one (turning.py). If neither fits,
+the scan of a sensor that sees around is searched for in all headings and metres around. A frame that fits
+nowhere is lost; the next one is searched around the last pose that was found, around the first, and around
+those of keyframes that look like it. Errors of alignment add up along the way, until a loop is closed
+(loops.py). Poses are kept relative to the keyframe of the moment, so that they follow when it is moved.
 """
 
 import math
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from taichi_mrf.alignment.appearance import Appearances, Picture, small_picture
 from taichi_mrf.alignment.keyframe_pictures import KeyframePictures
 from taichi_mrf.alignment.locate import Locator
+from taichi_mrf.alignment.optical_flow import motion_between
 from taichi_mrf.alignment.se3 import moved, twist
 from taichi_mrf.alignment.wide_search import Around
 from taichi_mrf.config.registry import methods_with
@@ -172,7 +174,11 @@ class Tracker:
             guesses += self._known_places(small_picture(depth_m, frame.color))
         config = self._config if turn is None or self._lost else self._gyro_config
         colors = partial(self._pictures.compared_with, frame, m.keyframes) if self._config.use_color else None
-        located = self._locator.locate(image, guesses, m.keyframes, config, around, colors)
+        flow = self._by_flow(frame)
+        for from_here in [guesses] if flow is None else [[flow], guesses]:
+            located = self._locator.locate(image, from_here, m.keyframes, config, around, colors)
+            if located.T_world_camera is not None:
+                break
         T_world_camera, reason = located.T_world_camera, located.reason
         if T_world_camera is not None and around is None:
             reason = self._objection(located.overlap, self._locator.looked_through(image, T_world_camera))
@@ -269,6 +275,13 @@ class Tracker:
             step = twist(inverse(self._pose(self._before)) @ T_last)
             guesses.append(moved(T_last, ahead * step))
         return guesses
+
+    def _by_flow(self, frame: Frame) -> Pose | None:
+        """Where the camera is by the corners that it has seen move since the last frame, if they tell."""
+        if self._frame is None or self._last is None or self._lost or not self._config.use_color:
+            return None
+        motion = motion_between(self._frame, frame)
+        return None if motion is None else self._pose(self._last) @ motion
 
     def _known_places(self, picture: Picture) -> list[Pose]:
         """Where a lost camera may be: where it began, and where keyframes look like its picture."""

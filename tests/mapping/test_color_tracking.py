@@ -75,3 +75,20 @@ def test_colours_are_read_where_they_are_tracked() -> None:
     assert wants_color(replace(CONFIG, color=True), "recording", track=False)
     blind = replace(CONFIG, poses=PoseConfig(use_color=False))
     assert not wants_color(blind, "recording", track=True)
+
+
+def test_steps_that_change_along_a_wall_are_followed() -> None:
+    """Neither standing still nor going on as before is near where the camera is."""
+    walk = [along_the_wall(i) for i in (0, 5, 2, 9, 6, 12)]
+    way = np.array([frame.T_world_camera[:3, 3] for frame in walk])
+    poses, _ = tracked(walk, PoseConfig())
+    assert np.abs(np.array(poses)[:, :3, 3] - way).max() < 0.01
+
+
+def test_where_flow_misleads_the_other_guesses_count() -> None:
+    """The picture has moved sideways by half a metre, and the depth image of the room has not."""
+    room = frames()[:2]
+    pictures = [along_the_wall(i).color for i in (0, 17)]
+    walk = [replace(frame, color=color) for frame, color in zip(room, pictures, strict=True)]
+    poses, _ = tracked(walk, PoseConfig())
+    np.testing.assert_allclose(poses[1], tracked(room, PoseConfig(use_color=False))[0][1], atol=0.02)
