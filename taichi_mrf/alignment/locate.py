@@ -40,6 +40,10 @@ OBSERVABLE = 0.0005
 """Least share of the largest eigenvalue that a direction needs. Where a recorded pose is rather kept, a guess
 drifts: with ten times as much a camera at 30 images a second slid 20 cm along a wall of the built-in room."""
 
+OBSERVABLE_BY_DEPTH = 0.005
+"""The same for depth alone where the guess is seen in the colours, and right to a centimetre. With a tenth of
+it, depth carries a handheld camera 32 cm away from there at a door."""
+
 WELL = 0.7
 """Share of the points that must lie on the map at a pose near a guess, or a sensor that sees around is
 searched for further away. Scans of a real building that fit near a guess by mistake have at most 0.62, those
@@ -90,18 +94,20 @@ class Locator:
         config: PoseConfig,
         around: Around | None = None,
         colors: Callable[[Pose], Sequence[ColorLevel]] | None = None,
+        observable: float = OBSERVABLE,
     ) -> Located:
         """The pose of an image in what some keyframes have measured. A search begins at each of the guesses;
         the end that fits best and is nearest to its guess counts. ``config`` bounds how far from a guess, and
         how much overlap is needed. If that finds nothing, or nothing that fits WELL, the image of a sensor
         that sees around is searched for ``around``, and the outcome of that counts. ``colors``, of a camera
-        that does not, is what the image can be compared with at a pose."""
+        that does not, is what the image can be compared with at a pose. ``observable``: the share of the
+        largest eigenvalue that a direction needs to be moved in by depth near the guesses."""
         points = oriented_points(image, self._surface.max_depth)
         if len(points.points) < LEAST_POINTS:
             return Located(None, "too few points on smooth surfaces")
         self._surface.update(keyframes)
         if around is None:
-            return self._near(points, guesses, config, 0.0, colors)
+            return self._near(points, guesses, config, 0.0, colors, observable)
         near, sight = self._near(points, guesses, config, FINEST_CELLS_M), Sightlines.of(image)
         begin = [] if near.T_world_camera is None else [near.T_world_camera]
         well = bool(begin) and near.overlap * near.agreement > WELL
@@ -122,6 +128,7 @@ class Locator:
         config: PoseConfig,
         finest_m: float,
         colors: Callable[[Pose], Sequence[ColorLevel]] | None = None,
+        observable: float = OBSERVABLE,
     ) -> Located:
         """The best of the ends of searches from some guesses, in cells of ``finest_m`` metres at the end, and
         from there on with colour, unless depth would fit worse."""
@@ -129,7 +136,7 @@ class Locator:
         lever_m = float(np.median(np.linalg.norm(points.points, axis=1)))
         priors = [Recorded(T, config) for T in guesses]
         ends = [
-            aligned(levels, T, prior, lever_m, OBSERVABLE) for T, prior in zip(guesses, priors, strict=True)
+            aligned(levels, T, prior, lever_m, observable) for T, prior in zip(guesses, priors, strict=True)
         ]
         # Where depth determines too little, ends that fit alike differ in how far they are from their guess.
         worth = max(end.equations.worth for end in ends)

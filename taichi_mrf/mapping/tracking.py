@@ -11,6 +11,7 @@ those of keyframes that look like it. Errors of alignment add up along the way, 
 """
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -18,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.alignment.appearance import Appearances, Picture, small_picture
-from taichi_mrf.alignment.keyframe_pictures import KeyframePictures
-from taichi_mrf.alignment.locate import Locator
+from taichi_mrf.alignment.keyframe_pictures import ColorLevel, KeyframePictures
+from taichi_mrf.alignment.locate import OBSERVABLE_BY_DEPTH, Located, Locator
 from taichi_mrf.alignment.optical_flow import motion_between
 from taichi_mrf.alignment.se3 import moved, twist
 from taichi_mrf.alignment.wide_search import Around
@@ -174,11 +175,9 @@ class Tracker:
             guesses += self._known_places(small_picture(depth_m, frame.color))
         config = self._config if turn is None or self._lost else self._gyro_config
         colors = partial(self._pictures.compared_with, frame, m.keyframes) if self._config.use_color else None
-        flow = self._by_flow(frame)
-        for from_here in [guesses] if flow is None else [[flow], guesses]:
-            located = self._locator.locate(image, from_here, m.keyframes, config, around, colors)
-            if located.T_world_camera is not None:
-                break
+        located = self._from_flow(image, frame, config, colors)
+        if located is None or located.T_world_camera is None:
+            located = self._locator.locate(image, guesses, m.keyframes, config, around, colors)
         T_world_camera, reason = located.T_world_camera, located.reason
         if T_world_camera is not None and around is None:
             reason = self._objection(located.overlap, self._locator.looked_through(image, T_world_camera))
@@ -276,12 +275,24 @@ class Tracker:
             guesses.append(moved(T_last, ahead * step))
         return guesses
 
-    def _by_flow(self, frame: Frame) -> Pose | None:
-        """Where the camera is by the corners that it has seen move since the last frame, if they tell."""
-        if self._frame is None or self._last is None or self._lost or not self._config.use_color:
+    def _from_flow(
+        self,
+        image: DepthImage,
+        frame: Frame,
+        config: PoseConfig,
+        colors: Callable[[Pose], Sequence[ColorLevel]] | None,
+    ) -> Located | None:
+        """The frame's place near where corners of the last image are seen now; None if that is not known."""
+        if self._frame is None or self._last is None or self._lost or colors is None:
             return None
         motion = motion_between(self._frame, frame)
-        return None if motion is None else self._pose(self._last) @ motion
+        if motion is None:
+            return None
+        guess = [self._pose(self._last) @ motion]
+        keyframes = self.map.keyframes
+        return self._locator.locate(
+            image, guess, keyframes, config, colors=colors, observable=OBSERVABLE_BY_DEPTH
+        )
 
     def _known_places(self, picture: Picture) -> list[Pose]:
         """Where a lost camera may be: where it began, and where keyframes look like its picture."""
