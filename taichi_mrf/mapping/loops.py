@@ -35,6 +35,9 @@ STEPS = 3
 """Recent keyframes that a new one is aligned with."""
 
 STEP_M, STEP_RAD = 0.05, 0.03
+"""Standard deviations of the guess of a step when it is measured."""
+
+TRACKED_M, TRACKED_RAD = 0.15, 0.08
 """Standard deviations of a tracked step, which count where the two images determine nothing."""
 
 FARTHEST_M = 1.0
@@ -155,14 +158,16 @@ class LoopCloser:
         """Measure the step from a recent keyframe to a new one. The step from the last one counts as tracked
         where their images tell nothing."""
         T_here, T_near = self._pose(id), self._pose(near)
+        tracked = np.diag(np.repeat([TRACKED_M, TRACKED_RAD], 3) ** -2.0)
         follows = self._order[-2] == near and tangent_norms(T_near, T_here)[1] < FARTHEST_M
         fit = fit_to(points, self._surface([near]), [T_here], self._step_config, CELLS_M[0])
         if fit is not None and fit.overlap >= self._step_config.min_overlap:
+            # Others than the last one have not been tracked from: what the guess says would count twice.
+            information = fit.information + tracked if follows else fit.information
             T_near_id = inverse(T_near) @ fit.T_world_camera
-            self._edges.append(Edge(near, id, T_near_id, fit.information, certain=follows))
+            self._edges.append(Edge(near, id, T_near_id, information, certain=follows))
         elif follows:
-            information = np.diag(np.repeat([STEP_M, STEP_RAD], 3) ** -2.0)
-            self._edges.append(Edge(near, id, inverse(T_near) @ T_here, information))
+            self._edges.append(Edge(near, id, inverse(T_near) @ T_here, tracked))
 
     def _candidates(self, id: int) -> list[int]:
         """Older keyframes that may have seen the same, those that look most alike first. Neighbours of one
