@@ -31,8 +31,8 @@ FEWEST_SURFELS = 50
 class PairFit:
     """Where an image fits a surface: ``T_world_camera`` (4, 4), with the ``information`` (6, 6) of its twist
     in the camera's frame, 0 along directions that are not determined: there the pose is the guess.
-    ``overlap``, ``agreement`` and ``directions`` as in Located; ``cost`` is what ends of searches are compared
-    by."""
+    ``overlap``, ``agreement`` and ``directions`` as in Located; ``cost`` is what ends of searches are
+    compared by."""
 
     T_world_camera: Pose
     information: NDArray[np.float64]
