@@ -85,12 +85,27 @@ def solve(
     and the number of those that they do."""
     scale = _scale(lever_m)
     known = equations.H + color.H / worth if worth > 0 else equations.H
-    values, vectors = np.linalg.eigh(known / np.outer(scale, scale))
-    told = vectors[:, values > observable * max(values[-1], 1e-12)]
+    told = _told(known, lever_m, observable)
     H = told.T @ ((worth * equations.H + recorded.H + color.H) / np.outer(scale, scale)) @ told
     g = told.T @ ((worth * equations.g + recorded.gradient(T) + color.g) / scale)
     H[np.diag_indices_from(H)] *= 1 + damping
     return (told @ np.linalg.solve(H, -g)) / scale, told.shape[1]
+
+
+def determined(H: NDArray[np.float64], lever_m: float, observable: float) -> NDArray[np.float64]:
+    """The part of normal equations H (6, 6) along the directions that they determine, as for align; along the
+    others it is 0."""
+    told, scale = _told(H, lever_m, observable), _scale(lever_m)
+    units = np.outer(scale, scale)
+    return np.asarray(units * (told @ told.T @ (H / units) @ told @ told.T))
+
+
+def _told(H: NDArray[np.float64], lever_m: float, observable: float) -> NDArray[np.float64]:
+    """(6, n): orthogonal unit vectors along the directions that normal equations determine, in metres that a
+    typical point is moved."""
+    scale = _scale(lever_m)
+    values, vectors = np.linalg.eigh(H / np.outer(scale, scale))
+    return np.asarray(vectors[:, values > observable * max(values[-1], 1e-12)])
 
 
 def _scale(lever_m: float) -> NDArray[np.float64]:

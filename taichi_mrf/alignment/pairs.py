@@ -8,15 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.alignment.levels import LEAST_POINTS, aligned, grids_of, levels_of
-from taichi_mrf.alignment.locate import OBSERVABLE, agreement
+from taichi_mrf.alignment.levenberg import determined
+from taichi_mrf.alignment.locate import agreement
 from taichi_mrf.alignment.oriented_points import OrientedPoints
 from taichi_mrf.alignment.recorded import SURFACE_SIGMA_M, Recorded
 from taichi_mrf.alignment.surfels import Surfels
 from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.geometry.poses import Pose
 
-PAIR_SIGMA_M = 0.005
-"""What the alignment of two single images is worth along each direction that it determines, in metres."""
+PAIR_SIGMA_M = 0.002
+"""What the alignment of two single images is worth along the direction that it determines best, in metres."""
+
+DETERMINED = 0.003
+"""Least share of the largest eigenvalue that a direction needs to count as determined. Steps of a handheld
+camera are wrong by about what this says along directions above it, and by 0.1 m along those below."""
 
 FEWEST_SURFELS = 50
 """A surface of fewer cells aligns nothing."""
@@ -25,8 +30,9 @@ FEWEST_SURFELS = 50
 @dataclass(frozen=True)
 class PairFit:
     """Where an image fits a surface: ``T_world_camera`` (4, 4), with the ``information`` (6, 6) of its twist
-    in the camera's frame, guess included. ``overlap``, ``agreement`` and ``directions`` as in Located;
-    ``cost`` is what ends of searches are compared by."""
+    in the camera's frame, 0 along directions that are not determined: there the pose is the guess.
+    ``overlap``, ``agreement`` and ``directions`` as in Located; ``cost`` is what ends of searches are
+    compared by."""
 
     T_world_camera: Pose
     information: NDArray[np.float64]
@@ -55,9 +61,9 @@ def fit_to(
     found = []
     for T in guesses:
         guess = Recorded(T, config)
-        end = aligned(levels, T, guess, lever_m, OBSERVABLE)
+        end = aligned(levels, T, guess, lever_m, DETERMINED)
         worth = end.equations.worth * (SURFACE_SIGMA_M / PAIR_SIGMA_M) ** 2
-        information = worth * end.equations.H + guess.H
+        information = worth * determined(end.equations.H, lever_m, DETERMINED)
         overlap, agrees = end.equations.overlap, agreement(end.equations)
         cost = end.equations.cost
         found.append(PairFit(end.T_world_camera, information, overlap, agrees, end.directions, cost))

@@ -14,7 +14,7 @@ from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.geometry.poses import Pose, inverse, tangent_norms
 from taichi_mrf.inference.keyframe import DepthImage
-from taichi_mrf.mapping.loops import Closure, LoopCloser
+from taichi_mrf.mapping.loops import TRACKED_M, Closure, LoopCloser
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.mapping.tracking import Tracker
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -82,6 +82,25 @@ def test_a_closed_loop_takes_the_drift_out_of_the_map_and_leaves_what_is_fixed()
     assert run.closures[0].off_m > 0.05
     assert not {0, 1} & {id for c in run.closures for id in c.moved}
     assert run.off_m() < 0.5 * drifted
+
+
+def test_where_images_tell_nothing_a_step_counts_as_tracked_once() -> None:
+    """A flat wall straight ahead says nothing of a motion across it."""
+    camera = PinholeCamera(160, 120, 150.0, 150.0, 79.5, 59.5)
+    m = MRFMap(0.1)
+    tracker = Tracker(m, PoseConfig())
+    loops = LoopCloser(tracker, PoseConfig())
+    for index in range(3):
+        T = moved(np.eye(4), [0.1 * index, 0.0, 0.0, 0.0, 0.0, 0.0])
+        frame = Frame(np.full(camera.shape, 2.0, np.float32), T, camera, float(index), f"{index}")
+        tracker._found(frame, T, 3)
+        tracker.took(m.add_keyframe(frame.depth_m, T, camera))
+        assert loops.took(index) is None
+    across = {(edge.first, edge.second): edge.information[0, 0] for edge in loops._edges}
+    assert across.keys() == {(0, 1), (1, 2), (0, 2)}
+    for step in ((0, 1), (1, 2)):
+        assert across[step] == pytest.approx(TRACKED_M**-2, rel=0.3)
+    assert across[0, 2] < 0.1 * TRACKED_M**-2
 
 
 def test_a_loop_that_does_not_fit_into_memory_leaves_the_keyframe(monkeypatch: pytest.MonkeyPatch) -> None:
