@@ -11,8 +11,8 @@ from inputs_bags import FRAME, Bag, Kind, images, stamp, writing
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.base import start_pose
-from taichi_mrf.datasets.ros.imu import GRAVITY, upwards
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.sensor.gravity import GRAVITY, upwards
 
 TOPIC, BODY = "/imu/data", "imu_link"
 T_camera_imu = moved(np.eye(4), [0.02, 0.0, 0.01, 1.2, -0.9, 0.4])

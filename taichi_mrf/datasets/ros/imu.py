@@ -11,22 +11,11 @@ from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.reader import RosReader
 from taichi_mrf.datasets.ros.topics import choose, placed
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.sensor.gravity import upwards_at
 from taichi_mrf.sensor.gyro import GyroSamples
 
 NONE = "none"
 """The value of the option ``imu`` for a camera that is tracked without."""
-
-GRAVITY = 9.81
-"""Metres per square second."""
-
-AT_REST_S = 0.3
-"""Seconds before and after the first image in which accelerations say which way is up."""
-
-AT_REST = 0.4
-"""Largest departure of the mean from GRAVITY, and largest standard deviation along an axis, of a camera that
-is held still: then up is right to about 2 degrees."""
-
-LEAST_SAMPLES = 10
 
 
 @dataclass(frozen=True)
@@ -67,24 +56,10 @@ def find_imu(reader: RosReader, wanted: str, optical: str, first_s: float) -> Ba
     times, first = np.unique(stamps, return_index=True)
     rates_imu = np.array(rates)[first]
     valid = np.isfinite(rates_imu).all(axis=1)
-    near = np.abs(times - first_s) <= AT_REST_S
-    up = upwards(np.array(accelerations)[first][near] @ to_optical)
+    up = upwards_at(times, np.array(accelerations)[first] @ to_optical, first_s)
     level = "the first image is level by it" if up is not None else "which way is up it does not say"
     gyro = GyroSamples(times[valid], rates_imu[valid] @ to_optical)
     return BagImu(gyro, up, [f"imu: {name} measures turns; {level}"])
-
-
-def upwards(accelerations: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Upwards, a unit vector (3,), by what an accelerometer measures (N, 3) in metres per square second; None
-    if it does not rest."""
-    measured = accelerations[np.isfinite(accelerations).all(axis=1)]
-    if len(measured) < LEAST_SAMPLES:
-        return None
-    mean = measured.mean(axis=0)
-    size = float(np.linalg.norm(mean))
-    if abs(size - GRAVITY) > AT_REST or measured.std(axis=0).max() > AT_REST:
-        return None
-    return np.asarray(mean / size)
 
 
 def _turns(message: Any | None) -> bool:
