@@ -17,11 +17,12 @@ import numpy as np
 
 from taichi_mrf.alignment.oriented_points import OrientedPoints, oriented_points
 from taichi_mrf.alignment.pairs import fit_to
-from taichi_mrf.alignment.pose_graph import Edge, solve_pose_graph
+from taichi_mrf.alignment.pose_graph import solve_pose_graph
 from taichi_mrf.alignment.se3 import twist
 from taichi_mrf.alignment.seen_through import looked_through
 from taichi_mrf.alignment.surfels import Surfels
 from taichi_mrf.config.schema import PoseConfig
+from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose, inverse, tangent_norms
 from taichi_mrf.mapping.tracking import ALIKE, LITTLE_THROUGH, Tracker
 
@@ -100,8 +101,8 @@ class LoopCloser:
         self._step_config = replace(config, translation_sigma=STEP_M, rotation_sigma=STEP_RAD)
         self._order: list[int] = []
         self._way_m: dict[int, float] = {}
-        self._edges: list[Edge] = []
-        self._waiting: list[Edge] = []
+        self._edges: list[PoseEdge] = []
+        self._waiting: list[PoseEdge] = []
         self._anchored: set[int] = set()
 
     def took(self, id: int) -> Closure | None:
@@ -159,10 +160,10 @@ class LoopCloser:
         fit = fit_to(points, self._surface([near]), [T_here], self._step_config, CELLS_M[0])
         if fit is not None and fit.overlap >= self._step_config.min_overlap:
             T_near_id = inverse(T_near) @ fit.T_world_camera
-            self._edges.append(Edge(near, id, T_near_id, fit.information, certain=follows))
+            self._edges.append(PoseEdge(near, id, T_near_id, fit.information, certain=follows))
         elif follows:
             information = np.diag(np.repeat([STEP_M, STEP_RAD], 3) ** -2.0)
-            self._edges.append(Edge(near, id, inverse(T_near) @ T_here, information))
+            self._edges.append(PoseEdge(near, id, inverse(T_near) @ T_here, information))
 
     def _candidates(self, id: int) -> list[int]:
         """Older keyframes that may have seen the same, those that look most alike first. Neighbours of one
@@ -184,7 +185,7 @@ class LoopCloser:
     def _drift_m(self, id: int, older: int) -> float:
         return DRIFT_M + DRIFT * (self._way_m[id] - self._way_m[older])
 
-    def _loop(self, id: int, older: int, points: OrientedPoints) -> Edge | None:
+    def _loop(self, id: int, older: int, points: OrientedPoints) -> PoseEdge | None:
         """The step from an older keyframe to a new one, if the new one's image fits there."""
         place = self._order.index(older)
         surface = self._surface(self._order[max(0, place - AROUND) : place + AROUND + 1])
@@ -198,15 +199,15 @@ class LoopCloser:
         image = self._map.keyframes[id].image
         if looked_through(surface.planes(), image, fit.T_world_camera) > LITTLE_THROUGH:
             return None
-        return Edge(older, id, inverse(T_there) @ fit.T_world_camera, fit.information, certain=False)
+        return PoseEdge(older, id, inverse(T_there) @ fit.T_world_camera, fit.information, certain=False)
 
-    def _off(self, edge: Edge) -> tuple[float, float]:
+    def _off(self, edge: PoseEdge) -> tuple[float, float]:
         """How far an edge disagrees with the poses: metres and radians."""
         T = inverse(self._pose(edge.first)) @ self._pose(edge.second)
         e = twist(inverse(edge.T_first_second) @ T)
         return float(np.linalg.norm(e[:3])), float(np.linalg.norm(e[3:]))
 
-    def _close(self, loops: Sequence[Edge]) -> Closure | None:
+    def _close(self, loops: Sequence[PoseEdge]) -> Closure | None:
         """Solve the graph with the loops that were found, and move keyframes if they fit better then."""
         self._waiting = [*self._waiting, *loops][-MOST_WAITING:]
         offs = [self._off(edge) for edge in loops]
@@ -235,7 +236,7 @@ class LoopCloser:
         self._edges += believed
         return Closure(worst.second, worst.first, *off, moved)
 
-    def _around_ends(self, edge: Edge) -> list[int]:
+    def _around_ends(self, edge: PoseEdge) -> list[int]:
         """The keyframes at both ends of a loop and their neighbours."""
         ends = [self._order.index(edge.first), self._order.index(edge.second)]
         return [
