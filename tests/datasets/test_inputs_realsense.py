@@ -278,6 +278,7 @@ def test_the_gyroscope_of_a_recording_is_read_whole(library: type[Pipeline], rec
         assert R is not None
         np.testing.assert_allclose(R, cv2.Rodrigues(RATE * 0.1)[0], atol=1e-9)
         np.testing.assert_allclose(up, [0, 0, 1], atol=1e-9)
+        assert source.read(i).acceleration is not None
     for query in ("imu=none", "poses=still"):
         assert open_dataset(f"realsense:{recording}?{query}").read(0).gyro is None
     library.motion = None

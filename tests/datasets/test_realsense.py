@@ -6,12 +6,13 @@ from types import ModuleType, SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from realsense_motion import CLOCK, RATE, UP, MotionSensor
+from realsense_motion import CLOCK, PLACE_M, RATE, UP, MotionSensor
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.base import start_pose
 from taichi_mrf.datasets.realsense.device import MISSES
 from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.sensor.acceleration import GRAVITY
 
 STEPS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
 
@@ -176,6 +177,9 @@ def test_the_gyroscope_turns_with_the_camera_and_the_first_image_is_level(librar
     np.testing.assert_allclose(R, cv2.Rodrigues(RATE * 0.3)[0], atol=1e-9)
     np.testing.assert_allclose(first.T_world_camera[:3, :3] @ UP, [0, 0, 1], atol=1e-9)
     np.testing.assert_array_equal(second.T_world_camera, first.T_world_camera)
+    assert second.acceleration is not None
+    np.testing.assert_allclose(second.acceleration.accelerations_m_s2[7], GRAVITY * UP, atol=1e-9)
+    np.testing.assert_array_equal(second.acceleration.position_m, PLACE_M)
     assert any("imu: it measures turns" in note for note in source.notes)
     del source
     assert library.motion.stopped

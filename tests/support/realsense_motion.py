@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from taichi_mrf.alignment.se3 import moved
-from taichi_mrf.sensor.gravity import GRAVITY
+from taichi_mrf.sensor.acceleration import GRAVITY
 
 R_DEPTH_IMU = moved(np.eye(4), [0, 0, 0, 1.2, -0.9, 0.4])[:3, :3]
 RATE = np.array([0.3, -0.8, 0.5])
@@ -15,6 +15,9 @@ RATE = np.array([0.3, -0.8, 0.5])
 
 UP = np.array([0.3, -0.9, 0.2]) / np.linalg.norm([0.3, -0.9, 0.2])
 """Upwards in the depth camera's frame."""
+
+PLACE_M = (0.01, -0.02, 0.03)
+"""Of the IMU in the depth camera's frame."""
 
 CLOCK = "global time"
 
@@ -33,7 +36,7 @@ class MotionSensor:
 
     def get_stream_profiles(self) -> list[SimpleNamespace]:
         rotation = R_DEPTH_IMU.T.ravel().tolist()  # by columns
-        extrinsics = SimpleNamespace(rotation=rotation, translation=[0.0, 0.01, 0.02])
+        extrinsics = SimpleNamespace(rotation=rotation, translation=list(PLACE_M))
         return [
             SimpleNamespace(
                 stream_type=lambda kind=kind: kind,

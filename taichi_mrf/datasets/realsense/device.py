@@ -125,14 +125,15 @@ class RealSenseCamera(Dataset):
         if steps.shape != self.camera.shape:
             raise FrameError(f"{name}: the image has the shape {steps.shape}, not {self.camera.shape}")
         depth_m = (steps * np.float32(self.depth_scale)).astype(np.float32)
-        stamp, gyro = image.get_timestamp() / 1000.0, None
+        stamp, gyro, acceleration = image.get_timestamp() / 1000.0, None, None
         if self.motion is not None:
             clock = image.get_frame_timestamp_domain()
             if not self.started:
                 self.T_world_camera = start_pose(self.motion.up(stamp, clock))
-            gyro = self.motion.gyro(clock)
+            gyro, acceleration = self.motion.gyro(clock), self.motion.acceleration(clock)
         self.started = True
-        return Frame(depth_m, self._pose(name, stamp), self.camera, stamp, name, color, gyro=gyro)
+        pose = self._pose(name, stamp)
+        return Frame(depth_m, pose, self.camera, stamp, name, color, gyro=gyro, acceleration=acceleration)
 
     def _pose(self, name: str, stamp: float) -> Pose:
         if self.trajectory is None:
@@ -247,12 +248,13 @@ def _open_recording(
     if not images:
         raise DatasetError(f"{path}: contains no depth images")
     notes: list[str] = []
-    gyro = up = None
+    gyro = acceleration = up = None
     if with_imu:
         motion, notes = motion_or_note(recorded_motion, rs, path)
         if motion is not None:
-            gyro = motion.gyro(images[0].clock)
-            up = motion.up(images[0].stamp, images[0].clock, wait_s=0)
+            clock = images[0].clock
+            gyro, acceleration = motion.gyro(clock), motion.acceleration(clock)
+            up = motion.up(images[0].stamp, clock, wait_s=0)
     still = start_pose(up)
     poses = [still if trajectory is None else trajectory.at(each.stamp, gap) for each in images]
     posed = [(each, pose) for each, pose in zip(images, poses, strict=True) if pose is not None]
@@ -273,6 +275,7 @@ def _open_recording(
         listed=[each for each, _ in posed],
         poses=[pose for _, pose in posed],
         gyro=gyro,
+        acceleration=acceleration,
     )
     weakref.finalize(source, player.close)
     return source

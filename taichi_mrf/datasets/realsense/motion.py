@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.sensor.gravity import AT_REST_S, upwards_at
+from taichi_mrf.sensor.acceleration import AT_REST_S, AccelerationSamples, upwards_at
 from taichi_mrf.sensor.gyro import GyroSamples
 
 LEAST_HZ = 100
@@ -39,10 +39,12 @@ class MotionModule:
         self._rs = rs
         self._came = threading.Condition()
         self._sensor, profiles = _sensor_of(rs, device)
-        self._R_depth_imu, self._samples = {}, {}
+        self._T_depth_imu, self._samples = {}, {}
         for kind, profile in profiles.items():
-            by_columns = profile.get_extrinsics_to(depth).rotation
-            self._R_depth_imu[kind] = np.array(by_columns, float).reshape(3, 3).T
+            extrinsics, T_depth_imu = profile.get_extrinsics_to(depth), np.eye(4)
+            T_depth_imu[:3, :3] = np.array(extrinsics.rotation, float).reshape(3, 3).T
+            T_depth_imu[:3, 3] = extrinsics.translation
+            self._T_depth_imu[kind] = T_depth_imu
             self._samples[kind] = deque[tuple[float, Any, tuple[float, float, float]]](maxlen=kept)
         self._sensor.open(list(profiles.values()))
         try:
@@ -56,16 +58,25 @@ class MotionModule:
         stamps, rates = self._by(self._rs.stream.gyro, clock)
         return GyroSamples(stamps, rates) if len(stamps) else None
 
+    def acceleration(self, clock: Any) -> AccelerationSamples | None:
+        """The accelerations so far, by this clock."""
+        accel = self._rs.stream.accel
+        if accel not in self._samples:
+            return None
+        stamps, accelerations = self._by(accel, clock)
+        samples = AccelerationSamples(stamps, accelerations, self._T_depth_imu[accel][:3, 3])
+        return samples if len(stamps) else None
+
     def up(self, first_s: float, clock: Any, wait_s: float = WAIT_S) -> NDArray[np.float64] | None:
         """Upwards in the depth camera's frame, (3,), at the first image; None if it moved, or is not known.
         Waits for the samples after that image."""
-        accel = self._rs.stream.accel
-        samples = self._samples.get(accel)
+        samples = self._samples.get(self._rs.stream.accel)
         if samples is None:
             return None
         with self._came:
             self._came.wait_for(lambda: samples and samples[-1][0] >= first_s + AT_REST_S, wait_s)
-        return upwards_at(*self._by(accel, clock), first_s)
+        found = self.acceleration(clock)
+        return None if found is None else upwards_at(found, first_s)
 
     def wait(self, ended: threading.Event) -> None:
         """Wait until it has ended, or no further sample comes."""
@@ -94,7 +105,7 @@ class MotionModule:
         table = np.array(taken, float).reshape(-1, 4)
         table = table[np.isfinite(table).all(axis=1)]
         stamps, first = np.unique(table[:, 0], return_index=True)
-        return stamps, table[first, 1:] @ self._R_depth_imu[kind].T
+        return stamps, table[first, 1:] @ self._T_depth_imu[kind][:3, :3].T
 
 
 def motion_or_note(

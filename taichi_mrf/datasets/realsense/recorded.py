@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.acceleration import AccelerationSamples
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.gyro import GyroSamples
@@ -106,12 +107,13 @@ class Player:
 
 @dataclass
 class RealSenseRecording(Dataset):
-    """The depth images of a recording, ``listed`` with their ``poses``, and the angular rates of its IMU."""
+    """The depth images of a recording, ``listed`` with their ``poses``, and what its IMU measured."""
 
     player: Player = field(kw_only=True)
     listed: Sequence[RecordedImage] = field(kw_only=True)
     poses: Sequence[Pose] = field(kw_only=True)
     gyro: GyroSamples | None = field(kw_only=True, default=None)
+    acceleration: AccelerationSamples | None = field(kw_only=True, default=None)
 
     def __post_init__(self) -> None:
         self._names = [f"realsense-{each.number:06d}" for each in self.listed]
@@ -144,4 +146,5 @@ class RealSenseRecording(Dataset):
         if steps.shape != self.camera.shape:
             raise FrameError(f"frame {name}: the image has the shape {steps.shape}, not {self.camera.shape}")
         depth_m = (steps * np.float32(self.player.depth_scale)).astype(np.float32)
-        return Frame(depth_m, self.poses[index], self.camera, wanted.stamp, name, color, gyro=self.gyro)
+        parts = (self.poses[index], self.camera, wanted.stamp, name, color)
+        return Frame(depth_m, *parts, gyro=self.gyro, acceleration=self.acceleration)

@@ -11,7 +11,7 @@ from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.reader import RosReader
 from taichi_mrf.datasets.ros.topics import choose, placed
 from taichi_mrf.errors import DatasetError
-from taichi_mrf.sensor.gravity import upwards_at
+from taichi_mrf.sensor.acceleration import AccelerationSamples, upwards_at
 from taichi_mrf.sensor.gyro import GyroSamples
 
 NONE = "none"
@@ -20,10 +20,12 @@ NONE = "none"
 
 @dataclass(frozen=True)
 class BagImu:
-    """The angular rates of the camera, and upwards in its frame, (3,), at the first image; None for what is
-    not known. ``notes`` are for the user: which topic is used, or why none is although there are some."""
+    """The angular rates and accelerations of the camera, and upwards in its frame, (3,), at the first image;
+    None for what is not known. ``notes`` are for the user: which topic is used, or why none is although there
+    are some."""
 
     gyro: GyroSamples | None = None
+    acceleration: AccelerationSamples | None = None
     up: NDArray[np.float64] | None = None
     notes: list[str] = field(default_factory=list)
 
@@ -56,10 +58,13 @@ def find_imu(reader: RosReader, wanted: str, optical: str, first_s: float) -> Ba
     times, first = np.unique(stamps, return_index=True)
     rates_imu = np.array(rates)[first]
     valid = np.isfinite(rates_imu).all(axis=1)
-    up = upwards_at(times, np.array(accelerations)[first] @ to_optical, first_s)
+    measured = np.array(accelerations)[first] @ to_optical
+    felt = np.isfinite(measured).all(axis=1)
+    acceleration = AccelerationSamples(times[felt], measured[felt], T_optical_imu[:3, 3])
+    up = upwards_at(acceleration, first_s)
     level = "the first image is level by it" if up is not None else "which way is up it does not say"
     gyro = GyroSamples(times[valid], rates_imu[valid] @ to_optical)
-    return BagImu(gyro, up, [f"imu: {name} measures turns; {level}"])
+    return BagImu(gyro, acceleration if felt.any() else None, up, [f"imu: {name} measures turns; {level}"])
 
 
 def _turns(message: Any | None) -> bool:

@@ -1,4 +1,6 @@
-"""Which way is up, by an accelerometer beside a camera that is held still."""
+"""What an accelerometer beside the camera has measured, and which way is up if the camera is held still."""
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,17 @@ is held still: then up is right to about 2 degrees."""
 LEAST_SAMPLES = 10
 
 
+@dataclass(frozen=True)
+class AccelerationSamples:
+    """Accelerations (N, 3) in metres per square second along the axes of the camera frame, against free fall:
+    at rest they point upwards. ``stamps_s`` (N,) are ascending seconds of the frames' clock, and
+    ``position_m`` (3,) is the accelerometer's place in the camera frame."""
+
+    stamps_s: NDArray[np.float64]
+    accelerations_m_s2: NDArray[np.float64]
+    position_m: NDArray[np.float64]
+
+
 def upwards(accelerations: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Upwards, a unit vector (3,), by what an accelerometer measures (N, 3) in metres per square second; None
     if it does not rest."""
@@ -29,9 +42,6 @@ def upwards(accelerations: NDArray[np.float64]) -> NDArray[np.float64] | None:
     return np.asarray(mean / size)
 
 
-def upwards_at(
-    stamps_s: NDArray[np.float64], accelerations: NDArray[np.float64], first_s: float
-) -> NDArray[np.float64] | None:
-    """The same by those samples (N, 3) that are around the first image, at ``first_s``; theirs are
-    ``stamps_s`` (N,)."""
-    return upwards(accelerations[np.abs(stamps_s - first_s) <= AT_REST_S])
+def upwards_at(samples: AccelerationSamples, first_s: float) -> NDArray[np.float64] | None:
+    """The same by the samples around the first image, at ``first_s``."""
+    return upwards(samples.accelerations_m_s2[np.abs(samples.stamps_s - first_s) <= AT_REST_S])
