@@ -81,7 +81,8 @@ FREE = PoseConfig(translation_sigma=1e3, rotation_sigma=1e3)
 @dataclass(frozen=True)
 class Closure:
     """A loop that was closed: keyframe ``keyframe`` sees what ``older`` has seen, and was ``off_m`` metres
-    and ``off_rad`` radians from where that puts it. ``moved`` are the keyframes that have new poses."""
+    and ``off_rad`` radians from where that puts it, more than with other loops that are believed. ``moved``
+    are the keyframes that have new poses."""
 
     keyframe: int
     older: int
@@ -213,16 +214,17 @@ class LoopCloser:
         offs = [self._off(edge) for edge in loops]
         if not any(m > DISAGREES_M or rad > DISAGREES_RAD for m, rad in offs):
             return None
-        worst, off = max(zip(loops, offs, strict=True), key=lambda each: sum(each[1]))
         # The poses that fit steps and loops best, and which of the loops these believe.
         stood = {id: self._pose(id) for id in self._order}
         stays = {min(self._order), *self._anchored, *self._fixed()} & stood.keys()
         solution = solve_pose_graph(stood, [*self._edges, *self._waiting], stays)
         trust = solution.trust[len(self._edges) :]
         believed = [edge for edge, share in zip(self._waiting, trust, strict=True) if share > TRUSTED]
+        if not believed:
+            return None
+        worst, off = max(((edge, self._off(edge)) for edge in believed), key=lambda each: sum(each[1]))
         # A place may look like another.
-        found_from = {edge.second for edge in believed}
-        if not believed or (off[0] > ALONE_M and len(found_from) < CONFIRMED):
+        if off[0] > ALONE_M and len({edge.second for edge in believed}) < CONFIRMED:
             return None
         # Is what the keyframes at both ends have measured more likely now?
         joined = sorted({id for edge in believed for id in self._around_ends(edge)})
