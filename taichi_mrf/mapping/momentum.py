@@ -25,6 +25,9 @@ FIRST_M_S2 = 3.0
 PLACE_M = 0.01
 """Standard deviation of a place that was found, against the two before it."""
 
+NEAR_M = 0.05
+"""A search from so near finds the place."""
+
 DRIFT_M_S2 = 0.02
 """By how much gravity and bias together change in a second, as the camera turns."""
 
@@ -42,10 +45,12 @@ class _Step:
 
 class Momentum:
     """Predicts places. ``gravity_m_s2`` (3,) is what the accelerometer measures at rest, along the axes of
-    the world; None until it is needed."""
+    the world; None until it is needed. ``proven`` says whether the last frame was found where it was
+    predicted."""
 
     def __init__(self) -> None:
         self.gravity_m_s2: NDArray[np.float64] | None = None
+        self.proven = False
         self._variance = FIRST_M_S2**2
         self._said: tuple[Frame, Pose, float] | None = None
         """The frame, its prediction, and by how much that falls short for each m/s^2 of gravity."""
@@ -78,13 +83,16 @@ class Momentum:
 
     def note(self, frame: Frame, T_now: Pose) -> None:
         """Learn from where the camera was found at the frame that was asked for last, (4, 4)."""
+        self.proven = False
         if self._said is None or self._said[0] is not frame or self.gravity_m_s2 is None:
             return
         _, T_said, lever = self._said
+        missed_m = T_now[:3, 3] - T_said[:3, 3]
+        self.proven = bool(np.linalg.norm(missed_m) < NEAR_M)
         variance = self._variance + DRIFT_M_S2**2
         share = variance / (variance + (PLACE_M / lever) ** 2)
         self._variance = (1 - share) * variance
-        self.gravity_m_s2 = self.gravity_m_s2 - share / lever * (T_now[:3, 3] - T_said[:3, 3])
+        self.gravity_m_s2 = self.gravity_m_s2 - share / lever * missed_m
 
 
 def _measured(

@@ -170,8 +170,7 @@ class Tracker:
         image = DepthImage.upload(depth_m, frame.camera, m.noise, own=frame.own_for(m.sensor))
         around = self._around(frame.camera, frame.stamp) if sees_around(frame.camera) else None
         turn = self._turns.since(frame, self._last.stamp)
-        guesses = turned(self._guesses(frame.stamp), self._pose(self._last), turn)
-        guesses += self._carried(frame)
+        guesses = turned(self._guesses(frame), self._pose(self._last), turn)
         if around is None and self._lost:
             guesses += self._known_places(small_picture(depth_m, frame.color))
         config = self._config if turn is None or self._lost else self._gyro_config
@@ -264,12 +263,15 @@ class Tracker:
             expected_m = expected_m + ahead * (expected_m - self._pose(self._before)[:3, 3])
         return Around(T_last, camera.up, reach_m, expected_m, EXPECTED_M * (1 + self._lost))
 
-    def _guesses(self, stamp: float) -> list[Pose]:
-        """Where the camera may be if it stands still, and if it moves on."""
+    def _guesses(self, frame: Frame) -> list[Pose]:
+        """Where the camera may be if it stands still, where its accelerometer says, and if it moves on, which
+        is left out while the accelerometer is right."""
         assert self._last is not None
         T_last = self._pose(self._last)
-        guesses = [T_last]
-        ahead = self._ahead(stamp)
+        guesses = [T_last, *(carried := self._carried(frame))]
+        ahead = self._ahead(frame.stamp)
+        if carried and self._momentum.proven and not self._lost:
+            return guesses
         if self._before is not None and ahead is not None:
             step = twist(inverse(self._pose(self._before)) @ T_last)
             guesses.append(moved(T_last, ahead * step))

@@ -82,7 +82,7 @@ def test_an_even_acceleration_gives_the_exact_place_also_of_a_camera_beside_the_
 
 
 def test_gravity_is_learnt_from_the_places_that_are_found() -> None:
-    momentum, off = Momentum(), []
+    momentum, off, proven = Momentum(), [], []
     for k in range(14, 28):
         before, last, now = (0.1 * (k + n) for n in (-2, -1, 0))
         frame = frame_at(swung, now)
@@ -90,8 +90,12 @@ def test_gravity_is_learnt_from_the_places_that_are_found() -> None:
         assert T is not None
         off.append(tangent_norms(T, swung(now))[1])
         momentum.note(frame, swung(now))
+        proven.append(momentum.proven)
     assert momentum.gravity_m_s2 is not None
-    assert off[0] > 0.02  # the mean of what was measured at first
+    assert off[0] > 0.05  # the mean of what was measured at first
+    np.testing.assert_array_equal(proven, np.array(off) < 0.05)
+    momentum.note(replace(frame), swung(now))
+    assert not momentum.proven  # a frame that it was not asked for
     assert max(off[-4:]) < 0.2 * off[0]
     assert np.linalg.norm(momentum.gravity_m_s2 - UP) < 0.2
 
