@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from taichi_mrf.alignment.pose_equations import PoseEquations
 from taichi_mrf.alignment.se3 import adjoint, cross_matrix
+from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose
 
 Twists = NDArray[np.float64]
@@ -46,21 +47,6 @@ SMALL_ANGLE = 1e-4
 """Radians below which the limits of the closed forms are more precise than they are."""
 
 
-@dataclass(frozen=True, eq=False)
-class Edge:
-    """A measured step: the pose ``T_first_second`` (4, 4) of node ``second`` in the frame of ``first``.
-
-    ``information`` (6, 6) is the inverse covariance of the twist e above, in the frame of ``second``, metres
-    and radians. ``certain``: not rejected however badly it fits, as steps between neighbours in time.
-    """
-
-    first: int
-    second: int
-    T_first_second: Pose
-    information: NDArray[np.float64]
-    certain: bool = True
-
-
 @dataclass(frozen=True)
 class Solution:
     """The poses (4, 4) of all nodes, and how far each edge was trusted, from 0 to 1 in the edges' order.
@@ -72,7 +58,7 @@ class Solution:
 
 
 def solve_pose_graph(
-    poses: Mapping[int, Pose], edges: Sequence[Edge], fixed: Collection[int] = ()
+    poses: Mapping[int, Pose], edges: Sequence[PoseEdge], fixed: Collection[int] = ()
 ) -> Solution:
     """The poses at which the edges fit best. The search begins at ``poses``; nodes that are ``fixed`` stay,
     and so does the one with the lowest id if none is. Raises ValueError for an edge of an unknown node."""
@@ -81,7 +67,7 @@ def solve_pose_graph(
 
 
 class _Problem:
-    def __init__(self, poses: Mapping[int, Pose], edges: Sequence[Edge], fixed: set[int]) -> None:
+    def __init__(self, poses: Mapping[int, Pose], edges: Sequence[PoseEdge], fixed: set[int]) -> None:
         self.ids = list(poses)
         number = {id: n for n, id in enumerate(self.ids)}
         unknown = {id for edge in edges for id in (edge.first, edge.second)} - number.keys()
@@ -91,7 +77,9 @@ class _Problem:
         self.first = np.array([number[edge.first] for edge in edges], np.intp)
         self.second = np.array([number[edge.second] for edge in edges], np.intp)
         self.Z = np.stack([edge.T_first_second for edge in edges]) if edges else np.zeros((0, 4, 4))
-        self.information = np.stack([e.information for e in edges]) if edges else np.zeros((0, 6, 6))
+        self.information = np.zeros((len(edges), 6, 6))
+        for n, edge in enumerate(edges):
+            self.information[n] = np.eye(6) if edge.information is None else edge.information
         self.certain = np.array([edge.certain for edge in edges], bool)
         self.free = np.array([id not in fixed for id in self.ids], bool)
 

@@ -212,8 +212,9 @@ class Session:
         state = self.state
         for entry in state.mapper.follow(closure.moved):
             state.send(state.mapper.describe(entry))
-        far = f"{100 * closure.off_m:.0f} cm"
-        state.send(Notice(f"loop closed: the camera was off by {far}, {len(closure.moved)} keyframes moved"))
+        far, count = f"{100 * closure.off_m:.0f} cm", len(closure.moved)
+        what = "1 keyframe" if count == 1 else f"{count} keyframes"
+        state.send(Notice(f"loop closed: the camera was off by {far}, {what} moved"))
 
     def _settle(self) -> bool:
         def settle() -> None:

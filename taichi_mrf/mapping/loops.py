@@ -18,11 +18,12 @@ import numpy as np
 
 from taichi_mrf.alignment.oriented_points import OrientedPoints, oriented_points
 from taichi_mrf.alignment.pairs import fit_to
-from taichi_mrf.alignment.pose_graph import Edge, solve_pose_graph
+from taichi_mrf.alignment.pose_graph import solve_pose_graph
 from taichi_mrf.alignment.se3 import twist
 from taichi_mrf.alignment.seen_through import looked_through
 from taichi_mrf.alignment.surfels import Surfels
 from taichi_mrf.config.schema import PoseConfig
+from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose, inverse, tangent_norms
 from taichi_mrf.mapping.tracking import ALIKE, LITTLE_THROUGH, Tracker
 
@@ -88,7 +89,8 @@ FREE = PoseConfig(translation_sigma=1e3, rotation_sigma=1e3)
 @dataclass(frozen=True)
 class Closure:
     """A loop that was closed: keyframe ``keyframe`` sees what ``older`` has seen, and was ``off_m`` metres
-    and ``off_rad`` radians from where that puts it. ``moved`` are the keyframes that have new poses."""
+    and ``off_rad`` radians from where that puts it, more than with other loops that are believed. ``moved``
+    are the keyframes that have new poses."""
 
     keyframe: int
     older: int
@@ -108,8 +110,8 @@ class LoopCloser:
         self._step_config = replace(config, translation_sigma=STEP_M, rotation_sigma=STEP_RAD)
         self._order: list[int] = []
         self._way_m: dict[int, float] = {}
-        self._edges: list[Edge] = []
-        self._waiting: list[Edge] = []
+        self._edges: list[PoseEdge] = []
+        self._waiting: list[PoseEdge] = []
         self._anchored: set[int] = set()
 
     def took(self, id: int) -> Closure | None:
@@ -170,9 +172,9 @@ class LoopCloser:
             # Others than the last one have not been tracked from: what the guess says would count twice.
             information = fit.information + tracked if follows else fit.information
             T_near_id = inverse(T_near) @ fit.T_world_camera
-            self._edges.append(Edge(near, id, T_near_id, information, certain=follows))
+            self._edges.append(PoseEdge(near, id, T_near_id, information, certain=follows))
         elif follows:
-            self._edges.append(Edge(near, id, inverse(T_near) @ T_here, tracked))
+            self._edges.append(PoseEdge(near, id, inverse(T_near) @ T_here, tracked))
 
     def _candidates(self, id: int) -> list[int]:
         """Older keyframes that may have seen the same, those that look most alike first. Neighbours of one
@@ -194,7 +196,7 @@ class LoopCloser:
     def _drift_m(self, id: int, older: int) -> float:
         return DRIFT_M + DRIFT * (self._way_m[id] - self._way_m[older])
 
-    def _loop(self, id: int, older: int, points: OrientedPoints) -> Edge | None:
+    def _loop(self, id: int, older: int, points: OrientedPoints) -> PoseEdge | None:
         """The step from an older keyframe to a new one, if the new one's image fits there."""
         place = self._order.index(older)
         surface = self._surface(self._order[max(0, place - AROUND) : place + AROUND + 1])
@@ -208,30 +210,31 @@ class LoopCloser:
         image = self._map.keyframes[id].image
         if looked_through(surface.planes(), image, fit.T_world_camera) > LITTLE_THROUGH:
             return None
-        return Edge(older, id, inverse(T_there) @ fit.T_world_camera, fit.information, certain=False)
+        return PoseEdge(older, id, inverse(T_there) @ fit.T_world_camera, fit.information, certain=False)
 
-    def _off(self, edge: Edge) -> tuple[float, float]:
+    def _off(self, edge: PoseEdge) -> tuple[float, float]:
         """How far an edge disagrees with the poses: metres and radians."""
         T = inverse(self._pose(edge.first)) @ self._pose(edge.second)
         e = twist(inverse(edge.T_first_second) @ T)
         return float(np.linalg.norm(e[:3])), float(np.linalg.norm(e[3:]))
 
-    def _close(self, loops: Sequence[Edge]) -> Closure | None:
+    def _close(self, loops: Sequence[PoseEdge]) -> Closure | None:
         """Solve the graph with the loops that were found, and move keyframes if they fit better then."""
         self._waiting = [*self._waiting, *loops][-MOST_WAITING:]
         offs = [self._off(edge) for edge in loops]
         if not any(m > DISAGREES_M or rad > DISAGREES_RAD for m, rad in offs):
             return None
-        worst, off = max(zip(loops, offs, strict=True), key=lambda each: sum(each[1]))
         # The poses that fit steps and loops best, and which of the loops these believe.
         stood = {id: self._pose(id) for id in self._order}
         stays = {min(self._order), *self._anchored, *self._fixed()} & stood.keys()
         solution = solve_pose_graph(stood, [*self._edges, *self._waiting], stays)
         trust = solution.trust[len(self._edges) :]
         believed = [edge for edge, share in zip(self._waiting, trust, strict=True) if share > TRUSTED]
+        if not believed:
+            return None
+        worst, off = max(((edge, self._off(edge)) for edge in believed), key=lambda each: sum(each[1]))
         # A place may look like another.
-        found_from = {edge.second for edge in believed}
-        if not believed or (off[0] > ALONE_M and len(found_from) < CONFIRMED):
+        if off[0] > ALONE_M and len({edge.second for edge in believed}) < CONFIRMED:
             return None
         # Is what the keyframes at both ends have measured about as likely now?
         joined = sorted({id for edge in believed for id in self._around_ends(edge)})
@@ -245,7 +248,7 @@ class LoopCloser:
         self._edges += believed
         return Closure(worst.second, worst.first, *off, moved)
 
-    def _around_ends(self, edge: Edge) -> list[int]:
+    def _around_ends(self, edge: PoseEdge) -> list[int]:
         """The keyframes at both ends of a loop and their neighbours."""
         ends = [self._order.index(edge.first), self._order.index(edge.second)]
         return [

@@ -3,11 +3,12 @@
 The first frame fixes the map's frame. Each later one is aligned with what the keyframes have measured
 (alignment/locate.py), from where corners of the image before are seen now (alignment/optical_flow.py).
 Without colour, or where that fits nothing, there are two guesses: that the camera stands still, and that it
-moves on as it did. Both have turned as the gyroscope says, where there is one (turning.py). If neither fits,
-the scan of a sensor that sees around is searched for in all headings and metres around. A frame that fits
-nowhere is lost; the next one is searched around the last pose that was found, around the first, and around
-those of keyframes that look like it. Errors of alignment add up along the way, until a loop is closed
-(loops.py). Poses are kept relative to the keyframe of the moment, so that they follow when it is moved.
+moves on as it did. Both have turned as the gyroscope says, where there is one (turning.py); an accelerometer
+adds a third guess (momentum.py). If none fits, the scan of a sensor that sees around is searched for in all
+headings and metres around. A frame that fits nowhere is lost; the next one is searched around the last pose
+that was found, around the first, and around those of keyframes that look like it. Errors of alignment add up
+along the way, until a loop is closed (loops.py). Poses are kept relative to the keyframe of the moment, so
+that they follow when it is moved.
 """
 
 import math
@@ -31,6 +32,7 @@ from taichi_mrf.datasets.realsense.device import NAME as CAMERA
 from taichi_mrf.errors import ConfigError, LostFrameError
 from taichi_mrf.geometry.poses import Pose, as_pose, inverse
 from taichi_mrf.inference.keyframe import DepthImage, checked_depth
+from taichi_mrf.mapping.momentum import Momentum
 from taichi_mrf.mapping.turning import GYRO_RAD, GyroTurns, turned
 from taichi_mrf.methods.capabilities import AligningMap, can_refine_poses
 from taichi_mrf.methods.protocol import OccupancyMap
@@ -142,6 +144,7 @@ class Tracker:
         self._locator = Locator(m.aligner.surface)
         self._gyro_config = replace(self._config, rotation_sigma=GYRO_RAD)
         self._turns = GyroTurns()
+        self._momentum = Momentum()
         self._pictures = KeyframePictures()
         self.appearances = Appearances()
         self._frame: Frame | None = None
@@ -170,7 +173,7 @@ class Tracker:
         image = DepthImage.upload(depth_m, frame.camera, m.noise, own=frame.own_for(m.sensor))
         around = self._around(frame.camera, frame.stamp) if sees_around(frame.camera) else None
         turn = self._turns.since(frame, self._last.stamp)
-        guesses = turned(self._guesses(frame.stamp), self._pose(self._last), turn)
+        guesses = turned(self._guesses(frame), self._pose(self._last), turn)
         if around is None and self._lost:
             guesses += self._known_places(small_picture(depth_m, frame.color))
         config = self._config if turn is None or self._lost else self._gyro_config
@@ -186,6 +189,7 @@ class Tracker:
             raise LostFrameError(f"{frame.name}: tracking lost: {reason}")
         if located.directions == 6:
             self._turns.note(frame, self._last.stamp, self._pose(self._last), T_world_camera)
+            self._momentum.note(frame, T_world_camera)
         if self._lost:
             self._last = None  # the motion since then is unknown
         return self._found(frame, T_world_camera, located.directions)
@@ -264,12 +268,15 @@ class Tracker:
             expected_m = expected_m + ahead * (expected_m - self._pose(self._before)[:3, 3])
         return Around(T_last, camera.up, reach_m, expected_m, EXPECTED_M * (1 + self._lost))
 
-    def _guesses(self, stamp: float) -> list[Pose]:
-        """Where the camera may be if it stands still, and if it moves on."""
+    def _guesses(self, frame: Frame) -> list[Pose]:
+        """Where the camera may be if it stands still, where its accelerometer says, and if it moves on, which
+        is left out while the accelerometer is right."""
         assert self._last is not None
         T_last = self._pose(self._last)
-        guesses = [T_last]
-        ahead = self._ahead(stamp)
+        guesses = [T_last, *(carried := self._carried(frame))]
+        ahead = self._ahead(frame.stamp)
+        if carried and self._momentum.proven and not self._lost:
+            return guesses
         if self._before is not None and ahead is not None:
             step = twist(inverse(self._pose(self._before)) @ T_last)
             guesses.append(moved(T_last, ahead * step))
@@ -293,6 +300,14 @@ class Tracker:
         return self._locator.locate(
             image, guess, keyframes, config, colors=colors, observable=OBSERVABLE_BY_DEPTH
         )
+
+    def _carried(self, frame: Frame) -> list[Pose]:
+        """Where the camera is by its accelerometer, if that tells."""
+        if self._last is None or self._before is None:
+            return []
+        before, last = ((tracked.stamp, self._pose(tracked)) for tracked in (self._before, self._last))
+        T_world_camera = self._momentum.ahead(frame, before, last, self._turns.bias_rad_s)
+        return [] if T_world_camera is None else [T_world_camera]
 
     def _known_places(self, picture: Picture) -> list[Pose]:
         """Where a lost camera may be: where it began, and where keyframes look like its picture."""

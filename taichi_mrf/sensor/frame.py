@@ -14,6 +14,7 @@ from taichi_mrf.sensor.own_evidence import OwnEvidence
 from taichi_mrf.sensor.pose_doubt import checked_covariance, covariance_of
 
 if TYPE_CHECKING:
+    from taichi_mrf.sensor.acceleration import AccelerationSamples
     from taichi_mrf.sensor.gyro import GyroSamples
     from taichi_mrf.sensor.noise import NoiseModel
 
@@ -31,7 +32,7 @@ class Frame:
     float32, the standard deviation in metres of each pixel's depth; ``noise``, a noise model for this frame;
     ``no_return``, (H, W) bool, the pixels that looked and got nothing back. ``sensor`` names the sensor of a
     recording of several. ``gyro`` has the camera's angular rates up to this frame and for at least the time
-    since the one before.
+    since the one before, ``acceleration`` its accelerations for the time since the two before.
     """
 
     depth_m: NDArray[np.float32]
@@ -45,6 +46,7 @@ class Frame:
     no_return: NDArray[np.bool_] | None = None
     sensor: str = ""
     gyro: "GyroSamples | None" = None
+    acceleration: "AccelerationSamples | None" = None
 
     @property
     def points_m(self) -> NDArray[np.float64]:

@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
 from taichi_mrf.alignment.pose_equations import PoseEquations
-from taichi_mrf.alignment.pose_graph import Edge, solve_pose_graph
+from taichi_mrf.alignment.pose_graph import solve_pose_graph
 from taichi_mrf.alignment.se3 import moved, twist
+from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose, inverse, tangent_norms
 
 SIGMAS = np.array([0.01, 0.02, 0.015, 0.004, 0.005, 0.006])
@@ -31,12 +32,12 @@ def information(random: np.random.Generator) -> np.ndarray:
 
 def measured(
     poses: dict[int, Pose], i: int, k: int, random: np.random.Generator, certain: bool = True
-) -> Edge:
+) -> PoseEdge:
     step = moved(inverse(poses[i]) @ poses[k], random.normal(size=6) * SIGMAS)
-    return Edge(i, k, step, information(random), certain)
+    return PoseEdge(i, k, step, information(random), certain)
 
 
-def chained(edges: list[Edge]) -> dict[int, Pose]:
+def chained(edges: list[PoseEdge]) -> dict[int, Pose]:
     poses = {0: np.eye(4)}
     for edge in edges:
         poses[edge.second] = poses[edge.first] @ edge.T_first_second
@@ -74,9 +75,10 @@ def test_a_closed_loop_removes_the_drift_and_wrong_loops_are_not_believed() -> N
     exact = information(random) * 100
     steps = [measured(true, i, i + 1, random) for i in range(39)]
     right = [
-        Edge(i, k, inverse(true[i]) @ true[k], exact, certain=False) for i, k in ((0, 39), (1, 38), (2, 37))
+        PoseEdge(i, k, inverse(true[i]) @ true[k], exact, certain=False)
+        for i, k in ((0, 39), (1, 38), (2, 37))
     ]
-    wrong = [Edge(i, k, np.eye(4), exact, certain=False) for i, k in ((3, 20), (8, 31))]
+    wrong = [PoseEdge(i, k, np.eye(4), exact, certain=False) for i, k in ((3, 20), (8, 31))]
     start = chained(steps)
     found = solve_pose_graph(start, [*steps, *right, *wrong])
     np.testing.assert_array_less(0.5, found.trust[39:42])
@@ -110,7 +112,7 @@ def test_moving_everything_moves_the_solution() -> None:
 
 def test_an_edge_of_an_unknown_node_is_named() -> None:
     with pytest.raises(ValueError, match="names node 7, which has no pose"):
-        solve_pose_graph(ring(2), [Edge(0, 7, np.eye(4), np.eye(6))])
+        solve_pose_graph(ring(2), [PoseEdge(0, 7, np.eye(4), np.eye(6))])
 
 
 def test_sparse_equations_are_the_dense_ones() -> None:

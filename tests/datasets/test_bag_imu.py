@@ -11,8 +11,8 @@ from inputs_bags import FRAME, Bag, Kind, images, stamp, writing
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.datasets.base import start_pose
-from taichi_mrf.datasets.ros.imu import GRAVITY, upwards
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.sensor.acceleration import GRAVITY, upwards
 
 TOPIC, BODY = "/imu/data", "imu_link"
 T_camera_imu = moved(np.eye(4), [0.02, 0.0, 0.01, 1.2, -0.9, 0.4])
@@ -77,6 +77,9 @@ def test_turns_come_in_the_cameras_frame_and_the_first_image_is_level(
     assert R is not None
     np.testing.assert_allclose(R, cv2.Rodrigues(RATE * (stamp(1) - stamp(0)))[0], atol=1e-6)
     np.testing.assert_allclose(first.T_world_camera[:3, :3] @ UP, [0, 0, 1], atol=1e-5)
+    assert second.acceleration is not None
+    np.testing.assert_allclose(second.acceleration.accelerations_m_s2[7], GRAVITY * UP, atol=1e-4)
+    np.testing.assert_array_equal(second.acceleration.position_m, T_camera_imu[:3, 3])
     assert any(f"{TOPIC} measures turns; the first image is level" in note for note in dataset.notes)
 
 

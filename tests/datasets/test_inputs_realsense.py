@@ -4,10 +4,12 @@ import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import tracked_room
 from datasets_recordings import stamped_line
+from realsense_motion import CLOCK, RATE, UP, MotionSensor
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import DatasetError, FrameError
@@ -34,6 +36,7 @@ class Pipeline:
     stopped = 0
     lost: tuple[int, ...] = ()
     colored = False
+    motion: MotionSensor | None = None
 
     def start(self, config: SimpleNamespace) -> SimpleNamespace:
         if config.file is not None and not Path(config.file).read_bytes().startswith(b"#ROSBAG"):
@@ -54,6 +57,7 @@ class Pipeline:
             get_data=lambda: STEPS + 10 * i,
             get_timestamp=lambda: 1000.0 * stamp(i),
             get_frame_number=lambda: 100 + i,
+            get_frame_timestamp_domain=lambda: CLOCK,
         )
         return SimpleNamespace(get_depth_frame=lambda: image, number=i)
 
@@ -84,7 +88,9 @@ class Config:
         player = SimpleNamespace(set_real_time=lambda on: setattr(self.playback, "real_time", on))
         return SimpleNamespace(
             get_stream=lambda kind: SimpleNamespace(as_video_stream_profile=lambda: video),
-            get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: sensor, as_playback=lambda: player),
+            get_device=lambda: SimpleNamespace(
+                first_depth_sensor=lambda: sensor, as_playback=lambda: player, query_sensors=lambda: []
+            ),
         )
 
 
@@ -100,6 +106,25 @@ class Align:
         return SimpleNamespace(get_depth_frame=frames.get_depth_frame, get_color_frame=lambda: color)
 
 
+class Context:
+    """Loads a recording with the sensors of a kind of pipeline; the motion sensor ends it."""
+
+    def __init__(self, pipeline: type[Pipeline]) -> None:
+        self.pipeline = pipeline
+
+    def load_device(self, file: str) -> SimpleNamespace:
+        assert Path(file).is_file()
+        depth = SimpleNamespace(get_stream_profiles=lambda: [SimpleNamespace(stream_type=lambda: "depth")])
+        motion = self.pipeline.motion
+        return SimpleNamespace(
+            set_real_time=lambda on: None if motion is None else setattr(motion, "real_time", on),
+            set_status_changed_callback=lambda changed: (
+                None if motion is None else setattr(motion, "then", lambda: changed("stopped"))
+            ),
+            query_sensors=lambda: [depth] if motion is None else [depth, motion],
+        )
+
+
 @pytest.fixture
 def library(monkeypatch: pytest.MonkeyPatch) -> type[Pipeline]:
     """A pyrealsense2 whose pipelines are this test's."""
@@ -109,7 +134,9 @@ def library(monkeypatch: pytest.MonkeyPatch) -> type[Pipeline]:
 
     module = ModuleType("pyrealsense2")
     names = {"pipeline": TestPipeline, "config": Config, "pipeline_wrapper": lambda pipeline: pipeline}
-    names |= {"stream": SimpleNamespace(depth="depth", color="color"), "align": Align}
+    names |= {"stream": SimpleNamespace(depth="depth", color="color", gyro="gyro", accel="accel")}
+    names |= {"align": Align, "context": lambda: Context(TestPipeline)}
+    names |= {"playback_status": SimpleNamespace(stopped="stopped")}
     names |= {"format": SimpleNamespace(z16="z16", rgb8="rgb8")}
     for name, value in names.items():
         setattr(module, name, value)
@@ -237,6 +264,27 @@ def test_a_camera_may_stand_still(library: type[Pipeline], recording: Path) -> N
         source = open_dataset(name)
         assert not source.tracked
         np.testing.assert_array_equal(source.read(0).T_world_camera, source.read(1).T_world_camera)
+
+
+def test_the_gyroscope_of_a_recording_is_read_whole(library: type[Pipeline], recording: Path) -> None:
+    library.motion = MotionSensor(FIRST - 1.0, stamp(COUNT) + 20.0)
+    source = open_dataset(f"realsense:{recording}")
+    assert not library.motion.real_time
+    assert library.motion.closed
+    for i in (0, 4, 2):
+        gyro, up = source.read(i).gyro, source.read(i).T_world_camera[:3, :3] @ UP
+        assert gyro is not None
+        R = gyro.turn(stamp(i), stamp(i + 1))
+        assert R is not None
+        np.testing.assert_allclose(R, cv2.Rodrigues(RATE * 0.1)[0], atol=1e-9)
+        np.testing.assert_allclose(up, [0, 0, 1], atol=1e-9)
+        assert source.read(i).acceleration is not None
+    for query in ("imu=none", "poses=still"):
+        assert open_dataset(f"realsense:{recording}?{query}").read(0).gyro is None
+    library.motion = None
+    plain = open_dataset(f"realsense:{recording}")
+    assert plain.read(0).gyro is None
+    assert not any("imu" in note for note in plain.notes)
 
 
 def test_poses_that_cannot_be_read_are_named(library: type[Pipeline], tmp_path: Path) -> None:

@@ -13,12 +13,13 @@ from scipy.spatial.transform import Rotation
 from sliding_camera import CAMERA, sequence
 
 from taichi_mrf.datasets.pose_sources.base import CallbackPoses, ChangedPoses
-from taichi_mrf.datasets.pose_sources.graph_file import read_pose_graph
+from taichi_mrf.datasets.pose_sources.graph_file import PoseGraph, read_pose_graph, write_pose_graph
 from taichi_mrf.datasets.pose_sources.matching import FramePoses
 from taichi_mrf.datasets.pose_sources.posed import open_posed, posed_by
 from taichi_mrf.datasets.pose_sources.registry import open_pose_source
 from taichi_mrf.datasets.pose_sources.watched import SETTLES_S, STAYS_BROKEN_S, WatchedFile
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose
 
 RANDOM = np.random.default_rng(7)
@@ -95,6 +96,20 @@ def test_gtsam_symbols_are_numbers_with_a_letter(tmp_path: Path) -> None:
     path.write_text(g2o({(ord("x") << 56) + 3: POSES[0], (ord("y") << 56) + 3: POSES[1]}))
     with pytest.raises(DatasetError, match=r"graph.g2o line 5: the number 3 stands for another vertex"):
         read_pose_graph(path)
+
+
+def test_a_written_graph_is_read_as_it_was(tmp_path: Path) -> None:
+    path, root = tmp_path / "graph.g2o", RANDOM.normal(size=(6, 6))
+    poses = {3: POSES[0], 0: POSES[1], 12: POSES[2]}
+    edges = [PoseEdge(3, 12, POSES[3], root @ root.T), PoseEdge(12, 0, POSES[0])]
+    write_pose_graph(path, PoseGraph(poses, edges))
+    found = read_pose_graph(path)
+    assert_same(found.poses, poses)
+    for edge, wanted in zip(found.edges, edges, strict=True):
+        assert (edge.first, edge.second) == (wanted.first, wanted.second)
+        np.testing.assert_allclose(edge.T_first_second, wanted.T_first_second, atol=1e-12)
+    np.testing.assert_array_equal(found.edges[0].information, edges[0].information)
+    np.testing.assert_array_equal(found.edges[1].information, np.eye(6))
 
 
 @pytest.mark.parametrize(

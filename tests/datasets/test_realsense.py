@@ -3,12 +3,16 @@
 import sys
 from types import ModuleType, SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
+from realsense_motion import CLOCK, PLACE_M, RATE, UP, MotionSensor
 
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.base import start_pose
 from taichi_mrf.datasets.realsense.device import MISSES
 from taichi_mrf.errors import DatasetError, FrameError
+from taichi_mrf.sensor.acceleration import GRAVITY
 
 STEPS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
 
@@ -19,6 +23,7 @@ class Pipeline:
     images: tuple[np.ndarray | None, ...] = ()
     problem: str | None = None
     color: np.ndarray | None = None  # of each image's pixels; None: the camera has no colour sensor
+    motion: MotionSensor | None = None
 
     def __init__(self) -> None:
         self.left = list(self.images)
@@ -35,14 +40,22 @@ class Pipeline:
         sensor = SimpleNamespace(get_depth_scale=lambda: 0.0005)
         return SimpleNamespace(
             get_stream=lambda kind: SimpleNamespace(as_video_stream_profile=lambda: video),
-            get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: sensor),
+            get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: sensor, query_sensors=self.sensors),
         )
+
+    def sensors(self) -> list[object]:
+        depth = SimpleNamespace(get_stream_profiles=lambda: [SimpleNamespace(stream_type=lambda: "depth")])
+        return [depth] if self.motion is None else [depth, self.motion]
 
     def wait_for_frames(self, timeout_ms: int) -> SimpleNamespace:
         steps = self.left.pop(0) if self.left else None
         if steps is None:
             raise RuntimeError(f"Frame didn't arrive within {timeout_ms}")
-        image = SimpleNamespace(get_data=lambda: steps, get_timestamp=lambda: 2500.0)
+        image = SimpleNamespace(
+            get_data=lambda: steps,
+            get_timestamp=lambda: 2500.0,
+            get_frame_timestamp_domain=lambda: CLOCK,
+        )
         return SimpleNamespace(get_depth_frame=lambda: image, raw_color=self.color)
 
     def stop(self) -> None:
@@ -75,7 +88,7 @@ def library(monkeypatch: pytest.MonkeyPatch) -> type[Pipeline]:
 
     module = ModuleType("pyrealsense2")
     names = {"pipeline": TestPipeline, "config": Config, "align": Align}
-    names |= {"stream": SimpleNamespace(depth="depth", color="color")}
+    names |= {"stream": SimpleNamespace(depth="depth", color="color", gyro="gyro", accel="accel")}
     names |= {"format": SimpleNamespace(z16="z16", rgb8="rgb8")}
     for name, value in names.items():
         setattr(module, name, value)
@@ -150,3 +163,52 @@ def test_the_camera_is_given_back_with_its_source(library: type[Pipeline]) -> No
     pipeline = source.pipeline
     del source
     assert pipeline.stopped
+
+
+def test_the_gyroscope_turns_with_the_camera_and_the_first_image_is_level(library: type[Pipeline]) -> None:
+    library.images = (STEPS, STEPS)
+    library.motion = MotionSensor(2.0, 3.0)
+    source = open_dataset("realsense:width=4&height=3")
+    assert library.motion.opened == [("gyro", 200), ("accel", 250)]
+    first, second = source.read(0), source.read(1)
+    assert second.gyro is not None
+    R = second.gyro.turn(2.2, 2.5)
+    assert R is not None
+    np.testing.assert_allclose(R, cv2.Rodrigues(RATE * 0.3)[0], atol=1e-9)
+    np.testing.assert_allclose(first.T_world_camera[:3, :3] @ UP, [0, 0, 1], atol=1e-9)
+    np.testing.assert_array_equal(second.T_world_camera, first.T_world_camera)
+    assert second.acceleration is not None
+    np.testing.assert_allclose(second.acceleration.accelerations_m_s2[7], GRAVITY * UP, atol=1e-9)
+    np.testing.assert_array_equal(second.acceleration.position_m, PLACE_M)
+    assert any("imu: it measures turns" in note for note in source.notes)
+    del source
+    assert library.motion.stopped
+    assert library.motion.closed
+
+
+def test_a_camera_whose_imu_cannot_help_is_tracked_without(library: type[Pipeline]) -> None:
+    library.images = (STEPS,)
+    without = open_dataset("realsense:width=4&height=3")
+    assert without.read(0).gyro is None
+    assert not any("imu" in note for note in without.notes)
+    library.motion = MotionSensor(2.0, 3.0, shake=2.0)
+    shaken = open_dataset("realsense:width=4&height=3").read(0)
+    assert shaken.gyro is not None
+    np.testing.assert_array_equal(shaken.T_world_camera, start_pose())
+    library.motion = MotionSensor(2.0, 3.0, clock="another")
+    assert open_dataset("realsense:width=4&height=3").read(0).gyro is None
+    library.motion = MotionSensor(2.0, 3.0)
+    library.motion.problem = "Device is busy"
+    busy = open_dataset("realsense:width=4&height=3")
+    assert busy.read(0).gyro is None
+    assert "imu: it is not used: Device is busy" in busy.notes
+
+
+def test_an_imu_may_be_left_alone(library: type[Pipeline]) -> None:
+    library.images = (STEPS,)
+    library.motion = MotionSensor(2.0, 3.0)
+    for query in ("imu=none", "poses=still"):
+        assert open_dataset(f"realsense:width=4&height=3&{query}").read(0).gyro is None
+    assert library.motion.opened == []
+    with pytest.raises(DatasetError, match="imu may be none, not 'yes'"):
+        open_dataset("realsense:imu=yes")

@@ -288,7 +288,7 @@ def test_keyframes_that_a_loop_moves_are_shown_where_they_stand(monkeypatch: pyt
     session.run(never)
     assert closed[0].moved == (1,)
     notices = [m.text for m in link.sent if isinstance(m, Notice)]
-    assert "loop closed: the camera was off by 2 cm, 1 keyframes moved" in notices
+    assert "loop closed: the camera was off by 2 cm, 1 keyframe moved" in notices
     last = {m.id: m for m in link.sent if isinstance(m, KeyframeInfo)}
     for entry in session.state.mapper.roster.entries.values():
         assert entry.map_id is not None

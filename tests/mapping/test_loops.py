@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from tracked_room import CONFIG, errors, nowhere, walk
 
+from taichi_mrf.alignment.oriented_points import OrientedPoints
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.alignment.seen_through import looked_through
 from taichi_mrf.alignment.surfels import Planes
 from taichi_mrf.config.schema import Config, PoseConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import CapacityError
+from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose, inverse, tangent_norms
 from taichi_mrf.inference.keyframe import DepthImage
 from taichi_mrf.mapping.loops import TRACKED_M, Closure, LoopCloser
@@ -101,6 +103,29 @@ def test_where_images_tell_nothing_a_step_counts_as_tracked_once() -> None:
     for step in ((0, 1), (1, 2)):
         assert across[step] == pytest.approx(TRACKED_M**-2, rel=0.3)
     assert across[0, 2] < 0.1 * TRACKED_M**-2
+
+
+def test_a_loop_that_is_not_believed_says_nothing_of_how_far_the_camera_was_off(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found, random, wrong = LoopCloser._loop, np.random.default_rng(0), 0
+
+    def or_wrong(self: LoopCloser, id: int, older: int, points: OrientedPoints) -> PoseEdge | None:
+        nonlocal wrong
+        edge = found(self, id, older, points)
+        if edge is None or random.random() < 0.5:
+            return edge
+        wrong += 1
+        xi = [*random.normal(0, 2.0, 3), *random.normal(0, 0.5, 3)]
+        return replace(edge, T_first_second=moved(edge.T_first_second, xi))
+
+    monkeypatch.setattr(LoopCloser, "_loop", or_wrong)
+    run = Drifting(fixed=set())
+    for index in range(VIEWS + MORE):
+        run.take(index)
+    assert wrong > 0
+    assert run.closures
+    assert all(0.005 < c.off_m < 0.3 for c in run.closures)
 
 
 def test_a_loop_that_does_not_fit_into_memory_leaves_the_keyframe(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,9 +1,10 @@
 """Pose graphs in text files: g2o (``VERTEX_SE3:QUAT``, ``EDGE_SE3:QUAT``) and TORO, which GTSAM reads too
 (``VERTEX3``, ``EDGE3``: roll, pitch and yaw in radians, R = Rz(yaw) Ry(pitch) Rx(roll)).
 
-A vertex is the pose T_world_camera of the frame with its number. GTSAM's symbols, such as x12, are keys with
-a letter in the highest of eight bytes; the rest is the number. Landmarks, parameters and other lines are
-passed over. A graph in the plane is refused: it does not say where a camera is in space.
+A vertex is the pose T_world_camera of the frame with its number. An edge's information is that of metres and
+radians, as GTSAM and the example of Ceres take it; g2o's own error has half the angle. GTSAM's symbols, such
+as x12, are keys with a letter in the highest of eight bytes; the rest is the number. Landmarks, parameters
+and other lines are passed over. A graph in the plane is refused: it does not say where a camera is in space.
 """
 
 import math
@@ -14,9 +15,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.timed_poses import quaternion
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
 from taichi_mrf.errors import DatasetError, KeyframeError
+from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose, as_pose
+from taichi_mrf.system.atomic import write_text
 from taichi_mrf.system.files import open_regular, read_text
 
 SUFFIXES = (".g2o", ".toro", ".graph")
@@ -28,17 +32,6 @@ _INFORMATION = 21
 _UPPER = np.triu_indices(6)
 _LETTER_BITS = 56
 """Below GTSAM's letter."""
-
-
-@dataclass(frozen=True)
-class PoseEdge:
-    """The pose (4, 4) of vertex ``second`` as measured from vertex ``first``, and the inverse (6, 6) of its
-    covariance, translation before rotation; None if the file gives none."""
-
-    first: int
-    second: int
-    T_first_second: Pose
-    information: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -88,6 +81,27 @@ def read_pose_graph(path: Path, with_edges: bool = True) -> PoseGraph:
     if not poses:
         raise DatasetError(f"{path}: contains no {' or '.join(_VERTICES)}")
     return PoseGraph(poses, edges)
+
+
+def write_pose_graph(path: Path, graph: PoseGraph) -> None:
+    """Write a graph as g2o, edges without information with the identity. The letters of GTSAM's keys are
+    lost. Raises MapFileError."""
+    lines = [f"VERTEX_SE3:QUAT {number} {_words(_seven(T))}" for number, T in graph.poses.items()]
+    for edge in graph.edges:
+        information = np.eye(6) if edge.information is None else edge.information
+        numbers = np.concatenate([_seven(edge.T_first_second), information[_UPPER]])
+        lines.append(f"EDGE_SE3:QUAT {edge.first} {edge.second} {_words(numbers)}")
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def _seven(T: Pose) -> NDArray[np.float64]:
+    """x y z qx qy qz qw."""
+    return np.concatenate([T[:3, 3], quaternion(T[:3, :3])])
+
+
+def _words(numbers: NDArray[np.float64]) -> str:
+    """With all their digits."""
+    return " ".join(repr(float(number)) for number in numbers)
 
 
 def _key(words: Sequence[str], place: int, where: str) -> tuple[int, int]:

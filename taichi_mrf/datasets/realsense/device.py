@@ -2,8 +2,9 @@
 
 ``realsense:width=848&height=480&fps=30`` is a camera, as long as it is plugged in; ``realsense:FILE`` is what
 its library has recorded (recorded.py). ``?poses=FILE`` gives the poses of the depth camera in TUM's
-layout, by the stamps of its images. Without a file they are found from the images while mapping. With
-``?poses=still`` all frames have one pose, at the origin, level, looking along x.
+layout, by the stamps of its images. Without a file they are found from the images while mapping, and from the
+camera's gyroscope if it has one (motion.py). With ``?poses=still`` all frames have one pose, at the origin,
+level, looking along x.
 """
 
 import weakref
@@ -16,6 +17,7 @@ import numpy as np
 
 from taichi_mrf.datasets.base import BuiltIn, Dataset, start_pose
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
+from taichi_mrf.datasets.realsense.motion import MotionModule, motion_or_note, recorded_motion
 from taichi_mrf.datasets.realsense.recorded import Player, RealSenseRecording, aligned_images
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_timed_poses
 from taichi_mrf.errors import DatasetError, FrameError
@@ -34,6 +36,9 @@ MISSES = 4
 
 STILL = "still"
 """In place of a file of poses: the camera stands still."""
+
+NO_IMU = "none"
+"""In place of the camera's IMU: track without."""
 
 TRACKED = "the camera is tracked by its images; ?poses=FILE gives its poses, ?poses=still says that it stands"
 ENDLESS = "the camera never ends: --keep-live N bounds the memory, --keyframes.* selects fewer keyframes"
@@ -56,6 +61,9 @@ class RealSenseOptions:
     """A file of the camera's poses: stamp tx ty tz qx qy qz qw; or track, to find them from the images; or
     still, for a camera that stands still."""
 
+    imu: str = ""
+    """none, to track the camera without its gyroscope and accelerometer."""
+
 
 class _EndlessNames(Sequence[str]):
     """Names of frames that are numbered as they arrive."""
@@ -76,15 +84,19 @@ class _EndlessNames(Sequence[str]):
 @dataclass
 class RealSenseCamera(Dataset):
     """A RealSense camera. ``pipeline`` is pyrealsense2's, started; ``depth_scale`` is metres a step;
-    ``align`` is the library's, which brings colour to the depth camera's pixels, None without colour."""
+    ``align`` is the library's, which brings colour to the depth camera's pixels, None without colour;
+    ``motion`` is its IMU, None if it has none or is not tracked; ``started`` says whether an
+    image has come."""
 
     pipeline: Any = None
     align: Any = None
+    motion: MotionModule | None = None
     depth_scale: float = 0.001
     trajectory: TimedPoses | None = None
     largest_gap: float = INTERPOLATION_GAP
     T_world_camera: Pose = field(default_factory=start_pose)
     misses: int = 0
+    started: bool = False
 
     @property
     def endless(self) -> bool:
@@ -113,8 +125,15 @@ class RealSenseCamera(Dataset):
         if steps.shape != self.camera.shape:
             raise FrameError(f"{name}: the image has the shape {steps.shape}, not {self.camera.shape}")
         depth_m = (steps * np.float32(self.depth_scale)).astype(np.float32)
-        stamp = image.get_timestamp() / 1000.0
-        return Frame(depth_m, self._pose(name, stamp), self.camera, stamp, name, color)
+        stamp, gyro, acceleration = image.get_timestamp() / 1000.0, None, None
+        if self.motion is not None:
+            clock = image.get_frame_timestamp_domain()
+            if not self.started:
+                self.T_world_camera = start_pose(self.motion.up(stamp, clock))
+            gyro, acceleration = self.motion.gyro(clock), self.motion.acceleration(clock)
+        self.started = True
+        pose = self._pose(name, stamp)
+        return Frame(depth_m, pose, self.camera, stamp, name, color, gyro=gyro, acceleration=acceleration)
 
     def _pose(self, name: str, stamp: float) -> Pose:
         if self.trajectory is None:
@@ -141,10 +160,13 @@ def open_realsense(text: str, options: ReadOptions) -> Dataset:
     rs = library("pyrealsense2", f"{NAME} needs", "realsense", DatasetError)
     gap = INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
     source: RealSenseCamera | RealSenseRecording
+    if wanted.imu not in ("", NO_IMU):
+        raise DatasetError(f"{NAME}{file}: imu may be {NO_IMU}, not {wanted.imu!r}")
+    with_imu = tracked and wanted.imu != NO_IMU
     if file:
-        source = _open_recording(rs, Path(file), trajectory, gap, options)
+        source = _open_recording(rs, Path(file), trajectory, gap, options, with_imu)
     else:
-        source = _open_camera(rs, wanted, trajectory, gap, options)
+        source = _open_camera(rs, wanted, trajectory, gap, options, with_imu)
     source.tracked = tracked
     if tracked:
         source.notes.insert(0, TRACKED)
@@ -161,7 +183,12 @@ def _file_and_options(text: str) -> tuple[str, RealSenseOptions]:
 
 
 def _open_camera(
-    rs: Any, wanted: RealSenseOptions, trajectory: TimedPoses | None, gap: float, options: ReadOptions
+    rs: Any,
+    wanted: RealSenseOptions,
+    trajectory: TimedPoses | None,
+    gap: float,
+    options: ReadOptions,
+    with_imu: bool,
 ) -> RealSenseCamera:
     notes, align, started = [ENDLESS], None, None
     if options.color:
@@ -175,7 +202,11 @@ def _open_camera(
     if isinstance(started, str):
         raise DatasetError(f"{NAME} cannot be started: {started}")
     pipeline, profile = started
-    stream = profile.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
+    depth, motion = profile.get_stream(rs.stream.depth), None
+    if with_imu:
+        motion, said = motion_or_note(MotionModule, rs, profile.get_device(), depth)
+        notes += said
+    stream = depth.as_video_stream_profile().get_intrinsics()
     camera = PinholeCamera(stream.width, stream.height, stream.fx, stream.fy, stream.ppx, stream.ppy)
     source = RealSenseCamera(
         NAME,
@@ -183,11 +214,14 @@ def _open_camera(
         notes=notes,
         pipeline=pipeline,
         align=align,
+        motion=motion,
         depth_scale=float(profile.get_device().first_depth_sensor().get_depth_scale()),
         trajectory=trajectory,
         largest_gap=gap,
     )
     weakref.finalize(source, pipeline.stop)
+    if motion is not None:
+        weakref.finalize(source, motion.stop)
     return source
 
 
@@ -205,7 +239,7 @@ def _started(rs: Any, wanted: RealSenseOptions, color: bool) -> tuple[Any, Any] 
 
 
 def _open_recording(
-    rs: Any, path: Path, trajectory: TimedPoses | None, gap: float, options: ReadOptions
+    rs: Any, path: Path, trajectory: TimedPoses | None, gap: float, options: ReadOptions, with_imu: bool
 ) -> RealSenseRecording:
     if not is_file(path):
         raise DatasetError(f"{NAME}{path}: no such file")
@@ -213,7 +247,15 @@ def _open_recording(
     images = [listed for listed, _ in player.images()]
     if not images:
         raise DatasetError(f"{path}: contains no depth images")
-    still = start_pose()
+    notes: list[str] = []
+    gyro = acceleration = up = None
+    if with_imu:
+        motion, notes = motion_or_note(recorded_motion, rs, path)
+        if motion is not None:
+            clock = images[0].clock
+            gyro, acceleration = motion.gyro(clock), motion.acceleration(clock)
+            up = motion.up(images[0].stamp, clock, wait_s=0)
+    still = start_pose(up)
     poses = [still if trajectory is None else trajectory.at(each.stamp, gap) for each in images]
     posed = [(each, pose) for each, pose in zip(images, poses, strict=True) if pose is not None]
     if not posed:
@@ -222,7 +264,6 @@ def _open_recording(
             f"{images[-1].stamp:.3f} s) has poses within {gap:g} s on both sides"
         )
     dropped = len(images) - len(posed)
-    notes = []
     if dropped:
         notes.append(f"{dropped} of {len(images)} images dropped: no poses within {gap:g} s on both sides")
     source = RealSenseRecording(
@@ -233,6 +274,8 @@ def _open_recording(
         player=player,
         listed=[each for each, _ in posed],
         poses=[pose for _, pose in posed],
+        gyro=gyro,
+        acceleration=acceleration,
     )
     weakref.finalize(source, player.close)
     return source

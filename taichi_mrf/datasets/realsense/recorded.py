@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.acceleration import AccelerationSamples
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.gyro import GyroSamples
 
 END_MS = 500
 """A recording that delivers no image for this long has ended: it is read from disk without waiting."""
@@ -25,10 +27,12 @@ END_MS = 500
 
 @dataclass(frozen=True)
 class RecordedImage:
-    """A depth image of a recording: the number that the camera gave it, and its stamp in seconds."""
+    """A depth image of a recording: the number that the camera gave it, its stamp in seconds, and by which
+    clock that is (the library's timestamp domain)."""
 
     number: int
     stamp: float
+    clock: Any
 
 
 def aligned_images(frames: Any, align: Any) -> tuple[Any, NDArray[np.uint8] | None]:
@@ -66,8 +70,9 @@ class Player:
                 found = aligned_images(self._pipeline.wait_for_frames(END_MS), self._align)
             except RuntimeError:
                 return
-            number, stamp = found[0].get_frame_number(), found[0].get_timestamp() / 1000.0
-            yield RecordedImage(number, stamp), found
+            image = found[0]
+            number, stamp = image.get_frame_number(), image.get_timestamp() / 1000.0
+            yield RecordedImage(number, stamp, image.get_frame_timestamp_domain()), found
 
     def rewind(self) -> None:
         """Start again from the first image."""
@@ -102,11 +107,13 @@ class Player:
 
 @dataclass
 class RealSenseRecording(Dataset):
-    """The depth images of a recording, ``listed`` with their ``poses``."""
+    """The depth images of a recording, ``listed`` with their ``poses``, and what its IMU measured."""
 
     player: Player = field(kw_only=True)
     listed: Sequence[RecordedImage] = field(kw_only=True)
     poses: Sequence[Pose] = field(kw_only=True)
+    gyro: GyroSamples | None = field(kw_only=True, default=None)
+    acceleration: AccelerationSamples | None = field(kw_only=True, default=None)
 
     def __post_init__(self) -> None:
         self._names = [f"realsense-{each.number:06d}" for each in self.listed]
@@ -139,4 +146,5 @@ class RealSenseRecording(Dataset):
         if steps.shape != self.camera.shape:
             raise FrameError(f"frame {name}: the image has the shape {steps.shape}, not {self.camera.shape}")
         depth_m = (steps * np.float32(self.player.depth_scale)).astype(np.float32)
-        return Frame(depth_m, self.poses[index], self.camera, wanted.stamp, name, color)
+        parts = (self.poses[index], self.camera, wanted.stamp, name, color)
+        return Frame(depth_m, *parts, gyro=self.gyro, acceleration=self.acceleration)

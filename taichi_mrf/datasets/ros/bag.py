@@ -31,6 +31,7 @@ from taichi_mrf.datasets.ros.topics import DepthTopic, choose, cloud_topics, dep
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.sensor.acceleration import AccelerationSamples
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.gyro import GyroSamples
@@ -82,6 +83,7 @@ class RosBag(Dataset):
     colors: BagColors | None = None
     confidence: BagConfidence | None = None
     gyro: GyroSamples | None = None
+    acceleration: AccelerationSamples | None = None
 
     @property
     def recorded_sigma(self) -> tuple[float, ...] | None:
@@ -138,7 +140,7 @@ class RosBag(Dataset):
         except DatasetError as error:
             raise FrameError(f"frame {name}: {error}") from error
         parts = (self.poses[index], self.camera, self.entries[index].stamp, name, color, sigma_m)
-        return Frame(depth_m, *parts, gyro=self.gyro)
+        return Frame(depth_m, *parts, gyro=self.gyro, acceleration=self.acceleration)
 
 
 def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
@@ -204,6 +206,7 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
         colors=colors,
         confidence=confidence,
         gyro=imu.gyro,
+        acceleration=imu.acceleration,
     )
 
 

@@ -11,30 +11,21 @@ from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.reader import RosReader
 from taichi_mrf.datasets.ros.topics import choose, placed
 from taichi_mrf.errors import DatasetError
+from taichi_mrf.sensor.acceleration import AccelerationSamples, upwards_at
 from taichi_mrf.sensor.gyro import GyroSamples
 
 NONE = "none"
 """The value of the option ``imu`` for a camera that is tracked without."""
 
-GRAVITY = 9.81
-"""Metres per square second."""
-
-AT_REST_S = 0.3
-"""Seconds before and after the first image in which accelerations say which way is up."""
-
-AT_REST = 0.4
-"""Largest departure of the mean from GRAVITY, and largest standard deviation along an axis, of a camera that
-is held still: then up is right to about 2 degrees."""
-
-LEAST_SAMPLES = 10
-
 
 @dataclass(frozen=True)
 class BagImu:
-    """The angular rates of the camera, and upwards in its frame, (3,), at the first image; None for what is
-    not known. ``notes`` are for the user: which topic is used, or why none is although there are some."""
+    """The angular rates and accelerations of the camera, and upwards in its frame, (3,), at the first image;
+    None for what is not known. ``notes`` are for the user: which topic is used, or why none is although there
+    are some."""
 
     gyro: GyroSamples | None = None
+    acceleration: AccelerationSamples | None = None
     up: NDArray[np.float64] | None = None
     notes: list[str] = field(default_factory=list)
 
@@ -67,24 +58,13 @@ def find_imu(reader: RosReader, wanted: str, optical: str, first_s: float) -> Ba
     times, first = np.unique(stamps, return_index=True)
     rates_imu = np.array(rates)[first]
     valid = np.isfinite(rates_imu).all(axis=1)
-    near = np.abs(times - first_s) <= AT_REST_S
-    up = upwards(np.array(accelerations)[first][near] @ to_optical)
+    measured = np.array(accelerations)[first] @ to_optical
+    felt = np.isfinite(measured).all(axis=1)
+    acceleration = AccelerationSamples(times[felt], measured[felt], T_optical_imu[:3, 3])
+    up = upwards_at(acceleration, first_s)
     level = "the first image is level by it" if up is not None else "which way is up it does not say"
     gyro = GyroSamples(times[valid], rates_imu[valid] @ to_optical)
-    return BagImu(gyro, up, [f"imu: {name} measures turns; {level}"])
-
-
-def upwards(accelerations: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Upwards, a unit vector (3,), by what an accelerometer measures (N, 3) in metres per square second; None
-    if it does not rest."""
-    measured = accelerations[np.isfinite(accelerations).all(axis=1)]
-    if len(measured) < LEAST_SAMPLES:
-        return None
-    mean = measured.mean(axis=0)
-    size = float(np.linalg.norm(mean))
-    if abs(size - GRAVITY) > AT_REST or measured.std(axis=0).max() > AT_REST:
-        return None
-    return np.asarray(mean / size)
+    return BagImu(gyro, acceleration if felt.any() else None, up, [f"imu: {name} measures turns; {level}"])
 
 
 def _turns(message: Any | None) -> bool:

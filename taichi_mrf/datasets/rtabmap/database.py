@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.pose_sources.graph_file import PoseEdge
 from taichi_mrf.errors import DatasetError, KeyframeError, said
+from taichi_mrf.geometry.pose_edge import PoseEdge
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.system.files import check_regular
 
