@@ -125,7 +125,7 @@ def test_taichi_started_again_by_the_program_is_a_clear_error() -> None:
     program = """
 import gc
 import numpy as np
-import taichi as ti
+from taichi_mrf.system.compiler import ti
 import taichi_mrf as tm
 camera = tm.PinholeCamera(8, 6, 7.0, 7.0, 3.5, 2.5)
 m = tm.MRFMap(0.25, max_depth=3.0)

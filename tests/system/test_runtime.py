@@ -145,7 +145,7 @@ def test_the_environment_does_not_change_what_was_asked_for() -> None:
 
 def test_a_taichi_that_runs_already_is_used_as_it_is() -> None:
     program = """
-import taichi as ti
+from taichi_mrf.system.compiler import ti
 ti.init(arch=ti.cpu)
 field = ti.field(ti.i32, 3)
 from taichi_mrf.system import runtime

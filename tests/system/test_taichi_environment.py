@@ -16,7 +16,7 @@ pytestmark = pytest.mark.skipif(os.name == "nt", reason="Taichi needs no variabl
 KERNEL = """
 import taichi_mrf as tm
 tm.init("cpu")
-import taichi as ti
+from taichi_mrf.system.compiler import ti
 
 @ti.kernel
 def one() -> ti.i32:
