@@ -28,6 +28,8 @@ def prepare() -> None:
     for name, each in COMPILERS.items():
         os.environ.setdefault(each.banner, "0")
         warnings.filterwarnings("ignore", category=DeprecationWarning, module=rf"{name}(\.|$)")
+    # Of a NumPy number among a kernel's arguments: Quadrants looks at all of them again in the next call.
+    warnings.filterwarnings("ignore", message=r".*Template mapper caching disabled")
     if os.name != "nt":  # on Windows Taichi needs no variable
         with contextlib.suppress(BackendError):
             _choose_cache()
