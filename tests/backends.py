@@ -40,7 +40,7 @@ def main() -> int:
         share = [*command, first, f"--queue={queue}"]  # one word: pytest takes a folder for tests
         beside = {arch: [*command, arch] for arch in others}
         beside |= {_name(first, number): share for number in range(2, PROCESSES + 1)}
-        beside |= {name: [*command, "cpu", "-m", "compilers"] for name in _other_compilers()}
+        beside |= {name: [*command, "cpu", "-m", "compilers or smoke"] for name in _other_compilers()}
         runs = []
         for name, its_command in beside.items():
             output = stack.enter_context(tempfile.TemporaryFile())

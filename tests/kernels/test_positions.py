@@ -10,6 +10,8 @@ import taichi_mrf.kernels.bundles  # noqa: F401 - shortens the notes
 from taichi_mrf.system import compiler
 from taichi_mrf.system.compiler import ti
 
+pytestmark = pytest.mark.compilers
+
 
 @pytest.mark.usefixtures("backend")
 def test_notes_are_a_line_and_an_error_shows_the_source(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,7 +29,7 @@ from taichi_mrf.sensor.noise import LEAST_SIGMA_M, TERMS
 from taichi_mrf.sensor.polynomials import PixelNoise
 from taichi_mrf.system.compiler import ti
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.compilers]
 
 Values = NDArray[np.float64]
 

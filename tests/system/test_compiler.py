@@ -62,9 +62,7 @@ def test_the_environment_chooses(installed: set[str], monkeypatch: pytest.Monkey
 def test_without_a_compiler_the_error_says_what_to_install(
     installed: set[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(
-        BackendError, match=r"pip install 'taichi>=.* or pip install 'taichi-mrf\[quad"
-    ):
+    with pytest.raises(BackendError, match=r"pip install 'taichi>=.* or pip install 'taichi-mrf\[quad"):
         chosen()
     installed.add("taichi")
     monkeypatch.setenv(VARIABLE, "quadrants")
@@ -96,9 +94,7 @@ def test_kernels_are_those_of_the_compiler_that_was_chosen(backend: str) -> None
     assert compiler.is_loaded()
 
 
-@pytest.mark.skipif(
-    not BOTH, reason="Taichi or Quadrants is not installed"
-)
+@pytest.mark.skipif(not BOTH, reason="Taichi or Quadrants is not installed")
 def test_both_compilers_make_the_same_map(tmp_path: Path) -> None:
     maps = {}
     for name in COMPILERS:

@@ -18,7 +18,7 @@ from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, offsets_in_brick
 from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_bricks, walk_voxels
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.compilers]
 
 EXACT = 1e-3
 """What a segment's length may be off, in voxels."""
