@@ -123,15 +123,16 @@ def is_loaded() -> bool:
     return name() in sys.modules
 
 
-def runtime() -> Any:
-    """The present runtime, which ``ti.init`` and ``ti.reset`` replace; None before the compiler is loaded."""
-    implementation = sys.modules.get(f"{name()}.lang.impl")
-    return getattr(implementation, COMPILERS[name()].runtime, None)
+def runtime_place() -> tuple[Any, str]:
+    """The module that keeps the runtime, None before the compiler is loaded, and its attribute: the present
+    runtime, which ``ti.init`` and ``ti.reset`` replace."""
+    return sys.modules.get(f"{name()}.lang.impl"), COMPILERS[name()].runtime
 
 
 def program() -> Any:
     """What runs kernels and owns the memory; None before ``ti.init``."""
-    return getattr(runtime(), COMPILERS[name()].program, None)
+    implementation, attribute = runtime_place()
+    return getattr(getattr(implementation, attribute, None), COMPILERS[name()].program, None)
 
 
 def kernel_class() -> Any:

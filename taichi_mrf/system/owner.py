@@ -21,8 +21,11 @@ from taichi_mrf.system import compiler
 class _Owner:
     thread: int
     thread_name: str
+    implementation: Any
+    """Taichi's module that keeps the runtime, None before it is loaded."""
+    attribute: str
+    """Its attribute that is the runtime, which ``ti.init`` and ``ti.reset`` replace."""
     runtime: Any
-    """Taichi's runtime, which ``ti.init`` and ``ti.reset`` replace; None before it is loaded."""
 
 
 _owner: _Owner | None = None
@@ -33,8 +36,10 @@ _forked = False
 def claim() -> None:
     """Make the calling thread the owner of Taichi's present runtime."""
     global _owner
+    implementation, attribute = compiler.runtime_place()
+    runtime = getattr(implementation, attribute, None)
     thread = threading.current_thread()
-    _owner = _Owner(threading.get_ident(), thread.name, compiler.runtime())
+    _owner = _Owner(threading.get_ident(), thread.name, implementation, attribute, runtime)
 
 
 def check_owner() -> None:
@@ -52,7 +57,9 @@ def check_owner() -> None:
             f"maps can only be used in the thread that started {compiler.title()} ('{owner.thread_name}'), "
             f"not in '{threading.current_thread().name}'"
         )
-    if owner.runtime is not None and compiler.runtime() is not owner.runtime:
+    if owner.implementation is not None and (
+        getattr(owner.implementation, owner.attribute) is not owner.runtime
+    ):
         raise BackendError(
             f"{compiler.title()} was started again (ti.init or ti.reset) after taichi_mrf, which frees the "
             "memory of all maps: call ti.init before the first map, or use taichi_mrf.init instead"

@@ -17,12 +17,15 @@ MAP = """
 import json, os, sys
 import numpy as np
 import taichi_mrf as tm
-from taichi_mrf.datasets import open_dataset
 tm.init("cpu")
 m = tm.MRFMap(0.1, tm.PolynomialNoise((0.01, 0.0, 0.002)))
-frames = open_dataset("synthetic:room?frames=4&width=80&height=60", color=False)
-for frame in (frames.read(i) for i in range(4)):
-    m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera)
+camera = tm.PinholeCamera(80, 60, 60.0, 60.0, 39.5, 29.5)
+columns, rows = np.meshgrid(np.arange(80), np.arange(60))
+depth_m = np.where(columns < 30 + rows // 3, 1.5 + columns / 64, 2.75 - rows / 128).astype(np.float32)
+for step in range(4):
+    T_world_camera = np.eye(4)
+    T_world_camera[0, 3] = 0.25 * step
+    m.add_keyframe(depth_m, T_world_camera, camera)
 m.infer(2)
 centres, p = m.voxels(0.0)
 np.savez(os.environ["OUT"], centres=centres, p=p)
