@@ -1,4 +1,4 @@
-# Two commands do everything on a machine that has Python 3.10 to 3.13 and make:
+# Two commands do everything on a machine that has Python 3.10 to 3.14 and make:
 #   make run    install, map the built-in room, show the results
 #   make test   install what the tests need, then lint, type-check and test on every backend there is
 # While working, `make check` lints, type-checks and runs all tests that start neither Taichi nor a process, and one
@@ -9,9 +9,10 @@ BIN := $(VENV)/bin
 OUT ?= runs/demo
 SOURCE ?= synthetic:room
 
-# The first interpreter that answers, is of a supported version and can make virtual environments.
-USABLE := import ensurepip, sys, venv; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))
-CANDIDATES := python3.13 python3.12 python3.11 python3.10 python3 python
+# The first interpreter that answers, is of a supported version and can make virtual environments. Python 3.14 comes
+# after those that Taichi has wheels for.
+USABLE := import ensurepip, sys, venv; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 14))
+CANDIDATES := python3.13 python3.12 python3.11 python3.10 python3.14 python3 python
 PYTHON ?= $(shell for python in $(CANDIDATES); do \
 	$$python -c "$(USABLE)" >/dev/null 2>&1 && { echo $$python; break; }; done)
 
@@ -36,7 +37,7 @@ clean:
 
 $(VENV)/.created:
 	@test -n "$(PYTHON)" || { \
-		echo "No Python 3.10 to 3.13 with the venv module was found (tried: $(CANDIDATES))." >&2; \
+		echo "No Python 3.10 to 3.14 with the venv module was found (tried: $(CANDIDATES))." >&2; \
 		echo "Install one (Debian and Ubuntu: apt install python3-venv), or: make PYTHON=/path/to/python" >&2; \
 		exit 1; }
 	$(PYTHON) -m venv $(VENV)
@@ -50,6 +51,8 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[dev]"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[octomap]" 2>/dev/null \
 		|| echo "OctoMap (extra: octomap) has no wheel for this Python: its comparison is left out."
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[quadrants]" 2>/dev/null \
+		|| echo "Quadrants (extra: quadrants) has no wheel for this Python: tests of the second compiler are left out."
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps "ouster-sdk>=1.0" 2>/dev/null \
 		|| echo "ouster-sdk (extra: ouster) has no wheel for this Python: tests of real recordings are left out."
 	@touch $@

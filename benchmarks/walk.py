@@ -121,8 +121,6 @@ def agreement(a: np.ndarray, b: np.ndarray, problem: Path) -> float:
 
 def time_taichi(problem: Path, threads: int) -> None:
     """Run Taichi's kernel, leave its sums beside the problem, and print seconds and steps."""
-    import taichi as ti
-
     from taichi_mrf.inference import sum_product
     from taichi_mrf.inference.keyframe import RayList
     from taichi_mrf.inference.ray_list import BITS
@@ -134,6 +132,7 @@ def time_taichi(problem: Path, threads: int) -> None:
     from taichi_mrf.sensor.forward import CENTRE
     from taichi_mrf.sensor.noise import PolynomialNoise
     from taichi_mrf.system import runtime
+    from taichi_mrf.system.compiler import ti
     from taichi_mrf.voxels.traversal import Space, Viewpoint
 
     runtime.init("cpu", threads)

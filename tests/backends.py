@@ -1,5 +1,6 @@
 """Run the test suite once for each backend that there is here: the CPU with all tests, the others with
-those that use a backend.
+those that use a backend. Where a second compiler of kernels is installed, the CPU's tests that are marked
+`compilers` run with that too.
 
     python tests/backends.py [options of pytest]
 
@@ -8,6 +9,7 @@ side, because tests of pages and processes wait more than they compute. Each one
 piece: that of the first as it comes, the others' when that is done.
 """
 
+import importlib.util
 import os
 import subprocess
 import sys
@@ -15,7 +17,7 @@ import tempfile
 from contextlib import ExitStack
 from typing import IO
 
-from taichi_mrf.system import runtime
+from taichi_mrf.system import compiler, runtime
 
 PROCESSES = 3
 
@@ -38,16 +40,29 @@ def main() -> int:
         share = [*command, first, f"--queue={queue}"]  # one word: pytest takes a folder for tests
         beside = {arch: [*command, arch] for arch in others}
         beside |= {_name(first, number): share for number in range(2, PROCESSES + 1)}
+        beside |= {name: [*command, "cpu", "-m", "compilers or smoke"] for name in _other_compilers()}
         runs = []
         for name, its_command in beside.items():
             output = stack.enter_context(tempfile.TemporaryFile())
-            process = subprocess.Popen(its_command, stdout=output, stderr=subprocess.STDOUT)
+            chosen = name if name in compiler.COMPILERS else compiler.name()
+            process = subprocess.Popen(
+                its_command,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, compiler.VARIABLE: chosen},
+            )
             runs.append((name, process, output))
         return _finish(_name(first, 1), share, runs)
 
 
 def _name(arch: str, number: int) -> str:
     return f"{arch}, process {number} of {PROCESSES}"
+
+
+def _other_compilers() -> list[str]:
+    """Those that are installed beside the one that compiles here."""
+    installed = [name for name in compiler.COMPILERS if importlib.util.find_spec(name) is not None]
+    return [name for name in installed if name != compiler.name()]
 
 
 def _finish(first: str, command: list[str], runs: list[Run]) -> int:

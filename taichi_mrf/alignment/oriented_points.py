@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.alignment.free_points import fit_free_planes
@@ -14,6 +13,7 @@ from taichi_mrf.kernels.types import I32, F32Array, F32Array2
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.origins import starts_at
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 
 STRIDE = 2
 """Pixels between points along both axes of the image."""

@@ -13,7 +13,6 @@ along the normal and what the surface departs from its planes together, by Tukey
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.alignment.oriented_points import OrientedPoints
@@ -24,6 +23,7 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import I32, F32Array, F32Array2, IVec3, Mat3, Template, Vec3
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat, voxel_number
 from taichi_mrf.voxels.traversal import Viewpoint

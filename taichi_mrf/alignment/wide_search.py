@@ -10,7 +10,6 @@ LIDAR SLAM", 2016).
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.alignment.oriented_points import OrientedPoints
@@ -19,6 +18,7 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import I32, I32Array
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 
 FINEST_CELL_M, WIDEST_CELL_M = 0.25, 0.5
 """Widths of the grid's cells, and the distance between places: in rooms and corridors, and in halls."""

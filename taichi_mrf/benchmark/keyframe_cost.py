@@ -10,10 +10,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import taichi as ti
-
 from taichi_mrf import Frame, MRFMap
 from taichi_mrf.inference.schedule import InferReport
+from taichi_mrf.system.compiler import ti
 
 
 @dataclass(frozen=True)

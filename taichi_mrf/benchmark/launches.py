@@ -12,10 +12,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import taichi as ti
-from taichi.lang.kernel_impl import Kernel
 
-from taichi_mrf.system import runtime
+from taichi_mrf.system import compiler, runtime
+from taichi_mrf.system.compiler import ti
 
 
 @dataclass
@@ -32,23 +31,24 @@ class Launches:
 def count_launches(timed: bool = False) -> Iterator[Launches]:
     """Watch all launches while the block runs. ``timed`` waits for each kernel, so as to time it."""
     launches = Launches()
-    launch = Kernel.launch_kernel
+    kernels = compiler.kernel_class()
+    launch = kernels.launch_kernel
     apart = runtime.active() != "cpu"
 
-    def watched(self: Any, compiled: Any, *arguments: Any) -> Any:
+    def watched(self: Any, *arguments: Any, **named: Any) -> Any:
         launches.number += 1
         launches.waits += apart and any(isinstance(argument, np.ndarray) for argument in arguments)
         if not timed:
-            return launch(self, compiled, *arguments)
+            return launch(self, *arguments, **named)
         ti.sync()
         begin = time.perf_counter()
-        result = launch(self, compiled, *arguments)
+        result = launch(self, *arguments, **named)
         ti.sync()
         launches.seconds[self.func.__name__].append(time.perf_counter() - begin)
         return result
 
-    Kernel.launch_kernel = watched
+    kernels.launch_kernel = watched
     try:
         yield launches
     finally:
-        Kernel.launch_kernel = launch
+        kernels.launch_kernel = launch

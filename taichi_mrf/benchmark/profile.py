@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import taichi as ti
 
 import taichi_mrf
 from taichi_mrf import Config, Frame, MRFMap
@@ -23,7 +22,8 @@ from taichi_mrf.benchmark.kernel_floors import FLOORS, Work
 from taichi_mrf.benchmark.keyframe_cost import live_stages, timed, warm_up
 from taichi_mrf.benchmark.launches import count_launches
 from taichi_mrf.kernels import positions
-from taichi_mrf.system import runtime
+from taichi_mrf.system import compiler, runtime
+from taichi_mrf.system.compiler import ti
 
 PACKAGE = str(Path(taichi_mrf.__file__).parent)
 TAICHI = str(Path(ti.__file__).parent)
@@ -137,7 +137,7 @@ def _profile_stage(
 
 def kernel_seconds() -> dict[str, list[float]]:
     """Seconds of each launch, by the kernel's name, since Taichi's profiler was last cleared."""
-    program = ti.lang.impl.get_runtime().prog
+    program = compiler.program()
     program.sync_kernel_profiler()
     program.update_kernel_profiler()
     seconds: dict[str, list[float]] = defaultdict(list)

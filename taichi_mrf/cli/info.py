@@ -55,6 +55,7 @@ def _backend_facts(arch: Arch) -> dict[str, Any]:
     return {
         "backend": choice.name,
         "device": choice.device,
+        "compiler": choice.compiler,
         "backends": {
             status.name: {"device": status.device, "problem": status.problem} for status in runtime.backends()
         },

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
@@ -29,6 +28,7 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.rays import CameraRays
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, walk_voxels
 from taichi_mrf.voxels.window import Window, WindowIndex

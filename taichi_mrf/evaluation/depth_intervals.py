@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.evaluation.accuracy import OUTLIERS, JudgedView
@@ -29,6 +28,7 @@ from taichi_mrf.sensor.forward import SUPPORT, normal_density, normal_tail
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import NoiseTable
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, walk_voxels
 from taichi_mrf.voxels.window import Window

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import FrameError
@@ -16,6 +15,7 @@ from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Struct
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.rays import CameraRays
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, CHUNK
 from taichi_mrf.voxels.marks import WORDS, Marks, mark, no_marks, voxel_in_window
 from taichi_mrf.voxels.numbering import flat

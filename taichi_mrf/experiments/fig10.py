@@ -8,8 +8,6 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import taichi as ti
-
 from taichi_mrf import Frame
 from taichi_mrf.benchmark.bench import octomap_available, octomap_inserter
 from taichi_mrf.errors import ConfigError
@@ -20,6 +18,7 @@ from taichi_mrf.experiments.folds import Experiment, fold_key
 from taichi_mrf.experiments.scenes import Scene, house_scene
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.system.atomic import atomic_path
+from taichi_mrf.system.compiler import ti
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf import MRFMap
@@ -41,6 +40,7 @@ from taichi_mrf.methods.mrf.reading import MapReading
 from taichi_mrf.queries.known_bricks import BrickReader
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.simulate import simulate_model
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
 
 CORRELATIONS = (1.0, 0.5, 0.3)

@@ -103,6 +103,7 @@ def _made_with(data: Path) -> dict[str, Any]:
     choice = runtime.choice()
     return {
         "version": taichi_mrf.__version__,
+        "compiler": choice.compiler if choice else None,
         "backend": choice.name if choice else None,
         "device": choice.device if choice else None,
         "data": str(data.resolve()),

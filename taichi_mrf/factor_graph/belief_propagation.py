@@ -14,7 +14,6 @@ over disagreeing nodes only.
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.config import LaserConfig
@@ -24,6 +23,7 @@ from taichi_mrf.factor_graph.workers import Workers, workers_for
 from taichi_mrf.inference.first_occupied import NEVER, message, next_ahead, next_behind
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, I64Array, Template
+from taichi_mrf.system.compiler import ti
 
 FINE = 2.0**20
 """Beliefs are counted in integers of 1 / FINE: exact to 1e-6, and a million beams fit 64 bits."""

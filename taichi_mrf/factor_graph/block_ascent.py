@@ -17,7 +17,6 @@ Everything is whole units, as in dual_decomposition.py, so the bound is exact.
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.config import LaserConfig
@@ -28,6 +27,7 @@ from taichi_mrf.factor_graph.workers import Workers, workers_for
 from taichi_mrf.inference.first_occupied import left_alone, message, next_ahead, next_behind
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import I32Array, I64Array
+from taichi_mrf.system.compiler import ti
 
 NEVER = 2**29
 """Stands for an infinite cost, in units; far above every energy, and its double still fits 32 bits."""

@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.config.inference import InferenceConfig
@@ -33,6 +32,7 @@ from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import softplus
 from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, F32Array2, I32Array, Struct, Template
 from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, walk_voxels
 from taichi_mrf.voxels.window import WindowIndex

@@ -21,7 +21,6 @@ rounding left goes back into the multipliers at the next step.
 """
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.config import LaserConfig
@@ -30,6 +29,7 @@ from taichi_mrf.factor_graph.potentials import GAUSSIAN, UNITS, Beam, BeamGraph,
 from taichi_mrf.inference.first_occupied import left_alone, next_behind
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import I32, I32Array, I64Array, Template
+from taichi_mrf.system.compiler import ti
 
 
 @ti.func

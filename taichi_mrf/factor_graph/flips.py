@@ -6,10 +6,9 @@ along the beam. Several labellings may be kept at once, one behind the other: a 
 ``base`` and its beams at ``beam_base``.
 """
 
-import taichi as ti
-
 from taichi_mrf.factor_graph.potentials import to_units
 from taichi_mrf.kernels.types import I32, I32Array, Template
+from taichi_mrf.system.compiler import ti
 
 SPREAD = 512
 """Taichi gives a CPU thread no fewer iterations of a loop at a time: one long task stands for that many."""

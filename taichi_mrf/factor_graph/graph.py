@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
@@ -18,6 +17,7 @@ from taichi_mrf.factor_graph.beams import Beams, BrickCells, Grid
 from taichi_mrf.factor_graph.kernels import count_cells, count_degrees, write_beams_of_cells, write_cells
 from taichi_mrf.kernels.bundles import Bundle
 from taichi_mrf.kernels.types import AnyArray, I32Array
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import available_bytes
 
 EDGE_BYTES = 4 + 6 + 4

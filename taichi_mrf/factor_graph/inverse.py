@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.graph import FactorGraph
 from taichi_mrf.kernels.types import I32Array
+from taichi_mrf.system.compiler import ti
 
 
 @ti.kernel

@@ -1,8 +1,7 @@
 """The kernels that build a factor graph: follow each beam through the box of cells, count, then write."""
 
-import taichi as ti
-
 from taichi_mrf.kernels.types import F32, AnyArray, F32Array2, I32Array, IVec3, Struct, Template, Vec3
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.traversal import advance, enter, leave_at, make_ray, within
 

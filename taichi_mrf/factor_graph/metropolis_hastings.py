@@ -12,7 +12,6 @@ on a seed, a stream and a counter alone, whichever thread asks for them.
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.config import LaserConfig
@@ -22,6 +21,7 @@ from taichi_mrf.factor_graph.inverse import ends_of_beams, inverse_model
 from taichi_mrf.factor_graph.potentials import UNITS, BeamGraph, beam_graph
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, I32Array, I64Array, Template
+from taichi_mrf.system.compiler import ti
 
 PROPOSAL, ACCEPTANCE = 0, 1
 """What a random number is for."""

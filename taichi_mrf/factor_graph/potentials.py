@@ -17,7 +17,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.factor_graph.config import LaserConfig
@@ -35,6 +34,7 @@ from taichi_mrf.kernels.types import (
     Vec3,
     Vec5,
 )
+from taichi_mrf.system.compiler import ti
 
 UNITS = 4096.0
 """Energies, messages and their sums are counted in integers of 1 / UNITS: they are the same in any order."""

@@ -2,12 +2,11 @@
 
 from dataclasses import dataclass
 
-import taichi as ti
-
 from taichi_mrf.factor_graph.graph import FactorGraph
 from taichi_mrf.kernels.bundles import Bundle
 from taichi_mrf.kernels.types import I32
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 
 SCRATCH_BYTES = 256 << 20
 """Most scratch on a GPU, of two values for each step of a worker's present beam."""

@@ -8,13 +8,13 @@ its images are dropped.
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.inference.accumulators import low_half
 from taichi_mrf.kernels.resident import Resident
 from taichi_mrf.kernels.types import F32, I32, I32Array, I64Array, Template
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import VOXELS, grid_keys
 from taichi_mrf.voxels.pool import BrickPool

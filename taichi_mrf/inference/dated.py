@@ -21,7 +21,6 @@ from collections.abc import Callable, Iterable
 from itertools import groupby
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.config.time import TimeConfig
@@ -39,6 +38,7 @@ from taichi_mrf.inference.dated_channels import (
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.schedule import content_key
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool, fill_bricks, read_bricks, write_bricks
 from taichi_mrf.voxels.strips import strip_length

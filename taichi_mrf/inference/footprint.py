@@ -7,7 +7,6 @@ they separate seen-free from unknown space, and give the bricks of other keyfram
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.config.inference import InferenceConfig
@@ -20,6 +19,7 @@ from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.origins import widened
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat

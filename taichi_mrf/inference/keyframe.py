@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import KeyframeError
@@ -16,6 +15,7 @@ from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import NoiseModel, NoiseTable
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.sensor.pose_doubt import Covariance, beside_edges, doubtful_table
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.window import Window
 
 Cells = NDArray[np.int32]

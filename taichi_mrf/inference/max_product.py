@@ -7,11 +7,10 @@ voxel alone, and first_occupied.py describes how all its messages are found in o
 voxel that the ray crosses for the length l is free with probability (1 - m)^l, as it is there.
 """
 
-import taichi as ti
-
 from taichi_mrf.inference.first_occupied import message, next_ahead, next_behind
 from taichi_mrf.kernels.log_odds import log_of_rest, logistic
 from taichi_mrf.kernels.types import F32, Template, Vec4
+from taichi_mrf.system.compiler import ti
 
 
 @ti.func

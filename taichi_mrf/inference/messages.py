@@ -3,13 +3,13 @@
 from collections.abc import Iterable
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.keyframe import VisibleBricks
 from taichi_mrf.kernels.types import F32, AnyArray, F32Array, I32Array, Template
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.strips import strip_begin, strip_length

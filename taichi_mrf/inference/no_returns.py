@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import taichi as ti
 
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.inference import sum_product
@@ -15,6 +14,7 @@ from taichi_mrf.inference.workers import Workers
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import F32, I32, I64Array
 from taichi_mrf.sensor.no_return import NoReturnLaw
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.traversal import Space, Viewpoint
 
 

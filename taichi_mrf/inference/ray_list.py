@@ -11,7 +11,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.inference.keyframe import TILE, DepthImage, RayList
@@ -19,6 +18,7 @@ from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Template
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.traversal import pixel_ray
 
 LEVELS = 10

@@ -17,8 +17,6 @@ and rays vote for their likeliest voxel (surface_votes.py).
 import math
 from dataclasses import dataclass
 
-import taichi as ti
-
 from taichi_mrf.inference.keyframe import RayList
 from taichi_mrf.inference.ray_list import listed_ray
 from taichi_mrf.inference.ray_model import RayModel, log_pass
@@ -28,6 +26,7 @@ from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import exp_of_negative, log_let_through
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Struct, Template, Vec4
 from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.pool import BrickPool, PoolPart

@@ -34,8 +34,6 @@ With ``maximise`` sums over explanations become maxima: max_product.py.
 
 from dataclasses import dataclass
 
-import taichi as ti
-
 from taichi_mrf.inference.accumulators import add_message, length_sum, mean_message
 from taichi_mrf.inference.first_occupied import NEVER
 from taichi_mrf.inference.keyframe import RayList
@@ -58,6 +56,7 @@ from taichi_mrf.kernels.types import (
     Vec4,
 )
 from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.strips import strip_begin
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_voxels

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.config.schema import VolumeConfig
@@ -19,6 +18,7 @@ from taichi_mrf.inference.ray_posterior import FreeLogs, follow_rays
 from taichi_mrf.inference.surface_rays import SCALE, AddDistances, Band, DistanceSums
 from taichi_mrf.inference.workers import workers_without_trace
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.layout import CHUNK, VOXELS, grid_keys

@@ -14,7 +14,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.config.schema import VolumeConfig
@@ -25,6 +24,7 @@ from taichi_mrf.inference.workers import workers_without_trace
 from taichi_mrf.kernels.bundles import Bundle
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool, PoolPart, copied
 from taichi_mrf.voxels.traversal import walk_voxels

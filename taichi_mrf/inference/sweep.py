@@ -5,7 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.config.inference import InferenceConfig
@@ -19,6 +18,7 @@ from taichi_mrf.inference.workers import Workers, workers_for
 from taichi_mrf.kernels.resident import on_host, vec4_array
 from taichi_mrf.sensor.forward import AUTO, CENTRE, SEGMENT
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.strips import strip_length

@@ -14,7 +14,6 @@ colour needs fewer rays than a message.
 from dataclasses import dataclass, replace
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.inference.color_sums import ColorShare, ColorSums, weigh
@@ -27,6 +26,7 @@ from taichi_mrf.inference.sum_product import TINY
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.kernels.types import F32, I32, I32Array, I64Array, Struct, Template, Vec4
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 

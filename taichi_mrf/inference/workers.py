@@ -2,11 +2,10 @@
 
 from dataclasses import dataclass
 
-import taichi as ti
-
 from taichi_mrf.kernels.bundles import Bundle
 from taichi_mrf.kernels.types import I32, Template
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 
 
 @dataclass(frozen=True)

@@ -32,10 +32,10 @@ import linecache
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-import taichi as ti
-
 from taichi_mrf.kernels import positions
 from taichi_mrf.kernels.types import Template
+from taichi_mrf.system import compiler
+from taichi_mrf.system.compiler import ti
 
 positions.shorten()
 
@@ -44,7 +44,10 @@ class Bundle:
     """The base of all bundles."""
 
     _data_oriented = True  # Taichi passes such an object on as it is
-    _is_taichi_function = False  # Taichi would warn where a kernel makes one
+
+
+setattr(Bundle, compiler.function_mark(), False)  # Taichi would warn where a kernel makes one
+compiler.pass_whole(Bundle)
 
 
 class _Flat:

@@ -1,8 +1,7 @@
 """Probabilities and their logarithms, kept precise near 0 and 1 and cheap where most voxels are."""
 
-import taichi as ti
-
 from taichi_mrf.kernels.types import F32, Template
+from taichi_mrf.system.compiler import ti
 
 
 @ti.func

@@ -8,19 +8,22 @@ is made when there is an error, and otherwise the note is the file and the line 
 
 import ast
 import sys
+from typing import Any
 
-from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+from taichi_mrf.system import compiler
 
-_full_note = ASTTransformerContext.get_pos_info
+_maker, _method = compiler.note_maker()
+_full_note = getattr(_maker, _method)
 
 
-def _note(context: ASTTransformerContext, node: ast.stmt | ast.expr) -> str:
+def _note(context: Any, node: ast.stmt | ast.expr) -> str:
     if sys.exc_info()[0] is not None:
-        return _full_note(context, node)
+        full: str = _full_note(context, node)
+        return full
     name = context.func.func.__name__
     return f'File "{context.file}", line {node.lineno + context.lineno_offset}, in {name}:\n'
 
 
 def shorten() -> None:
     """Have Taichi make short notes from now on, in the kernels of other packages too."""
-    ASTTransformerContext.get_pos_info = _note
+    setattr(_maker, _method, _note)

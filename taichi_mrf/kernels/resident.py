@@ -8,13 +8,11 @@ import weakref
 from typing import Any, TypeAlias
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
-from taichi.lang import impl
-from taichi.lang.util import to_taichi_type
 
 from taichi_mrf.kernels.types import Vec4
-from taichi_mrf.system import runtime
+from taichi_mrf.system import compiler, runtime
+from taichi_mrf.system.compiler import ti
 
 Resident: TypeAlias = "NDArray[Any] | ti.Ndarray"
 
@@ -25,7 +23,7 @@ def resident(values: NDArray[Any]) -> Resident:
     values = np.ascontiguousarray(values)
     if runtime.active() == "cpu":
         return values
-    array = ti.ndarray(to_taichi_type(values.dtype), values.shape)
+    array = ti.ndarray(compiler.data_type(values.dtype), values.shape)
     array.from_numpy(values)
     return array
 
@@ -42,11 +40,12 @@ def vec4_array(length: int) -> "ti.Ndarray":
     for what is made again and again, such as for each scan, take an array of scalars.
     """
     array = ti.ndarray(Vec4, length)
-    weakref.finalize(array, _free, array.arr).atexit = False
+    if not compiler.frees_vectors():
+        weakref.finalize(array, _free, array.arr).atexit = False
     return array
 
 
 def _free(memory: Any) -> None:
-    program = impl.get_runtime().prog
+    program = compiler.program()
     if program is not None:
         program.delete_ndarray(memory)

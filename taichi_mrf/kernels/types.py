@@ -6,7 +6,7 @@ everything.
 
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import taichi as ti
+from taichi_mrf.system.compiler import ti
 
 if TYPE_CHECKING:
     Template: TypeAlias = Any

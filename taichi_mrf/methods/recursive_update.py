@@ -8,10 +8,9 @@ counts as occupied (OctoMap).
 
 import math
 
-import taichi as ti
-
 from taichi_mrf.kernels.log_odds import faded
 from taichi_mrf.kernels.types import F32, F32Array, I32Array, Template
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.strips import strip_begin
 

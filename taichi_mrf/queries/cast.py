@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import ConfigError
@@ -13,6 +12,7 @@ from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, St
 from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.queries.ray_space import RaySpace
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_voxels
 from taichi_mrf.voxels.window import Window

@@ -13,7 +13,6 @@ were seen to be free, and in maps that integrate scan by scan the free voxels (s
 """
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import ConfigError
@@ -29,6 +28,7 @@ from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.origins import widened
 from taichi_mrf.sensor.rays import CameraRays
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.traversal import FAR, Space, Viewpoint, clip, pixel_ray, walk_voxels
 
 _THINNEST = 1e-6

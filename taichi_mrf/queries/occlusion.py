@@ -6,10 +6,9 @@ alpha = -ln(1 - p) / voxel size (MRFMap, section III-D).
 
 from dataclasses import dataclass
 
-import taichi as ti
-
 from taichi_mrf.kernels.log_odds import softplus
 from taichi_mrf.kernels.types import F32
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.traversal import FAR
 
 

@@ -1,13 +1,13 @@
 """The probability of occupied at points, and whether they are known."""
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import array
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.kernels.types import F32Array, I32Array
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology

@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import logistic
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template, Vec3
 from taichi_mrf.queries.occlusion import occlusion
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_voxels
 
 

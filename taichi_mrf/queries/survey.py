@@ -8,7 +8,6 @@ segments. Depths are axial, in metres.
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.kernels.bundles import Bundle, kernel
@@ -17,6 +16,7 @@ from taichi_mrf.kernels.types import F32, I32, F32Array, Struct, Template
 from taichi_mrf.queries.occlusion import occlusion, stopped_share
 from taichi_mrf.sensor.forward import SEGMENT
 from taichi_mrf.sensor.model import Sensor
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, walk_voxels
 
 OPAQUE = 1e-3

@@ -3,7 +3,6 @@
 import dataclasses
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import array
@@ -17,6 +16,7 @@ from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseTable
 from taichi_mrf.sensor.origins import widened
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.traversal import FAR

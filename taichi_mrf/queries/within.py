@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import array, real
@@ -28,6 +27,7 @@ from taichi_mrf.kernels.log_odds import logistic
 from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, IVec3, Template, Vec3
 from taichi_mrf.queries.points import checked_points
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat, voxel_number

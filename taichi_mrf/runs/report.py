@@ -31,6 +31,7 @@ def run_report(
         "source": source,
         "method": result.map.config.method,
         "version": taichi_mrf.__version__,
+        "compiler": choice.compiler if choice else None,
         "backend": choice.name if choice else None,
         "device": choice.device if choice else None,
         "interrupted": result.interrupted or result.full is not None,

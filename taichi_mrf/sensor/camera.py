@@ -197,9 +197,8 @@ class PinholeCamera:
 
     def in_kernels(self) -> "CameraRays":
         """The camera as kernels take it: a rays.PinholeRays."""
-        import taichi as ti
-
         from taichi_mrf.sensor.rays import PinholeRays
+        from taichi_mrf.system.compiler import ti
 
         return PinholeRays(self.width, ti.Vector([self.fx, self.fy, self.cx, self.cy], ti.f32))
 

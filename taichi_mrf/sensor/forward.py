@@ -6,9 +6,8 @@ depth for a pinhole), because that is what depth images hold and what noise is l
 kernels, which reach them through model.Sensor; each is tested against a NumPy oracle.
 """
 
-import taichi as ti
-
 from taichi_mrf.kernels.types import F32, Template
+from taichi_mrf.system.compiler import ti
 
 AUTO, SEGMENT, CENTRE = 0, 1, 2
 """How a segment of the ray stands for its surface: see InferenceConfig.likelihood."""

@@ -4,11 +4,10 @@ import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import taichi as ti
-
 from taichi_mrf.kernels.bundles import Bundle
 from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array3, Struct, Vec5
 from taichi_mrf.sensor.limits import LEAST_SIGMA_M, TERMS
+from taichi_mrf.system.compiler import ti
 
 SAME_SIGMA = 2**0.5
 """Pixels whose sigmas differ by no more than about this factor may share a ray."""

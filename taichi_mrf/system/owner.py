@@ -8,13 +8,13 @@ the memory that the maps use. Each of these is a BackendError here, before a ker
 import functools
 import inspect
 import os
-import sys
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from taichi_mrf.errors import BackendError
+from taichi_mrf.system import compiler
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,9 @@ class _Owner:
     thread_name: str
     implementation: Any
     """Taichi's module that keeps the runtime, None before it is loaded."""
+    attribute: str
+    """Its attribute that is the runtime, which ``ti.init`` and ``ti.reset`` replace."""
     runtime: Any
-    """The runtime in it, which ``ti.init`` and ``ti.reset`` replace."""
 
 
 _owner: _Owner | None = None
@@ -35,10 +36,10 @@ _forked = False
 def claim() -> None:
     """Make the calling thread the owner of Taichi's present runtime."""
     global _owner
-    implementation = sys.modules.get("taichi.lang.impl")
-    runtime = getattr(implementation, "pytaichi", None)
+    implementation, attribute = compiler.runtime_place()
+    runtime = getattr(implementation, attribute, None)
     thread = threading.current_thread()
-    _owner = _Owner(threading.get_ident(), thread.name, implementation, runtime)
+    _owner = _Owner(threading.get_ident(), thread.name, implementation, attribute, runtime)
 
 
 def check_owner() -> None:
@@ -48,18 +49,20 @@ def check_owner() -> None:
         return
     if _forked:
         raise BackendError(
-            "this process was forked from one in which Taichi runs, and cannot use it: start a new process "
-            "instead (multiprocessing's method 'spawn')"
+            f"this process was forked from one in which {compiler.title()} runs, and cannot use it: start a "
+            "new process instead (multiprocessing's method 'spawn')"
         )
     if threading.get_ident() != owner.thread:
         raise BackendError(
-            f"maps can only be used in the thread that started Taichi ('{owner.thread_name}'), "
+            f"maps can only be used in the thread that started {compiler.title()} ('{owner.thread_name}'), "
             f"not in '{threading.current_thread().name}'"
         )
-    if owner.implementation is not None and owner.implementation.pytaichi is not owner.runtime:
+    if owner.implementation is not None and (
+        getattr(owner.implementation, owner.attribute) is not owner.runtime
+    ):
         raise BackendError(
-            "Taichi was started again (ti.init or ti.reset) after taichi_mrf, which frees the memory of all "
-            "maps: call ti.init before the first map, or use taichi_mrf.init instead"
+            f"{compiler.title()} was started again (ti.init or ti.reset) after taichi_mrf, which frees the "
+            "memory of all maps: call ti.init before the first map, or use taichi_mrf.init instead"
         )
 
 

@@ -1,16 +1,15 @@
 """Starts Taichi once, on the best backend of this machine, and records why it was chosen.
 
-A process has one backend. Importing this module neither loads nor starts Taichi.
+A process has one backend, and one compiler of kernels (system/compiler.py): what is said of Taichi here holds
+for Quadrants too. Importing this module neither loads nor starts one.
 """
 
 import contextlib
-import importlib
 import importlib.metadata
 import io
 import logging
 import os
 import platform
-import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -18,7 +17,7 @@ from typing import Any
 
 import taichi_mrf
 from taichi_mrf.errors import BackendError
-from taichi_mrf.system import devices, owner, taichi_environment
+from taichi_mrf.system import compiler, devices, owner, taichi_environment
 
 BACKENDS = ("cuda", "vulkan", "cpu")
 """In the order in which "auto" tries them."""
@@ -42,6 +41,8 @@ class Backend:
     reason: str
     rejected: dict[str, str] = field(default_factory=dict)
     software: bool = False
+    compiler: str = field(default_factory=lambda: f"{compiler.name()} {_version(compiler.name())}")
+    """The package that compiles kernels, and its version."""
 
 
 @dataclass(frozen=True)
@@ -81,21 +82,25 @@ def init(arch: str = "auto", threads: int = 0, debug: bool = False, profile: boo
         else:
             _chosen = _already_running() or _started(arch, threads, debug, profile)
             owner.claim()
-            _log.info("Taichi runs on %s (%s), %s", _chosen.name, _chosen.device, _chosen.reason)
+            title = compiler.title()
+            _log.info("%s runs on %s (%s), %s", title, _chosen.name, _chosen.device, _chosen.reason)
             for name, why in _chosen.rejected.items():
-                _log.info("Taichi does not run on %s: %s", name, why)
+                _log.info("%s does not run on %s: %s", title, name, why)
     if arch not in ("auto", _chosen.name):
         raise BackendError(
-            f"Taichi already runs on {_chosen.name}: a process has one backend, {arch} needs another process"
+            f"{compiler.title()} already runs on {_chosen.name}: a process has one backend, "
+            f"{arch} needs another process"
         )
     if profile and not _profiles_kernels():
-        raise BackendError("Taichi already runs without its kernel profiler: profiling needs another process")
+        raise BackendError(
+            f"{compiler.title()} already runs without its kernel profiler: profiling needs another process"
+        )
     return _chosen.name
 
 
 def _profiles_kernels() -> bool:
     """Whether Taichi was started with its kernel profiler, which it has on all backends but Vulkan."""
-    import taichi as ti
+    from taichi_mrf.system.compiler import ti
 
     return active() == "vulkan" or bool(ti.cfg.kernel_profiler)
 
@@ -140,12 +145,16 @@ def backends() -> list[BackendStatus]:
 
 def versions() -> dict[str, str]:
     """Versions of this package and of what its results depend on."""
-    packages = ("taichi", "numpy", "opencv-python-headless")
+    packages = (compiler.name(), "numpy", "opencv-python-headless")
     return {
         "taichi_mrf": taichi_mrf.__version__,
         "python": platform.python_version(),
-        **{name: importlib.metadata.version(name) for name in packages},
+        **{name: _version(name) for name in packages},
     }
+
+
+def _version(package: str) -> str:
+    return importlib.metadata.version(package)
 
 
 def _started(arch: str, threads: int, debug: bool, profile: bool) -> Backend:
@@ -189,7 +198,7 @@ def _start(name: str, software: bool, threads: int, debug: bool, profile: bool) 
     arch = getattr(ti, name)
     with _quiet_start():
         if not ti.lang.misc.is_arch_supported(arch):
-            raise BackendError("the driver is there, but Taichi cannot load it")
+            raise BackendError(f"the driver is there, but {compiler.title()} cannot load it")
         if name == "vulkan":  # Taichi's own choice could be a software device beside a real one
             allow_software = all(device.software for device in devices.vulkan_devices())
             index = devices.best_vulkan_device(allow_software).index
@@ -197,7 +206,8 @@ def _start(name: str, software: bool, threads: int, debug: bool, profile: bool) 
         try:
             ti.init(arch=arch, debug=debug, log_level=ti.ERROR, enable_fallback=False, **options)
         except RuntimeError as error:
-            raise BackendError(f"Taichi does not start on it: {' '.join(str(error).split())}") from error
+            why = " ".join(str(error).split())
+            raise BackendError(f"{compiler.title()} does not start on it: {why}") from error
 
 
 def _usable(threads: int) -> int:
@@ -214,30 +224,31 @@ def _usable(threads: int) -> int:
 
 def _already_running() -> Backend | None:
     """The backend that the program around this library has started with ti.init, if it has."""
-    if "taichi" not in sys.modules:
+    if not compiler.is_loaded():
         return None
     ti = _quiet_taichi()
-    if ti.lang.impl.get_runtime().prog is None:
+    if compiler.program() is None:
         return None
     name = "cpu" if ti.cfg.arch == ti.cpu else str(ti.cfg.arch).removeprefix("Arch.")
     if name not in BACKENDS:
-        raise BackendError(f"Taichi already runs on {name}, which this package does not support")
+        raise BackendError(f"{compiler.title()} already runs on {name}, which this package does not support")
     device, software = _device(name, allow_software=True)
-    return Backend(name, device, "Taichi was running on it already", software=software)
+    return Backend(name, device, f"{compiler.title()} was running on it already", software=software)
 
 
 def _quiet_taichi() -> Any:
     """Taichi, told to log errors only."""
-    taichi = importlib.import_module("taichi")
-    taichi.set_logging_level(taichi.ERROR)
-    return taichi
+    from taichi_mrf.system.compiler import ti
+
+    ti.set_logging_level(ti.ERROR)
+    return ti
 
 
 @contextlib.contextmanager
 def _quiet_start() -> Iterator[None]:
     """Keep ti.init from printing, from asking its home page for a newer version, and from taking
     another backend than it is told because of an environment variable."""
-    settings = {"TI_SKIP_VERSION_CHECK": "ON", "TI_ARCH": None}
+    settings = {compiler.variable("SKIP_VERSION_CHECK"): "ON", compiler.variable("ARCH"): None}
     saved = {key: os.environ.get(key) for key in settings}
     _set_environment(settings)
     try:

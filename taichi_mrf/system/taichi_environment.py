@@ -1,5 +1,6 @@
 """The environment that Taichi and matplotlib need before they are loaded: no banner, writable folders.
 
+All of it holds for Quadrants too (system/compiler.py), whose variables and folder have other names.
 Taichi 1.7.4 aborts on import if neither HOME nor XDG_CACHE_HOME is set, and ends in a segmentation fault if
 its cache cannot be written, even when the cache is switched off (TI_OFFLINE_CACHE=0). matplotlib prints two
 lines on stderr if its folder cannot be written.
@@ -10,7 +11,10 @@ import os
 import stat
 import warnings
 
-_CACHE = "TI_OFFLINE_CACHE_FILE_PATH"
+from taichi_mrf.errors import BackendError
+from taichi_mrf.system import compiler
+from taichi_mrf.system.compiler import COMPILERS
+
 _BASE = "XDG_CACHE_HOME"
 _MATPLOTLIB = "MPLCONFIGDIR"
 
@@ -19,20 +23,30 @@ cache_note: str | None = None
 
 
 def prepare() -> None:
-    """Set what has to be set before Taichi is imported, whoever imports it."""
-    os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
-    warnings.filterwarnings("ignore", category=DeprecationWarning, module=r"taichi(\.|$)")
+    """Set what has to be set before Taichi is imported, whoever imports it. Without a compiler, or with an
+    unknown one, this is not the place to say so."""
+    for name, each in COMPILERS.items():
+        os.environ.setdefault(each.banner, "0")
+        warnings.filterwarnings("ignore", category=DeprecationWarning, module=rf"{name}(\.|$)")
+    # Of a NumPy number among a kernel's arguments: Quadrants looks at all of them again in the next call.
+    warnings.filterwarnings("ignore", message=r".*Template mapper caching disabled")
     if os.name != "nt":  # on Windows Taichi needs no variable
-        _choose_cache()
+        with contextlib.suppress(BackendError):
+            _choose_cache()
         _choose_matplotlib_folder()
+
+
+def cache_variable() -> str:
+    """The environment variable that names the folder of compiled kernels."""
+    return compiler.variable("OFFLINE_CACHE_FILE_PATH")
 
 
 def cache_folder() -> str | None:
     """The folder of compiled kernels that the environment names, None if it names none."""
-    if chosen := os.environ.get(_CACHE):
+    if chosen := os.environ.get(cache_variable()):
         return chosen
     base = os.environ.get(_BASE) or (os.path.join(home, ".cache") if (home := os.environ.get("HOME")) else "")
-    return os.path.join(base, "taichi", "ticache") if base else None
+    return os.path.join(base, *COMPILERS[compiler.name()].cache) if base else None
 
 
 def cache_problem() -> str | None:
@@ -40,7 +54,7 @@ def cache_problem() -> str | None:
     folder = cache_folder()
     if os.name == "nt" or (folder is not None and _is_writable(folder)):
         return None
-    return f"no folder can be written to for Taichi's compiled kernels: set {_CACHE}"
+    return f"no folder can be written to for {compiler.title()}'s compiled kernels: set {cache_variable()}"
 
 
 def _choose_cache() -> None:
@@ -51,12 +65,14 @@ def _choose_cache() -> None:
         chosen = _private_folder()
         why = "HOME is not set" if usual is None else f"{usual} cannot be written to"
         if chosen is not None:
-            cache_note = f"{why}: Taichi keeps its compiled kernels in {chosen}"
-            os.environ[_CACHE] = chosen
+            cache_note = f"{why}: {compiler.title()} keeps its compiled kernels in {chosen}"
+            os.environ[cache_variable()] = chosen
     if not os.environ.get(_BASE) and (_BASE in os.environ or not os.environ.get("HOME")):
         # Taichi takes an empty name for the root of the file system, and aborts without any.
         home = os.environ.get("HOME")
-        os.environ[_BASE] = os.path.join(home, ".cache") if home else os.environ.get(_CACHE) or os.devnull
+        os.environ[_BASE] = (
+            os.path.join(home, ".cache") if home else os.environ.get(cache_variable()) or os.devnull
+        )
 
 
 def _choose_matplotlib_folder() -> None:

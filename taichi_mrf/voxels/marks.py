@@ -7,11 +7,11 @@ with NumPy.
 from collections.abc import Iterator
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.kernels.types import I32, I32Array, IVec3
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
 from taichi_mrf.voxels.numbering import flat, voxel_number

@@ -1,8 +1,7 @@
 """How kernels number voxels and cells; the levels themselves are in layout.py, which needs no Taichi."""
 
-import taichi as ti
-
 from taichi_mrf.kernels.types import I32, IVec3
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK
 
 

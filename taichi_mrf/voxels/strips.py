@@ -4,10 +4,9 @@ On a CPU an iteration of a Taichi loop costs more than what is done to a voxel, 
 cache lines. On a GPU an iteration is a thread, and neighbouring threads should take neighbouring voxels.
 """
 
-import taichi as ti
-
 from taichi_mrf.kernels.types import I32, I32Array, Template
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
 
 CPU_STRIP = 64

@@ -15,11 +15,11 @@ import weakref
 from typing import ClassVar, Protocol
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.kernels.types import I32, AnyArray, I32Array, IVec3, IVec4, Template
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, CHUNK
 from taichi_mrf.voxels.numbering import flat
 

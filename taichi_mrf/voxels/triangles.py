@@ -7,11 +7,11 @@ of a huge triangle are work for many.
 """
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.kernels.types import F32, I32, F32Array3, I32Array, IVec3, Template, Vec3
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.marks import mark, voxel_in_window
 from taichi_mrf.voxels.traversal import within

@@ -9,7 +9,6 @@ on the host, so that float32 is exact enough anywhere in the world.
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import CapacityError
@@ -17,6 +16,7 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.resident import Resident
 from taichi_mrf.kernels.types import I32, I32Array, IVec3
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_BRICKS
 from taichi_mrf.voxels.numbering import flat

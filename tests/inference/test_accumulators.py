@@ -4,7 +4,6 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.inference.accumulators import LONGEST, add_message, finest_scale, length_sum, mean_message
 from taichi_mrf.kernels.types import F32, F32Array, I32Array, I64Array
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
 from taichi_mrf.voxels.window import Window
 

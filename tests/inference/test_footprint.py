@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import taichi as ti
 from numpy.typing import NDArray
 from oracles.forward import Noise
 from oracles.traversal import clip_to_box, segments
@@ -28,6 +27,7 @@ from taichi_mrf.kernels.types import F32, I32, AnyArray, I32Array, Struct, Templ
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel, PatchNoise, PolynomialNoise
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, CHUNK
 from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_voxels
 from taichi_mrf.voxels.window import Window

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-import taichi as ti
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from one_pixel import VOXEL, allocated, look_along, marginals, well_cut
@@ -20,6 +19,7 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.window import WindowIndex
 

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from taichi_mrf.inference.workers import Workers
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import I32, I32Array
+from taichi_mrf.system.compiler import ti
 
 pytestmark = pytest.mark.usefixtures("backend")
 

@@ -3,12 +3,14 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 
 from taichi_mrf.inference.ray_model import log_pass
 from taichi_mrf.kernels.log_odds import log_let_through
 from taichi_mrf.kernels.types import F32, F32Array, Template
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
+
+pytestmark = pytest.mark.compilers
 
 LOG_ODDS = np.array([-60.0, -20.0, -9.2, -2.2, -0.1, 0.0, 0.4, 3.0, 9.2, 20.0, 60.0], np.float32)
 

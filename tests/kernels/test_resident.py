@@ -15,6 +15,8 @@ import pytest
 from taichi_mrf.kernels.resident import vec4_array
 from taichi_mrf.system import runtime
 
+pytestmark = pytest.mark.compilers
+
 STATM = Path("/proc/self/statm")
 LENGTH = 1_000_000
 ARRAY_MB = 16.0 * LENGTH / 1e6

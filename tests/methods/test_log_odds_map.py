@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import taichi as ti
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -26,6 +25,7 @@ from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import PolynomialNoise
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
 
 pytestmark = pytest.mark.usefixtures("backend")

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import taichi as ti
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import visibility as reference
@@ -17,6 +16,7 @@ from taichi_mrf.methods.visibility import scan
 from taichi_mrf.methods.visibility.plug import TABLE_I, VisibilityConfig
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.traversal import Space
 from taichi_mrf.voxels.window import Window, WindowIndex

@@ -4,7 +4,6 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.polynomial import polynomial as exact
@@ -28,8 +27,9 @@ from taichi_mrf.sensor.forward import (
 )
 from taichi_mrf.sensor.noise import LEAST_SIGMA_M, TERMS
 from taichi_mrf.sensor.polynomials import PixelNoise
+from taichi_mrf.system.compiler import ti
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.compilers]
 
 Values = NDArray[np.float64]
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import taichi as ti
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.polynomial import polynomial
@@ -30,6 +29,7 @@ from taichi_mrf.sensor.noise import (
     warn_of_bad_sigma,
 )
 from taichi_mrf.sensor.polynomials import SensorNoise
+from taichi_mrf.system.compiler import ti
 
 CAMERA = PinholeCamera(width=50, height=37, fx=40, fy=40, cx=24.5, cy=18)
 """With patches of 16 pixels it has 4 columns and 3 rows, the last ones cut off by the image's edge."""

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.kernels.bundles import kernel
@@ -11,6 +10,7 @@ from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.sensor.rays import CameraRays
 from taichi_mrf.sensor.spherical import SphericalCamera
+from taichi_mrf.system.compiler import ti
 
 pytestmark = pytest.mark.usefixtures("backend")
 

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.kernels.resident import resident
 from taichi_mrf.kernels.types import F32, I32, F32Array, Struct, Template
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.polynomials import SensorNoise
+from taichi_mrf.system.compiler import ti
 
 # ruff: noqa: ANN201, ANN202 - Taichi does not allow `-> None` on a kernel or a func.
 

@@ -9,14 +9,15 @@ from pathlib import Path
 import pytest
 
 import taichi_mrf
-from taichi_mrf.system import taichi_environment
+from taichi_mrf.system import compiler, taichi_environment
+from taichi_mrf.system.compiler import COMPILERS
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="Taichi needs no variable on Windows")
 
 KERNEL = """
 import taichi_mrf as tm
 tm.init("cpu")
-import taichi as ti
+from taichi_mrf.system.compiler import ti
 
 @ti.kernel
 def one() -> ti.i32:
@@ -24,7 +25,9 @@ def one() -> ti.i32:
 
 print(one())
 """
-NAMES = ("HOME", "XDG_CACHE_HOME", "XDG_CONFIG_HOME", "MPLCONFIGDIR", "TI_OFFLINE_CACHE_FILE_PATH")
+CACHE = compiler.variable("OFFLINE_CACHE_FILE_PATH")
+USUAL = "/".join(COMPILERS[compiler.name()].cache)
+NAMES = ("HOME", "XDG_CACHE_HOME", "XDG_CONFIG_HOME", "MPLCONFIGDIR", CACHE)
 
 
 def run(tmp_path: Path, *, program: str = KERNEL, **variables: str) -> subprocess.CompletedProcess[str]:
@@ -45,9 +48,9 @@ def run(tmp_path: Path, *, program: str = KERNEL, **variables: str) -> subproces
     [
         ({}, "HOME is not set"),
         ({"HOME": ""}, "HOME is not set"),
-        ({"HOME": "/dev/null"}, "/dev/null/.cache/taichi/ticache cannot be written to"),
-        ({"HOME": "/tmp", "XDG_CACHE_HOME": "/dev/null"}, "/dev/null/taichi/ticache cannot be written to"),
-        ({"HOME": "/tmp", "TI_OFFLINE_CACHE_FILE_PATH": "/dev/null/x"}, "/dev/null/x cannot be written to"),
+        ({"HOME": "/dev/null"}, f"/dev/null/.cache/{USUAL} cannot be written to"),
+        ({"HOME": "/tmp", "XDG_CACHE_HOME": "/dev/null"}, f"/dev/null/{USUAL} cannot be written to"),
+        ({"HOME": "/tmp", CACHE: "/dev/null/x"}, "/dev/null/x cannot be written to"),
     ],
 )
 def test_without_a_usual_folder_the_cache_is_private_and_this_is_said(
@@ -56,17 +59,17 @@ def test_without_a_usual_folder_the_cache_is_private_and_this_is_said(
     done = run(tmp_path, **variables)
     assert (done.returncode, done.stdout) == (0, "1\n"), done.stderr
     folder = tmp_path / "tmp" / f"taichi-mrf-{os.getuid()}"
-    assert done.stderr == f"{said}: Taichi keeps its compiled kernels in {folder}\n"
+    assert done.stderr == f"{said}: {compiler.title()} keeps its compiled kernels in {folder}\n"
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     assert any(folder.iterdir())
 
 
-@pytest.mark.parametrize("name", ["HOME", "XDG_CACHE_HOME", "TI_OFFLINE_CACHE_FILE_PATH"])
+@pytest.mark.parametrize("name", ["HOME", "XDG_CACHE_HOME", CACHE])
 def test_a_folder_that_can_be_made_is_used_without_a_word(tmp_path: Path, name: str) -> None:
     done = run(tmp_path, **{name: str(tmp_path / "new")})
     assert (done.returncode, done.stdout, done.stderr) == (0, "1\n", "")
-    assert any((tmp_path / "new").rglob("*.tcb"))
-    if name == "TI_OFFLINE_CACHE_FILE_PATH":
+    assert any(path.suffix in {".tcb", ".qdc"} for path in (tmp_path / "new").rglob("*"))
+    if name == CACHE:
         assert not any((tmp_path / "tmp").glob("taichi-mrf-*/*"))
 
 
@@ -96,9 +99,9 @@ def test_a_folder_that_others_can_write_to_is_not_trusted(
 
 
 def test_without_any_folder_taichi_is_not_started(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TI_OFFLINE_CACHE_FILE_PATH", "/dev/null/x")
-    assert "set TI_OFFLINE_CACHE_FILE_PATH" in str(taichi_environment.cache_problem())
-    monkeypatch.setenv("TI_OFFLINE_CACHE_FILE_PATH", "/tmp/x")
+    monkeypatch.setenv(CACHE, "/dev/null/x")
+    assert f"set {CACHE}" in str(taichi_environment.cache_problem())
+    monkeypatch.setenv(CACHE, "/tmp/x")
     assert taichi_environment.cache_problem() is None
 
 

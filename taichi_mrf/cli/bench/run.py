@@ -49,7 +49,8 @@ class _Run:
         self.device = f"{choice.name}, {choice.device}" if choice else ""
         path = Path(options.source)
         name = path.resolve().name if exists(path) else options.source
-        self.title = f"{name}, {count} keyframes, on {self.device}"
+        self.compiler = choice.compiler if choice else ""
+        self.title = f"{name}, {count} keyframes, on {self.device}, {self.compiler}"
 
     def each_size(self, what: str = "") -> Iterator[tuple[Config, Callable[[int], None]]]:
         """Each voxel size's parameters, and a function to call with the number of frames done."""
@@ -111,7 +112,13 @@ def run_bench(options: Bench) -> int:
     for table in tables:
         console.print(table)
     if options.json is not None:
-        report = {"device": run.device, "source": options.source, "measured": mode, "rows": figures}
+        report = {
+            "device": run.device,
+            "compiler": run.compiler,
+            "source": options.source,
+            "measured": mode,
+            "rows": figures,
+        }
         write_text(options.json, json.dumps(report, indent=2) + "\n")
     if options.plot is not None and draw is not None:
         write_figure(draw(), options.plot)

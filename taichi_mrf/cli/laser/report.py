@@ -29,6 +29,7 @@ def laser_report(
     return {
         "source": source,
         "version": taichi_mrf.__version__,
+        "compiler": choice.compiler if choice else None,
         "backend": choice.name if choice else None,
         "device": choice.device if choice else None,
         "interrupted": interrupted,

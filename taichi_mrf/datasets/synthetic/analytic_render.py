@@ -1,7 +1,6 @@
 """Pictures of an analytic scene: one ray through each pixel's centre, on Taichi."""
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.synthetic.analytic_scene import KINDS, Scene
@@ -9,6 +8,7 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.types import F32, I32, AnyArray, Mat3, Template, Vec3, Vec4
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.origins import origins_of
+from taichi_mrf.system.compiler import ti
 
 BOX, SPHERE = KINDS.index("box"), KINDS.index("sphere")
 NOTHING = 1e30

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-import taichi as ti
 
 from taichi_mrf.benchmark.bench import octomap_available
 from taichi_mrf.evaluation.pictures.figures import new_figure
@@ -14,6 +13,7 @@ from taichi_mrf.experiments.contenders import Contender
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.experiments.stereo.street import TABLE_I, thinned
+from taichi_mrf.system.compiler import ti
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,7 +7,6 @@ returns count.
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
@@ -18,6 +17,7 @@ from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, Template, Ve
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.no_return import NoReturnLaw
 from taichi_mrf.sensor.origins import origins_of
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.traversal import Viewpoint, ray_start
 from taichi_mrf.voxels.window import Window
 

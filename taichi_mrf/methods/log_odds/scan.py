@@ -10,7 +10,6 @@ The result does not depend on the order of the rays.
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.config.schema import VolumeConfig
@@ -46,6 +45,7 @@ from taichi_mrf.methods.recursive_update import log_odds, updated
 from taichi_mrf.sensor.no_return import NoReturnLaw
 from taichi_mrf.sensor.origins import widened
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat, voxel_number

@@ -9,10 +9,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.pool import BrickPool, PoolSnapshot
 
 

@@ -3,8 +3,6 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import taichi as ti
-
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.geometry.poses import Pose
@@ -21,6 +19,7 @@ from taichi_mrf.inference.sweep import unknown_entry_depths
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.mrf.memory_budget import MemoryBudget
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.strips import strip_length
 
 SCOUTS = 4

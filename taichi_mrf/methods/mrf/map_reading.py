@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.method import Method
@@ -20,6 +19,7 @@ from taichi_mrf.methods.mrf.surfacing import WithSurface, surface_field_of
 from taichi_mrf.methods.protocol import MappedKeyframe
 from taichi_mrf.queries.colored import blended_colors
 from taichi_mrf.queries.view import View
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool

@@ -3,7 +3,6 @@
 import dataclasses
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.config.inference import InferenceConfig
@@ -16,6 +15,7 @@ from taichi_mrf.methods.recursive_update import log_odds
 from taichi_mrf.methods.visibility import scan as visibility_scan
 from taichi_mrf.methods.visibility.plug import VisibilityConfig
 from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool

@@ -11,10 +11,9 @@ range_sigma, g = a / angle_sigma and C the cumulative distribution of an approxi
 
 from dataclasses import dataclass
 
-import taichi as ti
-
 from taichi_mrf.kernels.bundles import Bundle
 from taichi_mrf.kernels.types import F32, I32
+from taichi_mrf.system.compiler import ti
 
 
 @ti.func

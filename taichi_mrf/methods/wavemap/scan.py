@@ -8,7 +8,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.config.schema import VolumeConfig
@@ -33,6 +32,7 @@ from taichi_mrf.methods.recursive_update import log_odds, updated
 from taichi_mrf.methods.wavemap.beams import NEIGHBOURS, Beams, beams_of, upright_axes, visit_near
 from taichi_mrf.methods.wavemap.model import BeamModel
 from taichi_mrf.methods.wavemap.plug import REACH_SIGMAS, WavemapConfig
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS
 from taichi_mrf.voxels.pool import BrickPool
