@@ -1,0 +1,291 @@
+"""Kernels of the distance field: which voxels are obstacles, and how far each is from the nearest.
+
+The squared distance to the nearest obstacle splits into one minimum for each axis,
+
+    d^2(x, y, z) = min over x' of (x - x')^2 + min over y' of (y - y')^2 + min over z' of (z - z')^2,
+
+taken over the obstacles at (x', y', z') (Felzenszwalb & Huttenlocher, Theory of Computing 8, 2012). Distances are
+cut off, so each minimum runs over a bounded stretch of a line, and a change reaches no further than that. All of
+it is in whole voxels: a field that was updated equals one that is made anew, bit for bit, on every backend.
+
+A voxel that is no obstacle has the squared distance to the nearest obstacle, an obstacle that to the nearest other
+voxel, negative. In both sums the voxels of the other kind have the distance 0, so one number serves for both.
+"""
+
+from dataclasses import dataclass
+
+import taichi as ti
+
+from taichi_mrf.kernels.bundles import Bundle, kernel
+from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, I32Array, IVec3, Template
+from taichi_mrf.queries.points import OCCUPIED, UNKNOWN, state_of
+from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.numbering import flat, voxel_number
+from taichi_mrf.voxels.traversal import within
+
+OUTSIDE, FAR = -1, -2
+"""In place of a slot: bricks of unknown space, and free ones, that are further from all else than distances go."""
+
+GONE, SEEN_FREE = -1, -2
+"""In place of a slot in the map's pool: a brick that the map no longer has, and one that rays have crossed and
+that has no voxels."""
+
+COLUMNS = BRICK**2
+"""Columns along z of a brick."""
+
+SIDE = BRICK + 1
+SAMPLES = SIDE**3
+"""Distances that a brick keeps: those of its voxels and of the layer after them along each axis, so that what lies
+between eight voxels is read from one brick."""
+
+_UNKNOWN_BITS, _FLIPPED_BITS = 8, 16
+_ALL = (1 << BRICK) - 1
+_KEPT = (1 << _FLIPPED_BITS) - 1
+
+
+@dataclass(frozen=True)
+class FieldGrid(Bundle):
+    """Where the bricks of a field are, and what space without bricks is."""
+
+    shape: IVec3
+    """Size of the window in bricks."""
+
+    index: I32Array
+    """(bricks of the window): the brick's slot in the field, OUTSIDE or FAR."""
+
+    classes: I32Array
+    """(slots * 64): for each column along z the obstacles in its lowest 8 bits, voxels whose distance is not known
+    in the next 8, and those that have just become so, or known again, in the next 8."""
+
+    outside_class: I32
+    """The same of a column in unknown space."""
+
+    reach: I32
+    """How many voxels a minimum looks to either side."""
+
+    outside: I32
+    """The squared distance in unknown space, -(reach + 1)^2 where that is an obstacle."""
+
+    @ti.func
+    def slot(self, cell: IVec3):
+        """The slot of a brick of the window, OUTSIDE or FAR."""
+        slot = OUTSIDE
+        if within(cell, self.shape):
+            slot = self.index[flat(cell, self.shape)]
+        return slot
+
+    @ti.func
+    def cell(self, number: I32):
+        """The brick of the window with this number."""
+        across = self.shape[1] * self.shape[2]
+        return IVec3(number // across, number // self.shape[2] % self.shape[1], number % self.shape[2])
+
+    @ti.func
+    def column(self, cell: IVec3, number: I32):
+        """What the voxels of a column of a brick are."""
+        slot = self.slot(cell)
+        found = 0
+        if slot >= 0:
+            found = self.classes[slot * COLUMNS + number]
+        elif slot == OUTSIDE:
+            found = self.outside_class
+        return found
+
+    @ti.func
+    def is_unknown(self, voxel: IVec3):
+        """1 for a voxel of the window whose distance is not known."""
+        column = self.column(voxel >> 3, (voxel[0] & 7) * BRICK + (voxel[1] & 7))
+        return (column >> ((voxel[2] & 7) + _UNKNOWN_BITS)) & 1
+
+    @ti.func
+    def squared(self, sums: Template, voxel: IVec3):
+        """The value of ``sums`` (slots * 512) at a voxel of the window."""
+        slot = self.slot(voxel >> 3)
+        found = self.outside
+        if slot >= 0:
+            found = sums[slot * VOXELS + voxel_number(voxel & 7)]
+        elif slot == FAR:
+            found = (self.reach + 1) * (self.reach + 1)
+        return found
+
+
+@kernel
+def classify_bricks(
+    belief: F32Array, sources: I32Array, cells: I32Array, prior: F32, min_evidence: F32, obstacles_unknown: I32,
+    distances_unknown: I32, grid: FieldGrid, found: I32Array, changed: I32Array,
+) -> None:  # fmt: skip
+    """What the voxels of some bricks are now, into ``found`` (n * 64), and which bricks differ from
+    ``grid.classes``: ``changed`` (n) becomes 1 there.
+
+    ``belief`` (pool * 512) are the map's log-odds, ``sources`` (n) the bricks' slots in its pool, GONE or
+    SEEN_FREE, ``cells`` (n) their numbers in the window. ``obstacles_unknown`` and ``distances_unknown`` tell
+    whether unknown voxels are obstacles, or have no distance.
+    """
+    for part in range(cells.shape[0] * COLUMNS):
+        row, number = part // COLUMNS, part % COLUMNS
+        column = grid.outside_class
+        if sources[row] == SEEN_FREE:
+            column = 0
+        elif sources[row] >= 0:
+            column = 0
+            for k in range(BRICK):
+                here = state_of(belief[sources[row] * VOXELS + number * BRICK + k], prior, min_evidence)
+                if here == OCCUPIED or (here == UNKNOWN and obstacles_unknown == 1):
+                    column |= 1 << k
+                elif here == UNKNOWN and distances_unknown == 1:
+                    column |= 1 << (k + _UNKNOWN_BITS)
+        found[part] = column
+        if column != grid.column(grid.cell(cells[row]), number) & _KEPT:
+            changed[row] = 1
+
+
+@kernel
+def keep_classes(found: I32Array, rows: I32Array, slots: I32Array, classes: I32Array) -> None:
+    """Copy the rows (k) of ``found`` (n * 64) to the bricks in ``slots`` (k) of ``classes`` (slots * 64)."""
+    for part in range(rows.shape[0] * COLUMNS):
+        row, number = part // COLUMNS, part % COLUMNS
+        place, column = slots[row] * COLUMNS + number, found[rows[row] * COLUMNS + number]
+        flipped = ((classes[place] ^ column) >> _UNKNOWN_BITS) & _ALL
+        classes[place] = column | (flipped << _FLIPPED_BITS)
+
+
+@kernel
+def fill_rows(channel: AnyArray, slots: I32Array, size: I32, values: AnyArray) -> None:
+    """Set all of the ``size`` entries of the bricks in ``slots`` (k) of a ``channel`` to the brick's one of
+    ``values`` (k)."""
+    for part in range(slots.shape[0] * size):
+        channel[slots[part // size] * size + part % size] = values[part // size]
+
+
+@kernel
+def copy_all(source: AnyArray, target: AnyArray, count: I32) -> None:
+    """Copy the first ``count`` entries."""
+    for i in range(count):
+        target[i] = source[i]
+
+
+@kernel
+def along_z(cells: I32Array, grid: FieldGrid, first: I32Array, changed: I32Array) -> None:
+    """Squared distances along z alone for the voxels of some bricks, numbers (n) in the window, into ``first``
+    (slots * 512); ``changed`` (n) becomes 1 for bricks in which any differs from what was there."""
+    for part in range(cells.shape[0] * COLUMNS):
+        row, number = part // COLUMNS, part % COLUMNS
+        cell = grid.cell(cells[row])
+        own = grid.column(cell, number) & _ALL
+        beyond = grid.reach + 1
+        # From the brick's lowest and highest voxel to the nearest of each kind before and after the brick.
+        free_before, full_before = _nearest(grid, cell, number, -1)
+        free_after, full_after = _nearest(grid, cell, number, 1)
+        near = ti.Vector.zero(ti.i32, BRICK)
+        for k in ti.static(range(BRICK)):
+            is_full = (own >> k) & 1
+            free_before = ti.select(is_full == 1, free_before + 1, 0)
+            full_before = ti.select(is_full == 1, 0, full_before + 1)
+            near[k] = ti.max(free_before, full_before)
+        for step in ti.static(range(BRICK)):
+            k = BRICK - 1 - step
+            is_full = (own >> k) & 1
+            free_after = ti.select(is_full == 1, free_after + 1, 0)
+            full_after = ti.select(is_full == 1, 0, full_after + 1)
+            nearest = ti.min(near[k], ti.max(free_after, full_after), beyond)
+            value = nearest * nearest * (1 - 2 * is_full)
+            place = grid.slot(cell) * VOXELS + number * BRICK + k
+            if first[place] != value:
+                first[place] = value
+                changed[row] = 1
+
+
+@ti.func
+def _nearest(grid: Template, cell: IVec3, number: I32, way: I32):
+    """From the layer of voxels beside a brick, below it (``way`` -1) or above (1), to the nearest voxel that is no
+    obstacle and to the nearest obstacle in a column, in voxels; ``reach`` or more where there is none."""
+    free, full = grid.reach, grid.reach
+    column = 0
+    k = 0
+    while k < grid.reach and (free == grid.reach or full == grid.reach):
+        if k % BRICK == 0:
+            column = grid.column(cell + IVec3(0, 0, way * (1 + k // BRICK)), number)
+        bit = k % BRICK
+        if way < 0:
+            bit = BRICK - 1 - bit
+        if (column >> bit) & 1 == 1:
+            full = ti.min(full, k)
+        else:
+            free = ti.min(free, k)
+        k += 1
+    return free, full
+
+
+@kernel
+def along_y(cells: I32Array, grid: FieldGrid, first: I32Array, second: I32Array, changed: I32Array) -> None:
+    """Squared distances in planes of equal x from those along z, ``first``, into ``second`` (slots * 512 each);
+    ``cells`` and ``changed`` as in :func:`along_z`."""
+    for part in range(cells.shape[0] * COLUMNS):
+        row, number = part // COLUMNS, part % COLUMNS
+        cell = grid.cell(cells[row])
+        slot = grid.slot(cell)
+        for k in range(BRICK):
+            place = slot * VOXELS + number * BRICK + k
+            voxel = cell * BRICK + IVec3(number // BRICK, number % BRICK, k)
+            value = _least(grid, first, voxel, IVec3(0, 1, 0))
+            if second[place] != value:
+                second[place] = value
+                changed[row] = 1
+
+
+@kernel
+def along_x(
+    cells: I32Array, grid: FieldGrid, second: I32Array, metres: F32Array, values: F32Array, changed: I32Array,
+    far: I32Array, outside: I32Array,
+) -> None:  # fmt: skip
+    """Distances in metres from squared ones in planes of equal x, ``second`` (slots * 512), into ``values``
+    (slots * 729). ``metres`` ((reach + 1)^2 + 1) has the distance of each square.
+
+    For each of the bricks ``cells`` (n), ``changed`` (n) counts the voxels whose distance differs from what was
+    there, or has become known or unknown, ``far`` (n) and ``outside`` (n) the distances that are those of FAR and of
+    OUTSIDE bricks.
+    """
+    for part in range(cells.shape[0] * SIDE * SIDE):
+        row, i, j = part // (SIDE * SIDE), part // SIDE % SIDE, part % SIDE
+        cell = grid.cell(cells[row])
+        slot = grid.slot(cell)
+        beyond = (grid.reach + 1) * (grid.reach + 1)
+        moved, in_far, in_outside, flipped = 0, 0, 0, 0
+        if ti.max(i, j) < BRICK:
+            own = slot * COLUMNS + i * BRICK + j
+            flipped = grid.classes[own] >> _FLIPPED_BITS
+            grid.classes[own] &= _KEPT
+        for k in range(SIDE):
+            voxel = cell * BRICK + IVec3(i, j, k)
+            square = _least(grid, second, voxel, IVec3(1, 0, 0))
+            unknown = grid.is_unknown(voxel)
+            value = metres[ti.abs(square)]
+            if square < 0:
+                value = -value
+            if square == beyond and unknown == 0:
+                in_far += 1
+            if square == grid.outside and unknown == (grid.outside_class >> _UNKNOWN_BITS) & 1:
+                in_outside += 1
+            place = slot * SAMPLES + (i * SIDE + j) * SIDE + k
+            if (values[place] != value or (flipped >> k) & 1 == 1) and ti.max(i, j, k) < BRICK:
+                moved += 1
+            values[place] = value
+        changed[row] += moved
+        far[row] += in_far
+        outside[row] += in_outside
+
+
+@ti.func
+def _least(grid: Template, sums: Template, voxel: IVec3, axis: IVec3):
+    """The least of the squared distance along an axis and the rest of it, ``sums`` (slots * 512), with the sign of
+    the voxel's own kind."""
+    own = grid.squared(sums, voxel)
+    sign = ti.select(own < 0, -1, 1)
+    least = ti.abs(own)
+    k = 1
+    while k * k < least and k <= grid.reach:
+        before = ti.max(sign * grid.squared(sums, voxel - k * axis), 0)
+        after = ti.max(sign * grid.squared(sums, voxel + k * axis), 0)
+        least = ti.min(least, k * k + ti.min(before, after))
+        k += 1
+    return sign * least
