@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
     class IVec4(Any): ...
 
+    class IVec8(Any): ...
+
 else:
     Template = ti.template()
     Struct = object
@@ -52,6 +54,7 @@ else:
     DVec3 = ti.types.vector(3, ti.f64)
     IVec3 = ti.types.vector(3, ti.i32)
     IVec4 = ti.types.vector(4, ti.i32)
+    IVec8 = ti.types.vector(8, ti.i32)
     Mat3 = ti.types.matrix(3, 3, ti.f32)
     AnyArray = ti.types.ndarray()
     AnyArray2 = ti.types.ndarray(ndim=2)

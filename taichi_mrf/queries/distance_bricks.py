@@ -28,6 +28,7 @@ from taichi_mrf.queries.distance_kernels import (
     classify_bricks,
     copy_all,
     fill_rows,
+    join_bricks,
     keep_classes,
 )
 from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, seen_free_bricks
@@ -176,17 +177,25 @@ class DistanceBricks:
             changed = _zeros(len(plane))
             along_y(plane.astype(np.int32), self.grid, self._first, self._second, changed)
             plane = plane[changed.to_numpy() > 0]
-        block = np.union1d(self._beside(plane, 0, stretch), cells)
-        for axis in range(3):  # bricks keep the first layer of those after them
-            block = self._beside(block, axis, (-1, 0))
+        block = np.unique(np.concatenate([self._beside(plane, 0, stretch), *made]))
         made.append(self._make(block))
-        block = np.union1d(block, np.concatenate(made))
-        counts = [_zeros(len(block)) for _ in range(3)]
-        along_x(block.astype(np.int32), self.grid, self._second, self._metres, self.values, *counts)
-        voxels, far, outside = (each.to_numpy() for each in counts)
-        self._drop(block[far == SAMPLES], FAR)
-        self._drop(block[(outside == SAMPLES) & (far < SAMPLES)], OUTSIDE)
+        changed = _zeros(len(block))
+        along_x(block.astype(np.int32), self.grid, self._second, self._metres, self.values, changed)
+        voxels = changed.to_numpy()
+        self._join(np.concatenate([block[voxels > 0], *made]))
         return int(voxels.sum())
+
+    def _join(self, cells: Cells) -> None:
+        """Let bricks before some bricks know of their distances, and give back those that need no slots."""
+        for axis in range(3):
+            cells = self._beside(cells, axis, (-1, 0))
+        self._make(cells)
+        far, outside = _zeros(len(cells)), _zeros(len(cells))
+        far_m, outside_m = float(self.rules.metres[-1]), self.rules.outside_m
+        join_bricks(cells.astype(np.int32), self.grid, self.values, far_m, outside_m, far, outside)
+        all_far, all_outside = far.to_numpy() == SAMPLES, outside.to_numpy() == SAMPLES
+        self._drop(cells[all_far], FAR)
+        self._drop(cells[all_outside & ~all_far], OUTSIDE)
 
     def _cells(self, bricks: Bricks) -> Cells:
         return np.ravel_multi_index(tuple((bricks - self.lowest).T), self._codes.shape)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import taichi as ti
 
 from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, I32Array, IVec3, Template
+from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, I32Array, IVec3, IVec8, Template
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN, state_of
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat, voxel_number
@@ -98,14 +98,15 @@ class FieldGrid(Bundle):
         return (column >> ((voxel[2] & 7) + _UNKNOWN_BITS)) & 1
 
     @ti.func
-    def squared(self, sums: Template, voxel: IVec3):
-        """The value of ``sums`` (slots * 512) at a voxel of the window."""
-        slot = self.slot(voxel >> 3)
-        found = self.outside
+    def column_of(self, sums: Template, cell: IVec3, number: I32) -> IVec8:
+        """The values of ``sums`` (slots * 512) in a column of a brick."""
+        slot = self.slot(cell)
+        found = IVec8(self.outside)
         if slot >= 0:
-            found = sums[slot * VOXELS + voxel_number(voxel & 7)]
+            for k in ti.static(range(BRICK)):
+                found[k] = sums[slot * VOXELS + number * BRICK + k]
         elif slot == FAR:
-            found = (self.reach + 1) * (self.reach + 1)
+            found = IVec8((self.reach + 1) * (self.reach + 1))
         return found
 
 
@@ -223,69 +224,96 @@ def along_y(cells: I32Array, grid: FieldGrid, first: I32Array, second: I32Array,
     for part in range(cells.shape[0] * COLUMNS):
         row, number = part // COLUMNS, part % COLUMNS
         cell = grid.cell(cells[row])
-        slot = grid.slot(cell)
-        for k in range(BRICK):
-            place = slot * VOXELS + number * BRICK + k
-            voxel = cell * BRICK + IVec3(number // BRICK, number % BRICK, k)
-            value = _least(grid, first, voxel, IVec3(0, 1, 0))
-            if second[place] != value:
-                second[place] = value
+        place = grid.slot(cell) * VOXELS + number * BRICK
+        found = _least(grid, first, cell, number, 1)
+        for k in ti.static(range(BRICK)):
+            if second[place + k] != found[k]:
+                second[place + k] = found[k]
                 changed[row] = 1
 
 
 @kernel
 def along_x(
-    cells: I32Array, grid: FieldGrid, second: I32Array, metres: F32Array, values: F32Array, changed: I32Array,
-    far: I32Array, outside: I32Array,
-) -> None:  # fmt: skip
-    """Distances in metres from squared ones in planes of equal x, ``second`` (slots * 512), into ``values``
-    (slots * 729). ``metres`` ((reach + 1)^2 + 1) has the distance of each square.
+    cells: I32Array, grid: FieldGrid, second: I32Array, metres: F32Array, values: F32Array, changed: I32Array
+) -> None:
+    """Distances in metres from squared ones in planes of equal x, ``second`` (slots * 512), for the bricks' own
+    voxels into ``values`` (slots * 729). ``metres`` ((reach + 1)^2 + 1) has the distance of each square.
 
-    For each of the bricks ``cells`` (n), ``changed`` (n) counts the voxels whose distance differs from what was
-    there, or has become known or unknown, ``far`` (n) and ``outside`` (n) the distances that are those of FAR and of
-    OUTSIDE bricks.
+    ``changed`` (n) counts the voxels of each brick of ``cells`` (n) whose distance differs from what was there, or
+    has become known or unknown.
+    """
+    for part in range(cells.shape[0] * COLUMNS):
+        row, number = part // COLUMNS, part % COLUMNS
+        cell = grid.cell(cells[row])
+        slot = grid.slot(cell)
+        found = _least(grid, second, cell, number, 0)
+        flipped = grid.classes[slot * COLUMNS + number] >> _FLIPPED_BITS
+        grid.classes[slot * COLUMNS + number] &= _KEPT
+        moved = 0
+        for k in ti.static(range(BRICK)):
+            value = metres[ti.abs(found[k])]
+            if found[k] < 0:
+                value = -value
+            place = slot * SAMPLES + (number // BRICK * SIDE + number % BRICK) * SIDE + k
+            if values[place] != value or (flipped >> k) & 1 == 1:
+                moved += 1
+            values[place] = value
+        if moved > 0:
+            changed[row] += moved
+
+
+@kernel
+def join_bricks(
+    cells: I32Array, grid: FieldGrid, values: F32Array, far_m: F32, outside_m: F32, far: I32Array, outside: I32Array
+) -> None:
+    """Copy to bricks, numbers (n) in the window, the first layers of those after them, in ``values`` (slots * 729).
+
+    ``far_m`` and ``outside_m`` are the distances in FAR and OUTSIDE bricks; ``far`` (n) and ``outside`` (n) count
+    the distances of each brick that are such, in space that is known and in space that is like OUTSIDE bricks.
     """
     for part in range(cells.shape[0] * SIDE * SIDE):
         row, i, j = part // (SIDE * SIDE), part // SIDE % SIDE, part % SIDE
         cell = grid.cell(cells[row])
-        slot = grid.slot(cell)
-        beyond = (grid.reach + 1) * (grid.reach + 1)
-        moved, in_far, in_outside, flipped = 0, 0, 0, 0
-        if ti.max(i, j) < BRICK:
-            own = slot * COLUMNS + i * BRICK + j
-            flipped = grid.classes[own] >> _FLIPPED_BITS
-            grid.classes[own] &= _KEPT
-        for k in range(SIDE):
-            voxel = cell * BRICK + IVec3(i, j, k)
-            square = _least(grid, second, voxel, IVec3(1, 0, 0))
-            unknown = grid.is_unknown(voxel)
-            value = metres[ti.abs(square)]
-            if square < 0:
-                value = -value
-            if square == beyond and unknown == 0:
-                in_far += 1
-            if square == grid.outside and unknown == (grid.outside_class >> _UNKNOWN_BITS) & 1:
-                in_outside += 1
-            place = slot * SAMPLES + (i * SIDE + j) * SIDE + k
-            if (values[place] != value or (flipped >> k) & 1 == 1) and ti.max(i, j, k) < BRICK:
-                moved += 1
-            values[place] = value
-        changed[row] += moved
+        own = grid.slot(cell) * SAMPLES + (i * SIDE + j) * SIDE
+        in_far, in_outside = 0, 0
+        for step in range(2):
+            there = cell + IVec3(i // BRICK, j // BRICK, step)
+            slot = grid.slot(there)
+            column = grid.column(there, i % BRICK * BRICK + j % BRICK)
+            source = slot * SAMPLES + (i % BRICK * SIDE + j % BRICK) * SIDE
+            for k in range(step * BRICK, BRICK + step):
+                value = outside_m
+                if slot >= 0:
+                    value = values[source + k % BRICK]
+                elif slot == FAR:
+                    value = far_m
+                values[own + k] = value
+                unknown = (column >> (k % BRICK + _UNKNOWN_BITS)) & 1
+                if value == far_m and unknown == 0:
+                    in_far += 1
+                if value == outside_m and unknown == (grid.outside_class >> _UNKNOWN_BITS) & 1:
+                    in_outside += 1
         far[row] += in_far
         outside[row] += in_outside
 
 
 @ti.func
-def _least(grid: Template, sums: Template, voxel: IVec3, axis: IVec3):
-    """The least of the squared distance along an axis and the rest of it, ``sums`` (slots * 512), with the sign of
-    the voxel's own kind."""
-    own = grid.squared(sums, voxel)
-    sign = ti.select(own < 0, -1, 1)
+def _least(grid: Template, sums: Template, cell: IVec3, number: I32, axis: Template) -> IVec8:
+    """For each voxel of a column of a brick, the least of the squared distance along an axis, x or y, and the rest
+    of it, ``sums`` (slots * 512), with the sign of the voxel's own kind."""
+    own = grid.column_of(sums, cell, number)
+    sign = ti.select(own < 0, IVec8(-1), IVec8(1))
     least = ti.abs(own)
+    here = number % BRICK if ti.static(axis == 1) else number // BRICK
     k = 1
-    while k * k < least and k <= grid.reach:
-        before = ti.max(sign * grid.squared(sums, voxel - k * axis), 0)
-        after = ti.max(sign * grid.squared(sums, voxel + k * axis), 0)
-        least = ti.min(least, k * k + ti.min(before, after))
+    while k <= grid.reach and k * k < least.max():
+        for way in ti.static((-1, 1)):
+            there = here + way * k
+            if ti.static(axis == 1):
+                beside = grid.column_of(sums, cell + IVec3(0, there >> 3, 0), number - here + (there & 7))
+                least = ti.min(least, k * k + ti.max(sign * beside, 0))
+            else:
+                beside = grid.column_of(sums, cell + IVec3(there >> 3, 0, 0), number % BRICK + (there & 7) * BRICK)
+                least = ti.min(least, k * k + ti.max(sign * beside, 0))
         k += 1
     return sign * least
