@@ -13,7 +13,7 @@ from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, St
 from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN, state_of
 from taichi_mrf.queries.ray_space import RaySpace
-from taichi_mrf.system import runtime
+from taichi_mrf.system import runtime, tensors
 from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_voxels
 from taichi_mrf.voxels.window import Window
@@ -37,6 +37,7 @@ class RayHits:
     in_unknown: NDArray[np.bool_]
 
 
+@tensors.in_kind("origins", "directions")
 def cast_rays(
     m: QueriedMap, origins: ArrayLike, directions: ArrayLike, max_range: float, unknown: Unknown = "free"
 ) -> RayHits:

@@ -1,7 +1,7 @@
 """How far it is to the nearest obstacle, and which way leads away from it: what planners ask.
-
-The distances are exact at the centres of voxels and linear between them along each axis, so that the gradient is
-that of what is returned. They are cut off at a stated distance, which bounds what a change of the map reaches.
+ The distances are exact at the centres of voxels and linear between them along each axis, so that the
+gradient is that of what is returned. They are cut off at a stated distance, which bounds what a change of the
+map reaches.
 """
 
 from typing import Any
@@ -37,9 +37,9 @@ _ENDLESS = 1e9
 class DistanceField(Owned):
     """Signed distances in metres to the nearest obstacle, anywhere in a map.
 
-    A voxel's distance is that of its centre to the centre of the nearest obstacle, less half a voxel, so that it is
-    0 on the faces of obstacles. In obstacles it is negative: half a voxel less the distance to the centre of the
-    nearest voxel that is none. No distance is further from 0 than ``max_distance_m``.
+    A voxel's distance is that of its centre to the centre of the nearest obstacle, less half a voxel, so that
+    it is 0 on the faces of obstacles. In obstacles it is negative: half a voxel less the distance to the
+    centre of the nearest voxel that is none. No distance is further from 0 than ``max_distance_m``.
 
     The field is that of the map at the last :meth:`update`. On the device of the map it takes
     :attr:`bytes`, about 14 for each voxel within ``max_distance_m`` of an obstacle.
@@ -59,8 +59,8 @@ class DistanceField(Owned):
         "unknown": no obstacles, and in them the distance is NaN. ``lower`` and ``upper``, (3,) in
         metres, bound the field to a box, outside of which all is NaN; obstacles around it count.
 
-        Raises ConfigError for another rule, a distance that is not positive or more than 1024 voxels, and corners
-        that make no box; CapacityError if there is not enough memory.
+        Raises ConfigError for another rule, a distance that is not positive or more than 1024 voxels, and
+        corners that make no box; CapacityError if there is not enough memory.
         """
         if unknown not in ("free", "occupied", "unknown"):
             raise ConfigError(f"unknown must be free, occupied or unknown, not {unknown!r}")
@@ -84,15 +84,15 @@ class DistanceField(Owned):
         return self._bricks.bytes
 
     def update(self) -> int:
-        """Follow the map: work out the distances again that have changed with the states of voxels since the last
-        call, and return for how many voxels that is so. Raises CapacityError."""
+        """Follow the map: work out the distances again that have changed with the states of voxels since the
+        last call, and return for how many voxels that is so. Raises CapacityError."""
         return self._bricks.update(self.map, self._within)
 
     @tensors.in_kind("points", on_device=True)
     def distance(self, points: ArrayLike) -> NDArray[np.float32]:
         """Metres to the nearest obstacle at points (N, 3) in metres, (N,) float32; NaN where it is not known.
         Raises ConfigError for points of another shape or that are not finite."""
-        given = tensors.real_array(points, "points", (None, 3))
+        given = tensors.real_array(points, "points", ("N", 3))
         out = tensors.empty(given, given.shape[:1])
         if len(given):
             read_distances(self._points(given), self._values(), out)
@@ -101,9 +101,10 @@ class DistanceField(Owned):
 
     @tensors.in_kind("points", on_device=True)
     def distance_and_gradient(self, points: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The same, and its change for each metre along x, y and z, (N, 3) float32: it points away from the nearest
-        obstacle, with a length of nearly 1, and is 0 where the distance is cut off. Raises ConfigError."""
-        given = tensors.real_array(points, "points", (None, 3))
+        """The same, and its change for each metre along x, y and z, (N, 3) float32: it points away from the
+        nearest obstacle, with a length of nearly 1, and is 0 where the distance is cut off. Raises
+        ConfigError."""
+        given = tensors.real_array(points, "points", ("N", 3))
         out, gradient = tensors.empty(given, given.shape[:1]), tensors.empty(given, given.shape)
         if len(given):
             read_gradients(self._points(given), self._values(), out, gradient)
@@ -114,14 +115,15 @@ class DistanceField(Owned):
 
     @tensors.in_kind("centres", "radii_m", on_device=True)
     def clearance(self, centres: ArrayLike, radii_m: ArrayLike) -> NDArray[np.float32]:
-        """How far bodies made of balls are from obstacles: centres (C, S, 3) of S balls for each of C bodies or
-        configurations, in metres, and their radii (S,) -> (C,) float32, the least distance of a centre less its
-        radius. It is positive if no ball reaches an obstacle, and NaN if the distance of one is not known.
+        """How far bodies made of balls are from obstacles: centres (C, S, 3) of S balls for each of C bodies
+        or configurations, in metres, and their radii (S,) -> (C,) float32, the least distance of a centre
+        less its radius. It is positive if no ball reaches an obstacle, and NaN if the distance of one is not
+        known.
 
-        Raises ConfigError for arrays that do not fit or are not finite, and for radii that are negative or not less
-        than ``max_distance_m``, of which the field cannot tell.
+        Raises ConfigError for arrays that do not fit or are not finite, and for radii that are negative or
+        not less than ``max_distance_m``, of which the field cannot tell.
         """
-        given = tensors.real_array(centres, "centres", (None, None, 3))
+        given = tensors.real_array(centres, "centres", ("C", "S", 3))
         radii = np.ascontiguousarray(tensors.on_host(radii_m, "radii_m"), np.float32)
         if radii.shape != given.shape[1:2] or not len(radii):
             raise ConfigError(
@@ -129,7 +131,7 @@ class DistanceField(Owned):
             )
         if not (radii.min() >= 0 and radii.max() < self.max_distance_m):
             raise ConfigError(
-                f"radii_m must be at least 0 and less than the field's max_distance_m, {self.max_distance_m:g} m"
+                f"radii_m must be at least 0 and less than max_distance_m, {self.max_distance_m:g} m"
             )
         out = tensors.empty(given, given.shape[:1])
         if len(given):
@@ -157,5 +159,6 @@ class DistanceField(Owned):
             lower, upper = (corner / voxel_size - centre for corner in self._box_m)
         return FieldValues(
             bricks.grid, bricks.values, self.max_distance_m, bricks.rules.outside_m,
-            ti.Vector((lower - _EDGE).tolist(), ti.f32), ti.Vector((upper + _EDGE).tolist(), ti.f32), 1 / voxel_size,
+            ti.Vector((lower - _EDGE).tolist(), ti.f32), ti.Vector((upper + _EDGE).tolist(), ti.f32),
+            1 / voxel_size,
         )  # fmt: skip

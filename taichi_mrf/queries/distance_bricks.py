@@ -1,8 +1,9 @@
-"""The bricks of a distance field: made where there is a distance to keep, and worked out again where states change.
-
-A window of bricks around all that is known says where each one's distances are. Bricks of free or unknown space
-that are further from all else than distances go need none. An update compares the states of the map with those
-that it kept, and follows what differs along z, then y, then x, each time only from bricks whose sums did change.
+"""The bricks of a distance field: made where there is a distance to keep, and worked out again where states
+change.
+ A window of bricks around all that is known says where each one's distances are. Bricks of free or unknown
+space that are further from all else than distances go need none. An update compares the states of the map
+with those that it kept, and follows what differs along z, then y, then x, each time only from bricks whose
+sums did change.
 """
 
 from dataclasses import dataclass
@@ -46,14 +47,17 @@ _BYTES_PER_BRICK = 4 * (COLUMNS + 2 * VOXELS + SAMPLES)
 _GROWTH = 1.2
 _LEAST_CAPACITY = 256
 
+BrickBox = tuple[NDArray[np.int64], NDArray[np.int64]]
+"""The lowest brick of a box and the highest, (3,) each."""
+
 Cells = NDArray[np.int64]
 """(n,) numbers of bricks in the window."""
 
 
 @dataclass(frozen=True)
 class SpaceRules:
-    """What counts as an obstacle and how far distances go: ``reach`` in voxels, and the distance in metres of each
-    square of voxels, ``metres`` ((reach + 1)^2 + 1)."""
+    """What counts as an obstacle and how far distances go: ``reach`` in voxels, and the distance in metres of
+    each square of voxels, ``metres`` ((reach + 1)^2 + 1)."""
 
     unknown: UnknownSpace
     reach: int
@@ -61,7 +65,8 @@ class SpaceRules:
 
     @staticmethod
     def of(unknown: UnknownSpace, max_distance_m: float, voxel_size: float) -> "SpaceRules":
-        """Distances to the faces of obstacles: half a voxel less than to their centres. Raises ConfigError."""
+        """Distances to the faces of obstacles: half a voxel less than to their centres. Raises
+        ConfigError."""
         reach = max(1, int(np.ceil(max_distance_m / voxel_size - 0.5)))
         if reach > MOST_REACH:
             raise ConfigError(
@@ -122,10 +127,10 @@ class DistanceBricks:
         """Bytes of memory that distances and what they are made of take."""
         return self._capacity * _BYTES_PER_BRICK + 4 * self._codes.size
 
-    def update(self, m: QueriedMap, within: tuple[Bricks, Bricks] | None = None) -> int:
+    def update(self, m: QueriedMap, within: BrickBox | None = None) -> int:
         """Take in the states of the map as they are now; returns how many voxels changed their distance.
 
-        ``within``: only bricks from one (3,) to another count, both included. Raises CapacityError.
+        ``within``: only bricks in this box count. Raises CapacityError.
         """
         bricks, sources = self._sources(m, within)
         if not len(bricks):
@@ -135,8 +140,9 @@ class DistanceBricks:
         view = m.view
         found, changed = ti.ndarray(ti.i32, len(cells) * COLUMNS), _zeros(len(cells))
         classify_bricks(
-            view.pool.belief, sources, cells.astype(np.int32), view.pool.prior_log_odds, view.volume.min_evidence,
-            self.rules.unknown == "occupied", self.rules.unknown == "unknown", self.grid, found, changed,
+            view.pool.belief, sources, cells.astype(np.int32), view.pool.prior_log_odds,
+            view.volume.min_evidence, self.rules.unknown == "occupied", self.rules.unknown == "unknown",
+            self.grid, found, changed,
         )  # fmt: skip
         rows = np.flatnonzero(changed.to_numpy()).astype(np.int32)
         voxels = self._spread(cells[rows], rows, found) if len(rows) else 0
@@ -144,10 +150,9 @@ class DistanceBricks:
         runtime.settle()
         return voxels
 
-    def _sources(
-        self, m: QueriedMap, within: tuple[Bricks, Bricks] | None
-    ) -> tuple[Bricks, NDArray[np.int32]]:
-        """The bricks (n, 3) that are known now or were at the last update, and where their states are (n,)."""
+    def _sources(self, m: QueriedMap, within: BrickBox | None) -> tuple[Bricks, NDArray[np.int32]]:
+        """The bricks (n, 3) that are known now or were at the last update, and where their states are
+        (n,)."""
         reader = BrickReader(m)
         bricks = reader.bricks
         sources = reader.slots(bricks)
@@ -204,8 +209,8 @@ class DistanceBricks:
         return self._codes.reshape(-1)[cells]
 
     def _beside(self, cells: Cells, axis: int, steps: "range | tuple[int, ...]") -> Cells:
-        """Some bricks with those so many steps beside them along an axis, ascending. The window's margin holds
-        them all."""
+        """Some bricks with those so many steps beside them along an axis, ascending. The window's margin
+        holds them all."""
         step = int(np.prod(self._codes.shape[axis + 1 :]))
         return np.unique((cells[:, None] + np.array(steps) * step).reshape(-1))
 
@@ -238,7 +243,9 @@ class DistanceBricks:
         slots = np.array([self._free.pop() for _ in new], np.int32)
         outside = codes == OUTSIDE
         squares = np.where(outside, self.rules.outside_square, self.rules.beyond).astype(np.int32)
-        fill_rows(self.classes, slots, COLUMNS, np.where(outside, self.rules.outside_class, 0).astype(np.int32))
+        fill_rows(
+            self.classes, slots, COLUMNS, np.where(outside, self.rules.outside_class, 0).astype(np.int32)
+        )
         fill_rows(self._first, slots, VOXELS, squares)
         fill_rows(self._second, slots, VOXELS, squares)
         metres = np.where(outside, self.rules.outside_m, self.rules.metres[-1]).astype(np.float32)
@@ -256,8 +263,15 @@ class DistanceBricks:
 
     def _grow(self, needed: int) -> None:
         capacity = max(needed, int(self._capacity * _GROWTH), _LEAST_CAPACITY)
-        check_memory(float(capacity) * _BYTES_PER_BRICK, f"distances in {capacity} bricks of {BRICK}^3 voxels")
-        for name, size in (("classes", COLUMNS), ("_first", VOXELS), ("_second", VOXELS), ("values", SAMPLES)):
+        check_memory(
+            float(capacity) * _BYTES_PER_BRICK, f"distances in {capacity} bricks of {BRICK}^3 voxels"
+        )
+        for name, size in (
+            ("classes", COLUMNS),
+            ("_first", VOXELS),
+            ("_second", VOXELS),
+            ("values", SAMPLES),
+        ):
             old = getattr(self, name)
             new = ti.ndarray(old.dtype, capacity * size)
             copy_all(old, new, self._capacity * size)
@@ -267,6 +281,7 @@ class DistanceBricks:
         self._capacity = capacity
 
     def _grid(self) -> FieldGrid:
+        runtime.settle()  # before the old index is dropped
         shape = ti.Vector(list(self._codes.shape), ti.i32)
         index = resident(self._codes.reshape(-1))
         rules = self.rules

@@ -3,13 +3,13 @@
 The squared distance to the nearest obstacle splits into one minimum for each axis,
 
     d^2(x, y, z) = min over x' of (x - x')^2 + min over y' of (y - y')^2 + min over z' of (z - z')^2,
-
-taken over the obstacles at (x', y', z') (Felzenszwalb & Huttenlocher, Theory of Computing 8, 2012). Distances are
-cut off, so each minimum runs over a bounded stretch of a line, and a change reaches no further than that. All of
-it is in whole voxels: a field that was updated equals one that is made anew, bit for bit, on every backend.
-
-A voxel that is no obstacle has the squared distance to the nearest obstacle, an obstacle that to the nearest other
-voxel, negative. In both sums the voxels of the other kind have the distance 0, so one number serves for both.
+ taken over the obstacles at (x', y', z') (Felzenszwalb & Huttenlocher, Theory of Computing 8, 2012).
+Distances are cut off, so each minimum runs over a bounded stretch of a line, and a change reaches no further
+than that. All of it is in whole voxels: a field that was updated equals one that is made anew, bit for bit,
+on every backend.
+ A voxel that is no obstacle has the squared distance to the nearest obstacle, an obstacle that to the nearest
+other voxel, negative. In both sums the voxels of the other kind have the distance 0, so one number serves for
+both.
 """
 
 from dataclasses import dataclass
@@ -20,23 +20,24 @@ from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, I32Array, IVec3, IVec8, Template
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN, state_of
 from taichi_mrf.voxels.layout import BRICK, VOXELS
-from taichi_mrf.voxels.numbering import flat, voxel_number
+from taichi_mrf.voxels.numbering import flat
 from taichi_mrf.voxels.traversal import within
 
 OUTSIDE, FAR = -1, -2
-"""In place of a slot: bricks of unknown space, and free ones, that are further from all else than distances go."""
+"""In place of a slot: bricks of unknown space, and free ones, that are further from all else than distances
+go."""
 
 GONE, SEEN_FREE = -1, -2
-"""In place of a slot in the map's pool: a brick that the map no longer has, and one that rays have crossed and
-that has no voxels."""
+"""In place of a slot in the map's pool: a brick that the map no longer has, and one that rays have crossed
+and that has no voxels."""
 
 COLUMNS = BRICK**2
 """Columns along z of a brick."""
 
 SIDE = BRICK + 1
 SAMPLES = SIDE**3
-"""Distances that a brick keeps: those of its voxels and of the layer after them along each axis, so that what lies
-between eight voxels is read from one brick."""
+"""Distances that a brick keeps: those of its voxels and of the layer after them along each axis, so that what
+lies between eight voxels is read from one brick."""
 
 _UNKNOWN_BITS, _FLIPPED_BITS = 8, 16
 _ALL = (1 << BRICK) - 1
@@ -54,8 +55,8 @@ class FieldGrid(Bundle):
     """(bricks of the window): the brick's slot in the field, OUTSIDE or FAR."""
 
     classes: I32Array
-    """(slots * 64): for each column along z the obstacles in its lowest 8 bits, voxels whose distance is not known
-    in the next 8, and those that have just become so, or known again, in the next 8."""
+    """(slots * 64): for each column along z the obstacles in its lowest 8 bits, voxels whose distance is not
+    known in the next 8, and those that have just become so, or known again, in the next 8."""
 
     outside_class: I32
     """The same of a column in unknown space."""
@@ -112,8 +113,8 @@ class FieldGrid(Bundle):
 
 @kernel
 def classify_bricks(
-    belief: F32Array, sources: I32Array, cells: I32Array, prior: F32, min_evidence: F32, obstacles_unknown: I32,
-    distances_unknown: I32, grid: FieldGrid, found: I32Array, changed: I32Array,
+    belief: F32Array, sources: I32Array, cells: I32Array, prior: F32, min_evidence: F32,
+    obstacles_unknown: I32, distances_unknown: I32, grid: FieldGrid, found: I32Array, changed: I32Array,
 ) -> None:  # fmt: skip
     """What the voxels of some bricks are now, into ``found`` (n * 64), and which bricks differ from
     ``grid.classes``: ``changed`` (n) becomes 1 there.
@@ -167,8 +168,8 @@ def copy_all(source: AnyArray, target: AnyArray, count: I32) -> None:
 
 @kernel
 def along_z(cells: I32Array, grid: FieldGrid, first: I32Array, changed: I32Array) -> None:
-    """Squared distances along z alone for the voxels of some bricks, numbers (n) in the window, into ``first``
-    (slots * 512); ``changed`` (n) becomes 1 for bricks in which any differs from what was there."""
+    """Squared distances along z alone for the voxels of some bricks, numbers (n) in the window, into
+    ``first`` (slots * 512); ``changed`` (n) becomes 1 for bricks in which any differs from what was there."""
     for part in range(cells.shape[0] * COLUMNS):
         row, number = part // COLUMNS, part % COLUMNS
         cell = grid.cell(cells[row])
@@ -198,8 +199,9 @@ def along_z(cells: I32Array, grid: FieldGrid, first: I32Array, changed: I32Array
 
 @ti.func
 def _nearest(grid: Template, cell: IVec3, number: I32, way: I32):
-    """From the layer of voxels beside a brick, below it (``way`` -1) or above (1), to the nearest voxel that is no
-    obstacle and to the nearest obstacle in a column, in voxels; ``reach`` or more where there is none."""
+    """From the layer of voxels beside a brick, below it (``way`` -1) or above (1), to the nearest voxel that
+    is no obstacle and to the nearest obstacle in a column, in voxels; ``reach`` or more where there is
+    none."""
     free, full = grid.reach, grid.reach
     column = 0
     k = 0
@@ -219,8 +221,8 @@ def _nearest(grid: Template, cell: IVec3, number: I32, way: I32):
 
 @kernel
 def along_y(cells: I32Array, grid: FieldGrid, first: I32Array, second: I32Array, changed: I32Array) -> None:
-    """Squared distances in planes of equal x from those along z, ``first``, into ``second`` (slots * 512 each);
-    ``cells`` and ``changed`` as in :func:`along_z`."""
+    """Squared distances in planes of equal x from those along z, ``first``, into ``second`` (slots * 512
+    each); ``cells`` and ``changed`` as in :func:`along_z`."""
     for part in range(cells.shape[0] * COLUMNS):
         row, number = part // COLUMNS, part % COLUMNS
         cell = grid.cell(cells[row])
@@ -236,11 +238,11 @@ def along_y(cells: I32Array, grid: FieldGrid, first: I32Array, second: I32Array,
 def along_x(
     cells: I32Array, grid: FieldGrid, second: I32Array, metres: F32Array, values: F32Array, changed: I32Array
 ) -> None:
-    """Distances in metres from squared ones in planes of equal x, ``second`` (slots * 512), for the bricks' own
-    voxels into ``values`` (slots * 729). ``metres`` ((reach + 1)^2 + 1) has the distance of each square.
+    """Distances in metres from squared ones in planes of equal x, ``second`` (slots * 512), for the bricks'
+    own voxels into ``values`` (slots * 729). ``metres`` ((reach + 1)^2 + 1) has the distance of each square.
 
-    ``changed`` (n) counts the voxels of each brick of ``cells`` (n) whose distance differs from what was there, or
-    has become known or unknown.
+    ``changed`` (n) counts the voxels of each brick of ``cells`` (n) whose distance differs from what was
+    there, or has become known or unknown.
     """
     for part in range(cells.shape[0] * COLUMNS):
         row, number = part // COLUMNS, part % COLUMNS
@@ -264,12 +266,20 @@ def along_x(
 
 @kernel
 def join_bricks(
-    cells: I32Array, grid: FieldGrid, values: F32Array, far_m: F32, outside_m: F32, far: I32Array, outside: I32Array
+    cells: I32Array,
+    grid: FieldGrid,
+    values: F32Array,
+    far_m: F32,
+    outside_m: F32,
+    far: I32Array,
+    outside: I32Array,
 ) -> None:
-    """Copy to bricks, numbers (n) in the window, the first layers of those after them, in ``values`` (slots * 729).
+    """Copy to bricks, numbers (n) in the window, the first layers of those after them, in ``values`` (slots *
+    729).
 
-    ``far_m`` and ``outside_m`` are the distances in FAR and OUTSIDE bricks; ``far`` (n) and ``outside`` (n) count
-    the distances of each brick that are such, in space that is known and in space that is like OUTSIDE bricks.
+    ``far_m`` and ``outside_m`` are the distances in FAR and OUTSIDE bricks; ``far`` (n) and ``outside`` (n)
+    count the distances of each brick that are such, in space that is known and in space that is like OUTSIDE
+    bricks.
     """
     for part in range(cells.shape[0] * SIDE * SIDE):
         row, i, j = part // (SIDE * SIDE), part // SIDE % SIDE, part % SIDE
@@ -299,8 +309,8 @@ def join_bricks(
 
 @ti.func
 def _least(grid: Template, sums: Template, cell: IVec3, number: I32, axis: Template) -> IVec8:
-    """For each voxel of a column of a brick, the least of the squared distance along an axis, x or y, and the rest
-    of it, ``sums`` (slots * 512), with the sign of the voxel's own kind."""
+    """For each voxel of a column of a brick, the least of the squared distance along an axis, x or y, and the
+    rest of it, ``sums`` (slots * 512), with the sign of the voxel's own kind."""
     own = grid.column_of(sums, cell, number)
     sign = ti.select(own < 0, IVec8(-1), IVec8(1))
     least = ti.abs(own)
@@ -313,7 +323,9 @@ def _least(grid: Template, sums: Template, cell: IVec3, number: I32, axis: Templ
                 beside = grid.column_of(sums, cell + IVec3(0, there >> 3, 0), number - here + (there & 7))
                 least = ti.min(least, k * k + ti.max(sign * beside, 0))
             else:
-                beside = grid.column_of(sums, cell + IVec3(there >> 3, 0, 0), number % BRICK + (there & 7) * BRICK)
+                beside = grid.column_of(
+                    sums, cell + IVec3(there >> 3, 0, 0), number % BRICK + (there & 7) * BRICK
+                )
                 least = ti.min(least, k * k + ti.max(sign * beside, 0))
         k += 1
     return sign * least

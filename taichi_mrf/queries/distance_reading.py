@@ -1,4 +1,5 @@
-"""Kernels that read a distance field: between the centres of voxels, with the gradient, and for many balls."""
+"""Kernels that read a distance field: between the centres of voxels, with the gradient, and for many
+balls."""
 
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -8,10 +9,21 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.types import F32, F64, AnyArray2, DVec3, F32Array, F32Array2, I32, IVec3, Template, Vec3, Vec4
+from taichi_mrf.kernels.types import (
+    F32,
+    F64,
+    I32,
+    AnyArray2,
+    DVec3,
+    F32Array,
+    F32Array2,
+    IVec3,
+    Template,
+    Vec3,
+    Vec4,
+)
 from taichi_mrf.queries.distance_kernels import FAR, SAMPLES, SIDE, FieldGrid
 from taichi_mrf.system import runtime
-from taichi_mrf.voxels.layout import BRICK
 
 NO_DISTANCE = 1e30
 """In place of a distance that is not known: finite, because Taichi's fast maths may not keep NaN apart."""
@@ -24,7 +36,8 @@ _FARTHEST = float(2**20)
 
 @dataclass(frozen=True)
 class PointsInPlace(Bundle):
-    """Points as they were given, (N, 3) float32 or float64 in metres: CPU and CUDA read them where they are."""
+    """Points as they were given, (N, 3) float32 or float64 in metres: CPU and CUDA read them where they
+    are."""
 
     points: AnyArray2
 
@@ -93,7 +106,7 @@ class FieldValues(Bundle):
     """Voxels in a metre."""
 
     @ti.func
-    def at(self, whole: IVec3, share: Vec3) -> Vec4:
+    def at(self, whole: IVec3, share: Vec3):
         """The distance and its gradient, ``share`` beyond the centre of the voxel ``whole``."""
         slot = self.grid.slot(whole >> 3)
         found = Vec4(self.outside_m, 0.0, 0.0, 0.0)
@@ -113,7 +126,7 @@ class FieldValues(Bundle):
         return found
 
     @ti.func
-    def between(self, i: I32, share: Vec3) -> Vec4:
+    def between(self, i: I32, share: Vec3):
         """Trilinear between the eight values from place i on, and the exact gradient of that."""
         x, y, z = share[0], share[1], share[2]
         a000, a001 = self.values[i], self.values[i + 1]
@@ -151,8 +164,9 @@ def read_gradients(points: Template, field: FieldValues, out: F32Array, gradient
 
 @kernel
 def read_clearances(points: Template, field: FieldValues, radii: F32Array, out: F32Array) -> None:
-    """The least of distance less radius over the balls of each body, into ``out`` (C); NO_DISTANCE if one of them
-    has no distance. ``points`` (FieldPoints) are the centres of body 0, then of body 1, ..., ``radii`` (S)."""
+    """The least of distance less radius over the balls of each body, into ``out`` (C); NO_DISTANCE if one of
+    them has no distance. ``points`` (FieldPoints) are the centres of body 0, then of body 1, ..., ``radii``
+    (S)."""
     for body in range(out.shape[0]):
         least, most = NO_DISTANCE, -NO_DISTANCE
         for ball in range(radii.shape[0]):

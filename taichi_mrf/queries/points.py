@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import array
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.kernels.types import F32, F32Array, I32, I32Array
+from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array
 from taichi_mrf.system import runtime
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.pool import BrickPool

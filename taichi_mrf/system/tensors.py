@@ -1,7 +1,8 @@
-"""Arrays of other libraries as arguments: what speaks DLPack is read where it lies, and answers come back in kind.
-
-A tensor in the host's memory is read as a NumPy array of the same memory. One of torch's in a CUDA device's memory
-goes to kernels as it is where Taichi runs on CUDA. No library is imported here: who passes a tensor has done so.
+"""Arrays of other libraries as arguments: what speaks DLPack is read where it lies, and answers come back in
+kind.
+ A tensor in the host's memory is read as a NumPy array of the same memory. One of torch's in a CUDA device's
+memory goes to kernels as it is where Taichi runs on CUDA. No library is imported here: who passes a tensor
+has done so.
 """
 
 import dataclasses
@@ -26,8 +27,9 @@ _HOST, _CUDA, _PINNED = 1, 2, 3
 def in_kind(*names: str, on_device: bool = False) -> Callable[[F], F]:
     """Let a function take tensors for its arguments ``names``, and return its arrays as such tensors.
 
-    The function itself gets NumPy arrays; with ``on_device`` it also gets tensors in the memory of the device that
-    Taichi runs on, which others get as copies. Arrays are returned by themselves, in a tuple or in a dataclass.
+    The function itself gets NumPy arrays; with ``on_device`` it also gets tensors in the memory of the device
+    that Taichi runs on, which others get as copies. Arrays are returned by themselves, in a tuple or in a
+    dataclass.
     """
 
     def decorate(function: F) -> F:
@@ -58,9 +60,10 @@ def on_host(value: Any, name: str) -> Any:
     return _taken(value, name, False) if _is_tensor(value) else value
 
 
-def real_array(value: Any, name: str, shape: tuple[int | None, ...]) -> Any:
-    """Numbers of a shape, None for any length, as a contiguous array of float32 or float64: the value itself if it
-    is one, also in a device's memory. Raises ConfigError for another shape or numbers that are not finite."""
+def real_array(value: Any, name: str, shape: tuple[int | str, ...]) -> Any:
+    """Numbers of a shape, a name for any length, as a contiguous array of float32 or float64: the value
+    itself if it is one, also in a device's memory. Raises ConfigError for another shape or numbers that are
+    not finite."""
     if _is_tensor(value):  # in the memory of Taichi's device
         given = value if value.dtype.itemsize in (4, 8) and value.is_floating_point() else value.double()
         given = given.contiguous()
@@ -69,13 +72,14 @@ def real_array(value: Any, name: str, shape: tuple[int | None, ...]) -> Any:
             given = np.asarray(value)
             given = np.ascontiguousarray(given, given.dtype if given.dtype in ("f4", "f8") else np.float64)
         except (TypeError, ValueError) as error:
-            raise ArgumentTypeError(f"{name} must be an array of numbers, not {type(value).__name__}") from error
+            kind = type(value).__name__
+            raise ArgumentTypeError(f"{name} must be an array of numbers, not {kind}") from error
     if len(given.shape) != len(shape) or any(
-        want is not None and n != want for n, want in zip(given.shape, shape, strict=True)
+        isinstance(want, int) and n != want for n, want in zip(given.shape, shape, strict=True)
     ):
-        wanted = ", ".join("N" if want is None else str(want) for want in shape)
+        wanted = ", ".join(map(str, shape))
         raise ConfigError(f"{name} must be of shape ({wanted}), not {tuple(given.shape)}")
-    # One pass over the memory: a value that is not finite spoils the sum. A finite sum that is too large does too.
+    # One pass over the memory: a value that is not finite spoils the sum. So may many large ones.
     if not math.isfinite(float(given.sum())) and not bool((abs(given) < math.inf).all()):
         raise ConfigError(f"{name} hold a value that is not finite")
     return given
@@ -97,8 +101,8 @@ def _taken(value: Any, name: str, on_device: bool) -> Any:
     if device not in (_HOST, _PINNED):
         if device != _CUDA or runtime.active() != "cuda" or not _is_torch(value):
             raise ArgumentTypeError(
-                f"{name} lies in the memory of a device that Taichi, on {runtime.active() or 'no backend'}, does not "
-                "read: pass a copy in the host's memory (torch: .cpu())"
+                f"{name} lies in the memory of a device that Taichi, on {runtime.active() or 'no backend'}, "
+                "does not read: pass a copy in the host's memory (torch: .cpu())"
             )
         if on_device:
             return value.detach()
