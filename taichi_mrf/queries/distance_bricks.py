@@ -182,16 +182,17 @@ class DistanceBricks:
             changed = _zeros(len(plane))
             along_y(plane.astype(np.int32), self.grid, self._first, self._second, changed)
             plane = plane[changed.to_numpy() > 0]
-        block = np.unique(np.concatenate([self._beside(plane, 0, stretch), *made]))
+        block = np.unique(np.concatenate([self._beside(plane, 0, stretch), cells, *made]))
         made.append(self._make(block))
-        changed = _zeros(len(block))
-        along_x(block.astype(np.int32), self.grid, self._second, self._metres, self.values, changed)
-        voxels = changed.to_numpy()
-        self._join(np.concatenate([block[voxels > 0], *made]))
-        return int(voxels.sum())
+        changed, counts = _zeros(len(block)), _zeros(len(block))
+        along_x(block.astype(np.int32), self.grid, self._second, self._metres, self.values, changed, counts)
+        self._join(np.concatenate([block[changed.to_numpy() > 0], *made]))
+        return int(counts.to_numpy().sum())
 
     def _join(self, cells: Cells) -> None:
         """Let bricks before some bricks know of their distances, and give back those that need no slots."""
+        if not len(cells):
+            return
         for axis in range(3):
             cells = self._beside(cells, axis, (-1, 0))
         self._make(cells)

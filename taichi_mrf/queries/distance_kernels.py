@@ -236,32 +236,37 @@ def along_y(cells: I32Array, grid: FieldGrid, first: I32Array, second: I32Array,
 
 @kernel
 def along_x(
-    cells: I32Array, grid: FieldGrid, second: I32Array, metres: F32Array, values: F32Array, changed: I32Array
-) -> None:
+    cells: I32Array, grid: FieldGrid, second: I32Array, metres: F32Array, values: F32Array,
+    changed: I32Array, counts: I32Array,
+) -> None:  # fmt: skip
     """Distances in metres from squared ones in planes of equal x, ``second`` (slots * 512), for the bricks'
     own voxels into ``values`` (slots * 729). ``metres`` ((reach + 1)^2 + 1) has the distance of each square.
 
-    ``changed`` (n) counts the voxels of each brick of ``cells`` (n) whose distance differs from what was
-    there, or has become known or unknown.
+    ``counts`` (n) counts the voxels of each brick of ``cells`` (n) that have another distance than before, or
+    have one now, or none any more. ``changed`` (n) becomes 1 where any number does, known or not.
     """
     for part in range(cells.shape[0] * COLUMNS):
         row, number = part // COLUMNS, part % COLUMNS
         cell = grid.cell(cells[row])
         slot = grid.slot(cell)
         found = _least(grid, second, cell, number, 0)
-        flipped = grid.classes[slot * COLUMNS + number] >> _FLIPPED_BITS
-        grid.classes[slot * COLUMNS + number] &= _KEPT
-        moved = 0
+        column = grid.classes[slot * COLUMNS + number]
+        flipped, unknown = column >> _FLIPPED_BITS, column >> _UNKNOWN_BITS
+        grid.classes[slot * COLUMNS + number] = column & _KEPT
+        moved, counted = 0, 0
         for k in ti.static(range(BRICK)):
             value = metres[ti.abs(found[k])]
             if found[k] < 0:
                 value = -value
             place = slot * SAMPLES + (number // BRICK * SIDE + number % BRICK) * SIDE + k
             if values[place] != value or (flipped >> k) & 1 == 1:
-                moved += 1
+                moved = 1
+                if (flipped >> k) & 1 == 1 or (unknown >> k) & 1 == 0:
+                    counted += 1
             values[place] = value
-        if moved > 0:
-            changed[row] += moved
+        if moved == 1:
+            changed[row] = 1
+            counts[row] += counted
 
 
 @kernel
