@@ -80,7 +80,9 @@ def real_array(value: Any, name: str, shape: tuple[int | str, ...]) -> Any:
         wanted = ", ".join(map(str, shape))
         raise ConfigError(f"{name} must be of shape ({wanted}), not {tuple(given.shape)}")
     # One pass over the memory: a value that is not finite spoils the sum. So may many large ones.
-    if not math.isfinite(float(given.sum())) and not bool((abs(given) < math.inf).all()):
+    with np.errstate(over="ignore", invalid="ignore"):
+        total = float(given.sum())
+    if not math.isfinite(total) and not bool((abs(given) < math.inf).all()):
         raise ConfigError(f"{name} hold a value that is not finite")
     return given
 

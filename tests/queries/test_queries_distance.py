@@ -172,7 +172,7 @@ class Edited:
 
     def edit(self, random: np.random.Generator) -> None:
         """A brick is written, in part or as a whole, goes, or is seen to be free."""
-        x, y, z = (random.integers(-1, 2, 3) + (-1, 0, 1)).tolist()
+        x, y, z = np.add(random.integers(-1, 2, 3), (-1, 0, 1)).tolist()
         what = random.integers(5)
         if what == 0:
             self.remove((x, y, z))
@@ -233,7 +233,7 @@ def test_only_what_has_changed_is_worked_out_again(edited: Edited) -> None:
     spoilt.fill(7.0)
     wall[4, 4, 3] = -6.0
     edited.write((-3, 0, 1), wall)
-    assert 0 < field.update()
+    assert field.update() > 0
     found = field.distance((np.array([[-20, 4, 11], [26, 4, 11]]) + 0.5) * VOXEL)
     assert found[0] == pytest.approx(0.5 * VOXEL)
     assert found[1] == 7.0
