@@ -39,6 +39,9 @@ BODIES, BALLS = 1000, 50
 REACH = 20
 """Voxels that distances reach."""
 
+LARGEST_BOX = 50_000_000
+"""Voxels up to which SciPy is asked: it takes 40 bytes for each."""
+
 _TRIES = 5
 
 Asked = Callable[[], object]
@@ -66,8 +69,8 @@ class Rate:
 class QueryRow:
     """One voxel size. ``rates`` are this package's, ``peers`` the others', by name. ``build`` is how long all
     distances of the map take, ``update`` those that one more keyframe changes, ``changed`` voxels;
-    ``transform`` is SciPy's for the same box of ``box_voxels``, of obstacles and of all else, ``field_mb``
-    what the field takes."""
+    ``transform`` is SciPy's for the same box of ``box_voxels``, of obstacles and of all else, None if the box
+    is too large; ``field_mb`` is what the field takes."""
 
     voxel_size: float
     keyframes: int
@@ -76,7 +79,7 @@ class QueryRow:
     update: Seconds
     changed: int
     field_mb: float
-    transform: Seconds
+    transform: Seconds | None
     box_voxels: int
     peers: dict[str, Rate] = field(default_factory=dict)
 
@@ -126,8 +129,11 @@ def bench_queries(
         "balls": Rate(BODIES * BALLS, fastest(lambda: distances.clearance(bodies, radii))),
         "rays": Rate(RAYS, fastest(lambda: cast_rays(m, starts, ways, RANGE_M))),
     }
-    obstacle = read_box(m, lower, upper).state == OCCUPIED
-    transform = fastest(lambda: _signed_transform(obstacle), tries=2)
+    box_voxels = round(float(np.prod((upper - lower) / m.voxel_size)))
+    transform = None
+    if box_voxels <= LARGEST_BOX:
+        obstacle = read_box(m, lower, upper).state == OCCUPIED
+        transform = timed(lambda: _signed_transform(obstacle))
     peers = _peers(m, points, starts, ways)
     id = m.add_keyframe(last.depth_m, last.T_world_camera, last.camera, last.name)
     m.renew([id])
@@ -136,7 +142,7 @@ def bench_queries(
     progress(len(frames))
     return QueryRow(
         m.voxel_size, len(frames), rates, build, update, changed[0], distances.bytes / 1e6, transform,
-        obstacle.size, peers,
+        box_voxels, peers,
     )  # fmt: skip
 
 

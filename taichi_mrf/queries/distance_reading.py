@@ -78,7 +78,7 @@ def field_points(points: Any, voxel_size: float, lowest_voxel: NDArray[np.int64]
     """Points (N, 3) in metres as kernels take them; ``lowest_voxel`` (3,) is the window's first."""
     lowest = lowest_voxel + 0.5
     if runtime.active() == "vulkan":
-        return PointsMoved(np.ascontiguousarray(points / voxel_size - lowest, np.float32))
+        return PointsMoved((np.asarray(points, np.float64) / voxel_size - lowest).astype(np.float32))
     return PointsInPlace(points, voxel_size, ti.Vector(lowest.tolist(), ti.f64))
 
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 from rich.table import Table
 
+from taichi_mrf.benchmark.keyframe_cost import Seconds
 from taichi_mrf.benchmark.queries import BALLS, BODIES, POINTS, RANGE_M, RAYS, REACH, QueryRow, Rate
 
 _NAMES = {"balls": "balls, by clearance", "rays": "rays, to what is occupied"}
@@ -35,8 +36,7 @@ def _distance_table(rows: Sequence[QueryRow]) -> Table:
     table = _columns(f"Signed distances up to {REACH} voxels, seconds (processors' seconds)", rows)
 
     def line(name: str, figure: str) -> None:
-        texts = [getattr(row, figure) for row in rows]
-        table.add_row(name, *[f"{seconds.wall:.3f} ({seconds.cpu:.3f})" for seconds in texts])
+        table.add_row(name, *[_seconds(getattr(row, figure)) for row in rows])
 
     line("of the whole map", "build")
     line("after one more keyframe", "update")
@@ -53,6 +53,10 @@ def _columns(title: str, rows: Sequence[QueryRow]) -> Table:
     for row in rows:
         table.add_column(f"{row.voxel_size * 100:g} cm", justify="right")
     return table
+
+
+def _seconds(seconds: Seconds | None) -> str:
+    return "-" if seconds is None else f"{seconds.wall:.3f} ({seconds.cpu:.3f})"
 
 
 def _rate(rate: Rate) -> str:
