@@ -71,6 +71,7 @@ class DistanceField(Owned):
         rules = SpaceRules.of(unknown, self.max_distance_m, m.voxel_size)
         self._bricks = DistanceBricks(rules)
         self._within = self._box_m = None
+        self._complete = False
         if lower is not None and upper is not None:
             first, after = voxels_of_box(lower, upper, m.voxel_size)
             margin = rules.reach + 1
@@ -85,8 +86,14 @@ class DistanceField(Owned):
 
     def update(self) -> int:
         """Follow the map: work out the distances again that have changed with the states of voxels since the
-        last call, and return for how many voxels that is so. Raises CapacityError."""
-        return self._bricks.update(self.map, self._within)
+        last call, and return for how many voxels that is so. Raises CapacityError; after an error the field
+        answers nothing until an update has ended."""
+        if not self._complete:
+            self._bricks.start_over()
+        self._complete = False
+        voxels = self._bricks.update(self.map, self._within)
+        self._complete = True
+        return voxels
 
     @tensors.in_kind("points", on_device=True)
     def distance(self, points: ArrayLike) -> NDArray[np.float32]:
@@ -152,6 +159,8 @@ class DistanceField(Owned):
         return field_points(points, self.map.voxel_size, self._bricks.lowest * BRICK)
 
     def _values(self) -> FieldValues:
+        if not self._complete:
+            raise ConfigError("the last update of this distance field did not end: call update() again")
         bricks, voxel_size = self._bricks, self.map.voxel_size
         lower, upper = np.full(3, -_ENDLESS), np.full(3, _ENDLESS)
         if self._box_m is not None:

@@ -112,12 +112,16 @@ class DistanceBricks:
 
     def __init__(self, rules: SpaceRules) -> None:
         self.rules = rules
+        self._metres = resident(rules.metres)
+        self.start_over()
+
+    def start_over(self) -> None:
+        """Forget all distances: the next update works out the whole field."""
         self.lowest = np.zeros(3, np.int64)
         self._codes = np.full((1, 1, 1), OUTSIDE, np.int32)
-        self._bricks = np.zeros((0, 3), np.int32)
+        self._known = np.zeros((0, 3), np.int32)
         self._free: list[int] = []
         self._capacity = 0
-        self._metres = resident(rules.metres)
         self.classes, self._first, self._second = (ti.ndarray(ti.i32, 1) for _ in range(3))
         self.values = ti.ndarray(ti.f32, 1)
         self.grid = self._grid()
@@ -146,7 +150,7 @@ class DistanceBricks:
         )  # fmt: skip
         rows = np.flatnonzero(changed.to_numpy()).astype(np.int32)
         voxels = self._spread(cells[rows], rows, found) if len(rows) else 0
-        self._bricks = bricks[sources != GONE]
+        self._known = bricks[sources != GONE]
         runtime.settle()
         return voxels
 
@@ -163,7 +167,7 @@ class DistanceBricks:
         if within is not None:
             inside = ((bricks >= within[0]) & (bricks <= within[1])).all(axis=1)
             bricks, sources = bricks[inside], sources[inside]
-        gone = self._bricks[~np.isin(grid_keys(self._bricks), grid_keys(bricks))]
+        gone = self._known[~np.isin(grid_keys(self._known), grid_keys(bricks))]
         gone_sources = np.full(len(gone), GONE, np.int32)
         return np.concatenate([bricks, gone]), np.concatenate([sources, gone_sources])
 

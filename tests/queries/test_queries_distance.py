@@ -239,6 +239,22 @@ def test_only_what_has_changed_is_worked_out_again(edited: Edited) -> None:
     assert found[1] == 7.0
 
 
+def test_a_field_whose_update_failed_answers_nothing(edited: Edited, monkeypatch: pytest.MonkeyPatch) -> None:
+    edited.clear()
+    edited.write((0, 0, 0), np.full(VOXELS, 2.0))
+    field = DistanceField(edited.map, 0.3)
+    edited.write((1, 0, 0), np.full(VOXELS, 2.0))
+    with monkeypatch.context() as patch:
+        patch.setattr("taichi_mrf.queries.distance_bricks.along_y", None)
+        with pytest.raises(TypeError):
+            field.update()
+    with pytest.raises(ConfigError, match=r"did not end: call update\(\) again"):
+        field.distance([[0, 0, 0]])
+    field.update()
+    points = np.random.default_rng(6).uniform(-0.5, 1.0, (300, 3))
+    np.testing.assert_array_equal(field.distance(points), DistanceField(edited.map, 0.3).distance(points))
+
+
 def test_the_window_grows_with_the_map(edited: Edited) -> None:
     edited.clear()
     block = np.full(VOXELS, 2.0)
