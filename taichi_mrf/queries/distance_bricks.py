@@ -13,7 +13,7 @@ import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf.errors import ConfigError
+from taichi_mrf.errors import CapacityError, ConfigError
 from taichi_mrf.kernels.resident import resident
 from taichi_mrf.queries.distance_kernels import (
     COLUMNS,
@@ -44,6 +44,7 @@ MOST_REACH = 1024
 """Voxels that distances may reach, at most."""
 
 _BYTES_PER_BRICK = 4 * (COLUMNS + 2 * VOXELS + SAMPLES)
+_MOST_BRICKS = 2**31 // SAMPLES - 1  # Taichi refuses arrays of 2^31 elements
 _GROWTH = 1.2
 _LEAST_CAPACITY = 256
 
@@ -267,7 +268,12 @@ class DistanceBricks:
             self.grid = self._grid()
 
     def _grow(self, needed: int) -> None:
-        capacity = max(needed, int(self._capacity * _GROWTH), _LEAST_CAPACITY)
+        if needed > _MOST_BRICKS:
+            raise CapacityError(
+                f"distances in {needed} bricks of {BRICK}^3 voxels are wanted and the most is {_MOST_BRICKS}; "
+                "choose a smaller max_distance_m, a box, or larger voxels"
+            )
+        capacity = max(needed, min(_MOST_BRICKS, int(self._capacity * _GROWTH)), _LEAST_CAPACITY)
         check_memory(
             float(capacity) * _BYTES_PER_BRICK, f"distances in {capacity} bricks of {BRICK}^3 voxels"
         )
