@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.config.arguments import real
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.queries.box import voxels_of_box
-from taichi_mrf.queries.distance_bricks import DistanceBricks, SpaceRules, UnknownSpace
+from taichi_mrf.queries.distance_bricks import DistanceBricks
 from taichi_mrf.queries.distance_reading import (
     NO_DISTANCE,
     FieldPoints,
@@ -23,6 +23,7 @@ from taichi_mrf.queries.distance_reading import (
     read_distances,
     read_gradients,
 )
+from taichi_mrf.queries.distance_rules import SpaceRules, UnknownSpace
 from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.owner import Owned

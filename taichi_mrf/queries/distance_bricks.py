@@ -6,16 +6,13 @@ with those that it kept, and follows what differs along z, then y, then x, each 
 sums did change.
 """
 
-from dataclasses import dataclass
-from typing import Literal
-
 import numpy as np
 import taichi as ti
 from numpy.typing import NDArray
 
-from taichi_mrf.errors import CapacityError, ConfigError
+from taichi_mrf.errors import CapacityError
 from taichi_mrf.kernels.resident import resident
-from taichi_mrf.queries.distance_kernels import (
+from taichi_mrf.queries.distance_grid import (
     COLUMNS,
     FAR,
     GONE,
@@ -23,25 +20,17 @@ from taichi_mrf.queries.distance_kernels import (
     SAMPLES,
     SEEN_FREE,
     FieldGrid,
-    along_x,
-    along_y,
-    along_z,
     classify_bricks,
     copy_all,
     fill_rows,
-    join_bricks,
     keep_classes,
 )
+from taichi_mrf.queries.distance_kernels import along_x, along_y, along_z, join_bricks
+from taichi_mrf.queries.distance_rules import SpaceRules
 from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, seen_free_bricks
 from taichi_mrf.system import runtime
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, VOXELS, grid_keys
-
-UnknownSpace = Literal["free", "occupied", "unknown"]
-"""What unknown voxels are: no obstacles, obstacles, or no obstacles but without a distance themselves."""
-
-MOST_REACH = 1024
-"""Voxels that distances may reach, at most."""
 
 _BYTES_PER_BRICK = 4 * (COLUMNS + 2 * VOXELS + SAMPLES)
 _MOST_BRICKS = 2**31 // SAMPLES - 1  # Taichi refuses arrays of 2^31 elements
@@ -53,56 +42,6 @@ BrickBox = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 Cells = NDArray[np.int64]
 """(n,) numbers of bricks in the window."""
-
-
-@dataclass(frozen=True)
-class SpaceRules:
-    """What counts as an obstacle and how far distances go: ``reach`` in voxels, and the distance in metres of
-    each square of voxels, ``metres`` ((reach + 1)^2 + 1)."""
-
-    unknown: UnknownSpace
-    reach: int
-    metres: NDArray[np.float32]
-
-    @staticmethod
-    def of(unknown: UnknownSpace, max_distance_m: float, voxel_size: float) -> "SpaceRules":
-        """Distances to the faces of obstacles: half a voxel less than to their centres. Raises
-        ConfigError."""
-        reach = max(1, int(np.ceil(max_distance_m / voxel_size - 0.5)))
-        if reach > MOST_REACH:
-            raise ConfigError(
-                f"max_distance_m must be at most {MOST_REACH} voxels, {MOST_REACH * voxel_size:g} m, "
-                f"not {max_distance_m:g}"
-            )
-        squares = np.arange((reach + 1) ** 2 + 1, dtype=np.float64)
-        metres = np.minimum((np.sqrt(squares) - 0.5) * voxel_size, max_distance_m)
-        metres[-1] = max_distance_m
-        return SpaceRules(unknown, reach, metres.astype(np.float32))
-
-    @property
-    def beyond(self) -> int:
-        """The square that stands for all that is further than distances go."""
-        return (self.reach + 1) ** 2
-
-    @property
-    def reach_bricks(self) -> int:
-        """How many bricks away a state can change a distance."""
-        return -(-self.reach // BRICK)
-
-    @property
-    def outside_class(self) -> int:
-        """A column of unknown voxels (distance_kernels.FieldGrid)."""
-        return {"free": 0, "occupied": 0x00FF, "unknown": 0xFF00}[self.unknown]
-
-    @property
-    def outside_square(self) -> int:
-        """The squared distance deep in unknown space."""
-        return -self.beyond if self.unknown == "occupied" else self.beyond
-
-    @property
-    def outside_m(self) -> float:
-        """The distance there, in metres."""
-        return -float(self.metres[-1]) if self.unknown == "occupied" else float(self.metres[-1])
 
 
 class DistanceBricks:
@@ -270,8 +209,8 @@ class DistanceBricks:
     def _grow(self, needed: int) -> None:
         if needed > _MOST_BRICKS:
             raise CapacityError(
-                f"distances in {needed} bricks of {BRICK}^3 voxels are wanted and the most is {_MOST_BRICKS}; "
-                "choose a smaller max_distance_m, a box, or larger voxels"
+                f"distances in {needed} bricks of {BRICK}^3 voxels are wanted and the most is "
+                f"{_MOST_BRICKS}; choose a smaller max_distance_m, a box, or larger voxels"
             )
         capacity = max(needed, min(_MOST_BRICKS, int(self._capacity * _GROWTH)), _LEAST_CAPACITY)
         check_memory(

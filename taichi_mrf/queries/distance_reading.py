@@ -22,7 +22,7 @@ from taichi_mrf.kernels.types import (
     Vec3,
     Vec4,
 )
-from taichi_mrf.queries.distance_kernels import FAR, SAMPLES, SIDE, FieldGrid
+from taichi_mrf.queries.distance_grid import FAR, SAMPLES, SIDE, FieldGrid
 from taichi_mrf.system import runtime
 
 NO_DISTANCE = 1e30
