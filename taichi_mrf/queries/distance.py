@@ -85,10 +85,21 @@ class DistanceField(Owned):
         """Bytes of memory that the field takes."""
         return self._bricks.bytes
 
-    def update(self) -> int:
+    def update(self, m: QueriedMap | None = None) -> int:
         """Follow the map: work out the distances again that have changed with the states of voxels since the
-        last call, and return for how many voxels that is so. Raises CapacityError; after an error the field
-        answers nothing until an update has ended."""
+        last call, and return for how many voxels that is so. ``m`` is another map to follow from now on, such
+        as a later layer or reading, with voxels of the same size.
+
+        Raises ConfigError for voxels of another size, CapacityError if there is not enough memory; after that
+        the field answers nothing until an update has ended.
+        """
+        if m is not None:
+            if not np.isclose(m.voxel_size, self.map.voxel_size, rtol=1e-6):
+                raise ConfigError(
+                    f"a distance field of voxels of {self.map.voxel_size:g} m cannot follow a map of voxels "
+                    f"of {m.voxel_size:g} m"
+                )
+            self.map = m
         if not self._complete:
             self._bricks.start_over()
         self._complete = False

@@ -305,6 +305,20 @@ def test_a_field_follows_keyframes(backend: str, kind: Any) -> None:
         np.testing.assert_array_equal(field.distance(points), anew.distance(points))
 
 
+def test_a_field_follows_another_map(hand: HandMap, edited: Edited) -> None:
+    edited.clear()
+    edited.write((-1, 3, -2), np.full(VOXELS, 2.0))
+    field = DistanceField(edited.map, MAX_M, "unknown")
+    assert field.update(hand) > 0
+    points = np.random.default_rng(7).uniform(LOWER, UPPER, (1000, 3))
+    wanted = DistanceField(hand, MAX_M, "unknown").distance(points)
+    np.testing.assert_array_equal(field.distance(points), wanted)
+    assert field.update() == 0
+    with pytest.raises(ConfigError, match=r"voxels of 0\.05 m cannot follow a map of voxels of 0\.1 m"):
+        field.update(room_map("mrf"))
+    np.testing.assert_array_equal(field.distance(points), wanted)
+
+
 def test_a_field_of_a_box_is_the_whole_one_in_it(hand: HandMap) -> None:
     points = np.random.default_rng(3).uniform(LOWER, UPPER, (1000, 3))
     whole, part = DistanceField(hand, MAX_M), DistanceField(hand, MAX_M, lower=LOWER, upper=UPPER)
