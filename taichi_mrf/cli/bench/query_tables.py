@@ -7,6 +7,7 @@ from rich.table import Table
 
 from taichi_mrf.benchmark.keyframe_cost import Seconds
 from taichi_mrf.benchmark.queries import BALLS, BODIES, POINTS, RANGE_M, RAYS, REACH, QueryRow, Rate
+from taichi_mrf.cli.bench.tables import size_columns
 
 _NAMES = {"balls": "balls, by clearance", "rays": "rays, to what is occupied"}
 """Of the rates, those that are called otherwise here."""
@@ -18,7 +19,8 @@ def query_tables(rows: Sequence[QueryRow], title: str) -> list[Table]:
 
 
 def _rate_table(rows: Sequence[QueryRow], title: str) -> Table:
-    table = _columns(f"Million a second (for each processor's second): {title}", rows)
+    sizes = [row.voxel_size for row in rows]
+    table = size_columns(f"Million a second (for each processor's second): {title}", sizes)
     for name in rows[0].rates:
         table.add_row(_NAMES.get(name, name), *[_rate(row.rates[name]) for row in rows])
     for name in rows[0].peers:
@@ -33,7 +35,10 @@ def _rate_table(rows: Sequence[QueryRow], title: str) -> Table:
 
 
 def _distance_table(rows: Sequence[QueryRow]) -> Table:
-    table = _columns(f"Signed distances up to {REACH} voxels, seconds (processors' seconds)", rows)
+    table = size_columns(
+        f"Signed distances up to {REACH} voxels, seconds (processors' seconds)",
+        [row.voxel_size for row in rows],
+    )
 
     def line(name: str, figure: str) -> None:
         table.add_row(name, *[_seconds(getattr(row, figure)) for row in rows])
@@ -44,14 +49,6 @@ def _distance_table(rows: Sequence[QueryRow]) -> Table:
     line("SciPy, the box around the map", "transform")
     table.add_row("  voxels of the box", *[f"{row.box_voxels:,}" for row in rows])
     table.add_row("memory of the field, MB", *[f"{row.field_mb:.0f}" for row in rows])
-    return table
-
-
-def _columns(title: str, rows: Sequence[QueryRow]) -> Table:
-    table = Table(title=title, title_justify="left")
-    table.add_column("")
-    for row in rows:
-        table.add_column(f"{row.voxel_size * 100:g} cm", justify="right")
     return table
 
 
