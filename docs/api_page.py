@@ -29,7 +29,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "read_box",
         "slice_map",
         "cast_rays",
-        "distance_field",
+        "DistanceField",
         "find_frontiers",
         "view_gain",
         "compare_maps",

@@ -20,7 +20,7 @@ from taichi_mrf.evaluation.pictures.viewpoint import faces_viewer, overview_pose
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.queries.box import map_extent
-from taichi_mrf.queries.distance import distance_field
+from taichi_mrf.queries.distance import DistanceField
 from taichi_mrf.queries.frontiers import find_frontiers
 from taichi_mrf.queries.slices import slice_map
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -70,7 +70,7 @@ def cuts(run: Path) -> Image.Image:
     cut = slice_map(m, at=CUT_AT_M)
     lower_m, upper_m = map_extent(m)
     lower_m[2], upper_m[2] = cut.at_m - m.voxel_size, cut.at_m + m.voxel_size
-    field = distance_field(m, lower_m, upper_m, max_distance=CLEARANCE_M)
+    field = DistanceField(m, CLEARANCE_M, lower=lower_m, upper=upper_m)
     rows, columns = cut.occupancy.shape
     left, _, bottom, _ = cut.extent
     x = left + (np.arange(columns) + 0.5) * m.voxel_size
@@ -84,7 +84,7 @@ def cuts(run: Path) -> Image.Image:
     figure = new_figure(13.0, 5.0)
     first, second = figure.subplots(1, 2)
     first.set_title(f"slice_map at {cut.axis} = {cut.at_m:.2f} m, find_frontiers (magenta)")
-    second.set_title("distance_field in the same layer")
+    second.set_title("DistanceField in the same layer")
     for axes, values, colors, most, label in (
         (first, cut.occupancy, "viridis", 1.0, "marginal occupancy"),
         (second, distance, "magma", CLEARANCE_M, "metres to what is occupied"),

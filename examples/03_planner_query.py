@@ -3,8 +3,7 @@
     python examples/03_planner_query.py
 
 All queries take and return NumPy arrays, so a planner's whole tree of points is one call. Unknown space is
-neither free nor occupied; an argument of the query says how to treat it. Distances need SciPy, which comes
-with pip install 'taichi-mrf[mesh]'.
+neither free nor occupied; an argument of the query says how to treat it.
 """
 
 import numpy as np
@@ -29,7 +28,7 @@ def main() -> None:
 
     # The same for a robot with a size: the distance of the nearest obstacle along the path.
     steps = start + np.linspace(0, 1, 20)[:, None] * way
-    field = tm.distance_field(m, steps.min(axis=0) - 0.5, steps.max(axis=0) + 0.5, max_distance=1.0)
+    field = tm.DistanceField(m, max_distance_m=1.0)
     distance, gradient = field.distance_and_gradient(steps)
     nearest = int(distance.argmin())
     away = gradient[nearest] / max(1e-9, np.linalg.norm(gradient[nearest]))

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from taichi_mrf.queries.box import read_box as read_box
     from taichi_mrf.queries.cast import cast_rays as cast_rays
     from taichi_mrf.queries.change import compare_maps as compare_maps
-    from taichi_mrf.queries.distance import distance_field as distance_field
+    from taichi_mrf.queries.distance import DistanceField as DistanceField
     from taichi_mrf.queries.frontiers import find_frontiers as find_frontiers
     from taichi_mrf.queries.gain import view_gain as view_gain
     from taichi_mrf.queries.points import FREE as FREE
@@ -69,7 +69,7 @@ _PUBLIC = {
     "read_box": "taichi_mrf.queries.box",
     "slice_map": "taichi_mrf.queries.slices",
     "cast_rays": "taichi_mrf.queries.cast",
-    "distance_field": "taichi_mrf.queries.distance",
+    "DistanceField": "taichi_mrf.queries.distance",
     "find_frontiers": "taichi_mrf.queries.frontiers",
     "view_gain": "taichi_mrf.queries.gain",
     "compare_maps": "taichi_mrf.queries.change",

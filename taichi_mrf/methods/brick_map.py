@@ -31,7 +31,7 @@ from taichi_mrf.queries.within import occupied_within, path_collision
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, noise_from_config
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
-from taichi_mrf.system import runtime
+from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.owner import Owned, owned_attribute
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology, create_topology, recycle
@@ -152,11 +152,13 @@ class BrickMap(Owned):
         if self._up is None:
             self._up = up_of(T_world_camera, camera.up)
 
+    @tensors.in_kind("points")
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
         """Probability of occupied at (N, 3) points in metres, (N,) float32; the prior where nothing was
         measured."""
         return probability(self._log_odds(points))
 
+    @tensors.in_kind("points")
     def state(self, points: ArrayLike) -> NDArray[np.int8]:
         """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,) int8."""
         return classify(self._log_odds(points), self._pool.prior_log_odds, self.view.volume.min_evidence)
@@ -165,11 +167,13 @@ class BrickMap(Owned):
         """All allocated voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
         return extract_voxels(self._pool, self.voxel_size, real(min_probability, "min_probability"))
 
+    @tensors.in_kind("T_world_camera")
     def render_depth(self, camera: Camera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
         """Axial depth of the likeliest surface seen by each pixel, (H, W) float32, NaN where none is."""
         check_camera(camera)
         return self.view.render_depth(camera, as_pose(T_world_camera), self.sensor.max_depth)
 
+    @tensors.in_kind("origin", "direction")
     def ray_profile(
         self, origin: ArrayLike, direction: ArrayLike, max_range: float | None = None
     ) -> RayProfile:
@@ -179,6 +183,7 @@ class BrickMap(Owned):
             real(max_range, "max_range", above=0)
         return self.view.ray_profile(origin, direction, max_range or self.sensor.max_depth)
 
+    @tensors.in_kind("depth_m", "T_world_camera")
     def ray_scores(
         self,
         depth_m: ArrayLike,
@@ -190,11 +195,13 @@ class BrickMap(Owned):
         above 0 something new, below 0 a surface that is gone (queries.contradiction.ray_scores)."""
         return ray_scores(self, depth_m, T_world_camera, camera, own)
 
+    @tensors.in_kind("points")
     def occupied_within(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
         """The probability that something lies within ``radius_m`` metres of points (N, 3) in metres, (N,)
         float32 (queries.within). Raises ConfigError, CapacityError if the points lie too far apart."""
         return occupied_within(points, radius_m, *self._grid())
 
+    @tensors.in_kind("points")
     def path_collision(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
         """The probability that a ball of ``radius_m`` metres hits something on its way from point to point: a
         path (N, 3) in metres -> (), paths (P, N, 3) -> (P,) (queries.within). Raises as

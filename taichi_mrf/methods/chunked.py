@@ -23,6 +23,7 @@ from taichi_mrf.methods.mrf.reading import READINGS, Reading
 from taichi_mrf.methods.stored_distances import StoredDistances
 from taichi_mrf.queries.box import BoxOfVoxels, voxels_of_box
 from taichi_mrf.queries.points import checked_points, classify, probability
+from taichi_mrf.system import tensors
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS
 
@@ -124,6 +125,7 @@ class ChunkedMap:
         ``after``, (3,) each."""
         return StoredDistances(self.store, self.chunks, first, after)
 
+    @tensors.in_kind("points")
     def log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
         """Log-odds of occupied at (N, 3) points in metres, (N,); the prior where nothing was observed.
 
@@ -136,6 +138,7 @@ class ChunkedMap:
             out[rows] = np.where(np.isnan(found), self.header.prior_log_odds, found)
         return out
 
+    @tensors.in_kind("points")
     def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
         """Colours of the voxels that hold points (N, 3) in metres, (N, 4) uint8: red, green, blue, and how
         much was seen; 0 for none. Raises ConfigError for points of another shape or that are not finite."""
@@ -145,11 +148,13 @@ class ChunkedMap:
             out[rows] = self._colors(chunk)[tuple((voxels[rows] % CHUNK_VOXELS).T)]
         return out
 
+    @tensors.in_kind("points")
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
         """Probability of occupied at (N, 3) points in metres, (N,) float32; the prior where nothing was
         observed."""
         return probability(self.log_odds(points))
 
+    @tensors.in_kind("points")
     def state(self, points: ArrayLike) -> NDArray[np.int8]:
         """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,) int8."""
         return self._state(self.log_odds(points))

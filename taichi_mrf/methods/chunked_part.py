@@ -25,7 +25,7 @@ from taichi_mrf.queries.view import View
 from taichi_mrf.queries.within import occupied_within, path_collision
 from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.origins import widened
-from taichi_mrf.system import runtime
+from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.owner import owned_attribute
 from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, by_chunk, grid_keys
 from taichi_mrf.voxels.pool import BrickPool
@@ -67,6 +67,7 @@ class MapPart:
         """The world axis that is up, None if the store does not hold it."""
         return self.source.up
 
+    @tensors.in_kind("points")
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
         """Probability of occupied at (N, 3) points in metres, (N,)."""
         points_m = checked_points(points)
@@ -74,6 +75,7 @@ class MapPart:
             self._inside(points_m), self.source.occupancy(points_m), np.float32(self.source.prior)
         )
 
+    @tensors.in_kind("points")
     def state(self, points: ArrayLike) -> NDArray[np.int8]:
         """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,)."""
         points_m = checked_points(points)
@@ -89,6 +91,7 @@ class MapPart:
         """Whether the map holds the colours that cameras saw."""
         return self.source.has_colors
 
+    @tensors.in_kind("points")
     def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
         """Colours of the voxels that hold points (N, 3) in metres, (N, 4), as of ChunkedMap, outside of the
         box too: the colours of a mesh at its border are blended with those beyond."""
@@ -138,11 +141,13 @@ class MapPart:
             out[slots[rows]] = block.reshape((CHUNK, BRICK) * 3)[x, :, y, :, z, :].reshape(-1, VOXELS)
         return out
 
+    @tensors.in_kind("points")
     def occupied_within(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
         """The probability that something lies within ``radius_m`` of points (N, 3) in metres, (N,), as
         OccupancyMap.occupied_within."""
         return occupied_within(points, radius_m, *self._grid())
 
+    @tensors.in_kind("points")
     def path_collision(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
         """The probability that a ball hits something on its way along paths (..., N, 3), as
         OccupancyMap.path_collision."""
@@ -178,6 +183,7 @@ class ChunkedViews:
 
     source: ChunkedMap
 
+    @tensors.in_kind("T_world_camera")
     def render_depth(self, camera: Camera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
         """As OccupancyMap.render_depth; the map may be larger than memory, what is in view may not."""
         check_camera(camera)
@@ -206,12 +212,12 @@ def take_part(m: ChunkedMap, lower: ArrayLike | None = None, upper: ArrayLike | 
     enough memory."""
     runtime.init()
     low, high = m.extent
-    low, high = low if lower is None else np.asarray(lower), high if upper is None else np.asarray(upper)
-    first, after = voxels_of_box(low, high, m.voxel_size)
+    corners = low if lower is None else lower, high if upper is None else upper
+    first, after = voxels_of_box(*corners, m.voxel_size)
     lowest, after = first // BRICK, -(-after // BRICK)
     pool = BrickPool(m.header.prior_log_odds, m.config.volume.memory_limit_gb)
     free = [np.zeros((0, 3), np.int32)]
-    for chunk, block in m.blocks(low, high):
+    for chunk, block in m.blocks(*corners):
         values = block.reshape((CHUNK, BRICK) * 3).transpose(0, 2, 4, 1, 3, 5).reshape(-1, VOXELS)
         bricks = np.indices((CHUNK,) * 3).reshape(3, -1).T + np.array(chunk) * CHUNK
         inside = ((bricks >= lowest) & (bricks < after)).all(axis=1)

@@ -10,6 +10,7 @@ from taichi_mrf.errors import ConfigError
 from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, bricks_between, known_bricks
 from taichi_mrf.queries.points import probability
 from taichi_mrf.system.memory import check_memory
+from taichi_mrf.system.tensors import on_host
 from taichi_mrf.voxels.layout import BRICK
 
 _BYTES_PER_VOXEL = 13
@@ -81,7 +82,9 @@ def voxels_of_box(
 
     Raises ConfigError for corners that make no box.
     """
-    low, high = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
+    low, high = (
+        np.asarray(on_host(corner, name), np.float64) for corner, name in ((lower, "lower"), (upper, "upper"))
+    )
     if low.shape != (3,) or high.shape != (3,) or not np.isfinite([low, high]).all() or (low >= high).any():
         raise ConfigError("a box needs a lower and an upper corner of three finite numbers, lower < upper")
     first = np.floor(np.clip(low / voxel_size, -FARTHEST_VOXEL, FARTHEST_VOXEL) + _ON_A_FACE).astype(np.int64)

@@ -10,8 +10,9 @@ from taichi_mrf.errors import ConfigError
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, Struct, Template, Vec3
 from taichi_mrf.queries.known_bricks import QueriedMap
+from taichi_mrf.queries.points import OCCUPIED, UNKNOWN, state_of
 from taichi_mrf.queries.ray_space import RaySpace
-from taichi_mrf.system import runtime
+from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK
 from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_voxels
@@ -36,6 +37,7 @@ class RayHits:
     in_unknown: NDArray[np.bool_]
 
 
+@tensors.in_kind("origins", "directions")
 def cast_rays(
     m: QueriedMap, origins: ArrayLike, directions: ArrayLike, max_range: float, unknown: Unknown = "free"
 ) -> RayHits:
@@ -168,10 +170,10 @@ def _look(search: Template, belief: Template, voxel: I32, near: F32, far: F32):
     if voxel < search.unknown_from:
         log_odds = belief[voxel]
     found = _PASSED
-    # The states of queries/points.py.
-    if log_odds > 0.0 and ti.abs(log_odds - search.prior) > search.min_evidence:
+    state = state_of(log_odds, search.prior, search.min_evidence)
+    if state == OCCUPIED:
         found = _HIT
-    elif log_odds >= search.prior - search.min_evidence and search.stop_in_unknown == 1:
+    elif state == UNKNOWN and search.stop_in_unknown == 1:
         found = _STOPPED
     if found != _PASSED:
         search.outcome = found

@@ -1,114 +1,185 @@
-"""How far it is to the nearest occupied voxel, and which way leads away from it: what planners ask.
-
-The distances are exact at the centres of voxels, from centre to centre (SciPy's Euclidean distance
-transform), and linear between them along each axis, so that the gradient is that of what is returned. They
-are cut off at a stated distance, which bounds the space that has to be looked at.
+"""How far it is to the nearest obstacle, and which way leads away from it: what planners ask.
+ The distances are exact at the centres of voxels and linear between them along each axis, so that the
+gradient is that of what is returned. They are cut off at a stated distance, which bounds what a change of the
+map reaches.
 """
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf.config.arguments import real
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.queries.box import voxel_box, voxels_of_box
+from taichi_mrf.queries.box import voxels_of_box
+from taichi_mrf.queries.distance_bricks import DistanceBricks
+from taichi_mrf.queries.distance_reading import (
+    NO_DISTANCE,
+    FieldPoints,
+    FieldValues,
+    field_points,
+    read_clearances,
+    read_distances,
+    read_gradients,
+)
+from taichi_mrf.queries.distance_rules import SpaceRules, UnknownSpace
 from taichi_mrf.queries.known_bricks import QueriedMap
-from taichi_mrf.queries.points import FREE, OCCUPIED, checked_points
-from taichi_mrf.system.libraries import library
-from taichi_mrf.system.memory import check_memory
+from taichi_mrf.system import runtime, tensors
+from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.owner import Owned
+from taichi_mrf.voxels.layout import BRICK
 
-_BYTES_PER_VOXEL = 40
-"""What SciPy's transform takes at its peak."""
+_EDGE = 1e-3
+"""In voxels: so far outside of its box a field answers, as rounding goes."""
 
-UnknownSpace = Literal["free", "occupied"]
-"""Whether unknown voxels are obstacles."""
-
-
-@dataclass(frozen=True)
-class DistanceField:
-    """Distances in a box: ``values`` (nx, ny, nz) float32 in metres at the centres of voxels, none larger
-    than ``max_distance``; index [i, j, k] is voxel ``lowest`` + (i, j, k) of the world."""
-
-    values: NDArray[np.float32]
-    lowest: tuple[int, int, int]
-    voxel_size: float
-    max_distance: float
-
-    def distance(self, points: ArrayLike) -> NDArray[np.float64]:
-        """Metres to the nearest obstacle, (N, 3) -> (N,). Raises ConfigError for a point outside the box."""
-        return self.distance_and_gradient(points)[0]
-
-    def gradient(self, points: ArrayLike) -> NDArray[np.float64]:
-        """The change of the distance per metre, (N, 3) -> (N, 3): it points away from the nearest obstacle,
-        with a length of nearly 1, and is 0 where the distance is cut off. Raises ConfigError."""
-        return self.distance_and_gradient(points)[1]
-
-    def distance_and_gradient(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Both at once. Raises ConfigError for a point outside the box."""
-        at = checked_points(points) / self.voxel_size - np.array(self.lowest) - 0.5
-        last = np.array(self.values.shape) - 1
-        if ((at < -0.5) | (at > last + 0.5)).any():
-            raise ConfigError("a point lies outside the box of the distance field")
-        at = np.clip(at, 0, last)
-        first = np.minimum(np.floor(at).astype(np.int64), np.maximum(last - 1, 0))
-        share = at - first
-        distance, gradient = np.zeros(len(at)), np.zeros((len(at), 3))
-        for corner in np.ndindex(2, 2, 2):
-            up = np.array(corner)
-            weights = np.where(up == 1, share, 1 - share)
-            values = self.values[tuple(np.minimum(first + up, last).T)].astype(np.float64)
-            distance += weights.prod(axis=1) * values
-            for axis in range(3):
-                others = np.delete(weights, axis, axis=1).prod(axis=1)
-                gradient[:, axis] += (1 if up[axis] else -1) * others * values
-        return distance, gradient / self.voxel_size
+_ENDLESS = 1e9
 
 
-def distance_field(
-    m: QueriedMap, lower: ArrayLike, upper: ArrayLike, max_distance: float, unknown: UnknownSpace = "free"
-) -> DistanceField:
-    """Distances everywhere in a box, (3,) corners in metres, to obstacles inside it and around it.
+class DistanceField(Owned):
+    """Signed distances in metres to the nearest obstacle, anywhere in a map.
 
-    ``unknown`` decides whether unknown voxels are obstacles. Raises ConfigError for corners that make no box
-    and a distance that is not positive, CapacityError for a box that does not fit memory, TaichiMRFError
-    without SciPy.
+    A voxel's distance is that of its centre to the centre of the nearest obstacle, less half a voxel, so that
+    it is 0 on the faces of obstacles. In obstacles it is negative: half a voxel less the distance to the
+    centre of the nearest voxel that is none. No distance is further from 0 than ``max_distance_m``.
+
+    The field is that of the map at the last :meth:`update`. On the device of the map it takes
+    :attr:`bytes`, about 14 for each voxel within ``max_distance_m`` of an obstacle.
     """
-    images = library("scipy.ndimage", "distances need", "mesh")
-    if unknown not in ("free", "occupied"):
-        raise ConfigError(f"unknown must be free or occupied, not {unknown!r}")
-    if not (np.isfinite(max_distance) and max_distance > 0):
-        raise ConfigError(f"max_distance must be a positive number, not {max_distance}")
-    first, after = voxels_of_box(lower, upper, m.voxel_size)
-    # A layer more: between the outermost centres and the box's own faces, too, the values must be right.
-    first, after = first - 1, after + 1
-    margin = int(np.ceil(max_distance / m.voxel_size))
-    begin, end = first - margin, after + margin
-    voxels = float(np.prod((end - begin).astype(np.float64)))
-    check_memory(_BYTES_PER_VOXEL * voxels, f"distances in {voxels / 1e6:.3g} million voxels")
-    state = voxel_box(m, begin, end).state
-    obstacle = state == OCCUPIED if unknown == "free" else state != FREE
-    inner = tuple(slice(margin, margin + n) for n in (after - first).tolist())
-    if obstacle.any():
-        distance = images.distance_transform_edt(~obstacle)[inner] * m.voxel_size
-    else:
-        distance = np.full(after - first, np.inf)
-    values = np.minimum(distance, max_distance).astype(np.float32)
-    x, y, z = first.tolist()
-    return DistanceField(values, (x, y, z), m.voxel_size, max_distance)
 
+    def __init__(
+        self,
+        m: QueriedMap,
+        max_distance_m: float,
+        unknown: UnknownSpace = "free",
+        lower: ArrayLike | None = None,
+        upper: ArrayLike | None = None,
+    ) -> None:
+        """Work out the distances of a map as it is now.
 
-def distances(
-    m: QueriedMap, points: ArrayLike, max_distance: float, unknown: UnknownSpace = "free"
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Metres to the nearest obstacle at points, (N, 3) -> (N,), and the gradient, (N, 3).
+        ``unknown`` says what unknown voxels are: "free" space, "occupied", which makes them obstacles, or
+        "unknown": no obstacles, and in them the distance is NaN. ``lower`` and ``upper``, (3,) in
+        metres, bound the field to a box, outside of which all is NaN; obstacles around it count.
 
-    Works out the field in the box around all points: for many queries of one place make a
-    :func:`distance_field` once. Raises what that raises.
-    """
-    points_m = checked_points(points)
-    if not len(points_m):
-        return np.zeros(0), np.zeros((0, 3))
-    middle = 0.5 * m.voxel_size
-    lower, upper = points_m.min(axis=0) - middle, points_m.max(axis=0) + middle
-    return distance_field(m, lower, upper, max_distance, unknown).distance_and_gradient(points_m)
+        Raises ConfigError for another rule, a distance that is not positive or more than 1024 voxels, and
+        corners that make no box; CapacityError if there is not enough memory.
+        """
+        if unknown not in ("free", "occupied", "unknown"):
+            raise ConfigError(f"unknown must be free, occupied or unknown, not {unknown!r}")
+        if (lower is None) != (upper is None):
+            raise ConfigError("a distance field needs both corners of its box, lower and upper, or none")
+        self.map, self.unknown = m, unknown
+        self.max_distance_m = real(max_distance_m, "max_distance_m", above=0)
+        rules = SpaceRules.of(unknown, self.max_distance_m, m.voxel_size)
+        self._bricks = DistanceBricks(rules)
+        self._within = self._box_m = None
+        self._complete = False
+        if lower is not None and upper is not None:
+            first, after = voxels_of_box(lower, upper, m.voxel_size)
+            margin = rules.reach + 1
+            self._within = (first - margin) // BRICK, (after + margin) // BRICK
+            self._box_m = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
+        self.update()
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of memory that the field takes."""
+        return self._bricks.bytes
+
+    def update(self, m: QueriedMap | None = None) -> int:
+        """Follow the map: work out the distances again that have changed with the states of voxels since the
+        last call, and return for how many voxels that is so. ``m`` is another map to follow from now on, such
+        as a later layer or reading, with voxels of the same size.
+
+        Raises ConfigError for voxels of another size, CapacityError if there is not enough memory; after that
+        the field answers nothing until an update has ended.
+        """
+        if m is not None:
+            if not np.isclose(m.voxel_size, self.map.voxel_size, rtol=1e-6):
+                raise ConfigError(
+                    f"a distance field of voxels of {self.map.voxel_size:g} m cannot follow a map of voxels "
+                    f"of {m.voxel_size:g} m"
+                )
+            self.map = m
+        if not self._complete:
+            self._bricks.start_over()
+        self._complete = False
+        voxels = self._bricks.update(self.map, self._within)
+        self._complete = True
+        return voxels
+
+    @tensors.in_kind("points", on_device=True)
+    def distance(self, points: ArrayLike) -> NDArray[np.float32]:
+        """Metres to the nearest obstacle at points (N, 3) in metres, (N,) float32; NaN where it is not known.
+        Raises ConfigError for points of another shape or that are not finite."""
+        given = tensors.real_array(points, "points", ("N", 3))
+        out = tensors.empty(given, given.shape[:1])
+        if len(given):
+            read_distances(self._points(given), self._values(), out)
+            runtime.settle()
+        return self._told(out)
+
+    @tensors.in_kind("points", on_device=True)
+    def distance_and_gradient(self, points: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The same, and its change for each metre along x, y and z, (N, 3) float32: it points away from the
+        nearest obstacle, with a length of nearly 1, and is 0 where the distance is cut off. Raises
+        ConfigError."""
+        given = tensors.real_array(points, "points", ("N", 3))
+        out, gradient = tensors.empty(given, given.shape[:1]), tensors.empty(given, given.shape)
+        if len(given):
+            read_gradients(self._points(given), self._values(), out, gradient)
+            runtime.settle()
+        if self._may_lack:
+            gradient[out > 0.5 * NO_DISTANCE] = np.nan
+        return self._told(out), gradient
+
+    @tensors.in_kind("centres", "radii_m", on_device=True)
+    def clearance(self, centres: ArrayLike, radii_m: ArrayLike) -> NDArray[np.float32]:
+        """How far bodies made of balls are from obstacles: centres (C, S, 3) of S balls for each of C bodies
+        or configurations, in metres, and their radii (S,) -> (C,) float32, the least distance of a centre
+        less its radius. It is positive if no ball reaches an obstacle, and NaN if the distance of one is not
+        known.
+
+        Raises ConfigError for arrays that do not fit or are not finite, and for radii that are negative or
+        not less than ``max_distance_m``, of which the field cannot tell.
+        """
+        given = tensors.real_array(centres, "centres", ("C", "S", 3))
+        radii = np.ascontiguousarray(tensors.on_host(radii_m, "radii_m"), np.float32)
+        if radii.shape != given.shape[1:2] or not len(radii):
+            raise ConfigError(
+                f"centres (C, S, 3) need radii_m (S,), one or more, not {given.shape} and {radii.shape}"
+            )
+        if not (radii.min() >= 0 and radii.max() < self.max_distance_m):
+            raise ConfigError(
+                f"radii_m must be at least 0 and less than max_distance_m, {self.max_distance_m:g} m"
+            )
+        out = tensors.empty(given, given.shape[:1])
+        if len(given):
+            read_clearances(self._points(given.reshape(-1, 3)), self._values(), radii, out)
+            runtime.settle()
+        return self._told(out)
+
+    @property
+    def _may_lack(self) -> bool:
+        return self.unknown == "unknown" or self._box_m is not None
+
+    def _told(self, out: Any) -> Any:
+        if self._may_lack:
+            out[out > 0.5 * NO_DISTANCE] = np.nan
+        return out
+
+    def _points(self, points: Any) -> FieldPoints:
+        return field_points(points, self.map.voxel_size, self._bricks.lowest * BRICK)
+
+    def _values(self) -> FieldValues:
+        if not self._complete:
+            raise ConfigError("the last update of this distance field did not end: call update() again")
+        bricks, voxel_size = self._bricks, self.map.voxel_size
+        lower, upper = np.full(3, -_ENDLESS), np.full(3, _ENDLESS)
+        if self._box_m is not None:
+            centre = bricks.lowest * BRICK + 0.5
+            lower, upper = (corner / voxel_size - centre for corner in self._box_m)
+        return FieldValues(
+            bricks.grid, bricks.values, self.max_distance_m, bricks.rules.outside_m,
+            ti.Vector((lower - _EDGE).tolist(), ti.f32), ti.Vector((upper + _EDGE).tolist(), ti.f32),
+            1 / voxel_size,
+        )  # fmt: skip

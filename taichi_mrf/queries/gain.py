@@ -27,7 +27,7 @@ from taichi_mrf.queries.survey import OPAQUE
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.origins import widened
 from taichi_mrf.sensor.rays import CameraRays
-from taichi_mrf.system import runtime
+from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.traversal import FAR, Space, Viewpoint, clip, pixel_ray, walk_voxels
 
@@ -35,6 +35,7 @@ _THINNEST = 1e-6
 """Below this thickness a voxel dims nothing, and the integral of the visibility is the length."""
 
 
+@tensors.in_kind("T_world_camera")
 def view_gain(
     m: QueriedMap, camera: Camera, T_world_camera: ArrayLike, max_depth: float
 ) -> NDArray[np.float64]:
@@ -52,6 +53,7 @@ def view_gain(
     return np.array([_gain(space, camera, as_pose(T), max_depth).sum(dtype=np.float64) for T in poses])
 
 
+@tensors.in_kind("T_world_camera")
 def pixel_gain(
     m: QueriedMap, camera: Camera, T_world_camera: ArrayLike, max_depth: float
 ) -> NDArray[np.float32]:

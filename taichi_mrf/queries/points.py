@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import array
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.kernels.types import F32Array, I32Array
+from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, VOXELS
@@ -67,6 +67,18 @@ def classify(log_odds: NDArray[np.float32], prior_log_odds: float, min_evidence:
     state = np.where(log_odds < prior_log_odds - min_evidence, FREE, UNKNOWN)
     known = np.abs(log_odds - prior_log_odds) > min_evidence
     return np.where((log_odds > 0) & known, OCCUPIED, state).astype(np.int8)
+
+
+@ti.func
+def state_of(log_odds: F32, prior_log_odds: F32, min_evidence: F32) -> I32:
+    """:func:`classify` in kernels."""
+    known = ti.abs(log_odds - prior_log_odds) > min_evidence
+    state = UNKNOWN
+    if log_odds > 0.0 and known:
+        state = OCCUPIED
+    elif log_odds < prior_log_odds - min_evidence:
+        state = FREE
+    return state
 
 
 def probability(log_odds: NDArray[np.float32]) -> NDArray[np.float32]:

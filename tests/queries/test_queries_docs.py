@@ -24,7 +24,7 @@ def test_the_examples_run(
     room_map("mrf").save(tmp_path / "map.npz")
     monkeypatch.chdir(tmp_path)
     examples = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    assert len(examples) == 14
+    assert len(examples) == 15
     names: dict[str, object] = {}
     for example in examples:
         assert len([line for line in example.splitlines() if line]) <= 6

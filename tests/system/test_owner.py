@@ -34,7 +34,7 @@ VERBS: dict[str, Callable[[Any], Any]] = {
     "save": lambda m: m.save("never-written.npz"),
     "cast_rays": lambda m: tm.cast_rays(m, POINTS, np.array([[0.0, 0.0, 1.0]]), 2.0),
     "read_box": lambda m: tm.read_box(m, np.zeros(3), np.ones(3)),
-    "distance_field": lambda m: tm.distance_field(m, np.zeros(3), np.ones(3), 0.5),
+    "DistanceField": lambda m: tm.DistanceField(m, 0.5),
     "find_frontiers": lambda m: tm.find_frontiers(m),
     "export_map": lambda m: tm.export_map(m, "never-written.ply"),
     "another map": lambda m: type(m)(0.1),

@@ -14,8 +14,10 @@ from taichi_mrf.benchmark.bench import STEADY_FRAMES, BenchRow, bench_mapping, o
 from taichi_mrf.benchmark.bench_pictures import draw_growth, draw_profiles, draw_stages, write_figure
 from taichi_mrf.benchmark.growth import Growth, measure_growth
 from taichi_mrf.benchmark.profile import Profile, profile_mapping
+from taichi_mrf.benchmark.queries import QueryRow, bench_queries, missing_peers
+from taichi_mrf.cli.bench.query_tables import query_tables
 from taichi_mrf.cli.bench.tables import bench_table, growth_table, profile_tables, viewer_table
-from taichi_mrf.cli.options.bench import Bench
+from taichi_mrf.cli.options.bench import MODES, Bench
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.config.schema import Config
@@ -89,6 +91,15 @@ class _Run:
         draw = partial(draw_growth, rows, self.title)
         return [growth_table(rows, self.title)], [row.to_json() for row in rows], draw
 
+    def queries(self) -> Measured:
+        for name in missing_peers():
+            line = f"{name} is left out: pip install 'taichi-mrf[bench]' brings it."
+            self.console.print_line(line)
+        rows: list[QueryRow] = []
+        for config, advance in self.each_size():
+            rows.append(bench_queries(self.frames, config, advance))
+        return query_tables(rows, self.title), [row.to_json() for row in rows], None
+
     def viewer(self) -> Measured:
         from taichi_mrf.live.bench import bench_viewer  # the page's packages are slow to import
 
@@ -107,7 +118,7 @@ def run_bench(options: Bench) -> int:
     runtime.init(wanted.arch, wanted.threads, wanted.debug, options.profile)
     with ProgressBar(console, options.printing) as progress:
         run = _Run(options, console, progress)
-        mode = next((name for name in ("viewer", "profile", "growth") if getattr(options, name)), "stages")
+        mode = next((name for name in MODES if getattr(options, name)), "stages")
         tables, figures, draw = getattr(run, mode)()
     for table in tables:
         console.print(table)

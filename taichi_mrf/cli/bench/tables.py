@@ -21,7 +21,7 @@ HOST_ROWS = 12
 
 def bench_table(rows: Sequence[BenchRow], title: str) -> Table:
     """Medians of the steady state, beside OctoMap and the targets."""
-    table = _columns(title, rows)
+    table = size_columns(title, [row.voxel_size for row in rows])
 
     def line(name: str, text: Callable[[BenchRow], str]) -> None:
         table.add_row(name, *[text(row) for row in rows])
@@ -169,11 +169,12 @@ def viewer_table(voxel_sizes: Sequence[float], benches: "Sequence[Sequence[Viewe
     return table
 
 
-def _columns(title: str, rows: Sequence[BenchRow]) -> Table:
+def size_columns(title: str, voxel_sizes: Sequence[float]) -> Table:
+    """A table with a column for what is in the row, and one for each voxel size, in metres."""
     table = Table(title=title, title_justify="left")
     table.add_column("")
-    for row in rows:
-        table.add_column(f"{row.voxel_size * 100:g} cm", justify="right")
+    for size in voxel_sizes:
+        table.add_column(f"{size * 100:g} cm", justify="right")
     return table
 
 

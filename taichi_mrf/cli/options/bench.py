@@ -11,7 +11,7 @@ from taichi_mrf.cli.options.verbosity import Verbosity
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
 
-MODES = ("viewer", "profile", "growth")
+MODES = ("viewer", "profile", "growth", "queries")
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,10 @@ class Bench:
     viewer: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Measure instead what each keyframe costs the live view: time on the server and bytes to a browser."""
 
+    queries: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Measure instead how many points, balls and rays a second a planner can ask about, and what distances
+    cost, of the whole map and after one more keyframe, beside OctoMap, SciPy and Open3D."""
+
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write all figures to this file as well."""
 
@@ -62,7 +66,8 @@ class Bench:
         chosen = [f"--{mode}" for mode in MODES if getattr(self, mode)]
         if len(chosen) > 1:
             raise ConfigError(f"{' and '.join(chosen)} do not go together")
-        if self.plot is not None and self.viewer:
-            raise ConfigError("--plot does not go with --viewer")
+        for mode in ("viewer", "queries"):
+            if self.plot is not None and getattr(self, mode):
+                raise ConfigError(f"--plot does not go with --{mode}")
         if self.plot is not None and self.plot.suffix not in (".png", ".svg", ".pdf"):
             raise ConfigError(f"--plot {self.plot}: the file must end in .png, .svg or .pdf")

@@ -19,6 +19,7 @@ from taichi_mrf.methods.mrf.surfacing import WithSurface, surface_field_of
 from taichi_mrf.methods.protocol import MappedKeyframe
 from taichi_mrf.queries.colored import blended_colors
 from taichi_mrf.queries.view import View
+from taichi_mrf.system import tensors
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.layout import VOXELS
@@ -74,6 +75,7 @@ class MapReading(BrickMap):
         """Whether any voxel may have a colour."""
         return bool(self._colors)
 
+    @tensors.in_kind("points")
     def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
         """What cameras saw of the voxels at (N, 3) points in metres by the time that is read, (N, 4)."""
         self._check()

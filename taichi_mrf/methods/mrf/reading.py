@@ -26,6 +26,7 @@ from taichi_mrf.methods.mrf.map_reading import MapReading, RaysThen
 from taichi_mrf.methods.mrf.surfacing import LEAST, WithSurface
 from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.change import MapChange, compare_maps
+from taichi_mrf.system import tensors
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import copied
 
@@ -86,6 +87,7 @@ class ReadableMRF(WithSurface):
         """Whether any voxel may have a colour: a keyframe has been added with a colour image."""
         return bool(self._colors)
 
+    @tensors.in_kind("points")
     def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
         """What cameras saw of the voxels at (N, 3) points in metres, (N, 4) uint8: red, green, blue, and how
         much of the voxel they have seen, 0 for nothing. Each pixel's colour goes to the voxels on its ray by

@@ -1,0 +1,198 @@
+"""How fast a planner's queries are: million points a second, beside OctoMap, SciPy and Open3D on the same
+map.
+ The peers get the map itself, as a file: OctoMap an octree of it, Open3D its voxels as cubes, SciPy the
+states of the box around it. Points lie anywhere in this box, rays begin there in any direction. The first
+call, which compiles kernels, does not count; of those after it the fastest does.
+"""
+
+import importlib.util
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from taichi_mrf import (
+    OCCUPIED,
+    Config,
+    DistanceField,
+    ExportOptions,
+    Frame,
+    MRFMap,
+    cast_rays,
+    export_map,
+    read_box,
+)
+from taichi_mrf.benchmark.keyframe_cost import Seconds, timed
+from taichi_mrf.system.libraries import library
+
+POINTS = 1_000_000
+RAYS = 100_000
+RANGE_M = 5.0
+BODIES, BALLS = 1000, 50
+"""Configurations of a robot in a call, and the balls that it is made of."""
+
+REACH = 20
+"""Voxels that distances reach."""
+
+LARGEST_BOX = 50_000_000
+"""Voxels up to which SciPy is asked: it takes 40 bytes for each."""
+
+_TRIES = 5
+
+Asked = Callable[[], object]
+
+
+@dataclass(frozen=True)
+class Rate:
+    """Queries ``count`` in a call, and how long the fastest call took."""
+
+    count: int
+    seconds: Seconds
+
+    @property
+    def millions(self) -> float:
+        """Million queries a second."""
+        return self.count / self.seconds.wall / 1e6
+
+    @property
+    def cpu_millions(self) -> float:
+        """Million queries for each second of a processor's time."""
+        return self.count / max(self.seconds.cpu, 1e-9) / 1e6
+
+
+@dataclass(frozen=True)
+class QueryRow:
+    """One voxel size. ``rates`` are this package's, ``peers`` the others', by name. ``build`` is how long all
+    distances of the map take, ``update`` those that one more keyframe changes, ``changed`` voxels;
+    ``transform`` is SciPy's for the same box of ``box_voxels``, of obstacles and of all else, None if the box
+    is too large; ``field_mb`` is what the field takes."""
+
+    voxel_size: float
+    keyframes: int
+    rates: dict[str, Rate]
+    build: Seconds
+    update: Seconds
+    changed: int
+    field_mb: float
+    transform: Seconds | None
+    box_voxels: int
+    peers: dict[str, Rate] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """All figures under their names, with the rates."""
+        millions = {
+            group: {
+                name: {"millions": rate.millions, "cpu_millions": rate.cpu_millions}
+                for name, rate in getattr(self, group).items()
+            }
+            for group in ("rates", "peers")
+        }
+        return asdict(self) | millions
+
+
+def missing_peers() -> list[str]:
+    """Of OctoMap and Open3D, those that are not installed."""
+    modules = {"OctoMap": "pyoctomap", "Open3D": "open3d"}
+    return [name for name, module in modules.items() if importlib.util.find_spec(module) is None]
+
+
+def bench_queries(
+    frames: Sequence[Frame], config: Config, progress: Callable[[int], object] = lambda done: None
+) -> QueryRow:
+    """Map all frames but the last, ask, and add the last for the update of the distances."""
+    m = MRFMap.from_config(config, frames[0].camera)
+    last = frames[-1]
+    for number, frame in enumerate(frames[:-1] or frames, start=1):
+        m.add_keyframe(frame.depth_m, frame.T_world_camera, frame.camera, frame.name)
+        progress(number)
+    m.infer()
+    max_distance_m = REACH * m.voxel_size
+    lower, upper = _extent(m)
+    random = np.random.default_rng(0)
+    points = random.uniform(lower, upper, (POINTS, 3))
+    starts, ways = points[:RAYS], random.normal(size=(RAYS, 3))
+    bodies = points[:BODIES, None] + random.normal(0.0, 0.3, (BODIES, BALLS, 3))
+    radii = random.uniform(0.2, 0.9, BALLS) * max_distance_m
+
+    distances = DistanceField(m, max_distance_m)
+    build = fastest(lambda: DistanceField(m, max_distance_m), tries=2)
+    rates = {
+        "occupancy": Rate(POINTS, fastest(lambda: m.occupancy(points))),
+        "state": Rate(POINTS, fastest(lambda: m.state(points))),
+        "distance": Rate(POINTS, fastest(lambda: distances.distance(points))),
+        "distance and gradient": Rate(POINTS, fastest(lambda: distances.distance_and_gradient(points))),
+        "balls": Rate(BODIES * BALLS, fastest(lambda: distances.clearance(bodies, radii))),
+        "rays": Rate(RAYS, fastest(lambda: cast_rays(m, starts, ways, RANGE_M))),
+    }
+    box_voxels = round(float(np.prod((upper - lower) / m.voxel_size)))
+    transform = None
+    if box_voxels <= LARGEST_BOX:
+        obstacle = read_box(m, lower, upper).state == OCCUPIED
+        transform = timed(lambda: _signed_transform(obstacle))
+    peers = _peers(m, points, starts, ways)
+    id = m.add_keyframe(last.depth_m, last.T_world_camera, last.camera, last.name)
+    m.renew([id])
+    changed: list[int] = []
+    update = timed(lambda: changed.append(distances.update()))
+    progress(len(frames))
+    return QueryRow(
+        m.voxel_size, len(frames), rates, build, update, changed[0], distances.bytes / 1e6, transform,
+        box_voxels, peers,
+    )  # fmt: skip
+
+
+def fastest(call: Asked, tries: int = _TRIES) -> Seconds:
+    """How long the fastest of some calls takes, after one that does not count."""
+    call()
+    return min((timed(call) for _ in range(tries)), key=lambda seconds: seconds.wall)
+
+
+def _extent(m: MRFMap) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two corners around all bricks with voxels, in metres."""
+    centres, _ = m.voxels(0.0)
+    half = 0.5 * m.voxel_size
+    return centres.min(axis=0) - half, centres.max(axis=0) + half
+
+
+def _signed_transform(obstacle: NDArray[np.bool_]) -> None:
+    distance_transform_edt(~obstacle)
+    distance_transform_edt(obstacle)
+
+
+def _peers(
+    m: MRFMap, points: NDArray[np.float64], starts: NDArray[np.float64], ways: NDArray[np.float64]
+) -> dict[str, Rate]:
+    """The same map in OctoMap and Open3D, as far as they are installed."""
+    missing, rates = missing_peers(), {}
+    with tempfile.TemporaryDirectory() as folder:
+        if "OctoMap" not in missing:
+            export_map(m, Path(folder) / "map.bt", ExportOptions(cells=False))
+            search = _octomap_search(Path(folder) / "map.bt", m.voxel_size, points)
+            rates["OctoMap's search"] = Rate(len(points), fastest(search, tries=2))
+        if "Open3D" not in missing:
+            export_map(m, Path(folder) / "map.ply", ExportOptions(cubes=True, cells=False))
+            cast = _open3d_rays(Path(folder) / "map.ply", starts, ways)
+            rates["Open3D's rays"] = Rate(len(starts), fastest(cast))
+    return rates
+
+
+def _octomap_search(path: Path, voxel_size: float, points: NDArray[np.float64]) -> Asked:
+    """What asks OctoMap for the states of points, in one call."""
+    tree = library("pyoctomap", "OctoMap's search needs", "bench").OcTree(voxel_size)
+    tree.readBinary(str(path))
+    return lambda: tree.getLabels(points)
+
+
+def _open3d_rays(path: Path, starts: NDArray[np.float64], ways: NDArray[np.float64]) -> Asked:
+    """What asks Open3D where rays meet the triangles of cubes."""
+    open3d = library("open3d", "Open3D's rays need", "bench")
+    scene = open3d.t.geometry.RaycastingScene()
+    scene.add_triangles(open3d.t.geometry.TriangleMesh.from_legacy(open3d.io.read_triangle_mesh(str(path))))
+    unit = ways / np.linalg.norm(ways, axis=1, keepdims=True)
+    rays = open3d.core.Tensor(np.concatenate([starts, unit], axis=1).astype(np.float32))
+    return lambda: scene.cast_rays(rays)

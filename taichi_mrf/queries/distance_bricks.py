@@ -1,0 +1,245 @@
+"""The bricks of a distance field: made where there is a distance to keep, and worked out again where states
+change.
+ A window of bricks around all that is known says where each one's distances are. Bricks of free or unknown
+space that are further from all else than distances go need none. An update compares the states of the map
+with those that it kept, and follows what differs along z, then y, then x, each time only from bricks whose
+sums did change.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.errors import CapacityError
+from taichi_mrf.kernels.resident import resident
+from taichi_mrf.queries.distance_grid import (
+    COLUMNS,
+    FAR,
+    GONE,
+    OUTSIDE,
+    SAMPLES,
+    SEEN_FREE,
+    FieldGrid,
+    classify_bricks,
+    copy_all,
+    fill_rows,
+    keep_classes,
+)
+from taichi_mrf.queries.distance_kernels import along_x, along_y, along_z, join_bricks
+from taichi_mrf.queries.distance_rules import SpaceRules
+from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, seen_free_bricks
+from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
+from taichi_mrf.system.memory import check_memory
+from taichi_mrf.voxels.layout import BRICK, VOXELS, grid_keys
+
+_BYTES_PER_BRICK = 4 * (COLUMNS + 2 * VOXELS + SAMPLES)
+_MOST_BRICKS = 2**31 // SAMPLES - 1  # Taichi refuses arrays of 2^31 elements
+_GROWTH = 1.2
+_LEAST_CAPACITY = 256
+
+BrickBox = tuple[NDArray[np.int64], NDArray[np.int64]]
+"""The lowest brick of a box and the highest, (3,) each."""
+
+Cells = NDArray[np.int64]
+"""(n,) numbers of bricks in the window."""
+
+
+class DistanceBricks:
+    """The distances of a map's bricks, in a window of bricks that grows with the map.
+
+    ``lowest`` (3,) is the window's first brick. ``values`` (slots * 729) are metres at the centres of voxels.
+    """
+
+    def __init__(self, rules: SpaceRules) -> None:
+        self.rules = rules
+        self._metres = resident(rules.metres)
+        self.start_over()
+
+    def start_over(self) -> None:
+        """Forget all distances: the next update works out the whole field."""
+        self.lowest = np.zeros(3, np.int64)
+        self._codes = np.full((1, 1, 1), OUTSIDE, np.int32)
+        self._known = np.zeros((0, 3), np.int32)
+        self._free: list[int] = []
+        self._capacity = 0
+        self.classes, self._first, self._second = (ti.ndarray(ti.i32, 1) for _ in range(3))
+        self.values = ti.ndarray(ti.f32, 1)
+        self.grid = self._grid()
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of memory that distances and what they are made of take."""
+        return self._capacity * _BYTES_PER_BRICK + 4 * self._codes.size
+
+    def update(self, m: QueriedMap, within: BrickBox | None = None) -> int:
+        """Take in the states of the map as they are now; returns how many voxels changed their distance.
+
+        ``within``: only bricks in this box count. Raises CapacityError.
+        """
+        bricks, sources = self._sources(m, within)
+        if not len(bricks):
+            return 0
+        self._cover(bricks)
+        cells = self._cells(bricks)
+        view = m.view
+        found, changed = ti.ndarray(ti.i32, len(cells) * COLUMNS), _zeros(len(cells))
+        classify_bricks(
+            view.pool.belief, sources, cells.astype(np.int32), view.pool.prior_log_odds,
+            view.volume.min_evidence, self.rules.unknown == "occupied", self.rules.unknown == "unknown",
+            self.grid, found, changed,
+        )  # fmt: skip
+        rows = np.flatnonzero(changed.to_numpy()).astype(np.int32)
+        voxels = self._spread(cells[rows], rows, found) if len(rows) else 0
+        self._known = bricks[sources != GONE]
+        runtime.settle()
+        return voxels
+
+    def _sources(self, m: QueriedMap, within: BrickBox | None) -> tuple[Bricks, NDArray[np.int32]]:
+        """The bricks (n, 3) that are known now or were at the last update, and where their states are
+        (n,)."""
+        reader = BrickReader(m)
+        bricks = reader.bricks
+        sources = reader.slots(bricks)
+        if self.rules.unknown != "free":
+            seen_free = seen_free_bricks(m)
+            bricks = np.concatenate([bricks, seen_free])
+            sources = np.concatenate([sources, np.full(len(seen_free), SEEN_FREE, np.int32)])
+        if within is not None:
+            inside = ((bricks >= within[0]) & (bricks <= within[1])).all(axis=1)
+            bricks, sources = bricks[inside], sources[inside]
+        gone = self._known[~np.isin(grid_keys(self._known), grid_keys(bricks))]
+        gone_sources = np.full(len(gone), GONE, np.int32)
+        return np.concatenate([bricks, gone]), np.concatenate([sources, gone_sources])
+
+    def _spread(self, cells: Cells, rows: NDArray[np.int32], found: "ti.Ndarray") -> int:
+        """Follow the new states ``found`` of some bricks; returns how many voxels changed their distance."""
+        made = [self._make(cells)]
+        keep_classes(found, rows, self._slots(cells), self.classes)
+        stretch = range(-self.rules.reach_bricks, self.rules.reach_bricks + 1)
+        column = self._beside(cells, 2, stretch)
+        made.append(self._make(column))
+        changed = _zeros(len(column))
+        along_z(column.astype(np.int32), self.grid, self._first, changed)
+        plane = self._beside(column[changed.to_numpy() > 0], 1, stretch)
+        made.append(self._make(plane))
+        if len(plane):
+            changed = _zeros(len(plane))
+            along_y(plane.astype(np.int32), self.grid, self._first, self._second, changed)
+            plane = plane[changed.to_numpy() > 0]
+        block = np.unique(np.concatenate([self._beside(plane, 0, stretch), cells, *made]))
+        made.append(self._make(block))
+        changed, counts = _zeros(len(block)), _zeros(len(block))
+        along_x(block.astype(np.int32), self.grid, self._second, self._metres, self.values, changed, counts)
+        self._join(np.concatenate([block[changed.to_numpy() > 0], *made]))
+        return int(counts.to_numpy().sum())
+
+    def _join(self, cells: Cells) -> None:
+        """Let bricks before some bricks know of their distances, and give back those that need no slots."""
+        if not len(cells):
+            return
+        for axis in range(3):
+            cells = self._beside(cells, axis, (-1, 0))
+        self._make(cells)
+        far, outside = _zeros(len(cells)), _zeros(len(cells))
+        far_m, outside_m = float(self.rules.metres[-1]), self.rules.outside_m
+        join_bricks(cells.astype(np.int32), self.grid, self.values, far_m, outside_m, far, outside)
+        all_far, all_outside = far.to_numpy() == SAMPLES, outside.to_numpy() == SAMPLES
+        self._drop(cells[all_far], FAR)
+        self._drop(cells[all_outside & ~all_far], OUTSIDE)
+
+    def _cells(self, bricks: Bricks) -> Cells:
+        return np.ravel_multi_index(tuple((bricks - self.lowest).T), self._codes.shape)
+
+    def _slots(self, cells: Cells) -> NDArray[np.int32]:
+        return self._codes.reshape(-1)[cells]
+
+    def _beside(self, cells: Cells, axis: int, steps: "range | tuple[int, ...]") -> Cells:
+        """Some bricks with those so many steps beside them along an axis, ascending. The window's margin
+        holds them all."""
+        step = int(np.prod(self._codes.shape[axis + 1 :]))
+        return np.unique((cells[:, None] + np.array(steps) * step).reshape(-1))
+
+    def _cover(self, bricks: Bricks) -> None:
+        """Let the window hold some bricks and all that their states can change. Raises CapacityError."""
+        margin = self.rules.reach_bricks + 1
+        lower, upper = bricks.min(axis=0) - margin, bricks.max(axis=0) + margin + 1
+        old_lower, old_shape = self.lowest, np.array(self._codes.shape)
+        if self._capacity:
+            lower, upper = np.minimum(lower, old_lower), np.maximum(upper, old_lower + old_shape)
+            if (lower == old_lower).all() and (upper == old_lower + old_shape).all():
+                return
+        shape = upper.astype(np.int64) - lower
+        check_memory(4.0 * float(np.prod(shape.astype(np.float64))), f"distances in {shape.tolist()} bricks")
+        codes = np.full(shape, OUTSIDE, np.int32)
+        if self._capacity:
+            place = tuple(slice(a, a + n) for a, n in zip(old_lower - lower, old_shape, strict=True))
+            codes[place] = self._codes
+        self.lowest, self._codes = lower.astype(np.int64), codes
+        self.grid = self._grid()
+
+    def _make(self, cells: Cells) -> Cells:
+        """Give slots to those of some bricks that have none; returns these. Raises CapacityError."""
+        codes = self._slots(cells)
+        new, codes = cells[codes < 0], codes[codes < 0]
+        if not len(new):
+            return new
+        if len(new) > len(self._free):
+            self._grow(self._capacity + len(new) - len(self._free))
+        slots = np.array([self._free.pop() for _ in new], np.int32)
+        outside = codes == OUTSIDE
+        squares = np.where(outside, self.rules.outside_square, self.rules.beyond).astype(np.int32)
+        fill_rows(
+            self.classes, slots, COLUMNS, np.where(outside, self.rules.outside_class, 0).astype(np.int32)
+        )
+        fill_rows(self._first, slots, VOXELS, squares)
+        fill_rows(self._second, slots, VOXELS, squares)
+        metres = np.where(outside, self.rules.outside_m, self.rules.metres[-1]).astype(np.float32)
+        fill_rows(self.values, slots, SAMPLES, metres)
+        self._codes.reshape(-1)[new] = slots
+        self.grid = self._grid()
+        return new
+
+    def _drop(self, cells: Cells, code: int) -> None:
+        """Give back the slots of bricks whose distances are all the same."""
+        if len(cells):
+            self._free += self._slots(cells).tolist()
+            self._codes.reshape(-1)[cells] = code
+            self.grid = self._grid()
+
+    def _grow(self, needed: int) -> None:
+        if needed > _MOST_BRICKS:
+            raise CapacityError(
+                f"distances in {needed} bricks of {BRICK}^3 voxels are wanted and the most is "
+                f"{_MOST_BRICKS}; choose a smaller max_distance_m, a box, or larger voxels"
+            )
+        capacity = max(needed, min(_MOST_BRICKS, int(self._capacity * _GROWTH)), _LEAST_CAPACITY)
+        check_memory(
+            float(capacity) * _BYTES_PER_BRICK, f"distances in {capacity} bricks of {BRICK}^3 voxels"
+        )
+        for name, size in (
+            ("classes", COLUMNS),
+            ("_first", VOXELS),
+            ("_second", VOXELS),
+            ("values", SAMPLES),
+        ):
+            old = getattr(self, name)
+            new = ti.ndarray(old.dtype, capacity * size)
+            copy_all(old, new, self._capacity * size)
+            runtime.settle()
+            setattr(self, name, new)
+        self._free += range(capacity - 1, self._capacity - 1, -1)
+        self._capacity = capacity
+
+    def _grid(self) -> FieldGrid:
+        runtime.settle()  # before the old index is dropped
+        shape = ti.Vector(list(self._codes.shape), ti.i32)
+        index = resident(self._codes.reshape(-1))
+        rules = self.rules
+        return FieldGrid(shape, index, self.classes, rules.outside_class, rules.reach, rules.outside_square)
+
+
+def _zeros(length: int) -> "ti.Ndarray":
+    """Counters that kernels write here and there."""
+    array = ti.ndarray(ti.i32, length)
+    array.fill(0)
+    return array

@@ -1,0 +1,154 @@
+"""Where a distance field keeps what it knows of a brick, and which of the brick's voxels are obstacles."""
+
+from dataclasses import dataclass
+
+from taichi_mrf.kernels.bundles import Bundle, kernel
+from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, I32Array, IVec3, IVec8, Template
+from taichi_mrf.queries.points import OCCUPIED, UNKNOWN, state_of
+from taichi_mrf.system.compiler import ti
+from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.numbering import flat
+from taichi_mrf.voxels.traversal import within
+
+OUTSIDE, FAR = -1, -2
+"""In place of a slot: bricks of unknown space, and free ones, that are further from all else than distances
+go."""
+
+GONE, SEEN_FREE = -1, -2
+"""In place of a slot in the map's pool: a brick that the map no longer has, and one that rays have crossed
+and that has no voxels."""
+
+COLUMNS = BRICK**2
+"""Columns along z of a brick."""
+
+SIDE = BRICK + 1
+SAMPLES = SIDE**3
+"""Distances that a brick keeps: those of its voxels and of the layer after them along each axis, so that what
+lies between eight voxels is read from one brick."""
+
+UNKNOWN_BITS, FLIPPED_BITS = 8, 16
+ALL_BITS = (1 << BRICK) - 1
+KEPT_BITS = (1 << FLIPPED_BITS) - 1
+"""Where a column of voxels has its bits (FieldGrid.classes)."""
+
+
+@dataclass(frozen=True)
+class FieldGrid(Bundle):
+    """Where the bricks of a field are, and what space without bricks is."""
+
+    shape: IVec3
+    """Size of the window in bricks."""
+
+    index: I32Array
+    """(bricks of the window): the brick's slot in the field, OUTSIDE or FAR."""
+
+    classes: I32Array
+    """(slots * 64): for each column along z the obstacles in its lowest 8 bits, voxels whose distance is not
+    known in the next 8, and those that have just become so, or known again, in the next 8."""
+
+    outside_class: I32
+    """The same of a column in unknown space."""
+
+    reach: I32
+    """How many voxels a minimum looks to either side."""
+
+    outside: I32
+    """The squared distance in unknown space, -(reach + 1)^2 where that is an obstacle."""
+
+    @ti.func
+    def slot(self, cell: IVec3):
+        """The slot of a brick of the window, OUTSIDE or FAR."""
+        slot = OUTSIDE
+        if within(cell, self.shape):
+            slot = self.index[flat(cell, self.shape)]
+        return slot
+
+    @ti.func
+    def cell(self, number: I32):
+        """The brick of the window with this number."""
+        across = self.shape[1] * self.shape[2]
+        return IVec3(number // across, number // self.shape[2] % self.shape[1], number % self.shape[2])
+
+    @ti.func
+    def column(self, cell: IVec3, number: I32):
+        """What the voxels of a column of a brick are."""
+        slot = self.slot(cell)
+        found = 0
+        if slot >= 0:
+            found = self.classes[slot * COLUMNS + number]
+        elif slot == OUTSIDE:
+            found = self.outside_class
+        return found
+
+    @ti.func
+    def is_unknown(self, voxel: IVec3):
+        """1 for a voxel of the window whose distance is not known."""
+        column = self.column(voxel >> 3, (voxel[0] & 7) * BRICK + (voxel[1] & 7))
+        return (column >> ((voxel[2] & 7) + UNKNOWN_BITS)) & 1
+
+    @ti.func
+    def column_of(self, sums: Template, cell: IVec3, number: I32) -> IVec8:
+        """The values of ``sums`` (slots * 512) in a column of a brick."""
+        slot = self.slot(cell)
+        found = IVec8(self.outside)
+        if slot >= 0:
+            for k in ti.static(range(BRICK)):
+                found[k] = sums[slot * VOXELS + number * BRICK + k]
+        elif slot == FAR:
+            found = IVec8((self.reach + 1) * (self.reach + 1))
+        return found
+
+
+@kernel
+def classify_bricks(
+    belief: F32Array, sources: I32Array, cells: I32Array, prior: F32, min_evidence: F32,
+    obstacles_unknown: I32, distances_unknown: I32, grid: FieldGrid, found: I32Array, changed: I32Array,
+) -> None:  # fmt: skip
+    """What the voxels of some bricks are now, into ``found`` (n * 64), and which bricks differ from
+    ``grid.classes``: ``changed`` (n) becomes 1 there.
+
+    ``belief`` (pool * 512) are the map's log-odds, ``sources`` (n) the bricks' slots in its pool, GONE or
+    SEEN_FREE, ``cells`` (n) their numbers in the window. ``obstacles_unknown`` and ``distances_unknown`` tell
+    whether unknown voxels are obstacles, or have no distance.
+    """
+    for part in range(cells.shape[0] * COLUMNS):
+        row, number = part // COLUMNS, part % COLUMNS
+        column = grid.outside_class
+        if sources[row] == SEEN_FREE:
+            column = 0
+        elif sources[row] >= 0:
+            column = 0
+            for k in range(BRICK):
+                here = state_of(belief[sources[row] * VOXELS + number * BRICK + k], prior, min_evidence)
+                if here == OCCUPIED or (here == UNKNOWN and obstacles_unknown == 1):
+                    column |= 1 << k
+                elif here == UNKNOWN and distances_unknown == 1:
+                    column |= 1 << (k + UNKNOWN_BITS)
+        found[part] = column
+        if column != grid.column(grid.cell(cells[row]), number) & KEPT_BITS:
+            changed[row] = 1
+
+
+@kernel
+def keep_classes(found: I32Array, rows: I32Array, slots: I32Array, classes: I32Array) -> None:
+    """Copy the rows (k) of ``found`` (n * 64) to the bricks in ``slots`` (k) of ``classes`` (slots * 64)."""
+    for part in range(rows.shape[0] * COLUMNS):
+        row, number = part // COLUMNS, part % COLUMNS
+        place, column = slots[row] * COLUMNS + number, found[rows[row] * COLUMNS + number]
+        flipped = ((classes[place] ^ column) >> UNKNOWN_BITS) & ALL_BITS
+        classes[place] = column | (flipped << FLIPPED_BITS)
+
+
+@kernel
+def fill_rows(channel: AnyArray, slots: I32Array, size: I32, values: AnyArray) -> None:
+    """Set all of the ``size`` entries of the bricks in ``slots`` (k) of a ``channel`` to the brick's one of
+    ``values`` (k)."""
+    for part in range(slots.shape[0] * size):
+        channel[slots[part // size] * size + part % size] = values[part // size]
+
+
+@kernel
+def copy_all(source: AnyArray, target: AnyArray, count: I32) -> None:
+    """Copy the first ``count`` entries."""
+    for i in range(count):
+        target[i] = source[i]

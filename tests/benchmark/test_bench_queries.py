@@ -1,0 +1,93 @@
+"""The benchmark of queries asks the same of the same map, and says who is missing."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import small_room
+from console import as_process
+
+from taichi_mrf import ExportOptions, cast_rays, export_map
+from taichi_mrf.benchmark import queries
+from taichi_mrf.benchmark.keyframe_cost import Seconds
+from taichi_mrf.cli.bench.query_tables import query_tables
+from taichi_mrf.cli.options.bench import Bench
+from taichi_mrf.config.schema import Config
+from taichi_mrf.errors import ConfigError
+
+NAMES = {"occupancy", "state", "distance", "distance and gradient", "balls", "rays"}
+
+
+@pytest.mark.usefixtures("backend")
+def test_all_queries_are_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("POINTS", "RAYS", "BODIES"):
+        monkeypatch.setattr(queries, name, 60)
+    done: list[int] = []
+    row = queries.bench_queries(small_room.frames()[:3], Config(voxel_size=0.1), done.append)
+    assert done == [1, 2, 3]
+    assert set(row.rates) == NAMES
+    assert {name: rate.count for name, rate in row.rates.items() if rate.count != 60} == {"balls": 3000}
+    assert all(rate.seconds.wall > 0 for rate in (*row.rates.values(), *row.peers.values()))
+    assert 0 < row.changed < row.box_voxels * 8
+    missing = queries.missing_peers()
+    peers = {"OctoMap": "OctoMap's search", "Open3D": "Open3D's rays"}
+    assert set(row.peers) == {title for name, title in peers.items() if name not in missing}
+    figures = json.loads(json.dumps(row.to_json()))
+    assert figures["rates"]["rays"]["millions"] == pytest.approx(row.rates["rays"].millions)
+    assert [table.row_count for table in query_tables([row], "a room")] == [6 + len(row.peers), 6]
+
+
+def test_rates_are_counts_by_seconds() -> None:
+    rate = queries.Rate(3_000_000, Seconds(wall=1.5, cpu=3.0))
+    assert (rate.millions, rate.cpu_millions) == (2.0, 1.0)
+
+
+def test_the_command_says_who_is_missing(tmp_path: Path) -> None:
+    out = tmp_path / "queries.json"
+    source = "synthetic:room?width=64&height=48&frames=3"
+    done = as_process(
+        "bench", source, "--queries", "--voxel-sizes", "0.2", "--runtime.arch", "cpu", "--json", str(out)
+    )
+    assert done.returncode == 0, done.stderr
+    report = json.loads(out.read_text(encoding="utf-8"))
+    assert report["measured"] == "queries"
+    assert set(report["rows"][0]["rates"]) == NAMES
+    assert "distance and gradient" in done.stdout
+    for name in ("OctoMap", "Open3D"):
+        line = f"{name} is left out: pip install 'taichi-mrf[bench]' brings it."
+        assert (line in done.stdout) == (name in queries.missing_peers())
+
+
+def test_queries_are_not_drawn() -> None:
+    with pytest.raises(ConfigError, match="--plot does not go with --queries"):
+        Bench(queries=True, plot=Path("a.png"))
+    with pytest.raises(ConfigError, match="--profile and --queries do not go together"):
+        Bench(queries=True, profile=True)
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_octomap_is_asked_about_the_same_map(tmp_path: Path) -> None:
+    pytest.importorskip("pyoctomap", reason="OctoMap is not installed: pip install 'taichi-mrf[octomap]'")
+    m = small_room.build([0, 1, 2])
+    points = np.random.default_rng(0).uniform(*queries._extent(m), (2000, 3))
+    export_map(m, tmp_path / "map.bt", ExportOptions(cells=False))
+    labels = np.asarray(queries._octomap_search(tmp_path / "map.bt", m.voxel_size, points)())
+    np.testing.assert_array_equal(labels, m.state(points).astype(int) - 1)
+    assert len(np.unique(labels)) == 3
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_open3d_follows_rays_to_the_same_voxels(tmp_path: Path) -> None:
+    pytest.importorskip("open3d", reason="Open3D is not installed: pip install 'taichi-mrf[bench]'")
+    m = small_room.build([0, 1, 2])
+    random = np.random.default_rng(1)
+    starts = random.uniform(*queries._extent(m), (500, 3))
+    ways = random.normal(size=starts.shape)
+    free = m.state(starts) == 1
+    export_map(m, tmp_path / "map.ply", ExportOptions(cubes=True, cells=False))
+    found = queries._open3d_rays(tmp_path / "map.ply", starts[free], ways[free])()["t_hit"].numpy()
+    ours = cast_rays(m, starts[free], ways[free], 50.0)
+    agree = np.where(ours.hit, np.abs(ours.range - found) < 1e-3, np.isinf(found))
+    assert ours.hit.any()
+    assert agree.mean() > 0.99
