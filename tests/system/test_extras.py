@@ -18,8 +18,9 @@ if sys.version_info >= (3, 11):
 else:
     tomllib = None
 
-FOR_ANOTHER_PURPOSE = {"dev", "docs", "octomap"}
-"""No command needs these: two serve who works on the program, and octomap is another name of bench."""
+FOR_ANOTHER_PURPOSE = {"dev", "docs", "octomap", "quadrants"}
+"""No command needs these: two serve who works on the program, octomap is another name of bench, and quadrants
+is a second compiler."""
 
 TRIANGLE = "v 0 0 2\nv 1 0 2\nv 0 1 2\nf 1 2 3\n"
 POSES = "0 0 0 0 0 0 0 1\n1 0.1 0 0 0 0 0 1\n"
