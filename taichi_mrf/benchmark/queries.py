@@ -1,6 +1,7 @@
 """How fast a planner's queries are: million points a second, beside OctoMap, SciPy and Open3D on the same
 map.
- The peers get the map itself, as a file: OctoMap an octree of it, Open3D its voxels as cubes, SciPy the
+
+The peers get the map itself, as a file: OctoMap an octree of it, Open3D its voxels as cubes, SciPy the
 states of the box around it. Points lie anywhere in this box, rays begin there in any direction. The first
 call, which compiles kernels, does not count; of those after it the fastest does.
 """

@@ -1,5 +1,6 @@
 """How far it is to the nearest obstacle, and which way leads away from it: what planners ask.
- The distances are exact at the centres of voxels and linear between them along each axis, so that the
+
+The distances are exact at the centres of voxels and linear between them along each axis, so that the
 gradient is that of what is returned. They are cut off at a stated distance, which bounds what a change of the
 map reaches.
 """

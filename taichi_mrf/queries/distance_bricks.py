@@ -1,6 +1,7 @@
 """The bricks of a distance field: made where there is a distance to keep, and worked out again where states
 change.
- A window of bricks around all that is known says where each one's distances are. Bricks of free or unknown
+
+A window of bricks around all that is known says where each one's distances are. Bricks of free or unknown
 space that are further from all else than distances go need none. An update compares the states of the map
 with those that it kept, and follows what differs along z, then y, then x, each time only from bricks whose
 sums did change.

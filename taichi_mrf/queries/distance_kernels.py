@@ -3,11 +3,13 @@
 The squared distance to the nearest obstacle splits into one minimum for each axis,
 
     d^2(x, y, z) = min over x' of (x - x')^2 + min over y' of (y - y')^2 + min over z' of (z - z')^2,
- taken over the obstacles at (x', y', z') (Felzenszwalb & Huttenlocher, Theory of Computing 8, 2012).
+
+taken over the obstacles at (x', y', z') (Felzenszwalb & Huttenlocher, Theory of Computing 8, 2012).
 Distances are cut off, so each minimum runs over a bounded stretch of a line, and a change reaches no further
 than that. All of it is in whole voxels: a field that was updated equals one that is made anew, bit for bit,
 on every backend.
- A voxel that is no obstacle has the squared distance to the nearest obstacle, an obstacle that to the nearest
+
+A voxel that is no obstacle has the squared distance to the nearest obstacle, an obstacle that to the nearest
 other voxel, negative. In both sums the voxels of the other kind have the distance 0, so one number serves for
 both.
 """

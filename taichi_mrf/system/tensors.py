@@ -1,6 +1,7 @@
 """Arrays of other libraries as arguments: what speaks DLPack is read where it lies, and answers come back in
 kind.
- A tensor in the host's memory is read as a NumPy array of the same memory. One of torch's in a CUDA device's
+
+A tensor in the host's memory is read as a NumPy array of the same memory. One of torch's in a CUDA device's
 memory goes to kernels as it is where Taichi runs on CUDA. No library is imported here: who passes a tensor
 has done so.
 """
