@@ -20,7 +20,7 @@ from taichi_mrf.alignment.levels import (
 from taichi_mrf.alignment.levenberg import Aligned
 from taichi_mrf.alignment.locate_around import FINEST_CELLS_M, found_around
 from taichi_mrf.alignment.oriented_points import OrientedPoints, oriented_points
-from taichi_mrf.alignment.point_to_plane import LARGEST_COST, NormalEquations
+from taichi_mrf.alignment.point_to_plane import LARGEST_COST, NormalEquations, PointToPlane
 from taichi_mrf.alignment.recorded import Recorded
 from taichi_mrf.alignment.seen_through import Sightlines, looked_through
 from taichi_mrf.alignment.surfel_grid import SurfelGrid
@@ -41,8 +41,8 @@ OBSERVABLE = 0.0005
 drifts: with ten times as much a camera at 30 images a second slid 20 cm along a wall of the built-in room."""
 
 OBSERVABLE_BY_DEPTH = 0.005
-"""The same for depth alone where the guess is seen in the colours, and right to a centimetre. With a tenth of
-it, depth carries a handheld camera 32 cm away from there at a door."""
+"""The same where the guess is seen in the colours, and right to a centimetre, and where depth would carry the
+camera far away. With a tenth of it, depth carries a handheld camera 32 cm away from where colours show it."""
 
 WELL = 0.7
 """Share of the points that must lie on the map at a pose near a guess, or a sensor that sees around is
@@ -55,6 +55,10 @@ corridor are put 1.6 m from where they were taken, at the door before, with fits
 
 WORSE_BY_COLOR = 0.02
 """How much fewer of its points may agree with the map where its colours fit than where its depth does."""
+
+CARRIED_M = 0.08
+"""Metres from a guess beyond which the directions that depth determines badly have to prove themselves: the
+pose without them must be as near to it. At a door they carry a handheld camera up to 27 cm away."""
 
 AHEAD_M = 1.0
 """Metres by which the surface's grids reach beyond the points, so that they serve more than one image."""
@@ -136,7 +140,8 @@ class Locator:
         lever_m = float(np.median(np.linalg.norm(points.points, axis=1)))
         priors = [Recorded(T, config) for T in guesses]
         ends = [
-            aligned(levels, T, prior, lever_m, observable) for T, prior in zip(guesses, priors, strict=True)
+            _not_carried_away(levels, T, prior, lever_m, observable)
+            for T, prior in zip(guesses, priors, strict=True)
         ]
         # Where depth determines too little, ends that fit alike differ in how far they are from their guess.
         worth = max(end.equations.worth for end in ends)
@@ -169,6 +174,19 @@ class Locator:
             self._grids = grids_of(self._surface.around(*self._box), FIRST_CELLS_M, finest_m)
             self._revision = self._surface.revision
         return self._grids
+
+
+def _not_carried_away(
+    levels: Sequence[PointToPlane], guess: Pose, prior: Recorded, lever_m: float, observable: float
+) -> Aligned:
+    """Where a search from a guess ends, and if that is far from there, without the directions that depth
+    determines badly, unless these change little."""
+    end = aligned(levels, guess, prior, lever_m, observable)
+    if tangent_norms(guess, end.T_world_camera)[1] < CARRIED_M:
+        return end
+    sure = aligned(levels, guess, prior, lever_m, OBSERVABLE_BY_DEPTH)
+    carried_m = tangent_norms(sure.T_world_camera, end.T_world_camera)[1]
+    return end if carried_m < CARRIED_M else sure
 
 
 def _judged(end: Aligned, reason: str, config: PoseConfig) -> Located:
