@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import small_room
 from hand_made import PRIOR, VOXEL
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from queried_maps import HandMap, hand_map, map_of, room_map
 from scipy.ndimage import distance_transform_edt
@@ -171,10 +171,11 @@ class Edited:
         self.crossed ^= {brick}
 
     def edit(self, random: np.random.Generator) -> None:
-        """A brick is written, in part or as a whole, goes, or is seen to be free."""
+        """A brick is written, in part or as a whole, goes, or is seen to be free. One is left: seen-free
+        bricks are looked for around those with voxels and cameras, and there are no cameras here."""
         x, y, z = np.add(random.integers(-1, 2, 3), (-1, 0, 1)).tolist()
         what = random.integers(5)
-        if what == 0:
+        if what == 0 and len(self.slots) > 1:
             self.remove((x, y, z))
         elif what == 1:
             self.cross((x, y, z))
@@ -189,6 +190,7 @@ def edited(backend: str) -> Edited:
     return Edited(backend)
 
 
+@example(190558, [1], "occupied", 0.04)  # bricks that are seen to be free, and hardly any others
 @given(
     st.integers(0, 2**32 - 1),
     st.lists(st.integers(1, 3), min_size=1, max_size=3),
@@ -200,6 +202,7 @@ def test_a_field_that_follows_edits_is_the_field_made_anew(
 ) -> None:
     random = np.random.default_rng(seed)
     edited.clear()
+    edited.write((-1, 0, 1), np.full(VOXELS, PRIOR))
     for _ in range(4):
         edited.edit(random)
     points = centres(np.array([-28, -20, -12]), np.array([20, 28, 36]), VOXEL)
