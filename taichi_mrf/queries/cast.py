@@ -14,7 +14,7 @@ from taichi_mrf.queries.points import OCCUPIED, UNKNOWN, state_of
 from taichi_mrf.queries.ray_space import RaySpace
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.compiler import ti
-from taichi_mrf.voxels.layout import BRICK
+from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_voxels
 from taichi_mrf.voxels.window import Window
 
@@ -23,6 +23,11 @@ Unknown = Literal["free", "stop", "hit"]
 
 _POLICIES: dict[str, int] = {"free": 0, "stop": 1, "hit": 2}
 _PASSED, _HIT, _STOPPED = 0, 1, 2
+
+
+RAYS_A_BRICK = 4
+"""From so many rays for each brick on, bricks are looked through for occupied voxels first: this takes about
+the time that four rays save."""
 
 
 @dataclass(frozen=True)
@@ -56,11 +61,13 @@ def cast_rays(
     end_m = np.full(len(start), max_range, np.float32)
     outcome = np.full(len(start), _PASSED, np.int32)
     if len(start):
-        points = np.concatenate([start, start + along * max_range])
+        # Column by column: NumPy takes ten times as long over rows of three numbers.
+        columns = [np.concatenate([a, a + b * max_range]) for a, b in zip(start.T, along.T, strict=True)]
+        corners = np.array([[each.min() for each in columns], [each.max() for each in columns]])
         if unknown == "free":
-            _through_voxels(m, start, along, points, end_m, outcome)
+            _through_voxels(m, start, along, corners, end_m, outcome)
         else:
-            _through_space(m, start, along, points, end_m, outcome)
+            _through_space(m, start, along, corners, end_m, outcome)
     ended_in_unknown = outcome == _STOPPED
     hit = outcome == _HIT
     if unknown == "hit":
@@ -94,12 +101,12 @@ def _through_voxels(
     m: QueriedMap,
     start: NDArray[np.float64],
     along: NDArray[np.float64],
-    points: NDArray[np.float64],
+    corners: NDArray[np.float64],
     end_m: NDArray[np.float32],
     outcome: NDArray[np.int32],
 ) -> None:
     """Past everything but occupied voxels: only bricks that exist need to be looked at."""
-    filled = m.view.fill(points)
+    filled = m.view.fill(corners, lambda slots: _may_end_rays(m, slots, len(start)))
     if filled is None:
         return
     window, cells = filled
@@ -112,14 +119,14 @@ def _through_space(
     m: QueriedMap,
     start: NDArray[np.float64],
     along: NDArray[np.float64],
-    points: NDArray[np.float64],
+    corners: NDArray[np.float64],
     end_m: NDArray[np.float32],
     outcome: NDArray[np.int32],
 ) -> None:
     """As far as space is known. A layer of unknown bricks lies around it, so no ray leaves the window."""
     space = RaySpace(m)
     known = space.known_box_m()
-    lower, upper = points.min(axis=0), points.max(axis=0)
+    lower, upper = corners
     if known is not None:
         lower, upper = np.maximum(lower, known[0]), np.minimum(upper, known[1])
     if known is None or (lower > upper).any():
@@ -131,6 +138,17 @@ def _through_space(
         local = window.to_voxels(start)
         outside = ((local < 0) | (local >= np.array(window.shape) * BRICK)).any(axis=1)
     end_m[outside], outcome[outside] = 0.0, _STOPPED
+
+
+def _may_end_rays(m: QueriedMap, slots: NDArray[np.int32], rays: int) -> NDArray[np.bool_]:
+    """Which of some bricks (n,) hold an occupied voxel: the others are passed in one step. Where rays are
+    few, looking would cost more than it saves, and it is all of them."""
+    marks = np.ones(len(slots), np.int32)
+    if rays >= RAYS_A_BRICK * len(slots):
+        pool = m.view.pool
+        _mark_occupied(slots, pool.belief, pool.prior_log_odds, m.view.volume.min_evidence, marks)
+        runtime.settle()
+    return marks > 0
 
 
 def _launch(
@@ -179,6 +197,18 @@ def _look(search: Template, belief: Template, voxel: I32, near: F32, far: F32):
         search.outcome = found
         search.end_m = near
     return ti.cast(found == _PASSED, ti.i32)
+
+
+@kernel
+def _mark_occupied(slots: I32Array, belief: F32Array, prior: F32, min_evidence: F32, marks: I32Array) -> None:
+    """Write to ``marks`` (n) whether a voxel of the brick in ``slots`` (n) is occupied."""
+    for i in range(slots.shape[0]):
+        found, k = 0, 0
+        while k < VOXELS and found == 0:
+            log_odds = belief[slots[i] * VOXELS + k]
+            found = ti.cast(state_of(log_odds, prior, min_evidence) == OCCUPIED, ti.i32)
+            k += 1
+        marks[i] = found
 
 
 @kernel

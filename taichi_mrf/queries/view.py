@@ -1,6 +1,7 @@
 """Looking at the map: what a camera would see in it, and what a single ray meets."""
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -127,8 +128,14 @@ class View:
         runtime.settle()
         return RayProfile(*[a[: count[0]].copy() for a in out])
 
-    def fill(self, points_m: NDArray[np.float64]) -> tuple[Window, NDArray[np.int32]] | None:
+    def fill(
+        self,
+        points_m: NDArray[np.float64],
+        keep: Callable[[NDArray[np.int32]], NDArray[np.bool_]] | None = None,
+    ) -> tuple[Window, NDArray[np.int32]] | None:
         """Index the bricks in the box around some points (n, 3); None if there are none.
+
+        ``keep`` says of slots (n,) which of them to index, all if it is not given.
 
         Returns the window and its cells that were filled, with which ``index.clear`` must follow.
         """
@@ -138,6 +145,8 @@ class View:
         upper = np.floor(points_m.max(axis=0) / brick_m)
         bricks = self.pool.bricks[slots]
         inside = ((bricks >= lower) & (bricks <= upper)).all(axis=1)
+        if keep is not None and inside.any():
+            inside[inside] = keep(slots[inside])
         if not inside.any():
             return None
         slots, bricks = slots[inside], bricks[inside]

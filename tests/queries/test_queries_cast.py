@@ -8,6 +8,7 @@ from queried_maps import HandMap, hand_map, room_map
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.queries import cast
 from taichi_mrf.queries.cast import RayHits, cast_rays
 
 MAX_RANGE = 3.0
@@ -39,8 +40,12 @@ def expected(
     return False, MAX_RANGE, False
 
 
+@pytest.mark.parametrize("rays_a_brick", [0, 10**9], ids=["bricks looked through", "all bricks"])
 @pytest.mark.parametrize("unknown", ["free", "stop", "hit"])
-def test_rays_end_where_the_oracle_says(hand: HandMap, unknown: str) -> None:
+def test_rays_end_where_the_oracle_says(
+    hand: HandMap, unknown: str, rays_a_brick: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cast, "RAYS_A_BRICK", rays_a_brick)
     origins, directions = rays(hand, 400, seed=3)
     found = cast_rays(hand, origins, directions, MAX_RANGE, unknown)  # type: ignore[arg-type]
     wanted = [expected(hand, o, d, unknown) for o, d in zip(origins, directions, strict=True)]
