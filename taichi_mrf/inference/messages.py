@@ -18,7 +18,7 @@ from taichi_mrf.voxels.strips import strip_begin, strip_length
 def new_messages(visible: VisibleBricks, precision: str) -> "ti.Ndarray":
     """(bricks * 512) messages of log-odds 0, in float16 or float32."""
     messages = ti.ndarray(ti.f16 if precision == "float16" else ti.f32, max(1, len(visible.cells)) * VOXELS)
-    messages.fill(0)
+    _clear(messages, strip_length())
     return messages
 
 
@@ -105,6 +105,14 @@ def _count_evidence(slots: I32Array, evidence: F32Array, prior: F32, counts: I32
         i, j = strip_begin(part, slots, strip)
         for k in range(strip):
             counts[i + k] += ti.cast(evidence[j + k] != prior, ti.i32)
+
+
+@ti.kernel
+def _clear(messages: AnyArray, strip: Template):
+    """Set messages (bricks * 512) to 0."""
+    for part in range(messages.shape[0] // strip):
+        for k in range(strip):
+            messages[part * strip + k] = 0.0
 
 
 @ti.kernel

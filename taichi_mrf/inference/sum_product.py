@@ -334,14 +334,15 @@ def finish(
         i, j = strip_begin(part, slots, strip)
         count = 0
         for k in range(strip):
-            if length_sum(sums[i + k], scale) > min_length:
-                mean = mean_message(sums[i + k])
+            packed = sums[i + k]
+            if packed != 0 and length_sum(packed, scale) > min_length:
+                mean = mean_message(packed)
                 log_odds = clamp * (2.0 * mean - 1.0)
                 if not ti.static(log_average):
                     log_odds = ti.log(ti.max(mean, TINY) / ti.max(1.0 - mean, TINY))
                     log_odds = ti.max(-clamp, ti.min(clamp, log_odds))
                 if ti.static(repeated):
-                    log_odds *= independent_rays(length_sum(sums[i + k], scale), correlation)
+                    log_odds *= independent_rays(length_sum(packed, scale), correlation)
                     log_odds = ti.max(-clamp, ti.min(clamp, log_odds))
                 old = ti.cast(messages[i + k], ti.f32)
                 messages[i + k] = old + (1.0 - damping) * (log_odds - old)
