@@ -20,7 +20,7 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import exp_of_negative
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template
-from taichi_mrf.queries.occlusion import occlusion, stopped_share
+from taichi_mrf.queries.occlusion import Occlusion, occlusion, stopped_share
 from taichi_mrf.queries.survey import OPAQUE
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.camera import Camera
@@ -45,8 +45,6 @@ class Prediction(Struct):
     """What is known of a ray on its way from the camera; depths are axial, in metres."""
 
     voxels_per_depth: F32
-    unknown: F32
-    empty_below: F32
     measured: F32
     visibility: F32
     below: F32  # probability of a surface so far whose measurement is no more than that
@@ -75,7 +73,7 @@ def probability_below(
             chosen, np.ascontiguousarray(measured_m.reshape(-1)[chosen], np.float32),
             noise.sensor(camera), window.viewpoint(T_world_camera),
             view.index.space(window, view.volume.lower, view.volume.upper), view.pool.belief,
-            max_depth, view.occlusion.unknown, view.occlusion.empty_below, below,
+            max_depth, view.predicting, below,
         )  # fmt: skip
         view.index.clear(window, cells)
         runtime.settle()
@@ -132,16 +130,18 @@ def _mean_below(low: F32, high: F32) -> F32:
 
 @dataclass(frozen=True)
 class _Predicted(Bundle):
-    """What a step along a ray reads: log-odds (pool * 512), and the noise of the ray's pixel."""
+    """What a step along a ray reads: log-odds (pool * 512), how voxels dim the ray, and the noise of its
+    pixel."""
 
     belief: F32Array
+    occlusion: Occlusion
     noise: Template
 
 
 @ti.func
 def _predict_voxel(ray: Template, predicted: Template, voxel: I32, near: F32, far: F32):
     """One voxel of a ray, whose segment in it reaches from axial depth ``near`` to ``far``."""
-    alpha = occlusion(predicted.belief[voxel], ray.unknown, ray.empty_below)
+    alpha = occlusion(predicted.belief[voxel], predicted.occlusion)
     thickness = alpha * (far - near) * ray.voxels_per_depth
     here = ray.visibility * stopped_share(thickness)
     ray.visibility *= exp_of_negative(-thickness)
@@ -155,7 +155,7 @@ def _predict_voxel(ray: Template, predicted: Template, voxel: I32, near: F32, fa
 @kernel
 def _follow(
     chosen: I32Array, measured: F32Array, sensor: Sensor, view: Viewpoint, space: Space, belief: F32Array,
-    max_depth: F32, unknown: F32, empty_below: F32, below: F32Array,
+    max_depth: F32, rule: Occlusion, below: F32Array,
 ) -> None:  # fmt: skip
     """Follow the rays of the ``chosen`` pixels (n) up to ``max_depth`` metres.
 
@@ -165,8 +165,10 @@ def _follow(
     for i in range(chosen.shape[0]):
         u, v = sensor.pixel(chosen[i])
         path = pixel_ray(sensor, view, u, v)
-        ray = Prediction(path.direction.norm(), unknown, empty_below, measured[i], 1.0, 0.0)
+        ray = Prediction(path.direction.norm(), measured[i], 1.0, 0.0)
         begin, end = 0.0, max_depth
         clip(path, begin, end, space.lower, space.upper)
-        walk_voxels(path, begin, end, space, _predict_voxel, ray, _Predicted(belief, sensor.noise_at(u, v)))
+        walk_voxels(
+            path, begin, end, space, _predict_voxel, ray, _Predicted(belief, rule, sensor.noise_at(u, v))
+        )
         below[i] = ray.below + ray.visibility * ti.min(1.0, ray.measured / max_depth)

@@ -105,9 +105,10 @@ class BrickMap(Owned):
         seen_free_log_odds: float,
         shown: VolumeConfig,
         occlusion: Occlusion,
+        predicting: Occlusion | None = None,
     ) -> None:
-        """Set the configuration and the noise, and make the empty grid. ``shown`` and ``occlusion``
-        are the View's."""
+        """Set the configuration and the noise, and make the empty grid. ``shown``, ``occlusion`` and
+        ``predicting`` are the View's."""
         if noise is not None:
             instance(noise, NoiseModel, "noise", "a noise model such as PolynomialNoise")
         runtime.init()
@@ -121,7 +122,7 @@ class BrickMap(Owned):
         self._registry = BrickRegistry(topology, self._pool, self.voxel_size)
         self.seen_free_log_odds = seen_free_log_odds
         self._up: Up | None = None
-        self.view = View(self._pool, self.voxel_size, shown, occlusion)
+        self.view = View(self._pool, self.voxel_size, shown, occlusion, predicting)
 
     @classmethod
     def from_config(cls: type[MapT], config: Config, camera: Camera) -> MapT:

@@ -12,16 +12,19 @@ that integrate scan by scan. What rays pass as empty holds nothing to be learnt:
 were seen to be free, and in maps that integrate scan by scan the free voxels (see Occlusion.empty_below).
 """
 
+import dataclasses
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.geometry.poses import Pose, as_pose
-from taichi_mrf.kernels.bundles import kernel
+from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import exp_of_negative, logistic
 from taichi_mrf.kernels.types import F32, I32, F32Array, Struct, Template
 from taichi_mrf.queries.known_bricks import QueriedMap
-from taichi_mrf.queries.occlusion import occlusion, stopped_share
+from taichi_mrf.queries.occlusion import Occlusion, occlusion, stopped_share
 from taichi_mrf.queries.ray_space import RaySpace
 from taichi_mrf.queries.survey import OPAQUE
 from taichi_mrf.sensor.camera import Camera
@@ -78,7 +81,8 @@ def _gain(space: RaySpace, camera: Camera, T_world_camera: Pose, max_depth: floa
         view = m.view
         _gain_rays(
             camera.in_kernels(), window.viewpoint(T_world_camera), view.index.space(window), view.pool.belief,
-            max_depth, view.pool.prior_log_odds, view.occlusion.empty_below, space.unknown_from, gain,
+            max_depth, view.pool.prior_log_odds, dataclasses.replace(view.occlusion, unknown=FAR),
+            space.unknown_from, gain,
         )  # fmt: skip
         runtime.settle()
     return gain.reshape(camera.shape)
@@ -90,10 +94,17 @@ class _Look(Struct):
 
     voxels_per_depth: F32  # length of the ray, in voxels, for one metre of depth
     prior: F32
-    empty_below: F32
     unknown_from: I32
     visibility: F32  # what is left of the ray
     bits: F32  # gained so far
+
+
+@dataclass(frozen=True)
+class _Learnt(Bundle):
+    """What a step along a ray reads: log-odds (pool * 512), and how voxels dim the ray."""
+
+    belief: F32Array
+    occlusion: Occlusion
 
 
 @ti.func
@@ -107,18 +118,17 @@ def _entropy(log_odds: F32):
 
 
 @ti.func
-def _learn(look: Template, belief: Template, voxel: I32, near: F32, far: F32):
+def _learn(look: Template, learnt: Template, voxel: I32, near: F32, far: F32):
     """One voxel of a ray."""
     log_odds = look.prior
     if voxel < look.unknown_from:
-        log_odds = belief[voxel]
+        log_odds = learnt.belief[voxel]
     length = (far - near) * look.voxels_per_depth
-    # Unknown voxels dim here, in every kind of map: what lies behind them is less likely to be seen.
-    alpha = occlusion(log_odds, FAR, look.empty_below)
+    alpha = occlusion(log_odds, learnt.occlusion)
     seen = length
     if alpha * length > _THINNEST:
         seen = stopped_share(alpha * length) / alpha
-    if log_odds >= look.empty_below:
+    if log_odds >= learnt.occlusion.empty_below:
         look.bits += _entropy(log_odds) * look.visibility * seen
     look.visibility *= exp_of_negative(-alpha * length)
     return ti.cast(look.visibility > OPAQUE, ti.i32)
@@ -127,7 +137,7 @@ def _learn(look: Template, belief: Template, voxel: I32, near: F32, far: F32):
 @kernel
 def _gain_rays(
     camera: CameraRays, view: Viewpoint, space: Space, belief: F32Array, max_depth: F32, prior: F32,
-    empty_below: F32, unknown_from: I32, gain: F32Array,
+    rule: Occlusion, unknown_from: I32, gain: F32Array,
 ) -> None:  # fmt: skip
     """The gain in bits of each pixel's ray into ``gain`` (H * W), up to ``max_depth`` metres.
 
@@ -136,8 +146,8 @@ def _gain_rays(
     for pixel in range(gain.shape[0]):
         u, v = camera.pixel(pixel)
         path = pixel_ray(camera, view, u, v)
-        look = _Look(path.direction.norm(), prior, empty_below, unknown_from, 1.0, 0.0)
+        look = _Look(path.direction.norm(), prior, unknown_from, 1.0, 0.0)
         begin, end = 0.0, max_depth
         clip(path, begin, end, space.lower, space.upper)
-        walk_voxels(path, begin, end, space, _learn, look, belief)
+        walk_voxels(path, begin, end, space, _learn, look, _Learnt(belief, rule))
         gain[pixel] = look.bits

@@ -4,30 +4,53 @@ Occupancy is read as a medium: a voxel of probability p has the occlusion densit
 alpha = -ln(1 - p) / voxel size (MRFMap, section III-D).
 """
 
+import math
 from dataclasses import dataclass
 
+from taichi_mrf.kernels.bundles import Bundle
 from taichi_mrf.kernels.log_odds import softplus
-from taichi_mrf.kernels.types import F32
+from taichi_mrf.kernels.types import F32, Template
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.traversal import FAR
 
 
 @dataclass(frozen=True)
-class Occlusion:
-    """Which voxels let every ray through, by their log-odds of being occupied."""
+class Occlusion(Bundle):
+    """Which voxels let every ray through, and how sure a view is of the others, by their log-odds of being
+    occupied."""
 
-    unknown: float = FAR
+    unknown: F32 = FAR
     """Log-odds that stand for "never seen" in maps that mark it so."""
 
-    empty_below: float = -FAR
+    empty_below: F32 = -FAR
     """Voxels with less than this are taken for empty, as in a map that keeps occupied voxels only."""
+
+    least: F32 = -FAR
+    """A voxel with less counts as one with these log-odds: none is surer to be free."""
+
+    most: F32 = FAR
+    """A voxel with more counts as one with these log-odds: none is surer to be occupied."""
+
+
+def doubting(surfaces: float, passing: float, voxel_size: float) -> Occlusion:
+    """The rule of a view that expects ``surfaces`` per metre where space was seen to be free however often,
+    and a ray to pass a voxel of ``voxel_size`` metres with the chance ``passing`` that was seen to be
+    occupied however often; 0 trusts what was seen.
+
+    Poses and noise are never as exact as they are said to be, so that evidence that agrees with itself a
+    hundred times is wrong more often than its log-odds say.
+    """
+    least = math.log(math.expm1(surfaces * voxel_size)) if surfaces > 0 else -FAR
+    most = math.log(1.0 / passing - 1.0) if passing > 0 else FAR
+    return Occlusion(least=least, most=most)
 
 
 @ti.func
-def occlusion(log_odds: F32, unknown: F32, empty_below: F32) -> F32:
-    """alpha times the voxel size: -ln(1 - p), or 0 for a voxel that lets every ray through."""
-    alpha = softplus(log_odds)
-    if log_odds == unknown or log_odds < empty_below:
+def occlusion(log_odds: F32, rule: Template) -> F32:
+    """alpha times the voxel size by a ``rule`` (Occlusion): -ln(1 - p), or 0 for a voxel that lets every ray
+    through."""
+    alpha = softplus(ti.max(rule.least, ti.min(rule.most, log_odds)))
+    if log_odds == rule.unknown or log_odds < rule.empty_below:
         alpha = 0.0
     return alpha
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import logistic
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template, Vec3
-from taichi_mrf.queries.occlusion import occlusion
+from taichi_mrf.queries.occlusion import Occlusion, occlusion
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_voxels
 
@@ -45,8 +45,6 @@ class _Meet(Struct):
     """The ray on its way."""
 
     voxel_size: F32  # metres
-    unknown: F32
-    empty_below: F32
     visibility: F32  # what is left of it
     count: I32  # voxels met
 
@@ -54,6 +52,7 @@ class _Meet(Struct):
 @dataclass(frozen=True)
 class _Profiled(Bundle):
     belief: F32Array
+    occlusion: Occlusion
     out: ProfileArrays
 
 
@@ -61,7 +60,7 @@ class _Profiled(Bundle):
 def _meet(meet: Template, profiled: Template, voxel: I32, near: F32, far: F32):
     """One voxel of the ray."""
     log_odds = profiled.belief[voxel]
-    alpha = occlusion(log_odds, meet.unknown, meet.empty_below) / meet.voxel_size
+    alpha = occlusion(log_odds, profiled.occlusion) / meet.voxel_size
     i = meet.count
     profiled.out.distance[i] = 0.5 * (near + far)
     profiled.out.length[i] = far - near
@@ -75,19 +74,18 @@ def _meet(meet: Template, profiled: Template, voxel: I32, near: F32, far: F32):
 
 @kernel
 def profile_ray(
-    origin: Vec3, direction: Vec3, voxel_size: F32, max_range: F32, unknown: F32, empty_below: F32,
+    origin: Vec3, direction: Vec3, voxel_size: F32, max_range: F32, rule: Occlusion,
     space: Space, belief: F32Array, out: ProfileArrays, count: I32Array,
 ) -> None:  # fmt: skip
     """Follow one ray up to ``max_range`` metres.
 
     ``origin`` is in voxels from the window's corner, ``direction`` the way in voxels for one metre.
-    ``belief`` (pool * 512) holds log-odds; ``count`` (1) receives the number of voxels met. The others:
-    Occlusion.
+    ``belief`` (pool * 512) holds log-odds; ``count`` (1) receives the number of voxels met.
     """
     for _ in range(1):
         ray = make_ray(origin, direction)
         begin, end = 0.0, max_range
         clip(ray, begin, end, space.lower, space.upper)
-        meet = _Meet(voxel_size, unknown, empty_below, 1.0, 0)
-        walk_voxels(ray, begin, end, space, _meet, meet, _Profiled(belief, out))
+        meet = _Meet(voxel_size, 1.0, 0)
+        walk_voxels(ray, begin, end, space, _meet, meet, _Profiled(belief, rule, out))
         count[0] = meet.count

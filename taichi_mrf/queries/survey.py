@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import exp_of_negative
 from taichi_mrf.kernels.types import F32, I32, F32Array, Struct, Template
-from taichi_mrf.queries.occlusion import occlusion, stopped_share
+from taichi_mrf.queries.occlusion import Occlusion, occlusion, stopped_share
 from taichi_mrf.sensor.forward import SEGMENT
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.system.compiler import ti
@@ -58,11 +58,8 @@ class Medium(Bundle):
     learnt: F32
     """Log-odds above which a voxel can be the surface."""
 
-    unknown: F32
-    """Log-odds of voxels that let every ray through (Occlusion.unknown)."""
-
-    empty_below: F32
-    """Voxels with less log-odds let every ray through (Occlusion.empty_below)."""
+    occlusion: Occlusion
+    """How voxels dim rays."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +103,7 @@ class _Surveyed(Bundle):
 def survey_voxel(ray: Template, surveyed: Template, voxel: I32, near: F32, far: F32):
     """One voxel of a ray, whose segment in it reaches from depth ``near`` to ``far``."""
     log_odds = surveyed.belief[voxel]
-    alpha = occlusion(log_odds, surveyed.medium.unknown, surveyed.medium.empty_below)
+    alpha = occlusion(log_odds, surveyed.medium.occlusion)
     # Eq. 18. A voxel that may not be the surface still dims the ray as eq. 15 has it.
     omega = alpha * ray.visibility
     if omega > ray.omega and log_odds > surveyed.medium.learnt:

@@ -31,14 +31,22 @@ class View:
     """Follows rays through a pool of bricks."""
 
     def __init__(
-        self, pool: BrickPool, voxel_size: float, volume: VolumeConfig, occlusion: Occlusion = _ALL_DIM
+        self,
+        pool: BrickPool,
+        voxel_size: float,
+        volume: VolumeConfig,
+        occlusion: Occlusion = _ALL_DIM,
+        predicting: Occlusion | None = None,
     ) -> None:
+        """``predicting`` takes the place of ``occlusion`` where measurements are predicted."""
         self.pool, self.voxel_size, self.volume, self.occlusion = pool, voxel_size, volume, occlusion
+        self.predicting = occlusion if predicting is None else predicting
         self.index = WindowIndex()
 
     def with_occlusion(self, **changes: float) -> "View":
         """Another view of the same map, in which other voxels let rays through (fields of Occlusion)."""
-        return View(self.pool, self.voxel_size, self.volume, dataclasses.replace(self.occlusion, **changes))
+        rules = (dataclasses.replace(rule, **changes) for rule in (self.occlusion, self.predicting))
+        return View(self.pool, self.voxel_size, self.volume, *rules)
 
     def render_depth(self, camera: Camera, T_world_camera: Pose, max_depth: float) -> NDArray[np.float32]:
         """(H, W) axial depth in metres, NaN where the ray is more likely to pass than to be stopped.
@@ -46,7 +54,7 @@ class View:
         What was never seen dims a ray, but is no surface.
         """
         learnt = self.pool.prior_log_odds + self.volume.min_evidence
-        survey = self._survey(camera, T_world_camera, max_depth, learnt, None, _NO_NOISE)
+        survey = self._survey(camera, T_world_camera, max_depth, learnt, self.occlusion, None, _NO_NOISE)
         surface = (survey.visibility < 0.5) & (survey.far > 0)
         return np.where(surface, survey.middle, np.float32(np.nan))
 
@@ -63,7 +71,7 @@ class View:
         ``noise`` is that of the measurements; a negative one stands for a pixel without. Every voxel can be
         the surface, seen or not.
         """
-        return self._survey(camera, T_world_camera, max_depth, -FAR, measured_m, noise)
+        return self._survey(camera, T_world_camera, max_depth, -FAR, self.predicting, measured_m, noise)
 
     def _survey(
         self,
@@ -71,6 +79,7 @@ class View:
         T_world_camera: Pose,
         max_depth: float,
         learnt: float,
+        rule: Occlusion,
         measured_m: NDArray[np.float32] | None,
         noise: NoiseTable,
     ) -> SurfaceSurvey:
@@ -90,7 +99,7 @@ class View:
         survey_rays(
             noise.sensor(camera), window[0].viewpoint(T_world_camera),
             self.index.space(window[0], self.volume.lower, self.volume.upper), self.pool.belief,
-            Medium(self.voxel_size, max_depth, learnt, self.occlusion.unknown, self.occlusion.empty_below),
+            Medium(self.voxel_size, max_depth, learnt, rule),
             np.ascontiguousarray(measured, np.float32),
             Answers(*(answer.reshape(-1) for answer in (near, far, visibility, expected, likelihood))),
             judged,
@@ -120,7 +129,7 @@ class View:
         profile_ray(
             ti.Vector(window[0].to_voxels(start).tolist(), ti.f32),
             ti.Vector((along / self.voxel_size).tolist(), ti.f32), self.voxel_size,
-            max_range, self.occlusion.unknown, self.occlusion.empty_below,
+            max_range, self.occlusion,
             self.index.space(window[0], self.volume.lower, self.volume.upper), self.pool.belief,
             ProfileArrays(*out), count,
         )  # fmt: skip

@@ -19,13 +19,15 @@ from hand_made import (
     row_pose,
     surveyed,
 )
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from oracles.forward import Noise
 from oracles.survey import SLIVER, Surveyed
 
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.geometry.poses import Pose, look_at
-from taichi_mrf.queries.occlusion import Occlusion
+from taichi_mrf.queries.occlusion import Occlusion, doubting
 from taichi_mrf.queries.survey import OPAQUE, SurfaceSurvey
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.noise import PatchNoise, PolynomialNoise
@@ -121,6 +123,35 @@ def test_some_voxels_let_every_ray_through(random_map: HandMade, occlusion: dict
         assert (found.visibility > all_dim.visibility + 0.1).mean() > 0.05
     again = whole.survey(CAMERA, VIEWS[0], MAX_DEPTH, measured, NOISE.table(CAMERA))
     np.testing.assert_array_equal(again.near, all_dim.near)
+
+
+@pytest.mark.parametrize("rule", [{"least": -2.5}, {"most": 0.5}, {"least": -4.0, "most": 1.0}])
+def test_a_prediction_is_no_surer_than_its_rule_while_a_picture_is(
+    random_map: HandMade, rule: dict[str, float]
+) -> None:
+    measured = measured_in(random_map, VIEWS[0], 3)
+    plain = View(random_map.pool, VOXEL, VolumeConfig())
+    view = View(random_map.pool, VOXEL, VolumeConfig(), predicting=Occlusion(**rule))
+    found = view.survey(CAMERA, VIEWS[0], MAX_DEPTH, measured, NOISE.table(CAMERA))
+    assert_same(found, surveyed(random_map, VIEWS[0], MAX_DEPTH, measured, noise_at, **rule))
+    sure = plain.survey(CAMERA, VIEWS[0], MAX_DEPTH, measured, NOISE.table(CAMERA))
+    assert (np.abs(found.visibility - sure.visibility) > 0.01).mean() > 0.05
+    pictures = (each.render_depth(CAMERA, VIEWS[0], MAX_DEPTH) for each in (view, plain))
+    np.testing.assert_array_equal(*pictures)
+
+
+@given(
+    surfaces=st.floats(1e-3, 5.0), passing=st.floats(1e-6, 0.4), voxel_size=st.floats(0.005, 0.5)
+)  # fmt: skip
+def test_doubt_is_a_density_of_surfaces_and_a_chance_to_pass(
+    surfaces: float, passing: float, voxel_size: float
+) -> None:
+    rule = doubting(surfaces, passing, voxel_size)
+    # A ray passes a voxel of probability p over its whole length with the chance 1 - p (eq. 15).
+    free, occupied = (1.0 / (1.0 + np.exp(bound)) for bound in (rule.least, rule.most))
+    assert -np.log(free) / voxel_size == pytest.approx(surfaces, rel=1e-6)
+    assert occupied == pytest.approx(passing, rel=1e-6)
+    assert doubting(0.0, 0.0, voxel_size) == Occlusion()
 
 
 @pytest.mark.parametrize("occlusion", [{"unknown": DENSE}, {"empty_below": -3.0}])

@@ -41,7 +41,7 @@ from taichi_mrf.methods.mrf.moving_window import MovingWindow
 from taichi_mrf.methods.mrf.plug import METHOD
 from taichi_mrf.methods.mrf.posed import PosedMRF
 from taichi_mrf.methods.mrf.storage import contents_of, read_contents, write_contents
-from taichi_mrf.queries.occlusion import Occlusion
+from taichi_mrf.queries.occlusion import Occlusion, doubting
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
 from taichi_mrf.sensor.own_evidence import checked_evidence, checked_no_return
@@ -83,7 +83,8 @@ class MRFMap(PosedMRF):
         inference = config.inference
         self.prior = prior_probability(inference, config.voxel_size)
         log_odds = log_odds_without_bricks(inference, config.voxel_size)
-        self._make_bricks(config, noise, *log_odds, config.volume, Occlusion())
+        doubt = doubting(inference.doubt_free, inference.doubt_occupied, config.voxel_size)
+        self._make_bricks(config, noise, *log_odds, config.volume, Occlusion(), doubt)
         bundler = RayBundler(self.voxel_size, inference)
         bounds = KeyframeBounds()
         parts = (self.sensor, inference, self.config.volume)

@@ -58,7 +58,7 @@ class MapReading(BrickMap):
         self._pool.dated, self._pool.total = None, belief
         self._pool.bricks, self._pool.owners = source._pool.bricks.copy(), source._pool.owners.copy()
         shown = source.view
-        self.view = View(self._pool, self.voxel_size, shown.volume, shown.occlusion)
+        self.view = View(self._pool, self.voxel_size, shown.volume, shown.occlusion, shown.predicting)
 
     @property
     def keyframes(self) -> Mapping[int, MappedKeyframe]:

@@ -41,9 +41,12 @@ def profile(
     *,
     unknown: float = np.inf,
     empty_below: float = -np.inf,
+    least: float = -np.inf,
+    most: float = np.inf,
 ) -> Profile:
-    """Voxels of the log-odds ``unknown``, or of less than ``empty_below``, dim nothing."""
-    alpha = np.log1p(np.exp(log_odds)) / voxel_size  # -ln(1 - p) / voxel size
+    """Voxels of the log-odds ``unknown``, or of less than ``empty_below``, dim nothing; the others as if
+    their log-odds were between ``least`` and ``most``."""
+    alpha = np.log1p(np.exp(np.clip(log_odds, least, most))) / voxel_size  # -ln(1 - p) / voxel size
     alpha[(log_odds == unknown) | (log_odds < empty_below)] = 0.0
     left = np.exp(-np.concatenate([[0.0], np.cumsum(alpha * (far - near) * speed)]))
     occupancy = 1 / (1 + np.exp(-log_odds))
