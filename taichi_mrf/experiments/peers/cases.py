@@ -20,7 +20,7 @@ from taichi_mrf.experiments.peers.peer import thinned
 from taichi_mrf.experiments.peers.truth import along_rays, of_geometry
 from taichi_mrf.experiments.scenes import Scene, house_scene, kitchen_scene, turned
 
-VIEWS = 25
+VIEWS = 20
 """The first so many views of each scene, one after the other as a live run meets them."""
 
 EVERY, FIRST = 5, 2

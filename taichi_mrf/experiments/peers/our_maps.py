@@ -130,7 +130,7 @@ def log_odds(scene: Scene, voxel_size: float, knob: Knob) -> Peer:
 
 
 def visibility(scene: Scene, voxel_size: float, knob: Knob) -> Peer:
-    """The visibility map. Its rays pass unknown voxels at once, as they do not with the paper's Table I, which
+    """The visibility map, whose rays pass unknown voxels at once. With the paper's Table I they do not, which
     needs a camera that moves less than a voxel a frame."""
     return RecursivePeer(VisibilityMap(voxel_size, scene.noise, **_shared(scene), **knob.parameters), scene)
 

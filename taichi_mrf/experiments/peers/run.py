@@ -123,8 +123,8 @@ def _states(rows: Sequence[_Row]) -> Table:
             entries.append([row.scene, f"{row.voxel_size * 100:g} cm", name, *figures, *surface])
     notes = [
         "Room and house: voxels that clean rays of the mapped views cross or end in. Kitchen and lidar: "
-        "points on the rays of held-out views, one at the measurement, four in front of it. Open3D has states, no "
-        "probabilities: 1, 0 and, unknown, one half. F: of the mesh against the true surface.",
+        "points on the rays of held-out views, one at the measurement, four in front of it. Open3D has "
+        "states, no probabilities: 1, 0 and, unknown, one half. F: of the mesh against the true surface.",
     ]
     return Table(
         "peers_states", "Every peer: free and occupied",
