@@ -1,6 +1,6 @@
 """One system with one setting on one scene: what its frames cost, and what its map is worth."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,7 +102,7 @@ def _answers(peer: Peer, case: Case) -> tuple[str, dict[str, float]]:
     return best, means[best]
 
 
-def answer_scores(answers: Answers, view: SceneView, case: Case) -> Mapping[str, float]:
+def answer_scores(answers: Answers, view: SceneView, case: Case) -> dict[str, float]:
     """Shares of the judged pixels of a view; those without an answer are wrong."""
     judged = view.judged & (view.true_m > 0) & (view.true_m <= case.scene.max_depth)
     depth_m = answers.depth_m[judged]

@@ -35,7 +35,7 @@ class Cells:
 class Peer(Protocol):
     """A map that takes frames one by one."""
 
-    stages_ms: Mapping[str, float]
+    stages_ms: dict[str, float]
     """Processor time of all frames so far by stage, if the system tells; in milliseconds."""
 
     def integration(self, view: SceneView) -> Callable[[], object]:

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 BUDGET_MS = 10.0
 """Processor time of two cores in 5 ms: the smallest budget that a user is taken to have."""
 
+SHOWN_NATS = 2.2
+"""Log-likelihoods that are this much below the best are off the picture."""
+
 MARKERS = "osD^vPX"
 
 
@@ -53,13 +56,17 @@ def curves(scene: str, points: Sequence[Point]) -> "Figure":
                 here = [p for p in points if p.system == name and p.voxel_size == size]
                 _draw(axes, here, quality, name, number)
             _dress(axes)
+            if quality == "log_likelihood":
+                best = max(p.log_likelihood for p in points if p.voxel_size == size)
+                axes.set_ylim(bottom=max(axes.get_ylim()[0], best - SHOWN_NATS))
         line[0].set_ylabel(label)
     for axes, size in zip(grid[0], sizes, strict=True):
         axes.set_title(f"{scene}, {size * 100:g} cm")
     for axes in grid[-1]:
         axes.set_xlabel("processor ms a frame")
     handles, labels = grid[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
+    columns = 4 if len(sizes) > 1 else 2
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=9, frameon=False)
     return figure
 
 
@@ -67,10 +74,9 @@ def _draw(axes: "Axes", here: Sequence[Point], quality: str, name: str, number: 
     """One system's settings."""
     color, marker = f"C{number}", MARKERS[number % len(MARKERS)]
     best = frontier(here, quality)
-    bold = {"linewidth": 2.6, "zorder": 5} if number == 0 else {"linewidth": 1.3}
     axes.plot(
         [p.cpu_ms for p in best], [getattr(p, quality) for p in best], color=color, marker=marker,
-        markersize=5, label=name, **bold,
+        markersize=5, label=name, linewidth=2.6 if number == 0 else 1.3, zorder=5 if number == 0 else 2,
     )  # fmt: skip
     for point in here:
         face = "white" if point.selected else color

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Result
@@ -49,6 +50,8 @@ def run_peers(experiment: Experiment) -> tuple[list[Table], list[Path]]:
         for size in experiment.voxel_sizes:
             if experiment.wants(f"{scene.name}, {size * 100:g} cm"):
                 rows += _rows(experiment, scene, size)
+    if not rows:
+        raise ConfigError(f"--only: no part matches {', '.join(experiment.only)}; one is 'kitchen, 5 cm'")
     tables = [_settings(rows), _states(rows), _profile(rows)]
     paths = [path for table in tables for path in write_table(experiment.out, table)]
     for name in dict.fromkeys(row.scene for row in rows):
