@@ -15,7 +15,7 @@ from taichi_mrf.evaluation.surface_scores import SurfaceTruth, surface_truth
 from taichi_mrf.experiments.exact import room_scene
 from taichi_mrf.experiments.folds import require_views
 from taichi_mrf.experiments.lidar import lidar_scene
-from taichi_mrf.experiments.peers.measuring import Case
+from taichi_mrf.experiments.peers.measuring import Case, keyframes
 from taichi_mrf.experiments.peers.peer import thinned
 from taichi_mrf.experiments.peers.truth import along_rays, of_geometry
 from taichi_mrf.experiments.scenes import Scene, house_scene, kitchen_scene, turned
@@ -30,7 +30,7 @@ SURFACE_STRIDE = 2
 """One in so many rows and columns of clean depth gives points of the true surface."""
 
 LIDAR_SIGMA_M = 0.06
-"""The standard deviation of ranges that `eval lidar` learns for voxels of 5 and 10 cm of this recording."""
+"""The standard deviation of ranges that `eval lidar` learns for voxels of 5 cm of this recording."""
 
 IMAGE = "&width=640&height=480"
 
@@ -61,6 +61,11 @@ class PeerScene:
     def mapped(self) -> Sequence[int]:
         """Numbers of all others."""
         return [i for i in range(len(self._made[0].views)) if i not in self.judged]
+
+    @property
+    def selects(self) -> bool:
+        """Whether there are fewer keyframes than frames."""
+        return len(keyframes([self._made[0].views[i] for i in self.mapped])) < len(self.mapped)
 
     @cached_property
     def _made(self) -> tuple[Scene, TriangleMesh | None]:

@@ -48,7 +48,7 @@ def measured(system: System, knob: Knob, case: Case) -> Result:
     warm.conclude()
     del warm
     peer = system.make(case.scene, case.voxel_size, knob)
-    taken = _keyframes(frames) if knob.selected else frames
+    taken = keyframes(frames) if knob.selected else frames
     times = [timed(peer.integration(frame)) for frame in taken]
     end = timed(peer.conclude)
     cpu_ms = 1e3 * (sum(time.cpu for time in times) + end.cpu)
@@ -77,7 +77,7 @@ def measured(system: System, knob: Knob, case: Case) -> Result:
     }
 
 
-def _keyframes(frames: Sequence[SceneView]) -> list[SceneView]:
+def keyframes(frames: Sequence[SceneView]) -> list[SceneView]:
     """Those that a run with tracked poses takes for keyframes."""
     selector, kept = KeyframeSelector(STEPS), []
     for frame in frames:

@@ -71,7 +71,12 @@ def _rows(experiment: Experiment, scene: PeerScene, voxel_size: float) -> list[_
         return measured(system, knob, case[0])
 
     rows = []
-    settings = [(system, knob) for system in systems(scene.is_lidar) for knob in system.knobs]
+    settings = [
+        (system, knob)
+        for system in systems(scene.is_lidar)
+        for knob in system.knobs
+        if scene.selects or not knob.selected  # else it would be the same once more
+    ]
     for number, (system, knob) in enumerate(settings):
         experiment.report(f"{scene.name}, {voxel_size * 100:g} cm, {system.name}", number, len(settings))
         parameters = ", ".join(f"{name} {value}" for name, value in knob.parameters.items())
