@@ -187,7 +187,7 @@ def test_the_comparison_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest
             "peers", data, tmp_path, (0.1,), (0,), None, lambda what, *_: done.append(what), parts
         )
 
-    (settings, states, profile), paths = evaluate()
+    (budgets, settings, states, profile), paths = evaluate()
     assert [row[:4] for row in settings.rows] == [
         [scene, "10 cm", system, knob]
         for scene in ("kitchen", "house")
@@ -195,6 +195,9 @@ def test_the_comparison_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest
     ]
     assert all(path.is_file() for path in paths)
     assert {"peers_kitchen.png", "peers_house.png"} <= {path.name for path in paths}
+    assert [row[:3] for row in budgets.rows] == [
+        [scene, "10 cm", system] for scene in ("kitchen", "house") for system in ("MRFMap", "log-odds")
+    ]
     rows = [dict(zip(settings.columns, row, strict=True)) for row in settings.rows]
     assert all(row["ms a frame"] > 0 and row[RIGHT] > 0.3 for row in rows)
     by_map = {(row[0], row[2]): dict(zip(states.columns, row, strict=True)) for row in states.rows}
@@ -202,7 +205,7 @@ def test_the_comparison_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest
     assert by_map["kitchen", "log-odds"]["F 5 cm"] is None  # there is no truth
     assert [row[3] for row in profile.rows] == ["coarse", "all"] * 2
     monkeypatch.setattr(run, "measured", lambda *_: pytest.fail("a known result is computed again"))
-    (again, *_), _ = evaluate()
+    (_, again, *_), _ = evaluate()
     assert again.rows == settings.rows
 
 
