@@ -68,5 +68,5 @@ _OTHERS = (
     System("log-odds", log_odds, _strided((8, 4, 1))),
     System("visibility", visibility, _strided((4, 1))),
     System("wavemap's model", wavemap, _strided((8, 4, 1))),
-    System("Open3D TSDF", TsdfPeer, _tsdf(), images_only=True),
+    System("TSDF (Open3D)", TsdfPeer, _tsdf(), images_only=True),
 )

@@ -56,7 +56,8 @@ def budgets(rows: Sequence[Row]) -> Table:
         entries.append([scene, f"{size * 100:g} cm", system, *cells])
     notes = [
         "Share of pixels of held-out views whose first surface is right within 1.5 voxels / mean "
-        "log-likelihood of a pixel, each by the setting that is best of those within the budget of processor time a frame."
+        "log-likelihood of a pixel, each by the setting that is best of those within the budget of "
+        "processor time a frame."
     ]
     columns = [f"{budget:g} ms" for budget in BUDGETS_MS]
     title = "Every peer: what it reaches within a budget"

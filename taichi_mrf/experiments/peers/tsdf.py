@@ -2,6 +2,7 @@
 of the surface counts as occupied for certain, one further in front as free, all others as unknown."""
 
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,6 @@ from taichi_mrf.system.libraries import library
 
 FIRST_BLOCKS = 2000
 """Blocks that the grid has room for at first; it grows by itself."""
-
-NEAREST_M = 0.1
 
 LEAST_WEIGHT = 1.0
 """A voxel that one image has seen counts."""
@@ -54,17 +53,22 @@ class TsdfPeer:
         """Nothing is left to do."""
 
     def answers(self, view: SceneView) -> Mapping[str, Answers]:
-        """Rays are cast through all blocks."""
-        core, table = self._o3d.core, self._grid.hashmap()
-        blocks = table.key_tensor()[table.active_buf_indices().to(core.int64)]
-        height, width = view.measured_m.shape
-        cast = self._grid.ray_cast(
-            blocks, *self._camera(view), width, height, ["depth"], 1.0, NEAREST_M, self._scene.max_depth,
-            LEAST_WEIGHT, self._truncation,
-        )  # fmt: skip
-        depth_m = cast["depth"].numpy()[..., 0].astype(np.float64)
-        depth_m[depth_m <= 0] = np.nan
+        """Where rays first meet its mesh. Its own casting of rays through blocks (0.20) leaves pixels out or
+        ends the process where blocks lie around the camera."""
+        camera, T = view.camera or self._scene.camera, view.T_world_camera
+        directions = camera.rays() @ T[:3, :3].T  # one metre of depth each
+        rays = np.concatenate([np.broadcast_to(T[:3, 3], directions.shape), directions], axis=-1)
+        found = self._cast.cast_rays(self._o3d.core.Tensor(rays.astype(np.float32)))
+        depth_m = found["t_hit"].numpy().astype(np.float64)
+        depth_m[~np.isfinite(depth_m)] = np.nan
         return {"": Answers(depth_m, self._log_likelihood(view, depth_m))}
+
+    @cached_property
+    def _cast(self) -> Any:
+        scene = self._o3d.t.geometry.RaycastingScene()
+        if self._grid.hashmap().size() < MOST_BLOCKS:
+            scene.add_triangles(self._grid.extract_triangle_mesh(weight_threshold=LEAST_WEIGHT))
+        return scene
 
     def cells(self, points_m: NDArray[np.float64]) -> Mapping[str, Cells]:
         """By the distance of the voxel that a point lies in."""
