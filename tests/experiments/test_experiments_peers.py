@@ -132,10 +132,10 @@ def test_each_peer_finds_the_wall(name: str) -> None:
         answer_scores(answers, scene.views[3], wall_case(scene))[RIGHT]
         for answers in peer.answers(scene.views[3]).values()
     )
-    assert best > 0.95
+    assert best > (0.8 if name == "open3d" else 0.95)  # a mesh ends at the outermost voxels that are seen
     in_front, at_the_wall, far_behind = [0.02, 0.02, 1.0], [0.02, 0.02, WALL_M], [0.02, 0.02, 3.9]
     cells = next(iter(peer.cells(np.array([in_front, at_the_wall, far_behind])).values()))
-    assert cells.free.tolist() == [name != "open3d", False, False]  # a TSDF keeps only what is near a surface
+    assert cells.free.tolist() == [True, False, False]
     assert cells.occupied.tolist() == [False, True, False]
     assert cells.probability[1] > cells.probability[0]
     assert peer.memory_mb > 0
