@@ -182,7 +182,7 @@ def test_the_comparison_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest
     done: list[str] = []
 
     def evaluate() -> tuple[list, list[Path]]:
-        parts = ("kitchen, 10 cm", "house*")
+        parts = ("kitchen, 10 cm, *", "house*")
         return run_experiment(
             "peers", data, tmp_path, (0.1,), (0,), None, lambda what, *_: done.append(what), parts
         )

@@ -24,15 +24,16 @@ def run_peers(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     """What each system reaches within a budget of time, all settings, states and meshes, MRFMap's profile,
     and a plot for each scene.
 
-    A part, for --only, is a scene with a voxel size, such as "kitchen, 5 cm".
+    A part, for --only, is a scene, a voxel size and a system, such as "kitchen, 5 cm, OctoMap".
     """
     rows: list[Row] = []
     for scene in peer_scenes(experiment.data, experiment.seeds[0], experiment.limit):
         for size in experiment.voxel_sizes:
-            if experiment.wants(f"{scene.name}, {size * 100:g} cm"):
-                rows += _rows(experiment, scene, size)
+            rows += _rows(experiment, scene, size)
     if not rows:
-        raise ConfigError(f"--only: no part matches {', '.join(experiment.only)}; one is 'kitchen, 5 cm'")
+        raise ConfigError(
+            f"--only: no part matches {', '.join(experiment.only)}; one is 'kitchen, 5 cm, OctoMap'"
+        )
     tables = [budgets(rows), settings(rows), states(rows), profile(rows)]
     paths = [path for table in tables for path in write_table(experiment.out, table)]
     for name in dict.fromkeys(row.scene for row in rows):
@@ -51,15 +52,19 @@ def _rows(experiment: Experiment, scene: PeerScene, voxel_size: float) -> list[R
             case.append(scene.case(voxel_size))
         return measured(system, knob, case[0])
 
-    rows = []
+    rows: list[Row] = []
+    place = f"{scene.name}, {voxel_size * 100:g} cm"
+    wanted = [s for s in systems(scene.is_lidar) if experiment.wants(f"{place}, {s.name}")]
+    if not wanted:
+        return rows
     combinations = [
         (system, knob)
-        for system in systems(scene.is_lidar)
+        for system in wanted
         for knob in system.knobs
         if scene.selects or not knob.selected  # else it would be the same once more
     ]
     for number, (system, knob) in enumerate(combinations):
-        experiment.report(f"{scene.name}, {voxel_size * 100:g} cm, {system.name}", number, len(combinations))
+        experiment.report(f"{place}, {system.name}", number, len(combinations))
         parameters = ", ".join(f"{name} {value}" for name, value in knob.parameters.items())
         key = (
             f"{scene.name} | {experiment.limit} views | noise {experiment.seeds[0]} | {voxel_size:g} m | "
