@@ -60,6 +60,7 @@ EXPERIMENTS = {
     "lidar": Entry("lidar:run_lidar", (0.2, 0.1, 0.05)),
     "sensors": Entry("sensors:run_sensors", (0.05,), needs_data=False),
     "trajectory": Entry("trajectory.tables:run_trajectory", (0.05,), has_parts=True),
+    "peers": Entry("peers.run:run_peers", (0.05, 0.02, 0.01), has_parts=True),
     "window": Entry("window:run_window", (0.1,), needs_data=False),
 }
 

@@ -50,7 +50,8 @@ class Eval:
     """Use at most N views or folds, for a quick look."""
 
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="PART ...")] = ()
-    """Run only these parts of the experiment trajectory, such as 'room, 10 Hz' or 'kitchen*'."""
+    """Run only these parts of the experiments trajectory and peers, such as 'room, 10 Hz' or
+    'kitchen*'."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
     """How much is printed."""
