@@ -59,8 +59,9 @@ class InferenceConfig:
 
     plane_window: float = 0.0
     """Half the side, in voxel sizes, of the window of pixels around each measurement that are averaged along
-    the plane through them, 8 pixels at most; sigma falls with what averages out, to half at most. For voxels
-    that are smaller than the sensor's sigma, 2 is a good value. 0 leaves measurements as they are."""
+    the plane through them, 8 pixels at most; sigma falls with what averages out, to half at most. Only where
+    sigma is above the voxel size. 2 is a good value for voxels much smaller than sigma. 0 leaves measurements
+    as they are."""
 
     pass_through: float | None = None
     """Chance that a ray passes through an occupied voxel, below 1, because what is in it fills only a part.

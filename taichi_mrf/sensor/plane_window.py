@@ -1,7 +1,7 @@
 """Neighbouring pixels measure one surface: what the plane through their measurements says of each of them.
 
 A voxel that is smaller than sigma meets few rays of an image, while errors of single pixels average out over
-those around. Seen by a camera, a plane's inverse depth is an affine function of the pixel. So in a square window
+those around. Seen by a camera, a plane's inverse depth is an affine function of the pixel. In a square window
 of n pixels around each pixel
 
     1 / z_j = a + b (u_j - u) + c (v_j - v) + e_j,     weights  w_j = (z_j^2 / sigma_j)^2
