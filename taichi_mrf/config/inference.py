@@ -57,6 +57,12 @@ class InferenceConfig:
     """Minimum rays cast at a voxel facing the camera, per centimetre of voxel size: 12.5 rays at 5 cm, 2.5 at
     1 cm. Pixels beyond that share rays. 0 casts a ray for every pixel."""
 
+    plane_window: float = 0.0
+    """Half the side, in voxel sizes, of the window of pixels around each measurement that are averaged along
+    the plane through them, 8 pixels at most; sigma falls with what averages out, to half at most. Only where
+    sigma is above the voxel size. 2 is a good value for voxels much smaller than sigma. 0 leaves measurements
+    as they are."""
+
     pass_through: float | None = None
     """Chance that a ray passes through an occupied voxel, below 1, because what is in it fills only a part.
     With 0, the paper's model, a few rays that pass clear a voxel; with 0.1 thin things such as posts and legs
@@ -120,6 +126,7 @@ class InferenceConfig:
         check_field(self.outlier_floor >= 0, "inference.outlier_floor", "must not be negative")
         check_field(self.end_sigmas > 0, "inference.end_sigmas", "must be positive")
         check_field(self.ray_density >= 0, "inference.ray_density", "must not be negative")
+        check_field(self.plane_window >= 0, "inference.plane_window", "must not be negative")
         share = self.pass_through or 0.0
         check_field(0 <= share < 1, "inference.pass_through", "must be at least 0 and less than 1")
         check_field(0 <= self.ray_correlation <= 1, "inference.ray_correlation", "must lie between 0 and 1")

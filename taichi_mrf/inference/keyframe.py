@@ -14,6 +14,7 @@ from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import NoiseModel, NoiseTable
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
+from taichi_mrf.sensor.plane_window import PlaneWindow, averaged_on_planes
 from taichi_mrf.sensor.pose_doubt import Covariance, beside_edges, doubtful_table
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.window import Window
@@ -68,8 +69,9 @@ class DepthImage:
     ``depth`` is (H * W) float32 in metres along each pixel's ray (axial depth for a pinhole), 0 where there
     is no measurement; ``farthest`` the largest in each tile (rows, columns). ``sensor`` is camera and noise
     as kernels take them, ``rays`` the number of measurements. ``color`` is (H, W, 3) RGB in host memory, 0
-    0 0 where a pixel has no colour, or None. ``own`` is what the keyframe states of its measurements. If its
-    pose is uncertain, ``certain`` is the image as it was measured.
+    0 0 where a pixel has no colour, or None. ``own`` is what the keyframe states of its measurements.
+    ``window`` is that in which measurements were averaged on planes, None for none. If they were, or the pose
+    is uncertain, ``certain`` is the image as it was measured.
     """
 
     depth: Resident
@@ -80,6 +82,7 @@ class DepthImage:
     farthest: NDArray[np.float32]
     color: NDArray[np.uint8] | None = None
     own: OwnEvidence = NOTHING
+    window: PlaneWindow | None = None
     certain: "DepthImage | None" = None
 
     @staticmethod
@@ -89,25 +92,26 @@ class DepthImage:
         noise: NoiseModel,
         color: NDArray[np.uint8] | None = None,
         own: OwnEvidence = NOTHING,
+        window: PlaneWindow | None = None,
     ) -> "DepthImage":
         """Put :func:`checked_depth` (H, W), which must not change from now on, where kernels can reach it.
-        ``noise`` is the map's, for what the keyframe does not state itself. Raises ConfigError if the noise
-        model does not fit the camera."""
+        ``noise`` is the map's, for what the keyframe does not state itself. With a ``window``
+        measurements are averaged on planes. Raises ConfigError if the noise model does not fit the camera."""
         pose_covariance, own = own.pose_covariance, replace(own, pose_covariance=None)
         table = own.noise_model(noise, depth_m).table(camera)
         depth, sensor = resident(depth_m.reshape(-1)), table.sensor(camera)
         rays = int(np.count_nonzero(depth_m))
-        image = DepthImage(depth, camera, sensor, table, rays, _farthest(depth_m), color, own)
+        image = DepthImage(depth, camera, sensor, table, rays, _farthest(depth_m), color, own, window)
         return image.doubting(pose_covariance)
 
     def doubting(self, pose_covariance: Covariance | None) -> "DepthImage":
         """The same image from a pose of another covariance (6, 6), None for an exact one: with the noise of
         sensor and pose, and without the pixels that an edge may cross (sensor/pose_doubt.py). Raises
         ConfigError if the noise is not made of polynomials."""
-        image = self.at_certain_pose
+        image = self.at_certain_pose._on_planes()
         if pose_covariance is None:
             return image
-        depth_m = image.to_numpy()
+        depth_m = np.array(on_host(image.depth)).reshape(image.camera.shape)
         table = doubtful_table(image.noise_table, depth_m, image.camera, pose_covariance)
         depth_m[beside_edges(depth_m, image.camera, pose_covariance)] = 0.0
         return replace(
@@ -117,7 +121,21 @@ class DepthImage:
             noise_table=table,
             rays=int(np.count_nonzero(depth_m)),
             own=replace(image.own, pose_covariance=pose_covariance),
-            certain=image,
+            certain=image.at_certain_pose,
+        )
+
+    def _on_planes(self) -> "DepthImage":
+        """An image as it was measured, with its measurements averaged on planes if they are to be."""
+        if self.window is None:
+            return self
+        depth_m, table = averaged_on_planes(self.to_numpy(), self.camera, self.noise_table, self.window)
+        return replace(
+            self,
+            depth=resident(depth_m.reshape(-1)),
+            sensor=table.sensor(self.camera),
+            noise_table=table,
+            farthest=_farthest(depth_m),
+            certain=self,
         )
 
     @property

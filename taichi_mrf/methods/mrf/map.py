@@ -45,6 +45,7 @@ from taichi_mrf.queries.occlusion import Occlusion, doubting
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
 from taichi_mrf.sensor.own_evidence import checked_evidence, checked_no_return
+from taichi_mrf.sensor.plane_window import PlaneWindow
 from taichi_mrf.voxels.layout import VOXELS
 
 
@@ -327,7 +328,9 @@ class MRFMap(PosedMRF):
         depth, own = checked_evidence(depth, camera, noise, sigma_m, pose_covariance)
         if self.sensor.no_return != "ignore":
             own = replace(own, no_return=checked_no_return(no_return, depth_m, camera))
-        image = DepthImage.upload(depth, camera, self.noise, checked_color(color, camera), own)
+        wide = self.config.inference.plane_window
+        window = PlaneWindow(wide * self.voxel_size, self.voxel_size) if wide > 0 else None
+        image = DepthImage.upload(depth, camera, self.noise, checked_color(color, camera), own, window)
         if not self._keyframes:
             warn_of_bad_sigma(image.noise_table, self.sensor.min_depth, self.sensor.max_depth)
         return image
