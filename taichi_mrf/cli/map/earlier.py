@@ -53,7 +53,8 @@ def _changed_parameters(task: MapTask) -> list[str]:
     changed = differences(held, task.settings)
     if "sensor.sigma" in changed:  # the run may have had it from the recording
         changed = differences(held, with_recorded_noise(task.settings, task.open(color=False)))
-    return changed
+    learnt = ("sensor.sigma_scale", "sensor.sigma_added") if task.learn_noise else ()
+    return [name for name in changed if name not in learnt]
 
 
 def finished_report(task: MapTask) -> dict[str, Any] | None:

@@ -1,0 +1,80 @@
+"""What a run says of its noise: whether held-out frames agree with it, and what was learnt of it."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from taichi_mrf.calibration.from_recording import LearntSigma
+from taichi_mrf.config.schema import SensorConfig
+from taichi_mrf.evaluation.noise_check import NoiseCheck
+
+_FIELDS = ("sigma", "bias", "sigma_table", "bias_table", "patch", "pixel_sigma", "sigma_scale", "sigma_added")
+"""The parameters of noise among those of the sensor."""
+
+
+def noise_report(
+    sensor: SensorConfig, check: NoiseCheck | None, learnt: LearntSigma | None
+) -> dict[str, Any]:
+    """The entry ``noise`` of a report: ``factor`` is what sigma would have to be multiplied by, ``by_voxels``
+    how much of it the size of voxels explains; both None if nothing was held out."""
+    report: dict[str, Any] = {
+        "sigma_scale": sensor.sigma_scale,
+        "sigma_added": sensor.sigma_added,
+        "factor": None,
+        "by_voxels": None,
+        "wrong": None,
+        "frames": 0,
+        "learnt": None,
+    }
+    if check is not None:
+        report |= {"factor": round(check.factor, 3), "by_voxels": round(check.by_voxels, 3)}
+        report |= {"wrong": check.wrong, "frames": check.frames}
+    if learnt is not None:
+        facts = asdict(learnt)
+        del facts["law"]
+        report["learnt"] = {name: round(value, 4) for name, value in facts.items()}
+    return report
+
+
+def noise_notes(sensor: SensorConfig, check: NoiseCheck | None, learnt: LearntSigma | None) -> list[str]:
+    """The same in sentences."""
+    notes = []
+    if learnt is not None:
+        notes.append(
+            f"Sigma was learnt from {learnt.frames} held-out frames: {sensor.sigma_scale:g} times the stated "
+            f"one and {100 * sensor.sigma_added:.2g} cm; a single factor would have been {learnt.factor:.2g}."
+        )
+    if check is not None and check.wrong:
+        notes.append(
+            f"The measured depths of {check.frames} held-out frames differ from the map by {check.factor:.2g} "
+            f"times what {_noise_name(sensor)} allows. {_advice(sensor, learnt)}"
+        )
+    return notes
+
+
+def sensor_yaml(sensor: SensorConfig, source: str, learnt: LearntSigma) -> str:
+    """The learnt noise as a file of parameters."""
+    fields = {
+        name: list(value) if isinstance(value := getattr(sensor, name), tuple) else value for name in _FIELDS
+    }
+    text = yaml.safe_dump({"sensor": fields}, sort_keys=False, default_flow_style=None)
+    return (
+        f"# Sigma as learnt from {learnt.frames} held-out frames of {source!r}.\n"
+        "# Use it with: taichi-mrf map SOURCE --out DIR --config FILE\n" + text
+    )
+
+
+def _noise_name(sensor: SensorConfig) -> str:
+    if sensor.sigma_table is not None:
+        return f"the noise of {Path(sensor.sigma_table).name}"
+    if sensor.sigma == SensorConfig().sigma:
+        return "the noise of a Kinect 1 (the default of sensor.sigma)"
+    return "sensor.sigma"
+
+
+def _advice(sensor: SensorConfig, learnt: LearntSigma | None) -> str:
+    if learnt is not None or sensor.sigma_scale != 1 or sensor.sigma_added:
+        return "It was learnt from other frames than these: poses or the scene differ along the recording."
+    return "Poses may be off, or the noise is another sensor's; --noise auto learns it from the recording."
