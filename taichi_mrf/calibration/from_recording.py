@@ -101,6 +101,7 @@ def learn_sigma(
         if abs(math.log(change)) < math.log(SETTLED) or should_stop():
             break
         law = better
+    assert found is not None, "there is at least one map"
     return found
 
 

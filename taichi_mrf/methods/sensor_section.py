@@ -20,8 +20,8 @@ def describing(noise: NoiseModel | None, sensor: SensorConfig) -> SensorConfig:
         if np.array_equal(described.sigma, noise.sigma) and np.array_equal(described.bias, noise.bias):
             return sensor
     sigma, bias = _coefficients(noise.sigma), _coefficients(noise.bias)
-    plain = {"sigma_table": None, "bias_table": None, "sigma_scale": 1.0, "sigma_added": 0.0}
-    return replace(sensor, sigma=sigma, bias=bias, **plain)
+    plain = replace(sensor, sigma_table=None, bias_table=None, sigma_scale=1.0, sigma_added=0.0)
+    return replace(plain, sigma=sigma, bias=bias)
 
 
 def _coefficients(padded: NDArray[np.float64]) -> tuple[float, ...]:

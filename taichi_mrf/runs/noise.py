@@ -48,8 +48,8 @@ def noise_notes(sensor: SensorConfig, check: NoiseCheck | None, learnt: LearntSi
         )
     if check is not None and check.wrong:
         notes.append(
-            f"The measured depths of {check.frames} held-out frames differ from the map by {check.factor:.2g} "
-            f"times what {_noise_name(sensor)} allows. {_advice(sensor, learnt)}"
+            f"The measured depths of {check.frames} held-out frames differ from the map by "
+            f"{check.factor:.2g} times what {_noise_name(sensor)} allows. {_advice(sensor, learnt)}"
         )
     return notes
 

@@ -119,8 +119,8 @@ class Map:
             raise ConfigError("--poses takes one SOURCE, and does not work with --submap-size")
         if self.noise == "auto" and (self.poses.track_poses or self.submap_size is not None):
             raise ConfigError(
-                "--noise auto needs poses and does not work with --track-poses or --submap-size: learn the noise "
-                "in a run without them, and pass its sensor.yaml with --config"
+                "--noise auto does not work with --track-poses or --submap-size: learn the noise in a run "
+                "without them, and pass its sensor.yaml with --config"
             )
         if self.shown_reading != "marginal":
             whole = self.submap_size is None and self.settings.volume.window_m == 0
