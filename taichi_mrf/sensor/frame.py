@@ -64,7 +64,8 @@ class Frame:
         """The part of it that a map with this configuration takes."""
         sigma_m = self._widened_sigma(sensor) if sensor.pixel_sigma else None
         no_return = self.no_return if sensor.no_return != "ignore" else None
-        return OwnEvidence(widened_noise(self.noise, sensor), sigma_m, no_return)
+        noise = None if self.noise is None else widened_noise(self.noise, sensor)
+        return OwnEvidence(noise, sigma_m, no_return)
 
     def own_in(self, config: Config) -> OwnEvidence:
         """What a map with this configuration takes: the same, and how uncertain the frame's pose is."""

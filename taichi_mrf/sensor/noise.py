@@ -185,9 +185,9 @@ def widened(sigma: NDArray[np.float64], config: SensorConfig) -> NDArray[np.floa
     return sigma
 
 
-def widened_noise(noise: NoiseModel | None, config: SensorConfig) -> NoiseModel | None:
-    """A noise model that a frame states, with the same; None for none. Models of other classes than those of
-    this file stay as they are."""
+def widened_noise(noise: NoiseModel, config: SensorConfig) -> NoiseModel:
+    """A noise model that was stated as an object, with the same. Models of other classes than those of this
+    file stay as they are."""
     return _with_sigma(noise, lambda sigma: widened(sigma, config))
 
 
