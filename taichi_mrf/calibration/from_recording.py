@@ -1,9 +1,10 @@
 """Sigma learnt from the recording that is to be mapped, without any truth.
 
 Some of its frames are mapped and others held out. The law of sigma under which the held-out measurements are
-likeliest takes the place of the assumed one, and the map is made again, until nothing changes or the
-measurements are no likelier. What the law then holds is not the sensor's noise alone: poses that are off and
-errors that neighbouring pixels share are in it, because they make depth differ from a map as noise does.
+likeliest takes the place of the assumed one, unless they agree with that, and the map is made again, until
+nothing changes or the measurements are no likelier. What the law then holds is not the sensor's noise alone:
+poses that are off and errors that neighbouring pixels share are in it, because they make depth differ from a
+map as noise does.
 """
 
 import math
@@ -16,8 +17,8 @@ from taichi_mrf.config.schema import Config, EvaluationConfig, without_window
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import chosen
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
-from taichi_mrf.evaluation.noise_check import explained_frame
-from taichi_mrf.evaluation.noise_fit import Explained, SigmaLaw, pooled, sigma_factor, sigma_law
+from taichi_mrf.evaluation.noise_check import checked, explained_frame
+from taichi_mrf.evaluation.noise_fit import Explained, SigmaLaw, pooled, sigma_law
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.mapping.result import MappingResult
 
@@ -39,7 +40,7 @@ SETTLED = 1.05
 class LearntSigma:
     """The law of sigma over what is stated, and what it was learnt from: held-out ``frames`` with ``pixels``
     measurements, which had wanted ``factor`` times the assumed sigma, and whose mean log density per metre
-    rose from ``before`` to ``after``."""
+    rose from ``before`` to ``after``. A noise that they agree with stays as it is."""
 
     law: SigmaLaw
     frames: int
@@ -88,9 +89,12 @@ def learn_sigma(
                 f"{dataset.name}: --noise auto cannot learn: {len(m.held_out)} held-out frames hold too few "
                 "measurements; name the noise with --sensor.sigma"
             )
-        mean, factor = measured.mean(), sigma_factor(measured)
+        mean = measured.mean(measured.sigma_m)
         if found is None:
-            found = LearntSigma(law, len(parts), len(measured.sigma_m), factor, mean, mean)
+            check = checked(measured, len(parts))
+            found = LearntSigma(law, check.frames, check.pixels, check.factor, mean, mean)
+            if not check.wrong:
+                break
         elif mean > found.after:
             found = replace(found, law=law, after=mean)
         else:

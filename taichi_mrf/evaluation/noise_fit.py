@@ -2,12 +2,16 @@
 
 A measurement's density under the map is that of its ray's surface, spread by sigma. It is computed for sigmas
 from an eighth to 32 times the assumed one; the factor under which all measurements together are likeliest is
-the answer. Unlike the ratio of residuals to sigma it knows which part of the residuals voxels are to blame
-for, and rays that meet another surface, or none, say nothing of sigma: their density does not depend on it.
+the answer. Unlike the ratio of residuals to sigma it does not depend on rays that meet another surface, or
+none: their density is the same for all sigmas.
 
 Sigma may also be off by other factors near than far: errors of poses add as much to a precise near
 measurement as to a coarse far one. So a law of two parameters is fitted in the same way, added + scale times
 what is stated.
+
+The map of a right noise, too, is off by a part of a voxel: it does not know where in a voxel a surface is,
+nor always in which of two neighbours. The variance of a place that may be anywhere in a voxel,
+voxel_size^2 / 12, is no noise of the sensor and is set aside.
 """
 
 from collections.abc import Callable, Iterable
@@ -30,6 +34,12 @@ PIXELS = 5_000
 LEAST_PIXELS = 200
 """With fewer nothing is said."""
 
+VOXEL_SPREAD = 12.0**-0.5
+"""Standard deviation of a place that may be anywhere in a voxel, in voxels."""
+
+LEAST_SCALE = 0.01
+"""A law keeps this share of the stated sigma: a parameter that is 0 would never grow again."""
+
 CLOSE = 1.02
 """Factor to which the parameters of a law are found."""
 
@@ -38,16 +48,19 @@ CLOSE = 1.02
 class Explained:
     """How well a map explains n measurements. ``sigma_m`` (n,) is the assumed standard deviation of each, in
     metres, ``stated_m`` (n,) the one without what was learnt, and ``log_likelihood`` (n, OCTAVES) the log
-    density, per metre, under each multiple of ``sigma_m``."""
+    density, per metre, under each multiple of ``sigma_m``. ``voxel_m`` is the standard deviation that the
+    size of a voxel adds."""
 
     sigma_m: NDArray[np.float64]
     stated_m: NDArray[np.float64]
     log_likelihood: NDArray[np.float64]
+    voxel_m: float = 0.0
 
-    def mean(self, factor: ArrayLike = 1.0) -> float:
-        """Mean log density with ``factor`` times sigma, a number or (n,), between the tried ones by
-        parabolas."""
-        place = np.broadcast_to((np.log2(factor) - OCTAVES[0]) / (OCTAVES[1] - OCTAVES[0]), len(self.sigma_m))
+    def mean(self, sigma_m: ArrayLike) -> float:
+        """Mean log density with other standard deviations, (n,), to which the voxel's is added; between the
+        tried ones by parabolas."""
+        factor = np.hypot(sigma_m, self.voxel_m) / self.sigma_m
+        place = (np.log2(factor) - OCTAVES[0]) / (OCTAVES[1] - OCTAVES[0])
         place = np.clip(place, 0.0, len(OCTAVES) - 1.0)
         middle = np.clip(np.rint(place).astype(np.int64), 1, len(OCTAVES) - 2)
         t, pixel = place - middle, np.arange(len(middle))
@@ -89,7 +102,7 @@ def explained(
         densities.append(view.log_densities())
     sigma_m = table.at_pixels(some)[0][measured]
     stated_m = sigma_m if stated is None else stated.table(camera).at_pixels(some)[0][measured]
-    return Explained(sigma_m, stated_m, np.stack(densities, axis=1))
+    return Explained(sigma_m, stated_m, np.stack(densities, axis=1), VOXEL_SPREAD * m.voxel_size)
 
 
 def pooled(parts: Iterable[Explained | None]) -> Explained | None:
@@ -97,17 +110,17 @@ def pooled(parts: Iterable[Explained | None]) -> Explained | None:
     found = [part for part in parts if part is not None]
     if sum(len(part.sigma_m) for part in found) < LEAST_PIXELS:
         return None
-    return Explained(
-        np.concatenate([part.sigma_m for part in found]),
-        np.concatenate([part.stated_m for part in found]),
-        np.concatenate([part.log_likelihood for part in found]),
+    sigma_m, stated_m, log_likelihood = (
+        np.concatenate([getattr(part, name) for part in found])
+        for name in ("sigma_m", "stated_m", "log_likelihood")
     )
+    return Explained(sigma_m, stated_m, log_likelihood, found[0].voxel_m)
 
 
 def sigma_factor(measurements: Explained) -> float:
     """The factor on sigma under which the measurements are likeliest."""
     octaves = np.linspace(OCTAVES[0], OCTAVES[-1], 8 * (len(OCTAVES) - 1) + 1)
-    means = [measurements.mean(2.0**octave) for octave in octaves]
+    means = [measurements.mean(2.0**octave * measurements.sigma_m) for octave in octaves]
     return float(2.0 ** octaves[int(np.argmax(means))])
 
 
@@ -117,7 +130,7 @@ def sigma_law(measurements: Explained) -> SigmaLaw:
 
     def mean(law: SigmaLaw) -> float:
         of_law = np.maximum(law.added_m + law.scale * stated_m, LEAST_SIGMA_M)
-        return measurements.mean(of_law / sigma_m)
+        return measurements.mean(of_law)
 
     scale = sigma_factor(measurements) * float(np.median(sigma_m / stated_m))
     middle_m = scale * float(np.median(stated_m))
@@ -140,6 +153,7 @@ def _improved(law: SigmaLaw, mean: Callable[[SigmaLaw], float]) -> SigmaLaw:
                 (1 / step, step),
             )
         ]
+        tried = [SigmaLaw(max(each.scale, LEAST_SCALE), each.added_m) for each in tried]
         values = [mean(each) for each in tried]
         if max(values) > best:
             best = max(values)

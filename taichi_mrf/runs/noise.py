@@ -9,6 +9,7 @@ import yaml
 from taichi_mrf.calibration.from_recording import LearntSigma
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.evaluation.noise_check import NoiseCheck
+from taichi_mrf.evaluation.noise_fit import SigmaLaw
 
 _FIELDS = ("sigma", "bias", "sigma_table", "bias_table", "patch", "pixel_sigma", "sigma_scale", "sigma_added")
 """The parameters of noise among those of the sensor."""
@@ -17,19 +18,19 @@ _FIELDS = ("sigma", "bias", "sigma_table", "bias_table", "patch", "pixel_sigma",
 def noise_report(
     sensor: SensorConfig, check: NoiseCheck | None, learnt: LearntSigma | None
 ) -> dict[str, Any]:
-    """The entry ``noise`` of a report: ``factor`` is what sigma would have to be multiplied by, ``by_voxels``
-    how much of it the size of voxels explains; both None if nothing was held out."""
+    """The entry ``noise`` of a report: ``factor`` is what sigma would have to be multiplied by, ``gain`` by
+    how many nats each measurement would then be likelier; both None if nothing was held out."""
     report: dict[str, Any] = {
         "sigma_scale": sensor.sigma_scale,
         "sigma_added": sensor.sigma_added,
         "factor": None,
-        "by_voxels": None,
+        "gain": None,
         "wrong": None,
         "frames": 0,
         "learnt": None,
     }
     if check is not None:
-        report |= {"factor": round(check.factor, 3), "by_voxels": round(check.by_voxels, 3)}
+        report |= {"factor": round(check.factor, 3), "gain": round(check.gain, 3)}
         report |= {"wrong": check.wrong, "frames": check.frames}
     if learnt is not None:
         facts = asdict(learnt)
@@ -41,7 +42,9 @@ def noise_report(
 def noise_notes(sensor: SensorConfig, check: NoiseCheck | None, learnt: LearntSigma | None) -> list[str]:
     """The same in sentences."""
     notes = []
-    if learnt is not None:
+    if learnt is not None and learnt.law == SigmaLaw(1.0, 0.0):
+        notes.append(f"Sigma stays as stated: {learnt.frames} held-out frames agree with it.")
+    elif learnt is not None:
         notes.append(
             f"Sigma was learnt from {learnt.frames} held-out frames: {sensor.sigma_scale:g} times the stated "
             f"one and {100 * sensor.sigma_added:.2g} cm; a single factor would have been {learnt.factor:.2g}."

@@ -38,7 +38,7 @@ def test_the_first_try_is_where_the_search_begins() -> None:
         "inference.outlier_floor",
         "inference.message_clamp",
         "inference.free_share",
-        "sensor.sigma",
+        "sensor.sigma_scale",
     }
     assert search.best == CONFIG
 
