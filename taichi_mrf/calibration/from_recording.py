@@ -2,12 +2,11 @@
 
 Some of its frames are mapped and others held out. The law of sigma under which the held-out measurements are
 likeliest takes the place of the assumed one, unless they agree with that, and the map is made again, until
-nothing changes or the measurements are no likelier. What the law then holds is not the sensor's noise alone:
+they agree or are no likelier. What the law then holds is not the sensor's noise alone:
 poses that are off and errors that neighbouring pixels share are in it, because they make depth differ from a
 map as noise does.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -31,9 +30,6 @@ HOLD_OUT = 4
 
 MAPS = 3
 """Maps that are made, at most."""
-
-SETTLED = 1.05
-"""A law that changes a typical sigma by less than this factor is the final one."""
 
 
 @dataclass(frozen=True)
@@ -90,21 +86,17 @@ def learn_sigma(
                 "measurements; name the noise with --sensor.sigma"
             )
         mean = measured.mean(measured.sigma_m)
+        check = checked(measured, len(parts))
         if found is None:
-            check = checked(measured, len(parts))
             found = LearntSigma(law, check.frames, check.pixels, check.factor, mean, mean)
-            if not check.wrong:
-                break
         elif mean > found.after:
             found = replace(found, law=law, after=mean)
         else:
             break
-        better = sigma_law(measured)
-        typical_m = float(np.median(measured.stated_m))
-        change = (better.added_m + better.scale * typical_m) / (law.added_m + law.scale * typical_m)
-        if abs(math.log(change)) < math.log(SETTLED) or should_stop():
+        if not check.wrong or should_stop():
             break
-        law = better
+        # A sigma that is too large is so without any part of a voxel, too.
+        law = sigma_law(measured if check.factor > 1.0 else replace(measured, voxel_m=0.0))
     assert found is not None, "there is at least one map"
     return found
 

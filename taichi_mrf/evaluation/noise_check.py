@@ -67,9 +67,12 @@ def check_noise(
 
 
 def checked(measured: Explained, frames: int) -> NoiseCheck:
-    """The check of the measurements of some frames."""
-    factor = sigma_factor(measured)
-    gain = measured.mean(factor * measured.sigma_m) - measured.mean(measured.sigma_m)
+    """The check of the measurements of some frames. How much of a voxel a map does not know depends on the
+    scene, so the factor is the one next to 1 of those between that for a whole voxel and that for none."""
+    without = replace(measured, voxel_m=0.0)
+    least, most = sigma_factor(measured), sigma_factor(without)
+    factor, by = (least, measured) if least > 1.0 else (min(most, 1.0), without)
+    gain = by.mean(factor * by.sigma_m) - by.mean(by.sigma_m)
     return NoiseCheck(factor, gain, frames, len(measured.sigma_m))
 
 

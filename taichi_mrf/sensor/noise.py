@@ -188,6 +188,8 @@ def widened(sigma: NDArray[np.float64], config: SensorConfig) -> NDArray[np.floa
 def widened_noise(noise: NoiseModel, config: SensorConfig) -> NoiseModel:
     """A noise model that was stated as an object, with the same. Models of other classes than those of this
     file stay as they are."""
+    if config.sigma_scale == 1 and config.sigma_added == 0:
+        return noise
     return _with_sigma(noise, lambda sigma: widened(sigma, config))
 
 

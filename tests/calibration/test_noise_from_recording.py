@@ -38,8 +38,8 @@ def test_the_true_sigma_is_learnt_whatever_is_stated(room: Dataset, factor: floa
     right = SensorConfig().sigma
     true_m = float(np.polynomial.polynomial.polyval(depth_m, right))
     found_m = learnt_m(room, SensorConfig(sigma=tuple(factor * c for c in right)), depth_m)
-    # Twelve coarse images leave more than a part of a voxel undecided, which the law takes for noise.
-    assert 0.6 * true_m < found_m < 1.6 * true_m
+    # Half a voxel is what twelve coarse images leave undecided, at most.
+    assert 0.6 * true_m < found_m < true_m + 0.5 * VOXEL
     assert abs(math.log(found_m / true_m)) < abs(math.log(factor))
 
 
