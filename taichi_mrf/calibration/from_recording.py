@@ -7,8 +7,10 @@ poses that are off and errors that neighbouring pixels share are in it, because 
 map as noise does.
 """
 
+import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -32,11 +34,23 @@ MAPS = 3
 """Maps that are made, at most."""
 
 
+LONG_RAY = 10.0
+"""Where a measured ray is longer on average than so many times what ``inference.surface_density`` expects, as
+outdoors, that prior is tried, too: one surface in the mean length of a ray, and with it"""
+
+WILD = 1e-2
+"""this density of outliers per metre, since a prior that expects few surfaces cannot explain them."""
+
+LEAST_GAIN = 0.1
+"""Nats by which each held-out measurement must be likelier for a prior to take the place of the given one."""
+
+
 @dataclass(frozen=True)
 class LearntSigma:
     """The law of sigma over what is stated, and what it was learnt from: held-out ``frames`` with ``pixels``
     measurements, which had wanted ``factor`` times the assumed sigma, and whose mean log density per metre
-    rose from ``before`` to ``after``. A noise that they agree with stays as it is."""
+    rose from ``before`` to ``after``. A noise that they agree with stays as it is. ``prior`` are the
+    parameters of inference that were changed with it, by name; empty for most recordings."""
 
     law: SigmaLaw
     frames: int
@@ -44,10 +58,11 @@ class LearntSigma:
     factor: float
     before: float
     after: float
+    prior: dict[str, float] = field(default_factory=dict)
 
     def put_into(self, config: Config) -> Config:
-        """The parameters with the law."""
-        return _with_law(config, self.law)
+        """The parameters with what was learnt."""
+        return _with(config, self.law, self.prior)
 
 
 def learn_sigma(
@@ -73,22 +88,29 @@ def learn_sigma(
         )
     frames = chosen(dataset, _spread(range(0, len(dataset), every)[:limit]))
     trial = replace(without_window(config), color=False, evaluation=EvaluationConfig(hold_out=HOLD_OUT))
-    law = SigmaLaw(config.sensor.sigma_scale, config.sensor.sigma_added)
-    found: LearntSigma | None = None
-    for number in range(1, MAPS + 1):
-        on_map(number)
-        m = map_sequence(frames, _with_law(trial, law), skip_bad_frames=True, should_stop=should_stop)
-        parts = _held_out(m, frames)
+    numbers = itertools.count(1)
+
+    def measured_with(law: SigmaLaw, prior: dict[str, float]) -> tuple[Explained, int]:
+        """The held-out measurements in a map of the others, and the number of frames that they are of."""
+        on_map(next(numbers))
+        changed = _with(trial, law, prior)
+        result = map_sequence(frames, changed, skip_bad_frames=True, should_stop=should_stop)
+        parts = _held_out(result, frames)
         measured = pooled(parts)
         if measured is None:
             raise DatasetError(
-                f"{dataset.name}: --noise auto cannot learn: {len(m.held_out)} held-out frames hold too few "
-                "measurements; name the noise with --sensor.sigma"
+                f"{dataset.name}: --noise auto cannot learn: {len(result.held_out)} held-out frames hold too "
+                "few measurements; name the noise with --sensor.sigma"
             )
-        mean = measured.mean(measured.sigma_m)
-        check = checked(measured, len(parts))
+        return measured, len(parts)
+
+    law = SigmaLaw(config.sensor.sigma_scale, config.sensor.sigma_added)
+    found: LearntSigma | None = None
+    for _ in range(MAPS):
+        measured, count = measured_with(law, {})
+        mean, check = measured.mean(measured.sigma_m), checked(measured, count)
         if found is None:
-            found = LearntSigma(law, check.frames, check.pixels, check.factor, mean, mean)
+            found = LearntSigma(law, count, check.pixels, check.factor, mean, mean)
         elif mean > found.after:
             found = replace(found, law=law, after=mean)
         else:
@@ -98,7 +120,30 @@ def learn_sigma(
         # A sigma that is too large is so without any part of a voxel, too.
         law = sigma_law(measured if check.factor > 1.0 else replace(measured, voxel_m=0.0))
     assert found is not None, "there is at least one map"
+    least_gain = LEAST_GAIN
+    for prior in _priors(frames, config):
+        measured, _ = measured_with(found.law, prior)
+        mean = measured.mean(measured.sigma_m)
+        if mean > found.after + least_gain:
+            found, least_gain = replace(found, after=mean, prior=prior), 0.0
     return found
+
+
+def _priors(frames: Dataset, config: Config) -> list[dict[str, float]]:
+    """The priors to try beside the given one: none but where rays are long."""
+    lengths_m = []
+    for index in range(len(frames)):
+        try:
+            depth_m = frames.read(index).depth_m
+        except FrameError:
+            continue
+        lengths_m.append(np.minimum(depth_m[depth_m > 0], config.sensor.max_depth))
+    density = 1.0 / float(np.concatenate(lengths_m).mean())
+    given = config.inference
+    if config.method != "mrf" or given.prior is not None or density * LONG_RAY > given.surface_density:
+        return []
+    few = {"surface_density": _rounded(density)}
+    return [few, few | {"outlier_floor": max(WILD, given.outlier_floor)}]
 
 
 def _spread(indices: range) -> list[int]:
@@ -111,9 +156,12 @@ def _spread(indices: range) -> list[int]:
     return [indices[start + k * stride] for start in starts for k in range(each)]
 
 
-def _with_law(config: Config, law: SigmaLaw) -> Config:
+def _with(config: Config, law: SigmaLaw, prior: dict[str, float]) -> Config:
     sensor = replace(config.sensor, sigma_scale=_rounded(law.scale), sigma_added=_rounded(law.added_m))
-    return replace(config, sensor=sensor)
+    changed: dict[str, Any] = {"sensor": sensor}
+    if prior:
+        changed["inference"] = replace(config.inference, **prior)
+    return replace(config, **changed)
 
 
 def _rounded(value: float) -> float:

@@ -78,7 +78,7 @@ def _of_scene(
     noises = {"given": scene.noise, "learnt": learnt.noise}
     maps = [
         (given, scene),
-        (case.ours(AUTO), learnt),
+        (case.ours(AUTO, **law["prior"]), learnt),
         (tuned_contender(experiment, scene, 0, voxel_size, keyframes), scene),
         (wavemap(), scene),
     ]
@@ -100,7 +100,8 @@ def _of_scene(
 
 def _learnt(ours: Contender, scene: Scene, voxel_size: float, keyframes: Sequence[int]) -> Result:
     found = learn_sigma(frames_of(scene, keyframes), ours.make(scene, voxel_size).config)
-    return {"scale": found.law.scale, "added_m": found.law.added_m, "factor": found.factor}
+    law = {"scale": found.law.scale, "added_m": found.law.added_m, "factor": found.factor}
+    return law | {"prior": found.prior}
 
 
 def _judged(

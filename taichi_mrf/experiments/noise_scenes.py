@@ -4,7 +4,8 @@ Real ones have poses that are off and errors that neighbouring pixels share, whi
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -15,7 +16,8 @@ from taichi_mrf import PolynomialNoise, open_dataset
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.datasets import Dataset
-from taichi_mrf.experiments.contenders import Contender, lidar_mrf, mrf
+from taichi_mrf.datasets.lidar.recording import LIDAR_PASS_THROUGH
+from taichi_mrf.experiments.contenders import Contender, mrf
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.lidar import lidar_scene
 from taichi_mrf.experiments.scenes import Scene, SceneView, coffin_scene, house_scene, kitchen_scene
@@ -34,6 +36,9 @@ TOF = SimulatedSensor(
 )
 """A small time-of-flight camera, which sees through edges: pixels beside them keep a depth."""
 
+AS_MAPPED = partial(mrf, ray_density=2.5)
+"""MRFMap with the default number of rays, as `map` has it, in place of a ray for each pixel."""
+
 TOF_WALK = "synthetic:corridor?rooms=2&frames=60&width=320&height=240&noise=none"
 TOF_WAVE_M, TOF_WAVE_PIXELS = 0.01, 25.0
 """Standard deviation of the errors that neighbouring pixels share, and how far they reach."""
@@ -44,14 +49,14 @@ TOF_POSE_M, TOF_POSE_RAD = 0.005, 0.003
 @dataclass(frozen=True)
 class NoiseCase:
     """A recording with a noise file: ``right`` if that is the sensor's. Views that are not ``held_out`` are
-    mapped; ``ours`` is MRFMap as ``map`` makes it for this kind of sensor."""
+    mapped; ``ours`` is MRFMap for this kind of sensor, by name and parameters."""
 
     name: str
     voxel_sizes: tuple[float, ...]
     right: bool
     take: Callable[[Experiment], Scene]
     held_out: slice
-    ours: Callable[[str], Contender] = field(default=lambda name: mrf(name, ray_density=2.5))
+    ours: Callable[..., Contender] = AS_MAPPED
 
     def split(self, scene: Scene) -> tuple[list[int], list[int]]:
         """Indices of the mapped and of the held-out views."""
@@ -66,9 +71,16 @@ def cases() -> list[NoiseCase]:
         NoiseCase(
             "kitchen", (0.05, 0.02, 0.01), False, lambda e: kitchen_scene(e.data, e.limit), every_other
         ),
-        NoiseCase("street", (0.2,), False, _street, every_other, lambda name: mrf(name, ray_density=2.5)),
+        NoiseCase("street", (0.2,), False, _street, every_other),
         NoiseCase("time of flight", (0.05,), False, _time_of_flight, every_fifth),
-        NoiseCase("building", (0.2,), False, lambda e: lidar_scene(e.data, e.limit), every_fifth, lidar_mrf),
+        NoiseCase(
+            "building",
+            (0.2,),
+            False,
+            lambda e: lidar_scene(e.data, e.limit),
+            every_fifth,
+            partial(mrf, pass_through=LIDAR_PASS_THROUGH),
+        ),
         NoiseCase("house", (0.05, 0.02), True, lambda e: house_scene(e.data, 0, e.limit), every_other),
         NoiseCase("room", (0.05, 0.02), True, _room, every_fifth),
         NoiseCase("coffin", (0.05,), True, lambda e: coffin_scene(e.data), slice(2, None, 4)),

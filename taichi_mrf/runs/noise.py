@@ -35,7 +35,8 @@ def noise_report(
     if learnt is not None:
         facts = asdict(learnt)
         del facts["law"]
-        report["learnt"] = {name: round(value, 4) for name, value in facts.items()}
+        prior = facts.pop("prior")
+        report["learnt"] = {name: round(value, 4) for name, value in facts.items()} | {"prior": prior}
     return report
 
 
@@ -49,6 +50,9 @@ def noise_notes(sensor: SensorConfig, check: NoiseCheck | None, learnt: LearntSi
             f"Sigma was learnt from {learnt.frames} held-out frames: {sensor.sigma_scale:g} times the stated "
             f"one and {100 * sensor.sigma_added:.2g} cm; a single factor would have been {learnt.factor:.2g}."
         )
+    if learnt is not None and learnt.prior:
+        changed = ", ".join(f"inference.{name} is {value:g}" for name, value in learnt.prior.items())
+        notes.append(f"Rays are long: {changed}, with which held-out measurements are likelier.")
     if check is not None and check.wrong:
         notes.append(
             f"The measured depths of {check.frames} held-out frames differ from the map by "
@@ -62,7 +66,8 @@ def sensor_yaml(sensor: SensorConfig, source: str, learnt: LearntSigma) -> str:
     fields = {
         name: list(value) if isinstance(value := getattr(sensor, name), tuple) else value for name in _FIELDS
     }
-    text = yaml.safe_dump({"sensor": fields}, sort_keys=False, default_flow_style=None)
+    sections = {"sensor": fields} | ({"inference": learnt.prior} if learnt.prior else {})
+    text = yaml.safe_dump(sections, sort_keys=False, default_flow_style=None)
     return (
         f"# Sigma as learnt from {learnt.frames} held-out frames of {source!r}.\n"
         "# Use it with: taichi-mrf map SOURCE --out DIR --config FILE\n" + text

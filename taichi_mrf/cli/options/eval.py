@@ -50,7 +50,7 @@ class Eval:
     """Use at most N views or folds, for a quick look."""
 
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="PART ...")] = ()
-    """Run only these parts of trajectory, such as 'room, 10 Hz' or 'kitchen*', or of noise, such as 'house'."""
+    """Run only these parts of trajectory, such as 'room, 10 Hz' or 'kitchen*', or of noise: 'house'."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
     """How much is printed."""
