@@ -30,8 +30,8 @@ because frames that are further apart may not see each other's surfaces."""
 HOLD_OUT = 4
 """One of so many is held out."""
 
-MAPS = 3
-"""Maps that are made, at most."""
+MAPS, MOST_MAPS = 3, 5
+"""Maps that are made for the law, and with those for the prior, at most."""
 
 
 LONG_RAY = 10.0
@@ -121,7 +121,7 @@ def learn_sigma(
         law = sigma_law(measured if check.factor > 1.0 else replace(measured, voxel_m=0.0))
     assert found is not None, "there is at least one map"
     least_gain = LEAST_GAIN
-    for prior in _priors(frames, config):
+    for prior in [] if should_stop() else _priors(frames, config):
         measured, _ = measured_with(found.law, prior)
         mean = measured.mean(measured.sigma_m)
         if mean > found.after + least_gain:

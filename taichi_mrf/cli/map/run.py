@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from taichi_mrf.calibration.from_recording import MAPS, LearntSigma, learn_sigma
+from taichi_mrf.calibration.from_recording import MOST_MAPS, LearntSigma, learn_sigma
 from taichi_mrf.cli.map.earlier import refuse_other_run
 from taichi_mrf.cli.map.keep import Keeper, resumed_map, skipped_before
 from taichi_mrf.cli.map.report import print_report
@@ -128,7 +128,7 @@ def _learn_noise(
         settings,
         every=task.every,
         limit=task.limit,
-        on_map=lambda number: progress.advance("Learning noise", number - 1, MAPS),
+        on_map=lambda number: progress.advance("Learning noise", number - 1, MOST_MAPS),
         should_stop=request,
     )
 
