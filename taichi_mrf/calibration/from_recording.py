@@ -39,7 +39,7 @@ LONG_RAY = 10.0
 outdoors, that prior is tried, too: one surface in the mean length of a ray, and with it"""
 
 WILD = 1e-2
-"""this density of outliers per metre, since a prior that expects few surfaces cannot explain them."""
+"""perhaps this density of outliers per metre, since a prior that expects few surfaces cannot explain them."""
 
 LEAST_GAIN = 0.1
 """Nats by which each held-out measurement must be likelier for a prior to take the place of the given one."""
@@ -104,29 +104,28 @@ def learn_sigma(
             )
         return measured, len(parts)
 
-    law = SigmaLaw(config.sensor.sigma_scale, config.sensor.sigma_added)
-    found: LearntSigma | None = None
-    for _ in range(MAPS):
-        measured, count = measured_with(law, {})
-        mean, check = measured.mean(measured.sigma_m), checked(measured, count)
-        if found is None:
-            found = LearntSigma(law, count, check.pixels, check.factor, mean, mean)
-        elif mean > found.after:
-            found = replace(found, law=law, after=mean)
-        else:
-            break
+    law, prior = SigmaLaw(config.sensor.sigma_scale, config.sensor.sigma_added), dict[str, float]()
+    measured, count = measured_with(law, prior)
+    before = after = measured.mean(measured.sigma_m)
+    # The prior first: a sigma that makes up for a wrong one would be too large with the right one.
+    least = before + LEAST_GAIN
+    for other in [] if should_stop() else _priors(frames, config):
+        tried, _ = measured_with(law, other)
+        if tried.mean(tried.sigma_m) > least:
+            measured, prior, least = tried, other, tried.mean(tried.sigma_m)
+            after = least
+    first = check = checked(measured, count)
+    for _ in range(MAPS - 1):
         if not check.wrong or should_stop():
             break
         # A sigma that is too large is so without any part of a voxel, too.
-        law = sigma_law(measured if check.factor > 1.0 else replace(measured, voxel_m=0.0))
-    assert found is not None, "there is at least one map"
-    least_gain = LEAST_GAIN
-    for prior in [] if should_stop() else _priors(frames, config):
-        measured, _ = measured_with(found.law, prior)
-        mean = measured.mean(measured.sigma_m)
-        if mean > found.after + least_gain:
-            found, least_gain = replace(found, after=mean, prior=prior), 0.0
-    return found
+        better = sigma_law(measured if check.factor > 1.0 else replace(measured, voxel_m=0.0))
+        measured, count = measured_with(better, prior)
+        mean, check = measured.mean(measured.sigma_m), checked(measured, count)
+        if mean <= after:
+            break
+        law, after = better, mean
+    return LearntSigma(law, first.frames, first.pixels, first.factor, before, after, prior)
 
 
 def _priors(frames: Dataset, config: Config) -> list[dict[str, float]]:
