@@ -1,4 +1,4 @@
-"""Learning a sensor's bias and noise from depth whose true value is known.
+"""Learning a sensor's bias and noise from depth whose true value is known, and its sigma from a recording.
 
-Uses `evaluation.pictures`, `datasets` and the packages below them.
+Uses `evaluation`, `mapping` and the packages below them.
 """

@@ -50,6 +50,13 @@ class SensorConfig:
     """Use the standard deviation that frames state for each pixel, as stereo matching does. Otherwise
     ``sigma`` or its table holds for all pixels."""
 
+    sigma_scale: float = 1.0
+    """Factor on every standard deviation that is stated: by ``sigma``, its table, or frames. With
+    ``sigma_added`` it is what ``map --noise auto`` learns from a recording."""
+
+    sigma_added: float = 0.0
+    """Metres added to every standard deviation after that: what poses and voxels add at all depths."""
+
     min_depth: float = 0.1
     """Ignore measurements nearer than this (metres)."""
 
@@ -80,6 +87,9 @@ class SensorConfig:
         check_field(all(map(math.isfinite, self.sigma)), "sensor.sigma", "holds a value that is not finite")
         check_field(len(self.bias) >= 1, "sensor.bias", "needs at least one coefficient")
         check_field(all(map(math.isfinite, self.bias)), "sensor.bias", "holds a value that is not finite")
+        scale_ok = 0 < self.sigma_scale < math.inf
+        check_field(scale_ok, "sensor.sigma_scale", "must be positive and finite")
+        check_field(0 <= self.sigma_added < math.inf, "sensor.sigma_added", "must be 0 or a number of metres")
         check_field(self.patch >= 1, "sensor.patch", "must be at least 1 pixel")
         check_field(self.min_depth >= 0, "sensor.min_depth", "must not be negative")
         check_field(self.max_depth > self.min_depth, "sensor.max_depth", "must be more than sensor.min_depth")

@@ -78,3 +78,33 @@ class Reposed(Derived):
 def reposed(dataset: Dataset, poses: Mapping[int, Pose]) -> Reposed:
     """The frames of a dataset at other poses."""
     return Reposed(dataset.name, dataset.camera, dataset.notes, dataset.dropped, source=dataset, poses=poses)
+
+
+@dataclass
+class Chosen(Derived):
+    """Some frames of ``source``: those with the ``indices``."""
+
+    indices: Sequence[int] = field(kw_only=True)
+
+    @property
+    def frame_names(self) -> Sequence[str]:
+        """Those of the chosen frames."""
+        return [self.source.frame_names[index] for index in self.indices]
+
+    def stamps(self) -> Sequence[float] | NDArray[np.float64]:
+        """Those of the chosen frames."""
+        stamps = self.source.stamps()
+        return [float(stamps[index]) for index in self.indices]
+
+    def sensor_of(self, index: int) -> str:
+        """The source's of that frame."""
+        return self.source.sensor_of(self.indices[index])
+
+    def read(self, index: int) -> Frame:
+        """The source's frame. Raises what the source raises."""
+        return self.source.read(self.indices[index])
+
+
+def chosen(dataset: Dataset, indices: Sequence[int]) -> Chosen:
+    """Some frames of a dataset, in the order of their ``indices``."""
+    return Chosen(dataset.name, dataset.camera, source=dataset, indices=indices)

@@ -124,17 +124,19 @@ class JudgedView:
 
     def log_likelihood(self) -> float:
         """Mean log density (per metre) of the measurements under the map and the sensor's noise; NaN if there
-        are none.
+        are none."""
+        return float(np.mean(self.log_densities())) if self.measured.any() else float("nan")
+
+    def log_densities(self) -> NDArray[np.float64]:
+        """The log density of each measurement, row by row, (n,).
 
         A share OUTLIERS of the measurements, and what is left of a ray that leaves the map, may come from
         anywhere in the sensor's range, so one pixel cannot cost more than log(OUTLIERS / range).
         """
-        if not self.measured.any():
-            return float("nan")
         survey, anywhere = self.survey, 1.0 / self.max_depth
         through = survey.visibility[self.measured].astype(np.float64)
         explained = survey.likelihood[self.measured] + through * anywhere
-        return float(np.mean(np.log((1.0 - OUTLIERS) * explained + OUTLIERS * anywhere)))
+        return np.asarray(np.log((1.0 - OUTLIERS) * explained + OUTLIERS * anywhere))
 
     def _within(self, tolerance: Tolerance) -> NDArray[np.bool_]:
         depth, answer = self.depth_m.astype(np.float64), self.survey.middle.astype(np.float64)

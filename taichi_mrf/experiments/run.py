@@ -58,6 +58,7 @@ EXPERIMENTS = {
     "submaps": Entry("submaps.corridor:run_submaps", (0.05,), needs_data=False),
     "surface": Entry("surface:run_surface", (0.05, 0.02, 0.01)),
     "lidar": Entry("lidar:run_lidar", (0.2, 0.1, 0.05)),
+    "noise": Entry("noise:run_noise", (), has_parts=True),
     "sensors": Entry("sensors:run_sensors", (0.05,), needs_data=False),
     "trajectory": Entry("trajectory.tables:run_trajectory", (0.05,), has_parts=True),
     "peers": Entry("peers.run:run_peers", (0.05, 0.02, 0.01), has_parts=True),

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.config.schema import SensorConfig
-from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise
+from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise, patch_coefficients
 
 
 def describing(noise: NoiseModel | None, sensor: SensorConfig) -> SensorConfig:
@@ -16,11 +16,12 @@ def describing(noise: NoiseModel | None, sensor: SensorConfig) -> SensorConfig:
     if not isinstance(noise, PolynomialNoise):
         return sensor
     if sensor.sigma_table is None and sensor.bias_table is None:
-        described = PolynomialNoise(sensor.sigma, sensor.bias)
+        described = PolynomialNoise(*(each[0].tolist() for each in patch_coefficients(sensor)))
         if np.array_equal(described.sigma, noise.sigma) and np.array_equal(described.bias, noise.bias):
             return sensor
     sigma, bias = _coefficients(noise.sigma), _coefficients(noise.bias)
-    return replace(sensor, sigma=sigma, bias=bias, sigma_table=None, bias_table=None)
+    plain = replace(sensor, sigma_table=None, bias_table=None, sigma_scale=1.0, sigma_added=0.0)
+    return replace(plain, sigma=sigma, bias=bias)
 
 
 def _coefficients(padded: NDArray[np.float64]) -> tuple[float, ...]:

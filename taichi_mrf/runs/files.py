@@ -4,7 +4,7 @@ import shutil
 from pathlib import Path
 
 MAP_FILE, VOXEL_FILE, CONFIG_FILE = "map.npz", "voxels.ply", "config.yaml"
-MESH_FILE = "mesh.ply"
+MESH_FILE, NOISE_FILE = "mesh.ply", "sensor.yaml"
 REPORT_FILE, TRAJECTORY_FILE = "report.json", "trajectory.txt"
 WINDOW_FOLDER = "map_window.zarr"
 """The map in chunks of a run with a window (methods.mrf.parked_chunks.folder_beside)."""
@@ -18,10 +18,10 @@ def holds_run(folder: Path) -> bool:
 
 
 def remove_files_of_earlier_run(folder: Path, written: list[Path]) -> None:
-    """Remove the pictures, the trajectory and the map in chunks that the present run has not ``written``:
-    they show a run that it replaced."""
+    """Remove the pictures, the trajectory, the learnt noise and the map in chunks that the present run has
+    not ``written``: they show a run that it replaced."""
     if folder / WINDOW_FOLDER not in written:
         shutil.rmtree(folder / WINDOW_FOLDER, ignore_errors=True)
-    for name in (*PICTURE_FILES, TRAJECTORY_FILE):
+    for name in (*PICTURE_FILES, TRAJECTORY_FILE, NOISE_FILE):
         if folder / name not in written:
             (folder / name).unlink(missing_ok=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+from taichi_mrf.calibration.from_recording import LearntSigma
 from taichi_mrf.config.registry import METHODS, methods_with
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import commented_yaml
@@ -14,6 +15,7 @@ from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import reposed
 from taichi_mrf.errors import ConfigError, CutShortError, FrameError
 from taichi_mrf.evaluation.held_out import HeldOutCheck, RenderedMap, check_held_out
+from taichi_mrf.evaluation.noise_check import NoiseCheck, check_noise
 from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
 from taichi_mrf.export.formats import export_map, export_note
 from taichi_mrf.export.options import ExportOptions
@@ -27,12 +29,14 @@ from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.runs.files import (
     CONFIG_FILE,
     MAP_FILE,
+    NOISE_FILE,
     REPORT_FILE,
     TRAJECTORY_FILE,
     VOXEL_FILE,
     WINDOW_FOLDER,
     remove_files_of_earlier_run,
 )
+from taichi_mrf.runs.noise import noise_notes, noise_report, sensor_yaml
 from taichi_mrf.runs.report import report_json, rounded, run_report, unfinished_report
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.atomic import write_text
@@ -78,7 +82,7 @@ NO_HASTE: Haste = _NoHaste()
 class RunFacts:
     """What a run's report says besides its result: the ``source`` as it was asked for, the parameters, the
     recording (None for a saved map), further entries (``choice``), the unreadable frames of the run that this
-    one resumes, and warnings to be listed as notes."""
+    one resumes, warnings to be listed as notes, and how sigma was learnt, if it was."""
 
     source: str
     config: Config
@@ -86,10 +90,15 @@ class RunFacts:
     choice: dict[str, Any] = field(default_factory=dict)
     skipped_before: dict[str, str] = field(default_factory=dict)
     warned: list[warnings.WarningMessage] = field(default_factory=list)
+    learnt: LearntSigma | None = None
 
-    def report(self, result: MappingResult, check: HeldOutCheck | None) -> dict[str, Any]:
+    def report(
+        self, result: MappingResult, check: HeldOutCheck | None, noise: NoiseCheck | None = None
+    ) -> dict[str, Any]:
         """The report of the finished run."""
         report = run_report(result, self.dataset, self.source, check)
+        report["noise"] = noise_report(self.config.sensor, noise, self.learnt)
+        report["notes"] += noise_notes(self.config.sensor, noise, self.learnt)
         report["notes"] += [str(warning.message) for warning in self.warned]
         report["skipped_frames"] = self.skipped_before | report["skipped_frames"]
         return report | self.choice
@@ -124,21 +133,26 @@ def write_run(
     posed = facts.dataset
     if posed is not None and result.track is not None:
         posed = reposed(posed, result.track.poses(result.map))
-    found = None
+    found, noise = None, None
     if check and posed is not None:
         mapped = result.map if chunked is None else ChunkedViews(chunked)
         found = _check(mapped, result, posed, haste, advance)
+        if found is not None and chunked is None:
+            noise = _check_noise(result, posed, haste)
         if not haste.hurried and not result.interrupted:
             with result.timed("checking"):
                 result.check_steps()
     # Computed before the pictures, which may be left half-way through the launch of a kernel.
-    report = facts.report(result, found)
+    report = facts.report(result, found, noise)
     if not occupied:
         report["notes"].append(_nothing_occupied(facts.config))
     if chunked is not None:
         report["notes"].append(_LARGER_THAN_MEMORY.format(len(chunked.chunks)))
     elif pictures:
         written += _write_pictures(folder, result, posed, shown, surface_picture, haste, advance)
+    if facts.learnt is not None:
+        write_text(folder / NOISE_FILE, sensor_yaml(facts.config.sensor, facts.source, facts.learnt))
+        written.append(folder / NOISE_FILE)
     remove_files_of_earlier_run(folder, written)
     report |= {"seconds": rounded(result.seconds), "peak_memory_mb": peak_memory_mb()}
     write_text(folder / REPORT_FILE, report_json(report))
@@ -225,6 +239,20 @@ def _check(
         return None
     result.skipped.update(check.skipped)
     return check
+
+
+def _check_noise(result: MappingResult, dataset: Dataset, haste: Haste) -> NoiseCheck | None:
+    """None if the frames that were held out do not tell, or if the run has to end before they do."""
+
+    def checked() -> None:
+        if haste.hurried:
+            raise CutShortError
+
+    try:
+        with result.timed("checking"):
+            return check_noise(result.map, dataset, result.held_out, checked)
+    except CutShortError:
+        return None
 
 
 def _write_pictures(

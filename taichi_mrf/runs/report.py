@@ -49,6 +49,7 @@ def run_report(
         "residual": result.residual,
         "seconds": rounded(result.seconds),
         "accuracy": None if check is None else {"frames": check.frames, **dataclasses.asdict(check.error)},
+        "noise": None,
         "tracking": None if result.track is None else _tracking(result.track, result.loops_closed),
         "followed": None if result.followed is None else dataclasses.asdict(result.followed),
         "steps": None if result.steps is None else _steps_report(result.steps),

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.noise import widened_noise
 from taichi_mrf.sensor.origins import points_at
 from taichi_mrf.sensor.own_evidence import OwnEvidence
 from taichi_mrf.sensor.pose_doubt import checked_covariance, covariance_of
@@ -61,8 +62,10 @@ class Frame:
 
     def own_for(self, sensor: SensorConfig) -> OwnEvidence:
         """The part of it that a map with this configuration takes."""
-        sigma_m = self.sigma_m if sensor.pixel_sigma else None
-        return OwnEvidence(self.noise, sigma_m, self.no_return if sensor.no_return != "ignore" else None)
+        sigma_m = self._widened_sigma(sensor) if sensor.pixel_sigma else None
+        no_return = self.no_return if sensor.no_return != "ignore" else None
+        noise = None if self.noise is None else widened_noise(self.noise, sensor)
+        return OwnEvidence(noise, sigma_m, no_return)
 
     def own_in(self, config: Config) -> OwnEvidence:
         """What a map with this configuration takes: the same, and how uncertain the frame's pose is."""
@@ -74,3 +77,11 @@ class Frame:
         """Whether it holds a measurement, or a pixel without a return that such a map takes notice of."""
         missing = self.own_for(sensor).no_return
         return bool((self.depth_m > 0).any() or (missing is not None and missing.any()))
+
+    def _widened_sigma(self, sensor: SensorConfig) -> NDArray[np.float32] | None:
+        """The sigma of each pixel with the configuration's ``sigma_scale`` and ``sigma_added``."""
+        stated = self.sigma_m
+        if stated is None or (sensor.sigma_scale == 1 and sensor.sigma_added == 0):
+            return stated
+        wider = np.float32(sensor.sigma_scale) * stated + np.float32(sensor.sigma_added)
+        return np.where(stated > 0, wider, stated)

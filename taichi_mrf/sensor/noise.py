@@ -6,7 +6,7 @@ patch of pixels (MRFMap, section IV-C).
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
@@ -150,10 +150,10 @@ class PatchNoise:
 
 def noise_from_config(config: SensorConfig, camera: Camera) -> NoiseModel:
     """The noise model that a configuration describes. Raises ConfigError naming field and file."""
-    if config.sigma_table is None and config.bias_table is None:
-        return PolynomialNoise(config.sigma, config.bias)
-    patches = -(-camera.width // config.patch) * -(-camera.height // config.patch)
     sigma, bias = patch_coefficients(config)
+    if config.sigma_table is None and config.bias_table is None:
+        return PolynomialNoise(sigma[0].tolist(), bias[0].tolist())
+    patches = -(-camera.width // config.patch) * -(-camera.height // config.patch)
     if config.sigma_table is None:
         sigma = np.repeat(sigma, patches, axis=0)
     if config.bias_table is None:
@@ -167,13 +167,50 @@ def noise_from_config(config: SensorConfig, camera: Camera) -> NoiseModel:
 
 def patch_coefficients(config: SensorConfig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Coefficients of sigma and of bias in ascending powers of depth: a row for each patch of the table that
-    is in force, or one for the whole image. Raises ConfigError naming field and file."""
+    is in force, or one for the whole image. ``sigma_scale`` and ``sigma_added`` are in them. Raises
+    ConfigError naming field and file."""
     sigma, bias = np.asarray([config.sigma], np.float64), np.asarray([config.bias], np.float64)
     if config.sigma_table is not None:
         sigma = _load_table(config.sigma_table, "sensor.sigma_table")
     if config.bias_table is not None:
         bias = _load_table(config.bias_table, "sensor.bias_table")
-    return sigma, bias
+    return widened(sigma, config), bias
+
+
+def widened(sigma: NDArray[np.float64], config: SensorConfig) -> NDArray[np.float64]:
+    """Coefficients (..., terms) of stated sigmas, with the configuration's ``sigma_scale`` and
+    ``sigma_added``."""
+    sigma = config.sigma_scale * sigma
+    sigma[..., 0] += config.sigma_added
+    return sigma
+
+
+def widened_noise(noise: NoiseModel, config: SensorConfig) -> NoiseModel:
+    """A noise model that was stated as an object, with the same. Models of other classes than those of this
+    file stay as they are."""
+    if config.sigma_scale == 1 and config.sigma_added == 0:
+        return noise
+    return _with_sigma(noise, lambda sigma: widened(sigma, config))
+
+
+def unwidened_noise(noise: NoiseModel, config: SensorConfig) -> NoiseModel:
+    """The noise model without ``sigma_scale`` and ``sigma_added``, which are in it."""
+
+    def stated(sigma: NDArray[np.float64]) -> NDArray[np.float64]:
+        sigma = sigma.copy()
+        sigma[..., 0] -= config.sigma_added
+        return sigma / config.sigma_scale
+
+    return _with_sigma(noise, stated)
+
+
+def _with_sigma(noise: Any, change: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Any:
+    """A noise model with other coefficients of sigma."""
+    if isinstance(noise, PatchNoise):
+        return PatchNoise(change(noise.sigma), noise.bias, noise.patch, noise.camera)
+    if isinstance(noise, PolynomialNoise):
+        return PolynomialNoise(change(noise.sigma)[0].tolist(), noise.bias[0].tolist())
+    return noise
 
 
 def evaluate(coefficients: NDArray[np.floating], depth_m: ArrayLike) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from taichi_mrf.system.libraries import library
 from taichi_mrf.viewer.tune.knobs import KNOBS, Knob
 
 SIGMA_SCALE = "sensor.sigma_scale"
-"""Not a parameter itself: multiplies all coefficients of sensor.sigma."""
+"""The factor on every stated sigma. The page has no slider for it: it shows the coefficients themselves."""
 
 SIGMA_SCALES = Range(0.25, 16.0, 0.0)
 
@@ -86,7 +86,7 @@ class Search:
             config = self.start
             try:
                 for each in self._dimensions:
-                    config = _with_value(config, each, _suggest(trial, each), self.start)
+                    config = _with_value(config, each, _suggest(trial, each))
             except ConfigError:  # parameters that each are in range may contradict each other
                 self._study.tell(trial, state=self._failed)
             else:
@@ -117,8 +117,6 @@ def _optuna() -> Any:
 
 def _dimension(name: str, start: Config) -> Dimension:
     if name == SIGMA_SCALE:
-        if start.sensor.sigma_table is not None:
-            raise ConfigError(f"{name} scales sensor.sigma, but sensor.sigma_table is in force")
         return Dimension(name, SIGMA_SCALES.least, SIGMA_SCALES.most, log=True)
     knob = _knob(name)
     if not knob.applies(start):
@@ -159,20 +157,18 @@ def _suggest(trial: Any, dimension: Dimension) -> Scalar:
 
 def _value_of(config: Config, dimension: Dimension) -> Scalar:
     """The start value of a parameter, clipped to its range."""
-    if dimension.name == SIGMA_SCALE:
-        return 1.0
-    value: Scalar = _knob(dimension.name).value_of(config)
+    scale = dimension.name == SIGMA_SCALE
+    value: Scalar = config.sensor.sigma_scale if scale else _knob(dimension.name).value_of(config)
     if dimension.choices:
         return value
     within = min(max(float(value), dimension.least), dimension.most)
     return int(within) if dimension.whole else within
 
 
-def _with_value(config: Config, dimension: Dimension, value: Scalar, start: Config) -> Config:
+def _with_value(config: Config, dimension: Dimension, value: Scalar) -> Config:
     if dimension.name == SIGMA_SCALE:
-        scale = float(value)
-        sigma = start.sensor.sigma if scale == 1 else tuple(_rounded(scale * c) for c in start.sensor.sigma)
-        return dataclasses.replace(config, sensor=dataclasses.replace(config.sensor, sigma=sigma))
+        sensor = dataclasses.replace(config.sensor, sigma_scale=float(value))
+        return dataclasses.replace(config, sensor=sensor)
     return _knob(dimension.name).parameter.replaced(config, value)
 
 

@@ -38,7 +38,7 @@ def test_the_first_try_is_where_the_search_begins() -> None:
         "inference.outlier_floor",
         "inference.message_clamp",
         "inference.free_share",
-        "sensor.sigma",
+        "sensor.sigma_scale",
     }
     assert search.best == CONFIG
 
@@ -64,13 +64,12 @@ def test_a_failed_try_counts_but_is_never_the_best() -> None:
     assert search.done
 
 
-def test_the_scale_multiplies_every_coefficient_of_sigma() -> None:
-    search = Search(CONFIG, (SIGMA_SCALE,), 2, seed=0)
-    search.ask()
+def test_the_scale_of_sigma_is_searched_from_where_it_is() -> None:
+    start = dataclasses.replace(CONFIG, sensor=SensorConfig(sigma_scale=2.0))
+    search = Search(start, (SIGMA_SCALE,), 2, seed=0)
+    assert search.ask() == start
     search.tell(0.0)
-    ratio = [a / b for a, b in zip(search.ask().sensor.sigma, CONFIG.sensor.sigma, strict=True)]
-    assert ratio == pytest.approx([ratio[0]] * 3, rel=1e-3)
-    assert ratio[0] != pytest.approx(1.0)
+    assert differences(start, search.ask()) == [SIGMA_SCALE]
 
 
 @pytest.mark.parametrize("name", [knob.name for knob in KNOBS if knob.applies(CONFIG)])
@@ -88,9 +87,6 @@ def test_what_cannot_be_searched_is_told_in_one_line() -> None:
         dimensions(("inference.swep",), CONFIG)
     with pytest.raises(ConfigError, match="changes nothing"):
         dimensions(("log_odds.hit",), CONFIG)
-    table = dataclasses.replace(CONFIG, sensor=SensorConfig(sigma_table="sigma.npy"))
-    with pytest.raises(ConfigError, match="sigma_table is in force"):
-        dimensions((SIGMA_SCALE,), table)
 
 
 def test_without_optuna_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,9 @@ from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.errors import ConfigError, MapFileError
 from taichi_mrf.runs.files import CONFIG_FILE, MAP_FILE, REPORT_FILE, VOXEL_FILE, holds_run
 
+LEARNT = ("sensor.sigma_scale", "sensor.sigma_added", "inference.surface_density", "inference.outlier_floor")
+"""The parameters that --noise auto changes."""
+
 _FILES = (MAP_FILE, VOXEL_FILE, CONFIG_FILE)
 
 
@@ -53,7 +56,7 @@ def _changed_parameters(task: MapTask) -> list[str]:
     changed = differences(held, task.settings)
     if "sensor.sigma" in changed:  # the run may have had it from the recording
         changed = differences(held, with_recorded_noise(task.settings, task.open(color=False)))
-    return changed
+    return [name for name in changed if not (task.learn_noise and name in LEARNT)]
 
 
 def finished_report(task: MapTask) -> dict[str, Any] | None:

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from taichi_mrf.calibration.from_recording import MOST_MAPS, LearntSigma, learn_sigma
 from taichi_mrf.cli.map.earlier import refuse_other_run
 from taichi_mrf.cli.map.keep import Keeper, resumed_map, skipped_before
 from taichi_mrf.cli.map.report import print_report
@@ -17,12 +18,14 @@ from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.terminal import Terminal, print_problem
+from taichi_mrf.config.schema import Config
+from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.pipeline import Event, FrameOffered, Listener, WaitingForPoses, map_sequence
 from taichi_mrf.mapping.rounds import RoundStep
 from taichi_mrf.mapping.tracking import wants_color
-from taichi_mrf.runs.files import MAP_FILE
+from taichi_mrf.runs.files import CONFIG_FILE, MAP_FILE
 from taichi_mrf.runs.folder import RunFacts, write_run
 from taichi_mrf.runs.report import report_json
 from taichi_mrf.system import runtime
@@ -88,7 +91,12 @@ def map_to_folder(
     opening = time.perf_counter() - start
 
     with _collected_warnings() as warned:
-        facts = RunFacts(task.source, settings, dataset, task.choice(), skipped, warned)
+        start = time.perf_counter()
+        learnt = _learn_noise(task, dataset, settings, progress, request)
+        if learnt is not None:
+            settings = learnt.put_into(settings)
+        learning = {"learning noise": time.perf_counter() - start} if learnt is not None else {}
+        facts = RunFacts(task.source, settings, dataset, task.choice(), skipped, warned, learnt)
         result = map_sequence(
             dataset,
             settings,
@@ -102,11 +110,27 @@ def map_to_folder(
             keep=Keeper(task.out, settings, task.keep_every, facts.unfinished),
             map_path=task.out / MAP_FILE,
         )
-        result.seconds = {"opening": opening, **result.seconds}
+        result.seconds = {"opening": opening, **learning, **result.seconds}
         return write_run(
             task.out, result, facts, pictures=task.pictures, surface_picture=task.surface_picture,
             reading=task.shown_reading, haste=request, advance=progress.advance,
         )  # fmt: skip
+
+
+def _learn_noise(
+    task: MapTask, dataset: Dataset, settings: Config, progress: ProgressBar, request: StopRequest
+) -> LearntSigma | None:
+    """What the recording says of its noise, if that was asked for. A resumed run has learnt it."""
+    if not task.learn_noise or (task.resume and (task.out / CONFIG_FILE).is_file()):
+        return None
+    return learn_sigma(
+        dataset,
+        settings,
+        every=task.every,
+        limit=task.limit,
+        on_map=lambda number: progress.advance("Learning noise", number - 1, MOST_MAPS),
+        should_stop=request,
+    )
 
 
 def listener_of(progress: ProgressBar) -> Listener:

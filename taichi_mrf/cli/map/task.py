@@ -36,13 +36,15 @@ class MapTask:
     overwrite: bool = False
     shown_reading: Reading = "marginal"
     surface_picture: bool = False
+    learn_noise: bool = False
 
     def __str__(self) -> str:
         return self.source
 
     def choice(self) -> dict[str, Any]:
         """What was asked for besides the parameters; the report says it too."""
-        return {"every": self.every, "limit": self.limit, **self.poses.choice()}
+        noise = "auto" if self.learn_noise else None
+        return {"every": self.every, "limit": self.limit, "noise_from": noise, **self.poses.choice()}
 
     def open(self, color: bool) -> Dataset:
         """Open the sequence. Raises DatasetError."""
@@ -71,4 +73,5 @@ def map_task(options: Map, source: str, out: Path) -> MapTask:
         options.overwrite,
         options.shown_reading,
         options.surface_picture,
+        options.noise == "auto",
     )

@@ -24,8 +24,8 @@ class Eval:
     experiment: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERIMENT")]
     """table1, table2, table3, fig7 and fig10 of MRFMap (Shankar and Michael 2020), stereo of Schauwecker and
     Zell 2014, exact, which compares MRFMap with the factor graph that it approximates, poses, which disturbs
-    poses and takes the error back, doubt, which maps such poses with their covariance, rays, which asks how
-    many rays a voxel needs,
+    poses and takes the error back, doubt, which maps such poses with their covariance, noise, which learns
+    sigma where a noise file is wrong, rays, which asks how many rays a voxel needs,
     endless, which freezes what has left the view for an hour, changes, in which things come and go and a
     person walks through, submaps, which maps the built-in corridor in parts and compares that with the map of
     a single machine, window, which keeps only what is near the camera in memory, surface, which compares the
@@ -50,7 +50,7 @@ class Eval:
     """Use at most N views or folds, for a quick look."""
 
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="PART ...")] = ()
-    """Run only these parts of the experiments trajectory and peers, such as 'room, 10 Hz' or
+    """Run only these parts of the experiments trajectory, peers and noise, such as 'room, 10 Hz' or
     'kitchen*'."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)

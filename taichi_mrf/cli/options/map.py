@@ -75,6 +75,11 @@ class Map:
     """With --submap-size: exchange beliefs between neighbouring submaps up to N times, and stop earlier once
     nothing changes."""
 
+    noise: Literal["stated", "auto"] = "stated"
+    """auto learns sigma from the recording before it is mapped: up to 60 of its frames are mapped up to three
+    times, and held-out ones say by how much sensor.sigma, or what frames state, is off. The result is
+    sensor.sigma-scale and sensor.sigma-added; DIR/sensor.yaml holds it for other recordings."""
+
     pictures: bool = True
     """Draw the map from above, in perspective, and against the measured depth."""
 
@@ -112,6 +117,11 @@ class Map:
             raise ConfigError("--resume and --overwrite do not go together")
         if self.poses.file is not None and (len(self.sources) > 1 or self.submap_size is not None):
             raise ConfigError("--poses takes one SOURCE, and does not work with --submap-size")
+        if self.noise == "auto" and (self.poses.track_poses or self.submap_size is not None):
+            raise ConfigError(
+                "--noise auto does not work with --track-poses or --submap-size: learn the noise in a run "
+                "without them, and pass its sensor.yaml with --config"
+            )
         if self.shown_reading != "marginal":
             whole = self.submap_size is None and self.settings.volume.window_m == 0
             if not METHODS[self.settings.method].has_layers or not whole:

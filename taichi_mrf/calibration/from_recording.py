@@ -1,0 +1,181 @@
+"""Sigma learnt from the recording that is to be mapped, without any truth.
+
+Some of its frames are mapped and others held out. The law of sigma under which the held-out measurements are
+likeliest takes the place of the assumed one, unless they agree with that, and the map is made again, until
+they agree or are no likelier. What the law then holds is not the sensor's noise alone:
+poses that are off and errors that neighbouring pixels share are in it, because they make depth differ from a
+map as noise does.
+"""
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from taichi_mrf.config.schema import Config, EvaluationConfig, without_window
+from taichi_mrf.datasets import Dataset
+from taichi_mrf.datasets.derived import chosen
+from taichi_mrf.errors import ConfigError, DatasetError, FrameError
+from taichi_mrf.evaluation.noise_check import checked, explained_frame
+from taichi_mrf.evaluation.noise_fit import Explained, SigmaLaw, pooled, sigma_law
+from taichi_mrf.mapping.pipeline import map_sequence
+from taichi_mrf.mapping.result import MappingResult
+
+FRAMES, RUNS, LONGEST_STRIDE = 60, 3, 10
+"""Of a long recording so many frames are used, in so many runs; of one run so many frames apart at most,
+because frames that are further apart may not see each other's surfaces."""
+
+HOLD_OUT = 4
+"""One of so many is held out."""
+
+MAPS, MOST_MAPS = 3, 5
+"""Maps that are made for the law, and with those for the prior, at most."""
+
+
+LONG_RAY = 10.0
+"""Where a measured ray is longer on average than so many times what ``inference.surface_density`` expects, as
+outdoors, that prior is tried, too: one surface in the mean length of a ray, and with it"""
+
+WILD = 1e-2
+"""perhaps this density of outliers per metre, since a prior that expects few surfaces cannot explain them."""
+
+LEAST_GAIN = 0.1
+"""Nats by which each held-out measurement must be likelier for a prior to take the place of the given one."""
+
+
+@dataclass(frozen=True)
+class LearntSigma:
+    """The law of sigma over what is stated, and what it was learnt from: held-out ``frames`` with ``pixels``
+    measurements, which had wanted ``factor`` times the assumed sigma, and whose mean log density per metre
+    rose from ``before`` to ``after``. A noise that they agree with stays as it is. ``prior`` are the
+    parameters of inference that were changed with it, by name; empty for most recordings."""
+
+    law: SigmaLaw
+    frames: int
+    pixels: int
+    factor: float
+    before: float
+    after: float
+    prior: dict[str, float] = field(default_factory=dict)
+
+    def put_into(self, config: Config) -> Config:
+        """The parameters with what was learnt."""
+        return _with(config, self.law, self.prior)
+
+
+def learn_sigma(
+    dataset: Dataset,
+    config: Config,
+    *,
+    every: int = 1,
+    limit: int | None = None,
+    on_map: Callable[[int], None] = lambda number: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> LearntSigma:
+    """Learn sigma from the frames 0, ``every``, 2 ``every``, ... of a dataset, ``limit`` of them at most.
+
+    ``config`` are the parameters that it will be mapped with; the map may be of any method. ``on_map`` is
+    called before each map with its number from 1, ``should_stop`` between keyframes.
+    Raises ConfigError for a dataset whose poses are not known or that never ends, DatasetError if the
+    held-out frames do not tell, and what mapping raises.
+    """
+    if dataset.tracked or dataset.endless:
+        raise ConfigError(
+            f"{dataset.name}: --noise auto needs a recording with poses: map it once, then again with "
+            "--poses trajectory.txt --noise auto"
+        )
+    frames = chosen(dataset, _spread(range(0, len(dataset), every)[:limit]))
+    trial = replace(without_window(config), color=False, evaluation=EvaluationConfig(hold_out=HOLD_OUT))
+    numbers = itertools.count(1)
+
+    def measured_with(law: SigmaLaw, prior: dict[str, float]) -> tuple[Explained, int]:
+        """The held-out measurements in a map of the others, and the number of frames that they are of."""
+        on_map(next(numbers))
+        changed = _with(trial, law, prior)
+        result = map_sequence(frames, changed, skip_bad_frames=True, should_stop=should_stop)
+        parts = _held_out(result, frames)
+        measured = pooled(parts)
+        if measured is None:
+            raise DatasetError(
+                f"{dataset.name}: --noise auto cannot learn: {len(result.held_out)} held-out frames hold too "
+                "few measurements; name the noise with --sensor.sigma"
+            )
+        return measured, len(parts)
+
+    law, prior = SigmaLaw(config.sensor.sigma_scale, config.sensor.sigma_added), dict[str, float]()
+    measured, count = measured_with(law, prior)
+    before = after = measured.mean(measured.sigma_m)
+    # The prior first: a sigma that makes up for a wrong one would be too large with the right one.
+    least = before + LEAST_GAIN
+    for other in [] if should_stop() else _priors(frames, config):
+        tried, _ = measured_with(law, other)
+        if tried.mean(tried.sigma_m) > least:
+            measured, prior, least = tried, other, tried.mean(tried.sigma_m)
+            after = least
+    first = check = checked(measured, count)
+    for _ in range(MAPS - 1):
+        if not check.wrong or should_stop():
+            break
+        # A sigma that is too large is so without any part of a voxel, too.
+        better = sigma_law(measured if check.factor > 1.0 else replace(measured, voxel_m=0.0))
+        measured, count = measured_with(better, prior)
+        mean, check = measured.mean(measured.sigma_m), checked(measured, count)
+        if mean <= after:
+            break
+        law, after = better, mean
+    return LearntSigma(law, first.frames, first.pixels, first.factor, before, after, prior)
+
+
+def _priors(frames: Dataset, config: Config) -> list[dict[str, float]]:
+    """The priors to try beside the given one: none but where rays are long."""
+    lengths_m = []
+    for index in range(len(frames)):
+        try:
+            depth_m = frames.read(index).depth_m
+        except FrameError:
+            continue
+        lengths_m.append(np.minimum(depth_m[depth_m > 0], config.sensor.max_depth))
+    density = 1.0 / float(np.concatenate(lengths_m).mean())
+    given = config.inference
+    if config.method != "mrf" or given.prior is not None or density * LONG_RAY > given.surface_density:
+        return []
+    few = {"surface_density": _rounded(density)}
+    return [few, few | {"outlier_floor": max(WILD, given.outlier_floor)}]
+
+
+def _spread(indices: range) -> list[int]:
+    """FRAMES of the indices at most, in RUNS."""
+    if len(indices) <= FRAMES:
+        return list(indices)
+    each = FRAMES // RUNS
+    stride = min(LONGEST_STRIDE, len(indices) // FRAMES)
+    starts = np.linspace(0, len(indices) - each * stride, RUNS).astype(int).tolist()
+    return [indices[start + k * stride] for start in starts for k in range(each)]
+
+
+def _with(config: Config, law: SigmaLaw, prior: dict[str, float]) -> Config:
+    sensor = replace(config.sensor, sigma_scale=_rounded(law.scale), sigma_added=_rounded(law.added_m))
+    changed: dict[str, Any] = {"sensor": sensor}
+    if prior:
+        changed["inference"] = replace(config.inference, **prior)
+    return replace(config, **changed)
+
+
+def _rounded(value: float) -> float:
+    """Rounded to four significant digits, which is all that counts."""
+    return float(f"{value:.4g}")
+
+
+def _held_out(result: MappingResult, frames: Dataset) -> list[Explained]:
+    """How well the map explains each frame that was held out."""
+    parts = []
+    for index in result.held_out:
+        try:
+            part = explained_frame(result.map, frames.read(index))
+        except FrameError:
+            part = None
+        if part is not None:
+            parts.append(part)
+    return parts

@@ -1,0 +1,177 @@
+"""By how much a map's noise is off, from measurements that the map has not seen.
+
+A measurement's density under the map is that of its ray's surface, spread by sigma. It is computed for sigmas
+from an eighth to 32 times the assumed one; the factor under which all measurements together are likeliest is
+the answer. Unlike the ratio of residuals to sigma it does not depend on rays that meet another surface, or
+none: their density is the same for all sigmas.
+
+Sigma may also be off by other factors near than far: errors of poses add as much to a precise near
+measurement as to a coarse far one. So a law of two parameters is fitted in the same way, added + scale times
+what is stated.
+
+The map of a right noise, too, is off by a part of a voxel: it does not know where in a voxel a surface is,
+nor always in which of two neighbours. The variance of a place that may be anywhere in a voxel,
+voxel_size^2 / 12, is no noise of the sensor and is set aside.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from taichi_mrf.evaluation.accuracy import JudgedMap, judge_view
+from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.limits import LEAST_SIGMA_M
+from taichi_mrf.sensor.noise import NoiseModel, NoiseTable
+
+OCTAVES = np.arange(-3.0, 5.01, 0.5)
+"""Binary logarithms of the factors on sigma that are tried."""
+
+PIXELS = 5_000
+"""Measurements of a view that are looked at."""
+
+LEAST_PIXELS = 200
+"""With fewer nothing is said."""
+
+VOXEL_SPREAD = 12.0**-0.5
+"""Standard deviation of a place that may be anywhere in a voxel, in voxels."""
+
+LEAST_SCALE = 0.01
+"""A law keeps this share of the stated sigma: a parameter that is 0 would never grow again."""
+
+CLOSE = 1.02
+"""Factor to which the parameters of a law are found."""
+
+
+@dataclass(frozen=True)
+class Explained:
+    """How well a map explains n measurements. ``sigma_m`` (n,) is the assumed standard deviation of each, in
+    metres, ``stated_m`` (n,) the one without what was learnt, and ``log_likelihood`` (n, OCTAVES) the log
+    density, per metre, under each multiple of ``sigma_m``. ``voxel_m`` is the standard deviation that the
+    size of a voxel adds."""
+
+    sigma_m: NDArray[np.float64]
+    stated_m: NDArray[np.float64]
+    log_likelihood: NDArray[np.float64]
+    voxel_m: float = 0.0
+
+    def mean(self, sigma_m: ArrayLike) -> float:
+        """Mean log density with other standard deviations, (n,), to which the voxel's is added; between the
+        tried ones by parabolas."""
+        factor = np.hypot(sigma_m, self.voxel_m) / self.sigma_m
+        place = (np.log2(factor) - OCTAVES[0]) / (OCTAVES[1] - OCTAVES[0])
+        place = np.clip(place, 0.0, len(OCTAVES) - 1.0)
+        middle = np.clip(np.rint(place).astype(np.int64), 1, len(OCTAVES) - 2)
+        t, pixel = place - middle, np.arange(len(middle))
+        before, at, after = (self.log_likelihood[pixel, middle + k] for k in (-1, 0, 1))
+        return float(np.mean(at + t * (0.5 * (after - before) + t * (0.5 * (before + after) - at))))
+
+
+@dataclass(frozen=True)
+class SigmaLaw:
+    """Sigma is ``added_m`` metres more than ``scale`` times the stated one."""
+
+    scale: float = 1.0
+    added_m: float = 0.0
+
+
+def explained(
+    m: JudgedMap,
+    depth_m: NDArray[np.float32],
+    T_world_camera: ArrayLike,
+    camera: Camera,
+    noise: NoiseModel,
+    stated: NoiseModel | None = None,
+) -> Explained | None:
+    """How well a map explains the measurements of a depth image (H, W) that it has not seen, of which
+    ``noise`` is assumed; ``stated`` is the noise without what was learnt, if that differs. None if there are
+    none to judge, or noise is not made of polynomials."""
+    table = noise.table(camera)
+    pixels = np.flatnonzero((depth_m > 0) & (depth_m <= m.sensor.max_depth))
+    if not len(pixels) or not isinstance(table, NoiseTable):
+        return None
+    some = np.zeros_like(depth_m)
+    # Evenly over the image, but not in columns: a stride that divides the width would make some.
+    kept = pixels[np.linspace(0, len(pixels) - 1, min(len(pixels), PIXELS)).astype(np.int64)]
+    some.flat[kept] = depth_m.flat[kept]
+    measured = some > 0
+    densities = []
+    for octave in OCTAVES:
+        view = judge_view(m, some, T_world_camera, camera, noise=_Multiple(table, 2.0**octave))
+        densities.append(view.log_densities())
+    sigma_m = table.at_pixels(some)[0][measured]
+    stated_m = sigma_m if stated is None else stated.table(camera).at_pixels(some)[0][measured]
+    return Explained(sigma_m, stated_m, np.stack(densities, axis=1), VOXEL_SPREAD * m.voxel_size)
+
+
+def pooled(parts: Iterable[Explained | None]) -> Explained | None:
+    """The measurements of several views together; None if there are fewer than LEAST_PIXELS."""
+    found = [part for part in parts if part is not None]
+    if sum(len(part.sigma_m) for part in found) < LEAST_PIXELS:
+        return None
+    sigma_m, stated_m, log_likelihood = (
+        np.concatenate([getattr(part, name) for part in found])
+        for name in ("sigma_m", "stated_m", "log_likelihood")
+    )
+    return Explained(sigma_m, stated_m, log_likelihood, found[0].voxel_m)
+
+
+def sigma_factor(measurements: Explained) -> float:
+    """The factor on sigma under which the measurements are likeliest."""
+    octaves = np.linspace(OCTAVES[0], OCTAVES[-1], 8 * (len(OCTAVES) - 1) + 1)
+    means = [measurements.mean(2.0**octave * measurements.sigma_m) for octave in octaves]
+    return float(2.0 ** octaves[int(np.argmax(means))])
+
+
+def sigma_law(measurements: Explained) -> SigmaLaw:
+    """The law under which the measurements are likeliest."""
+    stated_m, sigma_m = measurements.stated_m, measurements.sigma_m
+
+    def mean(law: SigmaLaw) -> float:
+        of_law = np.maximum(law.added_m + law.scale * stated_m, LEAST_SIGMA_M)
+        return measurements.mean(of_law)
+
+    scale = sigma_factor(measurements) * float(np.median(sigma_m / stated_m))
+    middle_m = scale * float(np.median(stated_m))
+    starts = [SigmaLaw(scale), SigmaLaw(0.5 * scale, 0.5 * middle_m), SigmaLaw(0.1 * scale, 0.9 * middle_m)]
+    return max((_improved(start, mean) for start in starts), key=mean)
+
+
+def _improved(law: SigmaLaw, mean: Callable[[SigmaLaw], float]) -> SigmaLaw:
+    """A law at which no step of either parameter helps, with steps that grow small."""
+    best, step = mean(law), 2.0
+    while step > CLOSE:
+        tried = [
+            SigmaLaw(law.scale * scale, law.added_m * added)
+            for scale, added in (
+                (step, 1),
+                (1 / step, 1),
+                (1, step),
+                (1, 1 / step),
+                (step, 1 / step),
+                (1 / step, step),
+            )
+        ]
+        tried = [SigmaLaw(max(each.scale, LEAST_SCALE), each.added_m) for each in tried]
+        values = [mean(each) for each in tried]
+        if max(values) > best:
+            best = max(values)
+            law = tried[values.index(best)]
+        else:
+            step **= 0.5
+    return law
+
+
+@dataclass(frozen=True)
+class _Multiple:
+    """The noise of a table with a multiple of its sigma."""
+
+    of: NoiseTable
+    factor: float
+
+    def table(self, camera: Camera) -> NoiseTable:
+        """The table of the one camera that it is for."""
+        coefficients = self.of.coefficients.copy()
+        coefficients[:, 0] *= self.factor
+        return replace(self.of, coefficients=coefficients)

@@ -1,0 +1,88 @@
+"""What a run says of its noise: whether held-out frames agree with it, and what was learnt of it."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from taichi_mrf.calibration.from_recording import LearntSigma
+from taichi_mrf.config.schema import SensorConfig
+from taichi_mrf.evaluation.noise_check import NoiseCheck
+from taichi_mrf.evaluation.noise_fit import SigmaLaw
+
+_FIELDS = ("sigma", "bias", "sigma_table", "bias_table", "patch", "pixel_sigma", "sigma_scale", "sigma_added")
+"""The parameters of noise among those of the sensor."""
+
+
+def noise_report(
+    sensor: SensorConfig, check: NoiseCheck | None, learnt: LearntSigma | None
+) -> dict[str, Any]:
+    """The entry ``noise`` of a report: ``factor`` is what sigma would have to be multiplied by, ``gain`` by
+    how many nats each measurement would then be likelier; both None if nothing was held out."""
+    report: dict[str, Any] = {
+        "sigma_scale": sensor.sigma_scale,
+        "sigma_added": sensor.sigma_added,
+        "factor": None,
+        "gain": None,
+        "wrong": None,
+        "frames": 0,
+        "learnt": None,
+    }
+    if check is not None:
+        report |= {"factor": round(check.factor, 3), "gain": round(check.gain, 3)}
+        report |= {"wrong": check.wrong, "frames": check.frames}
+    if learnt is not None:
+        facts = asdict(learnt)
+        del facts["law"]
+        prior = facts.pop("prior")
+        report["learnt"] = {name: round(value, 4) for name, value in facts.items()} | {"prior": prior}
+    return report
+
+
+def noise_notes(sensor: SensorConfig, check: NoiseCheck | None, learnt: LearntSigma | None) -> list[str]:
+    """The same in sentences."""
+    notes = []
+    if learnt is not None and learnt.law == SigmaLaw(1.0, 0.0):
+        notes.append(f"Sigma stays as stated: {learnt.frames} held-out frames agree with it.")
+    elif learnt is not None:
+        notes.append(
+            f"Sigma was learnt from {learnt.frames} held-out frames: {sensor.sigma_scale:g} times the stated "
+            f"one and {100 * sensor.sigma_added:.2g} cm; a single factor would have been {learnt.factor:.2g}."
+        )
+    if learnt is not None and learnt.prior:
+        changed = ", ".join(f"inference.{name} is {value:g}" for name, value in learnt.prior.items())
+        notes.append(f"Rays are long: {changed}, with which held-out measurements are likelier.")
+    if check is not None and check.wrong:
+        notes.append(
+            f"The measured depths of {check.frames} held-out frames differ from the map by "
+            f"{check.factor:.2g} times what {_noise_name(sensor)} allows. {_advice(sensor, learnt)}"
+        )
+    return notes
+
+
+def sensor_yaml(sensor: SensorConfig, source: str, learnt: LearntSigma) -> str:
+    """The learnt noise as a file of parameters."""
+    fields = {
+        name: list(value) if isinstance(value := getattr(sensor, name), tuple) else value for name in _FIELDS
+    }
+    sections = {"sensor": fields} | ({"inference": learnt.prior} if learnt.prior else {})
+    text = yaml.safe_dump(sections, sort_keys=False, default_flow_style=None)
+    return (
+        f"# Sigma as learnt from {learnt.frames} held-out frames of {source!r}.\n"
+        "# Use it with: taichi-mrf map SOURCE --out DIR --config FILE\n" + text
+    )
+
+
+def _noise_name(sensor: SensorConfig) -> str:
+    if sensor.sigma_table is not None:
+        return f"the noise of {Path(sensor.sigma_table).name}"
+    if sensor.sigma == SensorConfig().sigma:
+        return "the noise of a Kinect 1 (the default of sensor.sigma)"
+    return "sensor.sigma"
+
+
+def _advice(sensor: SensorConfig, learnt: LearntSigma | None) -> str:
+    if learnt is not None or sensor.sigma_scale != 1 or sensor.sigma_added:
+        return "It was learnt from other frames than these: poses or the scene differ along the recording."
+    return "Poses may be off, or the noise is another sensor's; --noise auto learns it from the recording."

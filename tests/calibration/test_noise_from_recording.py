@@ -1,0 +1,97 @@
+"""Sigma that is learnt from the recording itself, against simulated noise of a known sigma."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from taichi_mrf import open_dataset
+from taichi_mrf.calibration.from_recording import FRAMES, LONGEST_STRIDE, RUNS, _priors, _spread, learn_sigma
+from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.schema import Config, SensorConfig
+from taichi_mrf.datasets import Dataset
+from taichi_mrf.datasets.derived import chosen
+from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.evaluation.noise_check import WRONG
+from taichi_mrf.evaluation.noise_fit import VOXEL_SPREAD, SigmaLaw
+
+VOXEL = 0.05
+
+
+@pytest.fixture(scope="module")
+def room() -> Dataset:
+    """With the noise of a Kinect 1, which is the default."""
+    return open_dataset("synthetic:room?frames=12&width=160&height=120", color=False)
+
+
+def learnt_m(room: Dataset, sensor: SensorConfig, depth_m: float) -> float:
+    """Sigma at a depth as it is learnt by a user who states another one."""
+    found = learn_sigma(room, Config(VOXEL, sensor=sensor))
+    assert found.after >= found.before
+    stated_m = float(np.polynomial.polynomial.polyval(depth_m, sensor.sigma))
+    return found.law.scale * stated_m + found.law.added_m
+
+
+@pytest.mark.usefixtures("one_backend")
+@pytest.mark.parametrize("factor", [0.25, 4.0])
+def test_the_true_sigma_is_learnt_whatever_is_stated(room: Dataset, factor: float) -> None:
+    depths = np.concatenate([f.depth_m[f.depth_m > 0] for f in (room.read(i) for i in range(len(room)))])
+    depth_m = float(np.median(depths))
+    right = SensorConfig().sigma
+    true_m = float(np.polynomial.polynomial.polyval(depth_m, right))
+    found_m = learnt_m(room, SensorConfig(sigma=tuple(factor * c for c in right)), depth_m)
+    # What a part of a voxel explains is left to it, which may be all or nothing.
+    voxel_m = VOXEL_SPREAD * VOXEL
+    assert true_m / WRONG < math.hypot(found_m, voxel_m)
+    assert found_m < WRONG * math.hypot(true_m, voxel_m)
+    assert abs(math.log(found_m / true_m)) < abs(math.log(factor))
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_a_noise_that_held_out_frames_agree_with_stays(room: Dataset) -> None:
+    found = learn_sigma(room, Config(VOXEL))
+    assert found.law == SigmaLaw(1.0, 0.0)
+    assert found.before == found.after
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_a_prior_for_long_rays_is_tried_only_where_rays_are_long(room: Dataset) -> None:
+    assert _priors(room, Config(VOXEL)) == []
+    rays = np.concatenate([f.depth_m[f.depth_m > 0] for f in (room.read(i) for i in range(len(room)))])
+    dense = replace(Config(VOXEL), inference=InferenceConfig(surface_density=20.0))
+    few, wild = _priors(room, dense)
+    assert few["surface_density"] == pytest.approx(1.0 / rays.mean(), rel=1e-3)
+    assert wild == few | {"outlier_floor": 1e-2}
+    assert _priors(room, replace(dense, inference=InferenceConfig(surface_density=20.0, prior=0.1))) == []
+    assert _priors(room, replace(dense, method="log_odds")) == []
+
+
+def test_a_long_recording_is_sampled_in_runs() -> None:
+    assert _spread(range(0, 10, 2)) == [0, 2, 4, 6, 8]
+    picked = _spread(range(5000))
+    assert len(picked) == FRAMES
+    steps = np.diff(picked)
+    assert (steps > 0).all()
+    assert (steps == LONGEST_STRIDE).sum() == FRAMES - RUNS
+    assert picked[0] == 0
+    assert picked[-1] >= 5000 - 2 * LONGEST_STRIDE
+
+
+def test_chosen_frames_are_those_of_the_source(room: Dataset) -> None:
+    some = chosen(room, [7, 2])
+    assert list(some.frame_names) == [room.frame_names[7], room.frame_names[2]]
+    np.testing.assert_array_equal(some.read(1).depth_m, room.read(2).depth_m)
+    assert list(some.stamps()) == [room.read(7).stamp, room.read(2).stamp]
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_recordings_that_cannot_tell_are_refused(room: Dataset) -> None:
+    class Tracked(type(chosen(room, [0]))):  # type: ignore[misc]
+        pass
+
+    tracked = Tracked("walk", room.camera, tracked=True, source=room, indices=[0, 1, 2, 3])
+    with pytest.raises(ConfigError, match="needs a recording with poses"):
+        learn_sigma(tracked, Config(VOXEL))
+    with pytest.raises(DatasetError, match="0 held-out frames"):
+        learn_sigma(chosen(room, [0, 1]), Config(VOXEL))
