@@ -24,6 +24,7 @@ from taichi_mrf.evaluation.accuracy import JudgedMap, judge_view
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.limits import LEAST_SIGMA_M
 from taichi_mrf.sensor.noise import NoiseModel, NoiseTable
+from taichi_mrf.voxels.traversal import FAR
 
 OCTAVES = np.arange(-3.0, 5.01, 0.5)
 """Binary logarithms of the factors on sigma that are tried."""
@@ -96,9 +97,12 @@ def explained(
     kept = pixels[np.linspace(0, len(pixels) - 1, min(len(pixels), PIXELS)).astype(np.int64)]
     some.flat[kept] = depth_m.flat[kept]
     measured = some > 0
+    # A doubt in the map would bear a part of what sigma has to.
+    trusting = m.view.with_occlusion(least=-FAR, most=FAR)
     densities = []
     for octave in OCTAVES:
-        view = judge_view(m, some, T_world_camera, camera, noise=_Multiple(table, 2.0**octave))
+        noise_there = _Multiple(table, 2.0**octave)
+        view = judge_view(m, some, T_world_camera, camera, noise=noise_there, view=trusting)
         densities.append(view.log_densities())
     sigma_m = table.at_pixels(some)[0][measured]
     stated_m = sigma_m if stated is None else stated.table(camera).at_pixels(some)[0][measured]
