@@ -95,9 +95,9 @@ class InferenceConfig:
     """Lower bound on a voxel's cavity probability, as a share of its prior: a voxel that other keyframes see
     as free may still stop a ray. 0 leaves only ``cavity_clamp``."""
 
-    doubt_free: float = 0.02
-    """Surfaces per metre that a prediction of a measurement expects where space was seen to be free, however
-    often: poses and noise are never quite right. 0 trusts the marginals."""
+    doubt_free: float = 0.01
+    """Lower bound on a voxel's probability where measurements are predicted, as a share of its prior: poses
+    and noise are never quite right. By default 0.02 surfaces per metre; 0 trusts the marginals."""
 
     doubt_occupied: float = 0.01
     """Chance, below 0.5, that a predicted ray passes a voxel that was seen to be occupied, however often. 0
@@ -134,7 +134,7 @@ class InferenceConfig:
         check_field(0 < self.message_clamp <= 30, "inference.message_clamp", "must lie between 0 and 30")
         check_field(0 < self.cavity_clamp <= 60, "inference.cavity_clamp", "must lie between 0 and 60")
         check_field(0 <= self.free_share <= 1, "inference.free_share", "must lie between 0 and 1")
-        check_field(0 <= self.doubt_free <= 10, "inference.doubt_free", "must lie between 0 and 10")
+        check_field(0 <= self.doubt_free <= 1, "inference.doubt_free", "must lie between 0 and 1")
         check_field(
             0 <= self.doubt_occupied < 0.5, "inference.doubt_occupied", "must be at least 0 and below 0.5"
         )

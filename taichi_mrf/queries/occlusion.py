@@ -32,15 +32,15 @@ class Occlusion(Bundle):
     """A voxel with more counts as one with these log-odds: none is surer to be occupied."""
 
 
-def doubting(surfaces: float, passing: float, voxel_size: float) -> Occlusion:
-    """The rule of a view that expects ``surfaces`` per metre where space was seen to be free however often,
-    and a ray to pass a voxel of ``voxel_size`` metres with the chance ``passing`` that was seen to be
-    occupied however often; 0 trusts what was seen.
+def doubting(share: float, passing: float, prior: float) -> Occlusion:
+    """The rule of a view in which a voxel is occupied with at least the ``share`` of its ``prior``
+    probability, however often it was seen to be free, and lets a ray pass with at least the chance
+    ``passing``, however often it was seen to be occupied; 0 trusts what was seen.
 
     Poses and noise are never as exact as they are said to be, so that evidence that agrees with itself a
     hundred times is wrong more often than its log-odds say.
     """
-    least = math.log(math.expm1(surfaces * voxel_size)) if surfaces > 0 else -FAR
+    least = -math.log(1.0 / (share * prior) - 1.0) if share * prior > 0 else -FAR
     most = math.log(1.0 / passing - 1.0) if passing > 0 else FAR
     return Occlusion(least=least, most=most)
 

@@ -140,18 +140,16 @@ def test_a_prediction_is_no_surer_than_its_rule_while_a_picture_is(
     np.testing.assert_array_equal(*pictures)
 
 
-@given(
-    surfaces=st.floats(1e-3, 5.0), passing=st.floats(1e-6, 0.4), voxel_size=st.floats(0.005, 0.5)
-)  # fmt: skip
-def test_doubt_is_a_density_of_surfaces_and_a_chance_to_pass(
-    surfaces: float, passing: float, voxel_size: float
+@given(share=st.floats(1e-4, 1.0), passing=st.floats(1e-6, 0.4), prior=st.floats(1e-4, 0.9))
+def test_doubt_is_a_share_of_the_prior_and_a_chance_to_pass(
+    share: float, passing: float, prior: float
 ) -> None:
-    rule = doubting(surfaces, passing, voxel_size)
+    rule = doubting(share, passing, prior)
     # A ray passes a voxel of probability p over its whole length with the chance 1 - p (eq. 15).
-    free, occupied = (1.0 / (1.0 + np.exp(bound)) for bound in (rule.least, rule.most))
-    assert -np.log(free) / voxel_size == pytest.approx(surfaces, rel=1e-6)
-    assert occupied == pytest.approx(passing, rel=1e-6)
-    assert doubting(0.0, 0.0, voxel_size) == Occlusion()
+    least, most = (1.0 / (1.0 + np.exp(-bound)) for bound in (rule.least, rule.most))
+    assert least == pytest.approx(share * prior, rel=1e-6)
+    assert 1.0 - most == pytest.approx(passing, rel=1e-6)
+    assert doubting(0.0, 0.0, prior) == Occlusion()
 
 
 @pytest.mark.parametrize("occlusion", [{"unknown": DENSE}, {"empty_below": -3.0}])

@@ -84,7 +84,7 @@ class MRFMap(PosedMRF):
         inference = config.inference
         self.prior = prior_probability(inference, config.voxel_size)
         log_odds = log_odds_without_bricks(inference, config.voxel_size)
-        doubt = doubting(inference.doubt_free, inference.doubt_occupied, config.voxel_size)
+        doubt = doubting(inference.doubt_free, inference.doubt_occupied, self.prior)
         self._make_bricks(config, noise, *log_odds, config.volume, Occlusion(), doubt)
         bundler = RayBundler(self.voxel_size, inference)
         bounds = KeyframeBounds()
