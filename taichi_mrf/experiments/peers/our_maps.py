@@ -1,6 +1,7 @@
 """The maps of this package as peers: MRFMap as a live run feeds it, and the recursive baselines."""
 
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from taichi_mrf import FREE, OCCUPIED, LogOddsMap, MRFMap, VisibilityMap, Wavema
 from taichi_mrf.benchmark.keyframe_cost import timed
 from taichi_mrf.evaluation.accuracy import judge_view
 from taichi_mrf.experiments.contenders import BOTH
+from taichi_mrf.experiments.peers.mesh_rays import MeshRays, open3d_available
 from taichi_mrf.experiments.peers.peer import Answers, Cells, Knob, Mesh, Peer
 from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.export.surface import smooth_surface
@@ -66,8 +68,18 @@ class MrfPeer:
             self.map.infer(sweeps=self._full_sweeps)
 
     def answers(self, view: SceneView) -> Mapping[str, Answers]:
-        """By omega."""
-        return {"omega": _answers(self.map, self._scene, view, {})}
+        """By omega; and with Open3D where rays meet the measured surface, and by omega where they meet none.
+        The likelihood of both is the map's."""
+        omega = _answers(self.map, self._scene, view, {})
+        if not open3d_available():
+            return {"omega": omega}
+        depth_m = self._surface.depth_m(view, view.camera or self._scene.camera)
+        met = np.where(np.isnan(depth_m), omega.depth_m, depth_m)
+        return {"omega": omega, "surface": Answers(met, omega.log_likelihood)}
+
+    @cached_property
+    def _surface(self) -> MeshRays:
+        return MeshRays(self.mesh())
 
     def cells(self, points_m: NDArray[np.float64]) -> Mapping[str, Cells]:
         """By marginals, and by the calibrated reading."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.evaluation.accuracy import OUTLIERS
+from taichi_mrf.experiments.peers.mesh_rays import MeshRays
 from taichi_mrf.experiments.peers.peer import Answers, Cells, Knob, Mesh
 from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.experiments.surface import BLOCK, MOST_BLOCKS
@@ -55,20 +56,12 @@ class TsdfPeer:
     def answers(self, view: SceneView) -> Mapping[str, Answers]:
         """Where rays first meet its mesh. Its own casting of rays through blocks (0.20) leaves pixels out or
         ends the process where blocks lie around the camera."""
-        camera, T = view.camera or self._scene.camera, view.T_world_camera
-        directions = camera.rays() @ T[:3, :3].T  # one metre of depth each
-        rays = np.concatenate([np.broadcast_to(T[:3, 3], directions.shape), directions], axis=-1)
-        found = self._cast.cast_rays(self._o3d.core.Tensor(rays.astype(np.float32)))
-        depth_m = found["t_hit"].numpy().astype(np.float64)
-        depth_m[~np.isfinite(depth_m)] = np.nan
+        depth_m = self._surface.depth_m(view, view.camera or self._scene.camera)
         return {"": Answers(depth_m, self._log_likelihood(view, depth_m))}
 
     @cached_property
-    def _cast(self) -> Any:
-        scene = self._o3d.t.geometry.RaycastingScene()
-        if self._grid.hashmap().size() < MOST_BLOCKS:
-            scene.add_triangles(self._grid.extract_triangle_mesh(weight_threshold=LEAST_WEIGHT))
-        return scene
+    def _surface(self) -> MeshRays:
+        return MeshRays(self.mesh())
 
     def cells(self, points_m: NDArray[np.float64]) -> Mapping[str, Cells]:
         """By the distance of the voxel that a point lies in."""
