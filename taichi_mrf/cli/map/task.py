@@ -43,8 +43,8 @@ class MapTask:
 
     def choice(self) -> dict[str, Any]:
         """What was asked for besides the parameters; the report says it too."""
-        noise = "auto" if self.learn_noise else None
-        return {"every": self.every, "limit": self.limit, "noise_from": noise, **self.poses.choice()}
+        noise = {"noise_from": "auto"} if self.learn_noise else {}
+        return {"every": self.every, "limit": self.limit, **noise, **self.poses.choice()}
 
     def open(self, color: bool) -> Dataset:
         """Open the sequence. Raises DatasetError."""
