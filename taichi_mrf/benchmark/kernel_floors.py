@@ -56,7 +56,7 @@ FLOORS: Mapping[str, Mapping[str, Floor]] = {
         "count": lambda w: 20 * w.crossed,  # coordinates in, the tree in and out
     },
     "own_sweep": {
-        "fill_ndarray": lambda w: w.message_bytes * w.voxels,  # new messages
+        "_clear": lambda w: w.message_bytes * w.voxels,  # new messages
         "cavity": lambda w: (
             (4 + w.message_bytes + 4 + 8) * w.voxels
         ),  # belief, message in; log_free, sums out

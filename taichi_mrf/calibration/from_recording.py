@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config, EvaluationConfig, without_window
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import chosen
@@ -139,7 +140,11 @@ def _priors(frames: Dataset, config: Config) -> list[dict[str, float]]:
         lengths_m.append(np.minimum(depth_m[depth_m > 0], config.sensor.max_depth))
     density = 1.0 / float(np.concatenate(lengths_m).mean())
     given = config.inference
-    if config.method != "mrf" or given.prior is not None or density * LONG_RAY > given.surface_density:
+    if (
+        METHODS[config.method].section != "inference"
+        or given.prior is not None
+        or density * LONG_RAY > given.surface_density
+    ):
         return []
     few = {"surface_density": _rounded(density)}
     return [few, few | {"outlier_floor": max(WILD, given.outlier_floor)}]

@@ -197,7 +197,8 @@ def judge_view(
     measured = np.where(judged & (measured > 0), measured, np.float32(0))
     rays = np.where(judged & (measured == 0), np.float32(-1), measured)
     table = (noise or PolynomialNoise((m.voxel_size,))).table(camera)
-    survey = (view or m.view).survey(camera, as_pose(T_world_camera), m.sensor.max_depth, rays, table)
+    T, max_depth = as_pose(T_world_camera), m.sensor.max_depth
+    survey = (view or m.view).survey(camera, T, max_depth, rays, table, predicting=True)
     return JudgedView(depth, measured, survey, m.voxel_size, m.sensor.max_depth, table)
 
 

@@ -65,13 +65,15 @@ class View:
         max_depth: float,
         measured_m: NDArray[np.float32],
         noise: NoiseTable,
+        predicting: bool = False,
     ) -> SurfaceSurvey:
         """Follow the rays of those pixels of (H, W) ``measured_m`` that are not 0, up to ``max_depth``.
 
         ``noise`` is that of the measurements; a negative one stands for a pixel without. Every voxel can be
-        the surface, seen or not.
+        the surface, seen or not. With ``predicting`` voxels dim rays by the rule for predictions.
         """
-        return self._survey(camera, T_world_camera, max_depth, -FAR, self.predicting, measured_m, noise)
+        rule = self.predicting if predicting else self.occlusion
+        return self._survey(camera, T_world_camera, max_depth, -FAR, rule, measured_m, noise)
 
     def _survey(
         self,

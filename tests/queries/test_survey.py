@@ -132,9 +132,9 @@ def test_a_prediction_is_no_surer_than_its_rule_while_a_picture_is(
     measured = measured_in(random_map, VIEWS[0], 3)
     plain = View(random_map.pool, VOXEL, VolumeConfig())
     view = View(random_map.pool, VOXEL, VolumeConfig(), predicting=Occlusion(**rule))
-    found = view.survey(CAMERA, VIEWS[0], MAX_DEPTH, measured, NOISE.table(CAMERA))
+    found = view.survey(CAMERA, VIEWS[0], MAX_DEPTH, measured, NOISE.table(CAMERA), predicting=True)
     assert_same(found, surveyed(random_map, VIEWS[0], MAX_DEPTH, measured, noise_at, **rule))
-    sure = plain.survey(CAMERA, VIEWS[0], MAX_DEPTH, measured, NOISE.table(CAMERA))
+    sure = view.survey(CAMERA, VIEWS[0], MAX_DEPTH, measured, NOISE.table(CAMERA))
     assert (np.abs(found.visibility - sure.visibility) > 0.01).mean() > 0.05
     pictures = (each.render_depth(CAMERA, VIEWS[0], MAX_DEPTH) for each in (view, plain))
     np.testing.assert_array_equal(*pictures)

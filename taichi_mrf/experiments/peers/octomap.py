@@ -65,7 +65,7 @@ class OctomapPeer:
     def _read(self) -> RecursivePeer:
         scene = self._scene
         sensor = SensorConfig(max_depth=scene.max_depth)
-        config = Config(self._voxel_size, "log_odds", sensor=sensor, volume=scene.volume)
+        config = Config(self._voxel_size, LogOddsMap.METHOD.name, sensor=sensor, volume=scene.volume)
         with tempfile.TemporaryDirectory() as folder:
             tree, file = Path(folder) / "tree.ot", Path(folder) / "map.npz"
             self._tree.write(str(tree))

@@ -22,7 +22,7 @@ BONXAI: dict[str, Any] = {"hit": 0.7, "miss": 0.4, "lowest": 0.12, "highest": 0.
 ray to the centre of each voxel that is hit (github.com/facontidavide/Bonxai, probabilistic_map.hpp)."""
 
 WAVEMAP_ON_IMAGES: dict[str, Any] = {"beams": "ray", "scaling_free": 0.2, "scaling_occupied": 0.4}
-"""wavemap's published model for depth cameras, the continuous ray, with a sigma of range of half a voxel
+"""The published model of wavemap for depth cameras, the continuous ray, with a sigma of range of half a voxel
 (github.com/ethz-asl/wavemap, wavemap_panoptic_mapping_rgbd.yaml)."""
 
 BEAM_DEG = 0.06
@@ -148,7 +148,7 @@ def visibility(scene: Scene, voxel_size: float, knob: Knob) -> Peer:
 
 
 def wavemap(scene: Scene, voxel_size: float, knob: Knob) -> Peer:
-    """wavemap's measurement model: that for images or, for a lidar, that for an Ouster OS0."""
+    """The measurement model of wavemap: that for images or, for a lidar, that for an Ouster OS0."""
     parameters = dict(knob.parameters)
     if scene.camera.height > 1:
         widths = {"angle_sigma_deg": BEAM_DEG * knob.stride, "range_sigma": 0.5 * voxel_size}
