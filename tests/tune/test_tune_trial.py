@@ -171,7 +171,7 @@ def test_the_predicted_distribution_is_that_of_the_log_likelihood(method: str) -
     density = np.zeros((len(middles), int(chosen.sum())))
     for row, z in zip(density, middles, strict=True):
         image = np.where(chosen, np.float32(z), np.float32(0))
-        survey = m.view.survey(frame.camera, frame.T_world_camera, most, image, table)
+        survey = m.view.survey(frame.camera, frame.T_world_camera, most, image, table, predicting=True)
         through = survey.visibility[chosen] / most
         row[:] = (1 - OUTLIERS) * (survey.likelihood[chosen] + through) + OUTLIERS / most
     distribution = np.cumsum(density, axis=0) * step
