@@ -78,6 +78,7 @@ def test_a_long_recording_is_sampled_in_runs() -> None:
     assert picked[-1] >= 5000 - 2 * LONGEST_STRIDE
 
 
+@pytest.mark.usefixtures("one_backend")
 def test_chosen_frames_are_those_of_the_source(room: Dataset) -> None:
     some = chosen(room, [7, 2])
     assert list(some.frame_names) == [room.frame_names[7], room.frame_names[2]]
