@@ -8,7 +8,7 @@ The paper and its published code disagree on the tolerance and on rays that meet
 are here, and rays without an answer are counted as wrong and reported.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, Protocol
 
@@ -39,6 +39,12 @@ exactly in the grid's planes, where rounding decides."""
 
 OUTLIERS = 0.01
 """Share of measurements that the log-likelihood takes for outliers, spread evenly over the sensor's range."""
+
+MISSED = 0.2
+"""Share of measurements that the measured surface does not explain where it is near the likeliest voxel."""
+
+SURFACE_STD = 0.25
+"""Standard deviation of the measured surface in voxels, as its weights have it (docs/surfaces.md)."""
 
 
 class JudgedMap(Protocol):
@@ -96,6 +102,31 @@ class JudgedView:
     def answer_m(self) -> NDArray[np.float32]:
         """Axial depth of the likeliest surface, (H, W), NaN where there is no answer."""
         return np.where(self.answered, self.survey.middle, np.float32(np.nan))
+
+    def by_surface(self, surface_m: NDArray[np.float32]) -> "JudgedView":
+        """The same view judged by the map's measured surface: (H, W) its axial depth, NaN where it is not
+        near the likeliest voxel (FusedSurface.depth_near), which then stays the answer.
+
+        ``voxel`` is half a voxel to each side of the surface. A measurement is distributed around it with the
+        sensor's variance and that of the surface, or, for a share MISSED of them, as the map has it.
+        """
+        near, half = ~np.isnan(surface_m), np.float32(0.5 * self.voxel_size)
+        survey, there = self.survey, np.where(near, surface_m, np.float32(1.0))
+        sigma, bias = self.noise.at_pixels(there)
+        spread = np.hypot(sigma, SURFACE_STD * self.voxel_size)
+        off = (self.measured_m - there - bias) / spread
+        around = np.exp(-0.5 * off * off) / (np.sqrt(2.0 * np.pi) * spread)
+        likelihood = (1.0 - MISSED) * around + MISSED * survey.likelihood
+        return replace(
+            self,
+            survey=replace(
+                survey,
+                near=np.where(near, surface_m - half, survey.near),
+                far=np.where(near, surface_m + half, survey.far),
+                visibility=np.where(near, np.float32(MISSED) * survey.visibility, survey.visibility),
+                likelihood=np.where(near, likelihood, survey.likelihood).astype(np.float32),
+            ),
+        )
 
     def accuracy(self, tolerance: Tolerance) -> Accuracy:
         """Share of right pixels; with the tolerance "sensor" of those measured, NaN if there are none.

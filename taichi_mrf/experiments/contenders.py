@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from taichi_mrf import LogOddsMap, MRFMap, VisibilityMap, WavemapMap
@@ -10,6 +10,7 @@ from taichi_mrf.config.schema import to_yaml
 from taichi_mrf.datasets.lidar.recording import LIDAR_PASS_THROUGH
 from taichi_mrf.experiments.scenes import Scene
 from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.system.libraries import installed
 
 VISIBILITY_TABLE_I: dict[str, Any] = {"visible_if_occluded": 0.2}
 """Where Table I of Schauwecker & Zell differs from the defaults of VisibilityMap."""
@@ -18,19 +19,24 @@ BOTH: dict[str, dict[str, float]] = {"all leaves": {"empty_below": -1e30}, "occu
 """Readings of a recursive map: as the metric has it, every known voxel dims a ray; and as such maps are used,
 those that are more likely free than occupied let it through."""
 
+SURFACE = "measured surface"
+"""A reading of MRFMap: rays end on ``m.surface()`` where it is near their likeliest voxel, else in that."""
+
 
 @dataclass(frozen=True)
 class Contender:
     """A method with fixed parameters. ``make`` gives an empty map for a scene and a voxel size; ``readings``
-    are names and what each changes of the map's Occlusion."""
+    are names and what each changes of the map's Occlusion. With ``surface`` rays on the measured surface
+    answer as well (SURFACE)."""
 
     name: str
     make: Callable[[Scene, float], OccupancyMap]
     readings: dict[str, dict[str, float]] = field(default_factory=lambda: {"": {}})
+    surface: bool = False
 
     def signature(self, scene: Scene, voxel_size: float) -> str:
         """A short text that changes with any parameter of its maps."""
-        parameters = to_yaml(self.make(scene, voxel_size).config)
+        parameters = to_yaml(self.make(scene, voxel_size).config) + (SURFACE if self.surface else "")
         return hashlib.sha256(parameters.encode()).hexdigest()[:12]
 
 
@@ -88,9 +94,9 @@ def wavemap(name: str = "wavemap-style", **parameters: Any) -> Contender:
 
 
 def standard_contenders() -> Sequence[Contender]:
-    """All that need no tuning."""
+    """All that need no tuning; MRFMap by its surface too where the extra ``mesh`` is installed."""
     return [
-        mrf(),
+        replace(mrf(), surface=installed("skimage", "embreex")),
         log_odds("OctoMap-style"),
         log_odds("OctoMap-style, bias removed", correct_bias=True),
         visibility(),

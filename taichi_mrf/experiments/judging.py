@@ -1,15 +1,18 @@
 """From a map and the views that it has not seen to figures, the same for every contender."""
 
 import time
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, cast
 
 import numpy as np
 
-from taichi_mrf.evaluation.accuracy import TOLERANCES, judge_view
-from taichi_mrf.experiments.contenders import Contender
+from taichi_mrf import MRFMap
+from taichi_mrf.evaluation.accuracy import TOLERANCES, JudgedView, judge_view
+from taichi_mrf.experiments.contenders import SURFACE, Contender
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene, SceneView
+from taichi_mrf.export.fused_surface import FusedSurface
 from taichi_mrf.methods.protocol import OccupancyMap
 
 Figures = dict[str, Any]
@@ -38,12 +41,17 @@ def judge_all(
     views = [scene.views[i] for i in judged]
     for reading, changes in contender.readings.items():
         for view in views:
-            by_reading[reading][view.name] = _figures(m, scene, view, changes)
+            by_reading[reading][view.name] = _figures(judged_by_voxels(m, scene, view, changes))
+    if contender.surface:
+        surface = cast("MRFMap", m).surface()
+        by_reading[SURFACE] = {
+            view.name: _figures(judged_by_surface(m, surface, scene, view)) for view in views
+        }
     seconds = time.perf_counter() - start
     return {
         "readings": by_reading,
         "build_seconds": build_seconds,
-        "judge_seconds": seconds / max(1, len(views) * len(contender.readings)),
+        "judge_seconds": seconds / max(1, len(views) * len(by_reading)),
         "bricks": m.statistics().bricks,
     }
 
@@ -56,12 +64,25 @@ def build_and_judge(
     return judge_all(m, seconds, contender, scene, judged)
 
 
-def _figures(m: OccupancyMap, scene: Scene, view: SceneView, changes: dict[str, float]) -> Figures:
-    judged = judge_view(
+def judged_by_voxels(
+    m: OccupancyMap, scene: Scene, view: SceneView, changes: Mapping[str, float] = MappingProxyType({})
+) -> JudgedView:
+    """A view judged by the likeliest voxels, with some changes of the map's Occlusion."""
+    return judge_view(
         m, view.true_m, view.T_world_camera, view.camera or scene.camera,
         measured_m=view.measured_m, noise=scene.noise, mask=view.judged,
         view=m.view.with_occlusion(**changes) if changes else m.view,
     )  # fmt: skip
+
+
+def judged_by_surface(m: OccupancyMap, surface: FusedSurface, scene: Scene, view: SceneView) -> JudgedView:
+    """A view judged by the map's surface where that is near the likeliest voxels, else by these."""
+    judged, camera = judged_by_voxels(m, scene, view), view.camera or scene.camera
+    near_m = surface.depth_near(judged.answer_m, camera, view.T_world_camera, m.voxel_size)
+    return judged.by_surface(near_m)
+
+
+def _figures(judged: JudgedView) -> Figures:
     scores = {name: judged.accuracy(name) for name in TOLERANCES}
     error = judged.depth_error()
     return {name: score.score for name, score in scores.items()} | {

@@ -35,7 +35,7 @@ def score_table(
 ) -> Table:
     """One row for each contender's reading and voxel size: mean and spread over views (and noise seeds).
 
-    ``paper`` gives, by (row's beginning, voxel size), what the paper reports under its own tolerance.
+    ``paper`` gives, by (row, voxel size), what the paper reports under its own tolerance.
     """
     rows: list[list[Entry]] = []
     sizes = sorted({each.voxel_size for each in scored}, reverse=True)
@@ -46,9 +46,7 @@ def score_table(
             if not here:
                 continue
             figures: list[Entry] = [Spread.of([each.figures[key] for each in here]) for key in COLUMNS]
-            reported = next(
-                (v for (start, s), v in paper.items() if s == size and row.startswith(start)), None
-            )
+            reported = paper.get((row, size))
             seconds = Spread.of([each.build_seconds for each in here])
             rows.append([f"{size * 100:g} cm", row, *figures, reported, Spread(seconds.mean), len(here)])
     return Table(

@@ -21,7 +21,7 @@ from taichi_mrf.export.surface import Surface, welded_rows
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.queries.colored import marginals_behind
 from taichi_mrf.queries.known_bricks import QueriedMap, sorted_bricks
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.system.libraries import library
 from taichi_mrf.voxels.colors import marginal_colors
 from taichi_mrf.voxels.distance_field import DistanceSource
@@ -50,6 +50,11 @@ docs/surfaces.md."""
 BLENDED_VARIANCE = 0.5
 """Variance in voxels^2 of the distances of 27 voxels with binomial weights, whatever was measured."""
 
+NEAR_VOXELS, NEAR_M = 2.0, 0.1
+"""How far the likeliest voxel of a ray and its surface may lie apart to be the same: through a hole in the
+surface a ray meets what is behind it. In metres too, because a sensor's errors move the likeliest of small
+voxels."""
+
 MARGIN = 1
 """Voxels around a box that blending reads."""
 
@@ -67,15 +72,22 @@ class FusedSurface:
     std_m: NDArray[np.float32]
     colors: NDArray[np.uint8] | None = None
 
-    def render_depth(self, camera: PinholeCamera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
+    def render_depth(self, camera: Camera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
         """Axial depth of the surface as a camera at a pose (4, 4) sees it, (H, W) float32 metres, NaN where
         it sees none. It is more exact than OccupancyMap.render_depth, which ends rays in the middle of a
         voxel, and has more holes. Raises DatasetError without embreex."""
-        T = as_pose(T_world_camera)
-        if not len(self.triangles):
-            return np.full(camera.shape, np.nan, np.float32)
-        depth_m = self._scene.render_depth(camera, T)
+        depth_m = self._scene.render_depth(camera, as_pose(T_world_camera))
         return np.where(depth_m > 0, depth_m, np.float32(np.nan))
+
+    def depth_near(
+        self, depth_m: NDArray[np.float32], camera: Camera, T_world_camera: ArrayLike, voxel_size: float
+    ) -> NDArray[np.float32]:
+        """:meth:`render_depth` where it is near a depth (H, W) that was rendered from voxels of
+        ``voxel_size`` metres: within NEAR_VOXELS voxels or NEAR_M. NaN elsewhere."""
+        found = self.render_depth(camera, T_world_camera)
+        with np.errstate(invalid="ignore"):
+            near = np.abs(found - depth_m) <= max(NEAR_VOXELS * voxel_size, NEAR_M)
+        return np.where(near, found, np.float32(np.nan))
 
     @cached_property
     def _scene(self) -> MeshScene:

@@ -17,6 +17,7 @@ from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
 from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.config.values import overridden
+from taichi_mrf.export.fused_surface import FusedSurface
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.geometry.up import Up, up_of
 from taichi_mrf.methods.brick_registry import BrickRegistry
@@ -169,10 +170,22 @@ class BrickMap(Owned):
         return extract_voxels(self._pool, self.voxel_size, real(min_probability, "min_probability"))
 
     @tensors.in_kind("T_world_camera")
-    def render_depth(self, camera: Camera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
-        """Axial depth of the likeliest surface seen by each pixel, (H, W) float32, NaN where none is."""
+    def render_depth(
+        self, camera: Camera, T_world_camera: ArrayLike, surface: FusedSurface | None = None
+    ) -> NDArray[np.float32]:
+        """Axial depth of the likeliest surface seen by each pixel, (H, W) float32, NaN where none is.
+
+        It is the middle of a voxel; with ``surface``, the map's own (``m.surface()``), the depth of that
+        where it lies near the voxel (FusedSurface.depth_near), which is more exact. Raises DatasetError for
+        that without embreex."""
         check_camera(camera)
-        return self.view.render_depth(camera, as_pose(T_world_camera), self.sensor.max_depth)
+        T = as_pose(T_world_camera)
+        depth_m = self.view.render_depth(camera, T, self.sensor.max_depth)
+        if surface is None:
+            return depth_m
+        instance(surface, FusedSurface, "surface", "what m.surface() gives")
+        near_m = surface.depth_near(depth_m, camera, T, self.voxel_size)
+        return np.where(np.isnan(near_m), depth_m, near_m)
 
     @tensors.in_kind("origin", "direction")
     def ray_profile(

@@ -1,6 +1,7 @@
 """Optional libraries: loaded when they are first used; without them, the error names what to install."""
 
 import importlib
+import importlib.util
 from typing import Any
 
 from taichi_mrf.errors import TaichiMRFError
@@ -19,3 +20,8 @@ def library(name: str, who_needs: str, extra: str, error: type[TaichiMRFError] =
         raise error(
             f"{who_needs} {package}, which is not installed: pip install 'taichi-mrf[{extra}]'"
         ) from missing
+
+
+def installed(*names: str) -> bool:
+    """Whether all of some modules can be loaded."""
+    return all(importlib.util.find_spec(name) is not None for name in names)

@@ -19,6 +19,7 @@ from taichi_mrf.datasets.synthetic.room_furniture import camera_pose, room_scene
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.ray_table import RayTable
 from taichi_mrf.sensor.simulate import KINECT_1, KINECT_1_LATERAL, simulate
 
 trimesh = pytest.importorskip("trimesh", reason="meshes need the extra 'mesh': trimesh is not installed")
@@ -85,6 +86,29 @@ def test_a_ray_that_meets_nothing_has_no_depth() -> None:
     np.testing.assert_allclose(depth[x < 0.499], 2.5, atol=1e-6)
     assert (depth[x > 0.501] == 0).all()
     assert (scene.render_depth(CAMERA, look_at((3, 0, 0), (9, 0, 0))) == 0).all()
+
+
+def test_a_mesh_without_triangles_is_met_by_no_ray() -> None:
+    nothing = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
+    assert (MeshScene(nothing).render_depth(CAMERA, np.eye(4)) == 0).all()
+
+
+def test_rays_that_start_off_the_camera_meet_a_triangle_where_a_closed_form_says() -> None:
+    # A triangle through three points of the camera's frame, on a plane n x = 1.
+    corners = np.array([[-3.0, -3.0, 1.5], [4.0, -3.0, 2.0], [-1.0, 4.0, 2.5]])
+    normal = np.linalg.solve(corners, np.ones(3))
+    T, start = POSES[0], np.array([0.2, -0.1, 0.05])
+    mesh = TriangleMesh(corners @ T[:3, :3].T + T[:3, 3], np.array([[0, 1, 2]], np.int32))
+    directions = CAMERA.rays()
+    moving = RayTable(directions, np.tile(start, (CAMERA.width, 1)))
+    found = MeshScene(mesh).render_depth(moving, T)
+    expected = (1.0 - start @ normal) / (directions @ normal)
+    # A point is inside where its shares of the corners are positive.
+    shares = (start + directions * expected[..., None]) @ np.linalg.inv(corners)
+    inside = (shares > 1e-3).all(axis=-1)
+    assert 0.1 < inside.mean() <= 1
+    np.testing.assert_allclose(found[inside], expected[inside], rtol=1e-5)
+    assert (found[(shares < -1e-3).any(axis=-1)] == 0).all()
 
 
 @pytest.mark.parametrize("kind", KINDS)

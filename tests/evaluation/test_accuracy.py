@@ -27,10 +27,12 @@ from oracles.survey import Surveyed
 from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.errors import ConfigError, FrameError
 from taichi_mrf.evaluation.accuracy import (
+    MISSED,
     NO_ANSWER,
     NOT_JUDGED,
     OUTLIERS,
     RIGHT,
+    SURFACE_STD,
     TOLERANCES,
     WRONG,
     JudgedView,
@@ -40,6 +42,7 @@ from taichi_mrf.evaluation.accuracy import (
 )
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.queries.survey import SurfaceSurvey
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise
@@ -394,3 +397,26 @@ def test_a_view_without_measurements_still_has_a_truth(random_map: HandMade) -> 
     assert 0 <= judged.accuracy("1.5sigma").score <= 1
     assert np.isnan(judged.accuracy("sensor").score)
     assert np.isnan(judged.log_likelihood())
+
+
+def test_a_view_is_judged_by_a_surface_where_there_is_one() -> None:
+    sigma_m, measured_m = 0.03, np.array([[2.02, 2.02, 2.3]], np.float32)
+    of_voxels = np.array([[2.05, 2.05, 2.3]], np.float32)
+    survey = SurfaceSurvey(
+        of_voxels - 0.05, of_voxels + 0.05, np.full((1, 3), 0.5, np.float32), of_voxels, np.full((1, 3), 4.0)
+    )
+    table = PolynomialNoise((sigma_m,), (0.01,)).table(PinholeCamera(3, 1, 10.0, 10.0, 1.0, 0.0))
+    depth_m = np.array([[2.0, 2.0, 2.3]], np.float32)
+    judged = JudgedView(depth_m, measured_m, survey, 0.1, 10.0, table)
+    surface_m = np.array([[2.001, np.nan, 2.38]], np.float32)
+    found = judged.by_surface(surface_m)
+    np.testing.assert_allclose(found.answer_m, [[2.001, 2.05, 2.38]], rtol=1e-6)
+    assert found.accuracy("voxel").score == pytest.approx(2 / 3)  # half a voxel of 10 cm to each side
+    spread = math.hypot(sigma_m, SURFACE_STD * 0.1)
+    densities = []
+    for z, d in ((2.02, 2.001), (2.3, 2.38)):
+        around = math.exp(-0.5 * ((z - d - 0.01) / spread) ** 2) / (math.sqrt(2 * math.pi) * spread)
+        densities.append((1 - MISSED) * around + MISSED * (4.0 + 0.5 / 10.0))
+    densities.insert(1, 4.0 + 0.5 / 10.0)
+    expected = [math.log((1 - OUTLIERS) * each + OUTLIERS / 10.0) for each in densities]
+    np.testing.assert_allclose(found.log_densities(), expected, atol=2e-5)  # depths are float32

@@ -12,7 +12,6 @@ from taichi_mrf.benchmark.bench import octomap_available
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.experiments.peers import cases, our_maps, run
 from taichi_mrf.experiments.peers.measuring import RIGHT, Case, answer_scores, measured
-from taichi_mrf.experiments.peers.mesh_rays import MeshRays
 from taichi_mrf.experiments.peers.octomap import OctomapPeer
 from taichi_mrf.experiments.peers.peer import Answers, Cells, Knob, Peer, System, thinned
 from taichi_mrf.experiments.peers.plots import Point, frontier
@@ -140,26 +139,6 @@ def test_each_peer_finds_the_wall(name: str) -> None:
     assert cells.occupied.tolist() == [False, True, False]
     assert cells.probability[1] > cells.probability[0]
     assert peer.memory_mb > 0
-
-
-def test_rays_meet_a_mesh_where_a_closed_form_says() -> None:
-    pytest.importorskip("open3d", reason="open3d (the extra bench) is not installed")
-    scene = wall()
-    view = scene.views[1]
-    # A triangle through three points of the camera's frame, on a plane n x = 1.
-    corners = np.array([[-3.0, -3.0, 1.5], [4.0, -3.0, 2.0], [-1.0, 4.0, 2.5]])
-    normal = np.linalg.solve(corners, np.ones(3))
-    R, t = view.T_world_camera[:3, :3], view.T_world_camera[:3, 3]
-    mesh = corners @ R.T + t, np.array([[0, 1, 2]])
-    found = MeshRays(mesh).depth_m(view, scene.camera)
-    directions = scene.camera.rays()
-    shares = directions @ np.linalg.inv(corners)  # a ray is inside where all are positive
-    inside = (shares > 1e-3).all(axis=-1)
-    assert 0.1 < inside.mean() <= 1
-    np.testing.assert_allclose(found[inside], 1.0 / (directions @ normal)[inside], rtol=1e-4)
-    assert np.isnan(found[(shares < -1e-3).any(axis=-1)]).all()
-    nothing = MeshRays((np.zeros((0, 3)), np.zeros((0, 3), np.int64))).depth_m(view, scene.camera)
-    assert np.isnan(nothing).all()
 
 
 @needs_octomap

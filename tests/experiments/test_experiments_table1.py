@@ -32,6 +32,7 @@ FOLDS = 2
 
 ROWS = [
     "MRFMap",
+    "MRFMap, measured surface",
     "OctoMap-style, all leaves",
     "OctoMap-style, occupied leaves",
     "OctoMap-style, bias removed, all leaves",
@@ -131,6 +132,27 @@ def test_mrfmap_scores_what_the_judge_says(tables: list[Table], scenes: list[Sce
     for figure, heading in COLUMNS.items():
         assert row[heading] == Spread.of([each[figure] for each in found]), heading
     assert row["1.5sigma"].mean > 0.4
+
+
+def test_rays_end_on_the_measured_surface_where_it_is_near(tables: list[Table], scenes: list[Scene]) -> None:
+    scene, size = scenes[0], 0.05
+    errors, right = [], []
+    for fold in range(FOLDS):
+        m = MRFMap(size, scene.noise, volume=scene.volume, max_depth=scene.max_depth, ray_density=0.0)
+        mapped(m, scene, fold)
+        view = scene.views[fold]
+        voxel_m = judge_view(m, view.true_m, view.T_world_camera, scene.camera, mask=view.judged).answer_m
+        surface_m = m.surface().render_depth(scene.camera, view.T_world_camera)
+        near = np.abs(surface_m - voxel_m) <= 0.1
+        assert 0.2 < near.mean() < 1.0
+        off = np.abs(np.where(near, surface_m, voxel_m) - view.true_m)[view.judged & (view.true_m > 0)]
+        errors.append(np.nanmedian(off))
+        right.append(np.mean(off <= 0.05))
+    row, voxels = (row_of(tables[0], "5 cm", f"MRFMap{reading}") for reading in (", measured surface", ""))
+    assert row["median error (m)"].mean == pytest.approx(np.mean(errors), rel=1e-4)
+    assert row["5cm"].mean == pytest.approx(np.mean(right), abs=1e-6)
+    assert row["median error (m)"].mean < voxels["median error (m)"].mean
+    assert row["log-likelihood"].mean > voxels["log-likelihood"].mean
 
 
 def test_log_odds_are_read_with_and_without_free_leaves(tables: list[Table], scenes: list[Scene]) -> None:

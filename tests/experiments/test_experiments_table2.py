@@ -96,7 +96,7 @@ def test_table2_judges_all_views_and_held_out_ones(second: tuple, data: Path) ->
     assert row_of(held_out, "MRFMap")["views"] == len(rest)
     for each in (table, held_out):
         assert each.columns == ["voxels", "map", *COLUMNS.values(), "paper", "map (s)", "views"]
-        assert len(each.rows) == 1 + 4 * 2
+        assert len(each.rows) == 2 + 4 * 2
         assert {entry[0] for entry in each.rows} == {"10 cm"}
     assert any("3 keyframes of 5 views" in note for note in table.notes)
 

@@ -9,7 +9,7 @@ import pytest
 from taichi_mrf import MRFMap, PinholeCamera, PolynomialNoise
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.formats import export_map, export_note
-from taichi_mrf.export.fused_surface import _normals, without_free
+from taichi_mrf.export.fused_surface import NEAR_M, NEAR_VOXELS, _normals, without_free
 from taichi_mrf.export.options import ExportOptions
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -65,8 +65,40 @@ def test_depth_of_a_wall_on_voxels_faces_is_rendered_where_it_is() -> None:
     np.testing.assert_allclose(depth_m[inner], 30 * VOXEL - 0.2, atol=0.04 * VOXEL)
     # The middle of a voxel, in front of the wall or behind it, is half a voxel away.
     assert np.abs(m.render_depth(CAMERA, T)[inner] - (30 * VOXEL - 0.2)).mean() > 0.4 * VOXEL
+    refined = m.render_depth(CAMERA, T, m.surface())
+    np.testing.assert_array_equal(refined[inner], depth_m[inner])
+    T_far = T.copy()
+    T_far[2, 3] -= 1.0  # past the edge of the surface
+    depth_m, far = m.surface().render_depth(CAMERA, T_far), m.render_depth(CAMERA, T_far)
+    holes = np.isnan(depth_m)
+    assert holes.any()
+    np.testing.assert_array_equal(m.render_depth(CAMERA, T_far, m.surface())[holes], far[holes])
     T[:3, :3] = np.diag([-1.0, 1.0, -1.0])  # the other way, where nothing is
     assert np.isnan(m.surface().render_depth(CAMERA, T)).all()
+    assert np.isnan(m.render_depth(CAMERA, T, m.surface())).all()
+
+
+@pytest.mark.parametrize(("voxel_size", "near_m"), [(0.02, NEAR_M), (0.2, NEAR_VOXELS * 0.2)])
+def test_the_surfaces_depth_is_given_where_it_is_near(voxel_size: float, near_m: float) -> None:
+    pytest.importorskip("embreex")
+    surface = _map_of_plane(0.0).surface()
+    T = np.eye(4)
+    own = surface.render_depth(CAMERA, T)
+    off = np.linspace(-2 * near_m, 2 * near_m, CAMERA.width, dtype=np.float32)
+    coarse = own + off
+    coarse[0] = np.nan
+    found = surface.depth_near(coarse, CAMERA, T, voxel_size)
+    assert np.isnan(found[0]).all()
+    expected = np.where(np.abs(off) < near_m, own, np.float32(np.nan))[1:]
+    clear = np.abs(np.abs(off) - near_m) > 1e-4  # not where rounding decides
+    assert 0.2 < np.isfinite(expected).mean() < 0.8
+    np.testing.assert_array_equal(found[1:][:, clear], expected[:, clear])
+
+
+def test_a_map_is_rendered_with_nothing_but_its_surface() -> None:
+    m = _map_of_plane(0.0)
+    with pytest.raises(TypeError, match=r"surface must be what m\.surface\(\) gives"):
+        m.render_depth(CAMERA, np.eye(4), m)  # type: ignore[arg-type]
 
 
 def test_the_standard_deviation_grows_where_rays_are_few() -> None:

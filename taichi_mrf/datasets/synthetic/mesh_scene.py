@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.origins import origins_of
 from taichi_mrf.system.files import exists, is_file
 from taichi_mrf.system.libraries import library
 
@@ -37,12 +38,13 @@ class MeshScene:
     """A mesh that depth images can be taken of."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
-        """Raises DatasetError if Embree is not installed. The mesh must hold triangles."""
+        """Raises DatasetError if Embree is not installed."""
         self.mesh = mesh
         self._rays = _library("embreex.rtcore_scene")
         self._construction = _library("embreex.mesh_construction")
         # Embree counts in float32, which is most exact around zero.
-        self._middle = 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
+        corners = mesh.vertices if len(mesh.vertices) else np.zeros((1, 3))
+        self._middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
 
     @cached_property
     def _tree(self) -> Any:
@@ -52,13 +54,19 @@ class MeshScene:
         self._construction.TriangleMesh(tree, vertices, np.ascontiguousarray(self.mesh.triangles, np.int32))
         return tree
 
-    def render_depth(self, camera: PinholeCamera, T_world_camera: Pose) -> NDArray[np.float32]:
-        """Axial depth, (H, W) float32 in metres, of the first triangle on the ray through each pixel's
-        centre, seen from either side; 0 where a ray meets none."""
-        directions = (camera.rays().reshape(-1, 3) @ T_world_camera[:3, :3].T).astype(np.float32)
-        origins = np.empty_like(directions)
+    def render_depth(self, camera: Camera, T_world_camera: Pose) -> NDArray[np.float32]:
+        """Depth, (H, W) float32 in metres (axial for a pinhole), of the first triangle on the ray through
+        each pixel's centre, seen from either side; 0 where a ray meets none."""
+        if not len(self.mesh.triangles):
+            return np.zeros(camera.shape, np.float32)
+        rays = camera.rays()
+        directions = (rays.reshape(-1, 3) @ T_world_camera[:3, :3].T).astype(np.float32)
+        origins, starts = np.empty_like(directions), origins_of(camera)
         origins[:] = T_world_camera[:3, 3] - self._middle
-        # Directions are one metre of axial depth long, so that is what Embree's ray parameter is.
+        if starts is not None:
+            turned = np.broadcast_to(starts, rays.shape).reshape(-1, 3) @ T_world_camera[:3, :3].T
+            origins += turned.astype(np.float32)
+        # Directions are one metre of depth long, so that is what Embree's ray parameter is.
         hit = self._tree.run(origins, directions, query="INTERSECT", output=True)
         return np.where(hit["primID"] >= 0, hit["tfar"], np.float32(0)).reshape(camera.shape)
 

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from taichi_mrf import FREE, OCCUPIED, LogOddsMap, MRFMap, VisibilityMap, WavemapMap
 from taichi_mrf.benchmark.keyframe_cost import timed
-from taichi_mrf.evaluation.accuracy import judge_view
+from taichi_mrf.evaluation.accuracy import JudgedView
 from taichi_mrf.experiments.contenders import BOTH
-from taichi_mrf.experiments.peers.mesh_rays import MeshRays, open3d_available
+from taichi_mrf.experiments.judging import judged_by_surface, judged_by_voxels
 from taichi_mrf.experiments.peers.peer import Answers, Cells, Knob, Mesh, Peer
 from taichi_mrf.experiments.scenes import Scene, SceneView
+from taichi_mrf.export.fused_surface import FusedSurface
 from taichi_mrf.export.surface import smooth_surface
 from taichi_mrf.methods.protocol import OccupancyMap
 
@@ -68,18 +69,15 @@ class MrfPeer:
             self.map.infer(sweeps=self._full_sweeps)
 
     def answers(self, view: SceneView) -> Mapping[str, Answers]:
-        """By omega; and with Open3D where rays meet the measured surface, and by omega where they meet none.
-        The likelihood of both is the map's."""
-        omega = _answers(self.map, self._scene, view, {})
-        if not open3d_available():
-            return {"omega": omega}
-        depth_m = self._surface.depth_m(view, view.camera or self._scene.camera)
-        met = np.where(np.isnan(depth_m), omega.depth_m, depth_m)
-        return {"omega": omega, "surface": Answers(met, omega.log_likelihood)}
+        """By omega, and by the measured surface where that is near."""
+        return {
+            "omega": _answers(judged_by_voxels(self.map, self._scene, view)),
+            "surface": _answers(judged_by_surface(self.map, self._surface, self._scene, view)),
+        }
 
     @cached_property
-    def _surface(self) -> MeshRays:
-        return MeshRays(self.mesh())
+    def _surface(self) -> FusedSurface:
+        return self.map.surface()
 
     def cells(self, points_m: NDArray[np.float64]) -> Mapping[str, Cells]:
         """By marginals, and by the calibrated reading."""
@@ -91,8 +89,7 @@ class MrfPeer:
 
     def mesh(self) -> Mesh:
         """The measured surface."""
-        surface = self.map.surface()
-        return surface.vertices_m, surface.triangles
+        return self._surface.vertices_m, self._surface.triangles
 
     @property
     def memory_mb(self) -> float:
@@ -119,7 +116,10 @@ class RecursivePeer:
 
     def answers(self, view: SceneView) -> Mapping[str, Answers]:
         """Once for each reading."""
-        return {name: _answers(self.map, self._scene, view, changes) for name, changes in BOTH.items()}
+        return {
+            name: _answers(judged_by_voxels(self.map, self._scene, view, changes))
+            for name, changes in BOTH.items()
+        }
 
     def cells(self, points_m: NDArray[np.float64]) -> Mapping[str, Cells]:
         """By its probabilities."""
@@ -160,12 +160,7 @@ def _shared(scene: Scene) -> dict[str, Any]:
     return {"volume": scene.volume, "max_depth": scene.max_depth}
 
 
-def _answers(m: OccupancyMap, scene: Scene, view: SceneView, changes: Mapping[str, float]) -> Answers:
-    judged = judge_view(
-        m, view.true_m, view.T_world_camera, view.camera or scene.camera,
-        measured_m=view.measured_m, noise=scene.noise, mask=view.judged,
-        view=m.view.with_occlusion(**changes) if changes else m.view,
-    )  # fmt: skip
+def _answers(judged: JudgedView) -> Answers:
     return Answers(judged.answer_m, judged.log_likelihood())
 
 

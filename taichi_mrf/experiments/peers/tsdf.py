@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.synthetic.mesh_scene import MeshScene, TriangleMesh
 from taichi_mrf.evaluation.accuracy import OUTLIERS
-from taichi_mrf.experiments.peers.mesh_rays import MeshRays
 from taichi_mrf.experiments.peers.peer import Answers, Cells, Knob, Mesh
 from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.experiments.surface import BLOCK, MOST_BLOCKS
@@ -56,12 +56,14 @@ class TsdfPeer:
     def answers(self, view: SceneView) -> Mapping[str, Answers]:
         """Where rays first meet its mesh. Its own casting of rays through blocks (0.20) leaves pixels out or
         ends the process where blocks lie around the camera."""
-        depth_m = self._surface.depth_m(view, view.camera or self._scene.camera)
+        found = self._surface.render_depth(view.camera or self._scene.camera, view.T_world_camera)
+        depth_m = np.where(found > 0, found, np.nan)
         return {"": Answers(depth_m, self._log_likelihood(view, depth_m))}
 
     @cached_property
-    def _surface(self) -> MeshRays:
-        return MeshRays(self.mesh())
+    def _surface(self) -> MeshScene:
+        vertices_m, triangles = self.mesh()
+        return MeshScene(TriangleMesh(vertices_m, triangles.astype(np.int32)))
 
     def cells(self, points_m: NDArray[np.float64]) -> Mapping[str, Cells]:
         """By the distance of the voxel that a point lies in."""
@@ -102,7 +104,7 @@ class TsdfPeer:
         K = np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1.0]])
         return tensor(K), tensor(np.linalg.inv(view.T_world_camera))
 
-    def _log_likelihood(self, view: SceneView, depth_m: NDArray[np.float64]) -> float:
+    def _log_likelihood(self, view: SceneView, depth_m: NDArray[np.floating]) -> float:
         """As JudgedView.log_likelihood has it of a surface that is certain where there is an answer."""
         measured = view.judged & (view.true_m > 0) & (view.measured_m > 0)
         table = self._scene.noise.table(view.camera or self._scene.camera)
