@@ -82,7 +82,12 @@ def learn_sigma(
     Raises ConfigError for a dataset whose poses are not known or that never ends, DatasetError if the
     held-out frames do not tell, and what mapping raises.
     """
-    if dataset.tracked or dataset.endless:
+    if dataset.endless:
+        raise ConfigError(
+            f"--noise auto needs a recording, and {dataset.name} is a live camera: record it, learn with "
+            "taichi-mrf map RECORDING --out DIR --noise auto, and pass --config DIR/sensor.yaml"
+        )
+    if dataset.tracked:
         raise ConfigError(
             f"{dataset.name}: --noise auto needs a recording with poses: map it once, then again with "
             "--poses trajectory.txt --noise auto"

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from taichi_mrf.cli.options.live import Live
 from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
@@ -11,11 +12,15 @@ from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.serving import PrintLine, let_the_page_go_first, print_address, warn_of_host
 from taichi_mrf.cli.shared.terminal import print_problem
-from taichi_mrf.config.schema import with_absolute_tables
+from taichi_mrf.config.schema import Config, with_absolute_tables
 from taichi_mrf.errors import ConfigError, TaichiMRFError
 from taichi_mrf.live.link import ViewerLink
 from taichi_mrf.runs.files import holds_run
 from taichi_mrf.viewer.messages import Listening, Status, Update
+
+if TYPE_CHECKING:
+    from taichi_mrf.calibration.from_recording import LearntSigma
+    from taichi_mrf.datasets import Dataset
 
 SHORTEST_LIFE_SECONDS = 30.0
 """A viewer that lives shorter than this is not restarted."""
@@ -40,10 +45,15 @@ def run_live(options: Live) -> int:
         page = _Page(options, print_line, bar, stack)
         let_the_page_go_first()
         # Imported late: the page starts meanwhile, in a process of its own.
+        from taichi_mrf.cli.shared.learn_noise import learn_noise
         from taichi_mrf.live.run import Policy
         from taichi_mrf.live.session import Session
         from taichi_mrf.live.source import open_source
         from taichi_mrf.runs.folder import write_run
+
+        def learn(dataset: "Dataset", config: Config) -> "LearntSigma":
+            with ProgressBar(console, options.printing) as progress:
+                return learn_noise(dataset, config, progress, request, options.every, options.limit)
 
         source, notes = open_source(
             options.source,
@@ -56,6 +66,7 @@ def run_live(options: Live) -> int:
             track=options.poses.track_poses,
             poses=options.poses.file,
             follow=options.poses.follow,
+            learn_noise=learn if options.noise.is_learnt else None,
         )
         for note in notes:
             print_line(note)

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from taichi_mrf.cli.options.tune import FRAMES_BY_HAND, FRAMES_TO_SEARCH, Tune
-from taichi_mrf.cli.shared.interrupt import stop_on_signals
+from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.output import output_folder
-from taichi_mrf.cli.shared.progress import open_terminal
+from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.serving import PrintLine, let_the_page_go_first, print_address, warn_of_host
-from taichi_mrf.config.schema import with_absolute_tables
+from taichi_mrf.config.schema import Config, with_absolute_tables
 from taichi_mrf.errors import TaichiMRFError
 from taichi_mrf.live.link import ViewerLink
 from taichi_mrf.system.atomic import write_text
@@ -17,6 +17,8 @@ from taichi_mrf.tune.link import NoPage, start_page
 from taichi_mrf.viewer.tune.messages import FrameChoice
 
 if TYPE_CHECKING:
+    from taichi_mrf.calibration.from_recording import LearntSigma
+    from taichi_mrf.datasets import Dataset
     from taichi_mrf.tune.history import Attempt
     from taichi_mrf.tune.search import Search
     from taichi_mrf.tune.session import TuneSession
@@ -46,15 +48,21 @@ def run_tune(options: Tune) -> int:
         if dataset.tracked:
             raise DatasetError(f"{options.source}: tune needs poses: map it, and give poses=trajectory.txt")
         settings = with_tuned_noise(settings, dataset)
+        count = options.frames or (FRAMES_TO_SEARCH if options.auto is not None else FRAMES_BY_HAND)
+        choice = FrameChoice(options.first, options.stride, count, options.hold_out)
+        if options.noise.is_learnt:
+            with ProgressBar(console, options.printing) as progress:
+                learnt = _learn_noise(settings, dataset, choice, progress, request)
+            settings = learnt.put_into(settings)
+            _tell_noise(options, settings, learnt, print_line)
         search = None
         if options.auto is not None:
             search = Search(settings, options.names or DEFAULT_SEARCH, options.auto, options.seed)
         printed: set[int] = set()
-        count = options.frames or (FRAMES_TO_SEARCH if search else FRAMES_BY_HAND)
         session = TuneSession(
             dataset,
             settings,
-            FrameChoice(options.first, options.stride, count, options.hold_out),
+            choice,
             link,
             Policy(options.out, options.search_stride, leave_when_done=not options.viewer),
             search=search,
@@ -84,6 +92,31 @@ def _page(options: Tune, print_line: PrintLine, stack: ExitStack) -> ViewerLink:
     link = stack.enter_context(start_page(options.host, options.port))
     let_the_page_go_first()
     return link
+
+
+def _learn_noise(
+    settings: Config, dataset: "Dataset", choice: FrameChoice, progress: ProgressBar, request: StopRequest
+) -> "LearntSigma":
+    """What the recording says of its noise, learnt from frames that score no map. Raises TaichiMRFError."""
+    from taichi_mrf.cli.shared.learn_noise import learn_noise
+    from taichi_mrf.datasets.derived import chosen
+    from taichi_mrf.tune.working_set import split_indices
+
+    _, scored = split_indices(dataset, choice)
+    others = sorted(set(range(len(dataset))) - set(scored))
+    return learn_noise(chosen(dataset, others), settings, progress, request)
+
+
+def _tell_noise(options: Tune, settings: Config, learnt: "LearntSigma", print_line: PrintLine) -> None:
+    """Print what was learnt, and write it for other recordings."""
+    from taichi_mrf.runs.files import NOISE_FILE
+    from taichi_mrf.runs.noise import noise_notes, sensor_yaml
+
+    for note in noise_notes(settings.sensor, None, learnt):
+        print_line(note)
+    if options.out is not None:
+        write_text(options.out / NOISE_FILE, sensor_yaml(settings.sensor, options.source, learnt))
+        print_line(f"wrote {options.out / NOISE_FILE}")
 
 
 def _finish(session: "TuneSession", options: Tune, print_line: PrintLine) -> None:

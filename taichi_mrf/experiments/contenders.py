@@ -55,9 +55,9 @@ def mrf(name: str = "MRFMap", **parameters: Any) -> Contender:
     return Contender(name, make)
 
 
-def lidar_mrf(name: str = "MRFMap") -> Contender:
+def lidar_mrf(name: str = "MRFMap", **parameters: Any) -> Contender:
     """The same with the chance that a lidar's beam passes an occupied voxel."""
-    return mrf(name, pass_through=LIDAR_PASS_THROUGH)
+    return mrf(name, pass_through=LIDAR_PASS_THROUGH, **parameters)
 
 
 def log_odds(name: str, **parameters: Any) -> Contender:

@@ -6,23 +6,24 @@ second table is lidar_roc.py's.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from taichi_mrf import PolynomialNoise, open_dataset
 from taichi_mrf.config.schema import VolumeConfig
+from taichi_mrf.datasets.lidar.recording import LIDAR_SIGMA_M
 from taichi_mrf.evaluation.accuracy import judge_view
 from taichi_mrf.evaluation.tables import Entry, Spread, Table, write_table
 from taichi_mrf.experiments.contenders import Contender, lidar_mrf, log_odds, mrf, wavemap
 from taichi_mrf.experiments.folds import Experiment, Scored, flatten, fold_key, require_views
 from taichi_mrf.experiments.judging import build, judge_all
+from taichi_mrf.experiments.learnt_noise import learnt_law, with_law
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.lidar_rivals import TUNED, contender_of, in_words, tuned_parameters
 from taichi_mrf.experiments.lidar_roc import roc_table
 from taichi_mrf.experiments.scenes import Scene, SceneView
-from taichi_mrf.experiments.tuning import MOST_KEYFRAMES, tuned_contender
+from taichi_mrf.experiments.tuning import tuned_contender
 from taichi_mrf.methods.wavemap.plug import WavemapConfig
 
 MAX_RANGE_M = 60.0
@@ -34,9 +35,6 @@ EVERY, FIRST = 5, 2
 
 RUN = 15
 """Neighbouring keyframes by which wavemap's model is tuned."""
-
-SIGMAS_M = (0.03, 0.04, 0.06, 0.08, 0.12, 0.18)
-"""The standard deviations of range that are tried."""
 
 NEAR_M = 0.2
 """An answer within this of the measurement is near it, whatever the voxel size."""
@@ -62,7 +60,7 @@ def lidar_scene(data: Path, limit: int | None = None) -> Scene:
         views.append(
             SceneView(frame.name, frame.T_world_camera, depth, depth, seen, frame.stamp, camera=frame.camera)
         )
-    noise = PolynomialNoise(dataset.recorded_sigma or SIGMAS_M[:1])
+    noise = PolynomialNoise((LIDAR_SIGMA_M,))
     return Scene("lidar_building", dataset.camera, noise, VolumeConfig(), MAX_RANGE_M, views)
 
 
@@ -76,14 +74,15 @@ def run_lidar(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     learnt: list[str] = []
     tuned: list[str] = []
     for voxel_size in experiment.voxel_sizes:
-        sigma_m = _learnt_sigma(experiment, scene, voxel_size, keyframes)
-        learnt.append(f"{sigma_m * 100:g} cm for voxels of {voxel_size * 100:g} cm")
-        judged_scene = replace(scene, noise=PolynomialNoise((sigma_m,)))
+        experiment.report(f"learning sigma, {voxel_size * 100:g} cm", 0, 1)
+        law = learnt_law(experiment, lidar_mrf(), scene, voxel_size, keyframes)
+        learnt.append(_law_in_words(law, voxel_size))
+        judged_scene = with_law(scene, law)
         beams = _tuned_beams(experiment, judged_scene, voxel_size, keyframes)
         tuned.append(f"{voxel_size * 100:g} cm: {in_words(beams)}")
         contenders = [
-            lidar_mrf(),
-            mrf(OPAQUE),
+            lidar_mrf(**law["prior"]),
+            mrf(OPAQUE, **law["prior"]),
             log_odds("OctoMap-style"),
             tuned_contender(experiment, judged_scene, 0, voxel_size, keyframes),
             wavemap(),
@@ -110,6 +109,13 @@ def run_lidar(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     return [table, areas], write_table(experiment.out, table) + write_table(experiment.out, areas)
 
 
+def _law_in_words(law: Result, voxel_size: float) -> str:
+    """The learnt sigma, and what else was learnt with it."""
+    sigma_m = law["scale"] * LIDAR_SIGMA_M + law["added_m"]
+    others = "".join(f", {name} {value:g}" for name, value in law["prior"].items())
+    return f"{sigma_m * 100:.3g} cm for voxels of {voxel_size * 100:g} cm{others}"
+
+
 def _tuned_beams(
     experiment: Experiment, scene: Scene, voxel_size: float, keyframes: Sequence[int]
 ) -> WavemapConfig:
@@ -127,19 +133,6 @@ def _tuned_beams(
         return max(float(np.mean(figures)) for figures in readings.values())
 
     return tuned_parameters(voxel_size, score)
-
-
-def _learnt_sigma(experiment: Experiment, scene: Scene, voxel_size: float, keyframes: Sequence[int]) -> float:
-    """The sigma under which maps of some of the keyframes explain another one best."""
-    some = list(keyframes[:: -(-len(keyframes) // MOST_KEYFRAMES)])
-    check = some.pop(len(some) // 2)
-    found = {}
-    for number, sigma_m in enumerate(SIGMAS_M):
-        experiment.report(f"learning sigma, {voxel_size * 100:g} cm", number, len(SIGMAS_M))
-        assumed = replace(scene, noise=PolynomialNoise((sigma_m,)))
-        (scored,) = _scored(experiment, assumed, lidar_mrf(f"sigma {sigma_m:g}"), voxel_size, some, [check])
-        found[sigma_m] = scored.figures["log_likelihood"]
-    return max(found, key=lambda sigma_m: found[sigma_m])
 
 
 def _scored(

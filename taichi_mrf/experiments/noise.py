@@ -5,11 +5,8 @@ and the one that was learnt from the mapped views.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
-from taichi_mrf.calibration.from_recording import learn_sigma
-from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.accuracy import judge_view
 from taichi_mrf.evaluation.depth_intervals import interval_error, view_below
@@ -17,11 +14,12 @@ from taichi_mrf.evaluation.tables import Entry, Spread, Table, write_table
 from taichi_mrf.experiments.contenders import Contender, row_name, wavemap
 from taichi_mrf.experiments.folds import Experiment, require_views
 from taichi_mrf.experiments.judging import build
+from taichi_mrf.experiments.learnt_noise import learnt_law, noise_key, with_law
 from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.noise_scenes import NoiseCase, cases, frames_of
+from taichi_mrf.experiments.noise_scenes import NoiseCase, cases
 from taichi_mrf.experiments.scenes import Scene
 from taichi_mrf.experiments.tuning import tuned_contender
-from taichi_mrf.sensor.noise import NoiseModel, widened_noise
+from taichi_mrf.sensor.noise import NoiseModel
 
 GIVEN, AUTO = "MRFMap, given noise", "MRFMap, --noise auto"
 
@@ -70,11 +68,9 @@ def _of_scene(
     keyframes, held_out = case.split(scene)
     held_out = held_out[:: max(1, -(-len(held_out) // JUDGED))]
     given = case.ours(GIVEN)
-    where = f"{scene.name} | {len(scene.views)} views | {voxel_size:g} m"
     experiment.report(f"learning the noise of {case.name}", 0, 1)
-    law = experiment.ledger.result(f"{where} | learnt", lambda: _learnt(given, scene, voxel_size, keyframes))
-    wider = SensorConfig(sigma_scale=law["scale"], sigma_added=law["added_m"])
-    learnt = replace(scene, noise=widened_noise(scene.noise, wider))
+    law = learnt_law(experiment, given, scene, voxel_size, keyframes)
+    learnt, where = with_law(scene, law), noise_key(scene, voxel_size)
     noises = {"given": scene.noise, "learnt": learnt.noise}
     maps = [
         (given, scene),
@@ -96,12 +92,6 @@ def _of_scene(
         f"{case.name}, {voxel_size * 100:g} cm: {law['scale']:.2f} times the given sigma and "
         f"{100 * law['added_m']:.2g} cm; a single factor {law['factor']:.2g}."
     )
-
-
-def _learnt(ours: Contender, scene: Scene, voxel_size: float, keyframes: Sequence[int]) -> Result:
-    found = learn_sigma(frames_of(scene, keyframes), ours.make(scene, voxel_size).config)
-    law = {"scale": found.law.scale, "added_m": found.law.added_m, "factor": found.factor}
-    return law | {"prior": found.prior}
 
 
 def _judged(

@@ -3,7 +3,7 @@
 Real ones have poses that are off and errors that neighbouring pixels share, which no noise file holds.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -16,13 +16,11 @@ from taichi_mrf import PolynomialNoise, open_dataset
 from taichi_mrf.alignment.se3 import moved
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.datasets import Dataset
-from taichi_mrf.datasets.lidar.recording import LIDAR_PASS_THROUGH
-from taichi_mrf.experiments.contenders import Contender, mrf
+from taichi_mrf.experiments.contenders import Contender, lidar_mrf, mrf
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.lidar import lidar_scene
 from taichi_mrf.experiments.scenes import Scene, SceneView, coffin_scene, house_scene, kitchen_scene
 from taichi_mrf.experiments.stereo.street import street_scene, thinned
-from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.simulate import SimulatedSensor, simulate
 
 STEREO_SIGMA = (0.0, 0.0, 0.00075291)
@@ -73,46 +71,11 @@ def cases() -> list[NoiseCase]:
         ),
         NoiseCase("street", (0.2,), False, _street, every_other),
         NoiseCase("time of flight", (0.05,), False, _time_of_flight, every_fifth),
-        NoiseCase(
-            "building",
-            (0.2,),
-            False,
-            lambda e: lidar_scene(e.data, e.limit),
-            every_fifth,
-            partial(mrf, pass_through=LIDAR_PASS_THROUGH),
-        ),
+        NoiseCase("building", (0.2,), False, lambda e: lidar_scene(e.data, e.limit), every_fifth, lidar_mrf),
         NoiseCase("house", (0.05, 0.02), True, lambda e: house_scene(e.data, 0, e.limit), every_other),
         NoiseCase("room", (0.05, 0.02), True, _room, every_fifth),
         NoiseCase("coffin", (0.05,), True, lambda e: coffin_scene(e.data), slice(2, None, 4)),
     ]
-
-
-@dataclass
-class SceneFrames(Dataset):
-    """Views as a recording, each of which states the noise of its scene."""
-
-    frames: Sequence[Frame] = ()
-
-    @property
-    def frame_names(self) -> Sequence[str]:
-        """The views' names."""
-        return [frame.name for frame in self.frames]
-
-    def read(self, index: int) -> Frame:
-        """A view."""
-        return self.frames[index]
-
-
-def frames_of(scene: Scene, indices: Sequence[int]) -> SceneFrames:
-    """Some views of a scene as a recording."""
-    frames = [
-        Frame(
-            view.measured_m, view.T_world_camera, view.camera or scene.camera, float(i), view.name,
-            noise=scene.noise,
-        )
-        for i, view in ((i, scene.views[i]) for i in indices)
-    ]  # fmt: skip
-    return SceneFrames(scene.name, scene.camera, frames=frames)
 
 
 def _street(experiment: Experiment) -> Scene:

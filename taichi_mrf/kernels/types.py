@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     AnyArray2: TypeAlias = Any
     I32Array: TypeAlias = Any
     I64Array: TypeAlias = Any
+    F64Array: TypeAlias = Any
     F32Array: TypeAlias = Any
     F32Array2: TypeAlias = Any
     F32Array3: TypeAlias = Any
@@ -60,6 +61,7 @@ else:
     AnyArray2 = ti.types.ndarray(ndim=2)
     I32Array = ti.types.ndarray(dtype=ti.i32, ndim=1)
     I64Array = ti.types.ndarray(dtype=ti.i64, ndim=1)
+    F64Array = ti.types.ndarray(dtype=ti.f64, ndim=1)
     F32Array = ti.types.ndarray(dtype=ti.f32, ndim=1)
     F32Array2 = ti.types.ndarray(dtype=ti.f32, ndim=2)
     F32Array3 = ti.types.ndarray(dtype=ti.f32, ndim=3)

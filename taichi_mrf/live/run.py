@@ -173,7 +173,8 @@ class Run(SessionCore):
     @property
     def facts(self) -> RunFacts:
         """The facts of the run's report besides its result."""
-        return RunFacts(self.source.name, self.source.config, self.source.dataset, self.source.choice)
+        source = self.source
+        return RunFacts(source.name, source.config, source.dataset, source.choice, learnt=source.learnt)
 
     @property
     def has_frames_left(self) -> bool:

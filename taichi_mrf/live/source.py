@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from taichi_mrf.calibration.from_recording import LearntSigma
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.formats import frames_npz
@@ -21,8 +22,12 @@ from taichi_mrf.methods.map_file import open_map_file, read_header
 from taichi_mrf.methods.mrf.parked_chunks import folder_beside
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map, load_map
+from taichi_mrf.runs.noise import noise_notes
 from taichi_mrf.system import runtime
 from taichi_mrf.system.files import is_file
+
+LearnNoise = Callable[[Dataset, Config], LearntSigma]
+"""Learns sigma from a recording that is to be mapped with some parameters."""
 
 
 def saved_unsettled(name: str) -> str:
@@ -37,7 +42,8 @@ def saved_unsettled(name: str) -> str:
 class Source:
     """How to make the map (an empty one, or one from a file), and how to replay the frames, which a saved map
     does not have. ``tracked``: the poses of the frames are found by tracking. ``dataset`` is the recording,
-    to check the map against its held-out frames; ``choice`` are the flags that chose its frames."""
+    to check the map against its held-out frames; ``choice`` are the flags that chose its frames. ``learnt``:
+    how sigma was learnt from it, if it was."""
 
     name: str
     config: Config
@@ -46,6 +52,7 @@ class Source:
     tracked: bool = False
     dataset: Dataset | None = None
     choice: dict[str, Any] = field(default_factory=dict)
+    learnt: LearntSigma | None = None
 
     @property
     def hold_out(self) -> int:
@@ -67,10 +74,11 @@ def open_source(
     track: bool = False,
     poses: str | None = None,
     follow: bool = False,
+    learn_noise: LearnNoise | None = None,
 ) -> tuple[Source, list[str]]:
     """Start Taichi and open a source, read as ``reading`` says; returns it with notes for the user. With
     ``track`` the poses of its frames are found by tracking, with ``poses`` they come from that file, and
-    ``follow`` it as it changes.
+    ``follow`` it as it changes. ``learn_noise`` learns sigma before a recording is mapped.
 
     Raises TaichiMRFError: DatasetError, MapFileError, BackendError, ConfigError.
     """
@@ -80,6 +88,10 @@ def open_source(
         if poses is not None:
             raise ConfigError(
                 f"{path}: is a saved map, whose keyframes have poses: --poses is for a recording"
+            )
+        if learn_noise is not None:
+            raise ConfigError(
+                f"{path}: is a saved map, which keeps its noise: --noise auto is for a recording"
             )
         with open_map_file(path) as file:
             header, parked = read_header(path, file), "parked" in file
@@ -97,6 +109,9 @@ def open_source(
     keywords |= {"follow": follow, "carry": config.poses.carry_unnamed}
     dataset = open_posed(name, poses, track=track, color=color, **keywords)
     config = with_recorded_noise(config, dataset)
+    learnt = None if learn_noise is None else learn_noise(dataset, config)
+    if learnt is not None:
+        config = learnt.put_into(config)
     # Held-out frames of a tracked source are read, so that their poses are known when the map is checked.
     unread = 0 if dataset.tracked else hold_out_of(dataset, config)
 
@@ -106,4 +121,7 @@ def open_source(
     new_map = partial(create_map, config, dataset.camera)
     chosen = {"every": every, "limit": limit}
     choice = {**chosen, "track_poses": track, "poses_from": poses, "follow": follow or None}
-    return Source(name, config, new_map, new_replay, dataset.tracked, dataset, choice), dataset.notes
+    if learnt is not None:
+        choice["noise_from"] = "auto"
+    notes = dataset.notes + noise_notes(config.sensor, None, learnt)
+    return Source(name, config, new_map, new_replay, dataset.tracked, dataset, choice, learnt), notes

@@ -154,13 +154,13 @@ class BrickMap(Owned):
         if self._up is None:
             self._up = up_of(T_world_camera, camera.up)
 
-    @tensors.in_kind("points")
+    @tensors.in_kind("points", on_device=True)
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]:
         """Probability of occupied at (N, 3) points in metres, (N,) float32; the prior where nothing was
         measured."""
         return probability(self._log_odds(points))
 
-    @tensors.in_kind("points")
+    @tensors.in_kind("points", on_device=True)
     def state(self, points: ArrayLike) -> NDArray[np.int8]:
         """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,) int8."""
         return classify(self._log_odds(points), self._pool.prior_log_odds, self.view.volume.min_evidence)

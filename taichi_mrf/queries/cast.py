@@ -1,20 +1,21 @@
 """Where rays meet something: many rays at once, with a stated policy for unknown space."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import F32, I32, F32Array, F32Array2, I32Array, Struct, Template, Vec3
+from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template
+from taichi_mrf.queries.given_rays import GivenRays, WindowRays
 from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN, state_of
 from taichi_mrf.queries.ray_space import RaySpace
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.compiler import ti
-from taichi_mrf.voxels.layout import BRICK, VOXELS
+from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_voxels
 from taichi_mrf.voxels.window import Window
 
@@ -42,86 +43,54 @@ class RayHits:
     in_unknown: NDArray[np.bool_]
 
 
-@tensors.in_kind("origins", "directions")
+@tensors.in_kind("origins", "directions", on_device=True)
 def cast_rays(
     m: QueriedMap, origins: ArrayLike, directions: ArrayLike, max_range: float, unknown: Unknown = "free"
 ) -> RayHits:
     """Follow rays to the first voxel that is occupied (:meth:`state`), in one kernel for all of them.
 
     ``origins`` and ``directions`` are (N, 3) in the world, in metres, or one of them (3,), for all rays;
-    directions need not be normalised. The range is that of the face through which the ray enters the voxel, 0
-    if it begins inside. Raises ConfigError for another policy, for arrays that do not fit or are not finite
-    and for a direction of no length, CapacityError if the rays reach through more space than fits memory.
+    directions need not be normalised. CPU and CUDA read float32 and float64 where they are. The range is that
+    of the face through which the ray enters the voxel, 0 if it begins inside. Raises ConfigError for another
+    policy, for arrays that do not fit or are not finite and for a direction of no length, CapacityError if
+    the rays reach through more space than fits memory.
     """
     if unknown not in _POLICIES:
         raise ConfigError(f"unknown must be one of {', '.join(_POLICIES)}, not {unknown!r}")
-    start, along = _checked(origins, directions)
+    rays = GivenRays(origins, directions)
     if not (np.isfinite(max_range) and max_range > 0):
         raise ConfigError(f"max_range must be a positive number, not {max_range}")
-    end_m = np.full(len(start), max_range, np.float32)
-    outcome = np.full(len(start), _PASSED, np.int32)
-    if len(start):
-        # Column by column: NumPy takes ten times as long over rows of three numbers.
-        columns = [np.concatenate([a, a + b * max_range]) for a, b in zip(start.T, along.T, strict=True)]
-        corners = np.array([[each.min() for each in columns], [each.max() for each in columns]])
+    end_m = tensors.empty(rays.like, (rays.count,))
+    outcome = tensors.empty(rays.like, (rays.count,), "int32")
+    end_m[:], outcome[:] = max_range, _PASSED
+    if rays.count:
+        corners = rays.corners(max_range)
         if unknown == "free":
-            _through_voxels(m, start, along, corners, end_m, outcome)
+            _through_voxels(m, rays, corners, max_range, end_m, outcome)
         else:
-            _through_space(m, start, along, corners, end_m, outcome)
+            _through_space(m, rays, corners, max_range, end_m, outcome)
     ended_in_unknown = outcome == _STOPPED
     hit = outcome == _HIT
     if unknown == "hit":
         hit |= ended_in_unknown
-    return RayHits(hit, end_m, start + along * end_m[:, None].astype(np.float64), ended_in_unknown)
-
-
-def _checked(origins: ArrayLike, directions: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    start, along = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
-    shape = np.broadcast_shapes(start.shape, along.shape) if _fit(start, along) else ()
-    if len(shape) != 2:
-        raise ConfigError(
-            f"rays need origins and directions of shape (N, 3), not {start.shape} and {along.shape}"
-        )
-    if not (np.isfinite(start).all() and np.isfinite(along).all()):
-        raise ConfigError("rays hold a value that is not finite")
-    length = np.linalg.norm(along, axis=-1, keepdims=True)
-    if (length == 0).any():
-        raise ConfigError("a ray has a direction of no length")
-    return np.broadcast_to(start, shape).copy(), np.broadcast_to(along / length, shape).copy()
-
-
-def _fit(start: NDArray[np.float64], along: NDArray[np.float64]) -> bool:
-    """Whether both hold vectors, as many or one for all."""
-    shapes = start.shape, along.shape
-    counts = {shape[0] for shape in shapes if len(shape) == 2}
-    return all(len(s) in (1, 2) and s[-1] == 3 for s in shapes) and len(counts) == 1
+    return RayHits(hit, end_m, rays.points(end_m), ended_in_unknown)
 
 
 def _through_voxels(
-    m: QueriedMap,
-    start: NDArray[np.float64],
-    along: NDArray[np.float64],
-    corners: NDArray[np.float64],
-    end_m: NDArray[np.float32],
-    outcome: NDArray[np.int32],
+    m: QueriedMap, rays: GivenRays, corners: NDArray[np.float64], max_range: float, end_m: Any, outcome: Any
 ) -> None:
     """Past everything but occupied voxels: only bricks that exist need to be looked at."""
-    filled = m.view.fill(corners, lambda slots: _may_end_rays(m, slots, len(start)))
+    filled = m.view.fill(corners, lambda slots: _may_end_rays(m, slots, rays.count))
     if filled is None:
         return
     window, cells = filled
-    _launch(m, window, start, along, 2**31 - 1, 0, end_m, outcome)
+    _launch(m, window, rays, max_range, 2**31 - 1, 0, end_m, outcome)
     m.view.index.clear(window, cells)
     runtime.settle()
 
 
 def _through_space(
-    m: QueriedMap,
-    start: NDArray[np.float64],
-    along: NDArray[np.float64],
-    corners: NDArray[np.float64],
-    end_m: NDArray[np.float32],
-    outcome: NDArray[np.int32],
+    m: QueriedMap, rays: GivenRays, corners: NDArray[np.float64], max_range: float, end_m: Any, outcome: Any
 ) -> None:
     """As far as space is known. A layer of unknown bricks lies around it, so no ray leaves the window."""
     space = RaySpace(m)
@@ -133,11 +102,8 @@ def _through_space(
         end_m[:], outcome[:] = 0.0, _STOPPED
         return
     with space.indexed(lower, upper) as window:
-        _launch(m, window, start, along, space.unknown_from, 1, end_m, outcome)
+        _launch(m, window, rays, max_range, space.unknown_from, 1, end_m, outcome)
         runtime.settle()
-        local = window.to_voxels(start)
-        outside = ((local < 0) | (local >= np.array(window.shape) * BRICK)).any(axis=1)
-    end_m[outside], outcome[outside] = 0.0, _STOPPED
 
 
 def _may_end_rays(m: QueriedMap, slots: NDArray[np.int32], rays: int) -> NDArray[np.bool_]:
@@ -154,18 +120,17 @@ def _may_end_rays(m: QueriedMap, slots: NDArray[np.int32], rays: int) -> NDArray
 def _launch(
     m: QueriedMap,
     window: Window,
-    start: NDArray[np.float64],
-    along: NDArray[np.float64],
+    rays: GivenRays,
+    max_range: float,
     unknown_from: int,
     stop_in_unknown: int,
-    end_m: NDArray[np.float32],
-    outcome: NDArray[np.int32],
+    end_m: Any,
+    outcome: Any,
 ) -> None:
     view = m.view
     _cast(
-        window.to_voxels(start).astype(np.float32), (along / m.voxel_size).astype(np.float32),
-        float(end_m[0]), view.pool.prior_log_odds, view.volume.min_evidence, unknown_from, stop_in_unknown,
-        view.index.space(window), view.pool.belief, end_m, outcome,
+        rays.within(window), max_range, view.pool.prior_log_odds, view.volume.min_evidence, unknown_from,
+        stop_in_unknown, view.index.space(window), view.pool.belief, end_m, outcome,
     )  # fmt: skip
 
 
@@ -213,24 +178,25 @@ def _mark_occupied(slots: I32Array, belief: F32Array, prior: F32, min_evidence: 
 
 @kernel
 def _cast(
-    origins: F32Array2, directions: F32Array2, max_range: F32, prior: F32, min_evidence: F32,
-    unknown_from: I32, stop_in_unknown: I32, space: Space, belief: F32Array, end_m: F32Array, outcome:
-    I32Array,
+    rays: WindowRays, max_range: F32, prior: F32, min_evidence: F32, unknown_from: I32, stop_in_unknown: I32,
+    space: Space, belief: F32Array, end_m: F32Array, outcome: I32Array,
 ) -> None:  # fmt: skip
-    """Follow each ray until something ends it.
+    """Follow each ray until something ends it; where the unknown does, one that begins outside of the window
+    ends at once.
 
-    ``origins`` (N, 3) are in voxels from the window's corner, ``directions`` (N, 3) the way in voxels for one
-    metre; ``belief`` (pool * 512) holds log-odds. ``end_m`` (N) receives the range in metres, ``outcome`` (N)
-    what ended the ray.
+    ``belief`` (pool * 512) holds log-odds. ``end_m`` (N) receives the range in metres, ``outcome`` (N) what
+    ended the ray.
     """
     for i in range(outcome.shape[0]):
-        ray = make_ray(
-            Vec3(origins[i, 0], origins[i, 1], origins[i, 2]),
-            Vec3(directions[i, 0], directions[i, 1], directions[i, 2]),
-        )
+        start = rays.start(i)
+        ray = make_ray(start, rays.way(i))
         search = _Search(prior, min_evidence, unknown_from, stop_in_unknown, max_range, _PASSED)
-        begin, end = 0.0, max_range
-        clip(ray, begin, end, space.lower, space.upper)
-        walk_voxels(ray, begin, end, space, _look, search, belief)
+        if stop_in_unknown == 1 and ((start - space.lower).min() < 0.0 or (space.upper - start).min() <= 0.0):
+            search.end_m = 0.0
+            search.outcome = _STOPPED
+        else:
+            begin, end = 0.0, max_range
+            clip(ray, begin, end, space.lower, space.upper)
+            walk_voxels(ray, begin, end, space, _look, search, belief)
         end_m[i] = search.end_m
         outcome[i] = search.outcome

@@ -1,16 +1,17 @@
 """The probability of occupied at points, and whether they are known."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.config.arguments import array
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array
-from taichi_mrf.system import runtime
+from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.compiler import ti
-from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.pool import BrickPool
-from taichi_mrf.voxels.topology import Topology
+from taichi_mrf.voxels.topology import CROSSED, Topology
 
 UNKNOWN = 0
 """The state of a place that no ray has crossed, or that has too little evidence either way."""
@@ -24,27 +25,19 @@ OCCUPIED = 2
 
 def point_log_odds(
     points: ArrayLike, voxel_size: float, topology: Topology, pool: BrickPool, seen_free: float
-) -> NDArray[np.float32]:
-    """(N, 3) points in metres -> (N,) log-odds of being occupied.
+) -> Any:
+    """(N, 3) points in metres -> (N,) log-odds of being occupied, float32, in the points' memory.
 
-    Where no brick exists it is the prior where no ray has passed, else ``seen_free``. A point that is
-    not finite raises ConfigError.
+    Where no brick exists it is the prior where no ray has passed, else ``seen_free``. Points of float32 and
+    float64 are read where they are. A point that is not finite raises ConfigError.
     """
-    points_m = checked_points(points)
-    if len(points_m) == 0:
-        return np.zeros(0, np.float32)
-    # A point beyond 32 bits is further away than any map reaches.
-    voxels = np.clip(np.floor(points_m / voxel_size), -(2**30), 2**30).astype(np.int32)
-    bricks = np.ascontiguousarray(voxels // BRICK, np.int32)
-    slots = topology.slots(bricks)
-    without_brick = np.where(topology.crossings(bricks) > 0, seen_free, pool.prior_log_odds).astype(
-        np.float32
-    )
-    log_odds = np.zeros(len(points_m), np.float32)
-    local = voxels - bricks * BRICK
-    numbers = ((local[:, 0] * BRICK + local[:, 1]) * BRICK + local[:, 2]).astype(np.int32)
-    _gather(pool.belief, slots, numbers, without_brick, log_odds)
-    runtime.settle()
+    given = tensors.real_array(points, "points", ("N", 3))
+    log_odds = tensors.empty(given, given.shape[:1])
+    if len(given):
+        voxels = tensors.empty(given, given.shape[:1], "int32")
+        topology.locate(given, voxel_size, voxels)
+        _gather(pool.belief, voxels, pool.prior_log_odds, seen_free, log_odds)
+        runtime.settle()
     return log_odds
 
 
@@ -58,15 +51,15 @@ def checked_points(points: ArrayLike) -> NDArray[np.float64]:
     return points_m
 
 
-def classify(log_odds: NDArray[np.float32], prior_log_odds: float, min_evidence: float) -> NDArray[np.int8]:
-    """(N,) log-odds -> (N,) UNKNOWN, FREE or OCCUPIED.
+def classify(log_odds: Any, prior_log_odds: float, min_evidence: float) -> Any:
+    """(N,) log-odds -> (N,) UNKNOWN, FREE or OCCUPIED, int8; NumPy's arrays, or tensors of a device.
 
     Occupied is more likely than not; of the rest, unknown is what lies within ``min_evidence`` of the
     prior or above it: evidence for a surface that does not suffice.
     """
-    state = np.where(log_odds < prior_log_odds - min_evidence, FREE, UNKNOWN)
-    known = np.abs(log_odds - prior_log_odds) > min_evidence
-    return np.where((log_odds > 0) & known, OCCUPIED, state).astype(np.int8)
+    occupied = (log_odds > 0) & (abs(log_odds - prior_log_odds) > min_evidence)
+    free = (log_odds < prior_log_odds - min_evidence) & ~occupied
+    return tensors.as_int8(free) * FREE + tensors.as_int8(occupied) * OCCUPIED
 
 
 @ti.func
@@ -81,19 +74,21 @@ def state_of(log_odds: F32, prior_log_odds: F32, min_evidence: F32) -> I32:
     return state
 
 
-def probability(log_odds: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Log-odds to probability."""
-    return (0.5 * (1.0 + np.tanh(0.5 * log_odds))).astype(np.float32)
+def probability(log_odds: Any) -> Any:
+    """Log-odds to probability, float32."""
+    if isinstance(log_odds, np.ndarray | np.generic):
+        return (0.5 * (1.0 + np.tanh(0.5 * np.asarray(log_odds)))).astype(np.float32)
+    return 0.5 * (1.0 + (0.5 * log_odds).tanh())
 
 
 @ti.kernel
-def _gather(
-    belief: F32Array, slots: I32Array, numbers: I32Array, without_brick: F32Array, log_odds: F32Array
-):
-    """Log-odds of points: those of voxel ``numbers`` (N) of the bricks in ``slots`` (N), or ``without_brick``
-    (N) where the slot is -1, into ``log_odds`` (N). ``belief`` is (pool * 512)."""
-    for i in range(slots.shape[0]):
-        here = without_brick[i]
-        if slots[i] >= 0:
-            here = belief[slots[i] * VOXELS + numbers[i]]
+def _gather(belief: F32Array, voxels: I32Array, unseen: F32, crossed: F32, log_odds: F32Array):
+    """Log-odds of ``voxels`` (N), as Topology.locate has them, into ``log_odds`` (N): those of ``belief``
+    (pool * 512), or ``unseen`` or ``crossed`` where no brick is."""
+    for i in range(voxels.shape[0]):
+        here = unseen
+        if voxels[i] >= 0:
+            here = belief[voxels[i]]
+        elif voxels[i] == CROSSED:
+            here = crossed
         log_odds[i] = here

@@ -61,38 +61,62 @@ def on_host(value: Any, name: str) -> Any:
     return _taken(value, name, False) if _is_tensor(value) else value
 
 
-def real_array(value: Any, name: str, shape: tuple[int | str, ...]) -> Any:
-    """Numbers of a shape, a name for any length, as a contiguous array of float32 or float64: the value
-    itself if it is one, also in a device's memory. Raises ConfigError for another shape or numbers that are
-    not finite."""
+def numbers(value: Any, name: str) -> Any:
+    """Numbers as a contiguous array of float32 or float64: the value itself if it is one, also in a device's
+    memory. Raises ArgumentTypeError if it holds something else."""
     if _is_tensor(value):  # in the memory of Taichi's device
         given = value if value.dtype.itemsize in (4, 8) and value.is_floating_point() else value.double()
-        given = given.contiguous()
-    else:
-        try:
-            given = np.asarray(value)
-            given = np.ascontiguousarray(given, given.dtype if given.dtype in ("f4", "f8") else np.float64)
-        except (TypeError, ValueError) as error:
-            kind = type(value).__name__
-            raise ArgumentTypeError(f"{name} must be an array of numbers, not {kind}") from error
+        return given.contiguous()
+    try:
+        given = np.asarray(value)
+        return np.asarray(given, given.dtype if given.dtype in ("f4", "f8") else np.float64, order="C")
+    except (TypeError, ValueError) as error:
+        what = repr(value) if isinstance(value, str) else type(value).__name__
+        raise ArgumentTypeError(f"{name} must be an array of numbers, not {what}") from error
+
+
+def real_array(value: Any, name: str, shape: tuple[int | str, ...]) -> Any:
+    """The same of a shape, a name for any length. Raises ConfigError for another shape or numbers that are
+    not finite."""
+    given = numbers(value, name)
     if len(given.shape) != len(shape) or any(
         isinstance(want, int) and n != want for n, want in zip(given.shape, shape, strict=True)
     ):
         wanted = ", ".join(map(str, shape))
         raise ConfigError(f"{name} must be of shape ({wanted}), not {tuple(given.shape)}")
+    check_finite(given, name)
+    return given
+
+
+def check_finite(given: Any, name: str) -> None:
+    """Raises ConfigError for numbers that are not finite."""
     # One pass over the memory: a value that is not finite spoils the sum. So may many large ones.
     with np.errstate(over="ignore", invalid="ignore"):
         total = float(given.sum())
     if not math.isfinite(total) and not bool((abs(given) < math.inf).all()):
         raise ConfigError(f"{name} hold a value that is not finite")
-    return given
 
 
-def empty(like: Any, shape: tuple[int, ...]) -> Any:
-    """An array of float32 in the same memory as another."""
+def empty(like: Any, shape: tuple[int, ...], dtype: str = "float32") -> Any:
+    """An array in the same memory as another."""
     if isinstance(like, np.ndarray):
-        return np.empty(shape, np.float32)
-    return like.new_empty(tuple(shape), dtype=sys.modules["torch"].float32)
+        return np.empty(shape, dtype)
+    return like.new_empty(tuple(shape), dtype=getattr(sys.modules["torch"], dtype))
+
+
+def moved_to(like: Any, given: Any) -> Any:
+    """An array in the memory of a device's tensor, which it may be itself."""
+    return sys.modules["torch"].as_tensor(given, device=like.device)
+
+
+def as_numpy(given: Any) -> Any:
+    """An array in the host's memory."""
+    return given if isinstance(given, np.ndarray) else given.cpu().numpy()
+
+
+def as_int8(truth: Any) -> Any:
+    """Truth values as 0 and 1, int8 of the same memory."""
+    return truth.view(np.int8 if isinstance(truth, np.ndarray | np.generic) else sys.modules["torch"].int8)
 
 
 def _is_tensor(value: Any) -> bool:

@@ -44,19 +44,14 @@ def read_working_set(dataset: Dataset, choice: FrameChoice, keep_unseen: bool = 
     A broken frame is left out. Raises DatasetError for a source that never ends and one without frames to
     train on and to hold out, ConfigError for a choice that lies outside the sequence.
     """
-    if dataset.endless:
-        raise DatasetError(
-            f"{dataset.name}: parameters are tuned on frames that can be read again: record it"
-        )
+    indices, scored = split_indices(dataset, choice)
     choice = _settled(choice, len(dataset))
-    indices = range(choice.first, len(dataset), choice.stride)[: choice.count]
     roles: dict[str, list[tuple[int, Frame]]] = {"training": [], "held_out": [], "unseen": []}
-    skipped, held_out = [], 0
-    for number, index in enumerate(indices, start=1):
+    skipped = []
+    for index in indices:
         role = "training"
-        if is_held_out(number, choice.hold_out):
-            role = "unseen" if keep_unseen and held_out % 2 else "held_out"
-            held_out += 1
+        if index in scored:
+            role = "unseen" if keep_unseen and scored.index(index) % 2 else "held_out"
         try:
             frame = dataset.read(index)
         except FrameError as error:
@@ -82,6 +77,19 @@ def read_working_set(dataset: Dataset, choice: FrameChoice, keep_unseen: bool = 
         tuple(skipped),
         truth,
     )
+
+
+def split_indices(dataset: Dataset, choice: FrameChoice) -> tuple[list[int], list[int]]:
+    """The chosen frames of a dataset, by index, and of these the ones that do not make the map, held out or
+    kept back. Raises DatasetError for a source that never ends, ConfigError for a choice that lies outside
+    the sequence."""
+    if dataset.endless:
+        raise DatasetError(
+            f"{dataset.name}: parameters are tuned on frames that can be read again: record it"
+        )
+    choice = _settled(choice, len(dataset))
+    indices = range(choice.first, len(dataset), choice.stride)[: choice.count]
+    return list(indices), [i for n, i in enumerate(indices, start=1) if is_held_out(n, choice.hold_out)]
 
 
 def coarse_stride(camera: Camera) -> int:

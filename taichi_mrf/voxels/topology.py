@@ -12,19 +12,25 @@ brick without a slot is seen-free space; one that was never crossed is unknown.
 
 import gc
 import weakref
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import CapacityError
-from taichi_mrf.kernels.types import I32, AnyArray, I32Array, IVec3, IVec4, Template
+from taichi_mrf.kernels.types import F64, I32, AnyArray, AnyArray2, I32Array, IVec3, IVec4, Template
 from taichi_mrf.system.compiler import ti
-from taichi_mrf.voxels.layout import BRICK, CHUNK
-from taichi_mrf.voxels.numbering import flat
+from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS
+from taichi_mrf.voxels.numbering import flat, voxel_number
 
 Bricks = NDArray[np.int32]
 """(n, 3) brick coordinates in the world."""
+
+UNSEEN, CROSSED = -1, -2
+"""In place of a voxel that has no brick: one that no ray has crossed, and seen-free space."""
+
+FARTHEST = 2.0**30
+"""In voxels: points further away count as this far, which is beyond all maps."""
 
 
 class Topology(Protocol):
@@ -47,6 +53,11 @@ class Topology(Protocol):
 
     def crossings(self, bricks: Bricks) -> NDArray[np.int32]:
         """How many keyframes see through each brick."""
+
+    def locate(self, points: Any, voxel_size: float, voxels: Any) -> None:
+        """Write to ``voxels`` (N) int32 where in the pool the voxel of each of some points is, (N, 3) float32
+        or float64 in metres and finite: slot * 512 + the voxel's number, CROSSED where rays pass and no brick
+        is, else UNSEEN. The points are read where they are, also in a device's memory."""
 
     def check(self, bricks: Bricks, voxel_size: float) -> None:
         """Raise CapacityError, in metres, if any of the bricks lies outside the volume."""
@@ -151,6 +162,26 @@ class _Tree:
                     out[i] = self.crossing[cell]
 
     @ti.kernel
+    def locate(self, points: AnyArray2, voxel_size: F64, voxels: I32Array, layer: I32):
+        """Where in the pool the voxels of points (N, 3) in metres are, into ``voxels`` (N), as
+        Topology.locate has it."""
+        for i in range(voxels.shape[0]):
+            voxel = IVec3(0)
+            for axis in ti.static(range(3)):
+                place = ti.floor(ti.cast(points[i, axis], ti.f64) / voxel_size)
+                voxel[axis] = ti.cast(ti.min(ti.max(place, -FARTHEST), FARTHEST), ti.i32)
+            brick = (voxel >> 3) + self.HALF_SPAN
+            cell = IVec4(brick[0], brick[1], brick[2], layer)
+            found = UNSEEN
+            if self.in_span(cell):
+                slot = self.slot[cell] - 1
+                if slot >= 0:
+                    found = slot * VOXELS + voxel_number(voxel & 7)
+                elif self.crossing[cell] > 0:
+                    found = CROSSED
+            voxels[i] = found
+
+    @ti.kernel
     def drop_chunks(self, chunks: AnyArray, number: I32, layer: I32):
         """Deactivate ``number`` chunks (n, 3) of a layer."""
         for i in range(number):
@@ -227,6 +258,9 @@ class SparseTopology:
         self._tree.read(bricks, out, 1, self.layer)
         return out
 
+    def locate(self, points: Any, voxel_size: float, voxels: Any) -> None:
+        self._tree.locate(points, voxel_size, voxels, self.layer)
+
     def check(self, bricks: Bricks, voxel_size: float) -> None:
         if len(bricks) and max(-int(bricks.min()), int(bricks.max()) + 1) > self.HALF_SPAN:
             reach = self.HALF_SPAN * BRICK * voxel_size
@@ -279,6 +313,16 @@ class DenseTopology:
         out = np.zeros(len(bricks), np.int32)
         _dense_read(self.crossing, self._local(bricks), out, self.side)
         return out
+
+    def locate(self, points: Any, voxel_size: float, voxels: Any) -> None:
+        """On the host: the devices that need this index may lack float64."""
+        places = np.floor(np.divide(points, voxel_size, dtype=np.float64))
+        there = np.clip(places, -FARTHEST, FARTHEST).astype(np.int32)
+        bricks = there // BRICK
+        slots, local = self.slots(bricks), there - bricks * BRICK
+        numbers = (local[:, 0] * BRICK + local[:, 1]) * BRICK + local[:, 2]
+        without = np.where(self.crossings(bricks) > 0, CROSSED, UNSEEN)
+        voxels[:] = np.where(slots >= 0, slots * VOXELS + numbers, without)
 
     def check(self, bricks: Bricks, voxel_size: float) -> None:
         local = self._local(bricks)

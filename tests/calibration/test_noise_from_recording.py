@@ -94,5 +94,12 @@ def test_recordings_that_cannot_tell_are_refused(room: Dataset) -> None:
     tracked = Tracked("walk", room.camera, tracked=True, source=room, indices=[0, 1, 2, 3])
     with pytest.raises(ConfigError, match="needs a recording with poses"):
         learn_sigma(tracked, Config(VOXEL))
+
+    class Camera(Tracked):
+        endless = True
+
+    camera = Camera("realsense:", room.camera, tracked=True, source=room, indices=[])
+    with pytest.raises(ConfigError, match="recording, and realsense: is a live camera: record it"):
+        learn_sigma(camera, Config(VOXEL))
     with pytest.raises(DatasetError, match="0 held-out frames"):
         learn_sigma(chosen(room, [0, 1]), Config(VOXEL))

@@ -1,4 +1,5 @@
-"""``map --noise auto``: sigma from the recording, and the word about a noise that held-out frames doubt."""
+"""``--noise auto`` of map, live and tune: sigma from the recording, and the word about a noise that held-out
+frames doubt."""
 
 import json
 from pathlib import Path
@@ -6,15 +7,22 @@ from typing import Any
 
 import pytest
 import yaml
-from console import FAST, taichi_mrf
+from console import COARSE, FAST, as_process, assert_refused, taichi_mrf
 
+from taichi_mrf.cli.options.live import Live
 from taichi_mrf.cli.options.map import Map
+from taichi_mrf.cli.options.noise_flags import NoiseFlags
 from taichi_mrf.cli.options.pose_flags import PoseFlags
+from taichi_mrf.cli.shared import learn_noise
 from taichi_mrf.config.schema import load
+from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.tune.working_set import read_working_set
+from taichi_mrf.viewer.tune.messages import FrameChoice
 
 ROOM = "synthetic:room?frames=12&width=160&height=120"
-FLAGS = (*FAST, "--voxel-size", "0.03", "--evaluation.hold-out", "4")
+FINE = ("--voxel-size", "0.03", "--runtime.arch", "cpu")
+FLAGS = (*FINE, "--no-pictures", "--evaluation.hold-out", "4")
 TOO_SMALL = ("--sensor.sigma", "0.0003", "-0.0003", "0.00038")
 """A fifth of the simulated one."""
 
@@ -62,6 +70,73 @@ def test_the_right_noise_is_not_blamed(tmp_path: Path) -> None:
     assert not any("held-out frames differ" in note for note in report_of(tmp_path / "run")["notes"])
 
 
+def noise_in(path: Path) -> Any:
+    """The parameters of a file with the learnt noise."""
+    return yaml.safe_load(path.read_text())["sensor"]
+
+
+def test_live_learns_what_map_learns(tmp_path: Path) -> None:
+    """In a static world, as map's is."""
+    flags = (*FINE, "--evaluation.hold-out", "4", "--time.half-life-s", "0", *TOO_SMALL, "--noise", "auto")
+    done = taichi_mrf("map", ROOM, "--out", tmp_path / "map", "--no-pictures", *flags)
+    assert done.returncode == 0, done.stderr
+    done = as_process("live", ROOM, "--out", tmp_path / "live", "--exit-when-done", "--port", "0", *flags)
+    assert done.returncode == 0, done.stderr
+    assert "Sigma was learnt from" in done.stdout
+    learnt = noise_in(tmp_path / "live" / "sensor.yaml")
+    assert learnt == noise_in(tmp_path / "map" / "sensor.yaml")
+    assert (learnt["sigma_scale"], learnt["sigma_added"]) != (1.0, 0.0)
+    used = load(tmp_path / "live" / "config.yaml").sensor
+    assert (used.sigma_scale, used.sigma_added) == (learnt["sigma_scale"], learnt["sigma_added"])
+    report = report_of(tmp_path / "live")
+    assert report["noise_from"] == "auto"
+    assert report["noise"]["learnt"] == report_of(tmp_path / "map")["noise"]["learnt"]
+
+
+def test_tune_begins_with_what_it_learns(tmp_path: Path) -> None:
+    pytest.importorskip("optuna", reason="the search needs Optuna (extra: auto)")
+    done = as_process(
+        "tune", ROOM, "--no-viewer", "--auto", "1", "--search", "sensor.sigma_scale", "--out", tmp_path,
+        "--noise", "auto", *FINE, *TOO_SMALL,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "Sigma was learnt from" in done.stdout
+    learnt = noise_in(tmp_path / "sensor.yaml")
+    assert learnt["sigma_scale"] > 1.0 or learnt["sigma_added"] > 0.0
+    first = load(tmp_path / "best.yaml").sensor
+    assert (first.sigma_scale, first.sigma_added) == (learnt["sigma_scale"], learnt["sigma_added"])
+
+
+def test_tune_learns_from_no_frame_that_scores_a_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def learn(dataset: Dataset, *_: object) -> None:
+        asked.extend(dataset.frame_names)
+        raise ConfigError("that is enough")
+
+    monkeypatch.setattr(learn_noise, "learn_noise", learn)
+    pytest.importorskip("optuna", reason="the search needs Optuna (extra: auto)")
+    done = taichi_mrf("tune", ROOM, "--no-viewer", "--auto", "1", "--frames", "9", "--noise", "auto", *COARSE)
+    assert_refused(done, "that is enough")
+    frames = read_working_set(open_dataset(ROOM), FrameChoice(0, 0, 9, 3), keep_unseen=True)
+    scoring = {frame.name for frame in (*frames.held_out, *frames.unseen)}
+    assert len(scoring) == 3
+    assert sorted(asked) == sorted(set(open_dataset(ROOM).frame_names) - scoring)
+
+
 def test_noise_is_not_learnt_without_poses() -> None:
+    auto, tracking = NoiseFlags("auto"), PoseFlags(track_poses=True)
+    with pytest.raises(ConfigError, match="--noise auto does not work with --track-poses: learn"):
+        Map(sources=("walk",), out=Path("run"), noise=auto, poses=tracking)
+    with pytest.raises(ConfigError, match="--noise auto does not work with --track-poses or --submap-size"):
+        Map(sources=("walk",), out=Path("run"), noise=auto, poses=tracking, submap_size=4.0)
     with pytest.raises(ConfigError, match="--noise auto does not work with --track-poses"):
-        Map(sources=("walk",), out=Path("run"), noise="auto", poses=PoseFlags(track_poses=True))
+        Live(noise=auto, poses=tracking)
+
+
+def test_a_saved_map_keeps_its_noise(tmp_path: Path) -> None:
+    done = taichi_mrf("map", ROOM, "--out", tmp_path, "--limit", "2", *FAST)
+    assert done.returncode == 0, done.stderr
+    done = as_process("live", tmp_path / "map.npz", "--noise", "auto", "--port", "0", "--runtime.arch", "cpu")
+    assert done.returncode == 2
+    assert "map.npz: is a saved map, which keeps its noise: --noise auto is for a recording" in done.stderr

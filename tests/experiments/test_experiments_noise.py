@@ -11,8 +11,9 @@ from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.experiments import noise
 from taichi_mrf.experiments.folds import Experiment
+from taichi_mrf.experiments.learnt_noise import frames_of
 from taichi_mrf.experiments.ledger import Ledger
-from taichi_mrf.experiments.noise_scenes import NoiseCase, cases, frames_of
+from taichi_mrf.experiments.noise_scenes import NoiseCase, cases
 from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.sensor.simulate import KINECT_1
 

@@ -1,5 +1,8 @@
 """Queries take what speaks DLPack and answer in kind: with a stand-in made of NumPy, and with torch."""
 
+import dataclasses
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -9,12 +12,14 @@ from queried_maps import room_map
 
 from taichi_mrf.errors import ArgumentTypeError, ConfigError
 from taichi_mrf.methods.brick_map import BrickMap
+from taichi_mrf.queries import cast, given_rays
 from taichi_mrf.queries.box import read_box
 from taichi_mrf.queries.cast import cast_rays
 from taichi_mrf.queries.distance import DistanceField
 from taichi_mrf.queries.gain import view_gain
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system import runtime, tensors
+from taichi_mrf.voxels import topology
 
 POINTS = np.random.default_rng(0).uniform((-2.2, 0.9, -1.4), (0.2, 3.2, 0.9), (50, 3))
 CAMERA = PinholeCamera(width=4, height=3, fx=4.0, fy=4.0, cx=2.0, cy=1.5)
@@ -106,6 +111,76 @@ def test_tensors_are_read_where_they_lie() -> None:
     assert tensors.on_host([1, 2], "points") == [1, 2]
 
 
+SINGLE = POINTS.astype(np.float32)
+ON_DEVICE = {"occupancy", "state", "hit", "range", "point", "distance", "float32", "gradient", "clearance"}
+"""The queries of which nothing but small things is copied to the host."""
+
+
+def test_float32_answers_as_float64_of_the_same_values(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules[__name__], "POINTS", SINGLE.astype(np.float64))
+    for name, ask in queries(room_map("mrf")).items():
+        double, single = (ask(lambda a, d=d: np.asarray(a, d)) for d in (np.float64, np.float32))
+        np.testing.assert_array_equal(single, double, err_msg=name)
+        assert np.asarray(single).dtype == np.asarray(double).dtype, name
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("made", [np.asarray, Tensor])
+def test_points_and_rays_reach_kernels_where_they_lie(
+    one_backend: str, made: Any, dtype: type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points, ways = POINTS.astype(dtype), -POINTS.astype(dtype)
+    seen: list[np.ndarray] = []
+
+    def spy(
+        patch: pytest.MonkeyPatch, module: Any, name: str, arrays: Callable[..., tuple[np.ndarray, ...]]
+    ) -> None:
+        kernel = getattr(module, name)
+
+        def launch(*arguments: Any) -> Any:
+            seen.extend(arrays(*arguments))
+            return kernel(*arguments)
+
+        patch.setattr(module, name, launch)
+
+    m = room_map("mrf")
+    with monkeypatch.context() as patch:
+        spy(patch, topology.SparseTopology, "locate", lambda index, points, *_: (points,))
+        m.occupancy(made(points))
+        m.state(made(points))
+    assert len(seen) == 2
+    for module, name in ((given_rays, "_bound"), (given_rays, "_follow"), (cast, "_cast")):
+        spy(monkeypatch, module, name, lambda rays, *_: (rays.origins, rays.directions))
+    for unknown in ("free", "stop"):
+        cast_rays(m, made(points), made(ways), 3.0, unknown)  # type: ignore[arg-type]
+    assert len(seen) == 2 + 12
+    for array in seen:
+        assert np.shares_memory(array, points) or np.shares_memory(array, ways)
+
+
+def test_what_kernels_cannot_read_is_converted(backend: str) -> None:
+    m = room_map("mrf")
+    for odd in (POINTS.astype(">f8"), POINTS[::-1][::-1], np.asfortranarray(POINTS), POINTS.tolist()):
+        np.testing.assert_array_equal(m.state(odd), m.state(POINTS))
+        np.testing.assert_array_equal(
+            cast_rays(m, odd, odd, 3.0).range, cast_rays(m, POINTS, POINTS, 3.0).range
+        )
+    whole = np.rint(POINTS)
+    np.testing.assert_array_equal(m.state(whole.astype(int)), m.state(whole))
+    np.testing.assert_array_equal(m.state(whole.astype(np.float16)), m.state(whole))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_points_on_faces_belong_to_the_voxel_that_numpy_says(backend: str, dtype: type) -> None:
+    m = room_map("mrf")
+    i = np.arange(-60, 60)
+    faces = np.concatenate([i * m.voxel_size, i / round(1 / m.voxel_size)]).astype(dtype)
+    points = np.stack(np.meshgrid(faces[::7], faces[::5], faces[::3], indexing="ij"), axis=-1).reshape(-1, 3)
+    middles = (np.floor(points.astype(np.float64) / m.voxel_size) + 0.5) * m.voxel_size
+    assert len(np.unique(m.state(middles))) == 3
+    np.testing.assert_array_equal(m.occupancy(points), m.occupancy(middles))
+
+
 def test_boxes_take_tensors_and_return_numpy(backend: str) -> None:
     m = room_map("mrf")
     box = read_box(m, Tensor([-1.0, -1.0, -1.0]), Tensor([1.0, 1.0, 0.5]))
@@ -153,6 +228,25 @@ def test_a_tensor_that_keeps_gradients_is_refused(one_backend: str, torch: Any) 
         room_map("mrf").occupancy(torch.zeros((2, 3), requires_grad=True))
 
 
+def test_tensors_on_a_gpu_stay_there(backend: str, torch: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    if backend != "cuda" or not torch.cuda.is_available():
+        pytest.skip("needs Taichi and PyTorch on CUDA: pytest --arch cuda on a machine that has it")
+    to_host = torch.Tensor.cpu
+
+    def small(tensor: Any) -> Any:
+        assert tensor.numel() < len(POINTS)
+        return to_host(tensor)
+
+    for name, ask in queries(room_map("mrf")).items():
+        wanted = ask(np.asarray)
+        with monkeypatch.context() as patch:
+            if name in ON_DEVICE:
+                patch.setattr(torch.Tensor, "cpu", small)
+            found = ask(lambda array: torch.from_numpy(array.copy()).cuda())
+        assert found.device.type == "cuda", name
+        np.testing.assert_allclose(found.cpu().numpy(), wanted, rtol=1e-6, atol=1e-6, err_msg=name)
+
+
 def test_kernels_read_and_write_tensors_of_their_device(
     one_backend: str, torch: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -160,6 +254,9 @@ def test_kernels_read_and_write_tensors_of_their_device(
     field = DistanceField(room_map("mrf"), 0.4)
     wanted = field.distance_and_gradient(POINTS)
     balls = field.clearance(POINTS.reshape(10, 5, 3), np.full(5, 0.1))
+    m = room_map("mrf")
+    at_points = m.occupancy(POINTS), m.state(POINTS)
+    rays = cast_rays(m, np.zeros(3), POINTS, 3.0, "stop")
     monkeypatch.setattr(tensors, "_HOST", 99)
     monkeypatch.setattr(tensors, "_CUDA", 1)
     monkeypatch.setattr(runtime, "active", lambda: "cuda")
@@ -173,5 +270,21 @@ def test_kernels_read_and_write_tensors_of_their_device(
         field.distance(given.float().double()).numpy(), field.distance(given.float())
     )
     np.testing.assert_array_equal(field.clearance(given.reshape(10, 5, 3), np.full(5, 0.1)), balls)
+    for found_there, wanted_there in zip((m.occupancy(given), m.state(given)), at_points, strict=True):
+        assert isinstance(found_there, torch.Tensor)
+        # torch's tanh and NumPy's may differ by a rounding of 1
+        np.testing.assert_allclose(found_there.numpy(), wanted_there, rtol=0, atol=2**-24)
+        assert found_there.numpy().dtype == wanted_there.dtype
+    for start, way in ((np.zeros(3), given), (torch.zeros(3), given), (given * 0, given.float().double())):
+        ends = cast_rays(m, start, way, 3.0, "stop")
+        for each in dataclasses.fields(rays):
+            there, wanted_there = getattr(ends, each.name), getattr(rays, each.name)
+            assert isinstance(there, torch.Tensor), each.name
+            if way is given:
+                np.testing.assert_array_equal(there.numpy(), wanted_there, err_msg=each.name)
+    with pytest.raises(ConfigError, match="a ray has a direction of no length"):
+        cast_rays(m, np.zeros(3), given * 0, 3.0)
     with pytest.raises(ConfigError, match="points hold a value that is not finite"):
         field.distance(given * np.nan)
+    with pytest.raises(ConfigError, match="points hold a value that is not finite"):
+        m.state(given * np.nan)

@@ -8,13 +8,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from taichi_mrf.calibration.from_recording import MOST_MAPS, LearntSigma, learn_sigma
+from taichi_mrf.calibration.from_recording import LearntSigma
 from taichi_mrf.cli.map.earlier import refuse_other_run
 from taichi_mrf.cli.map.keep import Keeper, resumed_map, skipped_before
 from taichi_mrf.cli.map.report import print_report
 from taichi_mrf.cli.map.task import MapTask, map_task
 from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
+from taichi_mrf.cli.shared.learn_noise import learn_noise
 from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.terminal import Terminal, print_problem
@@ -123,14 +124,7 @@ def _learn_noise(
     """What the recording says of its noise, if that was asked for. A resumed run has learnt it."""
     if not task.learn_noise or (task.resume and (task.out / CONFIG_FILE).is_file()):
         return None
-    return learn_sigma(
-        dataset,
-        settings,
-        every=task.every,
-        limit=task.limit,
-        on_map=lambda number: progress.advance("Learning noise", number - 1, MOST_MAPS),
-        should_stop=request,
-    )
+    return learn_noise(dataset, settings, progress, request, task.every, task.limit)
 
 
 def listener_of(progress: ProgressBar) -> Listener:

@@ -73,5 +73,5 @@ def map_task(options: Map, source: str, out: Path) -> MapTask:
         options.overwrite,
         options.shown_reading,
         options.surface_picture,
-        options.noise == "auto",
+        options.noise.is_learnt,
     )

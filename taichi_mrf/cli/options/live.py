@@ -8,6 +8,7 @@ import tyro
 
 from taichi_mrf.cli.options.checks import check_least, check_port
 from taichi_mrf.cli.options.config_file import live_defaults
+from taichi_mrf.cli.options.noise_flags import NoiseFlags
 from taichi_mrf.cli.options.pose_flags import PoseFlags
 from taichi_mrf.cli.options.verbosity import Verbosity
 from taichi_mrf.config.schema import Config
@@ -73,6 +74,9 @@ class Live:
     poses: Annotated[PoseFlags, tyro.conf.arg(name="")] = field(default_factory=PoseFlags)
     """How SOURCE's poses are used."""
 
+    noise: Annotated[NoiseFlags, tyro.conf.arg(name="")] = field(default_factory=NoiseFlags)
+    """Where sigma comes from."""
+
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
     """How much is printed."""
 
@@ -84,3 +88,4 @@ class Live:
         if not 0 <= self.speed < float("inf"):
             raise ConfigError(f"--speed must be 0 or a positive number, not {self.speed:g}")
         check_port(self.port)
+        self.noise.refuse_with(track_poses=self.poses.track_poses)

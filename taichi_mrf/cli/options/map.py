@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from taichi_mrf.cli.options.checks import check_least
+from taichi_mrf.cli.options.noise_flags import NoiseFlags
 from taichi_mrf.cli.options.pose_flags import PoseFlags
 from taichi_mrf.cli.options.verbosity import Verbosity
 from taichi_mrf.config.registry import METHODS, methods_with
@@ -75,10 +76,8 @@ class Map:
     """With --submap-size: exchange beliefs between neighbouring submaps up to N times, and stop earlier once
     nothing changes."""
 
-    noise: Literal["stated", "auto"] = "stated"
-    """auto learns sigma from the recording before it is mapped: up to 60 of its frames are mapped up to three
-    times, and held-out ones say by how much sensor.sigma, or what frames state, is off. The result is
-    sensor.sigma-scale and sensor.sigma-added; DIR/sensor.yaml holds it for other recordings."""
+    noise: Annotated[NoiseFlags, tyro.conf.arg(name="")] = field(default_factory=NoiseFlags)
+    """Where sigma comes from."""
 
     pictures: bool = True
     """Draw the map from above, in perspective, and against the measured depth."""
@@ -117,11 +116,7 @@ class Map:
             raise ConfigError("--resume and --overwrite do not go together")
         if self.poses.file is not None and (len(self.sources) > 1 or self.submap_size is not None):
             raise ConfigError("--poses takes one SOURCE, and does not work with --submap-size")
-        if self.noise == "auto" and (self.poses.track_poses or self.submap_size is not None):
-            raise ConfigError(
-                "--noise auto does not work with --track-poses or --submap-size: learn the noise in a run "
-                "without them, and pass its sensor.yaml with --config"
-            )
+        self.noise.refuse_with(track_poses=self.poses.track_poses, submap_size=self.submap_size)
         if self.shown_reading != "marginal":
             whole = self.submap_size is None and self.settings.volume.window_m == 0
             if not METHODS[self.settings.method].has_layers or not whole:

@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from taichi_mrf.cli.options.checks import check_least, check_port
+from taichi_mrf.cli.options.noise_flags import NoiseFlags
 from taichi_mrf.cli.options.verbosity import Verbosity
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets.source_flags import SourceFlags
@@ -28,8 +29,8 @@ class Tune:
     """A folder, whose format is recognised, or a built-in sequence such as synthetic:room."""
 
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Folder for tries.csv and the YAML files that are saved, and with --auto for best.yaml; created if
-    needed."""
+    """Folder for tries.csv and the YAML files that are saved, with --auto for best.yaml, with --noise auto
+    for sensor.yaml; created if needed."""
 
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE")] = None
     """A YAML file of parameters to begin with, such as those in configs/."""
@@ -76,6 +77,9 @@ class Tune:
 
     reading: Annotated[SourceFlags, tyro.conf.arg(name="")] = field(default_factory=SourceFlags)
     """How SOURCE is read."""
+
+    noise: Annotated[NoiseFlags, tyro.conf.arg(name="")] = field(default_factory=NoiseFlags)
+    """Where sigma comes from."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
     """How much is printed."""

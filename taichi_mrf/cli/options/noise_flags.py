@@ -1,0 +1,33 @@
+"""The flag of map, live and tune for a noise that is learnt from the recording itself."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import tyro
+
+from taichi_mrf.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class NoiseFlags:
+    """Where sigma comes from."""
+
+    origin: Annotated[Literal["stated", "auto"], tyro.conf.arg(name="noise")] = "stated"
+    """auto learns sigma from the recording before anything else: up to 60 of its frames are mapped up to
+    three times, and held-out ones say by how much sensor.sigma, or what frames state, is off. The result is
+    sensor.sigma-scale and sensor.sigma-added; DIR/sensor.yaml holds it for other recordings, and for a
+    camera, which has to be recorded first."""
+
+    @property
+    def is_learnt(self) -> bool:
+        """Whether sigma is to be learnt."""
+        return self.origin == "auto"
+
+    def refuse_with(self, **flags: object) -> None:
+        """Raises ConfigError if sigma is to be learnt and one of some other flags is set."""
+        clashing = [f"--{name.replace('_', '-')}" for name, value in flags.items() if value]
+        if self.is_learnt and clashing:
+            raise ConfigError(
+                f"--noise auto does not work with {' or '.join(clashing)}: learn the noise in a run without, "
+                "and pass its sensor.yaml with --config"
+            )
