@@ -123,7 +123,7 @@ def time_taichi(problem: Path, threads: int) -> None:
     """Run Taichi's kernel, leave its sums beside the problem, and print seconds and steps."""
     from taichi_mrf.inference import sum_product
     from taichi_mrf.inference.keyframe import RayList
-    from taichi_mrf.inference.ray_list import BITS
+    from taichi_mrf.inference.ray_list import BITS, RayLattice
     from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
     from taichi_mrf.inference.sweep import TRACE_BYTES
     from taichi_mrf.inference.workers import workers_for
@@ -156,6 +156,8 @@ def time_taichi(problem: Path, threads: int) -> None:
         voxel_size=VOXEL_SIZE, max_depth=1e3, end_sigmas=SIGMAS, floor=FLOOR, clamp=CLAMP,
         pass_through=0.0, passes=False, likelihood=CENTRE,
         segment_lengths=True, log_average=True, maximise=False,
+        sample=RayLattice.of(1), samples=False, scouts=RayLattice.of(1), thins=False,
+        clear_sigmas=0.0, clear_voxels=0.0,
     )  # fmt: skip
     steps = np.zeros(workers.number, np.int32)
     rays = RayList(data["pixels"] << BITS, data["depth"], count, 1)

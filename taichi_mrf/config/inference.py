@@ -73,6 +73,14 @@ class InferenceConfig:
     """How pixels share rays: bundle casts one ray with the mean depth of neighbouring pixels that agree, with
     their number as its weight; thin casts only every second, third, ... pixel."""
 
+    first_sweep_stride: int = 1
+    """Follow one in so many neighbouring rays in a keyframe's first sweep, and all in later ones. 4 is a good
+    value where keyframes are swept again, as ``renew_tolerance`` and ``sweeps`` have it. 1 follows all."""
+
+    free_space_stride: int = 1
+    """Follow one in so many neighbouring rays through the free space far before its measurement, where it
+    counts for the others too. 1 follows all."""
+
     average: Literal["probability", "log_odds"] = "log_odds"
     """What a keyframe's message averages over its rays through a voxel, weighted by length."""
 
@@ -127,6 +135,8 @@ class InferenceConfig:
         check_field(self.end_sigmas > 0, "inference.end_sigmas", "must be positive")
         check_field(self.ray_density >= 0, "inference.ray_density", "must not be negative")
         check_field(self.plane_window >= 0, "inference.plane_window", "must not be negative")
+        for name in ("first_sweep_stride", "free_space_stride"):
+            check_field(1 <= getattr(self, name) <= 1024, f"inference.{name}", "must lie between 1 and 1024")
         share = self.pass_through or 0.0
         check_field(0 <= share < 1, "inference.pass_through", "must be at least 0 and less than 1")
         check_field(0 <= self.ray_correlation <= 1, "inference.ray_correlation", "must lie between 0 and 1")

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.inference import sum_product
+from taichi_mrf.inference import leave
 from taichi_mrf.inference.keyframe import VisibleBricks
 from taichi_mrf.kernels.types import F32, AnyArray, F32Array, I32Array, Template
 from taichi_mrf.system import runtime
@@ -42,7 +42,7 @@ def withdraw_messages(
         return np.zeros(0, np.int32)
     moved = ti.ndarray(ti.i32, n)
     moved.fill(0)
-    sum_product.withdraw(visible.slots, belief, messages, moved, strip_length())
+    leave.withdraw(visible.slots, belief, messages, moved, strip_length())
     return moved.to_numpy()
 
 

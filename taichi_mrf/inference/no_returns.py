@@ -47,7 +47,8 @@ def send_no_returns(
     sums.fill(0)
     sum_product.send_messages(
         no_returns.ray_list, no_returns.entry_depths, 1, no_returns.image.sensor, view, space,
-        replace(model, max_depth=no_returns.reach_m, floor=0.0), replace(swept, sums=sums),
+        replace(model, max_depth=no_returns.reach_m, floor=0.0, samples=False, thins=False),
+        replace(swept, sums=sums),
         trace, workers, retrace,
     )  # fmt: skip
 

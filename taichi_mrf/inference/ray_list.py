@@ -43,6 +43,29 @@ def block_of(ray: I32, width: I32):
     return pixel % width, pixel // width, 1 << (level + 1) // 2, 1 << level // 2
 
 
+@dataclass(frozen=True)
+class RayLattice(Bundle):
+    """One in ``stride`` neighbouring rays of a list, spread over rows and columns. Which ones follows from
+    their blocks of pixels, so they are the same in every map and after every edit."""
+
+    stride: I32
+    """1 takes every ray."""
+
+    row_step: I32
+    """A row's rays are shifted by so many against those of the row above."""
+
+    @staticmethod
+    def of(stride: int) -> "RayLattice":
+        """The most even one with this stride."""
+        return RayLattice(stride, math.isqrt(stride))
+
+    @ti.func
+    def holds(self, rays: Template, i: I32, width: I32) -> I32:
+        """Whether ray i of a list (keyframe.RayList) of an image with ``width`` columns is one of them."""
+        u, v, wide, high = block_of(rays.blocks[i], width)
+        return (u // wide + self.row_step * (v // high)) % self.stride == 0
+
+
 @ti.func
 def listed_ray(rays: Template, i: I32, sensor: Template, view: Template):
     """Ray i of a list (keyframe.RayList): the ray through the middle of its block, the noise there, and how

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+from taichi_mrf.inference.ray_list import RayLattice
 from taichi_mrf.kernels.bundles import Bundle
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, I64Array, Template, Vec4Array
 
@@ -43,6 +44,24 @@ class RayModel(Bundle):
 
     maximise: Template
     """Whether to maximise over explanations instead of summing them."""
+
+    sample: RayLattice
+    """The rays that are followed at all,"""
+
+    samples: Template
+    """which are not all."""
+
+    scouts: RayLattice
+    """Of them those that are followed through free space, where they count for the others,"""
+
+    thins: Template
+    """which are not all. The others begin near their measurements:"""
+
+    clear_sigmas: F32
+    """so many sigmas,"""
+
+    clear_voxels: F32
+    """and so many voxel sizes before them."""
 
 
 @dataclass(frozen=True)

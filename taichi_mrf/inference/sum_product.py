@@ -42,7 +42,7 @@ from taichi_mrf.inference.ray_list import listed_ray
 from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
 from taichi_mrf.inference.workers import Workers
 from taichi_mrf.kernels.bundles import Bundle, kernel
-from taichi_mrf.kernels.log_odds import clamped_log_odds, exp_of_negative, log_let_through, logistic
+from taichi_mrf.kernels.log_odds import clamped_log_odds, exp_of_negative, log_let_through, moves
 from taichi_mrf.kernels.types import (
     F32,
     I32,
@@ -63,9 +63,6 @@ from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, walk_voxels
 
 TINY = 1e-30
 """Keeps a ray that explains nothing, without an outlier floor, from dividing zero by zero."""
-
-MOVED = 0.01
-"""A marginal that changes by more than this counts as moved (the residual of a sweep)."""
 
 
 @ti.dataclass
@@ -90,6 +87,7 @@ class Cast(Bundle):
     support: F32  # depth before which no surface can have made the measurement
     voxels_per_depth: F32  # length of the ray, in voxels, for one metre of depth
     pixels: F32  # for how many pixels it stands
+    thinned_until: F32  # depth up to which it stands for its neighbours too
 
 
 @kernel
@@ -125,7 +123,7 @@ def send_messages(
     A worker follows one ray after the other. It writes each ray's steps into its own part of the trace and
     reads them on the way back; with ``retrace``, which cannot maximise, it walks along the ray a second time
     instead. ``entry_depths`` (rays) holds the depth at which each ray meets its first brick: the first sweep
-    finds it, and later sweeps start there.
+    finds it, and later sweeps start there, unless the model samples rays.
     """
     if ti.static(workers.block > 0):
         ti.loop_config(block_dim=workers.block)
@@ -138,12 +136,21 @@ def send_messages(
             trace.steps[worker] = 0
         for turn in range(turns):
             i = workers.ray(worker, turn)
-            if i < rays.number:
+            wanted = i < rays.number
+            if ti.static(model.samples):  # noqa: SIM102 (a static condition stands alone)
+                if wanted:
+                    wanted = model.sample.holds(rays, i, sensor.camera.width)
+            if wanted:
                 measured = rays.depth[i]
                 ray, noise, pixels = listed_ray(rays, i, sensor, view)
+                voxels_per_depth = ray.direction.norm()
+                thinned_until = 0.0
+                if ti.static(model.thins):
+                    thinned_until = sensor.nearest_depth(measured, noise, model.clear_sigmas)
+                    thinned_until -= model.clear_voxels / voxels_per_depth
                 cast = Cast(
                     model, swept, sensor, measured, noise, sensor.support(measured, noise),
-                    ray.direction.norm(), ti.cast(pixels, ti.f32),
+                    voxels_per_depth, ti.cast(pixels, ti.f32), thinned_until,
                 )  # fmt: skip
 
                 # The ray ends where its measurement carries no more evidence, or where the map ends.
@@ -151,6 +158,9 @@ def send_messages(
                 begin, end = 0.0, ti.min(last, model.max_depth)
                 if entry_depths_known == 1:
                     begin = entry_depths[i]
+                if ti.static(model.thins):  # noqa: SIM102
+                    if not model.scouts.holds(rays, i, sensor.camera.width):
+                        begin = ti.max(begin, thinned_until)
                 clip(ray, begin, end, space.lower, space.upper)
 
                 # Forward: eqs. 4 and 11 for each voxel, from the camera outwards.
@@ -231,7 +241,7 @@ def crossing(cast: Template, voxel: I32, near: F32, far: F32) -> Vec3:
 def _explain(ahead: Template, met: Vec3) -> Vec4:
     """Eqs. 4 and 11 for one voxel: it is visible, it is occupied, and it explains the measurement.
 
-    Renews ``ahead``; returns the step that the way back reads: length, (1 - m)^l, nu * vis, before.
+    Renews ``ahead``; returns the step that the way back reads: weight, (1 - m)^l, nu * vis, before.
     """
     free = exp_of_negative(met[1])
     density = met[2] * ahead.visibility
@@ -255,6 +265,7 @@ def see_voxel(ahead: Template, cast: Template, voxel: I32, near: F32, far: F32):
 def _trace_voxel(ahead: Template, traced: Template, voxel: I32, near: F32, far: F32):
     """One voxel of the forward pass, written down in the trace."""
     met = crossing(traced.cast, voxel, near, far)
+    met[0] = _weight(traced.cast, met[0], far)
     if ahead.voxels == 0:
         ahead.first = near
     j = traced.first_step + ahead.voxels
@@ -272,7 +283,9 @@ def _trace_voxel(ahead: Template, traced: Template, voxel: I32, near: F32, far: 
 def _tell_voxel(again: Template, retraced: Template, voxel: I32, near: F32, far: F32):
     """One voxel of the second way along a ray."""
     cast = retraced.cast
-    step = _explain(again, crossing(cast, voxel, near, far))
+    met = crossing(cast, voxel, near, far)
+    met[0] = _weight(cast, met[0], far)
+    step = _explain(again, met)
     behind = ti.max(0.0, retraced.total - again.explained)
     message = _message(cast.model, step[3], step[2], behind, step[1], retraced.largest)
     _add(cast, voxel, step[0], message)
@@ -308,11 +321,21 @@ def empty_message(before: F32, behind: F32, free: F32, floor: F32) -> F32:
 
 
 @ti.func
-def _add(cast: Template, voxel: I32, length: F32, message: F32):
-    """Section IV-A: a ray's message counts by its length in the voxel, and by the pixels it stands for."""
+def _weight(cast: Template, length: F32, far: F32) -> F32:
+    """Section IV-A: a ray's message counts by its length in the voxel, and by the pixels it stands for, those
+    of neighbours included that are not followed where it is."""
     weight = cast.pixels
     if ti.static(cast.model.segment_lengths):
         weight *= length
+    if ti.static(cast.model.thins):  # noqa: SIM102
+        if far <= cast.thinned_until:
+            weight *= ti.cast(cast.model.scouts.stride, ti.f32)
+    return weight
+
+
+@ti.func
+def _add(cast: Template, voxel: I32, weight: F32, message: F32):
+    """Add a ray's message to those of the others."""
     add_message(cast.swept.sums, voxel, weight, message, cast.swept.scale)
 
 
@@ -350,7 +373,7 @@ def finish(
                 change = ti.cast(messages[i + k], ti.f32) - old
                 before = belief[j + k]
                 belief[j + k] = before + change
-                count += _moves(before, change)
+                count += moves(before, change)
         if count > 0:
             moved[i // VOXELS] += count
 
@@ -361,36 +384,3 @@ def independent_rays(rays: F32, correlation: F32) -> F32:
     correlation: n / (1 + correlation (n - 1)). 1 ray for a correlation of 1, at most 1 / correlation."""
     n = ti.max(1.0, rays)
     return n / (1.0 + correlation * (n - 1.0))
-
-
-@ti.func
-def _moves(log_odds: F32, change: F32) -> I32:
-    """Whether a marginal changes by more than MOVED; never by more than a quarter of its log-odds' change."""
-    moves = 0
-    if ti.abs(change) > 4.0 * MOVED:
-        moves = ti.abs(logistic(log_odds + change) - logistic(log_odds)) > MOVED
-    return moves
-
-
-@kernel
-def withdraw(slots: I32Array, belief: F32Array, messages: AnyArray, moved: I32Array, strip: Template) -> None:
-    """Take a keyframe's messages out of the beliefs; arrays as in :func:`finish`."""
-    for part in range(slots.shape[0] * (VOXELS // strip)):
-        i, j = strip_begin(part, slots, strip)
-        count = 0
-        for k in range(strip):
-            message = ti.cast(messages[i + k], ti.f32)
-            count += _moves(belief[j + k], -message)
-            belief[j + k] -= message
-        if count > 0:
-            moved[i // VOXELS] += count
-
-
-@kernel
-def fold(slots: I32Array, evidence: F32Array, messages: AnyArray, strip: Template) -> None:
-    """Add a keyframe's messages (n * 512) to the ``evidence`` (pool * 512) that inference starts from
-    (freezing)."""
-    for part in range(slots.shape[0] * (VOXELS // strip)):
-        i, j = strip_begin(part, slots, strip)
-        for k in range(strip):
-            evidence[j + k] += ti.cast(messages[i + k], ti.f32)

@@ -13,6 +13,7 @@ from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.accumulators import finest_scale
 from taichi_mrf.inference.keyframe import Keyframe, RayList
 from taichi_mrf.inference.no_returns import send_no_returns, take_where_unmeasured
+from taichi_mrf.inference.ray_list import RayLattice
 from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace, log_pass
 from taichi_mrf.inference.workers import Workers, workers_for
 from taichi_mrf.kernels.resident import on_host, vec4_array
@@ -26,6 +27,9 @@ from taichi_mrf.voxels.traversal import FAR, Space, Viewpoint
 from taichi_mrf.voxels.window import WindowIndex
 
 LIKELIHOODS = {"auto": AUTO, "segment": SEGMENT, "centre": CENTRE}
+
+CLEAR_VOXELS = 2.0
+"""How far before its measurement, in voxel sizes and beyond ``end_sigmas``, every ray is followed."""
 
 TRACE_BYTES = 20
 """Bytes of one step of a ray in the trace."""
@@ -117,7 +121,8 @@ class Sweeper:
         keyframe.withdrawn = False
         if len(visible.slots) == 0:
             return False
-        messages, bricks, model = keyframe.messages, visible.on_device(), self.model()
+        first = keyframe.change_count_at_last_sweep is None
+        messages, bricks, model = keyframe.messages, visible.on_device(), self.model(first)
 
         # Eq. 6: the belief of each voxel without this keyframe's message.
         with self.casting(keyframe, pool.total, messages, pool.prior_log_odds) as cast:
@@ -131,7 +136,7 @@ class Sweeper:
                 keyframe.image.sensor, cast.view, cast.space, model, cast.swept, cast.trace, cast.workers,
                 retrace,
             )  # fmt: skip
-            keyframe.entry_depths_known = True
+            keyframe.entry_depths_known = not model.samples
             if keyframe.no_returns is not None:
                 take_where_unmeasured(
                     len(visible.slots) * VOXELS, cast.swept.sums, self._second_sums(),
@@ -146,7 +151,8 @@ class Sweeper:
             config.ray_correlation, config.ray_correlation < 1, strip_length(),
         )  # fmt: skip
         pool.revision += 1
-        keyframe.revision = pool.revision
+        # Rays that were left out have more to say.
+        keyframe.revision = -1 if model.samples else pool.revision
         return True
 
     def casting(
@@ -177,9 +183,12 @@ class Sweeper:
             lambda: self.index.clear(window, bricks.cells),
         )
 
-    def model(self) -> RayModel:
-        """What the rays of all keyframes share."""
+    def model(self, first_sweep: bool = False) -> RayModel:
+        """What the rays of all keyframes share; in a keyframe's first sweep they may be fewer."""
         config = self.inference
+        sample = config.first_sweep_stride if first_sweep else 1
+        # A sample is followed all the way: it has few enough rays.
+        scouts = config.free_space_stride if sample == 1 else 1
         return RayModel(
             voxel_size=self.voxel_size,
             max_depth=self.sensor.max_depth,
@@ -192,6 +201,12 @@ class Sweeper:
             segment_lengths=config.segment_lengths,
             log_average=config.average == "log_odds",
             maximise=config.method == "max-product",
+            sample=RayLattice.of(sample),
+            samples=sample > 1,
+            scouts=RayLattice.of(scouts),
+            thins=scouts > 1,
+            clear_sigmas=config.end_sigmas,
+            clear_voxels=CLEAR_VOXELS,
         )
 
     def take_moved(self, keyframe: Keyframe, pool: BrickPool) -> NDArray[np.int32]:
@@ -218,7 +233,9 @@ class Sweeper:
             if no_returns is not None:
                 rays, widest = rays + no_returns.image.rays, max(widest, no_returns.ray_list.widest)
             bricks = window.bricks_of(visible.cells)
-            visible.scale = finest_scale(image.camera, rays, keyframe.T_world_camera, window, bricks, widest)
+            finest = finest_scale(image.camera, rays, keyframe.T_world_camera, window, bricks, widest)
+            # A pixel counts for no more than so many.
+            visible.scale = finest / 2.0 ** math.ceil(math.log2(self.inference.free_space_stride))
         return visible.scale
 
     def _reserve(self, bricks: int, steps: int, workers: int) -> None:

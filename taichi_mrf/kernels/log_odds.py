@@ -1,7 +1,10 @@
 """Probabilities and their logarithms, kept precise near 0 and 1 and cheap where most voxels are."""
 
-from taichi_mrf.kernels.types import F32, Template
+from taichi_mrf.kernels.types import F32, I32, Template
 from taichi_mrf.system.compiler import ti
+
+MOVED = 0.01
+"""A marginal that changes by more than this counts as moved (the residual of a sweep)."""
 
 
 @ti.func
@@ -77,3 +80,12 @@ def faded(evidence: F32, kept: F32, left: F32, appeared: F32) -> F32:
     if evidence < 0.0:
         occupied, free = (kept + left) * small + appeared, kept + appeared + left * small
     return ti.log(occupied / free)
+
+
+@ti.func
+def moves(log_odds: F32, change: F32) -> I32:
+    """Whether a marginal changes by more than MOVED; never by more than a quarter of its log-odds' change."""
+    far = 0
+    if ti.abs(change) > 4.0 * MOVED:
+        far = ti.abs(logistic(log_odds + change) - logistic(log_odds)) > MOVED
+    return far

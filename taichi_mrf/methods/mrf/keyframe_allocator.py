@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.inference import sum_product
+from taichi_mrf.inference import leave
 from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.footprint import find_footprint
 from taichi_mrf.inference.incremental import change_count_seen_by
@@ -113,7 +113,7 @@ class KeyframeAllocator:
         good."""
         pool, messages = self.registry.pool, self.refresh(keyframe)
         if len(keyframe.visible.slots):
-            sum_product.fold(keyframe.visible.slots, pool.keep_evidence(), messages, strip_length())
+            leave.fold(keyframe.visible.slots, pool.keep_evidence(), messages, strip_length())
             if self.dated is not None:
                 self.dated.freeze(keyframe)
         self.registry.freeze(keyframe.footprint)
@@ -148,7 +148,9 @@ class KeyframeAllocator:
             keyframe.messages = new_messages(keyframe.visible, self.inference.message_precision)
             self.budget.mark_allocated(keyframe.id)
             keyframe.revision = -1
-            if old_messages is not None:
+            if old_messages is None:
+                keyframe.change_count_at_last_sweep = None  # they were never swept
+            else:
                 carry_over(old, old_messages, keyframe.visible, keyframe.messages)
         assert keyframe.messages is not None
         return keyframe.messages

@@ -5,7 +5,7 @@ definition of parameters.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,17 +24,21 @@ class Segment:
 
     voxel: Voxel
     length: float
+    share: float = 1.0  # for how many rays it stands
 
 
 @dataclass(frozen=True)
 class Ray:
     """A ray with its measurement. ``beyond`` is the density of the measurement if the first surface lies
-    past the last segment. Voxels that are not in ``told`` get no message, if it is given."""
+    past the last segment. Voxels that are not in ``told`` get no message, if it is given. ``sampled`` rays
+    are those of the first sweep; in later ones ``thinned`` takes the place of a ray, if it is given."""
 
     segments: list[Segment]
     densities: list[float]
     beyond: float
     told: frozenset[Voxel] | None = None
+    sampled: bool = True
+    thinned: "Ray | None" = None
 
 
 def cast(
@@ -45,9 +49,12 @@ def cast(
     noise: Noise,
     config: InferenceConfig,
     max_depth: float,
+    clear_voxels: float = 0.0,
 ) -> list[Ray]:
-    """All rays of a depth image, with the likelihood of each segment."""
+    """All rays of a depth image, with the likelihood of each segment. With strides all are followed from
+    ``clear_voxels`` and ``end_sigmas`` before their measurements on."""
     rays = []
+    sample, scouts = config.first_sweep_stride, config.free_space_stride
     directions = camera.rays()
     for v, u in np.argwhere(depth_m > 0):
         measured = float(depth_m[v, u])
@@ -68,13 +75,22 @@ def cast(
             likeliest = max(end, float(noise.depth_of_deviation(measured, 0.0)))
             beyond = float(noise.density_at(measured, likeliest))
         voxels = [(int(i), int(j), int(k)) for i, j, k in cells]
-        rays.append(
-            Ray(
-                [Segment(*each) for each in zip(voxels, lengths.tolist(), strict=True)],
-                density.tolist(),
-                beyond,
-            )
-        )
+        whole = [Segment(*each) for each in zip(voxels, lengths.tolist(), strict=True)]
+        thinned = None
+        if scouts > 1:
+            clear = float(noise.depth_of_deviation(measured, config.end_sigmas))
+            clear -= clear_voxels * voxel_size / float(np.linalg.norm(direction))
+            if (u + math.isqrt(scouts) * v) % scouts == 0:
+                shares = np.where(far <= clear, scouts, 1).tolist()
+                kept = [replace(each, share=s) for each, s in zip(whole, shares, strict=True)]
+                thinned = Ray(kept, density.tolist(), beyond)
+            else:
+                left = np.clip((far - clear) / (far - near), 0, 1).tolist()
+                parts = [replace(each, length=each.length * p) for each, p in zip(whole, left, strict=True)]
+                near_end = [(s, d) for s, d in zip(parts, density.tolist(), strict=True) if s.length > 0]
+                thinned = Ray([s for s, _ in near_end], [d for _, d in near_end], beyond)
+        sampled = (u + math.isqrt(sample) * v) % sample == 0
+        rays.append(Ray(whole, density.tolist(), beyond, None, sampled, thinned))
     return rays
 
 
@@ -111,7 +127,7 @@ def ray_messages(
         occupied = before + here + config.outlier_floor
         empty = before + behind / free + config.outlier_floor
         occupied += (config.pass_through or 0.0) * (empty - occupied)
-        weight = segment.length if config.segment_lengths else 1.0
+        weight = segment.share * (segment.length if config.segment_lengths else 1.0)
         out.append((segment.voxel, weight, occupied / (occupied + empty)))
         behind += (1 - free) * here
     return out
@@ -154,7 +170,7 @@ def best_messages(
                         total += min(free[j], occupied[j])
                 best = min(best, total)
             least[state] = best
-        weight = segment.length if config.segment_lengths else 1.0
+        weight = segment.share * (segment.length if config.segment_lengths else 1.0)
         out.append((segment.voxel, weight, logistic(least[0] - least[1])))
     return out
 
@@ -171,8 +187,11 @@ def infer(
     lowest = max(-clamp, logit(config.free_share * prior)) if config.free_share > 0 else -clamp
     sent: list[dict[Voxel, float]] = [{} for _ in keyframes]
     messages_of = best_messages if config.method == "max-product" else ray_messages
-    for _ in range(config.sweeps):
-        for rays, messages in zip(keyframes, sent, strict=True):
+    for sweep in range(config.sweeps):
+        for listed, messages in zip(keyframes, sent, strict=True):
+            rays = [ray.thinned or ray for ray in listed]
+            if sweep == 0 and config.first_sweep_stride > 1:
+                rays = [ray for ray in listed if ray.sampled]
             seen = {s.voxel for ray in rays for s in ray.segments if s.voxel in belief}
             incoming = {v: min(clamp, max(lowest, belief[v] - messages.get(v, 0.0))) for v in seen}
             weights: dict[Voxel, float] = dict.fromkeys(seen, 0.0)
