@@ -13,7 +13,13 @@ Only what keyframes say has these tails. Predictions are those of the sensor.
 from dataclasses import dataclass
 
 from taichi_mrf.kernels.types import F32, Template
-from taichi_mrf.sensor.forward import depth_of_deviation, normal_density, surface_likelihood
+from taichi_mrf.sensor.forward import (
+    beyond_likelihood,
+    depth_of_deviation,
+    deviation,
+    normal_density,
+    surface_likelihood,
+)
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.system.compiler import ti
 
@@ -40,10 +46,19 @@ class TailedSensor(Sensor):
         """Density, per metre, of the measurement if the first surface lies between depths near and far. The
         wider distribution is taken at the middle."""
         density = surface_likelihood(measured, near, far, noise, voxel_size, mode)
-        middle = 0.5 * (near + far)
-        wide = self.sigmas * noise.sigma(middle)
-        in_tail = normal_density((measured - middle - noise.bias(middle)) / wide) / wide
-        return density + self.share * (in_tail - density)
+        return self._mixed(density, measured, 0.5 * (near + far), noise)
+
+    @ti.func
+    def likelihood_beyond(self, measured: F32, depth: F32, noise: Template):
+        """Density, per metre, of the measurement if the first surface lies somewhere beyond ``depth``."""
+        surface = ti.max(depth, depth_of_deviation(measured, 0.0, noise))
+        return self._mixed(beyond_likelihood(measured, depth, noise), measured, surface, noise)
+
+    @ti.func
+    def _mixed(self, density: F32, measured: F32, depth: F32, noise: Template):
+        """With the share of a surface at ``depth`` that has the wider distribution."""
+        in_tail = normal_density(deviation(measured, depth, noise) / self.sigmas)
+        return density + self.share * (in_tail / (self.sigmas * noise.sigma(depth)) - density)
 
 
 @dataclass(frozen=True)
