@@ -46,6 +46,13 @@ class InferenceConfig:
     """Density of outliers per metre of depth, added to both sides of every message. It keeps a single wrong
     pixel from overruling all others."""
 
+    tail_share: float = 0.0
+    """Share of the measurements whose error is ``tail_sigmas`` times as wide: poses that are off, mixed
+    pixels and errors that neighbours share, which no sigma of the sensor holds. 0 takes errors as normal."""
+
+    tail_sigmas: float = 10.0
+    """How many times as wide the errors of ``tail_share`` are."""
+
     end_sigmas: float = 3.0
     """A ray ends this many sigma behind its measurement. Bricks are allocated this many sigma around it."""
 
@@ -132,6 +139,8 @@ class InferenceConfig:
         check_field(self.surface_density > 0, "inference.surface_density", "must be positive")
         check_field(self.prior is None or 0 < self.prior < 1, "inference.prior", "must lie between 0 and 1")
         check_field(self.outlier_floor >= 0, "inference.outlier_floor", "must not be negative")
+        check_field(0 <= self.tail_share < 1, "inference.tail_share", "must be at least 0 and less than 1")
+        check_field(self.tail_sigmas >= 2, "inference.tail_sigmas", "must be at least 2")
         check_field(self.end_sigmas > 0, "inference.end_sigmas", "must be positive")
         check_field(self.ray_density >= 0, "inference.ray_density", "must not be negative")
         check_field(self.plane_window >= 0, "inference.plane_window", "must not be negative")

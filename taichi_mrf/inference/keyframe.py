@@ -16,6 +16,7 @@ from taichi_mrf.sensor.noise import NoiseModel, NoiseTable
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.sensor.plane_window import PlaneWindow, averaged_on_planes
 from taichi_mrf.sensor.pose_doubt import Covariance, beside_edges, doubtful_table
+from taichi_mrf.sensor.tails import Tails
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.window import Window
 
@@ -71,7 +72,8 @@ class DepthImage:
     as kernels take them, ``rays`` the number of measurements. ``color`` is (H, W, 3) RGB in host memory, 0
     0 0 where a pixel has no colour, or None. ``own`` is what the keyframe states of its measurements.
     ``window`` is that in which measurements were averaged on planes, None for none. If they were, or the pose
-    is uncertain, ``certain`` is the image as it was measured.
+    is uncertain, ``certain`` is the image as it was measured. ``tails`` are those of the errors in
+    ``sensor``, None for normal ones.
     """
 
     depth: Resident
@@ -84,6 +86,7 @@ class DepthImage:
     own: OwnEvidence = NOTHING
     window: PlaneWindow | None = None
     certain: "DepthImage | None" = None
+    tails: Tails | None = None
 
     @staticmethod
     def upload(
@@ -93,15 +96,17 @@ class DepthImage:
         color: NDArray[np.uint8] | None = None,
         own: OwnEvidence = NOTHING,
         window: PlaneWindow | None = None,
+        tails: Tails | None = None,
     ) -> "DepthImage":
         """Put :func:`checked_depth` (H, W), which must not change from now on, where kernels can reach it.
-        ``noise`` is the map's, for what the keyframe does not state itself. With a ``window``
-        measurements are averaged on planes. Raises ConfigError if the noise model does not fit the camera."""
+        ``noise`` is the map's, for what the keyframe does not state itself; ``tails`` are those of its
+        errors. With a ``window`` measurements are averaged on planes. Raises ConfigError if the noise model
+        does not fit the camera."""
         pose_covariance, own = own.pose_covariance, replace(own, pose_covariance=None)
         table = own.noise_model(noise, depth_m).table(camera)
-        depth, sensor = resident(depth_m.reshape(-1)), table.sensor(camera)
-        rays = int(np.count_nonzero(depth_m))
-        image = DepthImage(depth, camera, sensor, table, rays, _farthest(depth_m), color, own, window)
+        depth, sensor = resident(depth_m.reshape(-1)), _sensor(table, camera, tails)
+        rays, farthest = int(np.count_nonzero(depth_m)), _farthest(depth_m)
+        image = DepthImage(depth, camera, sensor, table, rays, farthest, color, own, window, tails=tails)
         return image.doubting(pose_covariance)
 
     def doubting(self, pose_covariance: Covariance | None) -> "DepthImage":
@@ -117,7 +122,7 @@ class DepthImage:
         return replace(
             image,
             depth=resident(depth_m.reshape(-1)),
-            sensor=table.sensor(image.camera),
+            sensor=_sensor(table, image.camera, image.tails),
             noise_table=table,
             rays=int(np.count_nonzero(depth_m)),
             own=replace(image.own, pose_covariance=pose_covariance),
@@ -132,7 +137,7 @@ class DepthImage:
         return replace(
             self,
             depth=resident(depth_m.reshape(-1)),
-            sensor=table.sensor(self.camera),
+            sensor=_sensor(table, self.camera, self.tails),
             noise_table=table,
             farthest=_farthest(depth_m),
             certain=self,
@@ -157,6 +162,12 @@ class DepthImage:
     def to_numpy(self) -> NDArray[np.float32]:
         """(H, W) axial depth in metres, 0 where there is no measurement."""
         return np.array(on_host(self.at_certain_pose.depth)).reshape(self.camera.shape)
+
+
+def _sensor(table: NoiseTable, camera: Camera, tails: Tails | None) -> Sensor:
+    """Camera and noise as kernels take them."""
+    sensor = table.sensor(camera)
+    return sensor if tails is None else tails.of(sensor)
 
 
 def _farthest(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -46,6 +46,7 @@ from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
 from taichi_mrf.sensor.own_evidence import checked_evidence, checked_no_return
 from taichi_mrf.sensor.plane_window import PlaneWindow
+from taichi_mrf.sensor.tails import Tails
 from taichi_mrf.voxels.layout import VOXELS
 
 
@@ -328,9 +329,11 @@ class MRFMap(PosedMRF):
         depth, own = checked_evidence(depth, camera, noise, sigma_m, pose_covariance)
         if self.sensor.no_return != "ignore":
             own = replace(own, no_return=checked_no_return(no_return, depth_m, camera))
-        wide = self.config.inference.plane_window
+        inference = self.config.inference
+        wide = inference.plane_window
         window = PlaneWindow(wide * self.voxel_size, self.voxel_size) if wide > 0 else None
-        image = DepthImage.upload(depth, camera, self.noise, checked_color(color, camera), own, window)
+        tails = Tails(inference.tail_share, inference.tail_sigmas) if inference.tail_share > 0 else None
+        image = DepthImage.upload(depth, camera, self.noise, checked_color(color, camera), own, window, tails)
         if not self._keyframes:
             warn_of_bad_sigma(image.noise_table, self.sensor.min_depth, self.sensor.max_depth)
         return image
