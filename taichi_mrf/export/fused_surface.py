@@ -50,10 +50,10 @@ docs/surfaces.md."""
 BLENDED_VARIANCE = 0.5
 """Variance in voxels^2 of the distances of 27 voxels with binomial weights, whatever was measured."""
 
-NEAR_VOXELS, NEAR_M = 2.0, 0.1
-"""How far the likeliest voxel of a ray and its surface may lie apart to be the same: through a hole in the
-surface a ray meets what is behind it. In metres too, because a sensor's errors move the likeliest of small
-voxels."""
+NEAR_VOXELS, NEAR_M = 1.5, 0.075
+"""How far the likeliest voxel of a ray and its surface may lie apart, along the surface's normal, to be the
+same: through a hole in the surface a ray meets what is behind it. In metres too, because a sensor's errors move
+the likeliest of small voxels; along the normal, because rays that graze a surface run along it."""
 
 MARGIN = 1
 """Voxels around a box that blending reads."""
@@ -83,10 +83,11 @@ class FusedSurface:
         self, depth_m: NDArray[np.float32], camera: Camera, T_world_camera: ArrayLike, voxel_size: float
     ) -> NDArray[np.float32]:
         """:meth:`render_depth` where it is near a depth (H, W) that was rendered from voxels of
-        ``voxel_size`` metres: within NEAR_VOXELS voxels or NEAR_M. NaN elsewhere."""
-        found = self.render_depth(camera, T_world_camera)
+        ``voxel_size`` metres: within NEAR_VOXELS voxels or NEAR_M along its normal. NaN elsewhere."""
+        found, along_normal = self._scene.meet(camera, as_pose(T_world_camera))
+        off_m = np.abs(found - depth_m) * along_normal
         with np.errstate(invalid="ignore"):
-            near = np.abs(found - depth_m) <= max(NEAR_VOXELS * voxel_size, NEAR_M)
+            near = (found > 0) & (off_m <= max(NEAR_VOXELS * voxel_size, NEAR_M))
         return np.where(near, found, np.float32(np.nan))
 
     @cached_property

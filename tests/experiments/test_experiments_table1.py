@@ -142,8 +142,9 @@ def test_rays_end_on_the_measured_surface_where_it_is_near(tables: list[Table], 
         mapped(m, scene, fold)
         view = scene.views[fold]
         voxel_m = judge_view(m, view.true_m, view.T_world_camera, scene.camera, mask=view.judged).answer_m
-        surface_m = m.surface().render_depth(scene.camera, view.T_world_camera)
-        near = np.abs(surface_m - voxel_m) <= 0.1
+        surface = m.surface()
+        surface_m = surface.depth_near(voxel_m, scene.camera, view.T_world_camera, size)
+        near = ~np.isnan(surface_m)
         assert 0.2 < near.mean() < 1.0
         off = np.abs(np.where(near, surface_m, voxel_m) - view.true_m)[view.judged & (view.true_m > 0)]
         errors.append(np.nanmedian(off))

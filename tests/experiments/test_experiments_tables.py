@@ -146,7 +146,7 @@ def test_scores_become_rows_beside_the_paper() -> None:
         scored("A, all", 0.05, 0.8, rms=math.nan),
         scored("B", 0.05, 0.1),
     ]
-    paper = {("A", 0.05): Spread(0.9, 0.01), ("B", 0.01): Spread(0.3)}
+    paper = {("A, all", 0.05): Spread(0.9, 0.01), ("B", 0.01): Spread(0.3), ("A", 0.02): Spread(0.7)}
     table = score_table("t", "T", entries, paper, ["a note"])
     assert table.columns == ["voxels", "map", *COLUMNS.values(), "paper", "map (s)", "views"]
     assert table.notes[-1] == "a note"

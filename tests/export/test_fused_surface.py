@@ -84,15 +84,17 @@ def test_the_surfaces_depth_is_given_where_it_is_near(voxel_size: float, near_m:
     surface = _map_of_plane(0.0).surface()
     T = np.eye(4)
     own = surface.render_depth(CAMERA, T)
+    along = np.abs(CAMERA.rays() @ NORMAL)  # metres along the plane's normal for a metre of depth
     off = np.linspace(-2 * near_m, 2 * near_m, CAMERA.width, dtype=np.float32)
-    coarse = own + off
+    coarse = (own + off / along).astype(np.float32)
     coarse[0] = np.nan
     found = surface.depth_near(coarse, CAMERA, T, voxel_size)
     assert np.isnan(found[0]).all()
     expected = np.where(np.abs(off) < near_m, own, np.float32(np.nan))[1:]
-    clear = np.abs(np.abs(off) - near_m) > 1e-4  # not where rounding decides
+    clear = np.abs(np.abs(off) - near_m) > 0.02 * near_m  # triangles are not quite in the plane
     assert 0.2 < np.isfinite(expected).mean() < 0.8
-    np.testing.assert_array_equal(found[1:][:, clear], expected[:, clear])
+    inner = (slice(5, -5), np.flatnonzero(clear))
+    np.testing.assert_array_equal(found[1:][inner], expected[inner])
 
 
 def test_a_map_is_rendered_with_nothing_but_its_surface() -> None:
