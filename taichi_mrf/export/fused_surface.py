@@ -52,7 +52,7 @@ BLENDED_VARIANCE = 0.5
 
 NEAR_VOXELS, NEAR_M = 1.5, 0.075
 """How far the likeliest voxel of a ray and its surface may lie apart, along the surface's normal, to be the
-same: through a hole in the surface a ray meets what is behind it. In metres too, because a sensor's errors move
+same: through a hole in the surface a ray meets what is behind it. In metres too, since a sensor's errors move
 the likeliest of small voxels; along the normal, because rays that graze a surface run along it."""
 
 MARGIN = 1
