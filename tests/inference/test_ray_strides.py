@@ -57,7 +57,7 @@ def test_a_lattice_has_one_in_so_many_rays_of_each_row_and_column(stride: int, l
         assert not (image[:-shift] & image[shift:]).any()
 
 
-@settings(max_examples=30, suppress_health_check=[HealthCheck.filter_too_much])
+@settings(max_examples=20, suppress_health_check=[HealthCheck.filter_too_much])
 @given(
     seed=st.integers(0, 2**32 - 1),
     count=st.integers(1, 2),
@@ -67,8 +67,7 @@ def test_a_lattice_has_one_in_so_many_rays_of_each_row_and_column(stride: int, l
     compiled=st.sampled_from(
         [
             ("sum-product", "replay", True),
-            ("sum-product", "retrace", True),
-            ("sum-product", "replay", False),
+            ("sum-product", "retrace", False),
             ("max-product", "replay", True),
         ]
     ),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import small_room
 from hand_made import PRIOR, VOXEL
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from queried_maps import HandMap, hand_map, map_of, room_map
 from scipy.ndimage import distance_transform_edt
@@ -190,6 +190,7 @@ def edited(backend: str) -> Edited:
     return Edited(backend)
 
 
+@settings(max_examples=40)  # each makes up to four fields
 @example(190558, [1], "occupied", 0.04)  # bricks that are seen to be free, and hardly any others
 @given(
     st.integers(0, 2**32 - 1),
