@@ -15,9 +15,9 @@ IMAGES, OUT = REPOSITORY / "docs" / "images", REPOSITORY / "runs" / "peers"
 
 PICTURES: dict[str, list[str]] = {
     "peers_kitchen.png": ["--only", "kitchen*"],
-    "peers_room.png": ["--only", "room, 5 cm*", "room, 2 cm, [MOhlvT]*"],
-    "peers_house.png": ["--only", "house, 5 cm*", "house, 2 cm, [MhlT]*"],
-    "peers_lidar.png": ["--only", "lidar*", "--voxel-sizes", "0.2"],
+    "peers_room.png": ["--only", "room, 5 cm*", "room, 2 cm, [MOhlvT]*", "room, 1 cm, [MlT]*"],
+    "peers_house.png": ["--only", "house, 5 cm*", "house, 2 cm, [MhlT]*", "house, 1 cm, [MT]*"],
+    "peers_lidar.png": ["--only", "lidar, 20 cm*", "lidar, 5 cm, [Mhl]*", "--voxel-sizes", "0.2", "0.05"],
 }
 """The pictures, each with its arguments: the systems by their first letters where not all were measured."""
 
