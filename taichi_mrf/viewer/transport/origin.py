@@ -111,7 +111,7 @@ def answer_page(connection: ServerConnection, request: Request, pages: Pages) ->
     else:
         response = connection.respond(http.HTTPStatus.NOT_FOUND, "Not found.\n")
     if response.headers.get("Content-Type", "").startswith("text/html"):
-        response.body = _titled(response.body, response.headers.get("Content-Encoding") == "gzip")
+        response.body = _titled(bytes(response.body), response.headers.get("Content-Encoding") == "gzip")
         del response.headers["Content-Length"]
         response.headers["Content-Length"] = str(len(response.body))
     policy = POLICY.format(scripts=" ".join(page_script_hashes()))
