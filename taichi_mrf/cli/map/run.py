@@ -113,8 +113,8 @@ def map_to_folder(
         )
         result.seconds = {"opening": opening, **learning, **result.seconds}
         return write_run(
-            task.out, result, facts, pictures=task.pictures, surface_picture=task.surface_picture,
-            reading=task.shown_reading, haste=request, advance=progress.advance,
+            task.out, result, facts, pictures=task.pictures, reading=task.shown_reading,
+            haste=request, advance=progress.advance,
         )  # fmt: skip
 
 
