@@ -5,7 +5,7 @@ from taichi_mrf.datasets.registry import open_dataset
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import TaichiMRFError
 
-UNUSED_COLOR = "color: there are colour images, which are not used; map --color gives their colours to maps"
+UNUSED_COLOR = "color: there are colour images, which are not used; --color gives their colours to the map"
 
 
 def note_unused_color(dataset: Dataset, source: str, reading: SourceFlags) -> None:
