@@ -35,7 +35,6 @@ class MapTask:
     keep_every: float = Map.keep_every
     overwrite: bool = False
     shown_reading: Reading = "marginal"
-    surface_picture: bool = False
     learn_noise: bool = False
 
     def __str__(self) -> str:
@@ -72,6 +71,5 @@ def map_task(options: Map, source: str, out: Path) -> MapTask:
         options.keep_every,
         options.overwrite,
         options.shown_reading,
-        options.surface_picture,
         options.noise.is_learnt,
     )

@@ -13,10 +13,9 @@ class NoiseFlags:
     """Where sigma comes from."""
 
     origin: Annotated[Literal["stated", "auto"], tyro.conf.arg(name="noise")] = "stated"
-    """auto learns sigma from the recording before anything else: up to 60 of its frames are mapped up to
-    three times, and held-out ones say by how much sensor.sigma, or what frames state, is off. The result is
-    sensor.sigma-scale and sensor.sigma-added; DIR/sensor.yaml holds it for other recordings, and for a
-    camera, which has to be recorded first."""
+    """auto first learns from up to 60 frames of the recording by how much sensor.sigma, or what frames state,
+    is off: sensor.sigma-scale and sensor.sigma-added. DIR/sensor.yaml holds them for other recordings, and
+    for a camera, which has to be recorded first."""
 
     @property
     def is_learnt(self) -> bool:
