@@ -23,7 +23,7 @@ def run_diff(options: Diff) -> int:
         raise ConfigError(f"{options.out}: changes are written as a .ply")
     runtime.init(options.arch)
     a, b = _whole(options.a), _whole(options.b)
-    found = compare_maps(a, b)
+    found = compare_maps(a.decided, b.decided)
     report = diff_report(found, str(options.a), str(options.b), a.voxel_size)
     if options.out is not None:
         report["changes"] = {

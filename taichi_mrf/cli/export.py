@@ -100,8 +100,6 @@ def _move(file: Path, place: Path) -> None:
 def _opened(options: Export) -> ExportedMap:
     """The map, the part of a map in chunks, or the layer of a map that was asked for."""
     layered = options.layer != "both" or options.at is not None
-    if options.reading != "marginal":
-        return _read_by_rays(options, layered)
     if options.map.suffix == SUFFIX:
         if layered:
             raise ConfigError(f"--layer and --at need the map.npz of a run; {options.map} has no keyframes")
@@ -118,22 +116,6 @@ def _opened(options: Export) -> ExportedMap:
     if options.lower is not None or options.upper is not None:
         raise ConfigError(f"--lower and --upper need a map in chunks (.zarr); {options.map} is not one")
     return _layer(m, options) if layered else m
-
-
-def _read_by_rays(options: Export, layered: bool) -> ExportedMap:
-    """The map, with what its rays vote for as occupied."""
-    if layered:
-        raise ConfigError(f"--reading {options.reading} goes together with neither --layer nor --at")
-    m = None if options.map.suffix == SUFFIX else load_map(options.map)
-    whole = ChunkedMap.open(options.map) if m is None else in_chunks(m)
-    if whole is not None:
-        return take_part(whole.reading(options.reading), options.lower, options.upper)
-    if m is None or not has_layers(m):
-        raise ConfigError(
-            f"--reading {options.reading} needs the rays of a map of {methods_with('has_layers')}; "
-            f"{options.map} has none"
-        )
-    return m.reading(options.reading)
 
 
 def _layer(m: OccupancyMap, options: Export) -> ExportedMap:

@@ -1,8 +1,8 @@
 """How well a map explains a depth image that it has not seen (MRFMap, sections III-D and V).
 
 The map is asked, for each pixel, at which depth its ray most likely meets the first surface: where
-omega (eq. 18) is largest. The pixel is right if that depth is within a tolerance of the depth to judge
-by. One function for every kind of map: all that it needs is the map's ``view``.
+omega (eq. 18) is largest, or where the ray meets the measured surface near there. The pixel is right if that
+depth is within a tolerance of the depth to judge by. One function for every kind of map.
 
 The paper and its published code disagree on the tolerance and on rays that meet nothing, so all readings
 are here, and rays without an answer are counted as wrong and reported.
@@ -19,6 +19,7 @@ from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.errors import ConfigError, FrameError
 from taichi_mrf.evaluation.depth_error import DepthError, depth_error
 from taichi_mrf.geometry.poses import as_pose
+from taichi_mrf.queries.measured_depth import Answer
 from taichi_mrf.queries.survey import SurfaceSurvey
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.camera import Camera, check_camera
@@ -56,6 +57,9 @@ class JudgedMap(Protocol):
     def view(self) -> View: ...
     @property
     def sensor(self) -> SensorConfig: ...
+    def measured_depth(
+        self, likeliest_m: NDArray[np.float32], camera: Camera, T_world_camera: ArrayLike
+    ) -> NDArray[np.float32]: ...
 
 
 @dataclass(frozen=True)
@@ -105,7 +109,7 @@ class JudgedView:
 
     def by_surface(self, surface_m: NDArray[np.float32]) -> "JudgedView":
         """The same view judged by the map's measured surface: (H, W) its axial depth, NaN where it is not
-        near the likeliest voxel (FusedSurface.depth_near), which then stays the answer.
+        near the likeliest voxel (queries.measured_depth), which then stays the answer.
 
         ``voxel`` is half a voxel to each side of the surface. A measurement is distributed around it with the
         sensor's variance and that of the surface, or, for a share MISSED of them, as the map has it.
@@ -194,14 +198,16 @@ def judge_view(
     noise: NoiseModel | None = None,
     mask: ArrayLike | None = None,
     view: View | None = None,
+    by: Answer = "surface",
 ) -> JudgedView:
     """Follow the rays of a view's pixels through a map.
 
     ``depth_m`` is (H, W) axial depth in metres, 0 or NaN where there is none. Where it is the truth,
     ``measured_m`` (H, W) is what the sensor made of it; else it was measured itself. ``noise`` is that of the
     sensor, a constant sigma of one voxel if not given; ``mask`` (H, W) selects the pixels that count, all
-    with a depth if not given. ``view`` takes the place of ``m.view``. Raises FrameError if shapes do not fit
-    or no pixel is left to judge.
+    with a depth if not given. ``by="omega"`` ends all rays in their likeliest voxel, as in the paper; else
+    they end on the measured surface where it is near. ``view`` takes the place of ``m.view``, by omega.
+    Raises FrameError if shapes do not fit or no pixel is left to judge.
     """
     depth = np.asarray(depth_m, np.float32)
     check_camera(camera)
@@ -230,7 +236,10 @@ def judge_view(
     table = (noise or PolynomialNoise((m.voxel_size,))).table(camera)
     T, max_depth = as_pose(T_world_camera), m.sensor.max_depth
     survey = (view or m.view).survey(camera, T, max_depth, rays, table, predicting=True)
-    return JudgedView(depth, measured, survey, m.voxel_size, m.sensor.max_depth, table)
+    judged_view = JudgedView(depth, measured, survey, m.voxel_size, m.sensor.max_depth, table)
+    if by == "omega" or view is not None:
+        return judged_view
+    return judged_view.by_surface(m.measured_depth(judged_view.answer_m, camera, T))
 
 
 def accuracy(
@@ -242,8 +251,10 @@ def accuracy(
     *,
     noise: NoiseModel | None = None,
     mask: ArrayLike | None = None,
+    by: Answer = "surface",
 ) -> Accuracy:
-    """Score a map on one depth image: :func:`judge_view`, then :meth:`JudgedView.accuracy`."""
+    """Score a map on one depth image: :func:`judge_view`, then :meth:`JudgedView.accuracy`. ``by="omega"`` is
+    the paper's metric."""
     if tolerance not in TOLERANCES:
         raise ConfigError(f"there is no tolerance '{tolerance}'; known are: {', '.join(TOLERANCES)}")
-    return judge_view(m, depth_m, T_world_camera, camera, noise=noise, mask=mask).accuracy(tolerance)
+    return judge_view(m, depth_m, T_world_camera, camera, noise=noise, mask=mask, by=by).accuracy(tolerance)

@@ -131,7 +131,8 @@ def _judge(contender: Contender, place: _Place, voxel_size: float, seed: int) ->
     poses = [view.T_world_camera for view in scene.views]
     truth = occupancy_truth(place.mesh, clean, poses, scene.pinhole, voxel_size)
     space = SeenSpace(truth, clean, poses, scene.pinhole)
-    return {reading: _answers(m.reading(reading), truth, space, seed) for reading in READINGS}
+    maps = zip(READINGS, (m.layer(), m.calibrated()), strict=True)
+    return {reading: _answers(read, truth, space, seed) for reading, read in maps}
 
 
 def _answers(m: Any, truth: OccupancyTruth, space: SeenSpace, seed: int) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from taichi_mrf.config.schema import to_yaml
 from taichi_mrf.datasets.lidar.recording import LIDAR_PASS_THROUGH
 from taichi_mrf.experiments.scenes import Scene
 from taichi_mrf.methods.protocol import OccupancyMap
-from taichi_mrf.system.libraries import installed
 
 VISIBILITY_TABLE_I: dict[str, Any] = {"visible_if_occluded": 0.2}
 """Where Table I of Schauwecker & Zell differs from the defaults of VisibilityMap."""
@@ -20,7 +19,8 @@ BOTH: dict[str, dict[str, float]] = {"all leaves": {"empty_below": -1e30}, "occu
 those that are more likely free than occupied let it through."""
 
 SURFACE = "measured surface"
-"""A reading of MRFMap: rays end on ``m.surface()`` where it is near their likeliest voxel, else in that."""
+"""A reading of MRFMap: rays end on the measured surface where it is near their likeliest voxel, else in
+that."""
 
 
 @dataclass(frozen=True)
@@ -94,9 +94,9 @@ def wavemap(name: str = "wavemap-style", **parameters: Any) -> Contender:
 
 
 def standard_contenders() -> Sequence[Contender]:
-    """All that need no tuning; MRFMap by its surface too where the extra ``mesh`` is installed."""
+    """All that need no tuning; MRFMap by its surface too."""
     return [
-        replace(mrf(), surface=installed("embreex")),
+        replace(mrf(), surface=True),
         log_odds("OctoMap-style"),
         log_odds("OctoMap-style, bias removed", correct_bias=True),
         visibility(),

@@ -124,7 +124,7 @@ def figures(
             noise = DoubtfulPose(noise, covariance, view.measured_m)
         seen = judge_view(
             m, view.true_m, view.T_world_camera, scene.camera, measured_m=view.measured_m, noise=noise,
-            mask=view.judged,
+            mask=view.judged, by="omega",
         )  # fmt: skip
         below.append(view_below(m.view, seen, view.T_world_camera, scene.camera))
         each.append(

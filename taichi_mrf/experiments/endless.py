@@ -76,6 +76,7 @@ class _Run:
             judge_view(
                 m, view.true_m, view.T_world_camera, self.judged.camera,
                 measured_m=view.measured_m, noise=self.judged.noise, mask=view.judged,
+                by="omega",
             )
             for view in self.judged.views
         ]  # fmt: skip

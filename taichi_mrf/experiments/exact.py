@@ -173,6 +173,7 @@ class _Judge:
             judged = judge_view(
                 m, view.true_m, view.T_world_camera, self.full.camera,
                 measured_m=view.measured_m, noise=self.full.noise, mask=view.judged,
+                by="omega",
             )  # fmt: skip
             for tolerance in ("1.5sigma", "5cm"):
                 found[tolerance].append(judged.accuracy(tolerance).score)

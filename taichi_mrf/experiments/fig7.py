@@ -49,7 +49,8 @@ def run_fig7(experiment: Experiment) -> tuple[list[Table], list[Path]]:
             experiment.report(f"{contender.name}, {voxel_size * 100:g} cm", number, len(contenders))
             training = [i for i in range(len(scene.views)) if i != held_out]
             m, _ = build(contender, scene, voxel_size, training)
-            judged.append(judge_view(m, view.true_m, view.T_world_camera, scene.camera, mask=view.judged))
+            parts = (view.true_m, view.T_world_camera, scene.camera)
+            judged.append(judge_view(m, *parts, mask=view.judged, by="omega"))
             profiles.append(m.ray_profile(view.T_world_camera[:3, 3], _direction(scene, view, pixel)))
             score = judged[-1].accuracy("1.5sigma")
             rows.append([f"{voxel_size * 100:g} cm", contender.name, score.score, score.unanswered])

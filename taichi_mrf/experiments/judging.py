@@ -3,16 +3,14 @@
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
-from taichi_mrf import MRFMap
 from taichi_mrf.evaluation.accuracy import TOLERANCES, JudgedView, judge_view
 from taichi_mrf.experiments.contenders import SURFACE, Contender
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene, SceneView
-from taichi_mrf.export.fused_surface import FusedSurface
 from taichi_mrf.methods.protocol import OccupancyMap
 
 Figures = dict[str, Any]
@@ -43,10 +41,7 @@ def judge_all(
         for view in views:
             by_reading[reading][view.name] = _figures(judged_by_voxels(m, scene, view, changes))
     if contender.surface:
-        surface = cast("MRFMap", m).surface()
-        by_reading[SURFACE] = {
-            view.name: _figures(judged_by_surface(m, surface, scene, view)) for view in views
-        }
+        by_reading[SURFACE] = {view.name: _figures(judged_by_surface(m, scene, view)) for view in views}
     seconds = time.perf_counter() - start
     return {
         "readings": by_reading,
@@ -71,15 +66,14 @@ def judged_by_voxels(
     return judge_view(
         m, view.true_m, view.T_world_camera, view.camera or scene.camera,
         measured_m=view.measured_m, noise=scene.noise, mask=view.judged,
-        view=m.view.with_occlusion(**changes) if changes else m.view,
+        view=m.view.with_occlusion(**changes) if changes else m.view, by="omega",
     )  # fmt: skip
 
 
-def judged_by_surface(m: OccupancyMap, surface: FusedSurface, scene: Scene, view: SceneView) -> JudgedView:
-    """A view judged by the map's surface where that is near the likeliest voxels, else by these."""
+def judged_by_surface(m: OccupancyMap, scene: Scene, view: SceneView) -> JudgedView:
+    """A view judged by the measured surface where that is near the likeliest voxels, else by these."""
     judged, camera = judged_by_voxels(m, scene, view), view.camera or scene.camera
-    near_m = surface.depth_near(judged.answer_m, camera, view.T_world_camera, m.voxel_size)
-    return judged.by_surface(near_m)
+    return judged.by_surface(m.measured_depth(judged.answer_m, camera, view.T_world_camera))
 
 
 def _figures(judged: JudgedView) -> Figures:

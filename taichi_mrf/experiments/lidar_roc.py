@@ -6,15 +6,16 @@ learnt or tuned is on the scans that are mapped.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf import UNKNOWN, PolynomialNoise, open_dataset
+from taichi_mrf import UNKNOWN, MRFMap, PolynomialNoise, open_dataset
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.evaluation.occupancy_scores import score_occupancy
 from taichi_mrf.evaluation.tables import Entry, Spread, Table
@@ -26,7 +27,6 @@ from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.lidar_rivals import TUNED, contender_of, in_words, tuned_parameters
 from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.experiments.tuning import GRID, NAME
-from taichi_mrf.methods.mrf.reading import Reading
 
 FOLDS = 4
 """Scan i is held out in fold i modulo this."""
@@ -39,8 +39,12 @@ MAX_RANGE_M = 12.0
 SIGMAS_M = (0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.18)
 """The standard deviations of range that are tried."""
 
-READINGS: tuple[Reading, ...] = ("marginal", "calibrated", "surface")
-"""Of an MRFMap."""
+READINGS: dict[str, Callable[[MRFMap], Any]] = {
+    "marginal": MRFMap.layer,
+    "calibrated": MRFMap.calibrated,
+    "surface": lambda m: m.decided,
+}
+"""How an MRFMap is read."""
 
 KERNEL = "BGK-style"
 """Rows of kernel inference."""
@@ -153,12 +157,12 @@ def _fold_areas(
     weights = max(GRID, key=lambda weights: score(weights.contender()))
     beams = tuned_parameters(voxel_size, score)
     kernel = max(KernelModel().candidates(), key=kernel_score)
-    contenders: list[tuple[Contender, Sequence[Reading]]] = [
+    contenders: list[tuple[Contender, dict[str, Callable[[MRFMap], Any]]]] = [
         (lidar_mrf(), READINGS),
-        (log_odds("OctoMap-style"), ()),
-        (replace(weights.contender(), name=NAME), ()),
-        (wavemap(), ()),
-        (contender_of(beams, TUNED), ()),
+        (log_odds("OctoMap-style"), {}),
+        (replace(weights.contender(), name=NAME), {}),
+        (wavemap(), {}),
+        (contender_of(beams, TUNED), {}),
     ]
     assumed = replace(scene, noise=PolynomialNoise((sigma_m,)))
     rows: dict[str, list[Figures]] = {}
@@ -196,7 +200,7 @@ def _areas(
     voxel_size: float,
     keyframes: Sequence[int],
     judged: Sequence[int],
-    readings: Sequence[Reading] = (),
+    readings: Mapping[str, Callable[[MRFMap], Any]] = MappingProxyType({}),
 ) -> dict[str, list[Figures]]:
     """The figures of each judged scan under a map of the keyframes, by reading; AS_IT_IS without."""
 
@@ -204,7 +208,7 @@ def _areas(
         m: Any
         m, _ = build(contender, scene, voxel_size, keyframes)
         rays, _ = build(log_odds(""), scene, voxel_size, keyframes)
-        read: dict[str, Any] = {each: m.reading(each) for each in readings} or {AS_IT_IS: m}
+        read: dict[str, Any] = {name: read(m) for name, read in readings.items()} or {AS_IT_IS: m}
         return {
             name: [scan_figures(each, rays, scene.views[i], seed=i) for i in judged]
             for name, each in read.items()

@@ -128,7 +128,7 @@ def _figures(contender: Any, scene: Scene, mesh: TriangleMesh, voxel_size: float
     behind = _hidden(truth, m)
     maps: dict[str, MRFMap | MapReading] = {"marginal": m}
     if contender.name == "rho 1":
-        maps |= {name: m.reading(name) for name in ("surface", "calibrated")}
+        maps |= {"surface": m.decided, "calibrated": m.calibrated()}
     readings: list[list[Entry]] = [["omega", *_accuracy(m, scene, judged, m.view), None, None]]
     trust: list[list[Entry]] = []
     for name, shown in maps.items():

@@ -23,7 +23,7 @@ _BYTES_PER_VOXEL = 40
 
 def write_arrays(path: str | Path, m: QueriedMap) -> None:
     """Write the arrays described at the top of this file. Raises MapFileError, CapacityError."""
-    reader = BrickReader(m)
+    reader, deciding = BrickReader(m), BrickReader(m.decided)
     count = len(reader.bricks) * VOXELS
     check_memory(_BYTES_PER_VOXEL * count, f"{count / 1e6:.3g} million voxels as arrays")
     voxels, probabilities, states = (
@@ -31,7 +31,8 @@ def write_arrays(path: str | Path, m: QueriedMap) -> None:
         [np.zeros(0, np.float32)],
         [np.zeros(0, np.int8)],
     )
-    for bricks, log_odds, state in reader.batches(reader.bricks):
+    for bricks, log_odds, _ in reader.batches(reader.bricks):
+        state = deciding.state(deciding.log_odds(bricks))
         row, number = np.nonzero(state != UNKNOWN)
         voxels.append(bricks[row] * BRICK + offsets_in_brick()[number])
         probabilities.append(probability(log_odds[row, number]))

@@ -78,15 +78,17 @@ def write_chunks(
     measured: SurfacedMap | None = None,
 ) -> None:
     """Write a map in memory to a store, chunk by chunk; ``up`` (default: the map's) is kept in it, the
-    colours of ``colored``, and what the rays of ``measured`` say of the surface (both the same map or None).
+    colours of ``colored``, what the rays of ``measured`` say of the surface (both the same map or None), and
+    which voxels are occupied beyond their marginals.
     Raises MapFileError, TaichiMRFError without zarr."""
     reader = BrickReader(m)
     bricks = known_bricks(m)
-    places, surface, first = np.zeros((0, 3), np.int32), None, None
+    places, surface = np.zeros((0, 3), np.int32), None
     if measured is not None:
-        surface, first = measured.surface_field(), measured.first_surfaces()
+        surface = measured.surface_field()
         places = surface.chunks
-    kept = ((COLORS, colored), (SURFACE, surface), (FIRST, first))
+    deciding = None if m.decided is m else BrickReader(m.decided)
+    kept = ((COLORS, colored), (SURFACE, surface), (FIRST, deciding))
     extras = [name for name, each in kept if each is not None]
     with new_store(path) as folder:
         header = header_of(m, up)
@@ -98,9 +100,8 @@ def write_chunks(
             if colored is not None:
                 colors = colored.colors_in(reader.slots(bricks[rows]))
                 store.write_extra(COLORS, chunk, extra_block(chunk, bricks[rows], colors))
-            if first is not None:
-                slots = reader.slots(bricks[rows])
-                found = first[slots] & (slots >= 0)[:, None]
+            if deciding is not None:
+                found = deciding.log_odds(bricks[rows]) > log_odds
                 store.write_extra(FIRST, chunk, first_block(chunk, bricks[rows], found))
         for x, y, z in places.tolist():
             assert surface is not None

@@ -39,6 +39,11 @@ NO_SURFACE = (
 class ExportedMap(StorableMap, Protocol):
     """The parts of a map that exports use; all maps of methods/protocol.py have them."""
 
+    @property
+    def decided(self) -> "ExportedMap":
+        """The map by what is occupied."""
+        ...
+
     def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]: ...
 
 
@@ -114,6 +119,7 @@ def _plan_note(up: Up) -> str:
 def _points_or_surface(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
     if options.cubes or options.mesh:
         return _surface(m, path, options)
+    m = m.decided
     centres, p = m.voxels(options.threshold)
     sizes = np.full(len(p), m.voxel_size)
     if options.cells:
@@ -129,7 +135,7 @@ def _points_or_surface(m: ExportedMap, path: Path, options: ExportOptions) -> li
 
 def _surface(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
     if options.cubes:
-        surface = voxel_surface(m, options.threshold, options.cells)
+        surface = voxel_surface(m.decided, options.threshold, options.cells)
     elif (measured := _with_rays(m, path, options)) is not None:
         surface = measured_surface(measured)
     else:
@@ -163,18 +169,18 @@ def _photo(m: ExportedMap, path: Path, options: ExportOptions) -> ColoredMap | N
 
 
 def _octomap_binary(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
-    write_bt(path, m, options.cells)
+    write_bt(path, m.decided, options.cells)
     return [path]
 
 
 def _octomap(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
-    write_ot(path, m, _photo(m, path, options), options.cells)
+    write_ot(path, m.decided, _photo(m, path, options), options.cells)
     return [path]
 
 
 def _level_map(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
     up = _up(m, options)
-    found = level_map(m, options.z_min, options.z_max, options.occupied_from, options.free_below, up)
+    found = level_map(m.decided, options.z_min, options.z_max, options.occupied_from, options.free_below, up)
     image = grey_image(found.state == OCCUPIED, found.state != UNKNOWN)
     note = _plan_note(up)
     return write_map_server(path.parent, image, found.cell_size, found.lower_corner_m, path.stem, note)
@@ -196,7 +202,7 @@ def _chunks(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
 def _page(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
     from taichi_mrf.export.page import write_page  # viser takes a second to import
 
-    write_page(path, m, options.threshold, _up(m, options), _photo(m, path, options), options.cells)
+    write_page(path, m.decided, options.threshold, _up(m, options), _photo(m, path, options), options.cells)
     return [path]
 
 

@@ -1,9 +1,7 @@
 """The zero level of a field of signed distances as triangles, with a standard deviation for each vertex.
 
-Where few rays have crossed a voxel, as far away or at small voxels, its mean distance is noise. There the
-field is blended with its surroundings: with g = t / (t + W), a voxel of weight W takes g times the sums of
-the 27 voxels around it (binomial weights) to its own, so a voxel that many rays have crossed stays as it is.
-Triangles are made in cells of whose 8 corners all have weight: where both sides of the surface were seen.
+The field is blended where rays are few (voxels/distance_field.py). Triangles are made in cells of whose 8
+corners all have weight: where both sides of the surface were seen.
 
 It goes chunk by chunk, so that memory is bounded by the surface, not by the space around it.
 """
@@ -23,14 +21,8 @@ from taichi_mrf.queries.colored import marginals_behind
 from taichi_mrf.queries.known_bricks import QueriedMap, sorted_bricks
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.voxels.colors import marginal_colors
-from taichi_mrf.voxels.distance_field import DistanceSource
+from taichi_mrf.voxels.distance_field import LEAST_WEIGHT, MARGIN, DistanceSource, blended_sums
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
-
-BLENDED_BELOW = 0.3
-"""t: the weight at which a voxel's mean distance has a standard deviation of about half a voxel."""
-
-LEAST_WEIGHT = 0.02
-"""A voxel with less has no distance, nor has one that no ray has crossed."""
 
 RAY_STD = 0.48
 """Standard deviation of a vertex as a multiple of what the weight there gives: blending uses more rays."""
@@ -49,14 +41,6 @@ docs/surfaces.md."""
 BLENDED_VARIANCE = 0.5
 """Variance in voxels^2 of the distances of 27 voxels with binomial weights, whatever was measured."""
 
-NEAR_VOXELS, NEAR_M = 1.5, 0.075
-"""How far the likeliest voxel of a ray and its surface may lie apart, along the surface's normal, to be the
-same: through a hole in the surface a ray meets what is behind it. In metres too, since a sensor's errors move
-the likeliest of small voxels; along the normal, because rays that graze a surface run along it."""
-
-MARGIN = 1
-"""Voxels around a box that blending reads."""
-
 
 @dataclass(frozen=True)
 class FusedSurface:
@@ -73,21 +57,10 @@ class FusedSurface:
 
     def render_depth(self, camera: Camera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
         """Axial depth of the surface as a camera at a pose (4, 4) sees it, (H, W) float32 metres, NaN where
-        it sees none. It is more exact than OccupancyMap.render_depth, which ends rays in the middle of a
-        voxel, and has more holes. Raises DatasetError without embreex."""
+        it sees none. OccupancyMap.render_depth has the same depths, and fills the holes. Raises DatasetError
+        without embreex."""
         depth_m = self._scene.render_depth(camera, as_pose(T_world_camera))
         return np.where(depth_m > 0, depth_m, np.float32(np.nan))
-
-    def depth_near(
-        self, depth_m: NDArray[np.float32], camera: Camera, T_world_camera: ArrayLike, voxel_size: float
-    ) -> NDArray[np.float32]:
-        """:meth:`render_depth` where it is near a depth (H, W) that was rendered from voxels of
-        ``voxel_size`` metres: within NEAR_VOXELS voxels or NEAR_M along its normal. NaN elsewhere."""
-        found, along_normal = self._scene.meet(camera, as_pose(T_world_camera))
-        off_m = np.abs(found - depth_m) * along_normal
-        with np.errstate(invalid="ignore"):
-            near = (found > 0) & (off_m <= max(NEAR_VOXELS * voxel_size, NEAR_M))
-        return np.where(near, found, np.float32(np.nan))
 
     @cached_property
     def _scene(self) -> MeshScene:
@@ -108,10 +81,6 @@ class SurfacedMap(QueriedMap, Protocol):
 
     def surface_field(self) -> DistanceSource:
         """The signed distances that they measured."""
-        ...
-
-    def first_surfaces(self) -> NDArray[np.bool_]:
-        """Which voxels of ``view.pool`` their rays take for their first surface, (slots, 512)."""
         ...
 
 
@@ -216,21 +185,6 @@ def _boxes(field: DistanceSource) -> Iterator[tuple[NDArray[np.int64], Box, Box,
             own = sums[0][(slice(MARGIN, -MARGIN),) * 3]
             weight, distance, excess = blended_sums(*sums)
             yield chunk * CHUNK_VOXELS, own, weight, distance, excess
-
-
-def blended_sums(weight: Box, *sums: Box) -> list[Box]:
-    """Sums of weight, and others, blended with their surroundings; the box shrinks by MARGIN on each side."""
-    inner = (slice(MARGIN, -MARGIN),) * 3
-    share = BLENDED_BELOW / (BLENDED_BELOW + weight[inner])
-    return [each[inner] + share * _binomial(each) for each in (weight, *sums)]
-
-
-def _binomial(sums: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Each voxel and its neighbours with the weights 1/2, 1, 1/2 along each axis."""
-    for axis in range(3):
-        sums = np.moveaxis(sums, axis, 0)
-        sums = np.moveaxis(sums[1:-1] + 0.5 * (sums[:-2] + sums[2:]), 0, axis)
-    return sums
 
 
 def _all_corners(true: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -13,20 +13,17 @@ take for their surface. Rays whose measurement the map holds for an outlier do n
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.inference.keyframe import Keyframe, VisibleBricks
 from taichi_mrf.inference.ray_model import RayModel
 from taichi_mrf.inference.ray_posterior import FreeLogs, RayVisitor, follow_rays
 from taichi_mrf.inference.workers import workers_without_trace
-from taichi_mrf.kernels.bundles import Bundle
+from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, Struct, Template
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
-from taichi_mrf.voxels.pool import BrickPool, PoolPart, copied
+from taichi_mrf.voxels.pool import BrickPool, PoolPart
 from taichi_mrf.voxels.traversal import walk_voxels
 from taichi_mrf.voxels.window import WindowIndex
 
@@ -41,63 +38,14 @@ CALLED = 0.01
 """Log-odds above even odds, or above what counts as known, that a voxel that wins has at least."""
 
 
-Voting = tuple[
-    Iterable[tuple[Keyframe, VisibleBricks]],
-    BrickPool,
-    RayModel,
-    VolumeConfig,
-    tuple[NDArray[np.int32], NDArray[np.int32]] | None,
-]
-"""The parameters of :func:`surfaces_first`."""
-
-
-def surfaces_first(
-    keyframes: Iterable[tuple[Keyframe, VisibleBricks]],
-    pool: BrickPool,
-    model: RayModel,
-    volume: VolumeConfig,
-    kept: tuple[NDArray[np.int32], NDArray[np.int32]] | None = None,
-) -> "ti.Ndarray":
-    """The log-odds of a map's voxels, (capacity * 512), in which each voxel that wins the vote of the rays is
-    occupied; all others keep their marginals.
-
-    ``keyframes`` come with their lists of visible bricks, ``model`` are the parameters of their rays, and
-    ``kept`` are votes of other keyframes: bricks, (n,) slots, and their votes (n, 512).
-    """
-    votes = all_votes(keyframes, pool, model, volume, kept)
-    log_odds = copied(pool.belief)
-    _call(votes, log_odds, called(pool.prior_log_odds, volume.min_evidence))
-    runtime.settle()
-    return log_odds
-
-
-def called(prior_log_odds: float, min_evidence: float) -> float:
-    """The least log-odds of a voxel that wins the vote."""
-    return max(0.0, prior_log_odds + min_evidence) + CALLED
-
-
-def all_votes(
-    keyframes: Iterable[tuple[Keyframe, VisibleBricks]],
-    pool: BrickPool,
-    model: RayModel,
-    volume: VolumeConfig,
-    kept: tuple[NDArray[np.int32], NDArray[np.int32]] | None = None,
-) -> "ti.Ndarray":
-    """The votes of keyframes, and those that are ``kept``; parameters as above."""
-    votes = count_votes(keyframes, pool, model, volume)
-    if kept is not None:
-        _add_votes(kept[0], kept[1].reshape(-1), votes)
-        runtime.settle()
-    return votes
-
-
 def count_votes(
     keyframes: Iterable[tuple[Keyframe, VisibleBricks]],
     pool: BrickPool | PoolPart,
     model: RayModel,
     volume: VolumeConfig,
 ) -> "ti.Ndarray":
-    """The votes for and against each voxel, (capacity * 512) int32; parameters as above."""
+    """The votes for and against each voxel, (capacity * 512) int32, of keyframes with their lists of visible
+    bricks; ``model`` are the parameters of their rays."""
     learnt = pool.prior_log_odds + volume.min_evidence
     index = WindowIndex()
     votes = ti.ndarray(ti.i32, pool.belief.shape)
@@ -174,16 +122,28 @@ def _vote_against(state: Template, voting: Template, voxel: I32, near: F32, far:
     return before
 
 
-@ti.kernel
-def _add_votes(slots: I32Array, more: I32Array, votes: I32Array):
+def call_winners(votes: "ti.Ndarray", log_odds: "ti.Ndarray", prior: float, min_evidence: float) -> None:
+    """Raise the ``log_odds`` (n) of voxels that win the ``votes`` (n), so that they are occupied: those whose
+    evidence has since gone below what is known of them stay."""
+    _call(votes, log_odds, prior + min_evidence, called(prior, min_evidence))
+
+
+def called(prior_log_odds: float, min_evidence: float) -> float:
+    """The least log-odds of a voxel that wins the vote."""
+    return max(0.0, prior_log_odds + min_evidence) + CALLED
+
+
+@kernel
+def add_votes(slots: I32Array, more: I32Array, votes: I32Array) -> None:
     """Add votes ``more`` (n * 512) in the bricks in ``slots`` (n)."""
-    for i in range(more.shape[0]):
+    for i in range(slots.shape[0] * VOXELS):
         votes[slots[i // VOXELS] * VOXELS + i % VOXELS] += more[i]
 
 
 @ti.kernel
-def _call(votes: I32Array, log_odds: F32Array, least: F32):
-    """Raise the ``log_odds`` (n) of voxels that win the ``votes`` (n) to ``least``."""
+def _call(votes: I32Array, log_odds: F32Array, learnt: F32, least: F32):
+    """Raise the ``log_odds`` (n) of voxels that win the ``votes`` (n), if they are above ``learnt``, to
+    ``least``."""
     for i in range(votes.shape[0]):
-        if votes[i] > 0:
+        if votes[i] > 0 and log_odds[i] > learnt:
             log_odds[i] = ti.max(log_odds[i], least)

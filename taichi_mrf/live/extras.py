@@ -1,5 +1,5 @@
-"""What the page shows beside the map on request: images of a view, the measured surface, another reading
-than marginals, and the same keyframes mapped by OctoMap's method."""
+"""What the page shows beside the map: images of a view, the measured surface, what is occupied, and the same
+keyframes mapped by OctoMap's method."""
 
 import dataclasses
 import time
@@ -68,18 +68,14 @@ class Extras:
 
     def work(self, go_on: GoOn) -> bool:
         """Do one piece of the work that is left; returns whether there was any. ``go_on`` can stop it."""
-        shown, publisher = self._run.mapper.shown, self._run.mapper.shown.publisher
+        publisher = self._run.mapper.shown.publisher
         if publisher.counting != self._watch.counts:
             publisher.count(self._watch.counts)
             self._run.publish()
             return True
-        if shown.reading != self._watch.reading:
-            shown.read_as(self._watch.reading)
-            self._run.publish()
-            return True
         if self._run.renew_past() or self._make_images() or self._list_changes() or self._send_colors():
             return True
-        if self._send_surface(go_on) or self._find_reading(go_on):
+        if self._send_surface(go_on) or self._decide(go_on):
             return True
         if not self._watch.baseline:
             if self._baseline is not None:
@@ -166,20 +162,19 @@ class Extras:
             run.send(patch)
         return True
 
-    def _find_reading(self, go_on: GoOn) -> bool:
-        """Read the map by another rule than its marginals if that is shown, no frames are read, and the map
-        has changed; False if there was nothing to do."""
+    def _decide(self, go_on: GoOn) -> bool:
+        """Count the votes of rays if no frames are read and the map has changed; False if there was nothing
+        to do."""
         run, shown = self._run, self._run.mapper.shown
-        if run.is_replaying or not shown.lacks_reading:
+        if run.is_replaying or not shown.lacks_decisions:
             return False
-        doing = f"finding the {shown.reading} reading"
         try:
-            run.find_reading(self._between(go_on, doing, lambda: self._watch.reading == shown.reading))
+            run.decide(self._between(go_on, "finding what is occupied", lambda: True))
         except StopRequestedError:
             pass
         except Exception as error:  # marginals are shown instead
-            run.send(Notice(f"no {shown.reading} reading: {error}", "error"))
-            self._watch = dataclasses.replace(self._watch, reading="marginal")
+            run.send(Notice(f"shown by marginals: {error}", "error"))
+            shown.give_up_deciding()
         return True
 
     def _between(self, go_on: GoOn, doing: str, wanted: Callable[[], bool]) -> Callable[[], None]:

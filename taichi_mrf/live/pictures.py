@@ -10,6 +10,7 @@ from taichi_mrf.errors import FrameError
 from taichi_mrf.evaluation.accuracy import NO_ANSWER, NOT_JUDGED, RIGHT, WRONG, judge_view
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.queries.measured_depth import Answer
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.unrolled import covering, unrolled
 from taichi_mrf.viewer.messages import Images
@@ -86,7 +87,9 @@ def view_images(
     step = _step(camera.width, IMAGE_WIDTH) if flat else _step_of(camera, IMAGE_PIXELS)
     small = camera.thinned(step)
     picture = unrolled(small)
-    rendered = m.render_depth(small, T_world_camera)
+    # A map that is still growing has another surface after each keyframe.
+    by: Answer = "surface" if m.settled else "omega"
+    rendered = m.render_depth(small, T_world_camera, by)
     if depth_m is None:
         nothing = np.full((*picture.camera.shape, 3), _NO_DEPTH, np.uint8)
         score = "its depth image was dropped when it was frozen"
@@ -95,7 +98,7 @@ def view_images(
     bounds = depth_bounds(measured)
     verdict, score = np.full(small.shape, NOT_JUDGED, np.int8), "nothing to judge: no measurement"
     try:
-        judged = judge_view(m, measured, T_world_camera, small).accuracy("1.5sigma")
+        judged = judge_view(m, measured, T_world_camera, small, by=by).accuracy("1.5sigma")
     except FrameError:  # no pixel holds a measurement within the sensor's range
         pass
     else:

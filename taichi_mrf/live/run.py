@@ -129,9 +129,9 @@ class Run(SessionCore):
         """Send what is shown of the past if it is outdated; returns whether there was anything to send."""
         return self._send_layers(self.mapper.shown.renew())
 
-    def find_reading(self, between: Callable[[], object]) -> None:
-        """Show the map by the reading that is wanted; ``between`` is called after each keyframe."""
-        self._send_layers(self.mapper.shown.find_reading(between))
+    def decide(self, between: Callable[[], object]) -> None:
+        """Show what is occupied; ``between`` is called after each keyframe."""
+        self._send_layers(self.mapper.shown.decide(between))
 
     def show_camera(self, frame: Frame) -> None:
         """Show the viewer the pose of a frame."""

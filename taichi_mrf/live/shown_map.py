@@ -1,8 +1,8 @@
 """What the page shows of the map: as it is believed now or was believed at another time, with its dynamic
-voxels as a layer of their own; or the map as it is now by another reading than its marginals.
+voxels as a layer of their own.
 
-The past is read again only from time to time, because that takes all messages. A reading takes a pass over
-all keyframes: it is made when there is time, and until then marginals are shown.
+The past is read again only from time to time, because that takes all messages. What is occupied now takes a
+pass over new keyframes' rays: it is found when there is time, and until then marginals are shown.
 """
 
 import math
@@ -12,13 +12,12 @@ from collections.abc import Callable, Collection
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.errors import ConfigError
 from taichi_mrf.live.live_keyframes import LiveKeyframe
 from taichi_mrf.live.publish import Publisher
 from taichi_mrf.methods.capabilities import has_dates, has_layers
 from taichi_mrf.methods.mrf.layers import NOTHING_MOVES, Moving
 from taichi_mrf.methods.protocol import OccupancyMap
-from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Bricks, Reading, TimeSpan
+from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Bricks, TimeSpan
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 
@@ -36,10 +35,10 @@ class ShownMap:
         self.map = m
         self.stamp_s: float | None = None
         self._pool = m.view.pool
-        self._past = self._pool  # of the reading that is shown while stamp_s is set
+        self._past = self._pool  # what is shown: the map as of stamp_s, or by votes
         self._outdated, self._read_at = False, -math.inf  # whether renew() has something to do
-        self.reading: Reading = "marginal"
-        self._read_of: int | None = None  # the revision of the pool of which a reading is shown
+        self._decided_of: int | None = None  # the revision of the pool of which votes are shown
+        self._undecided = False  # it failed
         self.publisher = Publisher(
             "map",
             self._pool,
@@ -71,42 +70,39 @@ class ShownMap:
         """Show the map as of a time in seconds, None for now; :meth:`renew` does the work."""
         if self.has_dates and stamp_s != self.stamp_s:
             self.stamp_s, self._outdated, self._read_at = stamp_s, True, -math.inf
-            self._read_of = None
+            self._decided_of = None
             if stamp_s is None:
                 self._past = self._pool
                 self._look_again()
 
     def changes(self) -> list[Bricks]:
         """What has changed of each layer since the last call. While the past is shown it is nothing, and
-        :meth:`renew` follows. A reading is one of an earlier map, and marginals take its place."""
+        :meth:`renew` follows. Votes are those of an earlier map, and marginals take their place."""
         self._outdated = self.stamp_s is not None
         if self._outdated:
             return []
-        if self._read_of not in (None, self._pool.revision):
+        if self._decided_of not in (None, self._pool.revision):
             self._show_marginals()
         return self._changes()
-
-    def read_as(self, reading: Reading) -> None:
-        """Show the map by a reading; :meth:`find_reading` does the work."""
-        self.reading = reading
-        if self._read_of is not None:
-            self._show_marginals()
 
     @property
-    def lacks_reading(self) -> bool:
-        """Whether :meth:`find_reading` has something to do."""
-        wanted = self.reading != "marginal" and self.stamp_s is None
-        return wanted and self._read_of != self._pool.revision
+    def lacks_decisions(self) -> bool:
+        """Whether :meth:`decide` has something to do."""
+        able = has_layers(self.map) and not self._undecided
+        return able and self.stamp_s is None and self._decided_of != self._pool.revision
 
-    def find_reading(self, between: Callable[[], object]) -> list[Bricks]:
-        """Show the map by the reading that is wanted; returns what has changed of each layer. ``between`` is
-        called after each keyframe; what it raises ends the work. Raises ConfigError for a map that has
-        marginals only."""
-        if not has_layers(self.map):
-            raise ConfigError(f"a map of the method {self.map.config.method} has marginals only")
-        self._past, self._read_of = self.map.reading(self.reading, between).view.pool, self._pool.revision
+    def decide(self, between: Callable[[], object]) -> list[Bricks]:
+        """Show what is occupied; returns what has changed of each layer. ``between`` is called after each
+        keyframe; what it raises ends the work."""
+        assert has_layers(self.map)
+        self._past, self._decided_of = self.map.decide(between).view.pool, self._pool.revision
         self._look_again()
         return self._changes()
+
+    def give_up_deciding(self) -> None:
+        """Show marginals from now on."""
+        self._undecided = True
+        self._show_marginals()
 
     def renew(self) -> list[Bricks]:
         """Go to another time, or read the past again if the map has changed and a moment has gone by.
@@ -144,7 +140,7 @@ class ShownMap:
         return [self.publisher] if self._dynamic is None else [self.publisher, self._dynamic]
 
     def _show_marginals(self) -> None:
-        self._past, self._read_of = self._pool, None
+        self._past, self._decided_of = self._pool, None
         self._look_again()
 
     def _look_again(self) -> None:

@@ -17,13 +17,13 @@ from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
 from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.config.values import overridden
-from taichi_mrf.export.fused_surface import FusedSurface
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.geometry.up import Up, up_of
 from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.sensor_section import describing
 from taichi_mrf.queries.contradiction import ray_scores
 from taichi_mrf.queries.extract import extract_voxels
+from taichi_mrf.queries.measured_depth import Answer
 from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.queries.points import classify, point_log_odds, probability
 from taichi_mrf.queries.profile import RayProfile
@@ -160,10 +160,16 @@ class BrickMap(Owned):
         measured."""
         return probability(self._log_odds(points))
 
+    @property
+    def decided(self) -> Any:
+        """The map whose log-odds say which voxels are occupied: this one, unless a method knows better."""
+        return self
+
     @tensors.in_kind("points", on_device=True)
     def state(self, points: ArrayLike) -> NDArray[np.int8]:
         """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,) int8."""
-        return classify(self._log_odds(points), self._pool.prior_log_odds, self.view.volume.min_evidence)
+        log_odds = self.decided._log_odds(points)
+        return classify(log_odds, self._pool.prior_log_odds, self.view.volume.min_evidence)
 
     def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """All allocated voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
@@ -171,21 +177,28 @@ class BrickMap(Owned):
 
     @tensors.in_kind("T_world_camera")
     def render_depth(
-        self, camera: Camera, T_world_camera: ArrayLike, surface: FusedSurface | None = None
+        self, camera: Camera, T_world_camera: ArrayLike, by: Answer = "surface"
     ) -> NDArray[np.float32]:
-        """Axial depth of the likeliest surface seen by each pixel, (H, W) float32, NaN where none is.
+        """Axial depth of the surface that each pixel most likely sees, (H, W) float32, NaN where there is
+        none.
 
-        It is the middle of a voxel; with ``surface``, the map's own (``m.surface()``), the depth of that
-        where it lies near the voxel (FusedSurface.depth_near), which is more exact. Raises DatasetError for
-        that without embreex."""
+        A ray ends on the surface that keyframes measured where that is near its likeliest voxel
+        (queries.measured_depth), elsewhere, and in maps without such a surface, in the middle of that voxel.
+        ``by="omega"`` leaves the surface out: the paper's answer (eq. 18)."""
         check_camera(camera)
         T = as_pose(T_world_camera)
         depth_m = self.view.render_depth(camera, T, self.sensor.max_depth)
-        if surface is None:
+        if by == "omega":
             return depth_m
-        instance(surface, FusedSurface, "surface", "what m.surface() gives")
-        near_m = surface.depth_near(depth_m, camera, T, self.voxel_size)
+        near_m = self.measured_depth(depth_m, camera, T)
         return np.where(np.isnan(near_m), depth_m, near_m)
+
+    def measured_depth(
+        self, likeliest_m: NDArray[np.float32], camera: Camera, T_world_camera: ArrayLike
+    ) -> NDArray[np.float32]:
+        """Axial depth (H, W) of the measured surface where it is near the likeliest voxels, whose depths are
+        ``likeliest_m`` (H, W); NaN elsewhere, and everywhere in maps without such a surface."""
+        return np.full(camera.shape, np.nan, np.float32)
 
     @tensors.in_kind("origin", "direction")
     def ray_profile(

@@ -18,7 +18,7 @@ from taichi_mrf.inference.schedule import InferReport, Progress
 from taichi_mrf.methods.mrf.checkpoint import Checkpoint
 from taichi_mrf.methods.mrf.moving_window import MovingWindow
 from taichi_mrf.methods.mrf.posed import PoseUpdate
-from taichi_mrf.methods.mrf.reading import Layer, MapReading, Reading
+from taichi_mrf.methods.mrf.reading import Layer, MapReading
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.queries.change import MapChange
 from taichi_mrf.queries.colored import ColoredMap
@@ -104,8 +104,8 @@ class LayeredMap(OccupancyMap, Protocol):
         a static world."""
         ...
 
-    def reading(self, which: Reading = "surface", between: Callable[[], object] = ...) -> MapReading:
-        """The map with another rule for what is occupied; ``between`` is called between its steps."""
+    def decide(self, between: Callable[[], object] = ...) -> MapReading:
+        """The map by what is occupied; ``between`` is called between its steps."""
         ...
 
     def changes(self, since_s: float) -> MapChange:

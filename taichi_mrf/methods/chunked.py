@@ -2,8 +2,9 @@
 
 from collections import OrderedDict
 from collections.abc import Iterator
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +20,6 @@ from taichi_mrf.geometry.up import Up, up_from_name
 from taichi_mrf.inference.surface_votes import called
 from taichi_mrf.methods.map_file import check_registered
 from taichi_mrf.methods.mrf.calibrated import calibrated_block
-from taichi_mrf.methods.mrf.reading import READINGS, Reading
 from taichi_mrf.methods.stored_distances import StoredDistances
 from taichi_mrf.queries.box import BoxOfVoxels, voxels_of_box
 from taichi_mrf.queries.points import checked_points, classify, probability
@@ -59,20 +59,18 @@ def _voxels_of(points: ArrayLike, voxel_size: float) -> NDArray[np.int64]:
     return np.clip(np.floor(checked_points(points) / voxel_size), -(2**30), 2**30).astype(np.int64)
 
 
+LogOdds = Literal["marginal", "decided", "calibrated"]
+"""What the log-odds of a map in chunks are: the marginals', those of what is occupied, or those that can be
+trusted as probabilities."""
+
+
 class ChunkedMap:
     """Answers queries from a :class:`ChunkStore` on disk. It caches the chunks used last, up to ``cache_mb``
     MB (10^6 bytes); beyond that, memory grows only with the answers."""
 
-    def __init__(self, store: ChunkStore, cache_mb: float = 256.0, reading: Reading = "marginal") -> None:
-        """``reading``: see :meth:`reading`. Raises ConfigError for a cache smaller than one chunk, and for a
-        reading that the store does not hold."""
-        needed = {"surface": FIRST, "calibrated": SURFACE}.get(reading)
-        if needed is not None and needed not in store.extras:
-            raise ConfigError(
-                f"{store.path}: holds nothing of what rays measured: map the recording anew with "
-                "--keep-surface, or export from the map.npz of a run"
-            )
-        self._reading = reading
+    def __init__(self, store: ChunkStore, cache_mb: float = 256.0, by: LogOdds = "marginal") -> None:
+        """Raises ConfigError for a cache smaller than one chunk."""
+        self._by = by
         if not real(cache_mb, "cache_mb") * 1e6 >= CHUNK_BYTES:
             raise ConfigError(f"cache_mb must be at least {CHUNK_BYTES / 1e6:.3g}, not {cache_mb}")
         self.store, self.header = store, store.header
@@ -90,12 +88,22 @@ class ChunkedMap:
         """The map in a folder such as map.zarr. Raises MapFileError, TaichiMRFError without zarr."""
         return cls(ChunkStore.open(path), cache_mb)
 
-    def reading(self, which: Reading = "surface") -> "ChunkedMap":
-        """The map with another rule for what is occupied, as MRFMap.reading. Raises ConfigError for another
-        name, or if the store does not hold what rays measured."""
-        if which not in READINGS:
-            raise ConfigError(f"there is no reading {which!r}; known are {', '.join(READINGS)}")
-        return ChunkedMap(self.store, self._most * CHUNK_BYTES / 1e6, which)
+    @cached_property
+    def decided(self) -> "ChunkedMap":
+        """The map by what is occupied, as MRFMap.decided; itself if the store holds no votes of rays."""
+        if self._by != "marginal" or FIRST not in self.store.extras:
+            return self
+        return ChunkedMap(self.store, self._most * CHUNK_BYTES / 1e6, "decided")
+
+    def calibrated(self) -> "ChunkedMap":
+        """The map by the probability that voxels hold a surface, as MRFMap.calibrated. Raises ConfigError if
+        the store does not hold what rays measured."""
+        if not self.has_surface:
+            raise ConfigError(
+                f"{self.store.path}: holds nothing of what rays measured: map the recording anew with "
+                "--keep-surface, or export from the map.npz of a run"
+            )
+        return ChunkedMap(self.store, self._most * CHUNK_BYTES / 1e6, "calibrated")
 
     @property
     def up(self) -> Up | None:
@@ -157,7 +165,7 @@ class ChunkedMap:
     @tensors.in_kind("points")
     def state(self, points: ArrayLike) -> NDArray[np.int8]:
         """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,) int8."""
-        return self._state(self.log_odds(points))
+        return self._state(self.decided.log_odds(points))
 
     def box(self, lower: ArrayLike, upper: ArrayLike) -> BoxOfVoxels:
         """The voxels that overlap a box, given by two corners, (3,) in metres each, as dense arrays.
@@ -173,7 +181,8 @@ class ChunkedMap:
             place = tuple(slice(b, b + n) for b, n in zip(begin - first, block.shape, strict=True))
             log_odds[place] = np.where(np.isnan(block), self.header.prior_log_odds, block)
         x, y, z = first.tolist()
-        return BoxOfVoxels(log_odds, self._state(log_odds), (x, y, z), self.voxel_size)
+        state = self._state(log_odds) if self.decided is self else self.decided.box(lower, upper).state
+        return BoxOfVoxels(log_odds, state, (x, y, z), self.voxel_size)
 
     def voxels(
         self,
@@ -243,12 +252,12 @@ class ChunkedMap:
         return self._cache[chunk]
 
     def _read_by_rays(self, chunk: Chunk, block: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Log-odds of a chunk by the map's reading, from the marginals'."""
+        """Log-odds of a chunk by the rule of the map, from the marginals'."""
         prior = self.header.prior_log_odds
-        if self._reading == "surface":
+        if self._by == "decided":
             first = self.store.read_extra(FIRST, chunk)[..., 0] > 0
             block[first] = np.maximum(block[first], called(prior, self.header.min_evidence))
-        elif self._reading == "calibrated":
+        elif self._by == "calibrated":
             unknown = np.isnan(block)
             bricks = np.where(unknown, np.float32(prior), block).reshape((CHUNK, BRICK) * 3)
             # Free space away from surfaces has no voxels, and stays as it is, as does what is unknown.

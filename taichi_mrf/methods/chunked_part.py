@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.config.schema import Config
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.fused_surface import FusedSurface, fused_surface, within_voxels, without_free
-from taichi_mrf.export.store_header import FIRST
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.methods.capabilities import window_of
@@ -27,7 +27,7 @@ from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.origins import widened
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.owner import owned_attribute
-from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, by_chunk, grid_keys
+from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, grid_keys
 from taichi_mrf.voxels.pool import BrickPool
 
 _MARGIN = BRICK
@@ -74,6 +74,14 @@ class MapPart:
         return np.where(
             self._inside(points_m), self.source.occupancy(points_m), np.float32(self.source.prior)
         )
+
+    @cached_property
+    def decided(self) -> "MapPart":
+        """The part by what is occupied, as MRFMap.decided."""
+        by_votes, brick_m = self.source.decided, BRICK * self.voxel_size
+        if by_votes is self.source:
+            return self
+        return take_part(by_votes, self.lowest * brick_m, self.after * brick_m)
 
     @tensors.in_kind("points")
     def state(self, points: ArrayLike) -> NDArray[np.int8]:
@@ -129,17 +137,6 @@ class MapPart:
         found = without_free(self.source, found, LEAST * self.source.prior)
         found = within_voxels(found, self.voxel_size, first, after)
         return replace(found, colors=blended_colors(self, found.vertices_m) if self.has_colors else None)
-
-    def first_surfaces(self) -> NDArray[np.bool_]:
-        """Which voxels of ``view.pool`` the rays take for their first surface, (slots, 512)."""
-        out = np.zeros((self.view.pool.capacity, VOXELS), bool)
-        slots = self.view.pool.in_use
-        rows_of = by_chunk(self.view.pool.bricks[slots]) if FIRST in self.source.store.extras else ()
-        for chunk, rows in rows_of:
-            block = self.source.store.read_extra(FIRST, chunk)[..., 0] > 0
-            x, y, z = (self.view.pool.bricks[slots[rows]] - np.array(chunk) * CHUNK).T
-            out[slots[rows]] = block.reshape((CHUNK, BRICK) * 3)[x, :, y, :, z, :].reshape(-1, VOXELS)
-        return out
 
     @tensors.in_kind("points")
     def occupied_within(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:

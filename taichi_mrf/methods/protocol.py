@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +13,7 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.inference.schedule import InferReport, InferSteps, Progress
 from taichi_mrf.methods.statistics import MapStatistics
+from taichi_mrf.queries.measured_depth import Answer
 from taichi_mrf.queries.profile import RayProfile
 from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.camera import Camera
@@ -160,6 +161,12 @@ class OccupancyMap(Protocol):
         """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,) int8."""
         ...
 
+    @property
+    def decided(self) -> Any:
+        """The map whose log-odds say which voxels are occupied, perhaps this one; it can be queried and
+        exported, but not changed."""
+        ...
+
     def occupied_within(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
         """The probability that something lies within ``radius_m`` of points (N, 3), in metres: (N,)."""
         ...
@@ -172,8 +179,17 @@ class OccupancyMap(Protocol):
         """Voxels of at least this probability: centres (N, 3) in metres, and (N,)."""
         ...
 
-    def render_depth(self, camera: Camera, T_world_camera: ArrayLike) -> NDArray[np.float32]:
-        """Axial depth of the likeliest surface seen by each pixel, (H, W) float32, NaN where none is."""
+    def render_depth(
+        self, camera: Camera, T_world_camera: ArrayLike, by: Answer = "surface"
+    ) -> NDArray[np.float32]:
+        """Axial depth of the surface that each pixel most likely sees, (H, W) float32, NaN where there is
+        none: the measured one near the likeliest voxel, or ``by="omega"`` the middle of that voxel."""
+        ...
+
+    def measured_depth(
+        self, likeliest_m: NDArray[np.float32], camera: Camera, T_world_camera: ArrayLike
+    ) -> NDArray[np.float32]:
+        """Axial depth (H, W) of the measured surface where it is near the likeliest voxels, NaN elsewhere."""
         ...
 
     def ray_profile(

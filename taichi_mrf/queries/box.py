@@ -97,12 +97,14 @@ def voxel_box(
 ) -> BoxOfVoxels:
     """The voxels from ``first`` up to, but without, ``after``, (3,) voxel coordinates each.
 
-    ``reader`` saves time where many boxes of the same map are read. Raises CapacityError.
+    ``reader`` saves time where many boxes of the same map are read; states are then those of its log-odds.
+    Raises CapacityError.
     """
     lowest, highest = first // BRICK, (after - 1) // BRICK
     shape = highest - lowest + 1
     voxels = float(np.prod(shape.astype(np.float64))) * BRICK**3
     check_memory(_BYTES_PER_VOXEL * voxels, f"a box of {voxels / 1e6:.3g} million voxels")
+    whole = reader is None
     reader = BrickReader(m) if reader is None else reader
     values = reader.log_odds(bricks_between(lowest, highest))
     in_order = values.reshape(*shape, BRICK, BRICK, BRICK).transpose(0, 3, 1, 4, 2, 5)
@@ -110,4 +112,8 @@ def voxel_box(
     cut = tuple(slice(int(b), int(e)) for b, e in zip(begin, end, strict=True))
     log_odds = np.ascontiguousarray(in_order.reshape(shape * BRICK)[cut])
     x, y, z = first.tolist()
-    return BoxOfVoxels(log_odds, reader.state(log_odds), (x, y, z), m.voxel_size)
+    if whole and m.decided is not m:
+        state = voxel_box(m.decided, first, after).state
+    else:
+        state = reader.state(log_odds)
+    return BoxOfVoxels(log_odds, state, (x, y, z), m.voxel_size)

@@ -55,6 +55,7 @@ def cast_rays(
     policy, for arrays that do not fit or are not finite and for a direction of no length, CapacityError if
     the rays reach through more space than fits memory.
     """
+    m = m.decided
     if unknown not in _POLICIES:
         raise ConfigError(f"unknown must be one of {', '.join(_POLICIES)}, not {unknown!r}")
     rays = GivenRays(origins, directions)

@@ -68,7 +68,8 @@ def compare_maps(a: QueriedMap, b: QueriedMap, bricks: Bricks | None = None) -> 
     """Compare two maps over all that is known in either, also seen-free space without voxels; or only in
     ``bricks``, (n, 3) coordinates.
 
-    The maps can be of different methods. Raises ConfigError if their voxels are of different sizes.
+    States are those of the maps' own log-odds: give ``m.decided`` to compare what is occupied. The maps can
+    be of different methods. Raises ConfigError if their voxels are of different sizes.
     """
     if not np.isclose(a.voxel_size, b.voxel_size, rtol=1e-6):
         raise ConfigError(

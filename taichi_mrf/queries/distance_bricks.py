@@ -77,6 +77,7 @@ class DistanceBricks:
 
         ``within``: only bricks in this box count. Raises CapacityError.
         """
+        m = m.decided
         bricks, sources = self._sources(m, within)
         if not len(bricks):
             return 0

@@ -43,6 +43,7 @@ def find_frontiers(m: QueriedMap, min_voxels: int = 1) -> Frontiers:
 
 def frontier_voxels(m: QueriedMap) -> NDArray[np.int32]:
     """Coordinates (n, 3) of the free voxels that share a face with an unknown one, ascending by chunk."""
+    m = m.decided
     reader = BrickReader(m)
     found = [np.zeros((0, 3), np.int32)]
     for chunk in sorted_bricks(known_bricks(m) // CHUNK).astype(np.int64):

@@ -43,6 +43,11 @@ class QueriedMap(Protocol):
     @property
     def up(self) -> Up | None: ...
 
+    @property
+    def decided(self) -> "QueriedMap":
+        """The map whose log-odds say which voxels are occupied, perhaps this one."""
+        ...
+
     def occupancy(self, points: ArrayLike) -> NDArray[np.float32]: ...
 
     def state(self, points: ArrayLike) -> NDArray[np.int8]: ...
@@ -84,7 +89,7 @@ class BrickReader:
         out[~exist] = self._without_voxels(bricks[~exist])[:, None]
         return out
 
-    def state(self, log_odds: NDArray[np.float32]) -> NDArray[np.int8]:
+    def state(self, log_odds: NDArray[np.floating]) -> NDArray[np.int8]:
         """UNKNOWN, FREE or OCCUPIED for log-odds of this map, of any shape."""
         return classify(log_odds, self.pool.prior_log_odds, self.map.view.volume.min_evidence)
 
@@ -99,9 +104,9 @@ class BrickReader:
         if not len(bricks):
             return np.zeros(0, np.float32)
         centres = brick_centres(bricks, self.map.voxel_size)
-        p = np.maximum(self.map.occupancy(centres).astype(np.float64), _LEAST_PROBABILITY)
-        free = self.map.state(centres) == FREE
-        return np.where(free, np.log(p / (1 - p)), self.pool.prior_log_odds).astype(np.float32)
+        log_odds = _log_odds_at(self.map, centres)
+        free = self.state(log_odds) == FREE
+        return np.where(free, log_odds, self.pool.prior_log_odds).astype(np.float32)
 
 
 def seen_free_bricks(m: QueriedMap) -> Bricks:
@@ -157,8 +162,15 @@ def _free_without_voxels(m: QueriedMap, reader: BrickReader, lower: Bricks, uppe
         bricks = bricks_between(np.array([first, *lower[1:]]), np.array([last, *upper[1:]]))
         bricks = bricks[reader.slots(bricks) < 0]
         if len(bricks):
-            found.append(bricks[m.state(brick_centres(bricks, m.voxel_size)) == FREE])
+            log_odds = _log_odds_at(m, brick_centres(bricks, m.voxel_size))
+            found.append(bricks[reader.state(log_odds) == FREE])
     return np.concatenate(found)
+
+
+def _log_odds_at(m: QueriedMap, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Log-odds of a map at points (N, 3) without voxels, which votes of rays say nothing of: (N,)."""
+    p = np.maximum(m.occupancy(points_m).astype(np.float64), _LEAST_PROBABILITY)
+    return np.asarray(np.log(p / (1 - p)))
 
 
 def bricks_between(lower: NDArray[np.integer], upper: NDArray[np.integer]) -> Bricks:

@@ -27,6 +27,15 @@ _ALL_DIM = Occlusion()
 _NO_NOISE = NoiseTable(np.zeros((1, 2, 5), np.float32), 1 << 30, 1)
 
 
+def viewed_box(
+    camera: Camera, T_world_camera: Pose, max_depth: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The upright box, two corners (3,) in metres, around all that a camera sees up to ``max_depth``."""
+    corners = camera.tile_hulls(max(camera.shape)).reshape(-1, 3) * max_depth
+    points = np.concatenate([corners @ T_world_camera[:3, :3].T, np.zeros((1, 3))]) + T_world_camera[:3, 3]
+    return widened(camera, T_world_camera, points.min(axis=0), points.max(axis=0))
+
+
 class View:
     """Follows rays through a pool of bricks."""
 
@@ -88,12 +97,7 @@ class View:
         near, far, visibility, expected, likelihood = np.zeros((5, *camera.shape), np.float32)
         visibility[:] = 1.0
         survey = SurfaceSurvey(near, far, visibility, expected, likelihood)
-        corners = camera.tile_hulls(max(camera.shape)).reshape(-1, 3) * max_depth
-        points = (
-            np.concatenate([corners @ T_world_camera[:3, :3].T, np.zeros((1, 3))]) + T_world_camera[:3, 3]
-        )
-        box = widened(camera, T_world_camera, points.min(axis=0), points.max(axis=0))
-        window = self.fill(np.stack(box))
+        window = self.fill(np.stack(viewed_box(camera, T_world_camera, max_depth)))
         if window is None:
             return survey
         judged = measured_m is not None

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from taichi_mrf.calibration.from_recording import LearntSigma
-from taichi_mrf.config.registry import METHODS, methods_with
+from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import commented_yaml
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import reposed
-from taichi_mrf.errors import ConfigError, CutShortError, FrameError
+from taichi_mrf.errors import CutShortError, FrameError
 from taichi_mrf.evaluation.held_out import HeldOutCheck, RenderedMap, check_held_out
 from taichi_mrf.evaluation.noise_check import NoiseCheck, check_noise
 from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
@@ -22,9 +22,8 @@ from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.export.ply import photo_at, write_voxels
 from taichi_mrf.export.trajectory import CAMERA_AXES, LIDAR_AXES, write_trajectory
 from taichi_mrf.mapping.result import MappingResult
-from taichi_mrf.methods.capabilities import has_layers, window_of
+from taichi_mrf.methods.capabilities import window_of
 from taichi_mrf.methods.chunked_part import ChunkedViews, in_chunks
-from taichi_mrf.methods.mrf.reading import MapReading, Reading
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.runs.files import (
     CONFIG_FILE,
@@ -115,18 +114,17 @@ def write_run(
     *,
     check: bool = True,
     pictures: bool = True,
-    reading: Reading = "marginal",
     haste: Haste = NO_HASTE,
     advance: Advance = lambda stage, done, total: None,
 ) -> tuple[dict[str, Any], list[Path]]:
     """Write all files of a run to a folder that exists: the map first, because the time went into it, the
     report last. With ``check`` the held-out frames are compared with the map, and the poses with the depth;
     with ``pictures`` it is drawn, if it is in memory as a whole; both are left out in ``haste``. Pictures of
-    an earlier run are removed. ``reading`` says what is occupied in the voxels' file and their pictures.
+    an earlier run are removed.
 
-    Returns the report and the paths. Raises MapFileError, ConfigError if the map has no such reading.
+    Returns the report and the paths. Raises MapFileError.
     """
-    written, occupied, shown = _write_map(folder, result, facts.config, reading, advance)
+    written, occupied = _write_map(folder, result, facts.config, advance)
     chunked = in_chunks(result.map)
     posed = facts.dataset
     if posed is not None and result.track is not None:
@@ -147,7 +145,7 @@ def write_run(
     if chunked is not None:
         report["notes"].append(_LARGER_THAN_MEMORY.format(len(chunked.chunks)))
     elif pictures:
-        written += _write_pictures(folder, result, posed, shown, haste, advance)
+        written += _write_pictures(folder, result, posed, haste, advance)
     if facts.learnt is not None:
         write_text(folder / NOISE_FILE, sensor_yaml(facts.config.sensor, facts.source, facts.learnt))
         written.append(folder / NOISE_FILE)
@@ -163,11 +161,10 @@ def write_report(folder: Path, result: MappingResult, facts: RunFacts) -> None:
     write_text(folder / REPORT_FILE, report_json(facts.report(result, None)))
 
 
-def write_voxel_file(path: Path, m: OccupancyMap, shown: MapReading | None = None) -> int:
-    """Write the voxels that are more likely occupied than free, of a map with a window as of its last save,
-    in the colours that cameras saw if the map has them; returns their number. ``shown`` takes the place of
-    its marginals. Raises MapFileError."""
-    centres, probability = (in_chunks(m) or shown or m).voxels(min_probability=0.5)
+def write_voxel_file(path: Path, m: OccupancyMap) -> int:
+    """Write the occupied voxels, of a map with a window as of its last save, in the colours that cameras saw
+    if the map has them; returns their number. Raises MapFileError."""
+    centres, probability = (in_chunks(m) or m).decided.voxels(min_probability=0.5)
     write_voxels(path, centres, probability, m.voxel_size, photo_at(m, centres))
     return len(centres)
 
@@ -184,28 +181,16 @@ def _nothing_occupied(config: Config) -> str:
     return f"The map is empty: no voxel has a probability of 0.5 or more; {advice}."
 
 
-def _read_as(m: OccupancyMap, reading: Reading) -> MapReading | None:
-    """A map by a reading, None for its marginals. Raises ConfigError if it has no other."""
-    if reading == "marginal":
-        return None
-    if not has_layers(m) or in_chunks(m) is not None:
-        raise ConfigError(
-            f"a {reading} reading needs a map of {methods_with('has_layers')}, in memory as a whole"
-        )
-    return m.reading(reading)
-
-
 def _write_map(
-    folder: Path, result: MappingResult, config: Config, reading: Reading, advance: Advance
-) -> tuple[list[Path], int, MapReading | None]:
-    """Returns the paths, the number of occupied voxels, and the map by a reading other than its marginals."""
+    folder: Path, result: MappingResult, config: Config, advance: Advance
+) -> tuple[list[Path], int]:
+    """Returns the paths and the number of occupied voxels."""
     advance("Writing", 0, 2)
     with result.timed("writing"):
         result.map.save(folder / MAP_FILE)
         write_text(folder / CONFIG_FILE, commented_yaml(config))
         advance("Writing", 1, 2)
-        shown = _read_as(result.map, reading)
-        occupied = write_voxel_file(folder / VOXEL_FILE, result.map, shown)
+        occupied = write_voxel_file(folder / VOXEL_FILE, result.map)
         advance("Writing", 2, 2)
         written = [folder / MAP_FILE, folder / VOXEL_FILE, folder / CONFIG_FILE]
         if window_of(result.map) is not None:
@@ -215,7 +200,7 @@ def _write_map(
             poses = result.track.trajectory(result.map)
             write_trajectory(folder / TRAJECTORY_FILE, poses, LIDAR_AXES if z_up else CAMERA_AXES)
             written.append(folder / TRAJECTORY_FILE)
-    return written, occupied, shown
+    return written, occupied
 
 
 def _check(
@@ -257,7 +242,6 @@ def _write_pictures(
     folder: Path,
     result: MappingResult,
     dataset: Dataset | None,
-    shown: MapReading | None,
     haste: Haste,
     advance: Advance,
 ) -> list[Path]:
@@ -267,7 +251,7 @@ def _write_pictures(
         with result.timed("pictures"), haste.cutting_short():
             held_out = _spread(result.held_out, PICTURED_FRAMES)
             frames = [] if dataset is None else _readable(dataset, held_out)
-            pictures = write_pictures(folder, result.map, frames, shown)
+            pictures = write_pictures(folder, result.map, frames)
     except CutShortError:
         return []
     advance("Drawing", 1, 1)

@@ -22,9 +22,6 @@ Layer = Literal["map", "baseline", "dynamic"]
 """The map itself; the baseline beside it, OctoMap's log-odds update of the same keyframes; and of the map the
 bricks with dynamic voxels, those whose log-odds are not below 0."""
 
-Reading = Literal["marginal", "surface", "calibrated"]
-"""By which rule voxels are occupied, as ``MRFMap.reading`` has them."""
-
 KeyframeState = Literal["on", "off", "frozen"]
 
 
@@ -323,8 +320,7 @@ class PixelRay(Request):
 class Watch(Request):
     """Which extras the page shows and the mapping process must keep up to date: images of ``view`` (a
     keyframe, or None for the current camera), the baseline beside the map, the ``counts`` of keyframes that
-    see each voxel (else sent as 0), the ``colors`` of voxels, and the measured ``surface``; and by
-    which ``reading`` voxels are occupied."""
+    see each voxel (else sent as 0), the ``colors`` of voxels, and the measured ``surface``."""
 
     images: bool
     view: int | None
@@ -332,7 +328,6 @@ class Watch(Request):
     counts: bool = False
     colors: bool = False
     surface: bool = False
-    reading: Reading = "marginal"
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,9 @@
-"""Signed distances from a surface for the voxels of some bricks, as sums over measurements."""
+"""Signed distances from a surface for the voxels of some bricks, as sums over measurements.
+
+Where few rays have crossed a voxel, as far away or at small voxels, its mean distance is noise. There the
+field is blended with its surroundings: with g = t / (t + W), a voxel of weight W takes g times the sums of
+the 27 voxels around it (binomial weights) to its own, so a voxel that many rays have crossed stays as it is.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +19,15 @@ Sums = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 
 VALUES = 3
 """How many sums a voxel has."""
+
+BLENDED_BELOW = 0.3
+"""t: the weight at which a voxel's mean distance has a standard deviation of about half a voxel."""
+
+LEAST_WEIGHT = 0.02
+"""A voxel with less has no distance, nor has one that no ray has crossed."""
+
+MARGIN = 1
+"""Voxels around a box that blending reads."""
 
 
 class DistanceSource(Protocol):
@@ -74,6 +88,30 @@ class DistanceField:
             boxes.append(np.ascontiguousarray(dense.reshape(shape * BRICK)[cut]))
         return boxes[0], boxes[1], boxes[2]
 
+    def rows_around(self) -> NDArray[np.int32]:
+        """The rows of the 27 bricks in and around each, (n, 27), x slowest; -1 where there is none."""
+        steps = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1) - 1
+        wanted = grid_keys((self.bricks[:, None] + steps).reshape(-1, 3))
+        rows = np.minimum(np.searchsorted(self._keys, wanted), len(self._keys) - 1)
+        rows = np.where(self._keys[rows] == wanted, rows, -1)
+        return rows.astype(np.int32).reshape(-1, 27)
+
     @cached_property
     def _keys(self) -> NDArray[np.int64]:
         return grid_keys(self.bricks)
+
+
+def blended_sums(weight: NDArray[np.float32], *sums: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    """Sums of weight, and others, of a box (a, b, c) of voxels, blended with their surroundings; the box
+    shrinks by MARGIN on each side."""
+    inner = (slice(MARGIN, -MARGIN),) * 3
+    share = BLENDED_BELOW / (BLENDED_BELOW + weight[inner])
+    return [each[inner] + share * _binomial(each) for each in (weight, *sums)]
+
+
+def _binomial(sums: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Each voxel and its neighbours with the weights 1/2, 1, 1/2 along each axis."""
+    for axis in range(3):
+        sums = np.moveaxis(sums, axis, 0)
+        sums = np.moveaxis(sums[1:-1] + 0.5 * (sums[:-2] + sums[2:]), 0, axis)
+    return sums

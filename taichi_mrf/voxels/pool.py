@@ -86,11 +86,13 @@ class BrickPool:
         self.evidence: ti.Ndarray | None = None
         self.dated: Dated | None = None
         self._shown: ti.Ndarray | None = None
+        self.shown: PoolSnapshot | None = None  # instead of the pool itself
         self.bricks = np.zeros((0, 3), np.int32)
         self.owners = np.zeros(0, np.int32)
         self.identity = np.zeros(0, np.int64)
         self.change_count = np.zeros(0, np.int64)  # changed marginals in each brick since it was allocated
         self.revision = 0  # changes whenever the beliefs do
+        self.restarts = 0  # how often all of them were set anew
         self._touched = np.zeros(0, bool)
         self._changed = np.zeros(0, bool)
         self._free: list[int] = []
@@ -154,6 +156,7 @@ class BrickPool:
     def restart(self) -> None:
         """Set all beliefs to what inference starts from."""
         self.revision += 1
+        self.restarts += 1
         self._touched[:] = True
         if self.evidence is not None:
             self.total.copy_from(self.evidence)
@@ -192,6 +195,7 @@ class BrickPool:
     def restore(self, snapshot: PoolSnapshot) -> None:
         """Set the sums of messages back to a snapshot's. The bricks must still be the same."""
         self.revision += 1
+        self.restarts += 1
         self._touched[:] = True
         self.total.copy_from(snapshot.total)
         runtime.settle()  # before the snapshot is dropped
@@ -199,12 +203,13 @@ class BrickPool:
     @contextmanager
     def showing(self, snapshot: PoolSnapshot) -> Iterator[None]:
         """Let queries and files see a snapshot while the block runs, which must not change the pool."""
-        now = self._shown, self.bricks, self.owners
+        now = self._shown, self.bricks, self.owners, self.shown
         self._shown, self.bricks, self.owners = snapshot.belief, snapshot.bricks, snapshot.owners
+        self.shown = snapshot
         try:
             yield
         finally:
-            self._shown, self.bricks, self.owners = now
+            self._shown, self.bricks, self.owners, self.shown = now
 
     def keep_evidence(self) -> "ti.Ndarray":
         """The evidence channel, made when something is frozen for the first time."""

@@ -68,6 +68,9 @@ class PoolMap:
     def view(self) -> View:
         return View(self.pool, self.voxel_size, VolumeConfig())
 
+    def measured_depth(self, likeliest_m: NDArray, camera: PinholeCamera, T_world_camera: NDArray) -> NDArray:
+        return np.full(camera.shape, np.nan, np.float32)
+
 
 @dataclass(frozen=True)
 class Case:

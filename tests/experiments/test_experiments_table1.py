@@ -141,9 +141,9 @@ def test_rays_end_on_the_measured_surface_where_it_is_near(tables: list[Table], 
         m = MRFMap(size, scene.noise, volume=scene.volume, max_depth=scene.max_depth, ray_density=0.0)
         mapped(m, scene, fold)
         view = scene.views[fold]
-        voxel_m = judge_view(m, view.true_m, view.T_world_camera, scene.camera, mask=view.judged).answer_m
-        surface = m.surface()
-        surface_m = surface.depth_near(voxel_m, scene.camera, view.T_world_camera, size)
+        parts = (view.true_m, view.T_world_camera, scene.camera)
+        voxel_m = judge_view(m, *parts, mask=view.judged, by="omega").answer_m
+        surface_m = m.measured_depth(voxel_m, scene.camera, view.T_world_camera)
         near = ~np.isnan(surface_m)
         assert 0.2 < near.mean() < 1.0
         off = np.abs(np.where(near, surface_m, voxel_m) - view.true_m)[view.judged & (view.true_m > 0)]

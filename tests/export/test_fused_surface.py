@@ -9,7 +9,7 @@ import pytest
 from taichi_mrf import MRFMap, PinholeCamera, PolynomialNoise
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.formats import export_map, export_note
-from taichi_mrf.export.fused_surface import NEAR_M, NEAR_VOXELS, _normals, without_free
+from taichi_mrf.export.fused_surface import _normals, without_free
 from taichi_mrf.export.options import ExportOptions
 
 pytestmark = pytest.mark.usefixtures("backend")
@@ -63,43 +63,17 @@ def test_depth_of_a_wall_on_voxels_faces_is_rendered_where_it_is() -> None:
     inner = (slice(15, 45), slice(20, 60))
     np.testing.assert_allclose(depth_m[inner], 30 * VOXEL - 0.2, atol=0.04 * VOXEL)
     # The middle of a voxel, in front of the wall or behind it, is half a voxel away.
-    assert np.abs(m.render_depth(CAMERA, T)[inner] - (30 * VOXEL - 0.2)).mean() > 0.4 * VOXEL
-    refined = m.render_depth(CAMERA, T, m.surface())
-    np.testing.assert_array_equal(refined[inner], depth_m[inner])
+    assert np.abs(m.render_depth(CAMERA, T, by="omega")[inner] - (30 * VOXEL - 0.2)).mean() > 0.4 * VOXEL
+    np.testing.assert_allclose(m.render_depth(CAMERA, T)[inner], depth_m[inner], atol=0.01 * VOXEL)
     T_far = T.copy()
     T_far[2, 3] -= 1.0  # past the edge of the surface
-    depth_m, far = m.surface().render_depth(CAMERA, T_far), m.render_depth(CAMERA, T_far)
-    holes = np.isnan(depth_m)
+    far = m.render_depth(CAMERA, T_far, by="omega")
+    holes = np.isnan(m.measured_depth(far, CAMERA, T_far))
     assert holes.any()
-    np.testing.assert_array_equal(m.render_depth(CAMERA, T_far, m.surface())[holes], far[holes])
+    np.testing.assert_array_equal(m.render_depth(CAMERA, T_far)[holes], far[holes])
     T[:3, :3] = np.diag([-1.0, 1.0, -1.0])  # the other way, where nothing is
     assert np.isnan(m.surface().render_depth(CAMERA, T)).all()
-    assert np.isnan(m.render_depth(CAMERA, T, m.surface())).all()
-
-
-@pytest.mark.parametrize(("voxel_size", "near_m"), [(0.02, NEAR_M), (0.2, NEAR_VOXELS * 0.2)])
-def test_the_surfaces_depth_is_given_where_it_is_near(voxel_size: float, near_m: float) -> None:
-    pytest.importorskip("embreex")
-    surface = _map_of_plane(0.0).surface()
-    T = np.eye(4)
-    own = surface.render_depth(CAMERA, T)
-    along = np.abs(CAMERA.rays() @ NORMAL)  # metres along the plane's normal for a metre of depth
-    off = np.linspace(-2 * near_m, 2 * near_m, CAMERA.width, dtype=np.float32)
-    coarse = (own + off / along).astype(np.float32)
-    coarse[0] = np.nan
-    found = surface.depth_near(coarse, CAMERA, T, voxel_size)
-    assert np.isnan(found[0]).all()
-    expected = np.where(np.abs(off) < near_m, own, np.float32(np.nan))[1:]
-    clear = np.abs(np.abs(off) - near_m) > 0.02 * near_m  # triangles are not quite in the plane
-    assert 0.2 < np.isfinite(expected).mean() < 0.8
-    inner = (slice(5, -5), np.flatnonzero(clear))
-    np.testing.assert_array_equal(found[1:][inner], expected[inner])
-
-
-def test_a_map_is_rendered_with_nothing_but_its_surface() -> None:
-    m = _map_of_plane(0.0)
-    with pytest.raises(TypeError, match=r"surface must be what m\.surface\(\) gives"):
-        m.render_depth(CAMERA, np.eye(4), m)  # type: ignore[arg-type]
+    assert np.isnan(m.render_depth(CAMERA, T)).all()
 
 
 def test_the_standard_deviation_grows_where_rays_are_few() -> None:

@@ -10,7 +10,7 @@ from oracles.forward import Noise
 from uncertain_wall import WALL_M, uncertain_wall
 
 from taichi_mrf.config.inference import InferenceConfig
-from taichi_mrf.errors import ConfigError, KeyframeError
+from taichi_mrf.errors import KeyframeError
 from taichi_mrf.inference.surface_votes import CALLED, GRAZED
 from taichi_mrf.methods.mrf import keyframe_allocator
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -78,29 +78,30 @@ def test_voxels_are_called_as_the_rays_vote(seed: int, count: int, sigma: float)
     assume(len(doubtful) < len(voxels))
     called = reference.logistic(CALLED)
     expected = {v: max(p[v], called) if votes.get(v, 0) > 0 else p[v] for v in voxels if v not in doubtful}
-    got = marginals(m.reading("surface"), list(expected))
+    got = marginals(m.decided, list(expected))
     np.testing.assert_allclose(got, list(expected.values()), atol=1e-5)
-    np.testing.assert_array_equal(marginals(m.reading("marginal"), voxels), before)
+    np.testing.assert_array_equal(marginals(m.layer(), voxels), before)
     event(f"{sum(votes.get(v, 0) > 0 for v in expected)} voxels called")
 
 
 def test_a_wall_that_no_voxel_is_sure_of_stops_rays() -> None:
     m = uncertain_wall()
     straight = np.linspace(-0.3, 0.5, 9)[:, None] * [1, 0, 0] + [0.003, 0.02, 0]
-    assert not cast_rays(m, straight, (0, 0, 1), 3.0).hit.any()
-    surface = m.reading("surface")
-    found = cast_rays(surface, straight, (0, 0, 1), 3.0)
+    assert not cast_rays(m.layer(), straight, (0, 0, 1), 3.0).hit.any()
+    surface = m.decided
+    found = cast_rays(m, straight, (0, 0, 1), 3.0)
     assert found.hit.mean() > 0.8
     np.testing.assert_allclose(found.range[found.hit] + VOXEL / 2, WALL_M, atol=2.5 * VOXEL)
     called = found.point[found.hit] + [0, 0, VOXEL / 2]
-    assert (surface.state(called) == OCCUPIED).all()
+    assert (m.state(called) == OCCUPIED).all()
+    np.testing.assert_array_equal(surface.state(called), m.state(called))
     assert len(surface.voxels()[0]) > len(m.voxels()[0])
 
 
 def test_what_marginals_call_occupied_stays_so() -> None:
     m = uncertain_wall()
     centres, before = m.voxels(0.0)
-    after = m.reading("surface").occupancy(centres)
+    after = m.decided.occupancy(centres)
     assert (after >= before).all()
     raised = after > before
     assert raised.any()
@@ -109,19 +110,31 @@ def test_what_marginals_call_occupied_stays_so() -> None:
 
 def test_a_reading_follows_edits() -> None:
     edited, plain = uncertain_wall(3), uncertain_wall(2)
-    reading = edited.reading("surface")
+    reading = edited.decided
     edited.remove_keyframe(2)
     with pytest.raises(KeyframeError, match="has changed since it was read"):
         reading.occupancy(np.zeros((1, 3)))
     edited.infer()
     centres, _ = plain.voxels(0.0)
-    np.testing.assert_array_equal(
-        edited.reading("surface").occupancy(centres), plain.reading("surface").occupancy(centres)
-    )
+    np.testing.assert_array_equal(edited.decided.occupancy(centres), plain.decided.occupancy(centres))
+
+
+def test_a_new_keyframe_adds_its_votes_to_those_of_before() -> None:
+    m, scene = uncertain_wall(2), uncertain_wall(3)
+    assert m.decided is m.decided
+    third = scene.keyframes[2]
+    before = int(m.first_surfaces().sum())
+    m.add_keyframe(third.depth_m, third.T_world_camera, third.camera)
+    m.renew()
+    followed = m.decided
+    assert m.first_surfaces().sum() != before
+    centres, _ = scene.voxels(0.0)
+    same = followed.state(centres) == scene.decided.state(centres)
+    assert same.mean() > 0.97  # votes of the first two are those of before
+    m.infer()
+    np.testing.assert_array_equal(m.decided.occupancy(centres), scene.decided.occupancy(centres))
 
 
 def test_an_empty_map_can_be_read() -> None:
     m = MRFMap(VOXEL)
-    assert len(m.reading("surface").voxels()[0]) == 0
-    with pytest.raises(ConfigError, match="there is no reading 'first'"):
-        m.reading("first")  # type: ignore[arg-type]
+    assert len(m.decided.voxels()[0]) == 0

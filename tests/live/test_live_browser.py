@@ -69,7 +69,7 @@ def page(late_page: LivePage, request: pytest.FixtureRequest) -> Iterator[LivePa
 
 def voxels_of(m: MRFMap, probability: float) -> int:
     """How many voxels of a map are at least so probable."""
-    return len(m.voxels(probability)[0])
+    return len(m.decided.voxels(probability)[0])
 
 
 def test_voxels_appear_as_keyframes_arrive(program: LiveProgram, browser: "Browser") -> None:
@@ -195,15 +195,6 @@ def test_the_surface_takes_the_place_of_voxels(page: LivePage, saved: MRFMap) ->
     page.select("Color by", "marginal")
     page.select("Show", "voxels")
     page.until(lambda seen: seen.agrees and seen.voxels == voxels_of(saved, 0.5), "voxels again")
-
-
-def test_a_reading_says_what_is_occupied(page: LivePage, saved: MRFMap) -> None:
-    expected = len(saved.reading("surface").voxels(0.5)[0])
-    page.select("Reading", "surface")
-    page.until(lambda seen: seen.settled and seen.voxels == expected, "the first surfaces of rays")
-    page.screenshot("live_reading")
-    page.select("Reading", "marginal")
-    page.until(lambda seen: seen.settled and seen.voxels == voxels_of(saved, 0.5), "marginals")
 
 
 def test_the_outlines_of_bricks_come_and_go(page: LivePage) -> None:

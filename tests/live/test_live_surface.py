@@ -29,7 +29,6 @@ from taichi_mrf.viewer.messages import (
 pytestmark = pytest.mark.usefixtures("one_backend")
 
 SHOW = Watch(images=False, view=None, baseline=False, surface=True)
-FIRST = Watch(images=False, view=None, baseline=False, reading="surface")
 
 Triangle = tuple[tuple[float, ...], ...]
 
@@ -97,39 +96,26 @@ def test_a_map_without_a_surface_says_why() -> None:
     assert not link.of_type(SurfacePatch)
 
 
-def test_voxels_are_those_of_the_reading_that_is_asked_for() -> None:
+def test_voxels_are_those_that_are_occupied() -> None:
     link = FakeLink()
     session = session_of(link)
-    by_marginal = map_voxels(finished(session))
-    link.ask(FIRST)
     m = finished(session)
     by_rays = shown(link.sent).voxels()
-    assert by_rays == map_voxels(m.reading("surface"))
-    assert by_rays > by_marginal
-    link.ask(replace(FIRST, reading="calibrated"))
-    m = finished(session)
-    assert shown(link.sent).voxels() == map_voxels(m.reading("calibrated"))
-    link.ask(FIRST)
+    assert by_rays == map_voxels(m) > map_voxels(m.layer())
     link.ask(Switch(1, on=False))
     m = finished(session)
-    assert shown(link.sent).voxels() == map_voxels(m.reading("surface"))
-    link.ask(replace(FIRST, reading="marginal"))
-    m = finished(session)
-    assert shown(link.sent).voxels() == map_voxels(m)
-    link.ask(FIRST)
-    finished(session)
+    assert by_rays != shown(link.sent).voxels() == map_voxels(m)
     session.reconnect(other := FakeLink())
     finished(session)
-    assert shown(other.sent).voxels() == map_voxels(m)  # a new page shows marginals
+    assert shown(other.sent).voxels() == map_voxels(m)
     assert link.errors() == []
 
 
-def test_the_past_is_that_of_marginals_and_now_returns_to_the_reading() -> None:
+def test_the_past_is_that_of_marginals() -> None:
     link = FakeLink()
     session = session_of(link, config=replace(CONFIG, time=TimeConfig(half_life_s=600.0)))
-    link.ask(FIRST)
     m = finished(session)
-    now, then = map_voxels(m.reading("surface")), m.keyframes[0].stamp_s
+    now, then = map_voxels(m), m.keyframes[0].stamp_s
     assert shown(link.sent).voxels() == now
     link.ask(ShowTime(then))
     finished(session)
@@ -137,14 +123,6 @@ def test_the_past_is_that_of_marginals_and_now_returns_to_the_reading() -> None:
     link.ask(ShowTime(None))
     finished(session)
     assert shown(link.sent).voxels() == now
-
-
-def test_a_map_without_readings_says_why() -> None:
-    link = FakeLink()
-    session = session_of(link, config=replace(CONFIG, method="log_odds"))
-    link.ask(FIRST)
-    session.run(never)
-    assert link.errors() == ["no surface reading: a map of the method log_odds has marginals only"]
 
 
 def test_the_button_saves_the_mesh_that_export_writes(tmp_path: Path) -> None:

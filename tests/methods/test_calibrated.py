@@ -57,7 +57,7 @@ def test_without_distances_there_is_no_answer() -> None:
 
 def test_an_uncertain_wall_is_where_it_was_measured() -> None:
     m = uncertain_wall()
-    centres, p = m.reading("calibrated").voxels()
+    centres, p = m.calibrated().voxels()
     assert len(centres) > 3 * len(m.voxels()[0])
     assert (np.abs(centres[:, 2] - WALL_M) < 1.5 * VOXEL).mean() > 0.8
     assert p.max() <= 1
@@ -86,6 +86,6 @@ def test_the_reading_follows_edits() -> None:
     edited.infer()
     centres, _ = plain.voxels(0.0)
     np.testing.assert_array_equal(
-        edited.reading("calibrated").occupancy(centres), plain.reading("calibrated").occupancy(centres)
+        edited.calibrated().occupancy(centres), plain.calibrated().occupancy(centres)
     )
-    assert len(MRFMap(VOXEL).reading("calibrated").voxels()[0]) == 0
+    assert len(MRFMap(VOXEL).calibrated().voxels()[0]) == 0

@@ -85,7 +85,7 @@ def test_no_more_chunks_are_held_than_the_cache_may(stores: dict[str, Path]) -> 
     for begin in range(0, len(points), 5000):
         piece = slice(begin, begin + 5000)
         np.testing.assert_array_equal(chunked.state(points[piece]), expected[piece])
-        held.append(len(chunked._cache))
+        held.append(len(chunked.decided._cache))
     assert max(held) == 2 < len(chunked.chunks)
     with pytest.raises(ConfigError, match="cache_mb"):
         ChunkedMap.open(stores["mrf"], cache_mb=0.5)

@@ -90,20 +90,21 @@ def test_info_tells_what_a_store_holds(store: Path, capsys: pytest.CaptureFixtur
     assert "colors and surface" in capsys.readouterr().out
 
 
-def test_readings_and_balls_are_those_of_the_map(m: MRFMap, store: Path, tmp_path: Path) -> None:
+def test_states_probabilities_and_balls_are_those_of_the_map(m: MRFMap, store: Path, tmp_path: Path) -> None:
     chunked, points = ChunkedMap.open(store), scene.probes()
     marginal, ours, theirs = (
         chunked.occupancy(points),
-        chunked.reading().occupancy(points),
-        m.reading("surface"),
+        chunked.decided.occupancy(points),
+        m.decided,
     )
     assert ((ours > 0.5) & (marginal <= 0.5)).sum() > 20
     np.testing.assert_allclose(ours, theirs.occupancy(points), atol=1e-6)
-    np.testing.assert_array_equal(chunked.reading("marginal").occupancy(points), marginal)
-    calibrated = chunked.reading("calibrated").occupancy(points)
-    np.testing.assert_allclose(calibrated, m.reading("calibrated").occupancy(points), atol=1e-5)
+    np.testing.assert_array_equal(chunked.occupancy(points), marginal)
+    calibrated = chunked.calibrated().occupancy(points)
+    np.testing.assert_allclose(calibrated, m.calibrated().occupancy(points), atol=1e-5)
     assert np.abs(calibrated - marginal).max() > 0.1
-    part = take_part(chunked.reading())
+    part = take_part(chunked).decided
+    np.testing.assert_array_equal(chunked.state(points), theirs.state(points))
     assert {tuple(c) for c in part.voxels()[0].round(6)} == {tuple(c) for c in theirs.voxels()[0].round(6)}
     rays = scene.CAMERA.rays()[::6, ::6].reshape(-1, 3)
     hits = [cast_rays(each, np.zeros(3), rays, 4.0).range for each in (part, theirs)]
@@ -113,10 +114,7 @@ def test_readings_and_balls_are_those_of_the_map(m: MRFMap, store: Path, tmp_pat
     way = np.array([[0.0, 0.0, 0.3], [0.0, 0.0, 1.0], [0.4, 0.0, 1.9]])
     assert whole.path_collision(way, 0.1) == pytest.approx(m.path_collision(way, 0.1), abs=1e-5)
     out = tmp_path / "voxels.ply"
-    assert (
-        carry_out("export", store, "--to", out, "--reading", "surface", "--arch", runtime.active() or "cpu")
-        == 0
-    )
+    assert carry_out("export", store, "--to", out, "--arch", runtime.active() or "cpu") == 0
     assert len(trimesh.load(out).vertices) >= len(theirs.voxels()[0])
 
 
@@ -129,9 +127,7 @@ def test_a_map_without_them_says_what_to_do(m: MRFMap, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=r"map the recording anew with --keep-surface, or export from"):
             problem()
     with pytest.raises(ConfigError, match="nothing of what rays measured: map the recording anew with"):
-        part.source.reading("surface")
-    with pytest.raises(ConfigError, match="no reading 'sharp'"):
-        part.source.reading("sharp")  # type: ignore[arg-type]
+        part.source.calibrated()
     with pytest.raises(ConfigError, match="map the recording with --color"):
         export_map(part, tmp_path / "mesh.ply", ExportOptions(color_by="photo"))
     export_map(part, tmp_path / "mesh.ply", ExportOptions(mesh=True))

@@ -14,7 +14,7 @@ def test_posts_of_a_fence_stay_and_gaps_stay_open() -> None:
     assert (posts == OCCUPIED).mean() > 0.5
     assert (gaps == FREE).mean() > 0.5
     assert (gaps == OCCUPIED).mean() < 0.02
-    read = m.reading("calibrated")
+    read = m.calibrated()
     posts, gaps = (read.state(fence.post_points(12.0, aside)) for aside in (0.0, 0.5 * fence.GAP_M))
     assert (posts == OCCUPIED).mean() > 0.7
     assert (posts == FREE).mean() < 0.15

@@ -222,7 +222,7 @@ def test_unknown_space_is_no_contradiction() -> None:
 
 def test_rays_have_no_votes_for_what_is_gone() -> None:
     m = room_that_changed(ball_comes=False)
-    reading = m.reading("surface")
+    reading = m.decided
     centres = reading.voxels()[0]
     assert len(centres) > len(m.voxels()[0])
     assert near_ball(m.at(BEFORE_S).voxels()[0]).any()

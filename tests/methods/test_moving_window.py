@@ -98,8 +98,8 @@ def test_the_folder_holds_surface_and_colours_of_the_whole_map(tmp_path: Path) -
     m.save(tmp_path / "map.npz")
     part, points = take_part(ChunkedMap.open(tmp_path / "map_window.zarr")), probes(other)
     np.testing.assert_array_equal(part.colors(points), other.colors(points))
-    reading = ChunkedMap.open(tmp_path / "map_window.zarr").reading("surface")
-    np.testing.assert_array_equal(reading.state(points), other.reading("surface").state(points))
+    reading = ChunkedMap.open(tmp_path / "map_window.zarr").decided
+    np.testing.assert_array_equal(reading.state(points), other.decided.state(points))
     field, stored = other.surface_field(), part.surface_field()
     for place in field.chunks.astype(np.int64) * CHUNK_VOXELS:
         np.testing.assert_allclose(

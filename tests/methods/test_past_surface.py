@@ -35,7 +35,7 @@ def test_the_surface_is_that_of_its_time() -> None:
     # The room itself is the same.
     assert abs(len(now) - len(before)) < 0.2 * len(now)
     np.testing.assert_array_equal(m.layer("both").surface().vertices_m, now)
-    np.testing.assert_array_equal(m.reading("surface").surface().vertices_m, now)
+    np.testing.assert_array_equal(m.decided.surface().vertices_m, now)
 
 
 def test_layers_have_surfaces_of_their_own(tmp_path: Path) -> None:

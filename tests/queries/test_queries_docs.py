@@ -43,7 +43,7 @@ def test_the_examples_run_on_every_layer(
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     for example in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
-        if "m.reading(" not in example:  # which needs the keyframes of a whole map
+        if "m.calibrated(" not in example:  # which needs the keyframes of a whole map
             exec(example, names)
     assert (tmp_path / "room.bt").stat().st_size > 0
 

@@ -173,8 +173,8 @@ def test_colours_and_surface_are_those_of_a_single_machine(exchanged: Path) -> N
     # The surface goes on across the borders of columns: no more open edges are there than in the single map.
     assert abs(_open_edges_at_borders(surface) - _open_edges_at_borders(whole)) <= 4
     near = m.voxels(0.0)[0]
-    read = ChunkedMap.open(exchanged / "map.zarr").reading("surface").state(near)
-    assert (read == m.reading("surface").state(near)).mean() > 0.995
+    read = ChunkedMap.open(exchanged / "map.zarr").decided.state(near)
+    assert (read == m.decided.state(near)).mean() > 0.995
     vertices = {tuple(v) for v in surface.vertices_m}
     assert len(vertices) == len(surface.vertices_m)
 

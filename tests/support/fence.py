@@ -102,7 +102,7 @@ def main() -> None:
                 said = []
                 for rays, pass_through in ((1, 0.0), (5, 0.0), (1, 0.1)):
                     m = mapped(camera, fence_m, voxel_size, enough, 8, rays, pass_through)
-                    for view in (m, m.reading("calibrated")):
+                    for view in (m, m.calibrated()):
                         posts, gaps = (view.state(post_points(fence_m, a)) for a in (0.0, 0.5 * GAP_M))
                         shares = (posts == OCCUPIED).mean(), (posts == FREE).mean(), (gaps == OCCUPIED).mean()
                         said.append(" ".join(f"{share:.2f}" for share in shares))

@@ -103,7 +103,8 @@ def shown(updates: Iterable[Update]) -> Shown:
 
 
 def map_voxels(m: OccupancyMap, min_probability: float = 0.5) -> set[tuple[int, int, int]]:
-    centres, _ = m.voxels(min_probability)
+    """The occupied voxels as the page shows them, or those of another probability."""
+    centres, _ = m.decided.voxels(min_probability)
     return set(map(tuple, np.floor(centres / m.voxel_size).astype(int).tolist()))
 
 
@@ -181,11 +182,12 @@ def built(chosen: Iterable[int], poses: dict[int, np.ndarray] | None = None) -> 
     return m
 
 
-def assert_shown_is(session: Session, link: FakeLink) -> None:
-    """What the viewer knows are the very voxels of the map."""
+def assert_shown_is(session: Session, link: FakeLink, decided: bool = True) -> None:
+    """What the viewer knows are the very voxels of the map, or, until the rays' votes are counted, those of its
+    marginals."""
     m = session.state.mapper.map
     view = shown(link.sent)
-    assert view.voxels(min_probability=0.5) == map_voxels(m)
+    assert view.voxels(min_probability=0.5) == map_voxels(m if decided else m.layer())
     assert len(view.bricks["map"]) == m.statistics().bricks
 
 

@@ -117,7 +117,7 @@ def map_to_folder(
         )
         result.seconds = {"opening": opening, **learning, **result.seconds}
         return write_run(
-            task.out, result, facts, pictures=task.pictures, reading=task.shown_reading,
+            task.out, result, facts, pictures=task.pictures,
             haste=request, advance=progress.advance,
         )  # fmt: skip
 

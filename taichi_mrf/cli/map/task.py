@@ -10,7 +10,6 @@ from taichi_mrf.config.schema import Config, with_absolute_tables
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.source_flags import SourceFlags
-from taichi_mrf.methods.mrf.reading import Reading
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,6 @@ class MapTask:
     poses: PoseFlags = field(default_factory=PoseFlags)
     keep_every: float = Map.keep_every
     overwrite: bool = False
-    shown_reading: Reading = "marginal"
     learn_noise: bool = False
 
     def __str__(self) -> str:
@@ -70,6 +68,5 @@ def map_task(options: Map, source: str, out: Path) -> MapTask:
         options.poses,
         options.keep_every,
         options.overwrite,
-        options.shown_reading,
         options.noise.is_learnt,
     )

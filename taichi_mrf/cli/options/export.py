@@ -29,14 +29,10 @@ class Export:
     """What to write of a map whose world may change: what was there all along (static), what is there now
     although it was free (dynamic), or both."""
 
-    reading: Literal["marginal", "surface", "calibrated"] = "marginal"
-    """What is occupied: voxels that are more likely so than not (marginal), or also those that enough rays
-    take for their first surface (surface), which leaves fewer holes in walls that are seen unsharply, or
-    those that the measured surface passes through more likely than not (calibrated)."""
-
     at: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
-    """Write the map as it was believed then: a stamp as ``info`` shows them, or, below 0, seconds before the
-    newest keyframe."""
+    """Write
+    the map as it was believed then: a stamp as ``info`` shows them, or, below 0, seconds before the newest
+    keyframe."""
 
     lower: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="X Y Z")] = None
     """Lower corner (metres) of the box to export from a map in chunks; without it, the box starts where the

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
@@ -10,7 +10,6 @@ from taichi_mrf.cli.options.checks import check_least
 from taichi_mrf.cli.options.noise_flags import NoiseFlags
 from taichi_mrf.cli.options.pose_flags import PoseFlags
 from taichi_mrf.cli.options.verbosity import Verbosity
-from taichi_mrf.config.registry import METHODS, methods_with
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError
@@ -81,13 +80,6 @@ class Map:
     pictures: bool = True
     """Draw the measured surface, the map from above, and its depth against the measured depth."""
 
-    shown_reading: Annotated[Literal["marginal", "surface", "calibrated"], tyro.conf.arg(name="reading")] = (
-        "marginal"
-    )
-    """What is occupied in voxels.ply and the pictures: voxels that are more likely so than not (marginal),
-    also those that enough rays take for their first surface (surface), or those that the measured surface
-    passes through more likely than not (calibrated); the last two need mrf and a map in memory."""
-
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the report as JSON, and nothing else, on stdout."""
 
@@ -112,12 +104,5 @@ class Map:
         if self.poses.file is not None and (len(self.sources) > 1 or self.submap_size is not None):
             raise ConfigError("--poses takes one SOURCE, and does not work with --submap-size")
         self.noise.refuse_with(track_poses=self.poses.track_poses, submap_size=self.submap_size)
-        if self.shown_reading != "marginal":
-            whole = self.submap_size is None and self.settings.volume.window_m == 0
-            if not METHODS[self.settings.method].has_layers or not whole:
-                raise ConfigError(
-                    f"--reading {self.shown_reading} needs the method {methods_with('has_layers')} "
-                    "and a map in memory as a whole"
-                )
         if not self.keep_every >= 0:
             raise ConfigError(f"--keep-every must be a number of seconds, not {self.keep_every}")

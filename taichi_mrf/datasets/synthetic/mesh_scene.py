@@ -57,13 +57,8 @@ class MeshScene:
     def render_depth(self, camera: Camera, T_world_camera: Pose) -> NDArray[np.float32]:
         """Depth, (H, W) float32 in metres (axial for a pinhole), of the first triangle on the ray through
         each pixel's centre, seen from either side; 0 where a ray meets none."""
-        return self.meet(camera, T_world_camera)[0]
-
-    def meet(self, camera: Camera, T_world_camera: Pose) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """:meth:`render_depth`, and how many metres along the triangle's normal a metre of depth goes, (H, W)
-        float32; 0 where a ray meets none."""
         if not len(self.mesh.triangles):
-            return np.zeros(camera.shape, np.float32), np.zeros(camera.shape, np.float32)
+            return np.zeros(camera.shape, np.float32)
         rays = camera.rays()
         directions = (rays.reshape(-1, 3) @ T_world_camera[:3, :3].T).astype(np.float32)
         origins, starts = np.empty_like(directions), origins_of(camera)
@@ -73,11 +68,7 @@ class MeshScene:
             origins += turned.astype(np.float32)
         # Directions are one metre of depth long, so that is what Embree's ray parameter is.
         hit = self._tree.run(origins, directions, query="INTERSECT", output=True)
-        met, normals = hit["primID"] >= 0, hit["Ng"]
-        length = np.linalg.norm(normals, axis=1)
-        along = np.abs((normals * directions).sum(axis=1)) / np.where(length > 0, length, np.float32(1))
-        depth_m = np.where(met, hit["tfar"], np.float32(0)).reshape(camera.shape)
-        return depth_m, np.where(met, along, np.float32(0)).reshape(camera.shape)
+        return np.where(hit["primID"] >= 0, hit["tfar"], np.float32(0)).reshape(camera.shape)
 
 
 def load_mesh(path: Path) -> TriangleMesh:

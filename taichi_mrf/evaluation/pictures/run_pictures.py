@@ -2,10 +2,9 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from taichi_mrf.evaluation.depth_error import depth_error
 from taichi_mrf.evaluation.pictures.figures import new_figure, notice
@@ -18,7 +17,6 @@ from taichi_mrf.methods.protocol import OccupancyMap, PosedDepth
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.unrolled import unrolled
 from taichi_mrf.system.atomic import atomic_path
-from taichi_mrf.voxels.colors import LOWEST
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,26 +33,14 @@ _LOW = 0.5
 """Height over width of pictures beside which the labels have no room."""
 
 
-class ShownMap(Protocol):
-    """What is drawn of a map."""
-
-    def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]: ...
-
-
-def write_pictures(
-    out_dir: Path,
-    m: OccupancyMap,
-    held_out: Sequence[Frame],
-    shown: ShownMap | None = None,
-) -> list[Path]:
+def write_pictures(out_dir: Path, m: OccupancyMap, held_out: Sequence[Frame]) -> list[Path]:
     """Write ``surface.png``, ``top_view.png`` and ``depth.png`` to a folder that exists; where the map has no
     measured surface, ``perspective.png`` shows its voxels instead.
 
     ``held_out`` are frames that the map has not seen, to compare rendered with measured depth; without
-    any a keyframe serves, and its title says so. ``shown`` has the voxels to draw if they are not the map's
-    marginals. Returns the paths. Raises MapFileError.
+    any a keyframe serves, and its title says so. Returns the paths. Raises MapFileError.
     """
-    figures = {**_whole_map(m, shown or m), "depth.png": depth_comparison(m, held_out)}
+    figures = {**_whole_map(m), "depth.png": depth_comparison(m, held_out)}
     for name, figure in figures.items():
         with atomic_path(out_dir / name) as temporary:
             # Level 2 of 9 takes half of the default's time, and the files are a fifth larger.
@@ -62,7 +48,7 @@ def write_pictures(
     return [out_dir / name for name in figures]
 
 
-def _whole_map(m: OccupancyMap, shown: ShownMap) -> dict[str, "Figure"]:
+def _whole_map(m: OccupancyMap) -> dict[str, "Figure"]:
     """The views of the whole map, by file name."""
     keyframes = list(m.keyframes.values())
     seen = seen_surfaces(m)
@@ -72,9 +58,9 @@ def _whole_map(m: OccupancyMap, shown: ShownMap) -> dict[str, "Figure"]:
     if surface is not None and len(surface.triangles):
         drawn = DrawnSurface(surface.vertices_m, surface.triangles, surface.normals, surface.colors)
         views["surface.png"] = surface_view(drawn, m.voxel_size, up)
-    centres, _ = shown.voxels(min_probability=LOWEST)
+    centres, _ = m.decided.voxels(min_probability=0.5)
     if len(centres) == 0:
-        nothing = notice(f"The map holds no voxel with a marginal of {LOWEST} or more.")
+        nothing = notice("The map holds no occupied voxel.")
         return {**(views or {"perspective.png": nothing}), "top_view.png": nothing}
     normals = seen.thickened().normals_at(centres)
     room = DrawnMap(centres, normals, m.voxel_size, up, [each.T_world_camera for each in keyframes])

@@ -79,7 +79,7 @@ def seen_surfaces(m: OccupancyMap) -> Surfaces:
     for at in np.unique(np.linspace(0, len(keyframes) - 1, _VIEWS).round().astype(int)) if keyframes else ():
         keyframe = keyframes[at]
         camera = _small_view(keyframe.camera)
-        depth_m = m.render_depth(camera, keyframe.T_world_camera)
+        depth_m = m.render_depth(camera, keyframe.T_world_camera, by="omega")
         p, n = _normals(depth_m, camera, step_m=cell_m)
         R, t = keyframe.T_world_camera[:3, :3], keyframe.T_world_camera[:3, 3]
         points.append((p - 0.5 * m.voxel_size * n) @ R.T + t)  # from the voxel's face into the voxel

@@ -72,7 +72,7 @@ class MrfPeer:
         """By omega, and by the measured surface where that is near."""
         return {
             "omega": _answers(judged_by_voxels(self.map, self._scene, view)),
-            "surface": _answers(judged_by_surface(self.map, self._surface, self._scene, view)),
+            "surface": _answers(judged_by_surface(self.map, self._scene, view)),
         }
 
     @cached_property
@@ -81,7 +81,7 @@ class MrfPeer:
 
     def cells(self, points_m: NDArray[np.float64]) -> Mapping[str, Cells]:
         """By marginals, and by the calibrated reading."""
-        calibrated = self.map.reading("calibrated")
+        calibrated = self.map.calibrated()
         return {
             "marginal": _cells(self.map, points_m),
             "calibrated": _cells(calibrated, points_m),

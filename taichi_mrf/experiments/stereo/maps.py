@@ -132,7 +132,7 @@ def log_likelihood(m: OccupancyMap, row: Row, scene: Scene) -> float:
         measured = np.where(view.measured_m <= scene.max_depth, view.measured_m, np.float32(0.0))
         own = OwnEvidence(None, view.sigma_m if row.pixel_sigma else None)
         noise = own.noise_model(scene.noise, measured)
-        judged = judge_view(m, measured, view.T_world_camera, scene.camera, noise=noise)
+        judged = judge_view(m, measured, view.T_world_camera, scene.camera, noise=noise, by="omega")
         found.append(judged.log_likelihood())
     return float(np.mean(found))
 

@@ -22,8 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.export.fused_surface import MARGIN, blended_sums
-from taichi_mrf.voxels.distance_field import DistanceSource
+from taichi_mrf.voxels.distance_field import MARGIN, DistanceSource, blended_sums
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS, grid_keys
 from taichi_mrf.voxels.pool import BrickPool
 

@@ -1,4 +1,4 @@
-"""What the rays of frozen keyframes have measured, kept for the surface and for the reading of the map.
+"""What the rays of frozen keyframes have measured, kept for the surface and for what is occupied.
 
 A keyframe's weights and distances (inference/surface_rays.py) and its votes (inference/surface_votes.py) are
 taken with the marginals as they are when it is frozen, and rounded to integers. So what is kept is a sum over
@@ -74,7 +74,7 @@ class KeptRays:
         volume: VolumeConfig,
     ) -> RayShare:
         """What a keyframe, which is about to be frozen, leaves, with the bricks that it sees now; ``models``
-        are those of its rays for the surface and for the reading."""
+        are those of its rays for the surface and for votes."""
         # Only the keyframe's own bricks are looked at, however large the map is.
         part = pool.part(visible.slots)
         seen = [(keyframe, replace(visible, slots=part.in_use, arrays=None))]

@@ -34,6 +34,7 @@ from taichi_mrf.methods.brick_map import check_inference, own_parameters, own_se
 from taichi_mrf.methods.map_file import MapHeader, StoredKeyframe, naming
 from taichi_mrf.methods.mrf.checkpoint import Checkpoint, go_back, take_checkpoint
 from taichi_mrf.methods.mrf.coloring import MapColors
+from taichi_mrf.methods.mrf.decided import Decisions
 from taichi_mrf.methods.mrf.kept_rays import KeptRays
 from taichi_mrf.methods.mrf.keyframe_allocator import KeyframeAllocator
 from taichi_mrf.methods.mrf.memory_budget import MemoryBudget
@@ -105,6 +106,13 @@ class MRFMap(PosedMRF):
         self._settled = True
         self._colors = MapColors(self._registry, self._keyframes, self._sweeper, self._allocator.refresh)
         self._kept = KeptRays(config.keep_surface)
+        self._decisions = Decisions(
+            self._registry,
+            self._keyframes,
+            lambda: self._kept.share.votes,
+            lambda: replace(self._sweeper.model(), maximise=False),
+            self.config.volume,
+        )
         parked = (self._registry, self._dated, self.aligner.surface, self._colors, self._kept)
         self.window = MovingWindow.of(self.config.volume, *parked)
 
@@ -182,6 +190,7 @@ class MRFMap(PosedMRF):
         self._keep_share(keyframe)
         self._allocator.freeze(keyframe)
         self.aligner.surface.freeze(keyframe)
+        self._decisions.frozen(id)
         self._frozen[id] = keyframe.name
         del self._keyframes[id]
         self._settled = False

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.config.method import Method
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.export.fused_surface import FusedSurface, fused_surface, without_free
+from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.brick_map import BrickMap
@@ -18,11 +19,12 @@ from taichi_mrf.methods.mrf.coloring import MapColors
 from taichi_mrf.methods.mrf.surfacing import WithSurface, surface_field_of
 from taichi_mrf.methods.protocol import MappedKeyframe
 from taichi_mrf.queries.colored import blended_colors
+from taichi_mrf.queries.measured_depth import MeasuredDepth
 from taichi_mrf.queries.view import View
+from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.system import tensors
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.distance_field import DistanceField
-from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 from taichi_mrf.voxels.topology import Topology
 
@@ -101,14 +103,19 @@ class MapReading(BrickMap):
             return self._source.surface_field()
         return surface_field_of(self._source, self._judging, self._seen, self._rays.with_frozen)
 
-    def first_surfaces(self) -> NDArray[np.bool_]:
-        """Those of the map that is read. There is no vote of another time or a layer: of these, the voxels
-        that are occupied."""
+    @tensors.in_kind("likeliest_m", "T_world_camera")
+    def measured_depth(
+        self, likeliest_m: NDArray[np.float32], camera: Camera, T_world_camera: ArrayLike
+    ) -> NDArray[np.float32]:
+        """As BrickMap.measured_depth, by the surface of the reading."""
+        if not self.has_surface:
+            return super().measured_depth(likeliest_m, camera, T_world_camera)
         self._check()
-        if self._rays is None:
-            return self._source.first_surfaces()
-        log_odds = self._pool.belief.to_numpy()[: self._pool.capacity * VOXELS]
-        return np.asarray(log_odds.reshape(-1, VOXELS) > 0)
+        return self._measured.near(likeliest_m, camera, as_pose(T_world_camera), self.sensor.max_depth)
+
+    @cached_property
+    def _measured(self) -> MeasuredDepth:
+        return MeasuredDepth(self.surface_field(), self.voxel_size)
 
     def surface(self) -> FusedSurface:
         """The surface as of the time that is read, or that of the layer, as MRFMap.surface. Raises

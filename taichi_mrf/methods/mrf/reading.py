@@ -2,8 +2,7 @@
 of it."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Literal, TypeVar, get_args
 
@@ -17,28 +16,22 @@ from taichi_mrf.inference.color_sums import ColorShare
 from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import count_observations
-from taichi_mrf.inference.surface_votes import Voting, all_votes, surfaces_first
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.methods.mrf.calibrated import calibrated_log_odds
+from taichi_mrf.methods.mrf.decided import Decisions
 from taichi_mrf.methods.mrf.kept_rays import RayShare
 from taichi_mrf.methods.mrf.layers import layer_of
 from taichi_mrf.methods.mrf.map_reading import MapReading, RaysThen
-from taichi_mrf.methods.mrf.surfacing import LEAST, WithSurface
+from taichi_mrf.methods.mrf.surfacing import LEAST, MadeOf, WithSurface
 from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.change import MapChange, compare_maps
 from taichi_mrf.system import tensors
-from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import copied
 
 ItemT = TypeVar("ItemT")
 
 Layer = Literal["static", "dynamic", "both"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
-
-Reading = Literal["marginal", "surface", "calibrated"]
-"""What is called occupied: voxels whose marginal is over 0.5, or also those that enough rays take for their
-first surface, or those through which the measured surface passes more likely than not."""
-READINGS: tuple[Reading, ...] = get_args(Reading)
 
 
 class ReadableMRF(WithSurface):
@@ -48,6 +41,8 @@ class ReadableMRF(WithSurface):
     _frozen: dict[int, str]
     _sweeper: Sweeper
     _dated: DatedBelief | None
+    _decisions: Decisions
+    _last_decided: tuple[MadeOf, MapReading] | None = None
 
     @property
     def keyframes(self) -> Mapping[int, Keyframe]:
@@ -190,43 +185,40 @@ class ReadableMRF(WithSurface):
             reading.seen_free_log_odds = pool.prior_log_odds  # free space belongs to the static layer
         return reading
 
-    def reading(self, which: Reading = "surface", between: Callable[[], object] = lambda: None) -> MapReading:
-        """The map with another rule for what is occupied, to be queried, cast rays in, drawn and exported.
+    @property
+    def decided(self) -> MapReading:
+        """The map by what is occupied, to be queried, cast rays in, drawn and exported: :meth:`state` answers
+        by it.
 
-        A wall that is seen with a sigma of several voxels has no voxel that is more likely occupied than not.
-        "surface" also calls a voxel occupied if it wins the vote of the rays: each measured ray votes for
-        the voxel that most likely is its first surface, and against those in front of it
-        (inference.surface_votes). Its log-odds are raised to just above even odds; all others are the
-        marginals, which are what "marginal" gives. "calibrated" gives each voxel the probability that it
-        holds a surface, from the distances of all rays (methods.mrf.calibrated). Votes and distances of
-        frozen keyframes are kept with ``keep_surface``, else they have none. ``between`` is called after each
-        keyframe; what it raises ends the work. Raises ConfigError for another name, CapacityError if there is
-        not enough memory.
+        Besides the voxels whose marginal is over one half it has those that win the vote of the rays: each
+        measured ray votes for the voxel that most likely is its first surface, and against those in front of
+        it (inference.surface_votes). A wall that is seen with a sigma of several voxels has no voxel that is
+        more likely occupied than not. The log-odds of winners are raised to just above even odds, all others
+        are the marginals'. Votes of frozen keyframes are kept with ``keep_surface``, else they have none.
         """
-        if which not in READINGS:
-            raise ConfigError(f"there is no reading {which!r}; known are {', '.join(READINGS)}")
-        if which == "marginal":
-            return MapReading(self, copied(self._pool.belief))
-        if which == "calibrated":
-            log_odds = copied(self._pool.belief)
-            log_odds.from_numpy(calibrated_log_odds(self.surface_field(between), self._pool).reshape(-1))
-            return MapReading(self, log_odds)
-        seen, pool, model, volume, kept = self._voting()
-        return MapReading(self, surfaces_first(_calling(between, seen), pool, model, volume, kept))
+        return self.decide()
+
+    def decide(self, between: Callable[[], object] = lambda: None) -> MapReading:
+        """:attr:`decided`; ``between`` is called after each keyframe whose votes are counted, and what it
+        raises ends the work. Raises CapacityError if there is not enough memory."""
+        made_of = MadeOf(self)
+        if self._last_decided is None or self._last_decided[0] != made_of:
+            self._last_decided = None
+            reading = MapReading(self, self._decisions.log_odds(self._settled, between))
+            self._last_decided = made_of, reading
+        return self._last_decided[1]
+
+    def calibrated(self, between: Callable[[], object] = lambda: None) -> MapReading:
+        """The map by the probability that each voxel holds a surface, from the distances of all rays
+        (methods.mrf.calibrated), which can be trusted as a probability; the marginals are more cautious.
+        ``between`` is called after each keyframe. Raises CapacityError if there is not enough memory."""
+        log_odds = copied(self._pool.belief)
+        log_odds.from_numpy(calibrated_log_odds(self.surface_field(between), self._pool).reshape(-1))
+        return MapReading(self, log_odds)
 
     def first_surfaces(self) -> NDArray[np.bool_]:
         """Which voxels of ``view.pool`` win the vote of the rays for their first surface, (slots, 512)."""
-        votes = all_votes(*self._voting()).to_numpy()[: self._pool.capacity * VOXELS]
-        return np.asarray(votes.reshape(-1, VOXELS) > 0)
-
-    def _voting(self) -> Voting:
-        """Who votes: keyframes with what they see, bricks, rays, volume, and the votes of frozen ones."""
-        seen = [(k, self._registry.visible_again(k.footprint, k.visible)) for k in self._keyframes.values()]
-        model = replace(self._sweeper.model(), maximise=False)
-        votes = self._kept.share.votes
-        slots = self._registry.topology.slots(votes.bricks) if len(votes.bricks) else np.zeros(0, np.int32)
-        kept = (slots[slots >= 0], votes.sums[slots >= 0]) if len(slots) else None
-        return seen, self._pool, model, self.view.volume, kept
+        return self._decisions.winners(self._settled)
 
     def changes(self, since_s: float) -> MapChange:
         """What differs between the map as it was believed at a time in seconds and as it is now: its
@@ -255,10 +247,3 @@ class ReadableMRF(WithSurface):
 
     def _restore_messages(self) -> None:
         raise NotImplementedError
-
-
-def _calling(between: Callable[[], object], items: Iterable[ItemT]) -> Iterator[ItemT]:
-    """The items, with a call after each."""
-    for item in items:
-        yield item
-        between()

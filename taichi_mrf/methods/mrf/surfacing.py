@@ -5,10 +5,11 @@ from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.fused_surface import FusedSurface, fused_surface, without_free
+from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.ray_model import RayModel
 from taichi_mrf.inference.surface_field import SurfaceRays
@@ -18,6 +19,9 @@ from taichi_mrf.methods.mrf.coloring import MapColors
 from taichi_mrf.methods.mrf.kept_rays import KeptRays
 from taichi_mrf.queries.colored import blended_colors, is_colored
 from taichi_mrf.queries.known_bricks import sorted_bricks
+from taichi_mrf.queries.measured_depth import MeasuredDepth
+from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.system import tensors
 from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.pool import BrickPool
 
@@ -29,6 +33,24 @@ LEAST = 0.5
 """Where no marginal reaches this share of the prior, there is no surface."""
 
 
+class MadeOf:
+    """The state of a map that its surface and its states follow from: its beliefs, whether these are settled,
+    its bricks, and its keyframes, which are kept, because their identity is compared."""
+
+    def __init__(self, m: "WithSurface") -> None:
+        pool = m._pool
+        self._numbers = pool.revision, m._settled, m._registry.version
+        self._parts = pool.shown, *m.keyframes.values()
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, MadeOf)
+            and self._numbers == other._numbers
+            and len(self._parts) == len(other._parts)
+            and all(a is b for a, b in zip(self._parts, other._parts, strict=True))
+        )
+
+
 class WithSurface(BrickMap):
     """The part of an MRFMap that makes its surface."""
 
@@ -38,6 +60,8 @@ class WithSurface(BrickMap):
     _sweeper: Sweeper
     _kept: KeptRays
     _colors: MapColors
+    _settled: bool
+    _rendered: tuple[MadeOf, MeasuredDepth] | None = None
 
     @property
     def keyframes(self) -> Mapping[int, Keyframe]:
@@ -89,9 +113,17 @@ class WithSurface(BrickMap):
         colors = blended_colors(self, found.vertices_m) if is_colored(self) else None
         return replace(found, colors=colors)
 
-    def first_surfaces(self) -> NDArray[np.bool_]:
-        """Which voxels of ``view.pool`` win the vote of the rays for their first surface, (slots, 512)."""
-        raise NotImplementedError
+    @tensors.in_kind("likeliest_m", "T_world_camera")
+    def measured_depth(
+        self, likeliest_m: NDArray[np.float32], camera: Camera, T_world_camera: ArrayLike
+    ) -> NDArray[np.float32]:
+        """As BrickMap.measured_depth. The surface is found once for each state of the map."""
+        if not self.has_surface:
+            return super().measured_depth(likeliest_m, camera, T_world_camera)
+        made_of = MadeOf(self)
+        if self._rendered is None or self._rendered[0] != made_of:
+            self._rendered = made_of, MeasuredDepth(self.surface_field(), self.voxel_size)
+        return self._rendered[1].near(likeliest_m, camera, as_pose(T_world_camera), self.sensor.max_depth)
 
     def _prepare_colors(self) -> None:
         raise NotImplementedError

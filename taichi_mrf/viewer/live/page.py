@@ -227,9 +227,9 @@ class Page(BasePage[Panel]):
             self.ask(m.RayThrough((point[0], point[1], point[2]), click.origin, chosen))
 
 
-def _extras(options: ViewOptions) -> tuple[bool, bool, bool, bool, m.Reading]:
+def _extras(options: ViewOptions) -> tuple[bool, bool, bool, bool]:
     """Whether the options need the baseline's map, the counts of keyframes, the colours of voxels, and the
-    measured surface; and their reading."""
+    measured surface."""
     by = options.color_by
     surface = options.show == "surface"
-    return options.show_baseline, by == "keyframes", by == "photo", surface, options.reading
+    return options.show_baseline, by == "keyframes", by == "photo", surface

@@ -49,7 +49,6 @@ POSITION_STEP_M = 0.01
 
 _MAP_OPTIONS = (
     "show",
-    "reading",
     "color_by",
     "threshold",
     "size",

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Annotated, Literal, get_args
 
 from taichi_mrf.config.sliders import Range
-from taichi_mrf.viewer.messages import Reading
 
 ColorBy = Literal["marginal", "height", "uncertainty", "keyframes", "photo"]
 UNPAINTED: tuple[ColorBy, ...] = tuple(each for each in get_args(ColorBy) if each != "photo")
@@ -21,11 +20,6 @@ class ViewOptions:
     show: Show = "voxels"
     """Show the voxels of the map, or the surface that its keyframes measured, below the size of voxels. The
     surface is made when no frames are read: at the end, or while paused."""
-
-    reading: Reading = "marginal"
-    """Which voxels count as occupied: by their marginals; also those that the rays take for the first surface
-    in their way (surface); or by the probability that they hold a surface (calibrated). The latter two are
-    found when no frames are read: at the end, or while paused."""
 
     color_by: ColorBy = "marginal"
     """What the colour shows: the marginal probability, the height, the uncertainty (of a voxel its entropy,

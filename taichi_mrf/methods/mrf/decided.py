@@ -1,0 +1,128 @@
+"""What is occupied in an MRFMap: voxels whose marginal is over one half, and those that win the vote of the
+rays.
+
+A wall that is seen with a sigma of several voxels has no voxel that is more likely occupied than not, and yet
+the rays agree on where it is (inference/surface_votes.py). After a full :meth:`infer` all votes are counted
+anew, so states follow from the set of keyframes alone. While keyframes come, the votes of those that were
+counted before stay as they were, and a new keyframe costs its own rays.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.config.schema import VolumeConfig
+from taichi_mrf.inference.brick_sums import BrickSums
+from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.inference.ray_model import RayModel
+from taichi_mrf.inference.surface_votes import add_votes, call_winners, count_votes
+from taichi_mrf.methods.brick_registry import BrickRegistry
+from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
+from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.pool import BrickPool, PoolSnapshot, copied
+
+
+class Decisions:
+    """The votes of one map's rays, and the log-odds by which its voxels are occupied."""
+
+    def __init__(
+        self,
+        registry: BrickRegistry,
+        keyframes: Mapping[int, Keyframe],
+        kept: Callable[[], BrickSums],
+        model: Callable[[], RayModel],
+        volume: VolumeConfig,
+    ) -> None:
+        """``keyframes`` are those of the map, now and later; ``kept`` are votes that frozen ones have left,
+        and ``model`` is what rays share."""
+        self._registry, self._keyframes, self._kept = registry, keyframes, kept
+        self._model, self._volume = model, volume
+        self._votes = ti.ndarray(ti.i32, VOXELS)
+        self._identity = np.zeros(0, np.int64)
+        self._counted: dict[int, Keyframe] = {}
+        self._restarts = -1  # of the pool when votes were counted; -1 while they are not complete
+        self._shown: PoolSnapshot | None = None
+        self._exact = False
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the votes."""
+        return 4 * int(self._votes.shape[0])
+
+    def log_odds(self, settled: bool, between: Callable[[], object] = lambda: None) -> "ti.Ndarray":
+        """Log-odds (capacity * 512) above 0 in occupied voxels, the marginals' in all others. In a
+        ``settled`` map they follow from the keyframes alone. ``between`` is called after each keyframe; what
+        it raises ends the work."""
+        pool = self._registry.pool
+        self._count(settled, between)
+        log_odds = copied(pool.belief)
+        call_winners(self._votes, log_odds, pool.prior_log_odds, self._volume.min_evidence)
+        runtime.settle()
+        return log_odds
+
+    def winners(self, settled: bool) -> NDArray[np.bool_]:
+        """Which voxels win the vote, (slots, 512)."""
+        self._count(settled, lambda: None)
+        votes = self._votes.to_numpy()[: self._registry.pool.capacity * VOXELS]
+        return np.asarray(votes.reshape(-1, VOXELS) > 0)
+
+    def frozen(self, id: int) -> None:
+        """A keyframe was frozen: its votes stay until all are counted anew."""
+        self._counted.pop(id, None)
+
+    def _count(self, settled: bool, between: Callable[[], object]) -> None:
+        """Bring the votes up to date."""
+        pool = self._registry.pool
+        gone = any(self._keyframes.get(id) is not keyframe for id, keyframe in self._counted.items())
+        other_beliefs = self._restarts != pool.restarts or self._shown is not pool.shown
+        if gone or other_beliefs or (settled and not self._exact):
+            self._start_over()
+        else:
+            self._follow_bricks()
+        new = {id: k for id, k in self._keyframes.items() if id not in self._counted}
+        self._exact = settled if new else self._exact
+        for id, keyframe in new.items():
+            self._add(keyframe)
+            self._counted[id] = keyframe
+            between()
+        self._restarts, self._shown = pool.restarts, pool.shown
+
+    def _start_over(self) -> None:
+        """Forget all votes but those that frozen keyframes have left."""
+        pool, kept = self._registry.pool, self._kept()
+        self._counted, self._exact, self._restarts = {}, True, -1
+        self._votes = _zeros(pool)
+        self._identity = pool.identity.copy()
+        if len(kept.bricks):
+            slots = self._registry.topology.slots(kept.bricks)
+            add_votes(slots[slots >= 0], kept.sums[slots >= 0].reshape(-1), self._votes)
+
+    def _add(self, keyframe: Keyframe) -> None:
+        """Add the votes of a keyframe's rays. Only the bricks that it sees are looked at."""
+        visible = self._registry.visible(keyframe.footprint)
+        part = self._registry.pool.part(visible.slots)
+        seen = (keyframe, replace(visible, slots=part.in_use, arrays=None))
+        votes = count_votes([seen], part, self._model(), self._volume)
+        add_votes(visible.slots, votes.to_numpy()[: len(visible.slots) * VOXELS], self._votes)
+
+    def _follow_bricks(self) -> None:
+        """Forget the votes of bricks that are gone, and make room for new ones."""
+        pool = self._registry.pool
+        before, old = self._identity, self._votes
+        if np.array_equal(before, pool.identity):
+            return
+        self._identity = pool.identity.copy()
+        kept = np.flatnonzero(before == self._identity[: len(before)]).astype(np.int32)
+        votes = old.to_numpy().reshape(-1, VOXELS)[kept]
+        self._votes = _zeros(pool)
+        add_votes(kept, votes.reshape(-1), self._votes)
+
+
+def _zeros(pool: BrickPool) -> "ti.Ndarray":
+    """No votes, (capacity * 512)."""
+    votes = ti.ndarray(ti.i32, pool.belief.shape)
+    votes.fill(0)
+    return votes
