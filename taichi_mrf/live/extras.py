@@ -3,7 +3,7 @@ than marginals, and the same keyframes mapped by OctoMap's method."""
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from taichi_mrf.inference.schedule import InferProgress, StopRequestedError
@@ -13,8 +13,7 @@ from taichi_mrf.live.pictures import view_images
 from taichi_mrf.live.run import Run
 from taichi_mrf.live.shown_colors import ShownColors
 from taichi_mrf.live.shown_surface import ShownSurface
-from taichi_mrf.methods.capabilities import measures_surface
-from taichi_mrf.viewer.messages import BrickColors, Notice, SceneChanges, Watch
+from taichi_mrf.viewer.messages import BrickColors, Notice, SceneChanges, Update, Watch
 
 NOTHING = Watch(images=False, view=None, baseline=False)
 
@@ -140,30 +139,21 @@ class Extras:
         """Make the surface if it is shown, no frames are read, and the map has changed; False if there was
         nothing to do."""
         run = self._run
-        if not self._watch.surface or run.is_replaying:
+        if not self._watch.surface or run.is_replaying or not run.mapper.roster.entries:
             return False
         if self._surface is None:
             self._surface = ShownSurface(run.mapper)
         if self._surface.is_current:
             return False
         try:
-            patches = self._surface.patches(
-                self._between(go_on, "making the surface", lambda: self._watch.surface)
-            )
+            between = self._between(go_on, "making the surface", lambda: self._watch.surface)
+            news: Sequence[Update] = self._surface.news(between)
         except StopRequestedError:
             return True
         except Exception as error:  # mapping continues without the surface
-            self._surface.give_up()
-            run.send(Notice(f"no surface: {error}", "error"))
-            return True
-        frozen = len(run.mapper.roster.with_state("frozen"))
-        m = run.mapper.map
-        if frozen and patches and measures_surface(m) and not m.has_surface:
-            text = f"the surface lacks {frozen} frozen keyframes, whose images are no longer in memory; "
-            text += "--keep-surface keeps their part"
-            run.send(Notice(text, "warning"))
-        for patch in patches:
-            run.send(patch)
+            news = [*self._surface.nothing(), Notice(f"no surface: {error}", "warning")]
+        for update in news:
+            run.send(update)
         return True
 
     def _find_reading(self, go_on: GoOn) -> bool:
