@@ -136,10 +136,10 @@ class Extras:
         return bool(found)
 
     def _send_surface(self, go_on: GoOn) -> bool:
-        """Make the surface if it is shown, no frames are read, and the map has changed; False if there was
+        """Make the surface if it is shown, the map is at rest, and it has changed; False if there was
         nothing to do."""
         run = self._run
-        if not self._watch.surface or run.is_replaying or not run.mapper.roster.entries:
+        if not (self._watch.surface and self._is_at_rest and run.mapper.roster.entries):
             return False
         if self._surface is None:
             self._surface = ShownSurface(run.mapper)
@@ -157,10 +157,10 @@ class Extras:
         return True
 
     def _find_reading(self, go_on: GoOn) -> bool:
-        """Read the map by another rule than its marginals if that is shown, no frames are read, and the map
-        has changed; False if there was nothing to do."""
+        """Read the map by another rule than its marginals if that is shown, the map is at rest, and it has
+        changed; False if there was nothing to do."""
         run, shown = self._run, self._run.mapper.shown
-        if run.is_replaying or not shown.lacks_reading:
+        if not (self._is_at_rest and shown.lacks_reading):
             return False
         doing = f"finding the {shown.reading} reading"
         try:
@@ -171,6 +171,14 @@ class Extras:
             run.send(Notice(f"no {shown.reading} reading: {error}", "error"))
             self._watch = dataclasses.replace(self._watch, reading="marginal")
         return True
+
+    @property
+    def _is_at_rest(self) -> bool:
+        """Whether no frames are read, and neither inference nor alignment follows, after which all that is
+        made of the map would be made again."""
+        run, mapper = self._run, self._run.mapper
+        aligning = mapper.unaligned and mapper.refiner is not None and not run.has_frames_left
+        return not (run.is_replaying or mapper.unsettled or aligning)
 
     def _between(self, go_on: GoOn, doing: str, wanted: Callable[[], bool]) -> Callable[[], None]:
         """What is called between steps of long work: now and then it carries out requests, and it raises

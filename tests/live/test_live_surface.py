@@ -76,14 +76,24 @@ def test_the_page_gets_the_surface_of_the_map_when_it_shows_it() -> None:
     assert (view.eye_m - middle) @ view.up > 0.5 * np.linalg.norm(view.eye_m - middle) > 1.0
     heights = picture.vertices_m @ view.up
     assert np.mean((heights >= view.floor_m) & (heights <= view.floor_m + view.range_m)) > 0.97
-    assert isinstance(
-        [each for each in link.sent if isinstance(each, SurfacePatch | SurfaceView)][-1], SurfaceView
-    )
+    surfaced = [each for each in link.sent if isinstance(each, SurfacePatch | SurfaceView)]
+    assert isinstance(surfaced[-1], SurfaceView)
     link.ask(Freeze(0))
     finished(session)
     assert not any(len(patch.triangles) for patch in latest_patches(link))  # it would lack a part
     assert link.of_type(Notice)[-1].text.startswith("no surface: the images of 1 frozen keyframes are no")
     assert link.errors() == []
+
+
+def test_the_surface_waits_for_full_inference() -> None:
+    link = FakeLink()
+    link.ask(SHOW)
+    finished(session_of(link))
+    done = [each.activity.partition(" keyframe")[0] for each in link.of_type(Status)]
+    assert done.count("sweeping") > 0
+    first = next(i for i, each in enumerate(link.sent) if isinstance(each, SurfacePatch))
+    after = [each.activity for each in link.sent[first:] if isinstance(each, Status)]
+    assert not any(activity.startswith("sweeping") for activity in after)
 
 
 def test_an_edit_ends_the_making_of_a_surface(monkeypatch: pytest.MonkeyPatch) -> None:
