@@ -3,7 +3,6 @@
 The file holds the scene of the live page, made by the same classes, as viser serializes it.
 """
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from taichi_mrf.queries.colored import ColoredMap, shown_colors_in
 from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap
 from taichi_mrf.system.atomic import write_text
 from taichi_mrf.viewer.messages import pack_log_odds
-from taichi_mrf.viewer.scene.cell_layer import CellLayer
+from taichi_mrf.viewer.scene.cell_clouds import add_cells
 from taichi_mrf.viewer.scene.look import look_of
 from taichi_mrf.viewer.scene.options import ColorBy, ViewOptions
 from taichi_mrf.viewer.scene.viewpoint import ViewpointController
@@ -43,7 +42,6 @@ def write_page(
         layer = VoxelLayer(server.scene, "/voxels", m.voxel_size)
         reader = BrickReader(m)
         prior, min_evidence = reader.pool.prior_log_odds, m.view.volume.min_evidence
-        boxes = CellLayer(server.scene, "/cells", m.voxel_size, prior, min_evidence)
         for bricks, log_odds, _ in reader.batches(reader.bricks):
             # Some maps give unseen voxels a probability of one half; those must not be shown.
             seen = np.where(log_odds == prior, _NOT_SHOWN, log_odds)
@@ -54,13 +52,12 @@ def write_page(
         eye.set_up(up or m.up or Z_UP)
         bounds = layer.store.bounds()
         if bounds is not None:
-            options = ViewOptions(color_by=color_by, threshold=threshold, cells=cells)
+            options = ViewOptions(color_by=color_by, threshold=threshold)
             look = look_of(options, layer.store, eye.up, m.voxel_size)
             layer.prepare(layer.all_chunks(), look, exactly=True)
             layer.send()
-            boxes.outdate(layer.all_chunks())
-            boxes.prepare(layer.store, look, math.inf)
-            boxes.send()
+            if cells:
+                add_cells(server.scene, layer.store, look, m.voxel_size, prior + min_evidence)
             low, high = (end.astype(np.float64) * BRICK * m.voxel_size for end in (bounds[0], bounds[1] + 1))
             eye.map_grew(low, high)
         write_text(path, standalone_page(server.get_scene_serializer(), dark=False))

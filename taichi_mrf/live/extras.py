@@ -3,7 +3,7 @@ keyframes mapped by OctoMap's method."""
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from taichi_mrf.inference.schedule import InferProgress, StopRequestedError
@@ -13,8 +13,7 @@ from taichi_mrf.live.pictures import view_images
 from taichi_mrf.live.run import Run
 from taichi_mrf.live.shown_colors import ShownColors
 from taichi_mrf.live.shown_surface import ShownSurface
-from taichi_mrf.methods.capabilities import measures_surface
-from taichi_mrf.viewer.messages import BrickColors, Notice, SceneChanges, Watch
+from taichi_mrf.viewer.messages import BrickColors, Notice, SceneChanges, Update, Watch
 
 NOTHING = Watch(images=False, view=None, baseline=False)
 
@@ -133,40 +132,30 @@ class Extras:
         return bool(found)
 
     def _send_surface(self, go_on: GoOn) -> bool:
-        """Make the surface if it is shown, no frames are read, and the map has changed; False if there was
+        """Make the surface if it is shown, the map is at rest, and it has changed; False if there was
         nothing to do."""
         run = self._run
-        if not self._watch.surface or run.is_replaying:
+        if not (self._watch.surface and self._is_at_rest and run.mapper.roster.entries):
             return False
         if self._surface is None:
             self._surface = ShownSurface(run.mapper)
         if self._surface.is_current:
             return False
         try:
-            patches = self._surface.patches(
-                self._between(go_on, "making the surface", lambda: self._watch.surface)
-            )
+            between = self._between(go_on, "making the surface", lambda: self._watch.surface)
+            news: Sequence[Update] = self._surface.news(between)
         except StopRequestedError:
             return True
         except Exception as error:  # mapping continues without the surface
-            self._surface.give_up()
-            run.send(Notice(f"no surface: {error}", "error"))
-            return True
-        frozen = len(run.mapper.roster.with_state("frozen"))
-        m = run.mapper.map
-        if frozen and patches and measures_surface(m) and not m.has_surface:
-            text = f"the surface lacks {frozen} frozen keyframes, whose images are no longer in memory; "
-            text += "--keep-surface keeps their part"
-            run.send(Notice(text, "warning"))
-        for patch in patches:
-            run.send(patch)
+            news = [*self._surface.nothing(), Notice(f"no surface: {error}", "warning")]
+        for update in news:
+            run.send(update)
         return True
 
     def _decide(self, go_on: GoOn) -> bool:
-        """Count the votes of rays if no frames are read and the map has changed; False if there was nothing
-        to do."""
+        """Count the votes of rays if the map is at rest and has changed; False if there was nothing to do."""
         run, shown = self._run, self._run.mapper.shown
-        if run.is_replaying or not shown.lacks_decisions:
+        if not (self._is_at_rest and shown.lacks_decisions):
             return False
         try:
             run.decide(self._between(go_on, "finding what is occupied", lambda: True))
@@ -176,6 +165,14 @@ class Extras:
             run.send(Notice(f"shown by marginals: {error}", "error"))
             shown.give_up_deciding()
         return True
+
+    @property
+    def _is_at_rest(self) -> bool:
+        """Whether no frames are read, and neither inference nor alignment follows, after which all that is
+        made of the map would be made again."""
+        run, mapper = self._run, self._run.mapper
+        aligning = mapper.unaligned and mapper.refiner is not None and not run.has_frames_left
+        return not (run.is_replaying or mapper.unsettled or aligning)
 
     def _between(self, go_on: GoOn, doing: str, wanted: Callable[[], bool]) -> Callable[[], None]:
         """What is called between steps of long work: now and then it carries out requests, and it raises

@@ -27,6 +27,7 @@ from taichi_mrf.viewer.messages import (
     SceneChanges,
     Status,
     SurfacePatch,
+    SurfaceView,
     TimeSpan,
     Update,
 )
@@ -38,7 +39,7 @@ BRICKS_AT_ONCE = 2048
 MOST = {Notice: 50, File: 4}
 """Most updates of these kinds that wait; the oldest are dropped first."""
 
-LATEST_ONLY = (Status, CurrentCamera, Images, RayAnswer, TimeSpan, SceneChanges)
+LATEST_ONLY = (Status, CurrentCamera, Images, RayAnswer, TimeSpan, SceneChanges, SurfaceView)
 
 MERGE_FACTOR = 2
 """Waiting bricks are merged when their number has grown by this factor since the last merge, so that each is
@@ -119,7 +120,9 @@ class Outbox:
 
     def still_wanted(self, update: Update) -> Callable[[Waiting], bool] | None:
         """Which waiting updates are still sent after this one; None: all. A Hello makes earlier updates of
-        the map obsolete."""
+        the map obsolete. A view of the surface follows all its patches."""
+        if isinstance(update, SurfaceView):
+            return lambda waiting: not isinstance(waiting, SurfaceView)
         return (lambda waiting: isinstance(waiting, Notice | File)) if isinstance(update, Hello) else None
 
     def _place(self, update: Update) -> Hashable:

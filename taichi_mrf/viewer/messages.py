@@ -58,6 +58,8 @@ class Hello(Update):
     """Whether the map can be shown as of another time."""
     has_colors: bool = False
     """Whether voxels have the colours that cameras saw."""
+    has_surface: bool = False
+    """Whether the map can make the surface that its keyframes measured."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,25 @@ class SurfacePatch(Update):
     std_m: NDArray[np.float32]
     log_odds: NDArray[np.int16]
     colors: NDArray[np.uint8] | None
+
+
+@dataclass(frozen=True)
+class SurfaceView(Update):
+    """All patches of the measured surface are sent; this is how the picture of a run shows it.
+
+    ``eye_m`` and ``target_m`` are in metres, world; ``up`` and ``light``, towards the light, are unit vectors
+    there; ``fov_rad`` is the vertical field of view. Heights, along ``up``, are coloured from ``floor_m``
+    over ``range_m``, unless the picture is a ``photo``, in the colours that cameras saw.
+    """
+
+    eye_m: NDArray[np.float64]
+    target_m: NDArray[np.float64]
+    up: NDArray[np.float64]
+    light: NDArray[np.float64]
+    fov_rad: float
+    floor_m: float
+    range_m: float
+    photo: bool
 
 
 @dataclass(frozen=True)

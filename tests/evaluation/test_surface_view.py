@@ -1,10 +1,11 @@
-"""The picture of a surface: its colours, its background and its borders."""
+"""The pictures of a surface, and its plan: its colours, its background and its borders."""
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from taichi_mrf.evaluation.pictures.overview import backdrop
+from taichi_mrf.evaluation.pictures.room_views import DrawnMap, top_view
 from taichi_mrf.evaluation.pictures.surface_view import (
     PHOTO_VOXEL_M,
     DrawnSurface,
@@ -66,3 +67,23 @@ def test_steps_at_a_border_become_a_slope() -> None:
     inside = np.flatnonzero((vertices_m[:, 0] > vertices_m[:, 1] + 1) & (vertices_m[:, 0] < 12))
     inside = inside[vertices_m[inside, 1] > 0]
     np.testing.assert_array_equal(smooth[inside], vertices_m[inside])
+
+
+def test_the_plan_shows_the_surface_and_no_ceiling() -> None:
+    """A floor, and a ceiling of the same size that was seen from below; voxels are where neither is."""
+    floor, up_facing = _steps(np.ones((8, 8), bool))
+    vertices_m = np.concatenate([floor, floor + 3 * UP])
+    triangles = np.concatenate([up_facing, up_facing[:, ::-1] + len(floor)])
+    normals = np.concatenate([np.tile(UP, (len(floor), 1)), np.tile(-UP, (len(floor), 1))])
+    room = DrawnMap(np.full((1, 3), 20.0), UP[None], 0.05, UP, [])
+    axes = top_view(room, DrawnSurface(vertices_m, triangles, normals, None)).axes[0]
+    assert axes.get_title() == "the measured surface from above, ceilings left out"
+    picture = np.asarray(axes.images[0].get_array())
+    left, right, bottom, top = axes.images[0].get_extent()
+    assert (left, bottom) == pytest.approx((-0.3, -0.3), abs=0.05)
+    assert (right, top) == pytest.approx((8.3, 8.3), abs=0.05)
+    drawn = (picture < 255).any(axis=-1)
+    edge = len(drawn) // 6
+    assert drawn[edge:-edge, edge:-edge].all(), "the floor, without holes"
+    middle = picture[picture.shape[0] // 2, picture.shape[1] // 2].astype(int)
+    assert middle[2] > middle[1], "the colour of low things"

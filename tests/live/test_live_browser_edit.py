@@ -258,9 +258,7 @@ def test_the_standalone_page_shows_the_map(page: LivePage, browser: "Browser", t
     page.download("Page").save_as(tmp_path / "map.html")
     with LivePage(browser, (tmp_path / "map.html").as_uri()) as standalone:
         shown = page.look()
-        assert shown.cells
-        drawn = (shown.voxels, shown.cells)
-        standalone.until(lambda seen: (seen.voxels, seen.cells) == drawn, "the map without a server")
+        standalone.until(lambda seen: seen.voxels == shown.voxels, "the map without a server")
         standalone.pause(1.0)
         standalone.screenshot("standalone")
         assert standalone.problems == []

@@ -8,6 +8,7 @@ import pytest
 from live_scene import CONFIG, FakeLink, finished, map_voxels, never, session_of, shown
 
 from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.evaluation.pictures.surface_view import smooth_borders
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.live import extras
@@ -21,6 +22,7 @@ from taichi_mrf.viewer.messages import (
     ShowTime,
     Status,
     SurfacePatch,
+    SurfaceView,
     Switch,
     Update,
     Watch,
@@ -35,14 +37,18 @@ Triangle = tuple[tuple[float, ...], ...]
 
 def of_page(link: FakeLink) -> set[Triangle]:
     """The triangles that the page has, each by its corners."""
-    patches = {patch.chunk: patch for patch in link.of_type(SurfacePatch)}
-    corners = [patch.vertices_m[patch.triangles] for patch in patches.values()]
-    return as_set(np.concatenate(corners))
+    return as_set(np.concatenate([patch.vertices_m[patch.triangles] for patch in latest_patches(link)]))
+
+
+def latest_patches(link: FakeLink) -> list[SurfacePatch]:
+    """The patches that the page has in the end."""
+    return list({patch.chunk: patch for patch in link.of_type(SurfacePatch)}.values())
 
 
 def of_map(m: MRFMap) -> set[Triangle]:
     surface = m.surface()
-    return as_set(surface.vertices_m[surface.triangles].astype(np.float32))
+    vertices_m = smooth_borders(surface.vertices_m, surface.triangles)
+    return as_set(vertices_m[surface.triangles].astype(np.float32))
 
 
 def as_set(corners: np.ndarray) -> set[Triangle]:
@@ -63,11 +69,30 @@ def test_the_page_gets_the_surface_of_the_map_when_it_shows_it() -> None:
     link.ask(Switch(1, on=False))
     m = finished(session)
     assert of_page(link) == of_map(m)
+    view, picture = link.of_type(SurfaceView)[-1], m.surface()
+    middle = np.median(picture.vertices_m, axis=0)
+    assert view.up @ [0, 0, 1] > 0.99  # the room's
+    assert (view.eye_m - middle) @ view.up > 0.5 * np.linalg.norm(view.eye_m - middle) > 1.0
+    heights = picture.vertices_m @ view.up
+    assert np.mean((heights >= view.floor_m) & (heights <= view.floor_m + view.range_m)) > 0.97
+    surfaced = [each for each in link.sent if isinstance(each, SurfacePatch | SurfaceView)]
+    assert isinstance(surfaced[-1], SurfaceView)
     link.ask(Freeze(0))
-    m = finished(session)
-    assert of_page(link) == of_map(m)
-    assert link.of_type(Notice)[-1].text.startswith("the surface lacks 1 frozen keyframes, whose images")
+    finished(session)
+    assert not any(len(patch.triangles) for patch in latest_patches(link))  # it would lack a part
+    assert link.of_type(Notice)[-1].text.startswith("no surface: the images of 1 frozen keyframes are no")
     assert link.errors() == []
+
+
+def test_the_surface_waits_for_full_inference() -> None:
+    link = FakeLink()
+    link.ask(SHOW)
+    finished(session_of(link))
+    done = [each.activity.partition(" keyframe")[0] for each in link.of_type(Status)]
+    assert done.count("sweeping") > 0
+    first = next(i for i, each in enumerate(link.sent) if isinstance(each, SurfacePatch))
+    after = [each.activity for each in link.sent[first:] if isinstance(each, Status)]
+    assert not any(activity.startswith("sweeping") for activity in after)
 
 
 def test_an_edit_ends_the_making_of_a_surface(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,8 +116,7 @@ def test_a_map_without_a_surface_says_why() -> None:
     session = session_of(link, config=replace(CONFIG, method="log_odds"))
     link.ask(SHOW)
     session.run(never)
-    (error,) = link.errors()
-    assert error == "no surface: a map of the method log_odds has none"
+    assert link.of_type(Notice)[-1].text == "no surface: a map of the method log_odds has none"
     assert not link.of_type(SurfacePatch)
 
 

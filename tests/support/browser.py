@@ -51,21 +51,20 @@ _LOOK = """() => {
     }
     return false;
   };
-  const seen = {voxels: 0, cells: 0, baseline: 0, triangles: 0, colors: 0, nodes: []};
+  const seen = {voxels: 0, baseline: 0, triangles: 0, colors: 0, nodes: []};
   const hash = (start, numbers) =>
     numbers.reduce((h, number) => Math.imul(31 * h + Math.round(number) | 0, 2654435761) >>> 0, start);
   for (const [name, node] of Object.entries(mutable?.nodeRefFromName ?? {}).sort()) {
     if (!node || !inScene(node)) continue;
     seen.nodes.push(name);
     const root = name.split('/')[1];
-    if (!(root in {voxels: 0, cells: 0, baseline: 0, surface: 0}) || name.split('/').length < 3) continue;
+    if (!(root in {voxels: 0, baseline: 0, surface: 0}) || name.split('/').length < 3) continue;
     node.traverse(object => {
       if (object.isMesh) seen.triangles += object.geometry.index.count / 3;
       if (!object.isPoints) return;
       const {position, color} = object.geometry.attributes;
       const cloud = hash(7, [...name].map(letter => letter.codePointAt(0)));
       seen[root] += position?.count ?? 0;
-      if (root === 'cells') return;
       // A sum, since the order of the points depends on how updates were merged on their way.
       for (let i = 0; i < (color?.count ?? 0); i++) {
         const cell = [position.getX(i), position.getY(i), position.getZ(i)];
@@ -75,7 +74,7 @@ _LOOK = """() => {
     });
   }
   const paragraphs = [...document.querySelectorAll('p')];
-  const counts = paragraphs.find(p => p.textContent.includes('voxels shown'));
+  const counts = paragraphs.find(p => /^[0-9,]+ (voxels|triangles) /.test(p.textContent));
   seen.counts = counts?.textContent ?? '';
   let panel = counts;
   while (panel && !panel.querySelector('.mantine-Progress-root')) panel = panel.parentElement;
@@ -157,18 +156,16 @@ def _chromium() -> str | None:
 class Seen:
     """One look at a page: what it says of itself, and what is in its scene.
 
-    ``said``, ``said_cells``, ``said_baseline`` and ``said_triangles`` are the counts that the page gives,
-    ``voxels``, ``cells`` and ``baseline`` the points that it draws, ``triangles`` those of the surface;
+    ``said``, ``said_baseline`` and ``said_triangles`` are the counts that the page gives, ``voxels`` and
+    ``baseline`` the points that it draws, ``triangles`` those of the surface;
     ``colors`` changes with the colour or place of any voxel's point, and not with their order. ``table`` is
     that of the tab About, empty while another one is in front.
     """
 
     said: int
-    said_cells: int
     said_baseline: int
     said_triangles: int
     voxels: int
-    cells: int
     baseline: int
     triangles: int
     colors: int
@@ -183,9 +180,9 @@ class Seen:
 
     @property
     def agrees(self) -> bool:
-        """Whether the scene holds as many voxels, cells and triangles as the page says."""
-        said = self.said, self.said_cells, self.said_baseline, self.said_triangles
-        return said == (self.voxels, self.cells, self.baseline, self.triangles)
+        """Whether the scene holds as many voxels and triangles as the page says."""
+        said = self.said, self.said_baseline, self.said_triangles
+        return said == (self.voxels, self.baseline, self.triangles)
 
     @property
     def settled(self) -> bool:
@@ -209,11 +206,10 @@ class LivePage:
         """What is to be seen now."""
         found = self.page.evaluate(_LOOK)
         words = found.pop("counts").replace(",", "").split()
-        said = int(words[0]) if words else 0
         said_baseline = int(words[words.index("baseline") - 3]) if "baseline" in words else 0
-        counts = {"said": said, "said_baseline": said_baseline}
-        for name in ("cells", "triangles"):
-            counts[f"said_{name}"] = int(words[words.index(name) - 1]) if name in words else 0
+        counts = {"said_baseline": said_baseline}
+        for name, field in (("voxels", "said"), ("triangles", "said_triangles")):
+            counts[field] = int(words[words.index(name) - 1]) if name in words else 0
         return Seen(**counts, nodes=tuple(found.pop("nodes")), **found)
 
     def until(self, condition: Callable[[Seen], object], what: str) -> Seen:
@@ -228,8 +224,11 @@ class LivePage:
         return last[0]
 
     def until_settled(self) -> Seen:
-        """Wait until the map is at rest."""
-        return self.until(lambda seen: seen.settled and seen.voxels, "a settled map")
+        """Wait until the map is at rest, and show its voxels."""
+        self.until(lambda seen: seen.settled and (seen.voxels or seen.triangles), "a settled map")
+        self.tab("Map")
+        self.select("Show", "voxels")
+        return self.until(lambda seen: seen.settled and seen.voxels, "the voxels of a settled map")
 
     def pause(self, seconds: float) -> None:
         """Wait, while the page goes on."""

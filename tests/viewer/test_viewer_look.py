@@ -115,7 +115,7 @@ def test_up_is_the_axis_that_cameras_hold_upwards() -> None:
 def test_looks_that_differ_only_in_unused_heights_are_the_same() -> None:
     small, large = VoxelStore(), VoxelStore()
     large.put(np.array([[5, 5, 5]], np.int32), np.zeros((1, 512), np.int16), np.zeros((1, 512), np.uint8))
-    by_marginal, by_height = ViewOptions(), ViewOptions(color_by="height")
+    by_marginal, by_height = ViewOptions(color_by="marginal"), ViewOptions()
     up = (2, 1)
     assert look_of(by_marginal, small, up, 0.05) == look_of(by_marginal, large, up, 0.05)
     assert look_of(by_height, small, up, 0.05) != look_of(by_height, large, up, 0.05)

@@ -16,7 +16,28 @@ from taichi_mrf.viewer.scene.unlit_mesh import before_tone_mapping, unlit_glb
 from taichi_mrf.viewer.transport.server import start_server
 
 VOXEL = 0.1
-HELLO = m.Hello("a recording", "cpu", "a device", "mrf", VOXEL, -2.2, 0.1, "voxel_size: 0.1", has_colors=True)
+HELLO = m.Hello(
+    "a recording",
+    "cpu",
+    "a device",
+    "mrf",
+    VOXEL,
+    -2.2,
+    0.1,
+    "voxel_size: 0.1",
+    has_colors=True,
+    has_surface=True,
+)
+VIEW = m.SurfaceView(
+    eye_m=np.array([3.0, -9.0, 5.0]),
+    target_m=np.array([3.0, -3.0, 1.5]),
+    up=np.array([0.0, 0.0, 1.0]),
+    light=np.array([0.6, -0.8, 0.0]),
+    fov_rad=0.6,
+    floor_m=1.0,
+    range_m=2.0,
+    photo=False,
+)
 CHUNK = (0, -1, 0)
 
 
@@ -114,24 +135,87 @@ def test_a_large_mesh_has_large_indices() -> None:
 
 
 def test_the_surface_takes_the_place_of_voxels_once_it_is_there(drawn: SurfacePage) -> None:
-    assert drawn.draw() == "512 voxels shown"
-    assert drawn.draw(show="surface") == "512 voxels shown"
-    assert drawn.asked[-1] == m.Watch(False, None, False, surface=True)
+    assert drawn.asked == [m.Watch(False, None, False, surface=True)]  # the page opens with it
     drawn.take(patch())
-    assert drawn.draw(show="surface") == "0 voxels shown, 2 triangles of the surface"
+    assert drawn.draw() == "512 voxels shown"  # some of it may still be on its way
+    drawn.take(VIEW)
+    assert drawn.draw() == "2 triangles of the measured surface shown"
     assert (drawn.is_visible("/voxels"), drawn.is_visible("/surface")) == (False, True)
     vertices, triangles, _ = drawn.mesh()
     np.testing.assert_allclose(vertices[triangles], patch().vertices_m[patch().triangles], atol=1e-6)
-    assert drawn.draw() == "512 voxels shown"
+    assert drawn.draw(show="voxels") == "512 voxels shown"
     assert (drawn.is_visible("/voxels"), drawn.is_visible("/surface")) == (True, False)
     drawn.take(patch(empty=True))
-    assert drawn.draw(show="surface") == "512 voxels shown"
+    assert drawn.draw() == "512 voxels shown"
+
+
+def status(**changes: object) -> m.Status:
+    done = m.Status("", 1.0, 1, 1, 1, 0, 0.0, 512, 1, 1.0, paused=False, finished=True, pending=False)
+    return replace(done, **changes)  # type: ignore[arg-type]
+
+
+def test_while_frames_are_read_voxels_are_shown(drawn: SurfacePage) -> None:
+    drawn.take(patch())
+    drawn.take(VIEW)
+    for changes, shown in (
+        ({"finished": False}, "512 voxels"),
+        ({"paused": True, "finished": False}, "2 tri"),
+    ):
+        drawn.take(status(**changes))
+        assert drawn.draw().startswith(shown)
+
+
+def test_a_browser_begins_with_the_view_of_the_picture(drawn: SurfacePage) -> None:
+    viewpoint, start = drawn.page.viewpoint, drawn.server.initial_camera
+    drawn.page._take_status(status(finished=False))
+    viewpoint.map_grew(np.zeros(3), np.ones(3))
+    drawn.page._take_status(status())
+    drawn.take(VIEW)
+    along = start.look_at - start.position
+    np.testing.assert_allclose(np.cross(along, VIEW.target_m - VIEW.eye_m), 0, atol=1e-9)
+    np.testing.assert_array_equal(start.up, VIEW.up)
+    assert start.fov == VIEW.fov_rad
+    before = start.position
+    viewpoint.map_grew(np.zeros(3), np.full(3, 9.0))
+    drawn.take(replace(VIEW, eye_m=np.zeros(3)))  # after an edit, say
+    np.testing.assert_array_equal(start.position, before)
+
+
+def test_the_page_opens_in_the_colours_of_photographs_where_the_picture_does() -> None:
+    running = SurfacePage()
+    try:
+        for chosen, expected in ((None, "photo"), ("uncertainty", "uncertainty"), (None, "photo")):
+            widget = running.page.panel._map_options.handles["color_by"]
+            widget.value = chosen or ViewOptions().color_by
+            running.take(HELLO)
+            running.take(replace(VIEW, photo=True))
+            assert widget.value == expected
+        widget.value = "height"
+        running.take(replace(VIEW, photo=True))
+        assert widget.value == "height"  # a user has chosen it
+        running.page.options = ViewOptions(color_by="photo")
+        assert not running.page._extras(running.page.options)[2]  # the patches have colours of their own
+    finally:
+        running.server.stop()
+
+
+def test_a_map_without_a_surface_offers_none() -> None:
+    running = SurfacePage()
+    try:
+        running.asked.clear()
+        running.take(replace(HELLO, method="log_odds", has_surface=False))
+        assert running.page.panel._map_options.handles["show"].options == ("voxels",)
+        assert running.page.options.show == "voxels"
+        assert running.asked == []
+    finally:
+        running.server.stop()
 
 
 def test_a_cut_takes_the_triangles_beyond_it_away(drawn: SurfacePage) -> None:
     drawn.take(m.Bricks("map", np.array([[7, -7, 2]], np.int32), np.full((1, 512), -900, np.int16),
                         np.ones((1, 512), np.uint8), np.zeros((0, 3), np.int32)))  # fmt: skip
     drawn.take(patch())
+    drawn.take(VIEW)
     assert "2 triangles" in drawn.draw(show="surface", cut_axis="x", cut_at=1.0)
     assert "1 triangles" in drawn.draw(show="surface", cut_axis="x", cut_at=0.6)
 
@@ -139,7 +223,8 @@ def test_a_cut_takes_the_triangles_beyond_it_away(drawn: SurfacePage) -> None:
 def test_the_colours_are_those_of_the_scale(drawn: SurfacePage) -> None:
     photo = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [90, 90, 90]], np.uint8)
     drawn.take(patch(photo))
-    drawn.draw(show="surface", color_by="photo")
+    drawn.take(VIEW)
+    drawn.draw(color_by="photo", shade=False)
     assert np.abs(drawn.mesh()[2].astype(int) - photo).max() <= 1
     drawn.draw(show="surface", color_by="uncertainty", shade=False)
     scale = drawn.page.map.scale if drawn.page.map else None
@@ -147,16 +232,21 @@ def test_the_colours_are_those_of_the_scale(drawn: SurfacePage) -> None:
     assert (scale.high, scale.label) == (0.9, "standard deviation (cm)")  # nearly all lie below
     expected = scale.colors[np.rint(255 * np.array([1, 2, 3, 9]) / 9).astype(int)]
     assert np.abs(drawn.mesh()[2].astype(int) - expected).max() <= 1
-    drawn.draw(show="surface", shade=False)
+    drawn.draw(show="surface", color_by="marginal", shade=False)
     assert len(np.unique(drawn.mesh()[2], axis=0)) == 1  # they are equally likely
+    drawn.draw(shade=False)
+    scale = drawn.page.map.scale if drawn.page.map else None
+    assert scale is not None
+    assert (scale.high, scale.label) == (2.0, "height above the lowest surface (m)")
     lit = drawn.mesh()[2].astype(int)
-    drawn.draw(show="surface")
-    assert (drawn.mesh()[2] <= lit).all()
-    assert (drawn.mesh()[2] < lit).any()
+    assert np.abs(lit - scale.colors[[0, 0, 128, 0]]).max() <= 1
+    drawn.draw()
+    assert np.abs(drawn.mesh()[2] - lit * (0.62 + 0.38 * 0.8)).max() <= 2
 
 
 def test_a_click_on_the_surface_asks_for_the_ray_to_it(drawn: SurfacePage) -> None:
     drawn.take(patch())
+    drawn.take(VIEW)
     drawn.draw(show="surface")
     drawn.take(Clicked((3.03, -9.0, 2.01), (0.0, 1.0, 0.0)))
     asked = drawn.asked[-1]

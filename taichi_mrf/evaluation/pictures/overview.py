@@ -32,12 +32,18 @@ def backdrop(shape: tuple[int, int]) -> NDArray[np.uint8]:
     return np.repeat(np.rint(rows).astype(np.uint8)[:, None], shape[1], axis=1)
 
 
+def height_span(height_m: NDArray[np.floating], least_range_m: float) -> tuple[float, float]:
+    """The lowest of heights (N,) in metres, and the range from there to the highest; stray ones do not
+    count."""
+    floor, top = np.quantile(height_m, [0.005, 0.995]) if height_m.size else (0.0, 0.0)
+    return float(floor), max(float(top - floor), least_range_m)
+
+
 def height_colors(height_m: NDArray[np.floating], least_range_m: float) -> tuple[NDArray[np.uint8], float]:
-    """RGB (N, 3) of heights (N,), and the range in metres from the lowest to the highest but stray ones."""
+    """RGB (N, 3) of heights (N,), and the range in metres over which they are coloured."""
     from matplotlib import colormaps
 
-    floor, top = np.quantile(height_m, [0.005, 0.995]) if height_m.size else (0.0, 0.0)
-    range_m = max(float(top - floor), least_range_m)
+    floor, range_m = height_span(height_m, least_range_m)
     return colormaps[HEIGHT_COLORS]((height_m - floor) / range_m, bytes=True)[:, :3], range_m
 
 

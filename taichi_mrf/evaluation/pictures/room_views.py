@@ -1,4 +1,4 @@
-"""All voxels of a map in one picture: a plan from above, and a doll's-house view from outside."""
+"""A whole map in one picture: a plan from above, and a doll's-house view of its voxels from outside."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,8 +18,10 @@ from taichi_mrf.evaluation.pictures.overview import (
     height_colors,
     overview,
 )
-from taichi_mrf.evaluation.pictures.shading import shaded
+from taichi_mrf.evaluation.pictures.shading import shaded, shaded_triangles
+from taichi_mrf.evaluation.pictures.surface_view import DrawnSurface, smooth_borders
 from taichi_mrf.evaluation.pictures.surfaces import level_rotation
+from taichi_mrf.evaluation.pictures.triangle_raster import cast_triangles
 from taichi_mrf.evaluation.pictures.viewpoint import faces_viewer, overview_pose
 from taichi_mrf.evaluation.pictures.voxel_raster import cast_voxels
 from taichi_mrf.geometry.poses import Pose
@@ -32,6 +34,7 @@ _PLAN_PIXELS = 1200
 """Longer side of the plan."""
 
 _PLAN_SIZE_IN = 10.0
+_SURFACE = "the measured surface"
 
 
 @dataclass(frozen=True)
@@ -54,27 +57,25 @@ class DrawnMap:
     """Where the keyframes were taken, in their order."""
 
 
-def top_view(room: DrawnMap) -> "Figure":
-    """The voxels seen from above, coloured by height, with the way of the camera.
+def top_view(room: DrawnMap, surface: DrawnSurface | None = None) -> "Figure":
+    """The surface seen from above, or the voxels where there is none, coloured by height, with the way of the
+    camera.
 
     The axes are those of the world frame, turned by as little as makes them level.
     """
     R_level_world = level_rotation(room.up)
-    level = room.centres @ R_level_world.T
+    level = (room.centres if surface is None else surface.vertices_m) @ R_level_world.T
     way = np.array([R_level_world @ T[:3, 3] for T in room.T_world_cameras]).reshape(-1, 3)
     low, high = np.quantile(level, [0.002, 0.998], axis=0)
     if len(way):
         low[:2], high[:2] = np.minimum(low, way.min(axis=0))[:2], np.maximum(high, way.max(axis=0))[:2]
     margin = 0.03 * (high - low)[:2].max() + room.voxel_size
     low[:2], high[:2] = low[:2] - margin, high[:2] + margin
-    # Surfaces that were seen from below (ceilings, undersides) would hide the room.
-    open_above = room.normals @ room.up > -0.5
-    colors, height_range = height_colors(level[open_above, 2], room.voxel_size)
     camera, pose = _camera_above(0.5 * (low + high), (high - low)[:2], R_level_world)
-    image = cast_voxels(room.centres[open_above], room.voxel_size, camera, pose)
-    light = np.array([-0.4, 0.5, 0.77]) @ R_level_world
-    white = np.full((*camera.shape, 3), 255, np.uint8)
-    picture = shaded(image, colors, room.normals[open_above], light, white)
+    if surface is None:
+        what, (picture, height_range) = _voxels(room), _voxels_from_above(room, level[:, 2], camera, pose)
+    else:
+        what, (picture, height_range) = _SURFACE, _surface_from_above(surface, room, camera, pose)
 
     width_in, height_in = _PLAN_SIZE_IN * np.clip(
         np.array([camera.width, camera.height]) / _PLAN_PIXELS, 0.4, 1.0
@@ -83,9 +84,40 @@ def top_view(room: DrawnMap) -> "Figure":
     axes = figure.add_subplot()
     axes.imshow(picture, extent=(low[0], high[0], low[1], high[1]), interpolation="antialiased")
     draw_way(axes, way[:, :2])
-    axes.set(xlabel="metres", ylabel="metres", title=f"{_voxels(room)} from above, ceilings left out")
+    axes.set(xlabel="metres", ylabel="metres", title=f"{what} from above, ceilings left out")
     color_bar(axes, HEIGHT_COLORS, 0.0, height_range, HEIGHT_LABEL)
     return figure
+
+
+def _voxels_from_above(
+    room: DrawnMap, height_m: NDArray[np.floating], camera: PinholeCamera, pose: Pose
+) -> tuple[NDArray[np.uint8], float]:
+    """The picture (H, W, 3), RGB, and the range of its heights in metres."""
+    # Surfaces that were seen from below (ceilings, undersides) would hide the room.
+    open_above = room.normals @ room.up > -0.5
+    colors, height_range = height_colors(height_m[open_above], room.voxel_size)
+    image = cast_voxels(room.centres[open_above], room.voxel_size, camera, pose)
+    return shaded(image, colors, room.normals[open_above], _light(room.up), _white(camera)), height_range
+
+
+def _surface_from_above(
+    surface: DrawnSurface, room: DrawnMap, camera: PinholeCamera, pose: Pose
+) -> tuple[NDArray[np.uint8], float]:
+    """The same of the surface; what was seen from below faces away."""
+    triangles, vertices_m = surface.triangles, smooth_borders(surface.vertices_m, surface.triangles)
+    colors, height_range = height_colors(vertices_m @ room.up, room.voxel_size)
+    image = cast_triangles(vertices_m, triangles, camera, pose)
+    picture = shaded_triangles(image, triangles, colors, surface.normals, _light(room.up), _white(camera))
+    return picture, height_range
+
+
+def _light(up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Towards the light of a plan, in the world."""
+    return np.array([-0.4, 0.5, 0.77]) @ level_rotation(up)
+
+
+def _white(camera: PinholeCamera) -> NDArray[np.uint8]:
+    return np.full((*camera.shape, 3), 255, np.uint8)
 
 
 def perspective(room: DrawnMap) -> "Figure":

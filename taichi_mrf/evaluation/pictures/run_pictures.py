@@ -54,7 +54,7 @@ def _whole_map(m: OccupancyMap) -> dict[str, "Figure"]:
     seen = seen_surfaces(m)
     up = up_direction(map(upward_axis, keyframes), seen.normals, m.up or Z_UP)
     surface = m.surface() if measures_surface(m) and m.has_surface else None
-    views = {}
+    views, drawn = {}, None
     if surface is not None and len(surface.triangles):
         drawn = DrawnSurface(surface.vertices_m, surface.triangles, surface.normals, surface.colors)
         views["surface.png"] = surface_view(drawn, m.voxel_size, up)
@@ -64,7 +64,7 @@ def _whole_map(m: OccupancyMap) -> dict[str, "Figure"]:
         return {**(views or {"perspective.png": nothing}), "top_view.png": nothing}
     normals = seen.thickened().normals_at(centres)
     room = DrawnMap(centres, normals, m.voxel_size, up, [each.T_world_camera for each in keyframes])
-    return {**(views or {"perspective.png": perspective(room)}), "top_view.png": top_view(room)}
+    return {**(views or {"perspective.png": perspective(room)}), "top_view.png": top_view(room, drawn)}
 
 
 def depth_comparison(m: OccupancyMap, held_out: Sequence[Frame]) -> "Figure":

@@ -23,6 +23,9 @@ from taichi_mrf.viewer.scene.options import ViewOptions
 from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
 from taichi_mrf.viewer.transport.inbox import Inbox
 
+_PLAIN = ViewOptions(show="voxels")
+"""What the mapping process sends unless it is asked for more."""
+
 
 class Page(BasePage[Panel]):
     """One page for all browsers that show it."""
@@ -32,15 +35,17 @@ class Page(BasePage[Panel]):
         inbox = Inbox()
         super().__init__(server, ask, inbox, Panel(server.gui, server.scene, inbox.put))
         self._voxel_size = 0.0
+        self._in_photo = False  # whether the page has opened in the colours of photographs
         self._to_freeze: dict[int, int] = {}  # the keyframe that each client is asked about
         self.handlers |= {
             m.Hello: self._begin,
             m.Bricks: lambda bricks: None if self.map is None else self.map.take(bricks),
             m.BrickColors: lambda colors: None if self.map is None else self.map.paint(colors),
             m.SurfacePatch: lambda patch: None if self.map is None else self.map.surface.take(patch),
+            m.SurfaceView: self._take_surface_view,
             m.KeyframeInfo: self._take_keyframe,
             m.CurrentCamera: self._take_camera,
-            m.Status: self.panel.show_status,
+            m.Status: self._take_status,
             m.RayAnswer: self._show_ray,
             m.Images: self.panel.show_images,
             m.TimeSpan: self.panel.time.show_span,
@@ -78,17 +83,43 @@ class Page(BasePage[Panel]):
     def options_changed(self, before: ViewOptions) -> None:
         """Tell the mapping process which extras are shown, and follow the camera if asked."""
         self.viewpoint.set_following(self.options.follow)
-        if _extras(self.options) != _extras(before):
+        if self._extras(self.options) != self._extras(before):
             self._ask_for_extras()
 
     def _begin(self, hello: m.Hello) -> None:
         """Start with an empty map."""
         self.begin_map(hello)
-        self._voxel_size = hello.voxel_size
+        self._voxel_size, self._in_photo = hello.voxel_size, False
         self.keyframes.clear()
         self.panel.ray.clear()
         self.panel.show_hello(hello)
         self.panel.show_keyframes({}, None)
+        self.options = self.panel.options()  # what this map cannot show is not offered any more
+        if self._extras(self.options) != self._extras(_PLAIN):
+            self._ask_for_extras()
+
+    def _take_status(self, status: m.Status) -> None:
+        self.panel.show_status(status)
+        growing = not (status.paused or status.finished)
+        if self.map is not None and growing != self.map.growing:
+            before = self._extras(self.options)
+            self.map.growing = growing
+            self.map.look_changed()
+            if growing:
+                self.viewpoint.look_at_everything()
+            if self._extras(self.options) != before:
+                self._ask_for_extras()
+
+    def _take_surface_view(self, view: m.SurfaceView) -> None:
+        """Show the surface as the picture of a run does: the first time also in its colours."""
+        if self.map is None:
+            return
+        self.map.surface.take_view(view)
+        if not self._with_baseline:
+            self.viewpoint.look_as_pictured(view)
+        if view.photo and not self._in_photo:
+            self._in_photo = True
+            self.panel.color_by_photo()
 
     def _take_keyframe(self, keyframe: m.KeyframeInfo) -> None:
         if not self.keyframes.keyframes:
@@ -205,7 +236,7 @@ class Page(BasePage[Panel]):
     def _ask_for_extras(self) -> None:
         """Tell the mapping process which extras the page shows."""
         view = self.keyframes.chosen if self.panel.view.value == CHOSEN_KEYFRAME else None
-        self.ask(m.Watch(self.panel.images.value, view, *_extras(self.options)))
+        self.ask(m.Watch(self.panel.images.value, view, *self._extras(self.options)))
 
     def _clicked(self, click: Clicked) -> None:
         """A click on a keyframe's picture chooses it and asks for the pixel's ray; a click on a voxel asks
@@ -214,7 +245,7 @@ class Page(BasePage[Panel]):
             return
         shown = [k for k in self.keyframes.keyframes.values() if k.state != "frozen"]
         pixel = first_pixel(click.origin, click.direction, shown)
-        voxel = first_voxel(click.origin, click.direction, *self.map.boxes())
+        voxel = first_voxel(click.origin, click.direction, self.map.points(), self._voxel_size)
         if pixel is not None and (voxel is None or pixel.range_m < voxel[1]):
             self._choose(pixel.keyframe)
             if pixel.point is None:
@@ -226,10 +257,9 @@ class Page(BasePage[Panel]):
             point, chosen = voxel[0], self.keyframes.chosen
             self.ask(m.RayThrough((point[0], point[1], point[2]), click.origin, chosen))
 
-
-def _extras(options: ViewOptions) -> tuple[bool, bool, bool, bool]:
-    """Whether the options need the baseline's map, the counts of keyframes, the colours of voxels, and the
-    measured surface."""
-    by = options.color_by
-    surface = options.show == "surface"
-    return options.show_baseline, by == "keyframes", by == "photo", surface
+    def _extras(self, options: ViewOptions) -> tuple[bool, bool, bool, bool]:
+        """Whether the options need the baseline's map, the counts of keyframes, the colours of voxels, and
+        the measured surface, which has colours of its own."""
+        by, surface = options.color_by, options.show == "surface"
+        instead = surface and self.map is not None and not self.map.growing
+        return options.show_baseline, by == "keyframes", by == "photo" and not instead, surface

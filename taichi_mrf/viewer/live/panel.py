@@ -11,7 +11,7 @@ from taichi_mrf.viewer.live.actions import Action
 from taichi_mrf.viewer.live.time_folder import TimeFolder
 from taichi_mrf.viewer.messages import Hello, Images, KeyframeInfo, Status
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Tell, rows_html
-from taichi_mrf.viewer.scene.options import UNPAINTED, ColorBy, ViewOptions
+from taichi_mrf.viewer.scene.options import UNPAINTED, ColorBy, Show, ViewOptions
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
 from taichi_mrf.viewer.scene.safe_text import in_html, in_markdown
 from taichi_mrf.viewer.scene.widgets import OptionWidgets
@@ -53,7 +53,6 @@ _MAP_OPTIONS = (
     "threshold",
     "size",
     "shade",
-    "cells",
     "cut_axis",
     "cut_at",
     "bricks",
@@ -146,6 +145,7 @@ class Panel(BasePanel):
         self._hello = hello
         self.time.begin(hello.has_dates)
         self._map_options.offer("color_by", get_args(ColorBy) if hello.has_colors else UNPAINTED)
+        self._map_options.offer("show", get_args(Show) if hello.has_surface else ("voxels",))
         self._parameters.content = (
             '<div style="margin:0.5em 0.75em;font-size:0.85em">Parameters'
             f'<pre style="overflow:auto;margin:0.3em 0">{in_html(hello.parameters)}</pre></div>'
@@ -154,6 +154,12 @@ class Panel(BasePanel):
             label for label, action in EDIT_BUTTONS.items() if hello.can_freeze or action is not Action.FREEZE
         )
         self.clear_notices()
+
+    def color_by_photo(self) -> None:
+        """Show the colours that cameras saw, unless a user has chosen other colours than the first ones."""
+        widget = self._map_options.handles["color_by"]
+        if widget.value == ViewOptions().color_by:
+            widget.value = "photo"
 
     def show_status(self, status: Status) -> None:
         """Show progress and figures."""

@@ -10,7 +10,9 @@ from collections.abc import Callable
 from enum import Enum
 from typing import Any, ClassVar, Generic, Literal, TypeVar
 
+import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.scene.base_panel import BasePanel
@@ -28,6 +30,8 @@ P = TypeVar("P", bound=BasePanel)
 _HEAD_START_S = 0.01
 """Delay that lets the new count reach the browser before the voxel data: a browser that draws by software is
 busy with the voxels for half a second."""
+
+_TOP, _BOTTOM, _BACKDROP_ROWS = (52, 58, 68), (104, 112, 124), 256
 
 _ONLY_THE_LATEST = (m.Status, m.CurrentCamera, m.Images, m.TimeSpan, m.SceneChanges, OptionsMoved)
 """Of several of these that wait, only the latest is handled."""
@@ -62,6 +66,7 @@ class BasePage(Generic[P]):
         }
         """What is done with each kind of update and event; other kinds are ignored."""
         self._show_theme()
+        server.scene.set_background_image(_backdrop(), format="png")
         server.scene.configure_default_lights(cast_shadow=False)
         server.on_client_connect(lambda client: inbox.put(Joined(client.client_id)))
 
@@ -108,6 +113,8 @@ class BasePage(Generic[P]):
 
     def _take_options(self) -> None:
         before, self.options = self.options, self.panel.options()
+        if self.options == before:
+            return
         if self.options.dark != before.dark:
             self._show_theme()
         self.options_changed(before)
@@ -140,6 +147,13 @@ class BasePage(Generic[P]):
         if self.map.scale is not None and self.map.scale != self._scale:
             self._scale = self.map.scale
             self.panel.show_legend(legend_html(self._scale))
+
+
+def _backdrop() -> NDArray[np.uint8]:
+    """The background of the scene, RGB, that of a run's pictures: neither white nor black things merge with
+    it."""
+    rows = np.linspace(_TOP, _BOTTOM, _BACKDROP_ROWS)
+    return np.repeat(np.rint(rows).astype(np.uint8)[:, None], _BACKDROP_ROWS, axis=1)
 
 
 def _latest(batch: list[Item]) -> list[Item]:

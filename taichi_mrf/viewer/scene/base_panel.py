@@ -18,12 +18,10 @@ Tell = Callable[[Event], None]
 _MOST_NOTICES = 8
 
 _COUNTED = {
-    "cells": "cells",
-    "triangles": "triangles of the surface",
     "dynamic": "dynamic",
     "baseline": "of the baseline",
 }
-"""What is counted beside voxels, and its words."""
+"""What is counted beside voxels or the surface, and its words."""
 
 
 class BasePanel:
@@ -81,7 +79,9 @@ class BasePanel:
     def show_counts(self, counts: Mapping[str, int], recording: bool) -> None:
         """Show how much the page shows, by the names that MapScene.counts has, and whether the scene is being
         recorded."""
-        text = f"{counts['map']:,} voxels shown"
+        surface = counts["triangles"]
+        what = f"{surface:,} triangles of the measured surface" if surface else f"{counts['map']:,} voxels"
+        text = f"{what} shown"
         text += "".join(f", {counts[name]:,} {words}" for name, words in _COUNTED.items() if counts[name])
         self._shown.content = text + (" · recording" if recording else "")
 

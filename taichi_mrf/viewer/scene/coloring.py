@@ -1,8 +1,9 @@
-"""Colours of voxels, and the legend. All colour scales are perceptually uniform."""
+"""Colours of voxels, and the legend. Heights have the colours that they have in a run's pictures; all other
+colour scales are perceptually uniform."""
 
 import base64
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 
 import cv2
 import numpy as np
@@ -13,14 +14,13 @@ from taichi_mrf.viewer.scene.options import ColorBy
 from taichi_mrf.viewer.scene.voxel_store import Shown
 from taichi_mrf.voxels.colors import LOWEST, NO_COLOR
 
-_MAPS = {
-    "marginal": cv2.COLORMAP_VIRIDIS,
-    "height": cv2.COLORMAP_CIVIDIS,
-    "uncertainty": cv2.COLORMAP_MAGMA,
-    "keyframes": cv2.COLORMAP_PLASMA,
-    "photo": cv2.COLORMAP_BONE,  # of no voxel
+_MAPS: dict[ColorBy, str] = {
+    "marginal": "viridis",
+    "height": "Spectral_r",
+    "uncertainty": "magma",
+    "keyframes": "plasma",
+    "photo": "bone",  # of no voxel
 }
-
 
 PHOTO_LABEL = "what cameras saw; grey where none did"
 
@@ -64,8 +64,7 @@ def scale_of(
     """The scale of a mode. ``heights_m`` are the lowest and the highest height, ``most_keyframes`` is the
     largest number of keyframes that see a voxel. Marginals begin at one half, or at 0 if less probable voxels
     are shown; counts of keyframes are on a logarithmic scale that ends at a power of two."""
-    ramp = np.arange(256, dtype=np.uint8)[:, None]
-    colors = np.ascontiguousarray(cv2.applyColorMap(ramp, _MAPS[color_by])[:, 0, ::-1])
+    colors = _colors(color_by)
     if color_by == "height":
         return Scale(color_by, colors, *heights_m, "height (m)")
     if color_by == "keyframes":
@@ -80,6 +79,20 @@ def scale_of(
         return Scale(color_by, colors, 0.0, 1.0, "uncertainty: entropy (bits)", _numbers(_entropy(p)))
     low = LOWEST if threshold >= LOWEST else 0.0
     return Scale(color_by, colors, low, 1.0, "marginal probability", _numbers((p - low) / (1.0 - low)))
+
+
+@cache
+def _colors(color_by: ColorBy) -> NDArray[np.uint8]:
+    """The 256 colours (256, 3) of a mode, RGB."""
+    from matplotlib import colormaps
+
+    found: NDArray[np.uint8] = colormaps[_MAPS[color_by]](np.arange(256), bytes=True)[:, :3]
+    return np.ascontiguousarray(found)
+
+
+def height_scale(range_m: float) -> Scale:
+    """The scale of heights above the lowest surface, as a run's pictures have it."""
+    return Scale("height", _colors("height"), 0.0, range_m, "height above the lowest surface (m)")
 
 
 def std_scale(std_m: NDArray[np.floating]) -> Scale:

@@ -28,7 +28,6 @@ def look_of(options: ViewOptions, store: VoxelStore, up: Up, voxel_size: float) 
         point_size=options.size,
         shade=options.shade,
         dynamic=options.dynamic,
-        cells=options.cells,
         up=up,
     )
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.viewer.messages import BrickColors, Bricks, Hello, Layer
 from taichi_mrf.viewer.scene.brick_lines import BrickLines
-from taichi_mrf.viewer.scene.cell_layer import AT_ONCE_S, WHILE_CHANGING_S, CellLayer
 from taichi_mrf.viewer.scene.coloring import Scale
 from taichi_mrf.viewer.scene.cut_plane import CutPlane, cut_picture
 from taichi_mrf.viewer.scene.look import Look, look_of
@@ -35,7 +34,7 @@ _NAMES: dict[Layer, str] = {"map": "this map", "baseline": "baseline (OctoMap)"}
 
 
 class MapScene:
-    """Owns the scene nodes /voxels, /cells, /surface, /baseline, /cut, /bricks and /names."""
+    """Owns the scene nodes /voxels, /surface, /baseline, /cut, /bricks and /names."""
 
     def __init__(self, server: viser.ViserServer, hello: Hello) -> None:
         self._server, self._hello = server, hello
@@ -43,12 +42,11 @@ class MapScene:
             "map": VoxelLayer(server.scene, "/voxels", hello.voxel_size),
             "baseline": VoxelLayer(server.scene, "/baseline", hello.voxel_size),
         }
-        self.cells = CellLayer(
-            server.scene, "/cells", hello.voxel_size, hello.prior_log_odds, hello.min_evidence
-        )
         self.surface = SurfaceLayer(server.scene, "/surface", hello.voxel_size)
-        self._voxel_nodes = [server.scene.add_frame(name, show_axes=False) for name in ("/voxels", "/cells")]
+        self._voxels = server.scene.add_frame("/voxels", show_axes=False)
         self._surface_wanted = False
+        self.growing = False
+        """Whether frames are read: a surface that was made before lacks what they add."""
         self._cut_plane = CutPlane(server.scene, hello.voxel_size)
         self._brick_lines = BrickLines(server.scene, hello.voxel_size)
         self._dirty: dict[Layer, set[ChunkKey]] = {"map": set(), "baseline": set()}
@@ -70,8 +68,8 @@ class MapScene:
 
     @property
     def shows_surface(self) -> bool:
-        """Whether the measured surface is shown in the place of voxels and cells."""
-        return self._surface_wanted and bool(self.surface.patches)
+        """Whether the measured surface is shown in the place of voxels: not while the map grows."""
+        return self._surface_wanted and self.surface.is_complete and not self.growing
 
     def box_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """Lowest and highest corner of all maps that are shown, in metres, world; None if there is none."""
@@ -89,21 +87,15 @@ class MapScene:
     def counts(self) -> dict[str, int]:
         """How many of what is shown, or will be once everything has been sent, by name."""
         counts: dict[str, int] = {name: layer.voxels_shown for name, layer in self.layers.items()}
-        counts |= {"cells": self.cells.shown, "dynamic": self.layers["map"].dynamic_shown, "triangles": 0}
+        counts |= {"dynamic": self.layers["map"].dynamic_shown, "triangles": 0}
         if self.shows_surface:
-            hidden = dict.fromkeys(("map", "cells", "dynamic"), 0)
-            counts |= {**hidden, "triangles": self.surface.triangles_shown}
+            counts |= {"map": 0, "dynamic": 0, "triangles": self.surface.triangles_shown}
         return counts
 
-    def boxes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centres (n, 3) and sides (n,) of all voxels and cells of the map that are shown, in metres,
-        world; of the surface its vertices."""
-        if self.shows_surface:
-            vertices = self.surface.points()
-            return vertices, np.full(len(vertices), self._hello.voxel_size)
-        voxels, (cells, sides) = self.layers["map"].points(), self.cells.boxes()
-        alike = np.full(len(voxels), self._hello.voxel_size)
-        return np.concatenate([voxels, cells]), np.concatenate([alike, sides])
+    def points(self) -> NDArray[np.float64]:
+        """Centres (n, 3) of all voxels of the map that are shown, in metres, world; of the surface its
+        vertices."""
+        return self.surface.points() if self.shows_surface else self.layers["map"].points()
 
     def take(self, bricks: Bricks) -> None:
         """Take in changed bricks; :meth:`flush` draws them."""
@@ -127,7 +119,6 @@ class MapScene:
         """Remove everything from the scene."""
         for layer in self.layers.values():
             layer.clear()
-        self.cells.clear()
         self.surface.clear()
         self._cut_plane.hide()
         self._brick_lines.hide()
@@ -140,11 +131,8 @@ class MapScene:
         now = time.monotonic()
         if self._all_dirty or any(self._dirty.values()) or (self.shows_surface and self.surface.is_stale):
             return max(0.0, self._sent_at + 1 / UPDATES_PER_SECOND - now)
-        at_rest = self._news_at + REST_S
-        times = [self.cells.due(at_rest)]
-        if any(layer.inexact() for layer in self.layers.values()):
-            times.append(at_rest)
-        return min((max(0.0, each - now) for each in times if each is not None), default=None)
+        inexact = any(layer.inexact() for layer in self.layers.values())
+        return max(0.0, self._news_at + REST_S - now) if inexact else None
 
     def flush(
         self,
@@ -172,11 +160,6 @@ class MapScene:
             chunks = layer.all_chunks() if everything else self._dirty[name]
             layer.prepare(chunks | (layer.inexact() if rested else set()), look, exactly=rested)
             self._dirty[name] = set()
-            if name == "map":
-                self.cells.outdate(chunks)
-        due = self.cells.due(self._news_at + REST_S)
-        if due is not None and time.monotonic() >= due:
-            self.cells.prepare(self.store, look, AT_ONCE_S if rested else WHILE_CHANGING_S)
         if everything:
             self.surface.outdate()
         if self.shows_surface:
@@ -185,7 +168,6 @@ class MapScene:
         with self._server.atomic():
             for layer in self.layers.values():
                 layer.send()
-            self.cells.send()
             self._show_surface(self.shows_surface)
             if map_changed:
                 self._draw_cut(look, crossed)
@@ -197,11 +179,10 @@ class MapScene:
         return True
 
     def _show_surface(self, visible: bool) -> None:
-        """Show the surface in the place of voxels and cells, or these."""
+        """Show the surface in the place of voxels, or these."""
         self.surface.send(visible)
-        for node in self._voxel_nodes:
-            if node.visible == visible:
-                node.visible = not visible
+        if self._voxels.visible == visible:
+            self._voxels.visible = not visible
 
     def _draw_cut(self, look: Look, crossed: Iterable[NDArray[np.int32]]) -> None:
         if look.cut is None:

@@ -9,7 +9,7 @@ from taichi_mrf.config.sliders import Range
 ColorBy = Literal["marginal", "height", "uncertainty", "keyframes", "photo"]
 UNPAINTED: tuple[ColorBy, ...] = tuple(each for each in get_args(ColorBy) if each != "photo")
 """What the colour can show of a map that no camera has seen in colour."""
-Show = Literal["voxels", "surface"]
+Show = Literal["surface", "voxels"]
 CutAxis = Literal["none", "x", "y", "z"]
 
 
@@ -17,11 +17,11 @@ CutAxis = Literal["none", "x", "y", "z"]
 class ViewOptions:
     """How the map is shown; nothing here changes the map."""
 
-    show: Show = "voxels"
-    """Show the voxels of the map, or the surface that its keyframes measured, below the size of voxels. The
-    surface is made when no frames are read: at the end, or while paused."""
+    show: Show = "surface"
+    """Show the surface that the keyframes measured, below the size of voxels, or the voxels of the map. The
+    surface is made when no frames are read, at the end or while paused; until then voxels are shown."""
 
-    color_by: ColorBy = "marginal"
+    color_by: ColorBy = "height"
     """What the colour shows: the marginal probability, the height, the uncertainty (of a voxel its entropy,
     of the surface its standard deviation), the number of keyframes whose rays pass through the voxel, or what
     cameras saw (photo)."""
@@ -33,10 +33,7 @@ class ViewOptions:
     """Size of the points, in voxels."""
 
     shade: bool = True
-    """Darken voxels a little by the direction that their surface faces: shapes are easier to see."""
-
-    cells: bool = True
-    """Where no voxel reaches the threshold but a cell of 2, 4 or 8 voxels does, show the cell."""
+    """Darken voxels and the surface a little by the direction that they face: shapes are easier to see."""
 
     cut_axis: CutAxis = "none"
     """Cut the map open across this axis. The cut shows free space (blue), occupied (yellow) and unknown
@@ -61,4 +58,4 @@ class ViewOptions:
     """Show in red what is dynamic: occupied now, although all keyframes together say that it is free."""
 
     dark: bool = False
-    """Dark colours for the page."""
+    """Dark colours for the page's panel."""

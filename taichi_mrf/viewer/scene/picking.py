@@ -1,4 +1,4 @@
-"""What a click into the scene hits: a voxel or cell, or a pixel of a keyframe's picture."""
+"""What a click into the scene hits: a voxel, or a pixel of a keyframe's picture."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -26,10 +26,10 @@ class Pixel:
 
 
 def first_voxel(
-    origin: ArrayLike, direction: ArrayLike, centres: NDArray[np.float64], sides_m: ArrayLike
+    origin: ArrayLike, direction: ArrayLike, centres: NDArray[np.float64], side_m: float
 ) -> tuple[NDArray[np.float64], float] | None:
-    """The centre of the nearest voxel or cell that a ray hits, and its range in metres, of those with these
-    centres (n, 3) and sides (n,), or one for all.
+    """The centre of the nearest voxel that a ray hits, and its range in metres, of those with these centres
+    (n, 3) and this side.
 
     The ray hits a voxel if it passes the centre at no more than half the diagonal of a face: about the size
     of the voxel's point on the screen.
@@ -40,7 +40,7 @@ def first_voxel(
     offset = centres - start
     range_m = offset @ along
     aside = np.linalg.norm(offset - range_m[:, None] * along, axis=1)
-    met = np.flatnonzero((range_m > 0) & (aside <= np.sqrt(0.5) * np.asarray(sides_m)))
+    met = np.flatnonzero((range_m > 0) & (aside <= np.sqrt(0.5) * side_m))
     if not len(met):
         return None
     first = met[np.argmin(range_m[met])]

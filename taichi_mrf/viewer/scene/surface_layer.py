@@ -6,17 +6,14 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from taichi_mrf.viewer.messages import SurfacePatch
-from taichi_mrf.viewer.scene.coloring import Scale, std_colors, std_scale, voxel_colors
+from taichi_mrf.viewer.messages import SurfacePatch, SurfaceView
+from taichi_mrf.viewer.scene.coloring import Scale, height_scale, std_colors, std_scale, voxel_colors
 from taichi_mrf.viewer.scene.unlit_mesh import unlit_glb
 from taichi_mrf.viewer.scene.voxel_layer import Look
 from taichi_mrf.viewer.scene.voxel_store import ChunkKey, Cut, Shown, VoxelStore
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
 
-_LIGHT = (0.4, 0.25, 0.88)
-"""From where the light comes: along the two level axes, and up."""
-
-_DARKEST = 0.5
+_DARKEST = 0.62
 """Brightness of what the light does not reach."""
 
 
@@ -36,6 +33,7 @@ class SurfaceLayer:
         self._root = scene.add_frame(prefix, show_axes=False, visible=False)
         self.patches: dict[ChunkKey, SurfacePatch] = {}
         self._stale: set[ChunkKey] = set()
+        self._view: SurfaceView | None = None
         self._scale: Scale | None = None
         self._prepared: dict[ChunkKey, _Drawn | None] = {}
         self._nodes: dict[ChunkKey, tuple[_Drawn, viser.GlbHandle]] = {}
@@ -44,6 +42,11 @@ class SurfaceLayer:
     def is_stale(self) -> bool:
         """Whether :meth:`prepare` has something to do."""
         return bool(self._stale)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether there is a surface, and all of it has been taken in."""
+        return self._view is not None and bool(self.patches)
 
     @property
     def triangles_shown(self) -> int:
@@ -60,12 +63,21 @@ class SurfaceLayer:
             self.patches.pop(patch.chunk, None)
         self._stale.add(patch.chunk)
 
+    def take_view(self, view: SurfaceView) -> None:
+        """Take in how to show the patches that were taken in before. One that differs little from the last
+        changes nothing, so that an edit draws only what it changes."""
+        if self._view is None or not _is_like(self._view, view):
+            self._view = view
+            self.outdate()
+
     def outdate(self) -> None:
         """Draw everything again with the next :meth:`prepare`."""
         self._stale |= self.patches.keys()
 
     def scale(self, look: Look) -> Scale:
         """The scale of its colours."""
+        if look.scale.color_by == "height" and self._view is not None:
+            return height_scale(self._view.range_m)
         if look.scale.color_by != "uncertainty":
             return look.scale
         every = [np.zeros(0, np.float32), *(patch.std_m for patch in self.patches.values())]
@@ -74,7 +86,7 @@ class SurfaceLayer:
     def prepare(self, look: Look, store: VoxelStore) -> None:
         """Make the meshes of the patches that have changed; :meth:`send` sends them."""
         scale = self.scale(look)
-        if scale != self._scale:  # that of uncertainty depends on all patches
+        if scale != self._scale:  # that of uncertainty and that of heights depend on all patches
             self._scale = scale
             self.outdate()
         for key in sorted(self._stale):
@@ -102,6 +114,7 @@ class SurfaceLayer:
     def clear(self) -> None:
         """Remove everything from the scene."""
         self.patches.clear()
+        self._view = None
         self._stale.clear()
         self._prepared = dict.fromkeys(self._nodes)
         self.send(visible=False)
@@ -130,19 +143,17 @@ class SurfaceLayer:
         return patch.triangles[before[patch.triangles].all(axis=1)]
 
     def _colors(self, patch: SurfacePatch, look: Look, scale: Scale, store: VoxelStore) -> NDArray[np.uint8]:
-        axis, sign = look.up
+        view = self._view
+        assert view is not None  # until then nothing is drawn
         if scale.color_by == "uncertainty":
             colors = std_colors(scale, patch.std_m)
         else:
             seen = self._seen(patch, store) if scale.color_by == "keyframes" else np.zeros(0, np.uint8)
             shown = Shown(np.zeros((0, 3), np.uint8), patch.log_odds, seen, patch.colors)
-            colors = voxel_colors(scale, shown, sign * patch.vertices_m[:, axis])
-        if not look.shade or scale.color_by == "photo":
+            colors = voxel_colors(scale, shown, patch.vertices_m @ view.up - view.floor_m)
+        if not look.shade:
             return colors
-        towards = np.zeros(3)
-        towards[axis] = sign * _LIGHT[2]
-        towards[[other for other in range(3) if other != axis]] = _LIGHT[:2]
-        lit = 0.5 + 0.5 * (patch.normals / 127.0) @ towards
+        lit = np.clip((patch.normals / 127.0) @ view.light, 0.0, 1.0)
         return (colors * (_DARKEST + (1 - _DARKEST) * lit)[:, None] + 0.5).astype(np.uint8)
 
     def _seen(self, patch: SurfacePatch, store: VoxelStore) -> NDArray[np.uint8]:
@@ -155,3 +166,9 @@ class SurfaceLayer:
 
     def _corner_m(self, key: ChunkKey) -> NDArray[np.float64]:
         return np.array(key) * (CHUNK_VOXELS * self._voxel_size)
+
+
+def _is_like(view: SurfaceView, other: SurfaceView) -> bool:
+    """Whether colours by height are nearly the same."""
+    one, two = (np.array([each.floor_m, each.floor_m + each.range_m]) for each in (view, other))
+    return bool((np.abs(one - two) < 0.02 * view.range_m).all()) and float(view.up @ other.up) > 0.999

@@ -1,11 +1,14 @@
 """The viewpoint of the browsers: a view of the whole map at first, and a view that follows the camera."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Up, up_vector
+from taichi_mrf.viewer.messages import SurfaceView
 
 _GROWTH = 1.2
 """The first view is chosen again when the map has grown by this factor."""
@@ -14,7 +17,26 @@ _PANEL_SHARE = 0.2
 """Distance of the map's centre to the left of the window's, as a share of the map's size: the panel covers
 the right side."""
 
+_BACK, _ASIDE = 1.25, 0.1
+"""The page's view is so many times as far away as the picture's, and moved aside by this share of the
+window's width: the panel covers the right side."""
+
+_ASPECT = 1.6
+"""Width over height of a usual window."""
+
 _BEHIND_M, _ABOVE_M, _AHEAD_M = 1.5, 0.7, 2.0
+_WIDE_RAD = np.deg2rad(75.0)
+"""The vertical field of view, but of the picture's view."""
+
+
+@dataclass(frozen=True)
+class _View:
+    """From where a browser looks: metres, world."""
+
+    eye_m: NDArray[np.float64]
+    target_m: NDArray[np.float64]
+    up: NDArray[np.float64]
+    fov_rad: float = _WIDE_RAD
 
 
 class ViewpointController:
@@ -27,13 +49,15 @@ class ViewpointController:
         self._forwards = np.zeros(3)
         self._following = False
         self._seen_size = 0.0
-        self._view: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        self._view: _View | None = None
+        self._as_pictured = False
         self._placed: dict[int, NDArray[np.float64]] = {}
 
     def set_up(self, up: Up) -> None:
         """Set which way is up, from the first keyframe on."""
         self.up = up
-        self._seen_size, self._view = 0.0, None
+        self._view = None
+        self.look_at_everything()
         self._server.scene.set_up_direction(up_vector(up))
 
     def joined(self, client: int) -> None:
@@ -44,7 +68,7 @@ class ViewpointController:
         self._placed[client] = handle.camera.position
         view = self._shared_view()
         if view is not None:
-            self._point(handle, *view)
+            self._point(handle, view)
 
     def camera_moved(self, T_world_camera: Pose, forwards: NDArray[np.float64]) -> None:
         """Store the pose of a camera that looks ``forwards`` (3,) in its own frame, and follow it if
@@ -63,13 +87,25 @@ class ViewpointController:
 
     def look_at_everything(self) -> None:
         """Choose the view again at the next :meth:`map_grew`; a view that a user has chosen stays."""
-        self._seen_size = 0.0
+        self._seen_size, self._as_pictured = 0.0, False
+
+    def look_as_pictured(self, view: SurfaceView) -> None:
+        """Look at the surface as the picture of a run does, until :meth:`look_at_everything`: browsers that
+        connect later, and those whose user has not moved the view."""
+        if self._as_pictured:
+            return
+        self._as_pictured = True
+        along = view.target_m - view.eye_m
+        width_m = 2.0 * _BACK * float(np.linalg.norm(along)) * np.tan(0.5 * view.fov_rad) * _ASPECT
+        right = np.cross(along, view.up)
+        target = view.target_m + _ASIDE * width_m * right / np.linalg.norm(right)
+        self._begin_with(_View(target - _BACK * along, target, view.up, view.fov_rad))
 
     def map_grew(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
         """Look at the whole box from ``low`` to ``high`` (metres, world): browsers that connect later, and
         those whose user has not moved the view. While the view follows the camera it stays there."""
         size = float(np.linalg.norm(high - low))
-        if size < _GROWTH * self._seen_size:
+        if size < _GROWTH * self._seen_size or self._as_pictured:
             return
         self._seen_size = size
         centre = (low + high) / 2
@@ -83,21 +119,25 @@ class ViewpointController:
         right = np.cross(up, aside) / np.linalg.norm(aside)
         target = centre + _PANEL_SHARE * size * right
         eye = target + 0.5 * size * aside / np.linalg.norm(aside) + 0.7 * size * up
-        self._view = eye, target
+        self._begin_with(_View(eye, target, up))
+
+    def _begin_with(self, view: _View) -> None:
+        """Show this view to browsers that connect later, and to those whose user has not moved theirs."""
+        self._view = view
         self._begin_there()
         if self._following:
             return
         for id, client in self._server.get_clients().items():
             if np.allclose(client.camera.position, self._placed.get(id, np.inf), atol=1e-3):
-                self._point(client, eye, target)
+                self._point(client, view)
 
     def _follow(self) -> None:
         view = self._behind_camera() if self._following else None
         if view is not None:
             for client in self._server.get_clients().values():
-                self._point(client, *view)
+                self._point(client, view)
 
-    def _shared_view(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def _shared_view(self) -> _View | None:
         """The view that new browsers get; None before the first frame and keyframe."""
         behind = self._behind_camera() if self._following else None
         return self._view if behind is None else behind
@@ -108,21 +148,22 @@ class ViewpointController:
         view = self._shared_view()
         if view is not None:
             start = self._server.initial_camera
-            start.position, start.look_at = view
+            start.position, start.look_at, start.up, start.fov = (
+                view.eye_m, view.target_m, view.up, view.fov_rad,
+            )  # fmt: skip
 
-    def _behind_camera(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Eye and target that look over the camera's shoulder; None before the first frame."""
+    def _behind_camera(self) -> _View | None:
+        """The view that looks over the camera's shoulder; None before the first frame."""
         if self._camera is None:
             return None
         position, forward = self._camera[:3, 3], self._forwards
-        eye = position - _BEHIND_M * forward + _ABOVE_M * up_vector(self.up)
-        return eye, position + _AHEAD_M * forward
+        up = up_vector(self.up)
+        return _View(position - _BEHIND_M * forward + _ABOVE_M * up, position + _AHEAD_M * forward, up)
 
-    def _point(
-        self, client: viser.ClientHandle, eye: NDArray[np.float64], target: NDArray[np.float64]
-    ) -> None:
+    def _point(self, client: viser.ClientHandle, view: _View) -> None:
         with client.atomic():
-            client.camera.up_direction = up_vector(self.up)
-            client.camera.position = eye
-            client.camera.look_at = target
-        self._placed[client.client_id] = eye
+            client.camera.up_direction = view.up
+            client.camera.position = view.eye_m
+            client.camera.look_at = view.target_m
+            client.camera.fov = view.fov_rad
+        self._placed[client.client_id] = view.eye_m

@@ -26,8 +26,6 @@ class Look:
     shade: bool
     dynamic: bool
     """Whether dynamic voxels have a colour of their own."""
-    cells: bool
-    """Whether cells stand in for voxels."""
     up: tuple[int, int]
     """The axis that points up, and 1 or -1 for its direction."""
 

@@ -31,7 +31,7 @@ SAVE_BUTTONS = {
 }
 NONE_YET = "none yet"
 MAP_OPTIONS = (
-    "color_by", "threshold", "size", "shade", "cells", "cut_axis", "cut_at", "bricks", "pictures", "dark",
+    "color_by", "threshold", "size", "shade", "cut_axis", "cut_at", "bricks", "pictures", "dark",
 )  # fmt: skip
 
 _FOLDERS = {"map": "Map", **{m.section: m.title for m in METHODS.values()}, "keyframes": "Keyframes"}
