@@ -135,8 +135,7 @@ def write_run(
         posed = reposed(posed, result.track.poses(result.map))
     found, noise = None, None
     if check and posed is not None:
-        mapped = result.map if chunked is None else ChunkedViews(chunked)
-        found = _check(mapped, result, posed, haste, advance)
+        found = _check(result, posed, haste, advance, None if chunked is None else ChunkedViews(chunked))
         if found is not None and chunked is None:
             noise = _check_noise(result, posed, haste)
         if not haste.hurried and not result.interrupted:
@@ -221,7 +220,7 @@ def _write_map(
 
 
 def _check(
-    mapped: RenderedMap, result: MappingResult, dataset: Dataset, haste: Haste, advance: Advance
+    result: MappingResult, dataset: Dataset, haste: Haste, advance: Advance, rendered_by: RenderedMap | None
 ) -> HeldOutCheck | None:
     """None if no frame was held out, or if the run has to end before the check does."""
     if not result.held_out or haste.hurried:
@@ -234,7 +233,7 @@ def _check(
 
     try:
         with result.timed("checking"):
-            check = check_held_out(mapped, dataset, result.held_out, checked)
+            check = check_held_out(result.map, dataset, result.held_out, checked, rendered_by)
     except CutShortError:
         return None
     result.skipped.update(check.skipped)
