@@ -7,7 +7,7 @@ from typing import Protocol
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import FrameError
 from taichi_mrf.evaluation.accuracy import JudgedMap
-from taichi_mrf.evaluation.noise_fit import Explained, explained, pooled, sigma_factor
+from taichi_mrf.evaluation.noise_fit import Explained, SigmaLaw, explained, pooled, sigma_factor, sigma_law
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import NoiseModel, unwidened_noise
 
@@ -32,17 +32,19 @@ class NoisyMap(JudgedMap, Protocol):
 @dataclass(frozen=True)
 class NoiseCheck:
     """``factor`` is what sigma has to be multiplied by so that ``pixels`` measurements of ``frames`` held-out
-    frames are likeliest, and ``gain`` by how many nats each they are then likelier."""
+    frames are likeliest, and ``gain`` by how many nats each they are then likelier. ``law`` is the law of
+    sigma under which they are likeliest where sigma is off, else None."""
 
     factor: float
     gain: float
     frames: int
     pixels: int
+    law: SigmaLaw | None = None
 
     @property
     def wrong(self) -> bool:
         """Whether sigma is off."""
-        return self.gain > LEAST_GAIN and not 1.0 / WRONG <= self.factor <= WRONG
+        return self.law is not None
 
 
 def check_noise(
@@ -73,7 +75,8 @@ def checked(measured: Explained, frames: int) -> NoiseCheck:
     least, most = sigma_factor(measured), sigma_factor(without)
     factor, by = (least, measured) if least > 1.0 else (min(most, 1.0), without)
     gain = by.mean(factor * by.sigma_m) - by.mean(by.sigma_m)
-    return NoiseCheck(factor, gain, frames, len(measured.sigma_m))
+    wrong = gain > LEAST_GAIN and not 1.0 / WRONG <= factor <= WRONG
+    return NoiseCheck(factor, gain, frames, len(measured.sigma_m), sigma_law(by) if wrong else None)
 
 
 def explained_frame(m: NoisyMap, frame: Frame) -> Explained | None:

@@ -7,16 +7,36 @@ import numpy as np
 import pytest
 
 from taichi_mrf import open_dataset
-from taichi_mrf.calibration.from_recording import FRAMES, LONGEST_STRIDE, RUNS, _priors, _spread, learn_sigma
+from taichi_mrf.calibration import from_recording
+from taichi_mrf.calibration.from_recording import (
+    FRAMES,
+    LONGEST_STRIDE,
+    RUNS,
+    _priors,
+    _spread,
+    is_doubted,
+    learn_sigma,
+)
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.datasets import Dataset
-from taichi_mrf.datasets.derived import chosen
+from taichi_mrf.datasets.derived import Derived, chosen
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.evaluation.noise_check import WRONG
 from taichi_mrf.evaluation.noise_fit import VOXEL_SPREAD, SigmaLaw
+from taichi_mrf.sensor.frame import Frame
 
 VOXEL = 0.05
+
+
+class Noisy(Derived):
+    """A recording whose measurements are off by 10 cm more than its source's."""
+
+    def read(self, index: int) -> Frame:
+        frame = self.source.read(index)
+        off_m = np.random.default_rng(index).normal(0.0, 0.1, frame.depth_m.shape)
+        noisy_m = np.where(frame.depth_m > 0, np.maximum(frame.depth_m + off_m, 0.1), 0.0)
+        return replace(frame, depth_m=noisy_m.astype(np.float32))
 
 
 @pytest.fixture(scope="module")
@@ -103,3 +123,20 @@ def test_recordings_that_cannot_tell_are_refused(room: Dataset) -> None:
         learn_sigma(camera, Config(VOXEL))
     with pytest.raises(DatasetError, match="0 held-out frames"):
         learn_sigma(chosen(room, [0, 1]), Config(VOXEL))
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_only_a_default_noise_of_a_long_recording_is_doubted(
+    room: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = Config(VOXEL)
+    assert not is_doubted(room, config), "12 frames are too few"
+    monkeypatch.setattr(from_recording, "GLANCE_COST", 0)
+    assert not is_doubted(room, config), "its noise is the default"
+    noisy = Noisy(room.name, room.camera, source=room)
+    assert is_doubted(noisy, config)
+    stated = replace(config, sensor=SensorConfig(sigma=(0.001,)))
+    assert not is_doubted(noisy, stated), "the user has said what it is"
+    assert not is_doubted(noisy, replace(config, method="log_odds"))
+    noisy.tracked = True
+    assert not is_doubted(noisy, config)

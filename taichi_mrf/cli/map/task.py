@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from taichi_mrf.cli.options.map import Map
+from taichi_mrf.cli.options.noise_flags import NoiseFlags
 from taichi_mrf.cli.options.pose_flags import PoseFlags
 from taichi_mrf.config.schema import Config, with_absolute_tables
 from taichi_mrf.datasets import Dataset
@@ -36,14 +37,14 @@ class MapTask:
     overwrite: bool = False
     shown_reading: Reading = "marginal"
     surface_picture: bool = False
-    learn_noise: bool = False
+    noise: NoiseFlags = field(default_factory=NoiseFlags)
 
     def __str__(self) -> str:
         return self.source
 
     def choice(self) -> dict[str, Any]:
         """What was asked for besides the parameters; the report says it too."""
-        noise = {"noise_from": "auto"} if self.learn_noise else {}
+        noise = {} if self.noise == NoiseFlags() else {"noise_from": self.noise.origin}
         return {"every": self.every, "limit": self.limit, **noise, **self.poses.choice()}
 
     def open(self, color: bool) -> Dataset:
@@ -73,5 +74,5 @@ def map_task(options: Map, source: str, out: Path) -> MapTask:
         options.overwrite,
         options.shown_reading,
         options.surface_picture,
-        options.noise.is_learnt,
+        options.noise,
     )
