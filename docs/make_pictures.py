@@ -4,8 +4,8 @@
     python docs/make_pictures.py mesh.jpg cuts.jpg     # these
 
 The built-in room is mapped on the command line, and shown and tuned in a browser. Needs the same as the
-browser tests (playwright, extra dev; Debian's chromium) and the extra ``mesh``. make_clip.py makes the clip
-of the front page.
+browser tests (playwright, extra dev; Debian's chromium) and the extra ``mesh``. make_room_picture.py and
+make_clip.py make picture and clip of the front page.
 """
 
 import io
@@ -41,7 +41,6 @@ QUALITIES = range(80, 40, -4)
 Draw = Callable[[Any], Image.Image]
 
 OF_A_MAP: dict[str, Draw] = {
-    "room.jpg": map_pictures.overview,
     "level_map.jpg": map_pictures.level_map,
     "cuts.jpg": map_pictures.cuts,
     "mesh.jpg": map_pictures.mesh,

@@ -1,4 +1,4 @@
-"""The pictures of a saved map for make_pictures.py: overview, 2D map, cuts with queries, mesh.
+"""The pictures of a saved map for make_pictures.py: 2D map, cuts with queries, mesh.
 
 Each function takes the folder of a ``taichi-mrf map`` run and returns the picture. The mesh and the 2D map
 are drawn from exported files, so the pictures show what other programs read.
@@ -38,11 +38,6 @@ _CAMERA = PinholeCamera(width=1400, height=900, fx=1500.0, fy=1500.0, cx=699.5, 
 _AMBIENT = 0.35
 _FRONTIER_COLOR = "#e6007e"
 _DPI = 100
-
-
-def overview(run: Path) -> Image.Image:
-    """The picture that ``make run`` draws of the map in perspective."""
-    return Image.open(run / "perspective.png").convert("RGB").resize((1170, 738), Image.Resampling.LANCZOS)
 
 
 def level_map(run: Path) -> Image.Image:

@@ -60,7 +60,7 @@ class Command:
 
 
 _COMMON = ("out", "voxel-size", "method", "config", "every", "limit")
-_MAP_FLAGS = (*_COMMON, "resume", "overwrite", "jobs", "track-poses", "poses", "follow")
+_MAP_FLAGS = (*_COMMON, "color", "noise", "resume", "overwrite", "jobs", "track-poses", "poses", "follow")
 _LIVE_FLAGS = (
     *_COMMON,
     "overwrite",

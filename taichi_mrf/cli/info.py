@@ -18,6 +18,7 @@ from taichi_mrf.datasets.ros.summary import BagSummary
 from taichi_mrf.datasets.ros.summary import summarise as summarise_bag
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.summary import summarise
+from taichi_mrf.datasets.unused_color import note_unused_color
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.origins import origins_of
@@ -75,6 +76,7 @@ def _source_facts(options: Info) -> dict[str, Any]:
     if is_rendered(options.source):
         runtime.init(options.arch)
     dataset = open_dataset(options.source, color=False, **options.reading.keywords())
+    note_unused_color(dataset, options.source, options.reading)
     notes = list(dataset.notes)
     found = summarise(dataset)
     content = {field.name: getattr(found, field.name) for field in fields(found)}
@@ -126,6 +128,7 @@ def _print_source(console: Terminal, source: str, arch: Arch, reading: SourceFla
         runtime.init(arch)
     try:
         dataset = open_dataset(source, color=False, **reading.keywords())
+        note_unused_color(dataset, source, reading)
     except DatasetError as error:
         if path is None:
             raise

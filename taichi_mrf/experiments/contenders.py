@@ -96,7 +96,7 @@ def wavemap(name: str = "wavemap-style", **parameters: Any) -> Contender:
 def standard_contenders() -> Sequence[Contender]:
     """All that need no tuning; MRFMap by its surface too where the extra ``mesh`` is installed."""
     return [
-        replace(mrf(), surface=installed("skimage", "embreex")),
+        replace(mrf(), surface=installed("embreex")),
         log_odds("OctoMap-style"),
         log_odds("OctoMap-style, bias removed", correct_bias=True),
         visibility(),

@@ -22,7 +22,6 @@ from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.queries.colored import marginals_behind
 from taichi_mrf.queries.known_bricks import QueriedMap, sorted_bricks
 from taichi_mrf.sensor.camera import Camera
-from taichi_mrf.system.libraries import library
 from taichi_mrf.voxels.colors import marginal_colors
 from taichi_mrf.voxels.distance_field import DistanceSource
 from taichi_mrf.voxels.layout import CHUNK_VOXELS
@@ -133,9 +132,9 @@ def measured_surface(m: SurfacedMap) -> Surface:
 def fused_surface(
     field: DistanceSource, voxel_size: float, between: Callable[[], object] = lambda: None
 ) -> FusedSurface:
-    """The surface of a field. ``between`` is called after each chunk. Raises TaichiMRFError without
-    scikit-image."""
-    measure = library("skimage.measure", "surfaces need", "mesh")
+    """The surface of a field. ``between`` is called after each chunk."""
+    from skimage import measure  # slow to import
+
     vertices, triangles, variances = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0)]
     count = 0
     for lowest, own, weight, distance, excess in _boxes(field):

@@ -14,7 +14,6 @@ from taichi_mrf.queries.box import BoxOfVoxels, voxel_box
 from taichi_mrf.queries.cells import CellReader
 from taichi_mrf.queries.colored import ColoredMap, blended_colors, shown_colors
 from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, sorted_bricks
-from taichi_mrf.system.libraries import library
 from taichi_mrf.voxels.colors import MARGINAL_NOTE, PHOTO_NOTE, marginal_colors
 from taichi_mrf.voxels.layout import CHUNK, CHUNK_VOXELS
 
@@ -87,9 +86,10 @@ def photographed(m: ColoredMap, surface: Surface, of_voxels: bool) -> Surface:
 def smooth_surface(m: QueriedMap, level: float) -> Surface:
     """Where the marginal is ``level``, by marching cubes (Lewiner et al. 2003) between the centres of voxels.
 
-    Unknown space counts as empty. Raises TaichiMRFError without scikit-image.
+    Unknown space counts as empty.
     """
-    measure = library("skimage.measure", "meshes need", "mesh")
+    from skimage import measure  # slow to import
+
     vertices, triangles, values = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.float32)]
     count = 0
     for found in _chunks(m, 0, True, BrickReader(m)):

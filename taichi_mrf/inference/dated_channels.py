@@ -60,17 +60,6 @@ class Channels:
         return Channels(now, shown, glimpsed, np.full(bricks, NEVER))
 
 
-def layer_of(total: "ti.Ndarray", shown: "ti.Ndarray", prior_log_odds: float, dynamic: bool) -> "ti.Ndarray":
-    """One layer of dated beliefs, (capacity * 512): the dynamic one, or the static one.
-
-    A voxel is dynamic if it is occupied now, although all evidence together (``total``) makes it less likely
-    than the prior. There the static layer reads the total, and everywhere else the dynamic one the prior.
-    """
-    out = ti.ndarray(ti.f32, shown.shape)
-    _split(total, shown, out, prior_log_odds, dynamic)
-    return out
-
-
 def grown_channels(old: Channels, old_capacity: int, capacity: int) -> Channels:
     counts = ti.ndarray(ti.i32, capacity)
     kept = np.zeros(capacity, np.int32)
@@ -147,17 +136,6 @@ def age_bricks(
             after += ti.cast(shown[target + k] > now[target + k], ti.i32)
         if before != after:
             glimpsed[slots[brick]] += after - before
-
-
-@kernel
-def _split(total: F32Array, shown: F32Array, out: F32Array, prior: F32, dynamic: Template) -> None:
-    """See :func:`layer_of`; all arrays (capacity * 512)."""
-    for i in range(shown.shape[0]):
-        moving = shown[i] >= 0.0 and total[i] < prior
-        if ti.static(dynamic):
-            out[i] = shown[i] if moving else prior
-        else:
-            out[i] = total[i] if moving else shown[i]
 
 
 @ti.kernel

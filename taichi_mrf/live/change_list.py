@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from taichi_mrf.live.mapper import Mapper
 from taichi_mrf.methods.capabilities import has_dates
 from taichi_mrf.queries.change import compare_maps
-from taichi_mrf.queries.changed_things import find_changed_things
+from taichi_mrf.queries.changed_things import find_changed_things, without_slack
 from taichi_mrf.viewer.messages import SceneChange, SceneChanges
 from taichi_mrf.voxels.layout import grid_keys
 
@@ -24,7 +24,9 @@ LEAST_VOLUME_M3 = 0.003
 """Smaller clusters of changed voxels are not listed: edges of surfaces change with noise. The surface of a
 ball of 25 cm radius that one view sees has twice this volume in voxels of 5 cm."""
 
-LEAST_VOXELS = 8
+LEAST_VOXELS = 24
+"""As many voxels of 5 cm have that volume. Fewer of larger ones come and go where a lidar's rays are far
+apart."""
 
 SHARE_OF_TIME = 0.05
 """Comparisons take at most this share of the time."""
@@ -55,7 +57,9 @@ class ChangeList:
         if before_s is None or self._compared_s <= before_s:
             self._next = 0.0
             return []
-        change = compare_maps(m.layer(stamp_s=before_s), m, self._seen_since(before_s))
+        before = m.layer(stamp_s=before_s)
+        change = compare_maps(before, m, self._seen_since(before_s))
+        change = without_slack(change, before, m, core=self._least)
         things = find_changed_things(change, m.voxel_size, self._least, max(REACH_M, m.voxel_size))
         seconds = time.monotonic() - begin
         self._next = begin + seconds / SHARE_OF_TIME

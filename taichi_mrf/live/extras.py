@@ -50,6 +50,11 @@ class Extras:
         if wanted != self._watch:
             self._watch, self._shown_version = wanted, -1
 
+    @property
+    def need_messages(self) -> bool:
+        """Whether the page shows what only messages tell: who sees a voxel, and its colour."""
+        return self._watch.counts or self._watch.colors
+
     def start_again_for_viewer(self) -> None:
         """Show no extras, which a new viewer starts without; it is sent the list of changes."""
         self._watch, self._baseline, self._colors, self._surface = NOTHING, None, None, None

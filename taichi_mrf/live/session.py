@@ -119,9 +119,15 @@ class Session:
             return True
         if mapper.unaligned and mapper.refiner is not None and not state.has_frames_left:
             return self._align(mapper.refiner)
-        if mapper.unsettled and not state.is_replaying:
+        if (mapper.unsettled or self._needs_messages) and not state.is_replaying:
             return self._follow(exactly=True) or self._settle()
         return self._extras.work(self._go_on)
+
+    @property
+    def _needs_messages(self) -> bool:
+        """Whether an edit or what the page shows waits for the messages of a map from a file."""
+        wanted = self.state.inbox.has_edits() or self._extras.need_messages
+        return self.state.mapper.lacks_messages and wanted
 
     def _follow(self, exactly: bool = False) -> bool:
         """Move keyframes whose poses have changed, for a limited time, and show them; returns whether any

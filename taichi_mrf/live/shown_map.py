@@ -16,9 +16,11 @@ from taichi_mrf.errors import ConfigError
 from taichi_mrf.live.live_keyframes import LiveKeyframe
 from taichi_mrf.live.publish import Publisher
 from taichi_mrf.methods.capabilities import has_dates, has_layers
+from taichi_mrf.methods.mrf.layers import NOTHING_MOVES, Moving
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP, Bricks, Reading, TimeSpan
 from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.pool import BrickPool
 
 RENEW_SECONDS = 1.0
 """Shortest time between two readings of the map as of the same time, in seconds."""
@@ -46,6 +48,7 @@ class ShownMap:
             counting=False,
             beliefs=self._beliefs,
         )
+        self._moving = NOTHING_MOVES
         self._dynamic: Publisher | None = None
         if has_dates(m):
             # Packed log-odds of 0 count as occupied.
@@ -125,9 +128,17 @@ class ShownMap:
             publisher.start_over()
 
     def _changes(self) -> list[Bricks]:
-        touched = self._pool.take_touched()
-        found = (publisher.changes(touched) for publisher in self._publishers())
+        found = [self.publisher.changes()]
+        if self._dynamic is not None:
+            before, self._moving = self._moving.slots, Moving.of(self._pool, self._shown_pool)
+            slots = np.union1d(before, self._moving.slots).astype(np.int32)
+            found.append(self._dynamic.changes(slots[self._pool.owners[slots] > 0]))
         return [bricks for bricks in found if bricks is not None]
+
+    @property
+    def _shown_pool(self) -> BrickPool:
+        """The bricks with the marginals of the time that is shown."""
+        return self._pool if self.stamp_s is None else self._past
 
     def _publishers(self) -> list[Publisher]:
         return [self.publisher] if self._dynamic is None else [self.publisher, self._dynamic]
@@ -144,14 +155,12 @@ class ShownMap:
         return self._past.read("belief", slots)
 
     def _dynamic_beliefs(self, slots: NDArray[np.int32]) -> NDArray[np.float32]:
-        """The dynamic layer of inference/dated.py, of some bricks alone: occupied at the time that is shown,
-        although all evidence together says free."""
-        if not len(slots):
-            return np.zeros((0, VOXELS), np.float32)
-        source = self._pool if self.stamp_s is None else self._past
-        belief, total = source.read("belief", slots), self._pool.read("total", slots)
-        dynamic = (belief >= 0) & (total < self._pool.prior_log_odds)
-        return np.where(dynamic, belief, np.float32(NOT_DYNAMIC))
+        """Of some bricks the log-odds of what moves, (n,) slots -> (n, 512)."""
+        out = np.full((len(slots), VOXELS), NOT_DYNAMIC, np.float32)
+        _, rows, places = np.intersect1d(slots, self._moving.slots, return_indices=True)
+        belief = self._shown_pool.read("belief", slots[rows])
+        out[rows] = np.where(self._moving.voxels[places], belief, np.float32(NOT_DYNAMIC))
+        return out
 
 
 def time_span(shown: ShownMap, entries: Collection[LiveKeyframe]) -> TimeSpan | None:

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from taichi_mrf.calibration.from_recording import LearntSigma
+from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.formats import frames_npz
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.source_flags import SourceFlags
+from taichi_mrf.datasets.unused_color import note_unused_color
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.live.replay import Replay
 from taichi_mrf.mapping.intake import hold_out_of
@@ -108,6 +110,8 @@ def open_source(
     color = wants_color(config, name, track)
     keywords |= {"follow": follow, "carry": config.poses.carry_unnamed}
     dataset = open_posed(name, poses, track=track, color=color, **keywords)
+    if not config.color and METHODS[config.method].has_colors:
+        note_unused_color(dataset, name, reading or SourceFlags())
     config = with_recorded_noise(config, dataset)
     learnt = None if learn_noise is None else learn_noise(dataset, config)
     if learnt is not None:

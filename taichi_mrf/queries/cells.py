@@ -15,7 +15,7 @@ from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap
 from taichi_mrf.queries.points import probability
 from taichi_mrf.voxels import cells as rule
 from taichi_mrf.voxels.cells import SIDES, SUREST, lowest_voxels, voxels_of_cells
-from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
+from taichi_mrf.voxels.layout import BRICK
 
 
 @dataclass(frozen=True)
@@ -83,31 +83,6 @@ class CellReader(BrickReader):
             voxels[rows[:, None], voxels_of_cells(side)[cells]] = np.log(p / (1 - p))[:, None]
         filled[here] = voxels
         return filled
-
-
-def shown_voxels(m: QueriedMap, threshold: float) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """The voxels of at least a probability of ``threshold`` and those of the cells that stand in for others:
-    centres (N, 3) in metres and the probability of voxel or cell, (N,)."""
-    reader = CellReader(m, threshold)
-    least = np.log(threshold / (1 - threshold))
-    centres, likely = [np.zeros((0, 3))], [np.zeros(0, np.float32)]
-    for bricks, log_odds, _ in reader.batches(reader.bricks):
-        row, number = np.nonzero((log_odds >= least) & (log_odds != reader.pool.prior_log_odds))
-        voxels = bricks[row].astype(np.float64) * BRICK + offsets_in_brick()[number]
-        centres.append((voxels + 0.5) * m.voxel_size)
-        likely.append(probability(log_odds[row, number]))
-    return np.concatenate(centres), np.concatenate(likely)
-
-
-class FilledMap:
-    """A map's voxels together with those of the cells that stand in for others: what pictures draw."""
-
-    def __init__(self, m: QueriedMap) -> None:
-        self._map = m
-
-    def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """Those of at least this probability: :func:`shown_voxels`."""
-        return shown_voxels(self._map, min_probability)
 
 
 def standing_in(

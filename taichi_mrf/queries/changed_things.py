@@ -1,7 +1,7 @@
 """What appeared and what left between two maps: clusters of voxels that were free and are occupied, or the
 reverse."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -9,7 +9,10 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.queries.change import MapChange
+from taichi_mrf.queries.clear_of_surfaces import CORE_VOXELS, Surfaces, stands_clear
 from taichi_mrf.queries.clusters import find_clusters
+from taichi_mrf.queries.known_bricks import QueriedMap
+from taichi_mrf.queries.points import FREE, OCCUPIED
 
 Verb = Literal["appeared", "left"]
 
@@ -35,6 +38,23 @@ class ChangedThing:
         return 0.5 * (self.lower_m + self.upper_m)
 
 
+def without_slack(change: MapChange, a: QueriedMap, b: QueriedMap, core: int = CORE_VOXELS) -> MapChange:
+    """What appeared and left from map a to map b, without what can be a surface of the other map that has
+    shifted a little: clusters of which fewer than ``core`` voxels are clear of those surfaces."""
+    voxels = np.floor(change.points / a.voxel_size).astype(np.int32)
+    kept = np.zeros(len(voxels), np.bool_)
+    for before, after, other in ((FREE, OCCUPIED, a), (OCCUPIED, FREE, b)):
+        rows = np.flatnonzero((change.before == before) & (change.after == after))
+        kept[rows] = stands_clear(voxels[rows], Surfaces(other.view.pool), core)
+    return replace(
+        change,
+        points=change.points[kept],
+        before=change.before[kept],
+        after=change.after[kept],
+        difference=change.difference[kept],
+    )
+
+
 def find_changed_things(
     change: MapChange, voxel_size: float, min_voxels: int = 1, reach_m: float | None = None
 ) -> list[ChangedThing]:
@@ -44,7 +64,7 @@ def find_changed_things(
 
     ``voxel_size`` is that of the maps, in metres. Voxels belong together if they touch; with ``reach_m`` also
     those in touching cells of that size (metres), so that the seen parts of one object are one thing.
-    Raises ConfigError for min_voxels below 1 or reach_m below the voxel size, TaichiMRFError without SciPy.
+    Raises ConfigError for min_voxels below 1 or reach_m below the voxel size.
     """
     reach = 1 if reach_m is None else round(reach_m / voxel_size)
     if reach < 1:
@@ -57,7 +77,7 @@ def find_changed_things(
     for verb, points in verbs:
         voxels = np.floor(points / voxel_size).astype(np.int32)
         cells, cell = np.unique(voxels // reach, axis=0, return_inverse=True)
-        of_cells, _ = find_clusters(cells, 1, "groups of changed voxels need")
+        of_cells, _ = find_clusters(cells)
         cluster = of_cells[cell.reshape(-1)]
         for number in np.flatnonzero(np.bincount(cluster) >= min_voxels):
             mine = voxels[cluster == number]

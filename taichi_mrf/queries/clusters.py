@@ -4,7 +4,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.system.libraries import library
 from taichi_mrf.voxels.layout import grid_keys
 
 _HALF_OF_NEIGHBOURS = np.stack(np.unravel_index(np.arange(14, 27), (3, 3, 3)), axis=1) - 1
@@ -12,27 +11,34 @@ _HALF_OF_NEIGHBOURS = np.stack(np.unravel_index(np.arange(14, 27), (3, 3, 3)), a
 
 
 def find_clusters(
-    voxels: NDArray[np.int32], min_voxels: int, purpose: str
+    voxels: NDArray[np.int32], min_voxels: int = 1
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """The cluster of each voxel, coordinates (N, 3) -> (N,) int32, and the sizes (K,) of the clusters, the
-    largest first; -1 for voxels in clusters of less than ``min_voxels``.
-
-    ``purpose`` says in the error what needs SciPy. Raises ConfigError for min_voxels below 1, TaichiMRFError
-    without SciPy.
-    """
+    largest first; -1 for voxels in clusters of less than ``min_voxels``. Raises ConfigError for min_voxels
+    below 1."""
     if min_voxels < 1:
         raise ConfigError(f"min_voxels must be at least 1, not {min_voxels}")
-    graphs = library("scipy.sparse", purpose, "mesh")
-    csgraph = library("scipy.sparse.csgraph", purpose, "mesh")
-    pairs = _touching(voxels)
-    graph = graphs.coo_matrix((np.ones(len(pairs), np.int8), pairs.T), (len(voxels), len(voxels)))
-    labels = csgraph.connected_components(graph, directed=False)[1] if len(voxels) else np.zeros(0, np.int32)
-    counts = np.bincount(labels)
+    firsts, labels = np.unique(_first_of_each(_touching(voxels), len(voxels)), return_inverse=True)
+    counts = np.bincount(labels, minlength=len(firsts))
     order = np.argsort(-counts, kind="stable")
     order = order[counts[order] >= min_voxels]
     number = np.full(len(counts), -1, np.int32)
     number[order] = np.arange(len(order))
     return number[labels], counts[order]
+
+
+def _first_of_each(pairs: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """The first row of each row's group, (count,), if the rows of each of the pairs (p, 2) are in one."""
+    first = np.arange(count)
+    while len(pairs):
+        a, b = first[pairs].T
+        apart = a != b
+        pairs, a, b = pairs[apart], a[apart], b[apart]
+        np.minimum.at(first, np.maximum(a, b), np.minimum(a, b))
+        further = first[first]
+        while (further != first).any():
+            first, further = further, further[further]
+    return first
 
 
 def _touching(voxels: NDArray[np.int32]) -> NDArray[np.int64]:

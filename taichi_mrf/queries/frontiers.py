@@ -31,10 +31,10 @@ def find_frontiers(m: QueriedMap, min_voxels: int = 1) -> Frontiers:
     cluster. Clusters of less than ``min_voxels`` are left out.
 
     The map is looked at chunk by chunk, so that memory is bounded by what is found. Raises ConfigError for
-    min_voxels below 1, TaichiMRFError without SciPy.
+    min_voxels below 1.
     """
     voxels = frontier_voxels(m)
-    cluster, sizes = find_clusters(voxels, min_voxels, "frontiers need")
+    cluster, sizes = find_clusters(voxels, min_voxels)
     kept = cluster >= 0
     points, cluster = (voxels[kept].astype(np.float64) + 0.5) * m.voxel_size, cluster[kept]
     sums = [np.bincount(cluster, points[:, axis], len(sizes)) for axis in range(3)]

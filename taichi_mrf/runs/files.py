@@ -9,7 +9,7 @@ REPORT_FILE, TRAJECTORY_FILE = "report.json", "trajectory.txt"
 WINDOW_FOLDER = "map_window.zarr"
 """The map in chunks of a run with a window (methods.mrf.parked_chunks.folder_beside)."""
 
-PICTURE_FILES = ("top_view.png", "perspective.png", "depth.png", "surface.png")
+PICTURE_FILES = ("surface.png", "perspective.png", "top_view.png", "depth.png")
 
 
 def holds_run(folder: Path) -> bool:

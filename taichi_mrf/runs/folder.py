@@ -115,16 +115,14 @@ def write_run(
     *,
     check: bool = True,
     pictures: bool = True,
-    surface_picture: bool = False,
     reading: Reading = "marginal",
     haste: Haste = NO_HASTE,
     advance: Advance = lambda stage, done, total: None,
 ) -> tuple[dict[str, Any], list[Path]]:
     """Write all files of a run to a folder that exists: the map first, because the time went into it, the
     report last. With ``check`` the held-out frames are compared with the map, and the poses with the depth;
-    with ``pictures`` it is drawn, if it is in memory as a whole, and with ``surface_picture`` its measured
-    surface, too; both are left out in ``haste``. Pictures of an earlier run are removed. ``reading`` says
-    what is occupied in the voxels' file and the pictures.
+    with ``pictures`` it is drawn, if it is in memory as a whole; both are left out in ``haste``. Pictures of
+    an earlier run are removed. ``reading`` says what is occupied in the voxels' file and their pictures.
 
     Returns the report and the paths. Raises MapFileError, ConfigError if the map has no such reading.
     """
@@ -148,7 +146,7 @@ def write_run(
     if chunked is not None:
         report["notes"].append(_LARGER_THAN_MEMORY.format(len(chunked.chunks)))
     elif pictures:
-        written += _write_pictures(folder, result, posed, shown, surface_picture, haste, advance)
+        written += _write_pictures(folder, result, posed, shown, haste, advance)
     if facts.learnt is not None:
         write_text(folder / NOISE_FILE, sensor_yaml(facts.config.sensor, facts.source, facts.learnt))
         written.append(folder / NOISE_FILE)
@@ -259,7 +257,6 @@ def _write_pictures(
     result: MappingResult,
     dataset: Dataset | None,
     shown: MapReading | None,
-    surface: bool,
     haste: Haste,
     advance: Advance,
 ) -> list[Path]:
@@ -269,7 +266,7 @@ def _write_pictures(
         with result.timed("pictures"), haste.cutting_short():
             held_out = _spread(result.held_out, PICTURED_FRAMES)
             frames = [] if dataset is None else _readable(dataset, held_out)
-            pictures = write_pictures(folder, result.map, frames, shown, cells=True, surface=surface)
+            pictures = write_pictures(folder, result.map, frames, shown)
     except CutShortError:
         return []
     advance("Drawing", 1, 1)

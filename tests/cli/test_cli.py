@@ -27,7 +27,7 @@ from taichi_mrf.system import compiler
 from taichi_mrf.system.compiler import COMPILERS
 
 FILES = {"map.npz", "voxels.ply", "config.yaml", "report.json"}
-PICTURES = {"top_view.png", "depth.png", "perspective.png"}
+PICTURES = {"surface.png", "top_view.png", "depth.png"}
 
 
 def marginals(out: Path) -> dict[tuple[float, ...], float]:
@@ -205,7 +205,7 @@ def test_a_run_of_other_parameters_is_replaced_only_if_asked(tmp_path: Path) -> 
     assert (tmp_path / "report.json").read_bytes() == before
     assert f"{tmp_path} holds this run already" in mapped(ROOM, "--out", tmp_path, "--limit", "2", *FAST)
     assert (tmp_path / "report.json").read_bytes() == before
-    for stale in ("top_view.png", "perspective.png", "depth.png", "trajectory.txt"):
+    for stale in ("surface.png", "perspective.png", "top_view.png", "depth.png", "trajectory.txt"):
         (tmp_path / stale).touch()
     mapped(*other[1:], "--overwrite")
     assert report_of(tmp_path)["keyframes"] == 3

@@ -1,5 +1,6 @@
 """``map --color``: colours from the recording to the files, and where there are none."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 import trimesh
 from console import FAST, carry_out
 
+from taichi_mrf.datasets.unused_color import UNUSED_COLOR
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.ply import photo_at
 from taichi_mrf.methods.registry import load_map
@@ -34,3 +36,17 @@ def test_colours_go_from_the_images_into_the_files(tmp_path: Path) -> None:
 def test_what_has_no_colours_refuses_them(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="color needs the method"):
         carry_out(*MAP, "--color", "--method", "log_odds", "--out", tmp_path / "run")
+
+
+def test_unused_colours_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert carry_out("info", ROOM, "--json") == 0
+    assert UNUSED_COLOR in json.loads(capsys.readouterr().out)["notes"]
+    runs = {
+        "plain": (),
+        "colored": ("--color",),
+        "log_odds": ("--method", "log_odds"),
+    }
+    for name, flags in runs.items():
+        assert carry_out(*MAP, "--limit", "1", "--no-pictures", *flags, "--out", tmp_path / name) == 0
+        notes = json.loads((tmp_path / name / "report.json").read_text("utf-8"))["notes"]
+        assert (UNUSED_COLOR in notes) == (name == "plain"), name

@@ -1,4 +1,4 @@
-"""``--reading surface`` and ``--surface-picture``: files and pictures of what the rays say."""
+"""``--reading surface``: files and pictures of what the rays say."""
 
 from pathlib import Path
 
@@ -35,8 +35,7 @@ def test_a_map_is_exported_as_the_rays_read_it(tmp_path: Path) -> None:
 def test_a_run_shows_the_map_as_the_rays_read_it(tmp_path: Path) -> None:
     room = "synthetic:room?frames=1&width=32&height=24"
     surface = ("--reading", "surface", "--runtime.arch", runtime.active() or "cpu", "--quiet")
-    flags = (*surface, "--surface-picture")
-    assert carry_out("map", room, "--out", tmp_path / "run", "--voxel-size", 0.2, *flags) == 0
+    assert carry_out("map", room, "--out", tmp_path / "run", "--voxel-size", 0.2, *surface) == 0
     assert (tmp_path / "run" / "surface.png").stat().st_size > 0
     m = load_map(tmp_path / "run" / "map.npz")
     called = len(m.reading("surface").voxels()[0])
@@ -44,5 +43,3 @@ def test_a_run_shows_the_map_as_the_rays_read_it(tmp_path: Path) -> None:
     assert f"element vertex {called}\n".encode() in (tmp_path / "run" / "voxels.ply").read_bytes()
     with pytest.raises(ConfigError, match="--reading surface needs the method mrf"):
         Map(sources=(room,), out=tmp_path, shown_reading="surface", settings=Config(method="log_odds"))
-    with pytest.raises(ConfigError, match="--surface-picture needs the method mrf"):
-        Map(sources=(room,), out=tmp_path, surface_picture=True, settings=Config(method="log_odds"))

@@ -16,6 +16,7 @@ from inputs_bags import Bag, writing
 
 from taichi_mrf.cli.main import main
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.unused_color import UNUSED_COLOR
 from taichi_mrf.export.formats import export_map
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -186,6 +187,6 @@ def test_map_reads_as_its_flags_say(tmp_path: Path) -> None:
         intrinsics=(20.0, 20.0, 8.0, 6.0),
         undistort=(-0.1, 0.0, 0.0, 0.0),
     )
-    assert report["notes"] == told.notes
+    assert report["notes"] == [*told.notes, UNUSED_COLOR]
     measured = told.read(0).depth_m
     assert report["rays"] == np.count_nonzero(measured > 0.1)

@@ -29,7 +29,7 @@ def test_a_room_by_lidar_is_drawn(tmp_path: Path, camera: RayTable) -> None:
         m.add_keyframe(range_m.astype(np.float32), T, camera)
     m.infer()
     written = write_pictures(tmp_path, m, [])
-    assert [path.name for path in written] == ["depth.png", "top_view.png", "perspective.png"]
+    assert [path.name for path in written] == ["surface.png", "top_view.png", "depth.png"]
     image = np.asarray(depth_comparison(m, []).axes[0].images[0].get_array())
     assert image.shape[1] > 2 * image.shape[0]
     surfaces = seen_surfaces(m)

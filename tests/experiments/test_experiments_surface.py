@@ -9,8 +9,6 @@ from taichi_mrf.experiments import surface
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Ledger
 
-pytest.importorskip("skimage")
-
 
 class _Wall:
     """One triangle far from the room, whatever is fused."""

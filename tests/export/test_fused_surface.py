@@ -13,7 +13,6 @@ from taichi_mrf.export.fused_surface import NEAR_M, NEAR_VOXELS, _normals, witho
 from taichi_mrf.export.options import ExportOptions
 
 pytestmark = pytest.mark.usefixtures("backend")
-pytest.importorskip("skimage")
 
 CAMERA = PinholeCamera(80, 60, 80.0, 80.0, 39.5, 29.5)
 VOXEL, SIGMA, BIAS = 0.05, 0.02, 0.04

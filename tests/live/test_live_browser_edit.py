@@ -308,6 +308,7 @@ def test_a_frozen_keyframe_stays_in_the_map(page: LivePage, tmp_path: Path) -> N
     m = saved_map(page, tmp_path)
     page.tab("Keyframes")
     page.press("Freeze")
+    page.press("Freeze it")
     page.until(lambda seen: "(frozen)" in page.input("Keyframe").input_value(), "a frozen keyframe")
     page.until(lambda seen: "frozen: it cannot be changed" in page.text(), "the reason")
     for button in ("On/off", "Freeze", "Move", "Put back"):

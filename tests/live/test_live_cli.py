@@ -25,7 +25,7 @@ from taichi_mrf.cli.parser import parse
 ROOM = "synthetic:room?frames=6&width=80&height=60"
 FLAGS = ("--voxel-size", "0.1", "--runtime.arch", "cpu", "--port", "0")
 FILES = {"map.npz", "voxels.ply", "config.yaml", "report.json"}
-PICTURES = {"top_view.png", "perspective.png", "depth.png"}
+PICTURES = {"surface.png", "top_view.png", "depth.png"}
 
 linux_only = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs the list in /proc")
 

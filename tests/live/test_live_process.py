@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 ROOM = "synthetic:room?frames=6&width=96&height=72"
 COARSE = ("--voxel-size", "0.08", "--runtime.arch", "cpu")
 FILES = {"map.npz", "voxels.ply", "config.yaml", "report.json"}
-PICTURES = {"top_view.png", "depth.png", "perspective.png"}
+PICTURES = {"surface.png", "top_view.png", "depth.png"}
 """What a run that ends by itself leaves in addition."""
 
 NO_SERVER = ("WebSocket connection to", "Failed to open WebSocket")

@@ -137,6 +137,41 @@ def test_a_map_whose_inference_was_stopped_is_shown_as_saved_and_a_notice_says_s
     assert not link.of_type(Notice)
 
 
+def test_a_saved_map_is_done_at_once_and_an_edit_brings_its_messages(tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    built(range(3)).save(path)
+    link = FakeLink()
+    session = Session(Source("map.npz", CONFIG, lambda: load_map(path)), link, Policy(leave_when_done=True))
+    mapped = finished(session)
+    assert session.state.is_done
+    assert session.state.mapper.inferred is None
+    assert not any(isinstance(u, Status) and u.activity.startswith("sweeping") for u in link.sent)
+    assert marginals(mapped) == marginals(built(range(3)))
+    whole = map_voxels(mapped)
+    for reading in ("surface", "calibrated"):
+        link.ask(Watch(images=False, view=None, baseline=False, reading=reading))
+        finished(session)
+        assert shown(link.sent).voxels() == map_voxels(built(range(3)).reading(reading))
+    assert session.state.mapper.inferred is None
+    link.ask(Watch(images=False, view=None, baseline=False), Switch(2, on=False))
+    assert marginals(finished(session)) == marginals(built(range(2)))
+    assert shown(link.sent).voxels() == map_voxels(built(range(2))) != whole
+    assert link.errors() == []
+
+
+def test_what_messages_tell_brings_the_messages_of_a_saved_map(tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    built(range(3)).save(path)
+    link = FakeLink()
+    session = Session(Source("map.npz", CONFIG, lambda: load_map(path)), link, Policy(leave_when_done=True))
+    finished(session)
+    link.ask(Watch(images=False, view=None, baseline=False, counts=True))
+    mapped = finished(session)
+    slots = mapped.view.pool.in_use
+    assert mapped.seen_by(slots).max() == 3
+    assert session.state.mapper.inferred is not None
+
+
 def test_a_map_saved_during_inference_is_the_one_that_is_shown(tmp_path: Path) -> None:
     link = FakeLink(during_settling(Save("map", 7)))
     session = session_of(link)

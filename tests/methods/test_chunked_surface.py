@@ -21,7 +21,6 @@ from taichi_mrf.queries.cast import cast_rays
 from taichi_mrf.system import runtime
 
 pytest.importorskip("zarr", reason="maps in chunks need the extra store")
-pytest.importorskip("skimage")
 pytestmark = pytest.mark.usefixtures("one_backend")
 
 RAYS = ExportOptions(surface="rays", mesh=True)

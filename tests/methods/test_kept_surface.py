@@ -16,7 +16,6 @@ from taichi_mrf.methods.mrf.kept_rays import KeptRays, RayShare
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.mrf.storage import contents_of, read_contents, write_contents
 
-pytest.importorskip("skimage")
 pytestmark = pytest.mark.usefixtures("one_backend")
 
 

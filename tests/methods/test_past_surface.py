@@ -13,7 +13,6 @@ from taichi_mrf.export.formats import export_map
 from taichi_mrf.export.options import ExportOptions
 from taichi_mrf.methods.mrf.map import MRFMap
 
-pytest.importorskip("skimage")
 pytestmark = pytest.mark.usefixtures("one_backend")
 
 BEFORE_S = 19.0

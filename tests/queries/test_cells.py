@@ -8,7 +8,7 @@ from hand_made import PRIOR
 from queried_maps import HandMap, hand_map, map_of
 
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.queries.cells import FilledMap, all_cells, standing_cells
+from taichi_mrf.queries.cells import all_cells, standing_cells
 
 
 @pytest.fixture(scope="module")
@@ -49,18 +49,6 @@ def test_cells_stand_in_for_voxels_only_where_none_is_likely(backend: str) -> No
     assert {tuple(cell) for cell in of_four.lowest.tolist()} == {(0, y, z) for y in (16, 20) for z in (0, 4)}
     assert np.allclose(of_four.probability, 4 / (1 + np.exp(1.5)), atol=1e-4)
     assert len(of_eight.lowest) == 0
-
-
-def test_a_filled_map_has_the_voxels_of_cells_beside_its_own(backend: str) -> None:
-    log_odds = np.full((8, 8, 8), -9.0)
-    log_odds[2:4, :2, :2] = -0.5
-    log_odds[6, 6, 6] = 2.0
-    m = map_of(backend, (-8, 0, 0), log_odds)
-    centres, p = FilledMap(m).voxels(0.5)
-    voxels = np.floor(centres / m.voxel_size).astype(int) + np.array([8, 0, 0])
-    found = {tuple(voxel): float(each) for voxel, each in zip(voxels.tolist(), p, strict=True)}
-    cell = {(x, y, z): 2 / (1 + np.exp(0.5)) for x in (2, 3) for y in (0, 1) for z in (0, 1)}
-    assert found == pytest.approx({**cell, (6, 6, 6): 1 / (1 + np.exp(-2.0))}, abs=1e-4)
 
 
 def test_unknown_space_is_not_shown(backend: str) -> None:

@@ -8,7 +8,7 @@ from queried_maps import HandMap, map_of
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.queries.change import compare_maps
-from taichi_mrf.queries.changed_things import ChangedThing, find_changed_things
+from taichi_mrf.queries.changed_things import ChangedThing, find_changed_things, without_slack
 from taichi_mrf.voxels.layout import BRICK
 
 LOWER = (-8, 16, 0)
@@ -89,3 +89,18 @@ def test_impossible_arguments(
 ) -> None:
     with pytest.raises(ConfigError, match=words):
         find_changed_things(compare_maps(*two_maps), VOXEL, **options)
+
+
+def test_a_wall_that_shifts_has_not_come_and_gone(two_maps: tuple[HandMap, HandMap], backend: str) -> None:
+    """Poses that are off by two voxels move the floor and the chairs; a lamp hangs in free space."""
+    before, after = space(), space()
+    before[CHAIR_BEFORE] = after[box((4, 2, 1), (8, 6, 9))] = after[LAMP] = OCCUPIED
+    after[:, :20, 2] = OCCUPIED
+    after[:, :20, 0] = FREE
+    a, b = map_of(backend, LOWER, before), map_of(backend, LOWER, after)
+    change = compare_maps(a, b)
+    assert {thing.verb for thing in find_changed_things(change, VOXEL, 24)} == {"appeared", "left"}
+    (lamp,) = find_changed_things(without_slack(change, a, b), VOXEL)
+    assert as_text(lamp) == ("appeared", 8, *in_metres((14, 4, 10), (16, 6, 12)))
+    moved = find_changed_things(without_slack(compare_maps(*two_maps), *two_maps), VOXEL)
+    assert [thing.voxels for thing in moved] == [128, 128, 8]

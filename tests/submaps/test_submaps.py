@@ -159,7 +159,6 @@ def test_the_merged_map_is_that_of_a_single_machine(exchanged: Path) -> None:
 
 
 def test_colours_and_surface_are_those_of_a_single_machine(exchanged: Path) -> None:
-    pytest.importorskip("skimage")
     part, m = take_part(ChunkedMap.open(exchanged / "map.zarr")), single_map()
     centres = m.voxels(0.5)[0]
     ours, theirs = part.colors(centres).astype(int), m.colors(centres).astype(int)

@@ -39,7 +39,7 @@ COMMANDS = {
 }
 """Extra -> a module of it, and a command that cannot do without."""
 
-EXPORTS = {"glb": "trimesh", "stl": "skimage.measure", "obj": "skimage.measure"}
+EXPORTS = {"glb": "trimesh", "stl": "trimesh", "obj": "trimesh"}
 
 
 @pytest.fixture(autouse=True)

@@ -126,12 +126,27 @@ def test_reset_asks_before_it_deletes_a_map(handled: HandledPage, browser: RawCl
     browser.hear_type("GuiCloseModalMessage", uuid=question)
     question = browser.hear_type("GuiModalMessage")["uuid"]
     assert handled.asked == []
-    handled.act(Action.RESET_CANCELLED, client)
+    handled.act(Action.CANCELLED, client)
     browser.hear_type("GuiCloseModalMessage", uuid=question)
     assert handled.asked == []
     handled.act(Action.RESET, client)
     handled.act(Action.RESET_CONFIRMED, client)
     assert handled.asked == [m.Reset()]
+
+
+def test_freeze_asks_before_it_acts(handled: HandledPage, browser: RawClient) -> None:
+    client = handled.client_id()
+    handled.act(Action.FREEZE, client)
+    question = browser.hear_type("GuiModalMessage")["uuid"]
+    handled.act(Action.CANCELLED, client)
+    browser.hear_type("GuiCloseModalMessage", uuid=question)
+    handled.act(Action.FREEZE_CONFIRMED, client + 1)  # of one that was not asked
+    assert handled.asked == []
+    handled.act(Action.FREEZE, client)
+    handled.take(keyframe(1))
+    handled.page._choose(1)  # another browser chooses another one meanwhile
+    handled.act(Action.FREEZE_CONFIRMED, client)
+    assert handled.asked == [m.Freeze(0)]
 
 
 def test_an_empty_map_is_reset_at_once(handled: HandledPage, browser: RawClient) -> None:
@@ -147,17 +162,16 @@ def answer(keyframe: int | None, pixel: tuple[int, int] | None) -> m.RayAnswer:
     )
 
 
-def test_a_ray_fills_in_its_keyframe_and_its_pixel(handled: HandledPage) -> None:
-    handled.take(answer(1, (3, 4)))
-    assert handled.page.keyframes.chosen == 1
+def test_a_ray_fills_in_its_pixel(handled: HandledPage) -> None:
+    handled.take(answer(0, (3, 4)))
     assert handled.page.panel.pixel.value == (3.0, 4.0)
     handled.act(Action.SHOW_PIXEL_RAY)
-    assert handled.asked == [m.PixelRay(1, 3.0, 4.0)]
+    assert handled.asked == [m.PixelRay(0, 3.0, 4.0)]
     handled.take(answer(None, None), answer(77, (1, 1)))
     assert handled.page.panel.pixel.value == (3.0, 4.0)
 
 
-def test_a_ray_of_another_keyframe_leaves_the_gizmo_alone(handled: HandledPage) -> None:
+def test_a_ray_of_another_keyframe_leaves_the_choice_as_it_is(handled: HandledPage) -> None:
     handled.act(Action.TOGGLE_GIZMO)
     handled.take(answer(1, (3, 4)))
     assert handled.page.keyframes.chosen == 0

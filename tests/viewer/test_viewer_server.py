@@ -1,5 +1,6 @@
 """The viewer's server: where it listens, whom it accepts, what it serves, and that it prints nothing."""
 
+import gzip
 import re
 import socket
 import subprocess
@@ -45,6 +46,14 @@ def http_answer(port: int, target: bytes, *headers: bytes) -> tuple[int, bytes]:
         )
         answer = b"".join(iter(lambda: connection.recv(65536), b""))
     return int(answer.split(b" ", 2)[1]), answer
+
+
+@pytest.mark.parametrize("packing", [b"gzip", b"identity"])
+def test_the_tab_has_the_projects_name(server: viser.ViserServer, packing: bytes) -> None:
+    _, answer = http_answer(server.get_port(), b"/", b"Accept-Encoding: " + packing)
+    page = answer.partition(b"\r\n\r\n")[2]
+    page = gzip.decompress(page) if packing == b"gzip" else page
+    assert b"<title>taichi_mrf</title>" in page
 
 
 @pytest.mark.parametrize(
@@ -133,7 +142,8 @@ def test_the_page_is_served_unframed_and_unsniffed(server: viser.ViserServer) ->
         scripts = next(each for each in policy.split(b"; ") if each.startswith(b"script-src"))
         assert scripts.count(b"'sha256-") == 2
         assert b"unsafe-inline" not in scripts
-        assert body == (CLIENT_BUILD / "index.html").read_bytes()
+        named = (CLIENT_BUILD / "index.html").read_bytes().replace(b"<title>Viser<", b"<title>taichi_mrf<")
+        assert body == named
 
 
 OTHER_FILES = [

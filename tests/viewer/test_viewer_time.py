@@ -75,10 +75,13 @@ def test_the_past_begins_at_the_newest_frozen_keyframe(running: TimePage) -> Non
 def test_the_list_says_what_happened_and_when(running: TimePage) -> None:
     running.span(20.0)
     chair = m.SceneChange(START_S + 12.4, "appeared", (0.5, 0.5, 0.52), (1.0, 2.0, 0.4))
+    assert not running.time._list.visible
     running.take(m.SceneChanges((chair,)))
+    assert running.time._list.visible
     assert "12.4 s: something of 0.5 x 0.5 x 0.5 m appeared at (1.0, 2.0, 0.4)" in running.time._list.content
     running.take(HELLO)
     assert "appeared at" not in running.time._list.content
+    assert not running.time._list.visible
 
 
 def test_a_static_map_has_no_folder(running: TimePage) -> None:

@@ -19,9 +19,11 @@ from taichi_mrf.cli.shared.learn_noise import learn_noise
 from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
 from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
 from taichi_mrf.cli.shared.terminal import Terminal, print_problem
+from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
+from taichi_mrf.datasets.unused_color import note_unused_color
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.pipeline import Event, FrameOffered, Listener, WaitingForPoses, map_sequence
 from taichi_mrf.mapping.rounds import RoundStep
@@ -86,6 +88,8 @@ def map_to_folder(
     settings = task.settings
     runtime.init(settings.runtime.arch, settings.runtime.threads, settings.runtime.debug)
     dataset = task.open(wants_color(settings, task.source, task.poses.track_poses))
+    if not settings.color and METHODS[settings.method].has_colors:
+        note_unused_color(dataset, task.source, task.reading)
     settings = with_recorded_noise(settings, dataset)
     previous = resumed_map(task.out, settings) if task.resume else None
     skipped = skipped_before(task.out) if task.resume else {}
@@ -114,8 +118,8 @@ def map_to_folder(
         )
         result.seconds = {"opening": opening, **learning, **result.seconds}
         return write_run(
-            task.out, result, facts, pictures=task.pictures, surface_picture=task.surface_picture,
-            reading=task.shown_reading, haste=request, advance=progress.advance,
+            task.out, result, facts, pictures=task.pictures, reading=task.shown_reading,
+            haste=request, advance=progress.advance,
         )  # fmt: skip
 
 

@@ -36,7 +36,6 @@ class MapTask:
     keep_every: float = Map.keep_every
     overwrite: bool = False
     shown_reading: Reading = "marginal"
-    surface_picture: bool = False
     noise: NoiseFlags = field(default_factory=NoiseFlags)
 
     def __str__(self) -> str:
@@ -73,6 +72,5 @@ def map_task(options: Map, source: str, out: Path) -> MapTask:
         options.keep_every,
         options.overwrite,
         options.shown_reading,
-        options.surface_picture,
         options.noise,
     )

@@ -14,7 +14,6 @@ from taichi_mrf.config.registry import METHODS, methods_with
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.system.libraries import library
 
 _SOURCES = tyro.conf.arg(metavar="SOURCE...", help_behavior_hint="(required)")
 
@@ -80,11 +79,7 @@ class Map:
     """Where sigma comes from."""
 
     pictures: bool = True
-    """Draw the map from above, in perspective, and against the measured depth."""
-
-    surface_picture: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Also draw surface.png: the surface that the keyframes measured, in the colours that cameras saw, or by
-    height. Needs mrf, a map in memory and the extra 'mesh'."""
+    """Draw the measured surface, the map from above, and its depth against the measured depth."""
 
     shown_reading: Annotated[Literal["marginal", "surface", "calibrated"], tyro.conf.arg(name="reading")] = (
         "marginal"
@@ -124,12 +119,5 @@ class Map:
                     f"--reading {self.shown_reading} needs the method {methods_with('has_layers')} "
                     "and a map in memory as a whole"
                 )
-        if self.surface_picture:
-            if not self.pictures or not METHODS[self.settings.method].measures_surface or self.submap_size:
-                raise ConfigError(
-                    f"--surface-picture needs the method {methods_with('measures_surface')}, a map in memory "
-                    "as a whole, and --pictures"
-                )
-            library("skimage.measure", "surfaces need", "mesh")
         if not self.keep_every >= 0:
             raise ConfigError(f"--keep-every must be a number of seconds, not {self.keep_every}")

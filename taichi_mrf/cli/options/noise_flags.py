@@ -13,12 +13,10 @@ class NoiseFlags:
     """Where sigma comes from."""
 
     origin: Annotated[Literal["checked", "given", "auto"], tyro.conf.arg(name="noise")] = "checked"
-    """auto learns sigma from the recording before anything else: up to 60 of its frames are mapped up to
-    three times, and held-out ones say by how much sensor.sigma, or what frames state, is off. The result is
-    sensor.sigma-scale and sensor.sigma-added; DIR/sensor.yaml holds it for other recordings, and for a
-    camera, which has to be recorded first. checked does so in map alone, where neither parameters nor the
-    recording say anything of noise and a quick map of 16 of 64 or more frames contradicts the default. given
-    never does."""
+    """auto first learns from up to 60 frames of the recording by how much sensor.sigma, or what frames state,
+    is off: sensor.sigma-scale and sensor.sigma-added. DIR/sensor.yaml holds them for other recordings, and
+    for a camera, which has to be recorded first. checked learns them from 16 frames, in map alone, where
+    sigma is the default and these contradict it. given never learns."""
 
     @property
     def is_learnt(self) -> bool:

@@ -1,4 +1,4 @@
-"""The pictures that a mapping run leaves behind: from above, in perspective, and beside the measurements."""
+"""The pictures that a mapping run leaves behind: its surface, from above, and beside the measurements."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,22 +7,15 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.depth_error import depth_error
 from taichi_mrf.evaluation.held_out import surface_depth
 from taichi_mrf.evaluation.pictures.figures import new_figure, notice
-from taichi_mrf.evaluation.pictures.room_views import (
-    DrawnMap,
-    DrawnSurface,
-    perspective,
-    surface_view,
-    top_view,
-)
+from taichi_mrf.evaluation.pictures.room_views import DrawnMap, perspective, top_view
+from taichi_mrf.evaluation.pictures.surface_view import DrawnSurface, surface_view
 from taichi_mrf.evaluation.pictures.surfaces import seen_surfaces, up_direction, upward_axis
 from taichi_mrf.geometry.up import Z_UP
 from taichi_mrf.methods.capabilities import measures_surface
 from taichi_mrf.methods.protocol import OccupancyMap, PosedDepth
-from taichi_mrf.queries.cells import FilledMap
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.unrolled import unrolled
 from taichi_mrf.system.atomic import atomic_path
@@ -54,23 +47,15 @@ def write_pictures(
     m: OccupancyMap,
     held_out: Sequence[Frame],
     shown: ShownMap | None = None,
-    cells: bool = False,
-    surface: bool = False,
 ) -> list[Path]:
-    """Write ``top_view.png``, ``depth.png`` and ``perspective.png`` to a folder that exists, and
-    ``surface.png`` if the ``surface`` is to be drawn that the keyframes measured.
+    """Write ``surface.png``, ``top_view.png`` and ``depth.png`` to a folder that exists; where the map has no
+    measured surface, ``perspective.png`` shows its voxels instead.
 
     ``held_out`` are frames that the map has not seen, to compare rendered with measured depth; without
     any a keyframe serves, and its title says so. ``shown`` has the voxels to draw if they are not the map's
-    marginals; of these, ``cells`` also draws the cells that stand in for voxels (queries/cells.py). Returns
-    the paths. Raises MapFileError, ConfigError if there is no such surface.
+    marginals. Returns the paths. Raises MapFileError.
     """
-    figures = {
-        "depth.png": depth_comparison(m, held_out),
-        **_room_figures(m, shown or (FilledMap(m) if cells else m)),
-    }
-    if surface:
-        figures["surface.png"] = _surface_figure(m)
+    figures = {**_whole_map(m, shown or m), "depth.png": depth_comparison(m, held_out)}
     for name, figure in figures.items():
         with atomic_path(out_dir / name) as temporary:
             # Level 2 of 9 takes half of the default's time, and the files are a fifth larger.
@@ -78,35 +63,23 @@ def write_pictures(
     return [out_dir / name for name in figures]
 
 
-def _room_figures(m: OccupancyMap, shown: ShownMap) -> dict[str, "Figure"]:
+def _whole_map(m: OccupancyMap, shown: ShownMap) -> dict[str, "Figure"]:
     """The views of the whole map, by file name."""
-    centres, probability = shown.voxels(min_probability=LOWEST)
+    keyframes = list(m.keyframes.values())
+    seen = seen_surfaces(m)
+    up = up_direction(map(upward_axis, keyframes), seen.normals, m.up or Z_UP)
+    surface = m.surface() if measures_surface(m) and m.has_surface else None
+    views = {}
+    if surface is not None and len(surface.triangles):
+        drawn = DrawnSurface(surface.vertices_m, surface.triangles, surface.normals, surface.colors)
+        views["surface.png"] = surface_view(drawn, m.voxel_size, up)
+    centres, _ = shown.voxels(min_probability=LOWEST)
     if len(centres) == 0:
         nothing = notice(f"The map holds no voxel with a marginal of {LOWEST} or more.")
-        return {"top_view.png": nothing, "perspective.png": nothing}
-    surfaces = seen_surfaces(m)
-    keyframes = list(m.keyframes.values())
-    room = DrawnMap(
-        centres=centres,
-        probability=probability,
-        normals=surfaces.thickened().normals_at(centres),
-        voxel_size=m.voxel_size,
-        up=up_direction(map(upward_axis, keyframes), surfaces.normals, m.up or Z_UP),
-        T_world_cameras=[keyframe.T_world_camera for keyframe in keyframes],
-        of_cells=len(centres) - len(m.voxels(LOWEST)[0]) if isinstance(shown, FilledMap) else 0,
-    )
-    return {"top_view.png": top_view(room), "perspective.png": perspective(room)}
-
-
-def _surface_figure(m: OccupancyMap) -> "Figure":
-    if not measures_surface(m):
-        raise ConfigError(f"a map of the method {m.config.method} has no measured surface")
-    found = m.surface()
-    if not len(found.triangles):
-        return notice("The keyframes have measured no surface.")
-    up = up_direction(map(upward_axis, m.keyframes.values()), found.normals, m.up or Z_UP)
-    drawn = DrawnSurface(found.vertices_m, found.triangles, found.normals, found.colors)
-    return surface_view(drawn, m.voxel_size, up)
+        return {**(views or {"perspective.png": nothing}), "top_view.png": nothing}
+    normals = seen.thickened().normals_at(centres)
+    room = DrawnMap(centres, normals, m.voxel_size, up, [each.T_world_camera for each in keyframes])
+    return {**(views or {"perspective.png": perspective(room)}), "top_view.png": top_view(room)}
 
 
 def depth_comparison(m: OccupancyMap, held_out: Sequence[Frame]) -> "Figure":

@@ -1,6 +1,8 @@
 """Light on a picture of voxels or triangles, so that its shape is legible and its colours still mean
 something."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -14,17 +16,15 @@ _AMBIENT = 0.62
 _OCCLUSION = 0.55
 """How much of the light a deep hollow loses."""
 
-BACKGROUND = 255
-"""White."""
-
 
 def shaded(
     image: VoxelImage,
     colors: NDArray[np.uint8],
     normals: NDArray[np.floating],
     towards_light: NDArray[np.floating],
+    background: NDArray[np.uint8],
 ) -> NDArray[np.uint8]:
-    """Colours of the voxels (N, 3) under a far light, as an (H, W, 3) RGB picture on white.
+    """Colours of the voxels (N, 3) under a far light, on a background (H, W, 3), RGB.
 
     ``normals`` (N, 3) are the mean ones of the surfaces that the voxels belong to, 0 where unknown:
     mixed with the normal of the voxel's face they show both the surface and the grid.
@@ -33,12 +33,12 @@ def shaded(
     hit = image.index >= 0
     voxel = image.index[hit]
     if voxel.size == 0:
-        return np.full((*hit.shape, 3), BACKGROUND, np.uint8)
+        return background
     normal = image.normal[hit] + normals[voxel]
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
     light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(normal @ towards_light, 0.0, 1.0)
     light *= 1.0 - _OCCLUSION * _hollowness(image.depth_m)[hit]
-    picture = np.full((*hit.shape, 3), BACKGROUND, np.uint8)
+    picture = background.copy()
     picture[hit] = np.rint(colors[voxel] * light[:, None])
     return picture
 
@@ -47,22 +47,28 @@ def shaded_triangles(
     image: TriangleImage,
     triangles: NDArray[np.integer],
     colors: NDArray[np.uint8],
-    normals: NDArray[np.floating] | None,
+    normals: NDArray[np.floating],
     towards_light: NDArray[np.floating],
+    background: NDArray[np.uint8],
 ) -> NDArray[np.uint8]:
-    """Colours of vertices (V, 3) on their triangles (T, 3), as an (H, W, 3) RGB picture on white; under a far
-    light if the vertices' ``normals`` (V, 3) are given, else as they are."""
+    """Colours and ``normals`` of vertices (V, 3) on their triangles (T, 3) under a far light, on a background
+    (H, W, 3), RGB."""
     hit = image.index >= 0
-    picture = np.full((*hit.shape, 3), BACKGROUND, np.uint8)
+    if not hit.any():
+        return background
     corners, shares = triangles[image.index[hit]], image.shares[hit]
-    mixed = np.einsum("nk,nkc->nc", shares, colors[corners].astype(np.float64))
-    if normals is not None and len(mixed):
-        normal = np.einsum("nk,nkc->nc", shares, normals[corners])
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
-        light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(normal @ towards_light, 0.0, 1.0)
-        mixed *= (light * (1.0 - _OCCLUSION * _hollowness(image.depth_m)[hit]))[:, None]
-    picture[hit] = np.rint(mixed)
+    mixed = _mixed(shares, colors[corners])
+    normal = _mixed(shares, normals[corners])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
+    light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(normal @ towards_light.astype(np.float32), 0.0, 1.0)
+    picture = background.copy()
+    picture[hit] = np.rint(mixed * (light * (1.0 - _OCCLUSION * _hollowness(image.depth_m)[hit]))[:, None])
     return picture
+
+
+def _mixed(shares: NDArray[np.float32], of_corners: NDArray[Any]) -> NDArray[np.float32]:
+    """What three corners have, (n, 3, 3), by their shares (n, 3)."""
+    return np.einsum("nk,nkc->nc", shares, of_corners.astype(np.float32))
 
 
 def _hollowness(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -75,7 +81,9 @@ def _hollowness(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
     depth = np.where(met, depth_m, far).astype(np.float32)
     full = max(0.04 * float(far - near), 1e-6)
     out = np.zeros_like(depth)
+    size = depth.shape[1], depth.shape[0]
+    small = cv2.resize(depth, (-(-size[0] // 4), -(-size[1] // 4)), interpolation=cv2.INTER_AREA)
     for share_of_width in (0.004, 0.016):
-        blurred = cv2.GaussianBlur(depth, (0, 0), share_of_width * depth.shape[1])
+        blurred = cv2.resize(cv2.GaussianBlur(small, (0, 0), share_of_width * small.shape[1]), size)
         out += 0.5 * np.clip((depth - blurred) / full, 0.0, 1.0)
     return out

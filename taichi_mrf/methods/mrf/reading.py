@@ -15,13 +15,13 @@ from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.inference.color_sums import ColorShare
 from taichi_mrf.inference.dated import DatedBelief
-from taichi_mrf.inference.dated_channels import layer_of
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import count_observations
 from taichi_mrf.inference.surface_votes import Voting, all_votes, surfaces_first
 from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.methods.mrf.calibrated import calibrated_log_odds
 from taichi_mrf.methods.mrf.kept_rays import RayShare
+from taichi_mrf.methods.mrf.layers import layer_of
 from taichi_mrf.methods.mrf.map_reading import MapReading, RaysThen
 from taichi_mrf.methods.mrf.surfacing import LEAST, WithSurface
 from taichi_mrf.methods.statistics import MapStatistics, measure
@@ -158,8 +158,8 @@ class ReadableMRF(WithSurface):
 
     @property
     def dynamic(self) -> MapReading:
-        """The dynamic layer: what is occupied now, although all keyframes together say free. All else is
-        unknown. Raises ConfigError in a map of a static world."""
+        """The dynamic layer: what is occupied now, although all keyframes together say free and show no
+        surface near. All else is unknown. Raises ConfigError in a map of a static world."""
         return self.layer("dynamic")
 
     def layer(self, which: Layer = "both", stamp_s: float | None = None) -> MapReading:
@@ -182,7 +182,7 @@ class ReadableMRF(WithSurface):
             rays = None if stamp_s is None else RaysThen(shown, stamp_s, LEAST * self.prior, with_frozen)
             return MapReading(self, shown, rays)
         dynamic = which == "dynamic"
-        belief = layer_of(pool.total, shown, pool.prior_log_odds, dynamic)
+        belief = layer_of(pool, shown, dynamic)
         # All that is dynamic is occupied; what the layer does not know is at the prior.
         least, judging = (0.5, shown) if dynamic else (LEAST * self.prior, belief)
         reading = MapReading(self, belief, RaysThen(judging, stamp_s, least, with_frozen))

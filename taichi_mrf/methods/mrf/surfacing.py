@@ -80,8 +80,7 @@ class WithSurface(BrickMap):
         It is made from the keyframes' images and the marginals as they are now, so call :meth:`infer` before.
         Frozen keyframes have no images: their part is kept with ``keep_surface``, else they have none.
         ``between`` is called many times in a second; what it raises ends the work. Raises ConfigError for a
-        map without keyframes, CapacityError if there is not enough memory, TaichiMRFError without
-        scikit-image.
+        map without keyframes, CapacityError if there is not enough memory.
         """
         if not self._keyframes and not self.has_surface:
             raise ConfigError("the map has no keyframes: there is nothing to make a surface of")

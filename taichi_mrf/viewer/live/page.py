@@ -9,7 +9,14 @@ from taichi_mrf.geometry.up import up_of
 from taichi_mrf.sensor.camera import forwards
 from taichi_mrf.viewer import messages as m
 from taichi_mrf.viewer.live.actions import Action, Clicked, Dragged
-from taichi_mrf.viewer.live.panel import CHOSEN_KEYFRAME, POSITION_STEP_M, SPEEDS, Panel
+from taichi_mrf.viewer.live.panel import (
+    CHOSEN_KEYFRAME,
+    POSITION_STEP_M,
+    RESET_QUESTION,
+    SPEEDS,
+    Panel,
+    freeze_question,
+)
 from taichi_mrf.viewer.scene.base_page import BasePage
 from taichi_mrf.viewer.scene.keyframe_layer import Placement
 from taichi_mrf.viewer.scene.options import ViewOptions
@@ -25,6 +32,7 @@ class Page(BasePage[Panel]):
         inbox = Inbox()
         super().__init__(server, ask, inbox, Panel(server.gui, server.scene, inbox.put))
         self._voxel_size = 0.0
+        self._to_freeze: dict[int, int] = {}  # the keyframe that each client is asked about
         self.handlers |= {
             m.Hello: self._begin,
             m.Bricks: lambda bricks: None if self.map is None else self.map.take(bricks),
@@ -47,10 +55,11 @@ class Page(BasePage[Panel]):
             Action.SPEED: lambda client: ask(m.Speed(SPEEDS[self.panel.speed.value])),
             Action.RESET: self._reset,
             Action.RESET_CONFIRMED: self._reset_confirmed,
-            Action.RESET_CANCELLED: self.panel.answer_reset,
+            Action.CANCELLED: self.panel.close_question,
             Action.CHOOSE_KEYFRAME: lambda client: self._choose(self.panel.chosen_keyframe()),
             Action.SWITCH: lambda client: self._edit(lambda k: m.Switch(k.id, k.state == "off")),
-            Action.FREEZE: lambda client: self._edit(lambda k: m.Freeze(k.id)),
+            Action.FREEZE: self._freeze,
+            Action.FREEZE_CONFIRMED: self._freeze_confirmed,
             Action.TOGGLE_GIZMO: lambda client: self._toggle_gizmo(),
             Action.PUT_BACK: lambda client: self._edit(self._move_home),
             Action.SET_POSITION: lambda client: self._edit(self._move_as_typed),
@@ -94,13 +103,10 @@ class Page(BasePage[Panel]):
         self.viewpoint.camera_moved(camera.T_world_camera, forwards(camera.camera))
 
     def _show_ray(self, answer: m.RayAnswer) -> None:
-        """Show the answer, and fill in the pixel: the button then shows the same ray again."""
+        """Show the answer. If the ray is one of the chosen keyframe, fill in the pixel: the button then shows
+        the same ray again."""
         self.panel.ray.show(answer)
-        if answer.keyframe not in self.keyframes.keyframes or answer.pixel is None:
-            return
-        if self.keyframes.gizmo is None:
-            self._choose(answer.keyframe)
-        if self.keyframes.chosen == answer.keyframe:
+        if answer.pixel is not None and self.keyframes.chosen == answer.keyframe:
             self.panel.pixel.value = (float(answer.pixel[0]), float(answer.pixel[1]))
 
     def _reset(self, client: int) -> None:
@@ -109,11 +115,24 @@ class Page(BasePage[Panel]):
         if handle is None or not self.keyframes.keyframes:
             self.ask(m.Reset())
         else:
-            self.panel.ask_before_reset(handle)
+            self.panel.ask(handle, RESET_QUESTION)
 
     def _reset_confirmed(self, client: int) -> None:
-        self.panel.answer_reset(client)
+        self.panel.close_question(client)
         self.ask(m.Reset())
+
+    def _freeze(self, client: int) -> None:
+        """Ask before the chosen keyframe is frozen."""
+        handle, chosen = self.server.get_clients().get(client), self._changeable()
+        if handle is not None and chosen is not None:
+            self._to_freeze[client] = chosen.id
+            self.panel.ask(handle, freeze_question(chosen))
+
+    def _freeze_confirmed(self, client: int) -> None:
+        self.panel.close_question(client)
+        keyframe = self._to_freeze.pop(client, None)
+        if keyframe in self.keyframes.keyframes:
+            self.ask(m.Freeze(keyframe))
 
     def _record(self, client: int) -> None:
         self.downloads.toggle_recording(client)

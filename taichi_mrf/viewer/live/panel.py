@@ -1,7 +1,8 @@
 """The widgets of the live page. page.py decides what they do."""
 
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 import viser
@@ -61,6 +62,39 @@ _MAP_OPTIONS = (
 )
 _PAGE_OPTIONS = ("follow", "pictures", "dark")
 _TIME_OPTIONS = ("dynamic",)
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a user is asked before something that cannot be undone: ``yes`` does it, by ``action``."""
+
+    title: str
+    text: str
+    yes: str
+    no: str
+    action: Action
+
+
+RESET_QUESTION = Question(
+    "Reset the map?",
+    "This deletes the map and all edits of its keyframes, and maps the source again from its first frame. To "
+    "keep the map, save it first.",
+    "Delete the map and start again",
+    "Keep the map",
+    Action.RESET_CONFIRMED,
+)
+
+
+def freeze_question(keyframe: KeyframeInfo) -> Question:
+    """Before a keyframe is frozen."""
+    return Question(
+        "Freeze the keyframe?",
+        f"This makes the evidence of keyframe {keyframe.id} ({in_markdown(keyframe.name)}) permanent and "
+        "drops its image: it can never be switched off, moved or looked at again.",
+        "Freeze it",
+        "Leave it as it is",
+        Action.FREEZE_CONFIRMED,
+    )
 
 
 class Panel(BasePanel):
@@ -191,28 +225,22 @@ class Panel(BasePanel):
             picture.visible = False
         self._score.content = ""
 
-    def ask_before_reset(self, client: viser.ClientHandle) -> None:
-        """Ask one user to confirm that the map is deleted."""
-        self.answer_reset(client.client_id)
-        question = self._questions[client.client_id] = client.gui.add_modal("Reset the map?")
-        with question:
-            client.gui.add_markdown(
-                "This deletes the map and all edits of its keyframes, and maps the source again from its "
-                "first frame. To keep the map, save it first."
-            )
-            for label, action in (
-                ("Delete the map and start again", Action.RESET_CONFIRMED),
-                ("Keep the map", Action.RESET_CANCELLED),
-            ):
-                red: Literal["red"] | None = "red" if action is Action.RESET_CONFIRMED else None
-                button = client.gui.add_button(label, color=red)
-                button.on_click(partial(self._used, action=action))
+    def ask(self, client: viser.ClientHandle, question: Question) -> None:
+        """Ask one user to confirm what cannot be undone."""
+        self.close_question(client.client_id)
+        modal = self._questions[client.client_id] = client.gui.add_modal(question.title)
+        with modal:
+            client.gui.add_markdown(question.text)
+            yes = client.gui.add_button(question.yes, color="red")
+            yes.on_click(partial(self._used, action=question.action))
+            no = client.gui.add_button(question.no)
+            no.on_click(partial(self._used, action=Action.CANCELLED))
 
-    def answer_reset(self, client: int) -> None:
+    def close_question(self, client: int) -> None:
         """Close the question."""
-        question = self._questions.pop(client, None)
-        if question is not None and not question.closed:
-            question.close()
+        modal = self._questions.pop(client, None)
+        if modal is not None and not modal.closed:
+            modal.close()
 
     def _keyframe_tab(self) -> None:
         gui = self.gui
@@ -230,9 +258,9 @@ class Panel(BasePanel):
         self.watch(self.position, Action.SET_POSITION)
         self._keyframe_text = gui.add_markdown("")
         gui.add_markdown(
-            "**On/off** removes the keyframe from the map, or adds it again. **Freeze** makes its evidence "
-            "permanent and drops its image. **Move** shows a gizmo: drag it, and the map follows when you "
-            "let go. **Put back** returns the keyframe to its recorded pose."
+            "**On/off** removes the keyframe from the map, or adds it again. **Freeze** asks, and then makes "
+            "its evidence permanent and drops its image. **Move** shows a gizmo: drag it, and the map "
+            "follows when you let go. **Put back** returns the keyframe to its recorded pose."
         )
 
     def _ray_tab(self, scene: viser.SceneApi) -> None:

@@ -12,7 +12,6 @@ from taichi_mrf.viewer.scene.coloring import dynamic_legend_html
 from taichi_mrf.viewer.scene.safe_text import in_html
 
 STEP_S = 0.1
-NOTHING_CHANGED = "nothing has appeared or left yet"
 
 
 class TimeFolder:
@@ -34,7 +33,7 @@ class TimeFolder:
                 "and follows new keyframes. An edit returns to now.",
             )
             panel.watch(self.slider, Action.SHOW_TIME)
-            self._list = gui.add_html("")
+            self._list = gui.add_html("", visible=False)
             gui.add_html(dynamic_legend_html())
 
     def begin(self, has_dates: bool) -> None:
@@ -69,8 +68,10 @@ class TimeFolder:
         self._show_list()
 
     def _show_list(self) -> None:
+        """The list takes no room until there is something to tell."""
         start_s = 0.0 if self._span is None else self._span.start_s
-        lines = [_in_words(change, start_s) for change in self._latest] or [NOTHING_CHANGED]
+        lines = [_in_words(change, start_s) for change in self._latest]
+        self._list.visible = bool(lines)
         items = "".join(f"<div>{in_html(line)}</div>" for line in lines)
         self._list.content = f'<div style="padding:0 0.75em;font-size:0.8em">{items}</div>'
 

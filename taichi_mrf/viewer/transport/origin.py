@@ -5,11 +5,13 @@ after a page was loaded (DNS rebinding). So the requesting page must come from t
 to, and that address must not be one that a stranger can assign.
 """
 
+import gzip
 import http
 import ipaddress
 import re
 import socket
 from collections.abc import Callable
+from functools import cache
 from urllib.parse import urlsplit
 
 from websockets.asyncio.server import ServerConnection
@@ -31,6 +33,8 @@ talks to this server alone."""
 
 Pages = Callable[[ServerConnection, Request], Response | None]
 """Serves the client's files; None if the request is for a websocket."""
+
+TAB_TITLE = b"<title>taichi_mrf</title>"
 
 DEFAULT_PORTS = {"http": 80, "https": 443}
 
@@ -106,7 +110,18 @@ def answer_page(connection: ServerConnection, request: Request, pages: Pages) ->
             return None
     else:
         response = connection.respond(http.HTTPStatus.NOT_FOUND, "Not found.\n")
+    if response.headers.get("Content-Type", "").startswith("text/html"):
+        response.body = _titled(bytes(response.body), response.headers.get("Content-Encoding") == "gzip")
+        del response.headers["Content-Length"]
+        response.headers["Content-Length"] = str(len(response.body))
     policy = POLICY.format(scripts=" ".join(page_script_hashes()))
     for name, value in {**PAGE_HEADERS, "Content-Security-Policy": policy}.items():
         response.headers[name] = value
     return response
+
+
+@cache
+def _titled(page: bytes, packed: bool) -> bytes:
+    """viser's page with the project's name on the browser's tab, compressed again if it is ``packed``."""
+    named = (gzip.decompress(page) if packed else page).replace(b"<title>Viser</title>", TAB_TITLE, 1)
+    return gzip.compress(named) if packed else named

@@ -1,0 +1,68 @@
+"""The picture of a surface: its colours, its background and its borders."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from taichi_mrf.evaluation.pictures.overview import backdrop
+from taichi_mrf.evaluation.pictures.surface_view import (
+    PHOTO_VOXEL_M,
+    DrawnSurface,
+    smooth_borders,
+    surface_view,
+)
+
+UP = np.array([0.0, 0.0, 1.0])
+WHITE = np.full(3, 255, np.uint8)
+
+
+def _steps(cells: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Squares of 1 m at z = 0, two triangles each, seen from above, for the True cells of a grid."""
+    rows, columns = cells.shape
+    number = np.arange((rows + 1) * (columns + 1)).reshape(rows + 1, columns + 1)
+    a, b, c, d = (number[i : i + rows, j : j + columns][cells] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    x, y = np.divmod(np.arange(number.size), columns + 1)
+    return np.stack([x, y, 0 * x], axis=1).astype(np.float64), triangles
+
+
+def _drawn(voxel_size: float) -> tuple[NDArray[np.uint8], int]:
+    """The picture of a white square by its own colours if voxels are small enough; the number of its axes."""
+    vertices_m, triangles = _steps(np.ones((8, 8), bool))
+    normals, colors = np.tile(UP, (len(vertices_m), 1)), np.tile(WHITE, (len(vertices_m), 1))
+    figure = surface_view(DrawnSurface(vertices_m, triangles, normals, colors), voxel_size, UP)
+    return np.asarray(figure.axes[0].images[0].get_array()), len(figure.axes)
+
+
+@pytest.mark.parametrize("voxel_size", [PHOTO_VOXEL_M, 2.5 * PHOTO_VOXEL_M])
+def test_photographs_color_small_voxels_alone(voxel_size: float) -> None:
+    picture, axes = _drawn(voxel_size)
+    middle = picture[tuple(np.array(picture.shape[:2]) // 2)].astype(int)
+    grey = np.ptp(middle) < 3
+    assert grey == (voxel_size <= PHOTO_VOXEL_M)
+    assert axes == (1 if grey else 2), "a scale of heights where heights are shown"
+
+
+def test_white_things_stand_out_from_the_background() -> None:
+    picture, _ = _drawn(PHOTO_VOXEL_M)
+    background = backdrop((picture.shape[0], picture.shape[1]))
+    own = np.abs(picture.astype(int) - background).max(axis=-1) > 2
+    assert 0.1 < own.mean() < 0.9
+    assert (picture[own].astype(int).mean() - background.mean()) > 60
+    assert background.max() < 140
+
+
+def test_steps_at_a_border_become_a_slope() -> None:
+    i, j = np.indices((12, 12))
+    vertices_m, triangles = _steps(i >= j)
+    smooth = smooth_borders(vertices_m, triangles)
+
+    def roughness(of: NDArray[np.float64]) -> float:
+        """How far the corners of the stairs lie from their common line."""
+        stairs = [number for n in range(3, 9) for number in (n * 13 + n, n * 13 + n + 1)]
+        return float(np.std(of[stairs, 0] - of[stairs, 1]))
+
+    assert roughness(smooth) < 0.3 * roughness(vertices_m)
+    inside = np.flatnonzero((vertices_m[:, 0] > vertices_m[:, 1] + 1) & (vertices_m[:, 0] < 12))
+    inside = inside[vertices_m[inside, 1] > 0]
+    np.testing.assert_array_equal(smooth[inside], vertices_m[inside])
