@@ -30,7 +30,7 @@ FRAMES, RUNS, LONGEST_STRIDE = 60, 3, 10
 because frames that are further apart may not see each other's surfaces."""
 
 GLANCE, GLANCE_RUNS = 16, 2
-"""The default noise is looked at in so many frames, in so many runs,"""
+"""The default noise is checked, and learnt, by so many frames, in so many runs,"""
 
 GLANCE_COST = 4
 """of a recording that has at least so many times as many."""
@@ -146,35 +146,46 @@ def learn_sigma(
     return LearntSigma(law, first.frames, first.pixels, first.factor, before, after, prior, seconds)
 
 
-def is_doubted(
+def sigma_of_glance(
     dataset: Dataset,
     config: Config,
     *,
     every: int = 1,
     limit: int | None = None,
     should_stop: Callable[[], bool] = lambda: False,
-) -> bool:
-    """Whether held-out frames contradict the default noise: what a quick map of GLANCE of the frames 0,
-    ``every``, 2 ``every``, ..., ``limit`` of them at most, says. No map is made if the noise is not the
-    default, or the recording's own; if poses are not known; or if there are so few frames that it would cost
-    too much."""
+) -> LearntSigma | None:
+    """The law of sigma that takes the place of the default one, if held-out frames contradict that: what one
+    map of GLANCE of the frames 0, ``every``, 2 ``every``, ..., ``limit`` of them at most, says. None, and no
+    map, if the noise is not the default; if poses are not known; if rays are so long that a law needs another
+    prior, too; or if there are so few frames that it would cost too much."""
     indices = range(0, len(dataset), every)[:limit] if not dataset.endless else range(0)
     if (
         len(indices) < GLANCE * GLANCE_COST
         or dataset.tracked
-        or dataset.recorded_sigma is not None
-        or dataset.states_pixel_sigma
+        or not is_default_noise(dataset, config.sensor)
         or METHODS[config.method].section != "inference"
-        or any(getattr(config.sensor, name) != getattr(SensorConfig(), name) for name in NOISE)
     ):
-        return False
-    frames = chosen(dataset, _spread(indices, GLANCE, GLANCE_RUNS))
+        return None
+    begin, frames = time.perf_counter(), chosen(dataset, _spread(indices, GLANCE, GLANCE_RUNS))
+    if _priors(frames, config):
+        return None
     result = map_sequence(frames, _trial(config), skip_bad_frames=True, should_stop=should_stop)
     if any(keyframe.own.noise is not None for keyframe in result.map.keyframes.values()):
-        return False
+        return None
     parts = _held_out(result, frames)
     measured = pooled(parts)
-    return measured is not None and checked(measured, len(parts)).wrong
+    check = None if measured is None else checked(measured, len(parts))
+    if measured is None or check is None or check.law is None:
+        return None
+    before, after = measured.mean(measured.sigma_m), measured.under(check.law)
+    seconds = time.perf_counter() - begin
+    return LearntSigma(check.law, check.frames, check.pixels, check.factor, before, after, seconds=seconds)
+
+
+def is_default_noise(dataset: Dataset, sensor: SensorConfig) -> bool:
+    """Whether neither the parameters nor the recording say anything of noise."""
+    own, default = dataset.recorded_sigma is not None or dataset.states_pixel_sigma, SensorConfig()
+    return not own and all(getattr(sensor, name) == getattr(default, name) for name in NOISE)
 
 
 def _priors(frames: Dataset, config: Config) -> list[dict[str, float]]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from taichi_mrf.calibration.from_recording import LearntSigma
+from taichi_mrf.calibration.from_recording import LearntSigma, is_default_noise
 from taichi_mrf.config.registry import METHODS, methods_with
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import commented_yaml
@@ -15,7 +15,7 @@ from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import reposed
 from taichi_mrf.errors import ConfigError, CutShortError, FrameError
 from taichi_mrf.evaluation.held_out import HeldOutCheck, RenderedMap, check_held_out
-from taichi_mrf.evaluation.noise_check import NoiseCheck, check_noise
+from taichi_mrf.evaluation.noise_check import CONTRADICTED, DOUBTED, NoiseCheck, check_noise
 from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
 from taichi_mrf.export.formats import export_map, export_note
 from taichi_mrf.export.options import ExportOptions
@@ -135,7 +135,8 @@ def write_run(
     if check and posed is not None:
         found = _check(result, posed, haste, advance, None if chunked is None else ChunkedViews(chunked))
         if found is not None and chunked is None:
-            noise = _check_noise(result, posed, haste)
+            default = is_default_noise(posed, facts.config.sensor)
+            noise = _check_noise(result, posed, haste, DOUBTED if default else CONTRADICTED)
         if not haste.hurried and not result.interrupted:
             with result.timed("checking"):
                 result.check_steps()
@@ -238,7 +239,7 @@ def _check(
     return check
 
 
-def _check_noise(result: MappingResult, dataset: Dataset, haste: Haste) -> NoiseCheck | None:
+def _check_noise(result: MappingResult, dataset: Dataset, haste: Haste, most: float) -> NoiseCheck | None:
     """None if the frames that were held out do not tell, or if the run has to end before they do."""
 
     def checked() -> None:
@@ -247,7 +248,7 @@ def _check_noise(result: MappingResult, dataset: Dataset, haste: Haste) -> Noise
 
     try:
         with result.timed("checking"):
-            return check_noise(result.map, dataset, result.held_out, checked)
+            return check_noise(result.map, dataset, result.held_out, checked, most)
     except CutShortError:
         return None
 

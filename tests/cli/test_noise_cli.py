@@ -130,10 +130,8 @@ def test_tune_learns_from_no_frame_that_scores_a_map(monkeypatch: pytest.MonkeyP
 def test_a_default_noise_that_is_doubted_is_learnt_unless_it_is_given(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(run, "is_doubted", lambda *_, **__: True)
-    monkeypatch.setattr(
-        run, "learn_noise", lambda *_: LearntSigma(SigmaLaw(1.5, 0.01), 4, 4000, 1.8, 0.1, 0.2, seconds=2.5)
-    )
+    learnt = LearntSigma(SigmaLaw(1.5, 0.01), 4, 4000, 1.8, 0.1, 0.2, seconds=2.5)
+    monkeypatch.setattr(run, "sigma_of_glance", lambda *_, **__: learnt)
     learns, given = tmp_path / "learns", ("--noise", "given")
     for folder, flags in ((learns, ()), (tmp_path / "given", given)):
         done = taichi_mrf("map", ROOM, "--out", folder, "--limit", "3", *FAST, *flags)

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from taichi_mrf.calibration.from_recording import LearntSigma, is_doubted
+from taichi_mrf.calibration.from_recording import LearntSigma, sigma_of_glance
 from taichi_mrf.cli.map.earlier import refuse_other_run
 from taichi_mrf.cli.map.keep import Keeper, resumed_map, skipped_before
 from taichi_mrf.cli.map.report import print_report
@@ -130,12 +130,11 @@ def _learn_noise(
     resumed run has learnt it."""
     if task.resume and (task.out / CONFIG_FILE).is_file():
         return None
-    wanted = task.noise.is_learnt
-    if task.noise.is_checked and not task.poses.follow:
-        wanted = is_doubted(dataset, settings, every=task.every, limit=task.limit, should_stop=request)
-    if not wanted or request():
+    if task.noise.is_learnt:
+        return learn_noise(dataset, settings, progress, request, task.every, task.limit)
+    if not task.noise.is_checked or task.poses.follow:
         return None
-    return learn_noise(dataset, settings, progress, request, task.every, task.limit)
+    return sigma_of_glance(dataset, settings, every=task.every, limit=task.limit, should_stop=request)
 
 
 def listener_of(progress: ProgressBar) -> Listener:
