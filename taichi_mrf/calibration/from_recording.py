@@ -19,6 +19,7 @@ from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config, EvaluationConfig, SensorConfig, without_window
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import chosen
+from taichi_mrf.datasets.recorded_noise import LONG_RAY
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 from taichi_mrf.evaluation.noise_check import checked, explained_frame
 from taichi_mrf.evaluation.noise_fit import Explained, SigmaLaw, pooled
@@ -44,13 +45,10 @@ HOLD_OUT = 4
 MAPS, MOST_MAPS = 3, 5
 """Maps that are made for the law, and with those for the prior, at most."""
 
-
-LONG_RAY = 10.0
-"""Where a measured ray is longer on average than so many times what ``inference.surface_density`` expects, as
-outdoors, that prior is tried, too: one surface in the mean length of a ray, and with it"""
-
 WILD = 1e-2
-"""perhaps this density of outliers per metre, since a prior that expects few surfaces cannot explain them."""
+"""Where rays are long (LONG_RAY), as outdoors, a prior of one surface in the mean length of a ray is tried,
+too, and with it this density of outliers per metre, since a prior that expects few surfaces cannot explain
+them."""
 
 LEAST_GAIN = 0.1
 """Nats by which each held-out measurement must be likelier for a prior to take the place of the given one."""
@@ -206,7 +204,7 @@ def _priors(frames: Dataset, config: Config) -> list[dict[str, float]]:
     ):
         return []
     few = {"surface_density": _rounded(density)}
-    return [few, few | {"outlier_floor": max(WILD, given.outlier_floor)}]
+    return [few, few | {"outlier_floor": max(WILD, given.floor)}]
 
 
 def _trial(config: Config) -> Config:

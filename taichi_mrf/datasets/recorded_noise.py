@@ -23,17 +23,26 @@ MUCH = 0.1
 USEFUL = 0.03
 """Sigma over depth up to which the range follows the measurements."""
 
+LONG_RAY = 10.0
+"""A measured ray is long if it is on average longer than so many times what ``inference.surface_density``
+expects."""
+
+SHORT_RAYS_FLOOR = 0.01
+"""Density of outliers, per metre, where rays are short. The prior is less sure than this of what ends a long
+one, so that those would be taken for outliers."""
+
 LOOKED_AT = 3
 """Frames whose depths are looked at: the first, the middle and the last one."""
 
 
 def with_recorded_noise(settings: Config, dataset: Dataset) -> Config:
-    """The parameters with the recording's own sigma, reach and ``pass_through`` in place of the defaults;
-    adds notes to the dataset.
+    """The parameters with the recording's own sigma, reach, ``pass_through`` and density of outliers in place
+    of the defaults; adds notes to the dataset.
 
     What the user has set stays, and a sigma or sigma table that is set is that of all pixels.
     """
-    return _with_pass_through(_with_reach(_with_sigma(settings, dataset), dataset), dataset)
+    settings = _with_reach(_with_sigma(settings, dataset), dataset)
+    return _with_floor(_with_pass_through(settings, dataset), dataset)
 
 
 def _with_sigma(settings: Config, dataset: Dataset) -> Config:
@@ -50,8 +59,10 @@ def _with_sigma(settings: Config, dataset: Dataset) -> Config:
 
 
 def with_tuned_noise(settings: Config, dataset: Dataset) -> Config:
-    """The same for whoever tries other values of ``sensor.sigma``, which then is that of all pixels."""
-    return _for_all_pixels(with_recorded_noise(settings, dataset), dataset)
+    """The same for whoever tries other values of ``sensor.sigma``, which then is that of all pixels, and of
+    ``inference.outlier_floor``, which then is set."""
+    settings = _for_all_pixels(with_recorded_noise(settings, dataset), dataset)
+    return _with_outliers(settings, settings.inference.floor)
 
 
 def _for_all_pixels(settings: Config, dataset: Dataset) -> Config:
@@ -110,6 +121,22 @@ def _useful_depth(sensor: SensorConfig, depths_m: NDArray[np.float32]) -> float:
     sigma = np.median(evaluate(patch_coefficients(sensor)[0][:, None], tried), axis=0)
     worse = np.flatnonzero(sigma > USEFUL * tried)
     return float(np.rint(tried[max(0, worse[0] - 1)] if len(worse) else tried[-1]))
+
+
+def _with_floor(settings: Config, dataset: Dataset) -> Config:
+    given, reach_m = settings.inference, settings.sensor.max_depth
+    if given.outlier_floor is not None:
+        return settings
+    short = dataset.recorded_pass_through is None and reach_m <= SensorConfig().max_depth
+    depths_m = _some_depths(dataset) if short else np.zeros(0, np.float32)
+    if depths_m.size:
+        short = float(np.minimum(depths_m, reach_m).mean()) * given.surface_density <= LONG_RAY
+    return _with_outliers(settings, SHORT_RAYS_FLOOR) if short else settings
+
+
+def _with_outliers(settings: Config, per_m: float) -> Config:
+    changed: dict[str, Any] = {"inference": replace(settings.inference, outlier_floor=per_m)}
+    return replace(settings, **changed)
 
 
 def _with_pass_through(settings: Config, dataset: Dataset) -> Config:

@@ -8,9 +8,10 @@ import pytest
 from kitti_street import BASELINE, write_kitti
 from sliding_camera import CAMERA, SlidingCamera
 
+from taichi_mrf.config.inference import LEAST_FLOOR, InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig, load
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.datasets.recorded_noise import with_recorded_noise
+from taichi_mrf.datasets.recorded_noise import SHORT_RAYS_FLOOR, with_recorded_noise, with_tuned_noise
 from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX
 from taichi_mrf.sensor.frame import Frame
 
@@ -80,3 +81,15 @@ def test_the_shipped_sigma_of_a_stereo_rig_gives_way_to_the_recordings_own(tmp_p
     assert applied.pixel_sigma
     assert applied.sigma == pytest.approx((0.0, 0.0, SIGMA_D_PX / (BASELINE * 100)))
     assert (applied.min_depth, applied.max_depth) == (shipped.sensor.min_depth, shipped.sensor.max_depth)
+
+
+def test_outliers_are_dense_only_where_rays_are_short() -> None:
+    room, hall = street(far_m=3.0, share=1.0), street(far_m=9.0, share=1.0)
+    assert with_recorded_noise(Config(), room).inference.outlier_floor == SHORT_RAYS_FLOOR
+    assert with_recorded_noise(Config(), hall).inference.floor == LEAST_FLOOR
+    assert with_recorded_noise(Config(), street()).inference.floor == LEAST_FLOOR
+    few = replace(Config(), inference=InferenceConfig(surface_density=0.5))
+    assert with_recorded_noise(few, hall).inference.outlier_floor == SHORT_RAYS_FLOOR
+    stated = replace(Config(), inference=InferenceConfig(outlier_floor=1e-4))
+    assert with_recorded_noise(stated, room).inference == stated.inference
+    assert with_tuned_noise(Config(), hall).inference.outlier_floor == LEAST_FLOOR

@@ -54,7 +54,9 @@ def _changed_parameters(task: MapTask) -> list[str]:
     """The names of the parameters in which the task differs from the run in its folder."""
     held = load(task.out / CONFIG_FILE)
     changed = differences(held, task.settings)
-    if {"sensor.sigma", "sensor.max_depth"} & set(changed):  # the run may have had it from the recording
+    if {"sensor.sigma", "sensor.max_depth", "inference.outlier_floor"} & set(
+        changed
+    ):  # the run may have had it from the recording
         changed = differences(held, with_recorded_noise(task.settings, task.open(color=False)))
     return [name for name in changed if not (name in LEARNT and _learns_noise(task))]
 
