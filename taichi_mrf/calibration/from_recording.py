@@ -8,6 +8,7 @@ map as noise does.
 """
 
 import itertools
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -15,12 +16,13 @@ from typing import Any
 import numpy as np
 
 from taichi_mrf.config.registry import METHODS
-from taichi_mrf.config.schema import Config, EvaluationConfig, without_window
+from taichi_mrf.config.schema import Config, EvaluationConfig, SensorConfig, without_window
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import chosen
+from taichi_mrf.datasets.recorded_noise import LONG_RAY
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 from taichi_mrf.evaluation.noise_check import checked, explained_frame
-from taichi_mrf.evaluation.noise_fit import Explained, SigmaLaw, pooled, sigma_law
+from taichi_mrf.evaluation.noise_fit import Explained, SigmaLaw, pooled
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.mapping.result import MappingResult
 
@@ -28,19 +30,25 @@ FRAMES, RUNS, LONGEST_STRIDE = 60, 3, 10
 """Of a long recording so many frames are used, in so many runs; of one run so many frames apart at most,
 because frames that are further apart may not see each other's surfaces."""
 
+GLANCE, GLANCE_RUNS = 16, 2
+"""The default noise is checked, and learnt, by so many frames, in so many runs,"""
+
+GLANCE_COST = 4
+"""of a recording that has at least so many times as many."""
+
+NOISE = ("sigma", "bias", "sigma_table", "bias_table", "patch", "pixel_sigma", "sigma_scale", "sigma_added")
+"""The parameters of noise among those of the sensor."""
+
 HOLD_OUT = 4
 """One of so many is held out."""
 
 MAPS, MOST_MAPS = 3, 5
 """Maps that are made for the law, and with those for the prior, at most."""
 
-
-LONG_RAY = 10.0
-"""Where a measured ray is longer on average than so many times what ``inference.surface_density`` expects, as
-outdoors, that prior is tried, too: one surface in the mean length of a ray, and with it"""
-
 WILD = 1e-2
-"""perhaps this density of outliers per metre, since a prior that expects few surfaces cannot explain them."""
+"""Where rays are long (LONG_RAY), as outdoors, a prior of one surface in the mean length of a ray is tried,
+too, and with it this density of outliers per metre, since a prior that expects few surfaces cannot explain
+them."""
 
 LEAST_GAIN = 0.1
 """Nats by which each held-out measurement must be likelier for a prior to take the place of the given one."""
@@ -51,7 +59,8 @@ class LearntSigma:
     """The law of sigma over what is stated, and what it was learnt from: held-out ``frames`` with ``pixels``
     measurements, which had wanted ``factor`` times the assumed sigma, and whose mean log density per metre
     rose from ``before`` to ``after``. A noise that they agree with stays as it is. ``prior`` are the
-    parameters of inference that were changed with it, by name; empty for most recordings."""
+    parameters of inference that were changed with it, by name; empty for most recordings. It took some
+    ``seconds``."""
 
     law: SigmaLaw
     frames: int
@@ -60,6 +69,7 @@ class LearntSigma:
     before: float
     after: float
     prior: dict[str, float] = field(default_factory=dict)
+    seconds: float = 0.0
 
     def put_into(self, config: Config) -> Config:
         """The parameters with what was learnt."""
@@ -93,7 +103,7 @@ def learn_sigma(
             "--poses trajectory.txt --noise auto"
         )
     frames = chosen(dataset, _spread(range(0, len(dataset), every)[:limit]))
-    trial = replace(without_window(config), color=False, evaluation=EvaluationConfig(hold_out=HOLD_OUT))
+    begin, trial = time.perf_counter(), _trial(config)
     numbers = itertools.count(1)
 
     def measured_with(law: SigmaLaw, prior: dict[str, float]) -> tuple[Explained, int]:
@@ -122,16 +132,58 @@ def learn_sigma(
             after = least
     first = check = checked(measured, count)
     for _ in range(MAPS - 1):
-        if not check.wrong or should_stop():
+        better = check.law
+        if better is None or should_stop():
             break
-        # A sigma that is too large is so without any part of a voxel, too.
-        better = sigma_law(measured if check.factor > 1.0 else replace(measured, voxel_m=0.0))
         measured, count = measured_with(better, prior)
         mean, check = measured.mean(measured.sigma_m), checked(measured, count)
         if mean <= after:
             break
         law, after = better, mean
-    return LearntSigma(law, first.frames, first.pixels, first.factor, before, after, prior)
+    seconds = time.perf_counter() - begin
+    return LearntSigma(law, first.frames, first.pixels, first.factor, before, after, prior, seconds)
+
+
+def sigma_of_glance(
+    dataset: Dataset,
+    config: Config,
+    *,
+    every: int = 1,
+    limit: int | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> LearntSigma | None:
+    """The law of sigma that takes the place of the default one, if held-out frames contradict that: what one
+    map of GLANCE of the frames 0, ``every``, 2 ``every``, ..., ``limit`` of them at most, says. None, and no
+    map, if the noise is not the default; if poses are not known; if rays are so long that a law needs another
+    prior, too; or if there are so few frames that it would cost too much."""
+    indices = range(0, len(dataset), every)[:limit] if not dataset.endless else range(0)
+    if (
+        len(indices) < GLANCE * GLANCE_COST
+        or dataset.tracked
+        or not is_default_noise(dataset, config.sensor)
+        or METHODS[config.method].section != "inference"
+    ):
+        return None
+    begin, frames = time.perf_counter(), chosen(dataset, _spread(indices, GLANCE, GLANCE_RUNS))
+    if _priors(frames, config):
+        return None
+    result = map_sequence(frames, _trial(config), skip_bad_frames=True, should_stop=should_stop)
+    if any(keyframe.own.noise is not None for keyframe in result.map.keyframes.values()):
+        return None
+    parts = _held_out(result, frames)
+    measured = pooled(parts)
+    check = None if measured is None else checked(measured, len(parts))
+    if measured is None or check is None or check.law is None:
+        return None
+    before, after = measured.mean(measured.sigma_m), measured.under(check.law)
+    seconds = time.perf_counter() - begin
+    return LearntSigma(check.law, check.frames, check.pixels, check.factor, before, after, seconds=seconds)
+
+
+def is_default_noise(dataset: Dataset, sensor: SensorConfig) -> bool:
+    """Whether neither the parameters nor the recording say anything of noise."""
+    own, default = dataset.recorded_sigma is not None or dataset.states_pixel_sigma, SensorConfig()
+    return not own and all(getattr(sensor, name) == getattr(default, name) for name in NOISE)
 
 
 def _priors(frames: Dataset, config: Config) -> list[dict[str, float]]:
@@ -152,16 +204,21 @@ def _priors(frames: Dataset, config: Config) -> list[dict[str, float]]:
     ):
         return []
     few = {"surface_density": _rounded(density)}
-    return [few, few | {"outlier_floor": max(WILD, given.outlier_floor)}]
+    return [few, few | {"outlier_floor": max(WILD, given.floor)}]
 
 
-def _spread(indices: range) -> list[int]:
-    """FRAMES of the indices at most, in RUNS."""
-    if len(indices) <= FRAMES:
+def _trial(config: Config) -> Config:
+    """The parameters of a map that is made to learn from it."""
+    return replace(without_window(config), color=False, evaluation=EvaluationConfig(hold_out=HOLD_OUT))
+
+
+def _spread(indices: range, most: int = FRAMES, runs: int = RUNS) -> list[int]:
+    """``most`` of the indices at most, in some runs."""
+    if len(indices) <= most:
         return list(indices)
-    each = FRAMES // RUNS
-    stride = min(LONGEST_STRIDE, len(indices) // FRAMES)
-    starts = np.linspace(0, len(indices) - each * stride, RUNS).astype(int).tolist()
+    each = most // runs
+    stride = min(LONGEST_STRIDE, len(indices) // most)
+    starts = np.linspace(0, len(indices) - each * stride, runs).astype(int).tolist()
     return [indices[start + k * stride] for start in starts for k in range(each)]
 
 

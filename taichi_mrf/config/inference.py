@@ -6,6 +6,9 @@ from typing import Literal, get_args, get_type_hints
 
 from taichi_mrf.config.values import check_field
 
+LEAST_FLOOR = 1e-6
+"""The default of ``outlier_floor``, which holds for rays of any length."""
+
 
 @dataclass(frozen=True)
 class InferenceConfig:
@@ -42,9 +45,9 @@ class InferenceConfig:
     voxel, the value at the segment's centre, or (auto) the average where sigma is less than the voxel
     size."""
 
-    outlier_floor: float = 1e-6
+    outlier_floor: float | None = None
     """Density of outliers per metre of depth, added to both sides of every message. It keeps a single wrong
-    pixel from overruling all others."""
+    pixel from overruling all others. By default 1e-6; 0.01 where a recording's rays are short."""
 
     tail_share: float = 0.0
     """Share of the measurements whose error is ``tail_sigmas`` times as wide: poses that are off, mixed
@@ -126,6 +129,11 @@ class InferenceConfig:
     message_precision: Literal["float16", "float32"] = "float16"
     """Storage of messages. float16 halves their memory and changes beliefs by at most 0.006."""
 
+    @property
+    def floor(self) -> float:
+        """The density of outliers that is in force."""
+        return LEAST_FLOOR if self.outlier_floor is None else self.outlier_floor
+
     def __post_init__(self) -> None:
         for name in ("method", "likelihood", "ray_choice", "average", "return_pass", "message_precision"):
             choices = get_args(get_type_hints(type(self))[name])
@@ -138,7 +146,7 @@ class InferenceConfig:
         check_field(0 <= self.damping < 1, "inference.damping", "must be at least 0 and less than 1")
         check_field(self.surface_density > 0, "inference.surface_density", "must be positive")
         check_field(self.prior is None or 0 < self.prior < 1, "inference.prior", "must lie between 0 and 1")
-        check_field(self.outlier_floor >= 0, "inference.outlier_floor", "must not be negative")
+        check_field(self.floor >= 0, "inference.outlier_floor", "must not be negative")
         check_field(0 <= self.tail_share < 1, "inference.tail_share", "must be at least 0 and less than 1")
         check_field(self.tail_sigmas >= 2, "inference.tail_sigmas", "must be at least 2")
         check_field(self.end_sigmas > 0, "inference.end_sigmas", "must be positive")

@@ -102,8 +102,7 @@ class Dataset(ABC):
 
     @property
     def recorded_reach(self) -> float | None:
-        """How far the sensor measures, in metres, if that is further than depth cameras do; None if it is not
-        known."""
+        """How far the sensor measures, in metres; None if only its depths tell."""
         return None
 
     @property

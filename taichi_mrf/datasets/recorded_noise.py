@@ -1,21 +1,48 @@
 """What a recording itself says of its sensor, put into the parameters: the noise of depth that a stereo
-calibration gives, the reach of a lidar, and that its beams pass what fills only a part of a voxel."""
+calibration gives, how far depths reach, and that a lidar's beams pass what fills only a part of a voxel."""
 
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_mrf.config.files import shipped_configs
 from taichi_mrf.config.registry import METHODS
-from taichi_mrf.config.schema import Config, SensorConfig
+from taichi_mrf.config.schema import Config, SensorConfig, load
 from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.errors import BackendError, FrameError
+from taichi_mrf.sensor.noise import evaluate, patch_coefficients
+
+RIG = "stereo"
+"""The shipped parameters of a stereo rig, whose sigma stands for one that is not known."""
+
+MUCH = 0.1
+"""Share of the measurements that may lie beyond the range."""
+
+USEFUL = 0.03
+"""Sigma over depth up to which the range follows the measurements."""
+
+LONG_RAY = 10.0
+"""A measured ray is long if it is on average longer than so many times what ``inference.surface_density``
+expects."""
+
+SHORT_RAYS_FLOOR = 0.01
+"""Density of outliers, per metre, where rays are short. The prior is less sure than this of what ends a long
+one, so that those would be taken for outliers."""
+
+LOOKED_AT = 3
+"""Frames whose depths are looked at: the first, the middle and the last one."""
 
 
 def with_recorded_noise(settings: Config, dataset: Dataset) -> Config:
-    """The parameters with the recording's own sigma, reach and ``pass_through`` in place of the defaults;
-    adds notes to the dataset.
+    """The parameters with the recording's own sigma, reach, ``pass_through`` and density of outliers in place
+    of the defaults; adds notes to the dataset.
 
     What the user has set stays, and a sigma or sigma table that is set is that of all pixels.
     """
-    return _with_pass_through(_with_reach(_with_sigma(settings, dataset), dataset), dataset)
+    settings = _with_reach(_with_sigma(settings, dataset), dataset)
+    return _with_floor(_with_pass_through(settings, dataset), dataset)
 
 
 def _with_sigma(settings: Config, dataset: Dataset) -> Config:
@@ -23,7 +50,8 @@ def _with_sigma(settings: Config, dataset: Dataset) -> Config:
     if own is None or sensor.sigma == own:
         return settings
     text, origin = ", ".join(f"{value:.4g}" for value in own), dataset.sigma_origin
-    if sensor.sigma_table is not None or sensor.sigma != SensorConfig().sigma:
+    assumed = SensorConfig().sigma, load(shipped_configs()[RIG]).sensor.sigma
+    if sensor.sigma_table is not None or sensor.sigma not in assumed:
         dataset.notes.append(f"sensor.sigma is set, so [{text}], {origin}, is not used")
         return _for_all_pixels(settings, dataset)
     dataset.notes.append(f"sensor.sigma is [{text}], {origin}; setting sensor.sigma overrides it")
@@ -31,8 +59,10 @@ def _with_sigma(settings: Config, dataset: Dataset) -> Config:
 
 
 def with_tuned_noise(settings: Config, dataset: Dataset) -> Config:
-    """The same for whoever tries other values of ``sensor.sigma``, which then is that of all pixels."""
-    return _for_all_pixels(with_recorded_noise(settings, dataset), dataset)
+    """The same for whoever tries other values of ``sensor.sigma``, which then is that of all pixels, and of
+    ``inference.outlier_floor``, which then is set."""
+    settings = _for_all_pixels(with_recorded_noise(settings, dataset), dataset)
+    return _with_outliers(settings, settings.inference.floor)
 
 
 def _for_all_pixels(settings: Config, dataset: Dataset) -> Config:
@@ -43,12 +73,70 @@ def _for_all_pixels(settings: Config, dataset: Dataset) -> Config:
 
 
 def _with_reach(settings: Config, dataset: Dataset) -> Config:
-    own, sensor = dataset.recorded_reach, settings.sensor
-    if own is None or sensor.max_depth != SensorConfig().max_depth or sensor.max_depth == own:
+    sensor, own = settings.sensor, dataset.recorded_reach
+    given = sensor.max_depth != SensorConfig().max_depth
+    if own is not None and not given:
+        return _reaching(settings, dataset, own, "as far as the first scan reaches")
+    depths_m = _some_depths(dataset)
+    beyond = float((depths_m > sensor.max_depth).mean()) if depths_m.size else 0.0
+    useful = _useful_depth(sensor, depths_m)
+    if beyond <= MUCH or useful == sensor.max_depth:
         return settings
-    reach = f"{own:g} m, as far as the first scan reaches"
-    dataset.notes.append(f"sensor.max_depth is {reach}; setting sensor.max_depth overrides it")
-    return replace(settings, sensor=replace(sensor, max_depth=own))
+    if not given:
+        return _reaching(settings, dataset, useful, f"up to which sigma is at most {USEFUL:.0%} of depth")
+    dataset.notes.append(
+        f"{beyond:.0%} of the measurements lie beyond sensor.max_depth, {sensor.max_depth:g} m, and show "
+        f"only free space: with --sensor.max-depth {useful:g} those count whose sigma is useful"
+    )
+    return settings
+
+
+def _reaching(settings: Config, dataset: Dataset, reach_m: float, why: str) -> Config:
+    if reach_m == settings.sensor.max_depth:
+        return settings
+    note = f"sensor.max_depth is {reach_m:g} m, {why}; setting sensor.max_depth overrides it"
+    dataset.notes.append(note)
+    return replace(settings, sensor=replace(settings.sensor, max_depth=reach_m))
+
+
+def _some_depths(dataset: Dataset) -> NDArray[np.float32]:
+    """The measured depths of a few frames, (n,) metres; none of a camera, whose frames are read only once."""
+    depths = [np.zeros(0, np.float32)]
+    last = len(dataset) - 1 if not dataset.endless else -1
+    for index in sorted(set(np.linspace(0, last, LOOKED_AT).astype(int).tolist())) if last >= 0 else []:
+        try:
+            depth_m = dataset.read(index).depth_m
+        except (FrameError, BackendError):  # a broken frame; one to be rendered before Taichi runs
+            continue
+        depths.append(depth_m[np.isfinite(depth_m) & (depth_m > 0)])
+    return np.concatenate(depths)
+
+
+def _useful_depth(sensor: SensorConfig, depths_m: NDArray[np.float32]) -> float:
+    """Where measurements end but for a hundredth, or where sigma gets too large; whole metres, and no less
+    than the default."""
+    least = SensorConfig().max_depth
+    most = float(np.quantile(depths_m, 0.99)) if depths_m.size else least
+    tried = np.arange(least, max(most, least) + 0.5, 0.5)
+    sigma = np.median(evaluate(patch_coefficients(sensor)[0][:, None], tried), axis=0)
+    worse = np.flatnonzero(sigma > USEFUL * tried)
+    return float(np.rint(tried[max(0, worse[0] - 1)] if len(worse) else tried[-1]))
+
+
+def _with_floor(settings: Config, dataset: Dataset) -> Config:
+    given, reach_m = settings.inference, settings.sensor.max_depth
+    if given.outlier_floor is not None:
+        return settings
+    short = dataset.recorded_pass_through is None and reach_m <= SensorConfig().max_depth
+    depths_m = _some_depths(dataset) if short else np.zeros(0, np.float32)
+    if depths_m.size:
+        short = float(np.minimum(depths_m, reach_m).mean()) * given.surface_density <= LONG_RAY
+    return _with_outliers(settings, SHORT_RAYS_FLOOR) if short else settings
+
+
+def _with_outliers(settings: Config, per_m: float) -> Config:
+    changed: dict[str, Any] = {"inference": replace(settings.inference, outlier_floor=per_m)}
+    return replace(settings, **changed)
 
 
 def _with_pass_through(settings: Config, dataset: Dataset) -> Config:

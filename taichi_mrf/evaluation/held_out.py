@@ -10,7 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import FrameError
 from taichi_mrf.evaluation.depth_error import DepthError, pooled_depth_error
+from taichi_mrf.methods.protocol import PosedDepth
 from taichi_mrf.sensor.camera import Camera
+from taichi_mrf.sensor.noise import NoiseModel, without_bias
 
 
 @dataclass(frozen=True)
@@ -24,32 +26,50 @@ class HeldOutCheck:
 
 
 class RenderedMap(Protocol):
-    """A map that predicts depth."""
+    """What predicts depth."""
 
     def render_depth(self, camera: Camera, T_world_camera: ArrayLike) -> NDArray[np.float32]: ...
 
 
+class NoisyMap(RenderedMap, Protocol):
+    """A map that predicts depth and knows its noise."""
+
+    @property
+    def noise(self) -> NoiseModel: ...
+
+
 def check_held_out(
-    mapped: RenderedMap,
+    m: NoisyMap,
     dataset: Dataset,
     held_out: Sequence[int],
     on_frame: Callable[[int], None] = lambda number: None,
+    rendered_by: RenderedMap | None = None,
 ) -> HeldOutCheck:
-    """Compare the depth that a map predicts at held-out views with the depth measured there.
+    """Compare the depth that a map predicts at held-out views with the depth measured there, of which the
+    sensor's bias is taken.
 
     ``held_out`` are indices of the dataset. ``on_frame`` is called after each with its number from 1.
+    ``rendered_by`` renders in place of the map.
     """
+    mapped = m if rendered_by is None else rendered_by
     skipped: dict[str, str] = {}
 
-    def depth_pairs() -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+    def depth_pairs() -> Iterator[tuple[NDArray[np.float32], NDArray[np.float64]]]:
         for number, index in enumerate(held_out, start=1):
             try:
                 frame = dataset.read(index)
             except FrameError as error:
                 skipped[dataset.frame_names[index]] = str(error)
             else:
-                yield mapped.render_depth(frame.camera, frame.T_world_camera), frame.depth_m
+                yield mapped.render_depth(frame.camera, frame.T_world_camera), surface_depth(frame, m.noise)
             on_frame(number)
 
     error = pooled_depth_error(depth_pairs())
     return HeldOutCheck(error, len(held_out) - len(skipped), skipped)
+
+
+def surface_depth(frame: PosedDepth, noise: NoiseModel) -> NDArray[np.float64]:
+    """The depths that a frame measured, (H, W), without the bias of its own noise or of ``noise``, which is
+    its map's; 0 where it measured nothing."""
+    own = frame.own.noise
+    return without_bias(frame.depth_m, (noise if own is None else own).table(frame.camera))

@@ -7,19 +7,20 @@ from typing import Protocol
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import FrameError
 from taichi_mrf.evaluation.accuracy import JudgedMap
-from taichi_mrf.evaluation.noise_fit import Explained, explained, pooled, sigma_factor
+from taichi_mrf.evaluation.noise_fit import Explained, SigmaLaw, explained, pooled, sigma_factor, sigma_law
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import NoiseModel, unwidened_noise
 
 MOST_FRAMES = 8
 """Held-out frames that are looked at, evenly spread: a factor needs no more."""
 
-WRONG = 1.5
-"""A sigma that is off by more than this factor is worth a word,"""
+DOUBTED, CONTRADICTED = 1.25, 2.0
+"""A default sigma that is off by more than the first factor is doubted; one that was stated, or learnt from
+other frames, by more than the second,"""
 
 LEAST_GAIN = 0.02
 """if measurements are likelier by so many nats each with the right one. Where voxels are much larger than
-sigma, no factor on it makes a difference. Right noises came out at .002 and .004, the kitchen's at .05."""
+sigma, no factor on it makes a difference. Right noises came out at up to .004, the kitchen's at .05."""
 
 
 class NoisyMap(JudgedMap, Protocol):
@@ -32,24 +33,30 @@ class NoisyMap(JudgedMap, Protocol):
 @dataclass(frozen=True)
 class NoiseCheck:
     """``factor`` is what sigma has to be multiplied by so that ``pixels`` measurements of ``frames`` held-out
-    frames are likeliest, and ``gain`` by how many nats each they are then likelier."""
+    frames are likeliest, and ``gain`` by how many nats each they are then likelier. ``law`` is the law of
+    sigma under which they are likeliest where sigma is off, else None."""
 
     factor: float
     gain: float
     frames: int
     pixels: int
+    law: SigmaLaw | None = None
 
     @property
     def wrong(self) -> bool:
         """Whether sigma is off."""
-        return self.gain > LEAST_GAIN and not 1.0 / WRONG <= self.factor <= WRONG
+        return self.law is not None
 
 
 def check_noise(
-    m: NoisyMap, dataset: Dataset, held_out: Sequence[int], on_frame: Callable[[], None] = lambda: None
+    m: NoisyMap,
+    dataset: Dataset,
+    held_out: Sequence[int],
+    on_frame: Callable[[], None] = lambda: None,
+    most: float = DOUBTED,
 ) -> NoiseCheck | None:
     """Compare the noise of a map with some of the held-out frames, indices of the dataset. None if these do
-    not tell. ``on_frame`` is called after each."""
+    not tell. ``on_frame`` is called after each; ``most`` is the factor from which on sigma is off."""
     some = held_out[:: max(1, -(-len(held_out) // MOST_FRAMES))]
     parts: list[Explained] = []
     for index in some:
@@ -63,17 +70,21 @@ def check_noise(
     together = pooled(parts)
     if together is None:
         return None
-    return checked(together, len(parts))
+    return checked(together, len(parts), most)
 
 
-def checked(measured: Explained, frames: int) -> NoiseCheck:
-    """The check of the measurements of some frames. How much of a voxel a map does not know depends on the
-    scene, so the factor is the one next to 1 of those between that for a whole voxel and that for none."""
+def checked(measured: Explained, frames: int, most: float = DOUBTED) -> NoiseCheck:
+    """The check of the measurements of some frames, sigma being off from the factor ``most`` on.
+
+    How much of a voxel a map does not know depends on the scene, so the factor is the one next to 1 of those
+    between that for a whole voxel and that for none.
+    """
     without = replace(measured, voxel_m=0.0)
-    least, most = sigma_factor(measured), sigma_factor(without)
-    factor, by = (least, measured) if least > 1.0 else (min(most, 1.0), without)
+    of_whole, of_none = sigma_factor(measured), sigma_factor(without)
+    factor, by = (of_whole, measured) if of_whole > 1.0 else (min(of_none, 1.0), without)
     gain = by.mean(factor * by.sigma_m) - by.mean(by.sigma_m)
-    return NoiseCheck(factor, gain, frames, len(measured.sigma_m))
+    wrong = gain > LEAST_GAIN and not 1.0 / most <= factor <= most
+    return NoiseCheck(factor, gain, frames, len(measured.sigma_m), sigma_law(by) if wrong else None)
 
 
 def explained_frame(m: NoisyMap, frame: Frame) -> Explained | None:

@@ -46,6 +46,14 @@ CLOSE = 1.02
 
 
 @dataclass(frozen=True)
+class SigmaLaw:
+    """Sigma is ``added_m`` metres more than ``scale`` times the stated one."""
+
+    scale: float = 1.0
+    added_m: float = 0.0
+
+
+@dataclass(frozen=True)
 class Explained:
     """How well a map explains n measurements. ``sigma_m`` (n,) is the assumed standard deviation of each, in
     metres, ``stated_m`` (n,) the one without what was learnt, and ``log_likelihood`` (n, OCTAVES) the log
@@ -68,13 +76,9 @@ class Explained:
         before, at, after = (self.log_likelihood[pixel, middle + k] for k in (-1, 0, 1))
         return float(np.mean(at + t * (0.5 * (after - before) + t * (0.5 * (before + after) - at))))
 
-
-@dataclass(frozen=True)
-class SigmaLaw:
-    """Sigma is ``added_m`` metres more than ``scale`` times the stated one."""
-
-    scale: float = 1.0
-    added_m: float = 0.0
+    def under(self, law: SigmaLaw) -> float:
+        """Mean log density with a law of sigma."""
+        return self.mean(np.maximum(law.added_m + law.scale * self.stated_m, LEAST_SIGMA_M))
 
 
 def explained(
@@ -130,13 +134,8 @@ def sigma_factor(measurements: Explained) -> float:
 
 def sigma_law(measurements: Explained) -> SigmaLaw:
     """The law under which the measurements are likeliest."""
-    stated_m, sigma_m = measurements.stated_m, measurements.sigma_m
-
-    def mean(law: SigmaLaw) -> float:
-        of_law = np.maximum(law.added_m + law.scale * stated_m, LEAST_SIGMA_M)
-        return measurements.mean(of_law)
-
-    scale = sigma_factor(measurements) * float(np.median(sigma_m / stated_m))
+    stated_m, mean = measurements.stated_m, measurements.under
+    scale = sigma_factor(measurements) * float(np.median(measurements.sigma_m / stated_m))
     middle_m = scale * float(np.median(stated_m))
     starts = [SigmaLaw(scale), SigmaLaw(0.5 * scale, 0.5 * middle_m), SigmaLaw(0.1 * scale, 0.9 * middle_m)]
     return max((_improved(start, mean) for start in starts), key=mean)

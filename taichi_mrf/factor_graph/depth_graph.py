@@ -240,7 +240,7 @@ class _RaysOf:
         cells, table = into or (ti.ndarray(ti.i32, 1), ti.ndarray(ti.f32, (1, 1)))
         config, beam = self.inference, 0
         model = _RayFactors(
-            self.voxel_size, self.sensor.max_depth, config.end_sigmas, config.outlier_floor + TINY,
+            self.voxel_size, self.sensor.max_depth, config.end_sigmas, config.floor + TINY,
             LIKELIHOODS[config.likelihood],
         )  # fmt: skip
         for keyframe, pixels in zip(keyframes, chosen, strict=True):

@@ -193,7 +193,7 @@ class Sweeper:
             voxel_size=self.voxel_size,
             max_depth=self.sensor.max_depth,
             end_sigmas=config.end_sigmas,
-            floor=config.outlier_floor,
+            floor=config.floor,
             clamp=config.message_clamp,
             pass_through=self.pass_through,
             passes=self.pass_through > 0,

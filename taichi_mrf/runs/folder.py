@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from taichi_mrf.calibration.from_recording import LearntSigma
+from taichi_mrf.calibration.from_recording import LearntSigma, is_default_noise
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import commented_yaml
@@ -15,7 +15,7 @@ from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.derived import reposed
 from taichi_mrf.errors import CutShortError, FrameError
 from taichi_mrf.evaluation.held_out import HeldOutCheck, RenderedMap, check_held_out
-from taichi_mrf.evaluation.noise_check import NoiseCheck, check_noise
+from taichi_mrf.evaluation.noise_check import CONTRADICTED, DOUBTED, NoiseCheck, check_noise
 from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
 from taichi_mrf.export.formats import export_map, export_note
 from taichi_mrf.export.options import ExportOptions
@@ -131,10 +131,10 @@ def write_run(
         posed = reposed(posed, result.track.poses(result.map))
     found, noise = None, None
     if check and posed is not None:
-        mapped = result.map if chunked is None else ChunkedViews(chunked)
-        found = _check(mapped, result, posed, haste, advance)
+        found = _check(result, posed, haste, advance, None if chunked is None else ChunkedViews(chunked))
         if found is not None and chunked is None:
-            noise = _check_noise(result, posed, haste)
+            default = is_default_noise(posed, facts.config.sensor)
+            noise = _check_noise(result, posed, haste, DOUBTED if default else CONTRADICTED)
         if not haste.hurried and not result.interrupted:
             with result.timed("checking"):
                 result.check_steps()
@@ -204,7 +204,7 @@ def _write_map(
 
 
 def _check(
-    mapped: RenderedMap, result: MappingResult, dataset: Dataset, haste: Haste, advance: Advance
+    result: MappingResult, dataset: Dataset, haste: Haste, advance: Advance, rendered_by: RenderedMap | None
 ) -> HeldOutCheck | None:
     """None if no frame was held out, or if the run has to end before the check does."""
     if not result.held_out or haste.hurried:
@@ -217,14 +217,14 @@ def _check(
 
     try:
         with result.timed("checking"):
-            check = check_held_out(mapped, dataset, result.held_out, checked)
+            check = check_held_out(result.map, dataset, result.held_out, checked, rendered_by)
     except CutShortError:
         return None
     result.skipped.update(check.skipped)
     return check
 
 
-def _check_noise(result: MappingResult, dataset: Dataset, haste: Haste) -> NoiseCheck | None:
+def _check_noise(result: MappingResult, dataset: Dataset, haste: Haste, most: float) -> NoiseCheck | None:
     """None if the frames that were held out do not tell, or if the run has to end before they do."""
 
     def checked() -> None:
@@ -233,7 +233,7 @@ def _check_noise(result: MappingResult, dataset: Dataset, haste: Haste) -> Noise
 
     try:
         with result.timed("checking"):
-            return check_noise(result.map, dataset, result.held_out, checked)
+            return check_noise(result.map, dataset, result.held_out, checked, most)
     except CutShortError:
         return None
 

@@ -6,13 +6,10 @@ from typing import Any
 
 import yaml
 
-from taichi_mrf.calibration.from_recording import LearntSigma
+from taichi_mrf.calibration.from_recording import NOISE, LearntSigma
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.evaluation.noise_check import NoiseCheck
 from taichi_mrf.evaluation.noise_fit import SigmaLaw
-
-_FIELDS = ("sigma", "bias", "sigma_table", "bias_table", "patch", "pixel_sigma", "sigma_scale", "sigma_added")
-"""The parameters of noise among those of the sensor."""
 
 
 def noise_report(
@@ -34,7 +31,7 @@ def noise_report(
         report |= {"wrong": check.wrong, "frames": check.frames}
     if learnt is not None:
         facts = asdict(learnt)
-        del facts["law"]
+        del facts["law"], facts["seconds"]
         prior = facts.pop("prior")
         report["learnt"] = {name: round(value, 4) for name, value in facts.items()} | {"prior": prior}
     return report
@@ -47,8 +44,9 @@ def noise_notes(sensor: SensorConfig, check: NoiseCheck | None, learnt: LearntSi
         notes.append(f"Sigma stays as stated: {learnt.frames} held-out frames agree with it.")
     elif learnt is not None:
         notes.append(
-            f"Sigma was learnt from {learnt.frames} held-out frames: {sensor.sigma_scale:g} times the stated "
-            f"one and {100 * sensor.sigma_added:.2g} cm; a single factor would have been {learnt.factor:.2g}."
+            f"Sigma was learnt from {learnt.frames} held-out frames in {learnt.seconds:.1f} s: "
+            f"{sensor.sigma_scale:g} times the stated one and {100 * sensor.sigma_added:.2g} cm; a single "
+            f"factor would have been {learnt.factor:.2g}. --noise given leaves it as stated."
         )
     if learnt is not None and learnt.prior:
         changed = ", ".join(f"inference.{name} is {value:g}" for name, value in learnt.prior.items())
@@ -56,7 +54,8 @@ def noise_notes(sensor: SensorConfig, check: NoiseCheck | None, learnt: LearntSi
     if check is not None and check.wrong:
         notes.append(
             f"The measured depths of {check.frames} held-out frames differ from the map by "
-            f"{check.factor:.2g} times what {_noise_name(sensor)} allows. {_advice(sensor, learnt)}"
+            f"{check.factor:.2g} times what {_noise_name(sensor)} allows{_better(check.law)}. "
+            f"{_advice(sensor, learnt)}"
         )
     return notes
 
@@ -64,7 +63,7 @@ def noise_notes(sensor: SensorConfig, check: NoiseCheck | None, learnt: LearntSi
 def sensor_yaml(sensor: SensorConfig, source: str, learnt: LearntSigma) -> str:
     """The learnt noise as a file of parameters."""
     fields = {
-        name: list(value) if isinstance(value := getattr(sensor, name), tuple) else value for name in _FIELDS
+        name: list(value) if isinstance(value := getattr(sensor, name), tuple) else value for name in NOISE
     }
     sections = {"sensor": fields} | ({"inference": learnt.prior} if learnt.prior else {})
     text = yaml.safe_dump(sections, sort_keys=False, default_flow_style=None)
@@ -80,6 +79,12 @@ def _noise_name(sensor: SensorConfig) -> str:
     if sensor.sigma == SensorConfig().sigma:
         return "the noise of a Kinect 1 (the default of sensor.sigma)"
     return "sensor.sigma"
+
+
+def _better(law: SigmaLaw | None) -> str:
+    if law is None:
+        return ""
+    return f"; likeliest is {law.scale:.2g} times the stated sigma and {100 * law.added_m:.2g} cm"
 
 
 def _advice(sensor: SensorConfig, learnt: LearntSigma | None) -> str:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.sensor.camera import Camera
-from taichi_mrf.sensor.noise import NoiseTable
+from taichi_mrf.sensor.noise import NoiseTable, without_bias
 from taichi_mrf.sensor.pixel_sigma import ScaledNoiseTable
 
 Image = NDArray[np.float64]
@@ -44,10 +44,6 @@ MOST_SIGMAS = 3.0
 LEAST_SHARE = 0.5
 """Share of the window's pixels that have to hold a measurement. Half of a square is more than one line of it,
 so that its plane is determined."""
-
-UNBIASED_STEPS = 5
-"""Fixed-point steps from a measurement to the depth that gives it. Where the bias changes by less than a
-fifth of a metre in a metre, less than a thousandth of it is left."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +72,8 @@ def averaged_on_planes(
         )
     scale = np.ones(camera.shape, np.float32)
     if camera.pixels_per_radian > 0:
-        z, sigma = _without_bias(depth_m, table)
+        z = without_bias(depth_m, table)
+        sigma = table.at_pixels(z)[0]
         reach = np.where(sigma > window.least_sigma_m, _reach(z, camera, window.half_side_m), 0)
         flat, scale = _on_planes(z, sigma, reach)
         moved = flat != z
@@ -86,15 +83,6 @@ def averaged_on_planes(
     if isinstance(table, ScaledNoiseTable):
         scale = scale * table.scale
     return depth_m, ScaledNoiseTable(table.coefficients, table.patch, table.columns, scale)
-
-
-def _without_bias(depth_m: NDArray[np.float32], table: NoiseTable) -> tuple[Image, Image]:
-    """The surface's depth that gives each measurement on average, 0 where none, and sigma there."""
-    measured = depth_m > 0
-    z = depth_m.astype(np.float64)
-    for _ in range(UNBIASED_STEPS if table.coefficients[:, 1].any() else 0):
-        z = np.where(measured, np.maximum(depth_m - table.at_pixels(z)[1], 0.5 * depth_m), 0.0)
-    return z, table.at_pixels(z)[0]
 
 
 def _reach(z: Image, camera: Camera, half_side_m: float) -> NDArray[np.int32]:

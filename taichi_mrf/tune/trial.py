@@ -13,6 +13,7 @@ from taichi_mrf.config.schema import Config, PoseConfig, without_window
 from taichi_mrf.evaluation.accuracy import JudgedView, judge_view
 from taichi_mrf.evaluation.depth_error import pooled_depth_error
 from taichi_mrf.evaluation.depth_intervals import interval_error, view_below
+from taichi_mrf.evaluation.held_out import surface_depth
 from taichi_mrf.mapping.intake import Full, Intake
 from taichi_mrf.mapping.settling import FullInference
 from taichi_mrf.methods.protocol import OccupancyMap
@@ -76,11 +77,14 @@ def run_trial(
 
 
 def judge(m: OccupancyMap, frame: Frame, pixel_stride: int = 1) -> JudgedView:
-    """Judge the map's depth in the view of a frame, with its own noise or the map's. Raises FrameError if it
-    holds no measurement in the sensor's range."""
-    depth_m = thinned(frame, pixel_stride).depth_m
-    noise = frame.own_for(m.sensor).noise_model(m.noise, depth_m)
-    return judge_view(m, depth_m, frame.T_world_camera, frame.camera, noise=noise)
+    """Judge the map's depth in the view of a frame by what that measured, without the bias of its own noise
+    or the map's. Raises FrameError if it holds no measurement in the sensor's range."""
+    few = thinned(frame, pixel_stride)
+    noise = frame.own_for(m.sensor).noise_model(m.noise, few.depth_m)
+    return judge_view(
+        m, surface_depth(few, m.noise), frame.T_world_camera, frame.camera,
+        measured_m=few.depth_m, noise=noise,
+    )  # fmt: skip
 
 
 def _build(config: Config, frames: WorkingSet, pixel_stride: int, go_on: GoOn) -> OccupancyMap | None:

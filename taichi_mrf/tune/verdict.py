@@ -5,7 +5,9 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
+from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config
 from taichi_mrf.tune.trial import GoOn, run_trial
 from taichi_mrf.tune.working_set import WorkingSet
@@ -24,8 +26,11 @@ class Judged:
 
 
 def contenders(start: Config, found: Config) -> list[tuple[str, Config]]:
-    """The configurations to compare: the shipped defaults with the same voxel size and method, the start of
-    the search if it differs, and the result."""
+    """The configurations to compare: the shipped defaults with the same voxel size, method and density of
+    outliers, which is the recording's, the start of the search if it differs, and the result."""
+    changed: dict[str, Any] = {
+        "inference": dataclasses.replace(InferenceConfig(), outlier_floor=start.inference.outlier_floor)
+    }
     shipped = dataclasses.replace(
         Config(),
         voxel_size=start.voxel_size,
@@ -33,6 +38,7 @@ def contenders(start: Config, found: Config) -> list[tuple[str, Config]]:
         volume=start.volume,
         evaluation=start.evaluation,
         runtime=start.runtime,
+        **changed,
     )
     between = [] if start == shipped else [(STARTED, start)]
     return [(SHIPPED, shipped), *between, (FOUND, found)]

@@ -7,16 +7,38 @@ import numpy as np
 import pytest
 
 from taichi_mrf import open_dataset
-from taichi_mrf.calibration.from_recording import FRAMES, LONGEST_STRIDE, RUNS, _priors, _spread, learn_sigma
+from taichi_mrf.calibration import from_recording
+from taichi_mrf.calibration.from_recording import (
+    FRAMES,
+    LONGEST_STRIDE,
+    RUNS,
+    _priors,
+    _spread,
+    learn_sigma,
+    sigma_of_glance,
+)
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.datasets import Dataset
-from taichi_mrf.datasets.derived import chosen
+from taichi_mrf.datasets.derived import Derived, chosen
 from taichi_mrf.errors import ConfigError, DatasetError
-from taichi_mrf.evaluation.noise_check import WRONG
 from taichi_mrf.evaluation.noise_fit import VOXEL_SPREAD, SigmaLaw
+from taichi_mrf.sensor.frame import Frame
 
 VOXEL = 0.05
+
+CLOSE = 1.5
+"""Factor to which sigma is found."""
+
+
+class Noisy(Derived):
+    """A recording whose measurements are off by 10 cm more than its source's."""
+
+    def read(self, index: int) -> Frame:
+        frame = self.source.read(index)
+        off_m = np.random.default_rng(index).normal(0.0, 0.1, frame.depth_m.shape)
+        noisy_m = np.where(frame.depth_m > 0, np.maximum(frame.depth_m + off_m, 0.1), 0.0)
+        return replace(frame, depth_m=noisy_m.astype(np.float32))
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +65,8 @@ def test_the_true_sigma_is_learnt_whatever_is_stated(room: Dataset, factor: floa
     found_m = learnt_m(room, SensorConfig(sigma=tuple(factor * c for c in right)), depth_m)
     # What a part of a voxel explains is left to it, which may be all or nothing.
     voxel_m = VOXEL_SPREAD * VOXEL
-    assert true_m / WRONG < math.hypot(found_m, voxel_m)
-    assert found_m < WRONG * math.hypot(true_m, voxel_m)
+    assert true_m / CLOSE < math.hypot(found_m, voxel_m)
+    assert found_m < CLOSE * math.hypot(true_m, voxel_m)
     assert abs(math.log(found_m / true_m)) < abs(math.log(factor))
 
 
@@ -103,3 +125,26 @@ def test_recordings_that_cannot_tell_are_refused(room: Dataset) -> None:
         learn_sigma(camera, Config(VOXEL))
     with pytest.raises(DatasetError, match="0 held-out frames"):
         learn_sigma(chosen(room, [0, 1]), Config(VOXEL))
+
+
+@pytest.mark.usefixtures("one_backend")
+def test_only_a_default_noise_of_a_long_recording_is_doubted(
+    room: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = Config(VOXEL)
+    assert sigma_of_glance(room, config) is None, "12 frames are too few"
+    monkeypatch.setattr(from_recording, "GLANCE_COST", 0)
+    assert sigma_of_glance(room, config) is None, "its noise is the default"
+    noisy = Noisy(room.name, room.camera, source=room)
+    learnt = sigma_of_glance(noisy, config)
+    assert learnt is not None
+    assert learnt.after > learnt.before
+    sigma_m = learnt.law.scale * np.polynomial.polynomial.polyval(2.0, SensorConfig().sigma)
+    assert 0.1 / CLOSE < sigma_m + learnt.law.added_m < 0.1 * CLOSE
+    stated = replace(config, sensor=SensorConfig(sigma=(0.001,)))
+    assert sigma_of_glance(noisy, stated) is None, "the user has said what it is"
+    dense = replace(config, inference=InferenceConfig(surface_density=20.0))
+    assert sigma_of_glance(noisy, dense) is None, "rays are long for such a prior"
+    assert sigma_of_glance(noisy, replace(config, method="log_odds")) is None
+    noisy.tracked = True
+    assert sigma_of_glance(noisy, config) is None

@@ -9,6 +9,8 @@ import pytest
 import yaml
 from console import COARSE, FAST, as_process, assert_refused, taichi_mrf
 
+from taichi_mrf.calibration.from_recording import LearntSigma
+from taichi_mrf.cli.map import run
 from taichi_mrf.cli.options.live import Live
 from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.options.noise_flags import NoiseFlags
@@ -17,6 +19,7 @@ from taichi_mrf.cli.shared import learn_noise
 from taichi_mrf.config.schema import load
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.errors import ConfigError
+from taichi_mrf.evaluation.noise_fit import SigmaLaw
 from taichi_mrf.tune.working_set import read_working_set
 from taichi_mrf.viewer.tune.messages import FrameChoice
 
@@ -122,6 +125,28 @@ def test_tune_learns_from_no_frame_that_scores_a_map(monkeypatch: pytest.MonkeyP
     scoring = {frame.name for frame in (*frames.held_out, *frames.unseen)}
     assert len(scoring) == 3
     assert sorted(asked) == sorted(set(open_dataset(ROOM).frame_names) - scoring)
+
+
+def test_a_default_noise_that_is_doubted_is_learnt_unless_it_is_given(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    learnt = LearntSigma(SigmaLaw(1.5, 0.01), 4, 4000, 1.8, 0.1, 0.2, seconds=2.5)
+    monkeypatch.setattr(run, "sigma_of_glance", lambda *_, **__: learnt)
+    learns, given = tmp_path / "learns", ("--noise", "given")
+    for folder, flags in ((learns, ()), (tmp_path / "given", given)):
+        done = taichi_mrf("map", ROOM, "--out", folder, "--limit", "3", *FAST, *flags)
+        assert done.returncode == 0, done.stderr
+    assert load(learns / "config.yaml").sensor.sigma_scale == 1.5
+    notes = [note for note in report_of(learns)["notes"] if note.startswith("Sigma was learnt")]
+    assert len(notes) == 1
+    assert "in 2.5 s" in notes[0]
+    assert load(tmp_path / "given" / "config.yaml").sensor.sigma_scale == 1.0
+    assert "noise_from" not in report_of(learns)
+    assert report_of(tmp_path / "given")["noise_from"] == "given"
+    same = taichi_mrf("map", ROOM, "--out", learns, "--limit", "3", *FAST)
+    assert "holds this run already" in same.stdout
+    other = taichi_mrf("map", ROOM, "--out", learns, "--limit", "3", *FAST, *given)
+    assert_refused(other, "noise_from")
 
 
 def test_noise_is_not_learnt_without_poses() -> None:

@@ -59,7 +59,7 @@ def test_the_noise_of_the_rig_takes_the_place_of_the_default(folder: Path) -> No
     own = (0.0, 0.0, SIGMA_D_PX / (BASELINE * 100))
     applied = with_recorded_noise(Config(), dataset)
     assert applied.sensor.sigma == pytest.approx(own)
-    assert applied == replace(Config(), sensor=replace(SensorConfig(), sigma=applied.sensor.sigma))
+    assert applied.sensor == replace(SensorConfig(), sigma=applied.sensor.sigma)
     assert dataset.notes[-1].startswith("sensor.sigma is [0, 0, ")
     assert with_recorded_noise(applied, dataset) is applied
     chosen = replace(Config(), sensor=SensorConfig(sigma=(0.05,)))

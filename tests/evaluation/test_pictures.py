@@ -1,7 +1,7 @@
 """The pictures of a run: what they show of a room whose every voxel is known."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -24,6 +24,7 @@ from taichi_mrf.evaluation.pictures.voxel_raster import cast_voxels
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.sensor.noise import NoiseModel, PolynomialNoise
 
 CAMERA = PinholeCamera(width=160, height=120, fx=90.0, fy=90.0, cx=79.5, cy=59.5)
 KITCHEN = Path(__file__).resolve().parents[3] / "shared" / "data" / "seven_scenes_redkitchen"
@@ -42,6 +43,7 @@ class VoxelMap:
     keyframes: dict[int, Frame]
     voxel_size: float = VOXEL
     up: None = None
+    noise: NoiseModel = field(default_factory=lambda: PolynomialNoise((0.01,)))
 
     def voxels(self, min_probability: float = 0.5) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         shown = self.probability >= min_probability
@@ -132,6 +134,13 @@ def test_depth_comparison_names_frame_and_error(room: VoxelMap) -> None:
     assert "held-out frame frame-000123" in measured
     assert "0.0 % without" in rendered
     assert "error 3.0 cm, signed +3.0 cm" in difference
+
+
+def test_depth_comparison_takes_the_bias_of_the_sensor_from_measurements(room: VoxelMap) -> None:
+    biased = replace(room, noise=PolynomialNoise((0.01,), bias=(-0.03,)))
+    assert "median error 0.0 cm" in _titles(biased, [_held_out(room, -0.03)])[2]
+    own = replace(_held_out(room, 0.05), noise=PolynomialNoise((0.01,), bias=(0.05,)))
+    assert "median error 0.0 cm" in _titles(biased, [own])[2]
 
 
 def test_depth_comparison_takes_a_keyframe_where_nothing_is_held_out(room: VoxelMap) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sliding_camera import ALL_FRAMES, CAMERA, WALL_M, SlidingCamera, StopAfter, names, sequence
 
-from taichi_mrf.config.schema import EvaluationConfig, KeyframeConfig
+from taichi_mrf.config.schema import EvaluationConfig, KeyframeConfig, SensorConfig
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.evaluation.held_out import check_held_out
 from taichi_mrf.inference.schedule import InferProgress
@@ -58,6 +58,17 @@ def test_held_out_frames_are_not_mapped_and_check_the_map() -> None:
     assert check.frames == 2
     assert check.error.pixels > 0
     assert check.error.median_abs < config.voxel_size
+
+
+def test_the_bias_of_the_sensor_is_no_error_of_the_map() -> None:
+    """The wall is 20 cm nearer than it was measured, as the map knows."""
+    sensor = SensorConfig(bias=(0.0, 2 / 13))
+    config = replace(ALL_FRAMES, sensor=sensor, evaluation=EvaluationConfig(hold_out=3))
+    result = map_sequence(sequence(7), config)
+    check = check_held_out(result.map, sequence(7), result.held_out)
+    assert check.error.median_abs < config.voxel_size
+    rendered = result.map.render_depth(CAMERA, sequence(7).read(4).T_world_camera)
+    assert abs(float(np.nanmedian(rendered)) - 1.3) < config.voxel_size
 
 
 def test_a_broken_held_out_frame_is_named_and_the_others_count() -> None:

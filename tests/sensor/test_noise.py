@@ -27,6 +27,7 @@ from taichi_mrf.sensor.noise import (
     evaluate,
     noise_from_config,
     warn_of_bad_sigma,
+    without_bias,
 )
 from taichi_mrf.sensor.polynomials import SensorNoise
 from taichi_mrf.system.compiler import ti
@@ -290,3 +291,16 @@ def test_an_unreadable_table_is_named_with_its_field(
         noise_from_config(SensorConfig(patch=16, **{field: str(path)}), CAMERA)  # type: ignore[arg-type]
     assert str(caught.value).startswith(f"sensor.{field}: {path}")
     assert "\n" not in str(caught.value)
+
+
+def test_the_bias_is_taken_from_measurements() -> None:
+    bias = numbered(12, sign=-1) * 1e-4
+    table = PatchNoise(numbered(12), bias, 16, CAMERA).table(CAMERA)
+    true_m = np.random.default_rng(0).uniform(0.5, 5.0, CAMERA.shape)
+    measured_m = true_m + table.at_pixels(true_m)[1]
+    assert np.abs(measured_m - true_m).max() > 0.01
+    np.testing.assert_allclose(without_bias(measured_m, table), true_m, atol=1e-5)
+    measured_m[3, 4:6] = 0.0, np.nan
+    assert (without_bias(measured_m, table)[3, 4:6] == 0).all()
+    unbiased = PolynomialNoise((0.01,)).table(CAMERA)
+    np.testing.assert_array_equal(without_bias(true_m, unbiased), true_m)

@@ -183,8 +183,8 @@ def built(chosen: Iterable[int], poses: dict[int, np.ndarray] | None = None) -> 
 
 
 def assert_shown_is(session: Session, link: FakeLink, decided: bool = True) -> None:
-    """What the viewer knows are the very voxels of the map, or, until the rays' votes are counted, those of its
-    marginals."""
+    """What the viewer knows are the very voxels of the map, or, until the rays' votes are counted, those of
+    its marginals."""
     m = session.state.mapper.map
     view = shown(link.sent)
     assert view.voxels(min_probability=0.5) == map_voxels(m if decided else m.layer())

@@ -1,7 +1,9 @@
 """What tests of tuning share: a few small frames of the built-in room, and a coarse map's parameters."""
 
 from functools import cache
+from typing import Any
 
+from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.system import runtime
@@ -9,7 +11,8 @@ from taichi_mrf.tune.working_set import WorkingSet, read_working_set
 from taichi_mrf.viewer.tune.messages import FrameChoice
 
 ROOM = "synthetic:room?frames=9&width=80&height=60"
-CONFIG = Config(voxel_size=0.1)
+_TUNED: dict[str, Any] = {"inference": InferenceConfig(outlier_floor=1e-6)}  # as with_tuned_noise sets it
+CONFIG = Config(voxel_size=0.1, **_TUNED)
 CHOICE = FrameChoice(stride=1, count=9)
 
 

@@ -97,9 +97,10 @@ def test_without_optuna_one_line_says_what_to_install(monkeypatch: pytest.Monkey
 
 def test_what_was_found_is_compared_with_the_shipped_defaults_and_the_start() -> None:
     found = dataclasses.replace(CONFIG, inference=InferenceConfig(sweeps=5))
-    assert contenders(CONFIG, found) == [(SHIPPED, CONFIG), (FOUND, found)]
+    shipped = Config(CONFIG.voxel_size)
+    assert contenders(shipped, found) == [(SHIPPED, shipped), (FOUND, found)]
     start = dataclasses.replace(CONFIG, inference=InferenceConfig(sweeps=1))
-    assert contenders(start, found) == [(SHIPPED, CONFIG), (STARTED, start), (FOUND, found)]
+    assert contenders(start, found) == [(SHIPPED, shipped), (STARTED, start), (FOUND, found)]
 
 
 def test_the_verdict_is_that_of_the_unseen_views() -> None:

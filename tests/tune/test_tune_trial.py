@@ -103,6 +103,16 @@ def test_scores_are_those_of_the_judge() -> None:
     assert 0 < trial.scores.voxel_calibration < 0.3
 
 
+def test_a_map_of_a_biased_sensor_is_judged_by_surfaces() -> None:
+    config = dataclasses.replace(CONFIG, sensor=SensorConfig(bias=(0.05,)))
+    trial = run_trial(config, working_set())
+    assert trial is not None
+    for view, frame in zip(trial.views, working_set().held_out, strict=True):
+        measured = frame.depth_m > 0
+        assert np.array_equal(view.measured_m, frame.depth_m)
+        np.testing.assert_allclose(view.depth_m[measured], frame.depth_m[measured] - 0.05, atol=1e-6)
+
+
 def test_keyframe_thresholds_choose_among_the_training_frames() -> None:
     config = dataclasses.replace(CONFIG, keyframes=KeyframeConfig(translation=2.0))
     trial = run_trial(config, working_set())

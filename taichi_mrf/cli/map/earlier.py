@@ -54,9 +54,17 @@ def _changed_parameters(task: MapTask) -> list[str]:
     """The names of the parameters in which the task differs from the run in its folder."""
     held = load(task.out / CONFIG_FILE)
     changed = differences(held, task.settings)
-    if "sensor.sigma" in changed:  # the run may have had it from the recording
+    if {"sensor.sigma", "sensor.max_depth", "inference.outlier_floor"} & set(
+        changed
+    ):  # the run may have had it from the recording
         changed = differences(held, with_recorded_noise(task.settings, task.open(color=False)))
-    return [name for name in changed if not (task.learn_noise and name in LEARNT)]
+    return [name for name in changed if not (name in LEARNT and _learns_noise(task))]
+
+
+def _learns_noise(task: MapTask) -> bool:
+    """Whether the run in its folder, if it is the same, has learnt its noise."""
+    noise = (report_in(task.out) or {}).get("noise") or {}
+    return task.noise.is_learnt or (task.noise.is_checked and noise.get("learnt") is not None)
 
 
 def finished_report(task: MapTask) -> dict[str, Any] | None:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from taichi_mrf.calibration.from_recording import LearntSigma
+from taichi_mrf.calibration.from_recording import LearntSigma, sigma_of_glance
 from taichi_mrf.cli.map.earlier import refuse_other_run
 from taichi_mrf.cli.map.keep import Keeper, resumed_map, skipped_before
 from taichi_mrf.cli.map.report import print_report
@@ -100,7 +100,8 @@ def map_to_folder(
         learnt = _learn_noise(task, dataset, settings, progress, request)
         if learnt is not None:
             settings = learnt.put_into(settings)
-        learning = {"learning noise": time.perf_counter() - start} if learnt is not None else {}
+        took = time.perf_counter() - start
+        learning = {"learning noise": took} if took > 0.05 else {}  # most recordings are not looked at
         facts = RunFacts(task.source, settings, dataset, task.choice(), skipped, warned, learnt)
         result = map_sequence(
             dataset,
@@ -125,10 +126,15 @@ def map_to_folder(
 def _learn_noise(
     task: MapTask, dataset: Dataset, settings: Config, progress: ProgressBar, request: StopRequest
 ) -> LearntSigma | None:
-    """What the recording says of its noise, if that was asked for. A resumed run has learnt it."""
-    if not task.learn_noise or (task.resume and (task.out / CONFIG_FILE).is_file()):
+    """What the recording says of its noise, if that was asked for, or if it contradicts the default. A
+    resumed run has learnt it."""
+    if task.resume and (task.out / CONFIG_FILE).is_file():
         return None
-    return learn_noise(dataset, settings, progress, request, task.every, task.limit)
+    if task.noise.is_learnt:
+        return learn_noise(dataset, settings, progress, request, task.every, task.limit)
+    if not task.noise.is_checked or task.poses.follow:
+        return None
+    return sigma_of_glance(dataset, settings, every=task.every, limit=task.limit, should_stop=request)
 
 
 def listener_of(progress: ProgressBar) -> Listener:

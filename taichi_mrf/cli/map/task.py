@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from taichi_mrf.cli.options.map import Map
+from taichi_mrf.cli.options.noise_flags import NoiseFlags
 from taichi_mrf.cli.options.pose_flags import PoseFlags
 from taichi_mrf.config.schema import Config, with_absolute_tables
 from taichi_mrf.datasets import Dataset
@@ -33,14 +34,14 @@ class MapTask:
     poses: PoseFlags = field(default_factory=PoseFlags)
     keep_every: float = Map.keep_every
     overwrite: bool = False
-    learn_noise: bool = False
+    noise: NoiseFlags = field(default_factory=NoiseFlags)
 
     def __str__(self) -> str:
         return self.source
 
     def choice(self) -> dict[str, Any]:
         """What was asked for besides the parameters; the report says it too."""
-        noise = {"noise_from": "auto"} if self.learn_noise else {}
+        noise = {} if self.noise == NoiseFlags() else {"noise_from": self.noise.origin}
         return {"every": self.every, "limit": self.limit, **noise, **self.poses.choice()}
 
     def open(self, color: bool) -> Dataset:
@@ -68,5 +69,5 @@ def map_task(options: Map, source: str, out: Path) -> MapTask:
         options.poses,
         options.keep_every,
         options.overwrite,
-        options.noise.is_learnt,
+        options.noise,
     )

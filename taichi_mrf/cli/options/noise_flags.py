@@ -12,15 +12,21 @@ from taichi_mrf.errors import ConfigError
 class NoiseFlags:
     """Where sigma comes from."""
 
-    origin: Annotated[Literal["stated", "auto"], tyro.conf.arg(name="noise")] = "stated"
+    origin: Annotated[Literal["checked", "given", "auto"], tyro.conf.arg(name="noise")] = "checked"
     """auto first learns from up to 60 frames of the recording by how much sensor.sigma, or what frames state,
     is off: sensor.sigma-scale and sensor.sigma-added. DIR/sensor.yaml holds them for other recordings, and
-    for a camera, which has to be recorded first."""
+    for a camera, which has to be recorded first. checked learns them from 16 frames, in map alone, where
+    sigma is the default and these contradict it. given never learns."""
 
     @property
     def is_learnt(self) -> bool:
         """Whether sigma is to be learnt."""
         return self.origin == "auto"
+
+    @property
+    def is_checked(self) -> bool:
+        """Whether it is to be learnt if it is the default and held-out frames contradict it."""
+        return self.origin == "checked"
 
     def refuse_with(self, **flags: object) -> None:
         """Raises ConfigError if sigma is to be learnt and one of some other flags is set."""

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.intrinsics import PRIMESENSE
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene
@@ -100,6 +101,11 @@ class RenderedSequence(Dataset):
         """The names of the frames in order, for reports."""
         place = self.name.partition(":")[2]
         return [f"{place}-{index:04d}" for index in range(self.options.frames)]
+
+    @property
+    def recorded_reach(self) -> float:
+        """That of a Kinect, however far the scene is."""
+        return SensorConfig().max_depth
 
     def pose(self, index: int) -> Pose:
         """T_world_camera of a frame, (4, 4). Raises IndexError if there is no such frame."""

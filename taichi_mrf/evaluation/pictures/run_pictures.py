@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taichi_mrf.evaluation.depth_error import depth_error
+from taichi_mrf.evaluation.held_out import surface_depth
 from taichi_mrf.evaluation.pictures.figures import new_figure, notice
 from taichi_mrf.evaluation.pictures.room_views import DrawnMap, perspective, top_view
 from taichi_mrf.evaluation.pictures.surface_view import DrawnSurface, surface_view
@@ -68,8 +69,8 @@ def _whole_map(m: OccupancyMap) -> dict[str, "Figure"]:
 
 
 def depth_comparison(m: OccupancyMap, held_out: Sequence[Frame]) -> "Figure":
-    """Measured and rendered depth and their difference, a row for each of a few frames; those without a flat
-    image are unrolled.
+    """Depth as it was measured, but for the sensor's bias, rendered depth, and their difference, a row for
+    each of a few frames; those without a flat image are unrolled.
 
     Without held-out frames it shows a keyframe, and says so.
     """
@@ -90,7 +91,8 @@ def depth_comparison(m: OccupancyMap, held_out: Sequence[Frame]) -> "Figure":
     figure = new_figure(15.0, rows * (4.3 * aspect + 0.35) + 0.1)
     for axes, frame, picture in zip(figure.subplots(rows, 3, squeeze=False), chosen, pictures, strict=True):
         rendered = np.asarray(m.render_depth(frame.camera, frame.T_world_camera), np.float64)
-        measured = np.where(np.isfinite(frame.depth_m) & (frame.depth_m > 0), frame.depth_m, np.nan)
+        measured = surface_depth(frame, m.noise)
+        measured[measured == 0] = np.nan
         error = depth_error(rendered, measured)
         depths = np.concatenate([image[np.isfinite(image)] for image in (measured, rendered)])
         scale = Normalize(*np.quantile(depths, [0.01, 0.99])) if depths.size else Normalize(0.0, 1.0)

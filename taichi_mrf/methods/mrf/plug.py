@@ -26,7 +26,14 @@ METHOD = Method(
         Slider("prior", Range(0.005, 0.6, 0.005), counts=lambda section: section.prior is not None),
         Slider("sweeps", Range(1, 6, 1)),
         Slider("likelihood"),
-        Slider("outlier_floor", Range(-9.0, 0.0, 0.25), "per m", decades=True, searched=True),
+        Slider(
+            "outlier_floor",
+            Range(-9.0, 0.0, 0.25),
+            "per m",
+            counts=lambda section: section.outlier_floor is not None,
+            decades=True,
+            searched=True,
+        ),
         Slider("message_clamp", Range(0.5, 14.0, 0.1), "log-odds", searched=True),
         Slider("cavity_clamp", Range(0.5, 20.0, 0.1), "log-odds"),
         Slider(

@@ -1,0 +1,95 @@
+"""The range that a recording's depths call for, and the sigma that it brings."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from kitti_street import BASELINE, write_kitti
+from sliding_camera import CAMERA, SlidingCamera
+
+from taichi_mrf.config.inference import LEAST_FLOOR, InferenceConfig
+from taichi_mrf.config.schema import Config, SensorConfig, load
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.recorded_noise import SHORT_RAYS_FLOOR, with_recorded_noise, with_tuned_noise
+from taichi_mrf.datasets.stereo.matching import SIGMA_D_PX
+from taichi_mrf.sensor.frame import Frame
+
+
+@dataclass
+class Street(SlidingCamera):
+    """A street by a stereo rig: a ``share`` of the pixels sees what is up to ``far_m`` away."""
+
+    far_m: float = 100.0
+    share: float = 0.5
+    lambda_: float = 7.5e-4
+
+    @property
+    def recorded_sigma(self) -> tuple[float, ...]:
+        return (0.0, 0.0, self.lambda_)
+
+    def read(self, index: int) -> Frame:
+        frame = super().read(index)
+        far = np.linspace(0, 1, frame.depth_m.size).reshape(frame.depth_m.shape) < self.share
+        return replace(frame, depth_m=np.where(far, np.float32(self.far_m), frame.depth_m))
+
+
+def street(**parameters: float) -> Street:
+    return Street("street", CAMERA, **parameters)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "reach_m"),
+    [
+        ({}, 40.0),  # 3% of 40 m
+        ({"far_m": 25.0}, 25.0),
+        ({"far_m": 9.0}, 10.0),
+        ({"share": 0.05}, 10.0),
+        ({"lambda_": 0.01}, 10.0),
+    ],
+)
+def test_the_range_follows_the_depths_as_far_as_sigma_is_useful(
+    parameters: dict[str, float], reach_m: float
+) -> None:
+    dataset = street(**parameters)
+    assert with_recorded_noise(Config(), dataset).sensor.max_depth == reach_m
+    said = [note for note in dataset.notes if note.startswith("sensor.max_depth is")]
+    assert len(said) == (reach_m != 10.0)
+
+
+def test_a_range_that_was_set_stays_and_the_flag_is_named() -> None:
+    near, dataset = Config(sensor=SensorConfig(max_depth=8.0)), street()
+    assert with_recorded_noise(near, dataset).sensor.max_depth == 8.0
+    assert dataset.notes[-1].startswith("50% of the measurements lie beyond sensor.max_depth, 8 m")
+    assert "--sensor.max-depth 40 those" in dataset.notes[-1]
+    few, right = street(share=0.05), street()
+    with_recorded_noise(near, few)
+    with_recorded_noise(with_recorded_noise(Config(), right), right)
+    assert not any("lie beyond" in note for note in few.notes + right.notes)
+
+
+def test_a_broken_frame_does_not_count() -> None:
+    dataset = street(count=3)
+    dataset.broken = [0, 1, 2]
+    assert with_recorded_noise(Config(), dataset).sensor.max_depth == 10.0
+
+
+def test_the_shipped_sigma_of_a_stereo_rig_gives_way_to_the_recordings_own(tmp_path: Path) -> None:
+    dataset = open_dataset(write_kitti(tmp_path))
+    shipped = load("stereo")
+    applied = with_recorded_noise(shipped, dataset).sensor
+    assert applied.pixel_sigma
+    assert applied.sigma == pytest.approx((0.0, 0.0, SIGMA_D_PX / (BASELINE * 100)))
+    assert (applied.min_depth, applied.max_depth) == (shipped.sensor.min_depth, shipped.sensor.max_depth)
+
+
+def test_outliers_are_dense_only_where_rays_are_short() -> None:
+    room, hall = street(far_m=3.0, share=1.0), street(far_m=9.0, share=1.0)
+    assert with_recorded_noise(Config(), room).inference.outlier_floor == SHORT_RAYS_FLOOR
+    assert with_recorded_noise(Config(), hall).inference.floor == LEAST_FLOOR
+    assert with_recorded_noise(Config(), street()).inference.floor == LEAST_FLOOR
+    few = replace(Config(), inference=InferenceConfig(surface_density=0.5))
+    assert with_recorded_noise(few, hall).inference.outlier_floor == SHORT_RAYS_FLOOR
+    stated = replace(Config(), inference=InferenceConfig(outlier_floor=1e-4))
+    assert with_recorded_noise(stated, room).inference == stated.inference
+    assert with_tuned_noise(Config(), hall).inference.outlier_floor == LEAST_FLOOR
