@@ -39,6 +39,7 @@ def run_export(options: Export) -> int:
     with ExitStack() as stack:
         made: list[tuple[Path, Path]] = []
         for path in options.to:
+            path.parent.mkdir(parents=True, exist_ok=True)
             staging = Path(stack.enter_context(_staging(path)))
             begin = time.perf_counter()
             files = _export(m, staging / path.name, path, options)
@@ -71,9 +72,10 @@ def _check_names(options: Export) -> None:
             raise ConfigError(f"{path}: the map itself would be overwritten")
         if places.count(place) > 1:
             raise ConfigError(f"{path}: is named twice")
-        if not is_folder(path.parent):
-            raise MapFileError(f"{path}: cannot be written: there is no folder {path.parent}")
-        if not os.access(path.parent, os.W_OK):
+        folder = next(parent for parent in path.absolute().parents if exists(parent))
+        if not is_folder(folder):
+            raise MapFileError(f"{path}: cannot be written: {folder} is no folder")
+        if not os.access(folder, os.W_OK):
             raise MapFileError(f"{path}: cannot be written: Permission denied")
         if exists(path) and not is_file(path) and path.suffix != SUFFIX:
             raise MapFileError(f"{path}: cannot be written: it is no regular file")

@@ -33,13 +33,18 @@ def browser() -> Iterator["Browser"]:
 
 def until_it_says(page: LivePage, *words: str) -> None:
     """Wait until the page says these of the three, and none of the others."""
+    from playwright.sync_api import Error
+
     others = {DISCONNECTED, SILENT, DONE} - set(words)
 
     def says_so() -> bool:
-        text = page.text()
+        try:
+            text = page.text()
+        except Error:  # the page reloads
+            return False
         return all(each in text for each in words) and not any(each in text for each in others)
 
-    page.until(lambda seen: says_so(), f"{words} alone")
+    wait_for(says_so, f"{words} alone", page.pause)
 
 
 def test_a_page_says_what_does_not_answer_and_comes_back(browser: "Browser") -> None:

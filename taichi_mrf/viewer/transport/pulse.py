@@ -28,7 +28,7 @@ ACTIVITY = "taichi-mrf-activity"
 
 SCRIPT = (
     """(() => {
-const EVERY_MS = 1000, PATIENCE_MS = 3000, MOST_IN_VAIN = 10;
+const EVERY_MS = 1000, PATIENCE_MS = 3000, MOST_IN_VAIN = 20;
 document.hasFocus = () => true;  // viser's client connects again only where the page has the focus
 let timer, wasOpen = false, closed = false, inVain = 0;
 window.Worker = class extends Worker {  // viser's socket lives in one, which tells of it
