@@ -81,7 +81,7 @@ def _check_names(options: Export) -> None:
 
 
 def _staging(path: Path) -> "tempfile.TemporaryDirectory[str]":
-    """A folder beside the file, or beside the first folder to be made, so that moving the file is a rename."""
+    """A folder beside the file, or beside the first folder to be made, so that moving it is a rename."""
     return tempfile.TemporaryDirectory(prefix=".export-", dir=_nearest_folder(path))
 
 
