@@ -136,8 +136,10 @@ def write_run(
         mapped = result.map if chunked is None else ChunkedViews(chunked)
         found = _check(mapped, result, posed, haste, advance)
         if found is not None and chunked is None:
+            advance("Noise", 0, 1)
             noise = _check_noise(result, posed, haste)
         if not haste.hurried and not result.interrupted:
+            advance("Poses", 0, 1)
             with result.timed("checking"):
                 result.check_steps()
     # Computed before the pictures, which may be left half-way through the launch of a kernel.
