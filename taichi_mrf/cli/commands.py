@@ -37,6 +37,8 @@ class Command:
     parameters: Callable[[Sequence[str]], Any] | None = None
     brief: tuple[str, ...] = ()
     """The flags that --help explains; --help-all explains all. If it is empty, --help does so too."""
+    example: str = ""
+    """A command that works everywhere, for the line that says what is wrong with another."""
 
     def defaults(self, arguments: Sequence[str]) -> Any:
         """The options before any flag; what the user must give is tyro.MISSING.
@@ -60,6 +62,7 @@ class Command:
 
 
 _COMMON = ("out", "voxel-size", "method", "config", "every", "limit")
+_MAP_EXAMPLE = "taichi-mrf map synthetic:room --out runs/room"
 _MAP_FLAGS = (*_COMMON, "color", "noise", "resume", "overwrite", "jobs", "track-poses", "poses", "follow")
 _LIVE_FLAGS = (
     *_COMMON,
@@ -99,7 +102,7 @@ _LASER_FLAGS = (
 )
 
 COMMANDS = {
-    "map": Command(Map, "taichi_mrf.cli.map.many:run", mapping_parameters, _MAP_FLAGS),
+    "map": Command(Map, "taichi_mrf.cli.map.many:run", mapping_parameters, _MAP_FLAGS, _MAP_EXAMPLE),
     "live": Command(Live, "taichi_mrf.cli.live:run_live", live_parameters, _LIVE_FLAGS),
     "tune": Command(Tune, "taichi_mrf.cli.tune:run_tune", mapping_parameters, _TUNE_FLAGS),
     "export": Command(Export, "taichi_mrf.cli.export:run_export"),

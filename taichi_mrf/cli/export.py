@@ -14,7 +14,7 @@ from taichi_mrf.cli.shared.terminal import Terminal
 from taichi_mrf.config.registry import methods_with
 from taichi_mrf.errors import ConfigError, MapFileError, TaichiMRFError
 from taichi_mrf.export.chunk_store import SUFFIX, new_store
-from taichi_mrf.export.formats import ExportedMap, export_map, export_note, writer_of
+from taichi_mrf.export.formats import ExportedMap, export_map, export_note, require_libraries
 from taichi_mrf.methods.capabilities import can_freeze, has_layers
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import in_chunks, take_part
@@ -61,27 +61,33 @@ def run_export(options: Export) -> int:
 
 
 def _check_names(options: Export) -> None:
-    """Check what can be checked without the map. Raises ConfigError, MapFileError."""
+    """Check what can be checked without the map. Raises TaichiMRFError."""
     if not options.to:
         raise ConfigError("--to needs at least one file")
     places = [os.path.realpath(path) for path in options.to]
     for path, place in zip(options.to, places, strict=True):
-        writer_of(path)
+        require_libraries(path)
         if place == os.path.realpath(options.map):
             raise ConfigError(f"{path}: the map itself would be overwritten")
         if places.count(place) > 1:
             raise ConfigError(f"{path}: is named twice")
-        if not is_folder(path.parent):
-            raise MapFileError(f"{path}: cannot be written: there is no folder {path.parent}")
-        if not os.access(path.parent, os.W_OK):
+        folder = _nearest_folder(path)
+        if not is_folder(folder):
+            raise MapFileError(f"{path}: cannot be written: {folder} is no folder")
+        if not os.access(folder, os.W_OK):
             raise MapFileError(f"{path}: cannot be written: Permission denied")
         if exists(path) and not is_file(path) and path.suffix != SUFFIX:
             raise MapFileError(f"{path}: cannot be written: it is no regular file")
 
 
 def _staging(path: Path) -> "tempfile.TemporaryDirectory[str]":
-    """A folder beside the file, so that moving the file is a rename."""
-    return tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent)
+    """A folder beside the file, or beside the first folder to be made, so that moving it is a rename."""
+    return tempfile.TemporaryDirectory(prefix=".export-", dir=_nearest_folder(path))
+
+
+def _nearest_folder(path: Path) -> Path:
+    """The innermost of the folders around a file that exists; export makes the others."""
+    return next(parent for parent in path.absolute().parents if exists(parent))
 
 
 def _export(m: ExportedMap, staged: Path, path: Path, options: Export) -> list[Path]:
@@ -93,6 +99,7 @@ def _export(m: ExportedMap, staged: Path, path: Path, options: Export) -> list[P
 
 
 def _move(file: Path, place: Path) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
     with new_store(place) if is_folder(file) else atomic_path(place) as temporary:
         os.replace(file, temporary)
 

@@ -18,7 +18,7 @@ from taichi_mrf.datasets.ros.summary import BagSummary
 from taichi_mrf.datasets.ros.summary import summarise as summarise_bag
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.summary import summarise
-from taichi_mrf.datasets.unused_color import note_unused_color
+from taichi_mrf.datasets.unused_color import UNUSED_COLOR, note_unused_color
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.origins import origins_of
@@ -137,9 +137,17 @@ def _print_source(console: Terminal, source: str, arch: Arch, reading: SourceFla
             console.print_line(f"taichi-mrf map {shlex.quote(name)}{bag.flags} --out DIR")
         return False
     usable = _print_frames(console, format_name(source), dataset)
-    if path is not None and usable:
-        console.print_line(f"taichi-mrf map {shlex.quote(source)} --out DIR")
+    if usable:
+        console.print_line(_map_command(source, dataset, reading))
     return usable
+
+
+def _map_command(source: str, dataset: Dataset, reading: SourceFlags) -> str:
+    """The command that maps a source as it was read here, with what was found in it. Noise and reach that a
+    recording states need no flag."""
+    words = ["taichi-mrf", "map", source, *reading.words()]
+    words += ["--color"] if UNUSED_COLOR in dataset.notes else []
+    return shlex.join([*words, "--out", "DIR"])
 
 
 def _print_topics(console: Terminal, bag: BagSummary) -> None:

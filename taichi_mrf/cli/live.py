@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from taichi_mrf.cli.options.live import Live
 from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
-from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
+from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal, tell_first_run
 from taichi_mrf.cli.shared.serving import PrintLine, let_the_page_go_first, print_address, warn_of_host
 from taichi_mrf.cli.shared.terminal import print_problem
 from taichi_mrf.config.schema import Config, with_absolute_tables
@@ -43,6 +43,7 @@ def run_live(options: Live) -> int:
         warn_of_host(options.host, options.port, "watch and change the map", print_line)
         bar = ProgressBar(console, options.printing)
         page = _Page(options, print_line, bar, stack)
+        tell_first_run(options.printing)
         let_the_page_go_first()
         # Imported late: the page starts meanwhile, in a process of its own.
         from taichi_mrf.cli.shared.learn_noise import learn_noise

@@ -1,7 +1,12 @@
 """From the words of the command line to the options of a command, and the overview of all commands."""
 
+import contextlib
 import dataclasses
 import inspect
+import io
+import itertools
+import re
+import textwrap
 import typing
 from collections.abc import Sequence
 from difflib import get_close_matches
@@ -42,8 +47,8 @@ _COMPLETION = ("--tyro-print-completion", "--tyro-write-completion")
 def parse(arguments: Sequence[str]) -> tuple[Command, Any]:
     """The command that the arguments name, and its options.
 
-    Help ends the program with status 0, arguments that cannot be parsed with status 2. Raises ConfigError
-    for an unknown command and for values that are out of range.
+    Help ends the program with status 0. Raises ConfigError for an unknown command, for arguments that cannot
+    be parsed, and for values that are out of range.
     """
     if arguments and arguments[0] in _COMPLETION:
         _print_completion(arguments)
@@ -61,14 +66,30 @@ def parse(arguments: Sequence[str]) -> tuple[Command, Any]:
     wants_help = bool({*_HELP} & set(rest))
     if not wants_help:
         _refuse_unknown_flags(program, command, rest)
-    options = tyro.cli(
-        command.options,
-        prog=program,
-        args=rest,
-        default=command.defaults([] if wants_help else rest),
-        registry=registry,
-    )
+    box = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(box):
+            default = command.defaults([] if wants_help else rest)
+            options = tyro.cli(command.options, prog=program, args=rest, default=default, registry=registry)
+    except SystemExit as end:
+        if not end.code:
+            raise
+        problem = in_one_line(box.getvalue())
+        example = f", such as {command.example}" if command.example and problem.startswith("missing") else ""
+        raise ConfigError(f"{name}: {problem}{example}; '{program} --help' explains") from None
     return command, options
+
+
+def in_one_line(box: str) -> str:
+    """What tyro says of arguments in a box of several lines: the first part of it, without the frame."""
+    is_rule = re.compile(r"\s*[-─╰]{5,}").match
+    lines = [line.strip("│").rstrip() for line in box.splitlines()[1:]]  # the first is a title
+    first = itertools.takewhile(lambda line: not is_rule(line), itertools.dropwhile(is_rule, lines))
+    said = textwrap.dedent("\n".join(first)).splitlines()
+    if said and said[0].startswith("Missing from"):  # each with its help, further to the right
+        return "missing " + ", ".join(line.strip() for line in said if re.match(r" {4}\S", line))
+    text = " ".join(" ".join(said).split()).rstrip(".")
+    return text[:1].lower() + text[1:]
 
 
 def _refuse_unknown_flags(program: str, command: Command, arguments: Sequence[str]) -> None:

@@ -5,7 +5,7 @@ imported here, so that the command line's help stays fast.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from taichi_mrf.errors import ConfigError
@@ -29,6 +29,12 @@ class SourceFlags:
 
     max_time_gap: float | None = None
     """Largest difference in seconds between a depth image and the poses on either side of it."""
+
+    def words(self) -> list[str]:
+        """The flags that differ from the defaults, as they are typed."""
+        given = {field.name: getattr(self, field.name) for field in fields(self)}
+        changed = {name: value for name, value in given.items() if value != getattr(SourceFlags, name)}
+        return [f"--{name.replace('_', '-')}={value}" for name, value in changed.items()]
 
     def __post_init__(self) -> None:
         self.keywords()

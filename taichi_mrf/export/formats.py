@@ -26,6 +26,7 @@ from taichi_mrf.geometry.up import Z_UP, Up, plan_axes, up_from_name, up_name, y
 from taichi_mrf.queries.cells import standing_cells
 from taichi_mrf.queries.colored import ColoredMap, is_colored, shown_colors
 from taichi_mrf.queries.points import OCCUPIED, UNKNOWN
+from taichi_mrf.system.libraries import library
 
 _DEFAULTS = ExportOptions()
 
@@ -79,6 +80,16 @@ def writer_of(path: str | Path) -> Writer:
         raise ConfigError(f"{path}: no file extension: cannot choose an export format; known are {known}")
     near = difflib.get_close_matches(suffix, _WRITERS, 1, cutoff=0.0)[0]
     raise ConfigError(f"{path}: unknown export format {suffix}; did you mean {near}? known are {known}")
+
+
+def require_libraries(path: str | Path) -> None:
+    """Raises TaichiMRFError if the format of a file's extension needs a library that is not installed, and
+    ConfigError for an unknown one."""
+    writer = writer_of(path)
+    if writer is _chunks:
+        library("zarr", "maps in chunks need", "store")
+    elif writer is _surface:
+        library("trimesh", f"{Path(path).suffix.lower()} files need", "mesh")
 
 
 def extensions() -> Sequence[str]:

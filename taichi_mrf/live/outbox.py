@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.viewer.messages import (
+    BEAT_S,
+    Alive,
     BrickColors,
     Bricks,
     CurrentCamera,
@@ -86,9 +88,10 @@ class Outbox:
             self._changed.notify()
 
     def take(self) -> Update | Quit:
-        """Wait for the next update. Nothing follows after Quit."""
+        """Wait for the next update; Alive if none comes for a while. Nothing follows after Quit."""
         with self._changed:
-            self._changed.wait_for(lambda: self._waiting)
+            if not self._changed.wait_for(lambda: self._waiting, BEAT_S):
+                return Alive()
             key = next(iter(self._waiting))
             update = self._waiting.pop(key)
             if isinstance(update, WaitingBricks):

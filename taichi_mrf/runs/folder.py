@@ -133,9 +133,11 @@ def write_run(
     if check and posed is not None:
         found = _check(result, posed, haste, advance, None if chunked is None else ChunkedViews(chunked))
         if found is not None and chunked is None:
+            advance("Noise", 0, 1)
             default = is_default_noise(posed, facts.config.sensor)
             noise = _check_noise(result, posed, haste, DOUBTED if default else CONTRADICTED)
         if not haste.hurried and not result.interrupted:
+            advance("Poses", 0, 1)
             with result.timed("checking"):
                 result.check_steps()
     # Computed before the pictures, which may be left half-way through the launch of a kernel.

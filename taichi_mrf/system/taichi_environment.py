@@ -49,6 +49,17 @@ def cache_folder() -> str | None:
     return os.path.join(base, *COMPILERS[compiler.name()].cache) if base else None
 
 
+def first_run_note() -> str | None:
+    """What to say before kernels are compiled for the first time, which takes a while; None if there are some
+    in their folder, or if none are kept. Look before Taichi is started."""
+    folder = cache_folder()
+    if folder is None or os.environ.get(compiler.variable("OFFLINE_CACHE")) == "0":
+        return None
+    if os.path.isdir(folder) and os.listdir(folder):
+        return None
+    return f"first run: kernels are compiled once, which takes a while, and kept in {folder}"
+
+
 def cache_problem() -> str | None:
     """Why Taichi must not be started, if its cache has no folder that can be written to."""
     folder = cache_folder()

@@ -18,6 +18,9 @@ LOG_ODDS_STEP = 1 / 512
 """Log-odds are sent as int16 multiples of this. They are rounded down, so that their sign, and with it the
 threshold of one half, is exact; beyond +-64 they are clipped."""
 
+BEAT_S = 1.0
+"""The mapping process sends Alive when it has sent nothing else for so long."""
+
 Layer = Literal["map", "baseline", "dynamic"]
 """The map itself; the baseline beside it, OctoMap's log-odds update of the same keyframes; and of the map the
 bricks with dynamic voxels, those whose log-odds are not below 0."""
@@ -206,6 +209,11 @@ class SceneChanges(Update):
     """What has appeared and left lately, the latest first."""
 
     changes: tuple[SceneChange, ...]
+
+
+@dataclass(frozen=True)
+class Alive(Update):
+    """Sent when there is nothing else to send: the mapping process still runs."""
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from new_interpreter import obey_hangups, output
 
 from taichi_mrf.cli.commands import COMMANDS
 from taichi_mrf.cli.flag_list import flags_of
+from taichi_mrf.cli.main import main
 from taichi_mrf.cli.parser import parse
 from taichi_mrf.config.schema import load
 from taichi_mrf.system import compiler
@@ -102,6 +103,39 @@ def test_the_short_help_of_map_fits_a_screen_and_the_long_one_shows_every_parame
         assert flag in short.stdout
     assert "--inference.sweeps" in long.stdout
     assert "Number of sweeps over all keyframes." in long.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("map", "map: missing --out DIR, such as taichi-mrf map synthetic:room --out runs/room; "),
+        ("map --out runs", "map needs a SOURCE: a recording, or a built-in one such as synthetic:room"),
+        ("map a --out", "map: missing value for argument '--out'"),
+        ("map a --out b --voxel-size c", "map: error parsing --voxel-size: could not convert string"),
+        (
+            "map a --out b --method c",
+            "map: invalid choice 'c' for argument '--method'. Expected one of ('mrf', ",
+        ),
+        ("map a --out b --runtime.arch c", "map: invalid choice 'c' for argument '--runtime.arch'"),
+        ("export", "export: missing MAP, --to FILE [FILE ...]; 'taichi-mrf export --help' explains"),
+        ("info a b", "info: unrecognized options: b; "),
+        ("bench --frames c", "bench: error parsing --frames: invalid literal for int()"),
+        ("eval", "eval: missing EXPERIMENT; "),
+    ],
+)
+def test_wrong_arguments_are_told_in_one_line(
+    arguments: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments.split()) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(f"taichi-mrf: {words}")
+    assert err.count("\n") == 1
+    assert "─" not in err
+
+
+def test_the_short_help_of_map_has_colour_and_noise() -> None:
+    assert {"color", "noise"} <= set(COMMANDS["map"].brief)
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -113,6 +113,9 @@ def test_info_of_a_folder(tmp_path: Path) -> None:
     assert re.search(r"frames +│ +5", out)
     assert re.search(r"camera +│ +8 x 6, fx 10, fy 10, cx 4, cy 3", out)
     assert "one in 2 rows and columns is read" in out
+    flags = ["--camera=20,20,8,6", "--image-scale=0.5"]
+    command = ["taichi-mrf", "map", str(folder), *flags, "--color", "--out", "DIR"]
+    assert shlex.split(out.splitlines()[-1]) == command
     (folder / "frame-000000.depth.png").unlink()
     status, out, _ = said("info", folder)
     assert (status, "Note: frame frame-000000:" in out) == (2, True)

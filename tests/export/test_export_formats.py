@@ -55,7 +55,8 @@ def run_export(*arguments: object) -> int:
             ["b.stl", "--surface", "marginal", "--threshold", "0.9999999"],
             ConfigError,
         ),  # no voxel is that sure
-        (["missing/b.bt"], MapFileError),
+        (["a/b.pgm"], ConfigError),  # nor is its folder made
+        (["text/b.bt"], MapFileError),  # in a file
         (["a.ply"], ConfigError),  # twice
         (["folder.npz"], MapFileError),
     ],
@@ -64,11 +65,20 @@ def test_if_one_file_cannot_be_made_none_is_written(
     saved: dict[str, Path], tmp_path: Path, second: list[str], error: type[Exception]
 ) -> None:
     (tmp_path / "folder.npz").mkdir()
+    (tmp_path / "text").touch()
     name, *flags = second
     with pytest.raises(error) as caught:
         run_export(saved["mrf"], "--to", tmp_path / "a.ply", tmp_path / name, *flags)
     assert ".export-" not in str(caught.value)
-    assert [path.name for path in tmp_path.iterdir()] == ["folder.npz"]
+    assert {path.name for path in tmp_path.iterdir()} == {"folder.npz", "text"}
+
+
+def test_the_folder_of_a_file_is_made(saved: dict[str, Path], tmp_path: Path) -> None:
+    store, points = tmp_path / "a" / "b" / "map.zarr", tmp_path / "a" / "c.ply"
+    assert run_export(saved["mrf"], "--to", store, points) == 0
+    assert store.is_dir()
+    assert points.is_file()
+    assert not list(tmp_path.glob("**/.export-*"))
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -15,6 +15,7 @@ from live_scene import Shown
 from taichi_mrf.live.link import ViewerLink
 from taichi_mrf.live.outbox import BRICKS_AT_ONCE, Outbox, merged
 from taichi_mrf.viewer.messages import (
+    Alive,
     Bricks,
     File,
     Hello,
@@ -135,6 +136,10 @@ def test_only_the_latest_status_is_sent_and_notices_in_their_order() -> None:
     updates = drained(outbox)
     assert [u.frame for u in updates if isinstance(u, Status)] == [9]
     assert [u.text for u in updates if isinstance(u, Notice)] == [f"{number}" for number in range(10)]
+
+
+def test_an_outbox_without_updates_says_that_its_process_lives() -> None:
+    assert Outbox().take() == Alive()
 
 
 def test_notices_without_end_take_no_memory_without_end() -> None:

@@ -26,7 +26,7 @@ FILES = {"map.npz", "voxels.ply", "config.yaml", "report.json"}
 PICTURES = {"surface.png", "top_view.png", "depth.png"}
 """What a run that ends by itself leaves in addition."""
 
-NO_SERVER = ("WebSocket connection to", "Failed to open WebSocket")
+NO_SERVER = ("WebSocket connection to", "Failed to open WebSocket", "Failed to load resource: net::ERR")
 """Beginnings of what a browser reports while there is no server, as it must."""
 
 pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))

@@ -5,14 +5,15 @@ import signal
 import time
 from multiprocessing.connection import Connection
 
-from taichi_mrf.viewer.messages import Listening, Notice, Quit, Status, Step
+from taichi_mrf.viewer.messages import Alive, Listening, Notice, Quit, Status, Step
 
 
 def echo(connection: Connection, host: str, port: int) -> None:
     """Says where it is, and asks for a step for each update, until it is told to quit."""
     connection.send(Listening(host, port))
-    while not isinstance(connection.recv(), Quit):
-        connection.send(Step())
+    while not isinstance(update := connection.recv(), Quit):
+        if not isinstance(update, Alive):
+            connection.send(Step())
 
 
 def deaf(connection: Connection, host: str, port: int) -> None:

@@ -92,6 +92,17 @@ def test_an_export_says_which_extra_it_needs(
         assert not Path(f"wall.{suffix}").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "module", "extra"), [("a.zarr", "zarr", "store"), ("a.glb", "trimesh", "mesh")]
+)
+def test_an_export_asks_for_its_extra_before_it_reads_the_map(
+    name: str, module: str, extra: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    refused(["export", "no-such-map.npz", "--to", f"folder/{name}"], extra, capsys)
+    assert not Path("folder").exists()
+
+
 @pytest.mark.skipif(tomllib is None, reason="Python 3.10 reads no TOML")
 def test_every_extra_has_its_command(repository: Path) -> None:
     project = tomllib.loads((repository / "pyproject.toml").read_text("utf-8"))["project"]

@@ -110,3 +110,14 @@ def test_all_public_names_load_with_warnings_as_errors(tmp_path: Path) -> None:
     program += "".join(f"taichi_mrf.{name}\n" for name in taichi_mrf.__all__)
     done = run(tmp_path, program=program, HOME=str(tmp_path))
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_the_first_run_says_where_kernels_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(CACHE, str(tmp_path / "kernels"))
+    note = taichi_environment.first_run_note()
+    assert note is not None
+    assert note.endswith(f"kept in {tmp_path / 'kernels'}")
+    (tmp_path / "kernels").mkdir()
+    assert taichi_environment.first_run_note() == note
+    (tmp_path / "kernels" / "kernel.tic").touch()
+    assert taichi_environment.first_run_note() is None

@@ -2,6 +2,7 @@
 
 import gzip
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -23,8 +24,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.http11 import Request, Response
 
 from taichi_mrf.errors import TaichiMRFError
+from taichi_mrf.viewer.transport import pulse, viser_internals
 from taichi_mrf.viewer.transport import server as viewer_server
-from taichi_mrf.viewer.transport import viser_internals
 from taichi_mrf.viewer.transport.origin import answer_page, refusal
 from taichi_mrf.viewer.transport.server import start_server
 
@@ -140,10 +141,36 @@ def test_the_page_is_served_unframed_and_unsniffed(server: viser.ViserServer) ->
         policy = head.partition(b"Content-Security-Policy: ")[2].partition(b"\r\n")[0]
         assert b"default-src 'none'" in policy
         scripts = next(each for each in policy.split(b"; ") if each.startswith(b"script-src"))
-        assert scripts.count(b"'sha256-") == 2
+        assert scripts.count(b"'sha256-") == 3
         assert b"unsafe-inline" not in scripts
-        named = (CLIENT_BUILD / "index.html").read_bytes().replace(b"<title>Viser<", b"<title>taichi_mrf<")
-        assert body == named
+        viser_page = (CLIENT_BUILD / "index.html").read_bytes()
+        ours = b"<title>taichi_mrf</title>" + pulse.TAG
+        assert body == viser_page.replace(b"<title>Viser</title>", ours)
+
+
+def test_the_server_says_whether_the_mapping_process_speaks(monkeypatch: pytest.MonkeyPatch) -> None:
+    mapper = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    heard = pulse.Pulse(mapper.pid)
+    running = start_server("127.0.0.1", 0, "Alive", heard)
+    try:
+
+        def answer() -> bytes:
+            status, found = http_answer(running.get_port(), b"/alive")
+            assert status == 200
+            assert b"Cache-Control: no-store" in found
+            return found.partition(b"\r\n\r\n")[2]
+
+        assert answer() == b'{"mapper": true}'
+        mapper.send_signal(signal.SIGSTOP)
+        wait_for(lambda: answer() == b'{"mapper": false}', "the stop")
+        mapper.send_signal(signal.SIGCONT)
+        wait_for(lambda: answer() == b'{"mapper": true}', "the process again")
+        monkeypatch.setattr(pulse, "SILENCE_S", 0.0)
+        assert answer() == b'{"mapper": false}'
+    finally:
+        mapper.kill()
+        mapper.communicate()
+        running.stop()
 
 
 OTHER_FILES = [

@@ -17,7 +17,7 @@ from taichi_mrf.cli.options.map import Map
 from taichi_mrf.cli.shared.interrupt import StopRequest, stop_on_signals
 from taichi_mrf.cli.shared.learn_noise import learn_noise
 from taichi_mrf.cli.shared.output import DID_NOT_FIT, output_folder
-from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal
+from taichi_mrf.cli.shared.progress import ProgressBar, open_terminal, tell_first_run
 from taichi_mrf.cli.shared.terminal import Terminal, print_problem
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
@@ -50,6 +50,7 @@ def run_map(options: Map) -> int:
         if finished is not None:
             _print_finished(console, options, finished)
             return 0
+        tell_first_run(options.printing)
         with ProgressBar(console, options.printing) as progress:
             report, written = map_to_folder(task, progress, request)
         print_run(console, options, report, written)

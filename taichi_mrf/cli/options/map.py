@@ -98,7 +98,7 @@ class Map:
     def __post_init__(self) -> None:
         check_least(self, every=1, limit=1, jobs=1)
         if self.sources is not tyro.MISSING and not self.sources:
-            raise ConfigError("map needs a SOURCE")
+            raise ConfigError("map needs a SOURCE: a recording, or a built-in one such as synthetic:room")
         if self.resume and self.overwrite:
             raise ConfigError("--resume and --overwrite do not go together")
         if self.poses.file is not None and (len(self.sources) > 1 or self.submap_size is not None):

@@ -20,6 +20,7 @@ from rich.progress import (
 
 from taichi_mrf.cli.options.verbosity import Verbosity
 from taichi_mrf.cli.shared.terminal import Terminal, printable
+from taichi_mrf.system import taichi_environment
 
 LINE_SECONDS = 5.0
 """Time between two lines where there is no terminal."""
@@ -36,6 +37,13 @@ def open_terminal(verbosity: Verbosity, stderr: bool = False) -> Terminal:
         log.addHandler(_LogLines(Terminal(stderr=True)))
     log.setLevel(logging.INFO if verbosity.verbose else logging.NOTSET)
     return terminal
+
+
+def tell_first_run(verbosity: Verbosity) -> None:
+    """Say on stderr, before Taichi is started, that kernels have to be compiled, if there are none yet."""
+    note = taichi_environment.first_run_note()
+    if note is not None:
+        Terminal(stderr=True, quiet=verbosity.quiet).print_line(note)
 
 
 class _LogLines(logging.Handler):

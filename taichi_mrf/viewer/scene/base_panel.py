@@ -10,8 +10,9 @@ import viser
 from taichi_mrf.viewer.messages import Notice
 from taichi_mrf.viewer.scene.notices import notices_html
 from taichi_mrf.viewer.scene.options import ViewOptions
-from taichi_mrf.viewer.scene.safe_text import in_html, in_markdown
+from taichi_mrf.viewer.scene.safe_text import in_html
 from taichi_mrf.viewer.transport.inbox import Event, OptionsMoved, Used
+from taichi_mrf.viewer.transport.pulse import ACTIVITY
 
 Tell = Callable[[Event], None]
 
@@ -31,7 +32,7 @@ class BasePanel:
         """The first widgets of the panel; a subclass adds its own, ``add_legend`` and ``add_notices``."""
         self.gui, self._tell = gui, tell
         self._notices: list[Notice] = []
-        self._activity = gui.add_markdown("Starting …")
+        self._activity = gui.add_html(_activity_html("Starting …"))
         self._progress: Any = gui.add_progress_bar(0.0, animated=True)
 
     def options(self) -> ViewOptions:
@@ -72,7 +73,7 @@ class BasePanel:
 
     def show_activity(self, text: str, share: float, moving: bool) -> None:
         """Show what is being done and how much of it is, 0 to 1; ``moving`` animates the bar."""
-        self._activity.content = in_markdown(text)
+        self._activity.content = _activity_html(text)
         self._progress.value = 100.0 * min(max(share, 0.0), 1.0)
         self._progress.animated = moving
 
@@ -102,6 +103,11 @@ class BasePanel:
     def _used(self, event: viser.GuiEvent, action: Enum) -> None:
         if event.client_id is not None:
             self._tell(Used(action, event.client_id))
+
+
+def _activity_html(text: str) -> str:
+    """What is being done, in an element that the page hides while nothing answers it."""
+    return f'<p class="{ACTIVITY}" style="margin:0.5em 0.75em">{in_html(text)}</p>'
 
 
 def rows_html(rows: Mapping[str, str]) -> str:

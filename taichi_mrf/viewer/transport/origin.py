@@ -18,6 +18,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
+from taichi_mrf.viewer.transport import pulse
 from taichi_mrf.viewer.transport.viser_internals import page_script_hashes
 
 PAGE_HEADERS = {"X-Frame-Options": "DENY", "X-Content-Type-Options": "nosniff"}
@@ -111,17 +112,19 @@ def answer_page(connection: ServerConnection, request: Request, pages: Pages) ->
     else:
         response = connection.respond(http.HTTPStatus.NOT_FOUND, "Not found.\n")
     if response.headers.get("Content-Type", "").startswith("text/html"):
-        response.body = _titled(bytes(response.body), response.headers.get("Content-Encoding") == "gzip")
+        response.body = _made_ours(bytes(response.body), response.headers.get("Content-Encoding") == "gzip")
         del response.headers["Content-Length"]
         response.headers["Content-Length"] = str(len(response.body))
-    policy = POLICY.format(scripts=" ".join(page_script_hashes()))
+    policy = POLICY.format(scripts=" ".join([*page_script_hashes(), pulse.SOURCE]))
     for name, value in {**PAGE_HEADERS, "Content-Security-Policy": policy}.items():
         response.headers[name] = value
     return response
 
 
 @cache
-def _titled(page: bytes, packed: bool) -> bytes:
-    """viser's page with the project's name on the browser's tab, compressed again if it is ``packed``."""
-    named = (gzip.decompress(page) if packed else page).replace(b"<title>Viser</title>", TAB_TITLE, 1)
-    return gzip.compress(named) if packed else named
+def _made_ours(page: bytes, packed: bool) -> bytes:
+    """viser's page with the project's name on the browser's tab and the script that asks for the server's
+    pulse, compressed again if it is ``packed``."""
+    plain = gzip.decompress(page) if packed else page
+    ours = plain.replace(b"<title>Viser</title>", TAB_TITLE + pulse.TAG, 1)
+    return gzip.compress(ours) if packed else ours

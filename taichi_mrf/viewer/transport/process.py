@@ -3,6 +3,7 @@
 The mapping process starts it. It ends on Quit, and when the mapping process has ended.
 """
 
+import os
 import signal
 import threading
 from collections.abc import Callable
@@ -12,8 +13,9 @@ from typing import Any, Protocol
 import viser
 
 from taichi_mrf.errors import ViewerError
-from taichi_mrf.viewer.messages import Listening, Notice, Quit, Request
+from taichi_mrf.viewer.messages import Alive, Listening, Notice, Quit, Request
 from taichi_mrf.viewer.transport.inbox import Inbox
+from taichi_mrf.viewer.transport.pulse import Pulse
 from taichi_mrf.viewer.transport.server import start_server
 
 TITLE = "taichi_mrf"
@@ -40,8 +42,9 @@ def run_viewer(connection: "Connection[Any, Any]", host: str, port: int, new_pag
     # The mapping process gets these signals too, and tells this one when to end.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    pulse = Pulse(os.getppid())
     try:
-        server = start_server(host, port, TITLE)
+        server = start_server(host, port, TITLE, pulse)
     except ViewerError as error:
         connection.send(Notice(str(error), "error"))
         return
@@ -56,21 +59,23 @@ def run_viewer(connection: "Connection[Any, Any]", host: str, port: int, new_pag
 
     page = new_page(server, ask)
     ask(Listening(server.get_host(), server.get_port()))
-    threading.Thread(target=_read, args=(connection, page), daemon=True, name="reader").start()
+    threading.Thread(target=_read, args=(connection, page, pulse), daemon=True, name="reader").start()
     try:
         page.run()
     finally:
         server.stop()
 
 
-def _read(connection: "Connection[Any, Any]", page: AnyPage) -> None:
+def _read(connection: "Connection[Any, Any]", page: AnyPage, pulse: Pulse) -> None:
     """Put all updates into the page's inbox until the connection ends."""
     try:
         while True:
+            pulse.heard()
             update = connection.recv()
             if isinstance(update, Quit):
                 break
-            page.inbox.put(update)
+            if not isinstance(update, Alive):
+                page.inbox.put(update)
     except (EOFError, OSError):
         pass
     page.inbox.put(None)

@@ -27,6 +27,7 @@ from taichi_mrf.viewer.transport import viser_internals as internals
 from taichi_mrf.viewer.transport.connection import CLOSE_TIMEOUT_S, LARGEST_PICTURE, GuardedConnection
 from taichi_mrf.viewer.transport.guard import Gate
 from taichi_mrf.viewer.transport.origin import Pages, answer_page, refusal, unknown_name
+from taichi_mrf.viewer.transport.pulse import PATH, Pulse
 
 PORTS_TO_TRY = 100
 """From the port that was asked for upwards."""
@@ -40,16 +41,17 @@ LOGGER.addHandler(logging.NullHandler())
 Handler = Callable[[ServerConnection], Awaitable[None]]
 
 
-def start_server(host: str, port: int, title: str) -> viser.ViserServer:
+def start_server(host: str, port: int, title: str, pulse: Pulse | None = None) -> viser.ViserServer:
     """A running server that is bound to ``host`` alone, shows ``title`` and prints nothing.
 
     ``port`` is where the search for a free one begins, 0 takes any; the one taken is ``get_port()``.
+    ``pulse`` says whether the mapping process still speaks; without it there is none.
     Raises ViewerError if ``host`` is not an address of this machine, if no port is free, and if viser is
     not the version that this guard was written for.
     """
     internals.page_script_hashes()
     listener = _listen(host, port)
-    door = _Door(listener, host)
+    door = _Door(listener, host, pulse or Pulse())
     try:
         with internals.serving_by(door.serve):
             server = _QuietServer(host=host, port=listener.getsockname()[1], label=title, verbose=False)
@@ -89,11 +91,12 @@ class _Door:
     viser did differently from what is known here; then every client is refused, too.
     """
 
-    def __init__(self, listener: socket.socket, host: str) -> None:
+    def __init__(self, listener: socket.socket, host: str, pulse: Pulse) -> None:
         self.gate: Gate | None = None
         self.surprise: str | None = "it does not call websockets' serve"
         self._listener = listener
         self._host = host
+        self._pulse = pulse
         self._clients = 0
 
     def serve(self, *args: Any, **options: Any) -> websockets.asyncio.server.serve:
@@ -106,11 +109,17 @@ class _Door:
         return websockets.asyncio.server.serve(
             partial(self._welcome, handler),
             sock=self._listener,
-            process_request=partial(self._answer, pages),
+            process_request=partial(self._answer, partial(self._pages, pages)),
             create_connection=GuardedConnection,
             logger=LOGGER,
             **options,
         )
+
+    def _pages(self, pages: Pages, connection: ServerConnection, request: Request) -> Response | None:
+        """What viser serves, and the pulse."""
+        if request.path.partition("?")[0] == PATH:
+            return self._pulse.answer(connection)
+        return pages(connection, request)
 
     def _answer(self, pages: Pages, connection: ServerConnection, request: Request) -> Response | None:
         """A page, a refusal, or None to go on with the websocket's handshake."""

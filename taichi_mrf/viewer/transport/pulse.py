@@ -1,0 +1,116 @@
+"""Whether the page still has a server and a mapping process behind it: what the server says, and a script in
+the page that asks.
+
+viser's client notices only that its socket is closed, and a process that is stopped closes nothing. It keeps
+the last words of the panel, which may be "done". So the script asks each second, says in words what does not
+answer, and hides what the panel says is being done. It lets the client connect again also without the focus,
+and reloads the page of a server that answers while the socket stays closed.
+"""
+
+import base64
+import hashlib
+import http
+import json
+from pathlib import Path
+from time import monotonic
+
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Response
+
+SILENCE_S = 30.0
+"""A mapping process that has sent nothing for so long does not answer. It sends Alive each BEAT_S, but not
+while a kernel is compiled, which took 8.5 s at most with an empty cache (2 cores)."""
+
+PATH = "/alive"
+
+ACTIVITY = "taichi-mrf-activity"
+"""The class of the element that says what is being done."""
+
+SCRIPT = (
+    """(() => {
+const EVERY_MS = 1000, PATIENCE_MS = 3000, MOST_IN_VAIN = 20;
+document.hasFocus = () => true;  // viser's client connects again only where the page has the focus
+let timer, wasOpen = false, closed = false, inVain = 0;
+window.Worker = class extends Worker {  // viser's socket lives in one, which tells of it
+  constructor(...given) {
+    super(...given);
+    this.addEventListener("message", ({data}) => {
+      if (data?.type === "connected") [wasOpen, closed] = [true, false];
+      if (data?.type === "closed") closed = true;
+    });
+  }
+};
+const style = document.createElement("style");
+style.textContent = `
+  html[data-cut-off] :is(.ACTIVITY, .mantine-Progress-root) { visibility: hidden; }
+  #cut-off { position: fixed; inset: 0 0 auto; z-index: 100000; padding: 0.6em; text-align: center;
+    font: 600 16px sans-serif; color: #fff; background: #c92a2a; pointer-events: none; }
+  html:not([data-cut-off]) #cut-off { display: none; }`;
+document.head.append(style);
+const banner = document.createElement("div");
+banner.id = "cut-off";
+banner.setAttribute("role", "alert");
+const say = words => {
+  if (words !== banner.textContent) banner.textContent = words;
+  if (!banner.isConnected) document.body.append(banner);
+  document.documentElement.toggleAttribute("data-cut-off", words !== "");
+};
+const GONE = "disconnected: reload the page if it does not come back by itself";
+const ask = async () => {
+  const begun = performance.now();
+  try {
+    const answer = await fetch("alive", {cache: "no-store", signal: AbortSignal.timeout(PATIENCE_MS)});
+    if (!answer.ok) throw new Error(answer.statusText);
+    const {mapper} = await answer.json();
+    inVain = closed ? inVain + 1 : 0;  // answers of a server to which the socket does not come back
+    if (wasOpen && inVain > MOST_IN_VAIN) return location.reload();
+    say(closed ? GONE : mapper ? "" : "the mapper does not answer");
+  } catch {
+    // A page that slept or was busy itself is no sign of the server; it asks again.
+    if (performance.now() - begun < PATIENCE_MS + 1000) say(GONE);
+  }
+  timer = setTimeout(ask, EVERY_MS);
+};
+timer = setTimeout(ask, EVERY_MS);
+document.addEventListener("visibilitychange", () => {  // timers of a hidden page are slow
+  if (document.hidden || !timer) return;
+  clearTimeout(timer);
+  ask();
+});
+})();"""
+).replace("ACTIVITY", ACTIVITY)
+"""Runs before viser's own scripts."""
+
+TAG = f"<script>{SCRIPT}</script>".encode()
+
+SOURCE = f"'sha256-{base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode()}'"
+"""The script as a source of a content security policy."""
+
+
+class Pulse:
+    """What the page's script is told: whether the mapping process still speaks."""
+
+    def __init__(self, mapper: int | None = None) -> None:
+        """``mapper`` is the number of the mapping process, None without one."""
+        self._mapper, self._heard_s = mapper, monotonic()
+
+    def heard(self) -> None:
+        """Note that the mapping process has sent something."""
+        self._heard_s = monotonic()
+
+    def answer(self, connection: ServerConnection) -> Response:
+        """The answer to a request for :data:`PATH`."""
+        silent = monotonic() - self._heard_s > SILENCE_S
+        speaks = self._mapper is None or not (silent or _is_stopped(self._mapper))
+        response = connection.respond(http.HTTPStatus.OK, json.dumps({"mapper": speaks}))
+        response.headers["Cache-Control"] = "no-store"
+        return response
+
+
+def _is_stopped(process: int) -> bool:
+    """Whether a signal has stopped the process; False where the system does not say (other than Linux)."""
+    try:
+        status = Path(f"/proc/{process}/stat").read_text()
+    except OSError:
+        return False
+    return status.rpartition(")")[2].split()[0] in ("T", "t")
