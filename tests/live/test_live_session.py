@@ -186,7 +186,7 @@ def test_a_stop_during_full_inference_leaves_the_map_that_was_shown() -> None:
     session = session_of(link)
     session.run(lambda: any(s.activity.startswith("sweeping keyframe 3 ") for s in link.of_type(Status)[-1:]))
     assert not session.state.is_done
-    assert_shown_is(session, link)
+    assert_shown_is(session, link, decided=False)
     assert marginals(finished(session)) == marginals(built(range(4)))
 
 

@@ -40,6 +40,10 @@ class HandMap:
     def up(self) -> Up | None:
         return next((up_of(keyframe.T_world_camera) for keyframe in self.keyframes.values()), None)
 
+    @property
+    def decided(self) -> "HandMap":
+        return self
+
     def __post_init__(self) -> None:
         self.view = View(self.hand.pool, self.voxel_size, VolumeConfig(min_evidence=MIN_EVIDENCE))
         self.hand.topology.add_crossings(self.crossed, 1)
