@@ -61,11 +61,6 @@ class MeasuredDepth:
             _blend(field.weight.reshape(-1), field.distance.reshape(-1), around, self._mean)
             runtime.settle()
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes in the device's memory."""
-        return 4 * int(self._mean.shape[0])
-
     def near(
         self, depth_m: NDArray[np.float32], camera: Camera, T_world_camera: Pose, max_depth: float
     ) -> NDArray[np.float32]:

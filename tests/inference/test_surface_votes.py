@@ -121,7 +121,6 @@ def test_a_reading_follows_edits() -> None:
 
 def test_a_new_keyframe_adds_its_votes_to_those_of_before() -> None:
     m, scene = uncertain_wall(2), uncertain_wall(3)
-    assert m.decided is m.decided
     third = scene.keyframes[2]
     before = int(m.first_surfaces().sum())
     m.add_keyframe(third.depth_m, third.T_world_camera, third.camera)

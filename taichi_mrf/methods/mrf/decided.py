@@ -13,12 +13,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config.schema import VolumeConfig
-from taichi_mrf.inference.brick_sums import BrickSums
 from taichi_mrf.inference.keyframe import Keyframe
-from taichi_mrf.inference.ray_model import RayModel
 from taichi_mrf.inference.surface_votes import add_votes, call_winners, count_votes
+from taichi_mrf.inference.sweep import Sweeper
 from taichi_mrf.methods.brick_registry import BrickRegistry
+from taichi_mrf.methods.mrf.kept_rays import KeptRays
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
@@ -32,25 +31,18 @@ class Decisions:
         self,
         registry: BrickRegistry,
         keyframes: Mapping[int, Keyframe],
-        kept: Callable[[], BrickSums],
-        model: Callable[[], RayModel],
-        volume: VolumeConfig,
+        kept: KeptRays,
+        sweeper: Sweeper,
     ) -> None:
-        """``keyframes`` are those of the map, now and later; ``kept`` are votes that frozen ones have left,
-        and ``model`` is what rays share."""
-        self._registry, self._keyframes, self._kept = registry, keyframes, kept
-        self._model, self._volume = model, volume
+        """``keyframes`` are those of the map, now and later; ``kept`` has the votes that frozen ones have
+        left, and ``sweeper`` what rays share."""
+        self._registry, self._keyframes, self._kept, self._sweeper = registry, keyframes, kept, sweeper
         self._votes = ti.ndarray(ti.i32, VOXELS)
         self._identity = np.zeros(0, np.int64)
         self._counted: dict[int, Keyframe] = {}
         self._restarts = -1  # of the pool when votes were counted; -1 while they are not complete
         self._shown: PoolSnapshot | None = None
         self._exact = False
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the votes."""
-        return 4 * int(self._votes.shape[0])
 
     def log_odds(self, settled: bool, between: Callable[[], object] = lambda: None) -> "ti.Ndarray":
         """Log-odds (capacity * 512) above 0 in occupied voxels, the marginals' in all others. In a
@@ -59,7 +51,7 @@ class Decisions:
         pool = self._registry.pool
         self._count(settled, between)
         log_odds = copied(pool.belief)
-        call_winners(self._votes, log_odds, pool.prior_log_odds, self._volume.min_evidence)
+        call_winners(self._votes, log_odds, pool.prior_log_odds, self._sweeper.volume.min_evidence)
         runtime.settle()
         return log_odds
 
@@ -92,7 +84,7 @@ class Decisions:
 
     def _start_over(self) -> None:
         """Forget all votes but those that frozen keyframes have left."""
-        pool, kept = self._registry.pool, self._kept()
+        pool, kept = self._registry.pool, self._kept.share.votes
         self._counted, self._exact, self._restarts = {}, True, -1
         self._votes = _zeros(pool)
         self._identity = pool.identity.copy()
@@ -105,7 +97,8 @@ class Decisions:
         visible = self._registry.visible(keyframe.footprint)
         part = self._registry.pool.part(visible.slots)
         seen = (keyframe, replace(visible, slots=part.in_use, arrays=None))
-        votes = count_votes([seen], part, self._model(), self._volume)
+        model = replace(self._sweeper.model(), maximise=False)
+        votes = count_votes([seen], part, model, self._sweeper.volume)
         add_votes(visible.slots, votes.to_numpy()[: len(visible.slots) * VOXELS], self._votes)
 
     def _follow_bricks(self) -> None:

@@ -106,13 +106,7 @@ class MRFMap(PosedMRF):
         self._settled = True
         self._colors = MapColors(self._registry, self._keyframes, self._sweeper, self._allocator.refresh)
         self._kept = KeptRays(config.keep_surface)
-        self._decisions = Decisions(
-            self._registry,
-            self._keyframes,
-            lambda: self._kept.share.votes,
-            lambda: replace(self._sweeper.model(), maximise=False),
-            self.config.volume,
-        )
+        self._decisions = Decisions(self._registry, self._keyframes, self._kept, self._sweeper)
         parked = (self._registry, self._dated, self.aligner.surface, self._colors, self._kept)
         self.window = MovingWindow.of(self.config.volume, *parked)
 

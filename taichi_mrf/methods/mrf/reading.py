@@ -26,6 +26,7 @@ from taichi_mrf.methods.mrf.surfacing import LEAST, MadeOf, WithSurface
 from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.change import MapChange, compare_maps
 from taichi_mrf.system import tensors
+from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.pool import copied
 
 ItemT = TypeVar("ItemT")
@@ -42,7 +43,7 @@ class ReadableMRF(WithSurface):
     _sweeper: Sweeper
     _dated: DatedBelief | None
     _decisions: Decisions
-    _last_decided: tuple[MadeOf, MapReading] | None = None
+    _decided: "tuple[MadeOf, ti.Ndarray] | None" = None
 
     @property
     def keyframes(self) -> Mapping[int, Keyframe]:
@@ -202,11 +203,13 @@ class ReadableMRF(WithSurface):
         """:attr:`decided`; ``between`` is called after each keyframe whose votes are counted, and what it
         raises ends the work. Raises CapacityError if there is not enough memory."""
         made_of = MadeOf(self)
-        if self._last_decided is None or self._last_decided[0] != made_of:
-            self._last_decided = None
-            reading = MapReading(self, self._decisions.log_odds(self._settled, between))
-            self._last_decided = made_of, reading
-        return self._last_decided[1]
+        if self._decided is None or self._decided[0] != made_of:
+            self._decided = None  # its memory, before there is another
+            self._decided = made_of, self._decisions.log_odds(self._settled, between)
+        # Not kept: a reading keeps the map, whose memory would then wait for the collector of cycles.
+        reading = MapReading(self, self._decided[1])
+        reading.view.index = self.view.index
+        return reading
 
     def calibrated(self, between: Callable[[], object] = lambda: None) -> MapReading:
         """The map by the probability that each voxel holds a surface, from the distances of all rays
