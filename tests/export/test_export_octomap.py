@@ -77,7 +77,7 @@ def probabilities(log_odds: Iterable[float]) -> np.ndarray:
 def test_octomap_reads_the_log_odds_of_all_known_voxels_and_no_others(
     octomap: ModuleType, hand: HandMap, which: str, tmp_path: Path
 ) -> None:
-    m = hand if which == "hand" else room_map(which)
+    m = hand if which == "hand" else room_map(which).decided
     write_ot(tmp_path / "map.ot", m)
     tree = read_tree(octomap, tmp_path / "map.ot")
     assert tree.getResolution() == pytest.approx(m.voxel_size)  # type: ignore[attr-defined]
@@ -92,7 +92,7 @@ def test_octomap_reads_the_log_odds_of_all_known_voxels_and_no_others(
 def test_octomap_reads_what_is_free_and_what_is_occupied(
     octomap: ModuleType, hand: HandMap, which: str, tmp_path: Path
 ) -> None:
-    m = hand if which == "hand" else room_map(which)
+    m = hand if which == "hand" else room_map(which).decided
     write_bt(tmp_path / "map.bt", m)
     tree = read_tree(octomap, tmp_path / "map.bt")
     found, wanted = voxels_of(leaves_of(tree)), known_voxels(m)

@@ -178,7 +178,7 @@ def test_a_map_saved_during_inference_is_the_one_that_is_shown(tmp_path: Path) -
     path = tmp_path / file.name
     path.write_bytes(file.content)
     saved = link.sent.index(file)
-    assert map_voxels(MRFMap.load(path)) == shown(link.sent[:saved]).voxels()
+    assert map_voxels(MRFMap.load(path).layer()) == shown(link.sent[:saved]).voxels()
 
 
 def test_a_stop_during_full_inference_leaves_the_map_that_was_shown() -> None:

@@ -13,10 +13,9 @@ class NoiseFlags:
     """Where sigma comes from."""
 
     origin: Annotated[Literal["checked", "given", "auto"], tyro.conf.arg(name="noise")] = "checked"
-    """auto first learns from up to 60 frames of the recording by how much sensor.sigma, or what frames state,
-    is off: sensor.sigma-scale and sensor.sigma-added. DIR/sensor.yaml holds them for other recordings, and
-    for a camera, which has to be recorded first. checked learns them from 16 frames, in map alone, where
-    sigma is the default and these contradict it. given never learns."""
+    """auto learns sigma from up to 60 frames first (sensor.sigma-scale and sensor.sigma-added, which
+    DIR/sensor.yaml holds for other recordings); checked, in map alone, from 16 frames, where sigma is the
+    default and these contradict it; given never."""
 
     @property
     def is_learnt(self) -> bool:
