@@ -13,9 +13,8 @@ class NoiseFlags:
     """Where sigma comes from."""
 
     origin: Annotated[Literal["checked", "given", "auto"], tyro.conf.arg(name="noise")] = "checked"
-    """auto learns sigma from up to 60 frames first (sensor.sigma-scale and sensor.sigma-added, which
-    DIR/sensor.yaml holds for other recordings); checked, in map alone, from 16 frames, where sigma is the
-    default and these contradict it; given never."""
+    """auto learns sigma from up to 60 frames first (DIR/sensor.yaml keeps it for other recordings); checked,
+    in map alone, from 16 frames, where sigma is the default and these contradict it; given never."""
 
     @property
     def is_learnt(self) -> bool:
