@@ -49,7 +49,13 @@ class VoxelMap:
         shown = self.probability >= min_probability
         return self.centres[shown], self.probability[shown]
 
-    def render_depth(self, camera: PinholeCamera, T_world_camera: Pose) -> NDArray[np.float32]:
+    @property
+    def decided(self) -> "VoxelMap":
+        return self
+
+    def render_depth(
+        self, camera: PinholeCamera, T_world_camera: Pose, by: str = "surface"
+    ) -> NDArray[np.float32]:
         return cast_voxels(self.centres, self.voxel_size, camera, T_world_camera).depth_m
 
 

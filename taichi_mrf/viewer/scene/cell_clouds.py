@@ -25,6 +25,8 @@ def add_cells(
     for key, chunk in store.chunks.items():
         first_m = (np.array(key) * CHUNK_VOXELS + 0.5) * voxel_size  # the centre of the first voxel
         for side, shown in standing_cells(chunk, look.log_odds, evidence):
+            if not len(shown.cells):
+                continue
             centres = shown.cells + 0.5 * (side - 1)
             heights_m = sign * (first_m[axis] + centres[:, axis] * voxel_size)
             faces = facing(shown.cells // side, CHUNK_VOXELS // side) if look.shade else None
