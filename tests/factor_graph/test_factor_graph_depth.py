@@ -67,7 +67,7 @@ def test_sum_product_on_a_tree_of_rays_is_exact(
     graph = m.factor_graph()
     found = solve(graph, LaserConfig(method="bp", **CONVERGED)).marginals  # type: ignore[arg-type]
     assert found is not None
-    exact = reference.enumerate_marginals(rays, prior, config.outlier_floor)
+    exact = reference.enumerate_marginals(rays, prior, config.floor)
     np.testing.assert_allclose(at_voxels(graph, found, list(exact)), list(exact.values()), atol=1e-4)
     untouched = np.ones(len(found), bool)
     untouched[np.isin(np.arange(len(found)), at_voxels(graph, np.arange(len(found)), list(exact)))] = False
@@ -96,7 +96,7 @@ def test_energies_are_those_of_the_joint_distribution_and_bounds_bound_them(
         factor = np.full(len(states), ray.beyond)
         for segment, density in zip(reversed(ray.segments), reversed(ray.densities), strict=True):
             factor = np.where(states[:, column[segment.voxel]] == 1, density, factor)
-        energies -= np.log(factor + config.outlier_floor)
+        energies -= np.log(factor + config.floor)
     energies += (graph.grid.cells - len(voxels)) * -np.log1p(-prior)
     labels = at_voxels(graph, found.labels, voxels)
     index = int((labels * 2 ** np.arange(len(voxels))).sum())

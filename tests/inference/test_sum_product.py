@@ -66,7 +66,7 @@ def test_one_ray_equals_enumeration(
     m.add_keyframe(image(depth), T, ONE_PIXEL)
     m.infer(sweeps=2, method=method)
     passes = 0.0 if maximise else pass_through
-    exact = reference.enumerate_marginals(rays, prior, config.outlier_floor, maximise, passes)
+    exact = reference.enumerate_marginals(rays, prior, config.floor, maximise, passes)
     np.testing.assert_allclose(marginals(m, list(exact)), list(exact.values()), atol=1e-4)
 
 
@@ -98,7 +98,7 @@ def test_two_rays_that_share_one_voxel_equal_enumeration(
         m.add_keyframe(image(depth), T, ONE_PIXEL)
     assume({s.voxel for ray in rays for s in ray.segments} <= allocated(m))
     m.infer(sweeps=6, method=method)
-    exact = reference.enumerate_marginals(rays, prior, config.outlier_floor, method == "max-product")
+    exact = reference.enumerate_marginals(rays, prior, config.floor, method == "max-product")
     np.testing.assert_allclose(marginals(m, list(exact)), list(exact.values()), atol=1e-4)
 
 
@@ -203,7 +203,7 @@ def test_messages_with_lengths_are_those_of_the_factor(
     factor = np.full(2**n, ray.beyond)
     for i in reversed(range(n)):
         factor = np.where(states[:, i] == 1, ray.densities[i], factor)
-    factor = factor + config.outlier_floor
+    factor = factor + config.floor
     expected = []
     for i in range(n):
         others = np.delete(np.where(states == 1, stops, 1 - stops), i, axis=1).prod(axis=1) * factor

@@ -73,7 +73,7 @@ def test_voxels_are_called_as_the_rays_vote(seed: int, count: int, sigma: float)
     votes: dict[reference.Voxel, int] = {}
     doubtful: set[reference.Voxel] = set()
     for ray in rays:
-        if not vote(ray, p, learnt, config.outlier_floor, votes):
+        if not vote(ray, p, learnt, config.floor, votes):
             doubtful |= {s.voxel for s in ray.segments}
     assume(len(doubtful) < len(voxels))
     called = reference.logistic(CALLED)

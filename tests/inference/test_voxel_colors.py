@@ -46,7 +46,7 @@ def spread(ray: reference.Ray, cavity: dict, config: InferenceConfig, prior: flo
             free = (1 - m) ** segment.length
             found[segment.voxel] = (1 - free) * density * visibility
             visibility *= free
-    total = sum(found.values()) + visibility * ray.beyond + config.outlier_floor
+    total = sum(found.values()) + visibility * ray.beyond + config.floor
     return {voxel: here / total for voxel, here in found.items()}
 
 

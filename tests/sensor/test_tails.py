@@ -97,7 +97,7 @@ def test_one_ray_equals_enumeration(
     m = MRFMap(VOXEL, PolynomialNoise((sigma,), (0.01,)), inference=config, max_depth=0.75)
     m.add_keyframe(image(depth), T, ONE_PIXEL)
     m.infer(sweeps=2)
-    exact = reference.enumerate_marginals(rays, prior, config.outlier_floor, method == "max-product")
+    exact = reference.enumerate_marginals(rays, prior, config.floor, method == "max-product")
     np.testing.assert_allclose(marginals(m, list(exact)), list(exact.values()), atol=1e-4)
 
 

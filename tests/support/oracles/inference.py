@@ -124,8 +124,8 @@ def ray_messages(
     behind = ray.beyond * visibility
     out = []
     for segment, free, here, before in reversed(steps):
-        occupied = before + here + config.outlier_floor
-        empty = before + behind / free + config.outlier_floor
+        occupied = before + here + config.floor
+        empty = before + behind / free + config.floor
         occupied += (config.pass_through or 0.0) * (empty - occupied)
         weight = segment.share * (segment.length if config.segment_lengths else 1.0)
         out.append((segment.voxel, weight, occupied / (occupied + empty)))
@@ -142,7 +142,7 @@ def best_messages(
         for segment, density in zip(ray.segments, ray.densities, strict=True)
         if segment.voxel in incoming
     ]
-    floor = config.outlier_floor + 1e-30
+    floor = config.floor + 1e-30
     costs = [-math.log(density + floor) for _, density in steps] + [-math.log(ray.beyond + floor)]
     free, occupied = [], []
     for segment, _ in steps:
