@@ -23,7 +23,7 @@ MAP = ("map", ROOM, *FAST, "--evaluation.hold-out", "0")
 def test_colours_go_from_the_images_into_the_files(tmp_path: Path) -> None:
     assert carry_out(*MAP, "--color", "--out", tmp_path / "run") == 0
     m = load_map(tmp_path / "run" / "map.npz")
-    centres, _ = m.voxels(0.5)
+    centres, _ = m.decided.voxels(0.5)
     cloud = trimesh.load(tmp_path / "run" / "voxels.ply")
     np.testing.assert_array_equal(cloud.colors[:, :3], photo_at(m, centres))
     assert len(np.unique(cloud.colors, axis=0)) > 50

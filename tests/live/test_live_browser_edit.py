@@ -94,7 +94,7 @@ def saved_map(page: LivePage, folder: Path) -> MRFMap:
 def settled_count(m: MRFMap) -> int:
     """Voxels of at least one half after full inference."""
     m.infer()
-    return len(m.voxels(0.5)[0])
+    return len(m.decided.voxels(0.5)[0])
 
 
 def until_count(page: LivePage, count: int, what: str) -> None:
@@ -233,7 +233,7 @@ def drag(page: LivePage, start: np.ndarray, end: np.ndarray) -> None:
 
 def test_the_saved_map_is_the_one_that_is_shown(page: LivePage, tmp_path: Path, out: Path) -> None:
     shown = at_rest(page)
-    assert len(saved_map(page, tmp_path).voxels(0.5)[0]) == shown.voxels
+    assert len(saved_map(page, tmp_path).decided.voxels(0.5)[0]) == shown.voxels
     assert (out / "map.npz").read_bytes() == (tmp_path / "now.npz").read_bytes()
 
 
@@ -241,7 +241,7 @@ def test_the_voxels_open_as_ply(page: LivePage, tmp_path: Path) -> None:
     page.tab("Save")
     page.download("Voxels").save_as(tmp_path / "voxels.ply")
     cloud = trimesh.load(tmp_path / "voxels.ply")
-    assert len(cloud.vertices) == page.look().voxels
+    page.until(lambda seen: seen.voxels == len(cloud.vertices), "the voxels of the file")
 
 
 def test_the_picture_shows_the_map(page: LivePage, tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ def saved(page: LivePage, tmp_path_factory: pytest.TempPathFactory) -> MRFMap:
 
 
 def voxels_of(m: MRFMap | MapReading) -> int:
-    return len(m.voxels(0.5)[0])
+    return len(m.decided.voxels(0.5)[0])
 
 
 def red(page: LivePage) -> int:

@@ -6,6 +6,7 @@ progress on the screen.
 
 import contextlib
 import logging
+import sys
 import time
 from types import TracebackType
 
@@ -40,9 +41,10 @@ def open_terminal(verbosity: Verbosity, stderr: bool = False) -> Terminal:
 
 
 def tell_first_run(verbosity: Verbosity) -> None:
-    """Say on stderr, before Taichi is started, that kernels have to be compiled, if there are none yet."""
+    """Say to a person at a terminal, before Taichi is started, that kernels have to be compiled, if there are
+    none yet."""
     note = taichi_environment.first_run_note()
-    if note is not None:
+    if note is not None and sys.stderr.isatty():
         Terminal(stderr=True, quiet=verbosity.quiet).print_line(note)
 
 
