@@ -79,7 +79,7 @@ def mrf_map(scene: Scene, size: float, keyframes: tuple[int, ...]) -> MRFMap:
 def within_5cm(m: MRFMap, scene: Scene, judged: tuple[int, ...]) -> Spread:
     scores = []
     for view in (scene.views[i] for i in judged):
-        seen = judge_view(m, view.true_m, view.T_world_camera, scene.camera, mask=view.judged)
+        seen = judge_view(m, view.true_m, view.T_world_camera, scene.camera, mask=view.judged, by="omega")
         scores.append(seen.accuracy("5cm").score)
     return Spread.of(scores)
 

@@ -48,7 +48,7 @@ def vertex_colors(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def test_points_and_cubes_have_the_colours_of_their_voxels(m: MRFMap, tmp_path: Path) -> None:
     export_map(m, tmp_path / "points.ply", ExportOptions(cells=False))
     cloud = trimesh.load(tmp_path / "points.ply")
-    centres, p = m.voxels(0.5)
+    centres, p = m.decided.voxels(0.5)
     np.testing.assert_allclose(cloud.colors[:, :3], shown(m, centres), atol=0.51)
     assert b"color is what cameras saw" in (tmp_path / "points.ply").read_bytes()[:400]
     export_map(m, tmp_path / "marginals.ply", ExportOptions(color_by="marginal", cells=False))
