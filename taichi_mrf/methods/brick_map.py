@@ -23,7 +23,7 @@ from taichi_mrf.methods.brick_registry import BrickRegistry
 from taichi_mrf.methods.sensor_section import describing
 from taichi_mrf.queries.contradiction import ray_scores
 from taichi_mrf.queries.extract import extract_voxels
-from taichi_mrf.queries.measured_depth import Answer
+from taichi_mrf.queries.measured_depth import Answer, MeasuredDepth
 from taichi_mrf.queries.occlusion import Occlusion
 from taichi_mrf.queries.points import classify, point_log_odds, probability
 from taichi_mrf.queries.profile import RayProfile
@@ -193,12 +193,20 @@ class BrickMap(Owned):
         near_m = self.measured_depth(depth_m, camera, T)
         return np.where(np.isnan(near_m), depth_m, near_m)
 
+    @tensors.in_kind("likeliest_m", "T_world_camera")
     def measured_depth(
         self, likeliest_m: NDArray[np.float32], camera: Camera, T_world_camera: ArrayLike
     ) -> NDArray[np.float32]:
         """Axial depth (H, W) of the measured surface where it is near the likeliest voxels, whose depths are
         ``likeliest_m`` (H, W); NaN elsewhere, and everywhere in maps without such a surface."""
-        return np.full(camera.shape, np.nan, np.float32)
+        measured = self._measured_surface()
+        if measured is None:
+            return np.full(camera.shape, np.nan, np.float32)
+        return measured.near(likeliest_m, camera, as_pose(T_world_camera), self.sensor.max_depth)
+
+    def _measured_surface(self) -> MeasuredDepth | None:
+        """The surface that keyframes measured, as rays meet it; None in maps without one."""
+        return None
 
     @tensors.in_kind("origin", "direction")
     def ray_profile(

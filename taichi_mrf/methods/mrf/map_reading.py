@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from taichi_mrf.config.method import Method
 from taichi_mrf.errors import ConfigError, KeyframeError
 from taichi_mrf.export.fused_surface import FusedSurface, fused_surface, without_free
-from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.brick_map import BrickMap
@@ -21,7 +20,6 @@ from taichi_mrf.methods.protocol import MappedKeyframe
 from taichi_mrf.queries.colored import blended_colors
 from taichi_mrf.queries.measured_depth import MeasuredDepth
 from taichi_mrf.queries.view import View
-from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.system import tensors
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.distance_field import DistanceField
@@ -103,18 +101,15 @@ class MapReading(BrickMap):
             return self._source.surface_field()
         return surface_field_of(self._source, self._judging, self._seen, self._rays.with_frozen)
 
-    @tensors.in_kind("likeliest_m", "T_world_camera")
-    def measured_depth(
-        self, likeliest_m: NDArray[np.float32], camera: Camera, T_world_camera: ArrayLike
-    ) -> NDArray[np.float32]:
-        """As BrickMap.measured_depth, by the surface of the reading."""
-        if not self.has_surface:
-            return super().measured_depth(likeliest_m, camera, T_world_camera)
+    def _measured_surface(self) -> MeasuredDepth | None:
+        """That of the source, or of the keyframes of the reading."""
         self._check()
-        return self._measured.near(likeliest_m, camera, as_pose(T_world_camera), self.sensor.max_depth)
+        if self._rays is None:
+            return self._source._measured_surface()
+        return self._own_surface if self.has_surface else None
 
     @cached_property
-    def _measured(self) -> MeasuredDepth:
+    def _own_surface(self) -> MeasuredDepth:
         return MeasuredDepth(self.surface_field(), self.voxel_size)
 
     def surface(self) -> FusedSurface:

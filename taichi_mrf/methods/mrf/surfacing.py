@@ -5,11 +5,10 @@ from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.export.fused_surface import FusedSurface, fused_surface, without_free
-from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.ray_model import RayModel
 from taichi_mrf.inference.surface_field import SurfaceRays
@@ -20,8 +19,6 @@ from taichi_mrf.methods.mrf.kept_rays import KeptRays
 from taichi_mrf.queries.colored import blended_colors, is_colored
 from taichi_mrf.queries.known_bricks import sorted_bricks
 from taichi_mrf.queries.measured_depth import MeasuredDepth
-from taichi_mrf.sensor.camera import Camera
-from taichi_mrf.system import tensors
 from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.pool import BrickPool
 
@@ -113,17 +110,14 @@ class WithSurface(BrickMap):
         colors = blended_colors(self, found.vertices_m) if is_colored(self) else None
         return replace(found, colors=colors)
 
-    @tensors.in_kind("likeliest_m", "T_world_camera")
-    def measured_depth(
-        self, likeliest_m: NDArray[np.float32], camera: Camera, T_world_camera: ArrayLike
-    ) -> NDArray[np.float32]:
-        """As BrickMap.measured_depth. The surface is found once for each state of the map."""
+    def _measured_surface(self) -> MeasuredDepth | None:
+        """Found once for each state of the map."""
         if not self.has_surface:
-            return super().measured_depth(likeliest_m, camera, T_world_camera)
+            return None
         made_of = MadeOf(self)
         if self._rendered is None or self._rendered[0] != made_of:
             self._rendered = made_of, MeasuredDepth(self.surface_field(), self.voxel_size)
-        return self._rendered[1].near(likeliest_m, camera, as_pose(T_world_camera), self.sensor.max_depth)
+        return self._rendered[1]
 
     def _prepare_colors(self) -> None:
         raise NotImplementedError
