@@ -53,8 +53,12 @@ def visited_map(time: TimeConfig) -> MRFMap:
 
 
 def hear(view: Shown, shown_map: ShownMap, renewed: bool = False) -> Shown:
+    """Send what has changed, and what is occupied, as a page that is at rest has it."""
     for bricks in shown_map.renew() if renewed else shown_map.changes():
         view.hear(bricks)
+    if shown_map.lacks_decisions:
+        for bricks in shown_map.decide(lambda: None):
+            view.hear(bricks)
     return view
 
 
