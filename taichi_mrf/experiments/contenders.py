@@ -18,16 +18,16 @@ BOTH: dict[str, dict[str, float]] = {"all leaves": {"empty_below": -1e30}, "occu
 """Readings of a recursive map: as the metric has it, every known voxel dims a ray; and as such maps are used,
 those that are more likely free than occupied let it through."""
 
-SURFACE = "measured surface"
-"""A reading of MRFMap: rays end on the measured surface where it is near their likeliest voxel, else in
-that."""
+OMEGA = "omega"
+"""The row of MRFMap by the paper's metric, beside its own, in which rays end on the measured surface where it
+is near their likeliest voxel."""
 
 
 @dataclass(frozen=True)
 class Contender:
     """A method with fixed parameters. ``make`` gives an empty map for a scene and a voxel size; ``readings``
-    are names and what each changes of the map's Occlusion. With ``surface`` rays on the measured surface
-    answer as well (SURFACE)."""
+    are names and what each changes of the map's Occlusion. With ``surface`` its own row is by the measured
+    surface, and that by the likeliest voxels is called OMEGA."""
 
     name: str
     make: Callable[[Scene, float], OccupancyMap]
@@ -36,7 +36,7 @@ class Contender:
 
     def signature(self, scene: Scene, voxel_size: float) -> str:
         """A short text that changes with any parameter of its maps."""
-        parameters = to_yaml(self.make(scene, voxel_size).config) + (SURFACE if self.surface else "")
+        parameters = to_yaml(self.make(scene, voxel_size).config) + ("omega, surface" if self.surface else "")
         return hashlib.sha256(parameters.encode()).hexdigest()[:12]
 
 
@@ -94,7 +94,7 @@ def wavemap(name: str = "wavemap-style", **parameters: Any) -> Contender:
 
 
 def standard_contenders() -> Sequence[Contender]:
-    """All that need no tuning; MRFMap by its surface too."""
+    """All that need no tuning, MRFMap first."""
     return [
         replace(mrf(), surface=True),
         log_odds("OctoMap-style"),

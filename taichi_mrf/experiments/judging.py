@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from taichi_mrf.evaluation.accuracy import TOLERANCES, JudgedView, judge_view
-from taichi_mrf.experiments.contenders import SURFACE, Contender
+from taichi_mrf.experiments.contenders import OMEGA, Contender
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.methods.protocol import OccupancyMap
@@ -35,13 +35,14 @@ def judge_all(
 ) -> Result:
     """Figures of some views: ``readings`` -> reading -> view's name -> figures, and what they cost."""
     start = time.perf_counter()
-    by_reading: dict[str, dict[str, Figures]] = {reading: {} for reading in contender.readings}
+    by_reading: dict[str, dict[str, Figures]] = {}
     views = [scene.views[i] for i in judged]
-    for reading, changes in contender.readings.items():
-        for view in views:
-            by_reading[reading][view.name] = _figures(judged_by_voxels(m, scene, view, changes))
     if contender.surface:
-        by_reading[SURFACE] = {view.name: _figures(judged_by_surface(m, scene, view)) for view in views}
+        by_reading[""] = {view.name: _figures(judged_by_surface(m, scene, view)) for view in views}
+    for reading, changes in contender.readings.items():
+        by_reading[OMEGA if contender.surface else reading] = {
+            view.name: _figures(judged_by_voxels(m, scene, view, changes)) for view in views
+        }
     seconds = time.perf_counter() - start
     return {
         "readings": by_reading,

@@ -19,7 +19,8 @@ COLUMNS: dict[str, str] = {
 """Figure -> heading."""
 
 HOW_TO_READ = (
-    "Share of pixels whose likeliest surface (argmax omega) is right: voxel = the depth lies in its voxel; "
+    "Share of pixels whose surface is right: that of the largest omega (row omega, the paper's metric), for "
+    "MRFMap the measured surface where it is near. voxel = the depth lies in its voxel; "
     "1.5sigma = within 1.5 voxels (sigma = one voxel); 5cm = within 5 cm.",
     "Unanswered rays count as wrong. noisy, sensor = the noisy depth within 1.5 sigma of what the sensor "
     "would measure of that surface. Log-likelihood: mean per measured pixel, nats, density per metre.",

@@ -32,9 +32,9 @@ MORE_LIKELY_THAN_NOT = float(np.nextafter(np.float32(0.5), np.float32(1)))
 """Just above 0.5, the probability of unknown voxels in recursive maps."""
 
 PAPER = {
-    ("MRFMap", 0.01): Spread(0.945, 0.097),
-    ("MRFMap", 0.02): Spread(0.939, 0.101),
-    ("MRFMap", 0.05): Spread(0.891, 0.114),
+    ("MRFMap, omega", 0.01): Spread(0.945, 0.097),
+    ("MRFMap, omega", 0.02): Spread(0.939, 0.101),
+    ("MRFMap, omega", 0.05): Spread(0.891, 0.114),
     ("OctoMap-style, all leaves", 0.01): Spread(0.922, 0.105),
     ("OctoMap-style, all leaves", 0.02): Spread(0.882, 0.108),
     ("OctoMap-style, all leaves", 0.05): Spread(0.723, 0.113),

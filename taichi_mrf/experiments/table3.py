@@ -13,9 +13,9 @@ from taichi_mrf.experiments.score_tables import score_table
 from taichi_mrf.experiments.tuning import tuned_contender
 
 PAPER = {
-    ("MRFMap", 0.01): Spread(0.305, 0.185),
-    ("MRFMap", 0.02): Spread(0.335, 0.195),
-    ("MRFMap", 0.05): Spread(0.406, 0.188),
+    ("MRFMap, omega", 0.01): Spread(0.305, 0.185),
+    ("MRFMap, omega", 0.02): Spread(0.335, 0.195),
+    ("MRFMap, omega", 0.05): Spread(0.406, 0.188),
     ("OctoMap-style, all leaves", 0.01): Spread(0.309, 0.192),
     ("OctoMap-style, all leaves", 0.02): Spread(0.302, 0.191),
     ("OctoMap-style, all leaves", 0.05): Spread(0.263, 0.170),

@@ -106,10 +106,10 @@ def until_count(page: LivePage, count: int, what: str) -> None:
 
 def at_rest(page: LivePage) -> Seen:
     """What the page shows once it no longer changes: small changes of colour come late."""
-    seen = page.until_settled()
+    seen = page.until(lambda seen: seen.settled, "a settled map")
     while True:
         page.pause(1.0)
-        before, seen = seen, page.until_settled()
+        before, seen = seen, page.until(lambda seen: seen.settled, "a settled map")
         if (seen.voxels, seen.colors) == (before.voxels, before.colors):
             return seen
 
@@ -119,11 +119,6 @@ def until_same(page: LivePage, before: Seen, what: str) -> Seen:
     return page.until(
         lambda seen: seen.settled and (seen.voxels, seen.colors) == (before.voxels, before.colors), what
     )
-
-
-MAY_BE_EARLY = pytest.mark.xfail(
-    strict=False, reason="a page that seems at rest may still show marginals: votes are counted after that"
-)
 
 
 def test_pause_step_speed_and_go(page: LivePage) -> None:
@@ -143,7 +138,6 @@ def test_pause_step_speed_and_go(page: LivePage) -> None:
     assert len(page.until_settled().keyframes) == 5
 
 
-@MAY_BE_EARLY
 def test_a_keyframe_is_taken_out_and_comes_back(page: LivePage, edited: MRFMap) -> None:
     before = at_rest(page)
     edited.remove_keyframe(number_of(edited))
@@ -158,7 +152,6 @@ def test_a_keyframe_is_taken_out_and_comes_back(page: LivePage, edited: MRFMap) 
     assert "(on)" in page.input("Keyframe").input_value()
 
 
-@MAY_BE_EARLY
 def test_a_keyframe_is_moved_by_its_position_and_put_back(
     page: LivePage, edited: MRFMap, tmp_path: Path
 ) -> None:
@@ -180,7 +173,6 @@ def test_a_keyframe_is_moved_by_its_position_and_put_back(
     np.testing.assert_allclose(page.position(f"/keyframes/{KEYFRAME}"), start, atol=1e-6)
 
 
-@MAY_BE_EARLY
 def test_the_gizmo_goes_along_with_a_position_that_is_typed(page: LivePage, edited: MRFMap) -> None:
     node, start = f"/keyframes/{KEYFRAME}", page.position(f"/keyframes/{KEYFRAME}")
     page.press("Move")
@@ -200,7 +192,6 @@ def test_the_gizmo_goes_along_with_a_position_that_is_typed(page: LivePage, edit
     page.until_settled()
 
 
-@MAY_BE_EARLY
 def test_a_keyframe_is_dragged_by_its_gizmo(page: LivePage, edited: MRFMap) -> None:
     before, start = page.look(), page.position(f"/keyframes/{KEYFRAME}")
 
@@ -242,14 +233,12 @@ def drag(page: LivePage, start: np.ndarray, end: np.ndarray) -> None:
     mouse.up()
 
 
-@MAY_BE_EARLY
 def test_the_saved_map_is_the_one_that_is_shown(page: LivePage, tmp_path: Path, out: Path) -> None:
     shown = at_rest(page)
     assert len(saved_map(page, tmp_path).decided.voxels(0.5)[0]) == shown.voxels
     assert (out / "map.npz").read_bytes() == (tmp_path / "now.npz").read_bytes()
 
 
-@MAY_BE_EARLY
 def test_the_voxels_open_as_ply(page: LivePage, tmp_path: Path) -> None:
     page.tab("Save")
     page.download("Voxels").save_as(tmp_path / "voxels.ply")
@@ -266,7 +255,6 @@ def test_the_picture_shows_the_map(page: LivePage, tmp_path: Path) -> None:
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
 
 
-@MAY_BE_EARLY
 def test_the_standalone_page_shows_the_map(page: LivePage, browser: "Browser", tmp_path: Path) -> None:
     page.tab("Save")
     page.download("Page").save_as(tmp_path / "map.html")
@@ -278,7 +266,6 @@ def test_the_standalone_page_shows_the_map(page: LivePage, browser: "Browser", t
         assert standalone.problems == []
 
 
-@MAY_BE_EARLY
 def test_a_recording_holds_what_happened(page: LivePage, tmp_path: Path) -> None:
     page.tab("Save")
     page.press("Recording")
@@ -301,7 +288,6 @@ def test_a_recording_holds_what_happened(page: LivePage, tmp_path: Path) -> None
     assert 1.0 <= min(times) <= max(times) <= recording["durationSeconds"]
 
 
-@MAY_BE_EARLY
 def test_reset_begins_anew_and_ends_the_same(page: LivePage) -> None:
     before = at_rest(page)
     page.select("Speed", "0.25x")  # or a machine that draws slowly sees only the end
@@ -317,7 +303,6 @@ def test_reset_begins_anew_and_ends_the_same(page: LivePage) -> None:
     assert len(after.keyframes) == 5
 
 
-@MAY_BE_EARLY
 def test_a_frozen_keyframe_stays_in_the_map(page: LivePage, tmp_path: Path) -> None:
     before = page.until_settled()
     m = saved_map(page, tmp_path)
