@@ -22,8 +22,14 @@ from taichi_mrf.datasets.lidar.recording import LIDAR_PASS_THROUGH
 from taichi_mrf.datasets.recorded_noise import SHORT_RAYS_FLOOR
 from taichi_mrf.evaluation.accuracy import judge_view
 from taichi_mrf.experiments.exact import room_scene
-from taichi_mrf.experiments.lidar import lidar_scene
-from taichi_mrf.experiments.scenes import Scene, SceneView, coffin_scene, house_scene, kitchen_scene
+from taichi_mrf.experiments.scenes import (
+    Scene,
+    SceneView,
+    coffin_scene,
+    house_scene,
+    kitchen_scene,
+    lidar_scene,
+)
 from taichi_mrf.experiments.stereo.street import street_scene
 from taichi_mrf.queries.measured_depth import Answer
 

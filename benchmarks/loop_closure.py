@@ -1,6 +1,6 @@
 """What a closed loop costs: most poses of a trajectory change, and the map follows.
 
-    python benchmarks/loop_closure.py --keyframes 500 --moved 300 --voxel-size 0.05
+    python -m benchmarks.loop_closure --keyframes 500 --moved 300 --voxel-size 0.05
 
 A camera walks once around the built-in ring corridor (63 m). The last poses are off by 1 to 30 cm, until
 the loop is closed and ``update_poses`` takes in the true ones. The rows compare the map after so many seconds
@@ -22,10 +22,12 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
+from benchmarks.lab.surface import Open3DGrid
 from taichi_mrf import Frame, MRFMap, accuracy, open_dataset
 from taichi_mrf.benchmark.bench import octomap_available, octomap_inserter
 from taichi_mrf.config.schema import Arch, VolumeConfig
 from taichi_mrf.errors import TaichiMRFError
+from taichi_mrf.experiments.scenes import Scene
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.system import runtime
 
@@ -213,9 +215,6 @@ def rebuilt_by_others(frames: Sequence[Frame], voxel_size: float) -> dict[str, f
     if octomap_available():
         insert = octomap_inserter(voxel_size)
         seconds["OctoMap"] = sum(insert(frame).wall for frame in frames)
-    from taichi_mrf.experiments.scenes import Scene
-    from taichi_mrf.experiments.surface import Open3DGrid
-
     try:
         scene = Scene("loop", frames[0].camera, MRFMap(voxel_size).noise, VolumeConfig(), 10.0, ())
         grid = Open3DGrid(scene, voxel_size, TRUNCATION, len(frames))

@@ -4,6 +4,7 @@ The experiments are a package of their own, which is imported by name when the c
 """
 
 import importlib
+from collections.abc import Mapping
 from typing import Any
 
 from taichi_mrf.cli.options.eval import Eval
@@ -23,11 +24,12 @@ LABORATORY = "taichi_mrf.experiments.run"
 ALL = "all"
 
 
-def run_eval(options: Eval) -> int:
-    """Carry out the command; returns the exit status. Raises TaichiMRFError."""
+def run_eval(options: Eval, experiments: Mapping[str, Any] | None = None) -> int:
+    """Carry out the command, with other ``experiments`` than the papers' if there are any; returns the exit
+    status. Raises TaichiMRFError."""
     console = open_terminal(options.printing)
     laboratory = importlib.import_module(LABORATORY)
-    known: dict[str, Any] = laboratory.EXPERIMENTS
+    known = laboratory.EXPERIMENTS if experiments is None else experiments
     if options.experiment not in (*known, ALL):
         hint = nearest(options.experiment, [*known, ALL])
         raise ConfigError(f"unknown experiment '{options.experiment}'; {hint}")
@@ -42,7 +44,7 @@ def run_eval(options: Eval) -> int:
         failed = 0
         for name in names:
             try:
-                tables, paths = _run(laboratory, name, options, console, request)
+                tables, paths = _run(laboratory.run_experiment, name, known[name], options, console, request)
             except _StoppedError:
                 console.print_line("Stopped before the end; the same command continues from here.", "yellow")
                 return 128 + (request.signal or 0)
@@ -66,7 +68,7 @@ class _StoppedError(Exception):
     """The user has stopped the run; the results so far are kept."""
 
 
-def _run(laboratory: Any, name: str, options: Eval, console: Terminal, should_stop: StopRequest) -> Any:
+def _run(run: Any, name: str, entry: Any, options: Eval, console: Terminal, should_stop: StopRequest) -> Any:
     """The tables and the files of one experiment, with a progress bar on a terminal."""
     with ProgressBar(console, options.printing) as progress:
 
@@ -76,7 +78,7 @@ def _run(laboratory: Any, name: str, options: Eval, console: Terminal, should_st
                 raise _StoppedError
             progress.advance(name, done, total, note=what)
 
-        return laboratory.run_experiment(
-            name, options.data, options.out, options.voxel_sizes, options.seeds, options.limit, report,
+        return run(
+            name, entry, options.data, options.out, options.voxel_sizes, options.seeds, options.limit, report,
             options.only,
         )  # fmt: skip

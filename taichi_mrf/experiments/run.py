@@ -1,4 +1,4 @@
-"""The experiments by name, and how one is run: its ledger, its parameters beside the results.
+"""The papers' experiments by name, and how one is run: its ledger, its parameters beside the results.
 
 This is what `taichi-mrf eval` uses. An experiment's module is imported when it runs.
 """
@@ -37,37 +37,21 @@ class Entry:
     has_parts: bool = False
 
 
-_HERE = __name__.rpartition(".")[0]
-
 EXPERIMENTS = {
-    "table1": Entry("table1:run_table1", (0.05, 0.02, 0.01)),
-    "table2": Entry("table2:run_table2", (0.05, 0.02)),
-    "table3": Entry("table3:run_table3", (0.05, 0.02, 0.01)),
-    "fig7": Entry("fig7:run_fig7", (0.05, 0.02)),
-    "fig10": Entry("fig10:run_fig10", (0.05, 0.02, 0.01)),
-    "stereo": Entry("stereo.maps:run_stereo", (0.2,)),
-    "exact": Entry("exact:run_exact", (0.05,)),
-    "poses": Entry("poses:run_poses", (0.05,)),
-    "doubt": Entry("doubtful_poses:run_doubt", (0.05,)),
-    "rays": Entry("rays:run_rays", (0.05, 0.02, 0.01)),
-    "readings": Entry("readings:run_readings", (0.05, 0.02)),
-    "cells": Entry("cells:run_cells", (0.05, 0.02)),
-    "price": Entry("price:run_price", (0.05, 0.02)),
-    "endless": Entry("endless:run_endless", (0.1,)),
-    "changes": Entry("changes:run_changes", (0.05, 0.02), needs_data=False),
-    "submaps": Entry("submaps.corridor:run_submaps", (0.05,), needs_data=False),
-    "surface": Entry("surface:run_surface", (0.05, 0.02, 0.01)),
-    "lidar": Entry("lidar:run_lidar", (0.2, 0.1, 0.05)),
-    "noise": Entry("noise:run_noise", (), has_parts=True),
-    "sensors": Entry("sensors:run_sensors", (0.05,), needs_data=False),
-    "trajectory": Entry("trajectory.tables:run_trajectory", (0.05,), has_parts=True),
-    "peers": Entry("peers.run:run_peers", (0.05, 0.02, 0.01), has_parts=True),
-    "window": Entry("window:run_window", (0.1,), needs_data=False),
+    "table1": Entry("taichi_mrf.experiments.table1:run_table1", (0.05, 0.02, 0.01)),
+    "table2": Entry("taichi_mrf.experiments.table2:run_table2", (0.05, 0.02)),
+    "table3": Entry("taichi_mrf.experiments.table3:run_table3", (0.05, 0.02, 0.01)),
+    "fig7": Entry("taichi_mrf.experiments.fig7:run_fig7", (0.05, 0.02)),
+    "fig10": Entry("taichi_mrf.experiments.fig10:run_fig10", (0.05, 0.02, 0.01)),
+    "stereo": Entry("taichi_mrf.experiments.stereo.maps:run_stereo", (0.2,)),
+    "exact": Entry("taichi_mrf.experiments.exact:run_exact", (0.05,)),
+    "peers": Entry("taichi_mrf.experiments.peers.run:run_peers", (0.05, 0.02, 0.01), has_parts=True),
 }
 
 
 def run_experiment(
     name: str,
+    entry: Entry,
     data: Path,
     out: Path,
     voxel_sizes: tuple[float, ...],
@@ -76,13 +60,12 @@ def run_experiment(
     progress: Progress,
     only: tuple[str, ...] = (),
 ) -> tuple[list[Table], list[Path]]:
-    """Run one of EXPERIMENTS and write its files into ``out``; returns its tables and the files.
+    """Run an experiment and write its files into ``out``; returns its tables and the files.
 
     Without ``voxel_sizes`` the experiment's own are used, without ``only`` all of its parts. What an earlier
     run with the same ``out`` has found is not computed again. Raises TaichiMRFError, and what ``progress``
     raises.
     """
-    entry = EXPERIMENTS[name]
     if only and not entry.has_parts:
         raise ConfigError(f"--only: eval {name} has no parts that can be run alone")
     sizes = voxel_sizes or entry.voxel_sizes
@@ -92,7 +75,7 @@ def run_experiment(
         data, out, Ledger(out / f"{name}.jsonl", _made_with(data)), sizes, seeds, limit, progress, only
     )
     module, _, function = entry.function.partition(":")
-    run = getattr(importlib.import_module(f"{_HERE}.{module}"), function)
+    run = getattr(importlib.import_module(module), function)
     with warnings.catch_warnings():
         # Learnt tables have patches whose sigma falls below zero far away; the tables' notes mention it.
         warnings.filterwarnings("ignore", message="sigma of patch")

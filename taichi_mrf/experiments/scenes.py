@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf import PatchNoise, PinholeCamera, PolynomialNoise, TaichiMRFError, open_dataset
 from taichi_mrf.config.schema import KeyframeConfig, VolumeConfig
+from taichi_mrf.datasets.lidar.recording import LIDAR_SIGMA_M
 from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, as_pose, look_at
@@ -41,6 +42,8 @@ TURN = look_at(OFF_THE_GRID_M, OFF_THE_GRID_M + np.array([1.0, 0.4, -0.2]), (0.1
 are a voxel off as a whole or not at all, and shares of voxels mean little there."""
 
 TURNED = ", turned"
+
+LIDAR_RANGE_M = 60.0
 
 _UNREADABLE = (OSError, ValueError, EOFError, zipfile.BadZipFile)
 """What NumPy raises for a file that is missing or damaged."""
@@ -128,6 +131,20 @@ def kitchen_scene(data: Path, limit: int | None = None) -> Scene:
     return Scene(
         "seven_scenes_redkitchen", pinhole(dataset.camera, "the kitchen"), noise, VolumeConfig(), 10.0, views
     )
+
+
+def lidar_scene(data: Path, limit: int | None = None) -> Scene:
+    """The building; its noise is the data sheet's. Raises DatasetError."""
+    dataset = open_dataset(data / "lidar_building")
+    views = []
+    for index in range(len(dataset))[:limit]:
+        frame = dataset.read(index)
+        depth, seen = frame.depth_m, (frame.depth_m > 0) & (frame.depth_m <= LIDAR_RANGE_M)
+        views.append(
+            SceneView(frame.name, frame.T_world_camera, depth, depth, seen, frame.stamp, camera=frame.camera)
+        )
+    noise = PolynomialNoise((LIDAR_SIGMA_M,))
+    return Scene("lidar_building", dataset.camera, noise, VolumeConfig(), LIDAR_RANGE_M, views)
 
 
 def turned(scene: Scene, mesh: TriangleMesh) -> tuple[Scene, TriangleMesh]:

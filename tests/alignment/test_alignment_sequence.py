@@ -1,24 +1,19 @@
-"""Refining all poses of a sequence: alignment of all at once, the pipeline, and the experiment."""
+"""Refining all poses of a sequence: alignment of all at once, and the pipeline."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
-from small_scenes import experiment, make_data
 
 from taichi_mrf.alignment.joint import align_jointly
 from taichi_mrf.alignment.oriented_points import oriented_points
 from taichi_mrf.alignment.recorded import RecordedPoses
 from taichi_mrf.alignment.se3 import moved
-from taichi_mrf.config.schema import Config, EvaluationConfig, PoseConfig, VolumeConfig
+from taichi_mrf.config.schema import Config, EvaluationConfig, PoseConfig
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.experiments.poses import DISTURBED_M, DISTURBED_RAD, halved, run_poses
-from taichi_mrf.experiments.scenes import Scene, SceneView
 from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.inference.keyframe import DepthImage
 from taichi_mrf.inference.schedule import InferProgress, driven
@@ -26,7 +21,6 @@ from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.pipeline import Event, FrameOffered, map_sequence
 from taichi_mrf.mapping.rounds import RoundStep
 from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import PolynomialNoise
 
@@ -47,7 +41,7 @@ def true_frames() -> list[Frame]:
 
 def disturbed(seed: int) -> list[Pose]:
     random = np.random.default_rng(seed)
-    scale = np.repeat([DISTURBED_M, DISTURBED_RAD], 3)
+    scale = np.repeat([0.02, np.radians(1.0)], 3)
     true = [frame.T_world_camera for frame in true_frames()]
     return [true[0], *(moved(T, random.normal(0, scale)) for T in true[1:])]
 
@@ -184,32 +178,3 @@ def test_without_it_nothing_is_moved() -> None:
 def test_only_mrf_maps_can_move_keyframes() -> None:
     with pytest.raises(ConfigError, match=r"poses.refine needs the method mrf"):
         map_sequence(WrongPoses(disturbed(1)), replace(REFINE, method="log_odds"))
-
-
-def test_every_second_pixel_is_the_same_view() -> None:
-    camera = PinholeCamera(width=9, height=7, fx=10.0, fy=11.0, cx=4.2, cy=3.1)
-    depth = np.arange(63, dtype=np.float32).reshape(7, 9)
-    view = SceneView("a", np.eye(4), depth, depth + 1, depth > 3)
-    half = halved(Scene("s", camera, PolynomialNoise((0.01,)), VolumeConfig(), 5.0, [view]))
-    assert half.views[0].measured_m.shape == half.camera.shape == (4, 5)
-    np.testing.assert_allclose(half.camera.rays(), camera.rays()[::2, ::2])
-    np.testing.assert_array_equal(half.views[0].true_m, view.true_m[::2, ::2])
-
-
-def test_the_experiment_goes_on_where_it_was(tmp_path: Path) -> None:
-    data = make_data(tmp_path)
-    options = {"voxel_sizes": (0.1,), "seeds": (0,), "limit": 4}
-    tables, paths = run_poses(experiment(data, tmp_path / "out", **options))
-    (table,) = tables
-    names = [row[2] for row in table.rows]
-    simulated = ["true", "disturbed", "disturbed, refined"]
-    real = ["recorded", "recorded, refined", "recorded, views aligned", "recorded, refined, views aligned"]
-    assert names == [*simulated, *simulated, *real]
-    assert {path.name for path in paths} == {"poses.csv", "poses.tex", "poses.png"}
-    again = experiment(data, tmp_path / "out", **options)
-    run_poses(again)
-    assert again.ledger.computed == 0
-    kept = (tmp_path / "out" / "ledger.jsonl").read_text().splitlines()
-    results = [json.loads(line)["result"] for line in kept[1:]]
-    assert results[0]["translation_m"] == [0.0]
-    assert results[1]["translation_m"][0] > 0

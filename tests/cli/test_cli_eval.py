@@ -58,8 +58,8 @@ def test_the_table_is_printed_beside_the_papers(table3: tuple[Path, str]) -> Non
         # Piped, a row is a line, with the digits of the table.
         (line,) = (each for each in lines if row["voxels"] in each and f" {row['map']} " in each)
         assert f"{float(row['5cm']):.3f} ± {float(row['5cm (std)']):.3f}" in line
-        if (row["map"], row["voxels"]) == ("MRFMap", "5 cm"):
-            assert entry_text(PAPER["MRFMap", 0.05], 3) in line
+        if (row["map"], row["voxels"]) == ("MRFMap, omega", "5 cm"):
+            assert entry_text(PAPER["MRFMap, omega", 0.05], 3) in line
     assert len(rows_of(out)) == 2 * (2 + 4 * 2)
     for words in (
         "Table III",
@@ -111,20 +111,11 @@ def test_ctrl_c_keeps_what_was_found(table3: tuple[Path, str], data: Path, tmp_p
         assert {**row, "map (s)": ""} == {**whole, "map (s)": ""}
 
 
-def test_a_part_of_an_experiment(data: Path, tmp_path: Path) -> None:
-    part = ("trajectory", "--only", "room, 5 Hz", "--limit", "3", "--voxel-sizes", "0.1")
-    printed = evaluated(data, tmp_path, *part)
-    assert "room, 5 Hz" in printed
-    assert "kitchen, 3 Hz" not in printed
-    with open(tmp_path / "trajectory.csv", newline="") as file:
-        assert {row["frames"] for row in csv.DictReader(file)} == {"3"}
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["table3", "--only", "room"], ["--only: eval table3 has no parts"]),
-        (["trajectory", "--only", "attic"], ["--only leaves none of: kitchen, 3 Hz"]),
+        (["peers", "--only", "attic"], ["no part matches attic"]),
         (["table3", "--data", "no/such"], ["no/such", "no such folder", "--data"]),
         (["table1", "--data", "."], ["coffin_world/clean_depth.npz", "No such file"]),
         (["table3", "--limit", "0"], ["--limit must be at least 1, not 0"]),

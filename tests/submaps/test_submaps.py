@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from scipy.spatial import KDTree
 from small_room import VOXEL_SIZE, add, frames
 
+from benchmarks.lab.submaps.equality import KilledOnce, compare, infer_or_be_killed
 from taichi_mrf.cluster.local import LocalProcesses
 from taichi_mrf.cluster.runner import InProcess
 from taichi_mrf.config.inference import InferenceConfig
@@ -24,8 +25,6 @@ from taichi_mrf.config.schema import Config, EvaluationConfig, PoseConfig, Runti
 from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError, DatasetError, MapFileError
-from taichi_mrf.experiments.submaps.costs import MeasuredCost, Place, need
-from taichi_mrf.experiments.submaps.equality import KilledOnce, compare, infer_or_be_killed
 from taichi_mrf.export.fused_surface import FusedSurface
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.chunked import ChunkedMap
@@ -349,20 +348,3 @@ def test_the_command(exchanged: Path, tmp_path: Path) -> None:
     assert wrong.returncode == 2
     assert "submap" in wrong.stderr
     assert wrong.stderr.count("\n") == 1
-
-
-def test_needs_grow_in_proportion() -> None:
-    cost = MeasuredCost(
-        voxel_size=0.05, seconds=2.0, keyframe_mb=5.0, overlap=3.0, rounds=2, submap_m=10.0,
-        keyframes_per_m2=0.5, voxels_per_m2=1000.0, memory_bytes_per_voxel=8.0, store_bytes_per_voxel=1.5,
-    )  # fmt: skip
-    found = need(Place("hall", 1000.0), cost)
-    assert found.keyframes == 500
-    assert found.submaps == 10
-    assert found.core_days == pytest.approx(500 * 3 * 2 * 2.0 / 86400)
-    assert found.task_gb == pytest.approx((100 * 0.5 * 3 * 5e6 + 100 * 1000 * 3 * 8) / 1e9)
-    assert found.store_gb == pytest.approx(1000 * 1000 * 1.5 / 1e9)
-    twice = need(Place("two halls", 2000.0), cost)
-    assert twice.core_days == pytest.approx(2 * found.core_days)
-    assert twice.task_gb == found.task_gb
-    assert need(Place("dense", 1000.0, keyframes_per_m2=1.0), cost).keyframes == 1000

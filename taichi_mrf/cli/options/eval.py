@@ -23,16 +23,8 @@ class Eval:
 
     experiment: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERIMENT")]
     """table1, table2, table3, fig7 and fig10 of MRFMap (Shankar and Michael 2020), stereo of Schauwecker and
-    Zell 2014, exact, which compares MRFMap with the factor graph that it approximates, poses, which disturbs
-    poses and takes the error back, doubt, which maps such poses with their covariance, noise, which learns
-    sigma where a noise file is wrong, rays, which asks how many rays a voxel needs,
-    endless, which freezes what has left the view for an hour, changes, in which things come and go and a
-    person walks through, submaps, which maps the built-in corridor in parts and compares that with the map of
-    a single machine, window, which keeps only what is near the camera in memory, surface, which compares the
-    surface of maps with that of Open3D (extra bench), cells, which judges the probabilities of cells, balls
-    and paths, lidar, which maps a building and judges the map by other scans, sensors, which
-    maps the built-in corridor by a depth camera, by a lidar and by both, trajectory, which tracks cameras
-    without poses and measures their drift, or all."""
+    Zell 2014, exact, which compares MRFMap with the factor graph that it approximates (Dhiman et al. 2014),
+    peers, which compares all mappers that are installed, or all."""
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("runs/eval")
     """Folder for the results; created if needed."""
@@ -50,8 +42,7 @@ class Eval:
     """Use at most N views or folds, for a quick look."""
 
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="PART ...")] = ()
-    """Run only these parts of the experiments trajectory, peers and noise, such as 'room, 10 Hz' or
-    'kitchen*'."""
+    """Run only these parts of the experiment peers, such as 'kitchen*'."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
     """How much is printed."""

@@ -14,11 +14,10 @@ from taichi_mrf.datasets.synthetic.room_furniture import room_scene as furnished
 from taichi_mrf.evaluation.surface_scores import SurfaceTruth, surface_truth
 from taichi_mrf.experiments.exact import room_scene
 from taichi_mrf.experiments.folds import require_views
-from taichi_mrf.experiments.lidar import lidar_scene
 from taichi_mrf.experiments.peers.measuring import Case, keyframes
 from taichi_mrf.experiments.peers.peer import thinned
 from taichi_mrf.experiments.peers.truth import along_rays, of_geometry
-from taichi_mrf.experiments.scenes import Scene, house_scene, kitchen_scene, turned
+from taichi_mrf.experiments.scenes import Scene, house_scene, kitchen_scene, lidar_scene, turned
 
 VIEWS = 20
 """The first so many views of each scene, one after the other as a live run meets them."""
@@ -30,7 +29,7 @@ SURFACE_STRIDE = 2
 """One in so many rows and columns of clean depth gives points of the true surface."""
 
 LIDAR_SIGMA_M = 0.06
-"""The standard deviation of ranges that `eval lidar` learns for voxels of 5 cm of this recording."""
+"""The standard deviation of ranges that `benchmarks.lab lidar` learns for 5 cm voxels of this recording."""
 
 IMAGE = "&width=640&height=480"
 

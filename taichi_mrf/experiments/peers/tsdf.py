@@ -12,9 +12,15 @@ from taichi_mrf.datasets.synthetic.mesh_scene import MeshScene, TriangleMesh
 from taichi_mrf.evaluation.accuracy import OUTLIERS
 from taichi_mrf.experiments.peers.peer import Answers, Cells, Knob, Mesh
 from taichi_mrf.experiments.scenes import Scene, SceneView
-from taichi_mrf.experiments.surface import BLOCK, MOST_BLOCKS
 from taichi_mrf.sensor.camera import pinhole
 from taichi_mrf.system.libraries import library
+
+BLOCK = 16
+"""Voxels along each side of Open3D's blocks."""
+
+MOST_BLOCKS = 2**31 // (16 * BLOCK**3)
+"""Open3D makes triangles through a table with four numbers of 32 bits for each voxel of its blocks, and ends
+the process if that has more than 2 GiB (0.20, on the CPU)."""
 
 FIRST_BLOCKS = 2000
 """Blocks that the grid has room for at first; it grows by itself."""

@@ -7,6 +7,8 @@ and the one that was learnt from the mapped views.
 from collections.abc import Sequence
 from pathlib import Path
 
+from benchmarks.lab.learnt_noise import learnt_law, noise_key, with_law
+from benchmarks.lab.noise_scenes import NoiseCase, cases
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.evaluation.accuracy import judge_view
 from taichi_mrf.evaluation.depth_intervals import interval_error, view_below
@@ -14,9 +16,7 @@ from taichi_mrf.evaluation.tables import Entry, Spread, Table, write_table
 from taichi_mrf.experiments.contenders import Contender, row_name, wavemap
 from taichi_mrf.experiments.folds import Experiment, require_views
 from taichi_mrf.experiments.judging import build
-from taichi_mrf.experiments.learnt_noise import learnt_law, noise_key, with_law
 from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.noise_scenes import NoiseCase, cases
 from taichi_mrf.experiments.scenes import Scene
 from taichi_mrf.experiments.tuning import tuned_contender
 from taichi_mrf.sensor.noise import NoiseModel

@@ -14,12 +14,12 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.lab.cell_truth import hidden_voxels
 from taichi_mrf import MRFMap
 from taichi_mrf.datasets.synthetic.analytic_mesh import scene_mesh
 from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh, load_mesh
 from taichi_mrf.datasets.synthetic.room_furniture import room_scene as furnished_room
 from taichi_mrf.evaluation.accuracy import judge_view
-from taichi_mrf.evaluation.cell_truth import hidden_voxels
 from taichi_mrf.evaluation.occupancy_scores import reliability_bins
 from taichi_mrf.evaluation.occupancy_truth import OccupancyTruth, occupancy_truth
 from taichi_mrf.evaluation.tables import Entry, Table, write_table

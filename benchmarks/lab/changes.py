@@ -1,4 +1,4 @@
-"""`taichi-mrf eval changes`: log-odds tuned on other scenes, all methods on all scripts, and the tables.
+"""`benchmarks.lab changes`: log-odds tuned on other scenes, all methods on all scripts, and the tables.
 
 Each script is run with other places and times than those that the baselines are tuned on (TUNED_ON).
 """
@@ -11,11 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.datasets.synthetic.moving_room import SCRIPTS
-from taichi_mrf.evaluation.moving_truth import MovingTruth
-from taichi_mrf.evaluation.robot_paths import LENGTH_M, PLAY_M, RADIUS_M
-from taichi_mrf.evaluation.tables import Entry, Table, write_table
-from taichi_mrf.experiments.change_runs import (
+from benchmarks.lab.change_runs import (
     FRAMES,
     FRESH_S,
     WATCHED_S,
@@ -27,6 +23,10 @@ from taichi_mrf.experiments.change_runs import (
     run_script,
     static_mrf,
 )
+from benchmarks.lab.moving_truth import MovingTruth
+from benchmarks.lab.robot_paths import LENGTH_M, PLAY_M, RADIUS_M
+from taichi_mrf.datasets.synthetic.moving_room import SCRIPTS
+from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Result
 

@@ -20,6 +20,7 @@ from taichi_mrf.evaluation.surface_scores import SurfaceScores, SurfaceTruth, su
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.folds import Experiment, require_views
 from taichi_mrf.experiments.ledger import Result
+from taichi_mrf.experiments.peers.tsdf import BLOCK, MOST_BLOCKS
 from taichi_mrf.experiments.scenes import Scene, SceneView, coffin_scene, house_scene
 from taichi_mrf.export.surface import smooth_surface
 from taichi_mrf.sensor.noise import NoiseModel
@@ -34,13 +35,6 @@ TRUNCATIONS = (4.0, 8.0, 16.0)
 
 WEIGHTS = (1.0, 2.0, 3.0)
 """and least weights of a voxel, in images."""
-
-BLOCK = 16
-"""Voxels along each side of Open3D's blocks."""
-
-MOST_BLOCKS = 2**31 // (16 * BLOCK**3)
-"""Open3D makes triangles through a table with four numbers of 32 bits for each voxel of its blocks, and ends
-the process if that has more than 2 GiB (0.20, on the CPU)."""
 
 SURFACE, MARGINAL = "MRFMap, surface", "MRFMap, marginal 0.5"
 

@@ -10,23 +10,19 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf import PolynomialNoise, open_dataset
-from taichi_mrf.config.schema import VolumeConfig
+from benchmarks.lab.learnt_noise import learnt_law, with_law
+from benchmarks.lab.lidar_rivals import TUNED, contender_of, in_words, tuned_parameters
+from benchmarks.lab.lidar_roc import roc_table
 from taichi_mrf.datasets.lidar.recording import LIDAR_SIGMA_M
 from taichi_mrf.evaluation.accuracy import judge_view
 from taichi_mrf.evaluation.tables import Entry, Spread, Table, write_table
 from taichi_mrf.experiments.contenders import Contender, lidar_mrf, log_odds, mrf, wavemap
 from taichi_mrf.experiments.folds import Experiment, Scored, flatten, fold_key, require_views
 from taichi_mrf.experiments.judging import build, judge_all
-from taichi_mrf.experiments.learnt_noise import learnt_law, with_law
 from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.lidar_rivals import TUNED, contender_of, in_words, tuned_parameters
-from taichi_mrf.experiments.lidar_roc import roc_table
-from taichi_mrf.experiments.scenes import Scene, SceneView
+from taichi_mrf.experiments.scenes import Scene, lidar_scene
 from taichi_mrf.experiments.tuning import tuned_contender
 from taichi_mrf.methods.wavemap.plug import WavemapConfig
-
-MAX_RANGE_M = 60.0
 
 OPAQUE = "MRFMap, no beam passes"
 
@@ -48,20 +44,6 @@ COLUMNS = {
     "log_likelihood": "log-likelihood",
 }
 """Figure -> heading."""
-
-
-def lidar_scene(data: Path, limit: int | None = None) -> Scene:
-    """The building; its noise is the data sheet's. Raises DatasetError."""
-    dataset = open_dataset(data / "lidar_building")
-    views = []
-    for index in range(len(dataset))[:limit]:
-        frame = dataset.read(index)
-        depth, seen = frame.depth_m, (frame.depth_m > 0) & (frame.depth_m <= MAX_RANGE_M)
-        views.append(
-            SceneView(frame.name, frame.T_world_camera, depth, depth, seen, frame.stamp, camera=frame.camera)
-        )
-    noise = PolynomialNoise((LIDAR_SIGMA_M,))
-    return Scene("lidar_building", dataset.camera, noise, VolumeConfig(), MAX_RANGE_M, views)
 
 
 def run_lidar(experiment: Experiment) -> tuple[list[Table], list[Path]]:

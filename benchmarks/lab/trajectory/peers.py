@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.lab.trajectory.walks import Walk
 from taichi_mrf.errors import TaichiMRFError
-from taichi_mrf.experiments.trajectory.walks import Walk
 from taichi_mrf.geometry.poses import Pose, inverse, tangent_norms
 from taichi_mrf.sensor.camera import pinhole
 from taichi_mrf.sensor.frame import Frame

@@ -1,4 +1,4 @@
-"""Recordings whose noise file is right, and such where it is not: those that `eval noise` maps.
+"""Recordings whose noise file is right, and such where it is not: those that `benchmarks.lab noise` maps.
 
 Real ones have poses that are off and errors that neighbouring pixels share, which no noise file holds.
 """
@@ -18,8 +18,14 @@ from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.experiments.contenders import Contender, lidar_mrf, mrf
 from taichi_mrf.experiments.folds import Experiment
-from taichi_mrf.experiments.lidar import lidar_scene
-from taichi_mrf.experiments.scenes import Scene, SceneView, coffin_scene, house_scene, kitchen_scene
+from taichi_mrf.experiments.scenes import (
+    Scene,
+    SceneView,
+    coffin_scene,
+    house_scene,
+    kitchen_scene,
+    lidar_scene,
+)
 from taichi_mrf.experiments.stereo.street import street_scene, thinned
 from taichi_mrf.sensor.simulate import SimulatedSensor, simulate
 

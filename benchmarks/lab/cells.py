@@ -1,8 +1,8 @@
-"""`taichi-mrf eval cells`: how far the probabilities of cells, balls and paths can be trusted.
+"""`python -m benchmarks.lab cells`: how far the probabilities of cells, balls and paths can be trusted.
 
 Maps of half of the house's views and of views of the built-in room, as they stand and turned, are asked for
 cells of 1, 2, 4 and 8 voxels, and for balls that stand still or move for a metre, at random places in free
-space, by their marginals and calibrated. The truth is that of evaluation/cell_truth.py.
+space, by their marginals and calibrated. The truth is that of cell_truth.py.
 """
 
 from dataclasses import dataclass
@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.lab.cell_truth import NOT_JUDGED, OCCUPIED, SeenSpace, occupied_bricks, true_cells
 from taichi_mrf import MRFMap, open_dataset
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.datasets.synthetic.analytic_mesh import scene_mesh
 from taichi_mrf.datasets.synthetic.mesh_scene import TriangleMesh, load_mesh
-from taichi_mrf.evaluation.cell_truth import NOT_JUDGED, OCCUPIED, SeenSpace, occupied_bricks, true_cells
 from taichi_mrf.evaluation.occupancy_scores import OccupancyScores, reliability_bins, score_occupancy
 from taichi_mrf.evaluation.occupancy_truth import OccupancyTruth, occupancy_truth
 from taichi_mrf.evaluation.pictures.reliability import reliability_figure

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.lab.poses import DISTURBED_M, DISTURBED_RAD, aligned, disturbed, kitchen, room
 from taichi_mrf.alignment.se3 import twist
 from taichi_mrf.evaluation.accuracy import judge_view
 from taichi_mrf.evaluation.depth_intervals import interval_error, view_below
@@ -19,7 +20,6 @@ from taichi_mrf.evaluation.tables import Entry, Spread, Table, write_table
 from taichi_mrf.experiments.contenders import mrf
 from taichi_mrf.experiments.folds import Experiment, fold_key, require_views
 from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.poses import DISTURBED_M, DISTURBED_RAD, aligned, disturbed, kitchen, room
 from taichi_mrf.experiments.scenes import Scene
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.methods.capabilities import AligningMap, can_refine_poses

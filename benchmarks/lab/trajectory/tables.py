@@ -1,4 +1,4 @@
-"""``eval trajectory``: the tables of all walks, of the maps that they give, and of cameras that get lost."""
+"""``benchmarks.lab trajectory``: the tables of all walks, of their maps, and of cameras that get lost."""
 
 import hashlib
 from collections.abc import Callable, Iterator
@@ -7,12 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.config.schema import Config, to_yaml
-from taichi_mrf.errors import ConfigError
-from taichi_mrf.evaluation.tables import Entry, Table, write_table
-from taichi_mrf.experiments.folds import Experiment
-from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.trajectory.following import (
+from benchmarks.lab.trajectory.following import (
     FIGURES,
     TRACKING,
     configurations,
@@ -20,11 +15,11 @@ from taichi_mrf.experiments.trajectory.following import (
     recorded_result,
     tracked_result,
 )
-from taichi_mrf.experiments.trajectory.lost import COLUMNS as LOST_COLUMNS
-from taichi_mrf.experiments.trajectory.lost import NOTES as LOST_NOTES
-from taichi_mrf.experiments.trajectory.lost import PLACES, lost_entries, lost_result
-from taichi_mrf.experiments.trajectory.peers import Open3DTracker, Peer, PeerMissingError
-from taichi_mrf.experiments.trajectory.walks import (
+from benchmarks.lab.trajectory.lost import COLUMNS as LOST_COLUMNS
+from benchmarks.lab.trajectory.lost import NOTES as LOST_NOTES
+from benchmarks.lab.trajectory.lost import PLACES, lost_entries, lost_result
+from benchmarks.lab.trajectory.peers import Open3DTracker, Peer, PeerMissingError
+from benchmarks.lab.trajectory.walks import (
     HEIGHT,
     HOLD_OUT,
     KITCHEN,
@@ -34,6 +29,11 @@ from taichi_mrf.experiments.trajectory.walks import (
     sources,
     walk_name,
 )
+from taichi_mrf.config.schema import Config, to_yaml
+from taichi_mrf.errors import ConfigError
+from taichi_mrf.evaluation.tables import Entry, Table, write_table
+from taichi_mrf.experiments.folds import Experiment
+from taichi_mrf.experiments.ledger import Result
 
 COLUMNS = [
     "walk", "voxels", "poses by", "moves (cm)", "turns (deg)", "frames", "lost", "RMS (cm)", "anchored (cm)",

@@ -6,6 +6,8 @@ import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
+from benchmarks.lab.submaps.costs import MeasuredCost, costs_table
+from benchmarks.lab.submaps.equality import KilledOnce, compare, infer_or_be_killed
 from taichi_mrf import ChunkedMap, Config
 from taichi_mrf.cluster.local import LocalProcesses
 from taichi_mrf.config.schema import EvaluationConfig
@@ -15,8 +17,6 @@ from taichi_mrf.datasets.synthetic.corridor_plan import floor_area_m2
 from taichi_mrf.evaluation.tables import Entry, Table, write_table
 from taichi_mrf.experiments.folds import Experiment
 from taichi_mrf.experiments.ledger import Result
-from taichi_mrf.experiments.submaps.costs import MeasuredCost, costs_table
-from taichi_mrf.experiments.submaps.equality import KilledOnce, compare, infer_or_be_killed
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.capabilities import has_messages
 from taichi_mrf.methods.protocol import OccupancyMap
