@@ -221,7 +221,7 @@ def _work_of(m: MRFMap, created: int) -> Work:
         visible=len(k.visible.slots),
         met=spoken,
         voxel_steps=m.last_voxel_steps,
-        message_bytes=2 if m.config.inference.message_precision == "float16" else 4,
+        message_bytes=2 if m.LIMITS.precision == "float16" else 4,
         trace_in_cache=runtime.active() == "cpu" or runtime.is_software(),
     )
 

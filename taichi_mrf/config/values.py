@@ -10,9 +10,11 @@ import numbers
 import reprlib
 import types
 import typing
+import warnings
 from collections.abc import Sequence
 from typing import Any, Literal, TypeVar
 
+from taichi_mrf.config.gone import note_gone
 from taichi_mrf.errors import ArgumentTypeError, ConfigError
 
 T = TypeVar("T")
@@ -36,9 +38,10 @@ def overridden(config: T, overrides: dict[str, Any], where: str) -> T:
     """A dataclass instance with some fields replaced. Raises ConfigError for an unknown name or a value of
     the wrong type."""
     names = [f.name for f in dataclasses.fields(config)]  # type: ignore[arg-type]
-    for key in overrides:
+    for key, value in overrides.items():
         if key not in names:
-            raise unknown_key(key, names, where)
+            note = note_gone(type(config).__name__, key, value)
+            raise ConfigError(f"{where}: {note}") if note else unknown_key(key, names, where)
     hints = typing.get_type_hints(type(config))
     values = {}
     for key, value in overrides.items():
@@ -60,8 +63,8 @@ _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 100
 def from_dict(cls: type[T], values: Any, where: str) -> T:
     """Build a configuration dataclass from parsed YAML.
 
-    ``where`` is the file, for error messages. Raises ConfigError for an unknown key (naming the
-    nearest), a value of the wrong type, or one outside its range.
+    ``where`` is the file, for error messages. Warns of a parameter that is no more. Raises ConfigError for an
+    unknown key (naming the nearest), a value of the wrong type, or one outside its range.
     """
     if values is None:
         values = {}
@@ -71,7 +74,12 @@ def from_dict(cls: type[T], values: Any, where: str) -> T:
     arguments = {}
     for key, value in values.items():
         if key not in hints:
-            raise unknown_key(key, hints, where)
+            note = note_gone(cls.__name__, str(key), value)
+            if note is None:
+                raise unknown_key(key, hints, where)
+            if note:
+                warnings.warn(f"{where}: {note}", stacklevel=2)
+            continue
         arguments[key] = _convert(value, hints[key], f"{where}: {key}")
     missing = [
         field.name

@@ -25,20 +25,20 @@ from taichi_mrf.experiments.scenes import Scene, SceneView, kitchen_scene
 from taichi_mrf.factor_graph.config import LaserConfig
 from taichi_mrf.factor_graph.graph import FactorGraph
 from taichi_mrf.factor_graph.solve import Solution, energy, solve
+from taichi_mrf.inference.ray_model import AS_PRINTED
 from taichi_mrf.sensor.simulate import KINECT_1
 
 VIEWS = 32
 """Of each scene; every second one is a keyframe."""
 
-AS_PRINTED: dict[str, Any] = {
-    "segment_lengths": False,
-    "free_share": 0.0,
-    "message_clamp": 25.0,
-    "cavity_clamp": 25.0,
-    "message_precision": "float32",
-    "min_length": 0.0,
-}
-"""MRFMap without lengths, floors and clamps: then the average message is all that is approximated."""
+
+class MRFMapAsPrinted(MRFMap):
+    """MRFMap without lengths and clamps; with PRINTED the average message is all that is approximated."""
+
+    LIMITS = AS_PRINTED
+
+
+PRINTED: dict[str, Any] = {"free_share": 0.0}
 
 CERTAIN = 20.0
 """Log-odds of a label, where a method gives nothing but labels; float32 has no probability nearer to 1."""
@@ -54,14 +54,11 @@ PER_RAY: dict[str, LaserConfig] = {
 }
 """Rows of the graph's own methods; the first is what all are compared with."""
 
-MAPS: dict[str, dict[str, Any]] = {
-    "MRFMap": {},
-    "MRFMap, as printed": AS_PRINTED,
-    "MRFMap, as printed, mean of probabilities": AS_PRINTED | {"average": "probability"},
-    "MRFMap, max-product": {"method": "max-product"},
-    "MRFMap, max-product, as printed": AS_PRINTED | {"method": "max-product"},
+MAPS: dict[str, tuple[type[MRFMap], dict[str, Any]]] = {
+    "MRFMap": (MRFMap, {}),
+    "MRFMap, as printed": (MRFMapAsPrinted, PRINTED),
 }
-"""Rows of average messages, and what differs from the defaults."""
+"""Rows of average messages: their class, and what differs from the defaults."""
 
 
 def run_exact(experiment: Experiment) -> tuple[list[Table], list[Path]]:
@@ -118,7 +115,7 @@ class _Judge:
 
     def all_rows(self) -> Result:
         """Figures by row, and the graph's size."""
-        reference_map = self._map({})
+        reference_map = self._map(MRFMap)
         graph = reference_map.factor_graph()
         size_text = f"{graph.edges:,} edges, {graph.nbytes / 1e6:.0f} MB"
         crossed = graph.degrees.to_numpy() > 1  # one is the prior
@@ -142,10 +139,10 @@ class _Judge:
             }
             number += 1
         assert reference is not None
-        for name, parameters in MAPS.items():
+        for name, (made_by, parameters) in MAPS.items():
             self.experiment.report(f"{self.full.name}, {name}", number, total)
             start = time.perf_counter()
-            m = self._map(parameters)
+            m = self._map(made_by, **parameters)
             seconds = time.perf_counter() - start
             marginals = m.occupancy(graph.grid.centres())  # type: ignore[union-attr]
             rows[name] = _difference(graph, marginals, reference, crossed) | {
@@ -158,9 +155,11 @@ class _Judge:
         size = {"beams": graph.beams, "edges": graph.edges, "cells": graph.grid.cells, "bytes": graph.nbytes}
         return {"rows": rows, "graph": size | {"crossed": int(crossed.sum())}}
 
-    def _map(self, parameters: dict[str, Any]) -> MRFMap:
+    def _map(self, made_by: type[MRFMap], **parameters: Any) -> MRFMap:
         scene = self.thinned
-        m = MRFMap(self.voxel_size, scene.noise, volume=scene.volume, max_depth=scene.max_depth, **parameters)
+        m = made_by(
+            self.voxel_size, scene.noise, volume=scene.volume, max_depth=scene.max_depth, **parameters
+        )
         for view in scene.views[::2]:
             m.add_keyframe(view.measured_m, view.T_world_camera, scene.camera, view.name)
         m.infer()

@@ -26,11 +26,12 @@ from taichi_mrf.factor_graph.beams import BrickCells
 from taichi_mrf.factor_graph.graph import FactorGraph, check_capacity
 from taichi_mrf.factor_graph.kernels import count_degrees
 from taichi_mrf.inference.keyframe import Keyframe
+from taichi_mrf.inference.ray_model import END_SIGMAS
 from taichi_mrf.inference.sum_product import TINY
-from taichi_mrf.inference.sweep import LIKELIHOODS
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.log_odds import softplus
 from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, F32Array2, I32Array, Struct, Template
+from taichi_mrf.sensor.forward import AUTO
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.pool import BrickPool
@@ -53,9 +54,6 @@ class _RayFactors(Bundle):
 
     floor: F32
     """Density, per metre, of a measurement that no surface explains."""
-
-    likelihood: Template
-    """AUTO, SEGMENT or CENTRE of sensor/forward.py."""
 
 
 @ti.dataclass
@@ -93,7 +91,7 @@ def _write_voxel(way: Template, factor: Template, voxel: I32, near: F32, far: F3
     density = 0.0
     if far > factor.support:
         density = factor.sensor.likelihood(
-            factor.measured, near, far, factor.noise, factor.model.voxel_size, factor.model.likelihood
+            factor.measured, near, far, factor.noise, factor.model.voxel_size, AUTO
         )
     factor.cells[factor.edge + way.steps] = voxel
     factor.table[factor.entry + way.steps, 0] = -ti.log(density + factor.model.floor)
@@ -239,10 +237,7 @@ class _RaysOf:
         """Count the voxels on every ray's way into ``begins``, or write cells and table (``into``)."""
         cells, table = into or (ti.ndarray(ti.i32, 1), ti.ndarray(ti.f32, (1, 1)))
         config, beam = self.inference, 0
-        model = _RayFactors(
-            self.voxel_size, self.sensor.max_depth, config.end_sigmas, config.floor + TINY,
-            LIKELIHOODS[config.likelihood],
-        )  # fmt: skip
+        model = _RayFactors(self.voxel_size, self.sensor.max_depth, END_SIGMAS, config.floor + TINY)
         for keyframe, pixels in zip(keyframes, chosen, strict=True):
             image, visible, window = keyframe.image, keyframe.visible, keyframe.footprint.window
             if len(pixels) == 0:

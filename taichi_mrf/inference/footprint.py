@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.errors import CapacityError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import TILE, DepthImage, Footprint, NoReturnRays, RayList
 from taichi_mrf.inference.ray_list import listed_ray
+from taichi_mrf.inference.ray_model import END_SIGMAS
 from taichi_mrf.kernels.bundles import Bundle, kernel
 from taichi_mrf.kernels.types import F32, I32, I32Array, IVec3, Struct, Template, Vec3
 from taichi_mrf.sensor.model import Sensor
@@ -35,8 +35,8 @@ def find_footprint(
     T_world_camera: Pose,
     voxel_size: float,
     sensor: SensorConfig,
-    inference: InferenceConfig,
     volume: VolumeConfig,
+    end_sigmas: float = END_SIGMAS,
     beyond_m: float = 0.0,
     scouts: int = 1,
     no_returns: NoReturnRays | None = None,
@@ -48,9 +48,9 @@ def find_footprint(
 
     Raises CapacityError if the space that the image sees has too many bricks at this voxel size.
     """
-    lower_m, upper_m = visible_box(image, T_world_camera, sensor.max_depth, inference.end_sigmas, beyond_m)
+    lower_m, upper_m = visible_box(image, T_world_camera, sensor.max_depth, end_sigmas, beyond_m)
     if no_returns is not None:
-        end = visible_box(no_returns.image, T_world_camera, no_returns.reach_m, inference.end_sigmas)
+        end = visible_box(no_returns.image, T_world_camera, no_returns.reach_m, end_sigmas)
         lower_m, upper_m = np.minimum(lower_m, end[0]), np.maximum(upper_m, end[1])
     window = window_around(lower_m, upper_m, voxel_size, volume)
     if (image.rays == 0 and no_returns is None) or window is None:
@@ -64,11 +64,9 @@ def find_footprint(
         window.viewpoint(T_world_camera),
         _Marks(window.shape_vector, box_lower, box_upper, marks, longest),
     )
-    _mark(
-        rays, image.sensor, view, _Reach(0.0, sensor.max_depth, inference.end_sigmas, beyond_m, scouts), seen
-    )
+    _mark(rays, image.sensor, view, _Reach(0.0, sensor.max_depth, end_sigmas, beyond_m, scouts), seen)
     if no_returns is not None:
-        reach = _Reach(sensor.min_depth, no_returns.reach_m, inference.end_sigmas, 0.0, 1)
+        reach = _Reach(sensor.min_depth, no_returns.reach_m, end_sigmas, 0.0, 1)
         _mark(no_returns.ray_list, no_returns.image.sensor, view, reach, seen)
     crossed = np.flatnonzero(marks).astype(np.int32)
     surface = crossed[marks[crossed] & SURFACE != 0]

@@ -14,9 +14,7 @@ from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import NoiseModel, NoiseTable
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
-from taichi_mrf.sensor.plane_window import PlaneWindow, averaged_on_planes
 from taichi_mrf.sensor.pose_doubt import Covariance, beside_edges, doubtful_table
-from taichi_mrf.sensor.tails import Tails
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.window import Window
 
@@ -71,9 +69,7 @@ class DepthImage:
     is no measurement; ``farthest`` the largest in each tile (rows, columns). ``sensor`` is camera and noise
     as kernels take them, ``rays`` the number of measurements. ``color`` is (H, W, 3) RGB in host memory, 0
     0 0 where a pixel has no colour, or None. ``own`` is what the keyframe states of its measurements.
-    ``window`` is that in which measurements were averaged on planes, None for none. If they were, or the pose
-    is uncertain, ``certain`` is the image as it was measured. ``tails`` are those of the errors in
-    ``sensor``, None for normal ones.
+    If the pose is uncertain, ``certain`` is the image as it was measured.
     """
 
     depth: Resident
@@ -84,9 +80,7 @@ class DepthImage:
     farthest: NDArray[np.float32]
     color: NDArray[np.uint8] | None = None
     own: OwnEvidence = NOTHING
-    window: PlaneWindow | None = None
     certain: "DepthImage | None" = None
-    tails: Tails | None = None
 
     @staticmethod
     def upload(
@@ -95,25 +89,22 @@ class DepthImage:
         noise: NoiseModel,
         color: NDArray[np.uint8] | None = None,
         own: OwnEvidence = NOTHING,
-        window: PlaneWindow | None = None,
-        tails: Tails | None = None,
     ) -> "DepthImage":
         """Put :func:`checked_depth` (H, W), which must not change from now on, where kernels can reach it.
-        ``noise`` is the map's, for what the keyframe does not state itself; ``tails`` are those of its
-        errors. With a ``window`` measurements are averaged on planes. Raises ConfigError if the noise model
-        does not fit the camera."""
+        ``noise`` is the map's, for what the keyframe does not state itself. Raises ConfigError if the noise
+        model does not fit the camera."""
         pose_covariance, own = own.pose_covariance, replace(own, pose_covariance=None)
         table = own.noise_model(noise, depth_m).table(camera)
-        depth, sensor = resident(depth_m.reshape(-1)), _sensor(table, camera, tails)
+        depth, sensor = resident(depth_m.reshape(-1)), table.sensor(camera)
         rays, farthest = int(np.count_nonzero(depth_m)), _farthest(depth_m)
-        image = DepthImage(depth, camera, sensor, table, rays, farthest, color, own, window, tails=tails)
+        image = DepthImage(depth, camera, sensor, table, rays, farthest, color, own)
         return image.doubting(pose_covariance)
 
     def doubting(self, pose_covariance: Covariance | None) -> "DepthImage":
         """The same image from a pose of another covariance (6, 6), None for an exact one: with the noise of
         sensor and pose, and without the pixels that an edge may cross (sensor/pose_doubt.py). Raises
         ConfigError if the noise is not made of polynomials."""
-        image = self.at_certain_pose._on_planes()
+        image = self.at_certain_pose
         if pose_covariance is None:
             return image
         depth_m = np.array(on_host(image.depth)).reshape(image.camera.shape)
@@ -122,25 +113,11 @@ class DepthImage:
         return replace(
             image,
             depth=resident(depth_m.reshape(-1)),
-            sensor=_sensor(table, image.camera, image.tails),
+            sensor=table.sensor(image.camera),
             noise_table=table,
             rays=int(np.count_nonzero(depth_m)),
             own=replace(image.own, pose_covariance=pose_covariance),
-            certain=image.at_certain_pose,
-        )
-
-    def _on_planes(self) -> "DepthImage":
-        """An image as it was measured, with its measurements averaged on planes if they are to be."""
-        if self.window is None:
-            return self
-        depth_m, table = averaged_on_planes(self.to_numpy(), self.camera, self.noise_table, self.window)
-        return replace(
-            self,
-            depth=resident(depth_m.reshape(-1)),
-            sensor=_sensor(table, self.camera, self.tails),
-            noise_table=table,
-            farthest=_farthest(depth_m),
-            certain=self,
+            certain=image,
         )
 
     @property
@@ -162,12 +139,6 @@ class DepthImage:
     def to_numpy(self) -> NDArray[np.float32]:
         """(H, W) axial depth in metres, 0 where there is no measurement."""
         return np.array(on_host(self.at_certain_pose.depth)).reshape(self.camera.shape)
-
-
-def _sensor(table: NoiseTable, camera: Camera, tails: Tails | None) -> Sensor:
-    """Camera and noise as kernels take them."""
-    sensor = table.sensor(camera)
-    return sensor if tails is None else tails.of(sensor)
 
 
 def _farthest(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:

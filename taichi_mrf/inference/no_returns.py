@@ -37,7 +37,7 @@ def no_return_rays(image: DepthImage, config: SensorConfig, bundler: RayBundler)
 
 def send_no_returns(
     no_returns: NoReturnRays, sums: "ti.Ndarray", view: Viewpoint, space: Space,
-    model: RayModel, swept: SweptVoxels, trace: Trace, workers: Workers, retrace: bool,
+    model: RayModel, swept: SweptVoxels, trace: Trace, workers: Workers,
 ) -> None:  # fmt: skip
     """Sum up the messages of rays without a return in ``sums``, as measured ones are in ``swept.sums``.
 
@@ -47,9 +47,9 @@ def send_no_returns(
     sums.fill(0)
     sum_product.send_messages(
         no_returns.ray_list, no_returns.entry_depths, 1, no_returns.image.sensor, view, space,
-        replace(model, max_depth=no_returns.reach_m, floor=0.0, samples=False, thins=False),
+        replace(model, max_depth=no_returns.reach_m, floor=0.0),
         replace(swept, sums=sums),
-        trace, workers, retrace,
+        trace, workers,
     )  # fmt: skip
 
 

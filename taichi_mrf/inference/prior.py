@@ -20,9 +20,11 @@ def prior_probability(inference: InferenceConfig, voxel_size: float) -> float:
     return prior
 
 
-def log_odds_without_bricks(inference: InferenceConfig, voxel_size: float) -> tuple[float, float]:
+def log_odds_without_bricks(
+    inference: InferenceConfig, voxel_size: float, clamp: float
+) -> tuple[float, float]:
     """Log-odds of places where no brick is allocated: the prior's, where no ray came, and those of a place
-    that rays crossed without a surface near."""
+    that rays crossed without a surface near; ``clamp`` bounds messages."""
     prior = prior_probability(inference, voxel_size)
     prior_log_odds = math.log(prior / (1 - prior))
-    return prior_log_odds, prior_log_odds - inference.message_clamp
+    return prior_log_odds, prior_log_odds - clamp

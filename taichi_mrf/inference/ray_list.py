@@ -43,29 +43,6 @@ def block_of(ray: I32, width: I32):
     return pixel % width, pixel // width, 1 << (level + 1) // 2, 1 << level // 2
 
 
-@dataclass(frozen=True)
-class RayLattice(Bundle):
-    """One in ``stride`` neighbouring rays of a list, spread over rows and columns. Which ones follows from
-    their blocks of pixels, so they are the same in every map and after every edit."""
-
-    stride: I32
-    """1 takes every ray."""
-
-    row_step: I32
-    """A row's rays are shifted by so many against those of the row above."""
-
-    @staticmethod
-    def of(stride: int) -> "RayLattice":
-        """The most even one with this stride."""
-        return RayLattice(stride, math.isqrt(stride))
-
-    @ti.func
-    def holds(self, rays: Template, i: I32, width: I32) -> I32:
-        """Whether ray i of a list (keyframe.RayList) of an image with ``width`` columns is one of them."""
-        u, v, wide, high = block_of(rays.blocks[i], width)
-        return (u // wide + self.row_step * (v // high)) % self.stride == 0
-
-
 @ti.func
 def listed_ray(rays: Template, i: I32, sensor: Template, view: Template):
     """Ray i of a list (keyframe.RayList): the ray through the middle of its block, the noise there, and how
@@ -103,8 +80,7 @@ class RayBundler:
         counts, widest = np.zeros(tiles, np.int32), np.ones(tiles, np.int32)
         rule = _MergeRule(stride, AGREE_VOXELS * self.voxel_size, AGREE_SIGMAS)
         blocks_of_pixels = _PixelBlocks(self._nearest, self._farthest, self._mean, self._level)
-        thin = self.inference.ray_choice == "thin"
-        _choose(image.depth, image.sensor, rule, blocks_of_pixels, counts, thin)
+        _choose(image.depth, image.sensor, rule, blocks_of_pixels, counts)
         number = int(counts.sum())
         blocks, depth = ti.ndarray(ti.i32, max(1, number)), ti.ndarray(ti.f32, max(1, number))
         first = np.cumsum(counts, dtype=np.int32) - counts
@@ -149,13 +125,6 @@ class _PixelBlocks(Bundle):
 
 
 @ti.func
-def _is_thinned_out(u: I32, v: I32, measured: F32, stride_metres: F32) -> I32:
-    """Whether pixel (u, v) lies beside the grid for its depth."""
-    stride = ti.max(1, ti.cast(stride_metres / measured, ti.i32))
-    return u % stride != 0 or v % stride != 0
-
-
-@ti.func
 def _merge(rule: Template, blocks: Template, sensor: Template, u: I32, v: I32, n: I32):
     """Make one block of level ``n`` at pixel (u, v) of the two below it, if they are there and agree."""
     wide, high = 1 << (n + 1) // 2, 1 << n // 2
@@ -183,7 +152,7 @@ def _merge(rule: Template, blocks: Template, sensor: Template, u: I32, v: I32, n
 
 @kernel
 def _choose(
-    depth: F32Array, sensor: Sensor, rule: _MergeRule, blocks: _PixelBlocks, counts: I32Array, thin: Template
+    depth: F32Array, sensor: Sensor, rule: _MergeRule, blocks: _PixelBlocks, counts: I32Array
 ) -> None:
     """Give each pixel the level of the block that begins there, or -1 if none does; count them by tile.
 
@@ -205,17 +174,13 @@ def _choose(
                     blocks.farthest[i] = measured
                     blocks.mean[i] = measured
                     blocks.level[i] = 0 if measured > 0.0 else -1
-                    if ti.static(thin):  # noqa: SIM102 (a static condition stands alone)
-                        if measured > 0.0 and _is_thinned_out(u, v, measured, rule.stride_metres):
-                            blocks.level[i] = -1
-            if ti.static(not thin):
-                for n in range(1, LEVELS + 1):
-                    wide, high = 1 << (n + 1) // 2, 1 << n // 2
-                    for block in range(TILE * TILE >> n):
-                        u = left + block % (TILE // wide) * wide
-                        v = top + block // (TILE // wide) * high
-                        if u + wide <= right and v + high <= bottom:
-                            _merge(rule, blocks, sensor, u, v, n)
+            for n in range(1, LEVELS + 1):
+                wide, high = 1 << (n + 1) // 2, 1 << n // 2
+                for block in range(TILE * TILE >> n):
+                    u = left + block % (TILE // wide) * wide
+                    v = top + block // (TILE // wide) * high
+                    if u + wide <= right and v + high <= bottom:
+                        _merge(rule, blocks, sensor, u, v, n)
             rays = 0
             for v in range(top, bottom):
                 for u in range(left, right):

@@ -2,10 +2,39 @@
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
-from taichi_mrf.inference.ray_list import RayLattice
 from taichi_mrf.kernels.bundles import Bundle
 from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, I64Array, Template, Vec4Array
+
+END_SIGMAS = 3.0
+"""A ray ends this many sigma behind its measurement, and bricks are allocated this many sigma around it."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Bounds that keep a few measurements from overruling all others, and what else all maps share."""
+
+    message: float = 6.9
+    """Bound on the log-odds of a keyframe's message to a voxel: a probability of 0.999."""
+
+    cavity: float = 9.2
+    """Bound on the log-odds of a voxel's belief minus the keyframe's own message."""
+
+    length: float = 0.02
+    """A voxel keeps its old message if a keyframe's rays cross it for less than this length in total, in
+    voxel sizes."""
+
+    segment_lengths: bool = True
+    """See RayModel."""
+
+    precision: Literal["float16", "float32"] = "float16"
+    """Storage of messages. float16 halves their memory and changes beliefs by at most 0.006."""
+
+
+AS_PRINTED = Limits(message=25.0, cavity=25.0, length=0.0, segment_lengths=False, precision="float32")
+"""Next to no bounds, and no lengths: the equations as the paper prints them, for comparisons with exact
+inference."""
 
 
 @dataclass(frozen=True)
@@ -33,35 +62,9 @@ class RayModel(Bundle):
     passes: Template
     """Whether that is more than 0."""
 
-    likelihood: Template
-    """AUTO, SEGMENT or CENTRE of sensor/forward.py."""
-
     segment_lengths: Template
-    """Whether a voxel counts by the length of the ray's segment in it, or once."""
-
-    log_average: Template
-    """Whether rays' log-odds are averaged, or their probabilities."""
-
-    maximise: Template
-    """Whether to maximise over explanations instead of summing them."""
-
-    sample: RayLattice
-    """The rays that are followed at all,"""
-
-    samples: Template
-    """which are not all."""
-
-    scouts: RayLattice
-    """Of them those that are followed through free space, where they count for the others,"""
-
-    thins: Template
-    """which are not all. The others begin near their measurements:"""
-
-    clear_sigmas: F32
-    """so many sigmas,"""
-
-    clear_voxels: F32
-    """and so many voxel sizes before them."""
+    """Whether a voxel counts by the length of the ray's segment in it (section IV-A), or once, as eqs. 11 to
+    14 are printed."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ class Trace(Bundle):
     """(workers * longest): the voxel of each step."""
 
     step: Vec4Array
-    """(workers * longest): length, 1 - m to its power, nu * vis, before; max_product.see_best has its own."""
+    """(workers * longest): length, 1 - m to its power, nu * vis, before."""
 
     longest: I32
     """No ray crosses more voxels than this."""

@@ -106,14 +106,13 @@ def sweep_steps(
     keyframes, on StopRequestedError.
     """
     begin = time.perf_counter()
-    damping = sweeper.inference.damping
     residual, rays, done, complete = 0.0, 0, 0, True
     for sweep in range(1, sweeps + 1):
         moved = seen = 0
         swept: list[Keyframe] = []
         try:
             for number, keyframe in enumerate(keyframes, start=1):
-                if not _has_converged(keyframe, pool, damping) and sweeper.sweep(keyframe, pool):
+                if not _has_converged(keyframe, pool) and sweeper.sweep(keyframe, pool):
                     swept.append(keyframe)
                 rays += keyframe.rays
                 yield InferProgress(sweep, sweeps, number, len(keyframes), keyframe.rays)
@@ -134,10 +133,10 @@ def sweep_steps(
     return InferReport(time.perf_counter() - begin, residual, done, rays, complete)
 
 
-def _has_converged(keyframe: Keyframe, pool: BrickPool, damping: float) -> bool:
+def _has_converged(keyframe: Keyframe, pool: BrickPool) -> bool:
     """Whether a sweep over this keyframe would send the very messages that it has sent.
 
     They follow from the cavity, which is what all *others* believe: if no belief has changed since this
     keyframe's own last sweep, the cavity has not.
     """
-    return damping == 0 and keyframe.messages is not None and keyframe.revision == pool.revision
+    return keyframe.messages is not None and keyframe.revision == pool.revision

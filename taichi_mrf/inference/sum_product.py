@@ -28,16 +28,12 @@ section III, for the voxels 1 .. N of one ray, ordered from the camera:
 What is in a voxel may fill only a part of it. With the chance s that a ray passes through an occupied voxel
 (``pass_through``), m becomes (1 - s) m in all of these, and a voxel's message for occupied has the share s of
 that for empty. In the paper s is 0.
-
-With ``maximise`` sums over explanations become maxima: max_product.py.
 """
 
 from dataclasses import dataclass
 
 from taichi_mrf.inference.accumulators import add_message, length_sum, mean_message
-from taichi_mrf.inference.first_occupied import NEVER
 from taichi_mrf.inference.keyframe import RayList
-from taichi_mrf.inference.max_product import best_message, cost, see_best
 from taichi_mrf.inference.ray_list import listed_ray
 from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace
 from taichi_mrf.inference.workers import Workers
@@ -55,6 +51,7 @@ from taichi_mrf.kernels.types import (
     Vec3,
     Vec4,
 )
+from taichi_mrf.sensor.forward import AUTO
 from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
@@ -70,7 +67,7 @@ class ForwardPass(Struct):
     """A ray on its way from the camera, in front of voxel i."""
 
     visibility: F32  # vis_i
-    explained: F32  # before_i; for max-product the least cost of such an explanation
+    explained: F32  # before_i
     first: F32  # depth at which the ray enters its first voxel
     voxels: I32  # i
 
@@ -87,7 +84,6 @@ class Cast(Bundle):
     support: F32  # depth before which no surface can have made the measurement
     voxels_per_depth: F32  # length of the ray, in voxels, for one metre of depth
     pixels: F32  # for how many pixels it stands
-    thinned_until: F32  # depth up to which it stands for its neighbours too
 
 
 @kernel
@@ -116,14 +112,13 @@ def cavity(
 def send_messages(
     rays: RayList, entry_depths: F32Array, entry_depths_known: I32,
     sensor: Sensor, view: Viewpoint, space: Space,
-    model: RayModel, swept: SweptVoxels, trace: Trace, workers: Workers, retrace: Template,
+    model: RayModel, swept: SweptVoxels, trace: Trace, workers: Workers,
 ) -> None:  # fmt: skip
     """Follow the rays of a keyframe out and back, and sum up their messages to each voxel.
 
     A worker follows one ray after the other. It writes each ray's steps into its own part of the trace and
-    reads them on the way back; with ``retrace``, which cannot maximise, it walks along the ray a second time
-    instead. ``entry_depths`` (rays) holds the depth at which each ray meets its first brick: the first sweep
-    finds it, and later sweeps start there, unless the model samples rays.
+    reads them on the way back. ``entry_depths`` (rays) holds the depth at which each ray meets its first
+    brick: the first sweep finds it, and later sweeps start there.
     """
     if ti.static(workers.block > 0):
         ti.loop_config(block_dim=workers.block)
@@ -136,21 +131,12 @@ def send_messages(
             trace.steps[worker] = 0
         for turn in range(turns):
             i = workers.ray(worker, turn)
-            wanted = i < rays.number
-            if ti.static(model.samples):  # noqa: SIM102 (a static condition stands alone)
-                if wanted:
-                    wanted = model.sample.holds(rays, i, sensor.camera.width)
-            if wanted:
+            if i < rays.number:
                 measured = rays.depth[i]
                 ray, noise, pixels = listed_ray(rays, i, sensor, view)
-                voxels_per_depth = ray.direction.norm()
-                thinned_until = 0.0
-                if ti.static(model.thins):
-                    thinned_until = sensor.nearest_depth(measured, noise, model.clear_sigmas)
-                    thinned_until -= model.clear_voxels / voxels_per_depth
                 cast = Cast(
                     model, swept, sensor, measured, noise, sensor.support(measured, noise),
-                    voxels_per_depth, ti.cast(pixels, ti.f32), thinned_until,
+                    ray.direction.norm(), ti.cast(pixels, ti.f32),
                 )  # fmt: skip
 
                 # The ray ends where its measurement carries no more evidence, or where the map ends.
@@ -158,50 +144,29 @@ def send_messages(
                 begin, end = 0.0, ti.min(last, model.max_depth)
                 if entry_depths_known == 1:
                     begin = entry_depths[i]
-                if ti.static(model.thins):  # noqa: SIM102
-                    if not model.scouts.holds(rays, i, sensor.camera.width):
-                        begin = ti.max(begin, thinned_until)
                 clip(ray, begin, end, space.lower, space.upper)
 
                 # Forward: eqs. 4 and 11 for each voxel, from the camera outwards.
-                ahead = ForwardPass(1.0, NEVER if ti.static(model.maximise) else 0.0, end, 0)
+                ahead = ForwardPass(1.0, 0.0, end, 0)
                 first_step = worker * trace.longest
-                if ti.static(retrace):
-                    walk_voxels(ray, begin, end, space, see_voxel, ahead, cast)
-                else:
-                    walk_voxels(ray, begin, end, space, _trace_voxel, ahead, _Traced(cast, trace, first_step))
+                walk_voxels(ray, begin, end, space, _trace_voxel, ahead, _Traced(cast, trace, first_step))
                 if entry_depths_known == 0:
                     entry_depths[i] = ahead.first
                 trace.steps[worker] += ahead.voxels
 
                 # What gets through to where the map ends may have met its surface there.
-                beyond = 0.0
+                behind = 0.0
                 if end < last:
-                    beyond = sensor.likelihood_beyond(measured, end, noise)
+                    behind = ahead.visibility * sensor.likelihood_beyond(measured, end, noise)
 
                 # Backward: eqs. 13 and 14 for each voxel, from the far end.
-                if ti.static(model.maximise):
-                    behind = cost(beyond, model.floor + TINY)
-                    for step in range(ahead.voxels):
-                        j = first_step + ahead.voxels - 1 - step
-                        message = best_message(trace.step[j], behind, model.clamp, model.log_average)
-                        _add(cast, trace.voxel[j], trace.step[j][0], message)
-                elif ti.static(retrace):
-                    # From the near end again: behind a voxel is what neither it nor those before it explain.
-                    total = ahead.explained + ahead.visibility * beyond
-                    again = ForwardPass(1.0, 0.0, end, 0)
-                    if ahead.voxels > 0:
-                        walk_voxels(
-                            ray, ahead.first, end, space, _tell_voxel, again, _Retraced(cast, total, largest)
-                        )
-                else:
-                    behind = ahead.visibility * beyond
-                    for step in range(ahead.voxels):
-                        j = first_step + ahead.voxels - 1 - step
-                        free, density, before = trace.step[j][1], trace.step[j][2], trace.step[j][3]
-                        message = _message(model, before, density, behind, free, largest)
-                        behind += (1.0 - free) * density
-                        _add(cast, trace.voxel[j], trace.step[j][0], message)
+                for step in range(ahead.voxels):
+                    j = first_step + ahead.voxels - 1 - step
+                    weight, free = trace.step[j][0], trace.step[j][1]
+                    density, before = trace.step[j][2], trace.step[j][3]
+                    message = _message(model, before, density, behind, free, largest)
+                    behind += (1.0 - free) * density
+                    add_message(swept.sums, trace.voxel[j], weight, message, swept.scale)
 
 
 @dataclass(frozen=True)
@@ -213,15 +178,6 @@ class _Traced(Bundle):
     first_step: I32
 
 
-@dataclass(frozen=True)
-class _Retraced(Bundle):
-    """A ray that is followed a second time, with all that its voxels explain together."""
-
-    cast: Cast
-    total: F32
-    largest: F32
-
-
 @ti.func
 def crossing(cast: Template, voxel: I32, near: F32, far: F32) -> Vec3:
     """l_i, log(1 - m_i)^l_i and nu_i of a voxel, in which the ray is from depth ``near`` to ``far``."""
@@ -231,9 +187,7 @@ def crossing(cast: Template, voxel: I32, near: F32, far: F32) -> Vec3:
         log_free *= length
     density = 0.0
     if far > cast.support:
-        density = cast.sensor.likelihood(
-            cast.measured, near, far, cast.noise, cast.model.voxel_size, cast.model.likelihood
-        )
+        density = cast.sensor.likelihood(cast.measured, near, far, cast.noise, cast.model.voxel_size, AUTO)
     return Vec3(length, log_free, density)
 
 
@@ -252,43 +206,16 @@ def _explain(ahead: Template, met: Vec3) -> Vec4:
 
 
 @ti.func
-def see_voxel(ahead: Template, cast: Template, voxel: I32, near: F32, far: F32):
-    """One voxel of the forward pass, of which nothing is written down."""
-    if ahead.voxels == 0:
-        ahead.first = near
-    _explain(ahead, crossing(cast, voxel, near, far))
-    ahead.voxels += 1
-    return 1
-
-
-@ti.func
 def _trace_voxel(ahead: Template, traced: Template, voxel: I32, near: F32, far: F32):
     """One voxel of the forward pass, written down in the trace."""
     met = crossing(traced.cast, voxel, near, far)
-    met[0] = _weight(traced.cast, met[0], far)
+    met[0] = _weight(traced.cast, met[0])
     if ahead.voxels == 0:
         ahead.first = near
     j = traced.first_step + ahead.voxels
     traced.trace.voxel[j] = voxel
-    if ti.static(traced.cast.model.maximise):
-        floor = traced.cast.model.floor + TINY
-        traced.trace.step[j] = see_best(ahead.explained, met[0], met[1], met[2], floor)
-    else:
-        traced.trace.step[j] = _explain(ahead, met)
+    traced.trace.step[j] = _explain(ahead, met)
     ahead.voxels += 1
-    return 1
-
-
-@ti.func
-def _tell_voxel(again: Template, retraced: Template, voxel: I32, near: F32, far: F32):
-    """One voxel of the second way along a ray."""
-    cast = retraced.cast
-    met = crossing(cast, voxel, near, far)
-    met[0] = _weight(cast, met[0], far)
-    step = _explain(again, met)
-    behind = ti.max(0.0, retraced.total - again.explained)
-    message = _message(cast.model, step[3], step[2], behind, step[1], retraced.largest)
-    _add(cast, voxel, step[0], message)
     return 1
 
 
@@ -299,10 +226,7 @@ def _message(model: Template, before: F32, here: F32, behind: F32, free: F32, la
     empty = empty_message(before, behind, free, model.floor)
     if ti.static(model.passes):
         occupied += model.pass_through * (empty - occupied)
-    message = occupied / (occupied + empty)
-    if ti.static(model.log_average):
-        message = clamped_log_odds(occupied, empty, model.clamp, largest)
-    return message
+    return clamped_log_odds(occupied, empty, model.clamp, largest)
 
 
 @ti.func
@@ -321,54 +245,34 @@ def empty_message(before: F32, behind: F32, free: F32, floor: F32) -> F32:
 
 
 @ti.func
-def _weight(cast: Template, length: F32, far: F32) -> F32:
-    """Section IV-A: a ray's message counts by its length in the voxel, and by the pixels it stands for, those
-    of neighbours included that are not followed where it is."""
+def _weight(cast: Template, length: F32) -> F32:
+    """Section IV-A: a ray's message counts by its length in the voxel, and by the pixels it stands for."""
     weight = cast.pixels
     if ti.static(cast.model.segment_lengths):
         weight *= length
-    if ti.static(cast.model.thins):  # noqa: SIM102
-        if far <= cast.thinned_until:
-            weight *= ti.cast(cast.model.scouts.stride, ti.f32)
     return weight
-
-
-@ti.func
-def _add(cast: Template, voxel: I32, weight: F32, message: F32):
-    """Add a ray's message to those of the others."""
-    add_message(cast.swept.sums, voxel, weight, message, cast.swept.scale)
 
 
 @kernel
 def finish(
     slots: I32Array, belief: F32Array, messages: AnyArray, sums: I64Array, scale: F32,
-    clamp: F32, damping: F32, min_length: F32, moved: I32Array, log_average: Template,
-    correlation: F32, repeated: Template, strip: Template,
+    clamp: F32, least_length: F32, moved: I32Array, strip: Template,
 ) -> None:  # fmt: skip
     """Renew a keyframe's messages with the rays' averages (eq. 7), and the beliefs with them (eq. 8).
 
     ``slots`` (n) are the visible bricks' places in the pool, ``belief`` (pool * 512) and ``messages`` (n *
-    512) log-odds, ``sums`` (n * 512) those of the rays. A voxel that rays crossed for ``min_length`` voxel
-    sizes or less keeps its message. ``damping`` is the share of the old message that stays. ``moved`` (n)
-    counts, for each brick, the voxels whose marginal changed by more than MOVED. With ``repeated`` an average
-    counts as often as rays whose errors have this ``correlation`` do (:func:`independent_rays`).
+    512) log-odds, ``sums`` (n * 512) those of the rays. A voxel that rays crossed for ``least_length`` voxel
+    sizes or less keeps its message. ``moved`` (n) counts, for each brick, the voxels whose marginal changed
+    by more than MOVED.
     """
     for part in range(slots.shape[0] * (VOXELS // strip)):
         i, j = strip_begin(part, slots, strip)
         count = 0
         for k in range(strip):
             packed = sums[i + k]
-            if packed != 0 and length_sum(packed, scale) > min_length:
-                mean = mean_message(packed)
-                log_odds = clamp * (2.0 * mean - 1.0)
-                if not ti.static(log_average):
-                    log_odds = ti.log(ti.max(mean, TINY) / ti.max(1.0 - mean, TINY))
-                    log_odds = ti.max(-clamp, ti.min(clamp, log_odds))
-                if ti.static(repeated):
-                    log_odds *= independent_rays(length_sum(packed, scale), correlation)
-                    log_odds = ti.max(-clamp, ti.min(clamp, log_odds))
+            if packed != 0 and length_sum(packed, scale) > least_length:
                 old = ti.cast(messages[i + k], ti.f32)
-                messages[i + k] = old + (1.0 - damping) * (log_odds - old)
+                messages[i + k] = old + (clamp * (2.0 * mean_message(packed) - 1.0) - old)
                 # The belief takes what was stored, not what was meant, so that it stays the sum of messages.
                 change = ti.cast(messages[i + k], ti.f32) - old
                 before = belief[j + k]
@@ -376,11 +280,3 @@ def finish(
                 count += moves(before, change)
         if count > 0:
             moved[i // VOXELS] += count
-
-
-@ti.func
-def independent_rays(rays: F32, correlation: F32) -> F32:
-    """How many independent rays say as much as ``rays`` of one image, of which any two have errors of this
-    correlation: n / (1 + correlation (n - 1)). 1 ray for a correlation of 1, at most 1 / correlation."""
-    n = ti.max(1.0, rays)
-    return n / (1.0 + correlation * (n - 1.0))

@@ -13,11 +13,9 @@ from taichi_mrf.inference import sum_product
 from taichi_mrf.inference.accumulators import finest_scale
 from taichi_mrf.inference.keyframe import Keyframe, RayList
 from taichi_mrf.inference.no_returns import send_no_returns, take_where_unmeasured
-from taichi_mrf.inference.ray_list import RayLattice
-from taichi_mrf.inference.ray_model import RayModel, SweptVoxels, Trace, log_pass
+from taichi_mrf.inference.ray_model import END_SIGMAS, Limits, RayModel, SweptVoxels, Trace, log_pass
 from taichi_mrf.inference.workers import Workers, workers_for
 from taichi_mrf.kernels.resident import on_host, vec4_array
-from taichi_mrf.sensor.forward import AUTO, CENTRE, SEGMENT
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
@@ -26,22 +24,15 @@ from taichi_mrf.voxels.strips import strip_length
 from taichi_mrf.voxels.traversal import FAR, Space, Viewpoint
 from taichi_mrf.voxels.window import WindowIndex
 
-LIKELIHOODS = {"auto": AUTO, "segment": SEGMENT, "centre": CENTRE}
-
-CLEAR_VOXELS = 2.0
-"""How far before its measurement, in voxel sizes and beyond ``end_sigmas``, every ray is followed."""
-
 TRACE_BYTES = 20
 """Bytes of one step of a ray in the trace."""
 
 
-def least_log_odds(inference: InferenceConfig, prior_log_odds: float) -> float:
+def least_log_odds(free_share: float, clamp: float, prior_log_odds: float) -> float:
     """How surely free a voxel can be for a keyframe's rays, as log-odds: by ``free_share``, and never beyond
-    the clamp."""
-    chance = inference.free_share / (1.0 + math.exp(-prior_log_odds))
-    if chance == 0:
-        return -inference.cavity_clamp
-    return max(-inference.cavity_clamp, math.log(chance / (1.0 - chance)))
+    the ``clamp``."""
+    chance = free_share / (1.0 + math.exp(-prior_log_odds))
+    return -clamp if chance == 0 else max(-clamp, math.log(chance / (1.0 - chance)))
 
 
 def unknown_entry_depths(rays: RayList) -> "ti.Ndarray":
@@ -75,8 +66,14 @@ class Sweeper:
     """Runs sweeps; owns the scratch that all keyframes share, which grows to the largest of them."""
 
     def __init__(
-        self, voxel_size: float, sensor: SensorConfig, inference: InferenceConfig, volume: VolumeConfig
+        self,
+        voxel_size: float,
+        sensor: SensorConfig,
+        inference: InferenceConfig,
+        volume: VolumeConfig,
+        limits: Limits,
     ) -> None:
+        self.limits = limits
         self.voxel_size, self.sensor, self.inference, self.volume = voxel_size, sensor, inference, volume
         self.index = WindowIndex()
         self.log_free = ti.ndarray(ti.f32, VOXELS)
@@ -102,8 +99,6 @@ class Sweeper:
     @property
     def pass_through(self) -> float:
         """Chance that a ray passes through an occupied voxel."""
-        if self.inference.method == "max-product":
-            return 0.0
         return self.inference.pass_through or 0.0
 
     @property
@@ -117,42 +112,37 @@ class Sweeper:
         False if it sees no brick. The host does not wait for the device: call :meth:`take_moved` before the
         next sweep over the same keyframe.
         """
-        config, visible = self.inference, keyframe.visible
+        visible, limits = keyframe.visible, self.limits
         keyframe.withdrawn = False
         if len(visible.slots) == 0:
             return False
-        first = keyframe.change_count_at_last_sweep is None
-        messages, bricks, model = keyframe.messages, visible.on_device(), self.model(first)
+        messages, bricks, model = keyframe.messages, visible.on_device(), self.model()
 
         # Eq. 6: the belief of each voxel without this keyframe's message.
         with self.casting(keyframe, pool.total, messages, pool.prior_log_odds) as cast:
             # Eqs. 4, 11, 13 and 14: the rays' messages.
-            retrace = config.return_pass == "retrace" and not model.maximise
             if keyframe.no_returns is not None:
-                parts = (cast.view, cast.space, model, cast.swept, cast.trace, cast.workers, retrace)
+                parts = (cast.view, cast.space, model, cast.swept, cast.trace, cast.workers)
                 send_no_returns(keyframe.no_returns, self._second_sums(), *parts)
             sum_product.send_messages(
                 keyframe.ray_list, keyframe.entry_depths, int(keyframe.entry_depths_known),
                 keyframe.image.sensor, cast.view, cast.space, model, cast.swept, cast.trace, cast.workers,
-                retrace,
             )  # fmt: skip
-            keyframe.entry_depths_known = not model.samples
+            keyframe.entry_depths_known = True
             if keyframe.no_returns is not None:
                 take_where_unmeasured(
                     len(visible.slots) * VOXELS, cast.swept.sums, self._second_sums(),
-                    cast.swept.scale, config.min_length,
+                    cast.swept.scale, limits.length,
                 )  # fmt: skip
 
         # Eqs. 7 and 8: the average over rays is the keyframe's new message, and changes the beliefs.
         bricks.moved.fill(0)  # a NumPy array's method or a Taichi array's
         sum_product.finish(
-            bricks.slots, pool.total, messages, cast.swept.sums, cast.swept.scale, config.message_clamp,
-            config.damping, config.min_length, bricks.moved, model.log_average,
-            config.ray_correlation, config.ray_correlation < 1, strip_length(),
+            bricks.slots, pool.total, messages, cast.swept.sums, cast.swept.scale, limits.message,
+            limits.length, bricks.moved, strip_length(),
         )  # fmt: skip
         pool.revision += 1
-        # Rays that were left out have more to say.
-        keyframe.revision = -1 if model.samples else pool.revision
+        keyframe.revision = pool.revision
         return True
 
     def casting(
@@ -169,7 +159,7 @@ class Sweeper:
         swept = SweptVoxels(self.log_free, self.sums, self._scale(keyframe))
         sum_product.cavity(
             bricks.slots, belief, messages,
-            least_log_odds(self.inference, prior_log_odds), self.inference.cavity_clamp,
+            least_log_odds(self.inference.free_share, self.limits.cavity, prior_log_odds), self.limits.cavity,
             log_pass(self.pass_through), self.pass_through > 0,
             swept.log_free, swept.sums, strip_length(),
         )  # fmt: skip
@@ -183,30 +173,17 @@ class Sweeper:
             lambda: self.index.clear(window, bricks.cells),
         )
 
-    def model(self, first_sweep: bool = False) -> RayModel:
-        """What the rays of all keyframes share; in a keyframe's first sweep they may be fewer."""
-        config = self.inference
-        sample = config.first_sweep_stride if first_sweep else 1
-        # A sample is followed all the way: it has few enough rays.
-        scouts = config.free_space_stride if sample == 1 else 1
+    def model(self) -> RayModel:
+        """What the rays of all keyframes share."""
         return RayModel(
             voxel_size=self.voxel_size,
             max_depth=self.sensor.max_depth,
-            end_sigmas=config.end_sigmas,
-            floor=config.floor,
-            clamp=config.message_clamp,
+            end_sigmas=END_SIGMAS,
+            floor=self.inference.floor,
+            clamp=self.limits.message,
             pass_through=self.pass_through,
             passes=self.pass_through > 0,
-            likelihood=LIKELIHOODS[config.likelihood],
-            segment_lengths=config.segment_lengths,
-            log_average=config.average == "log_odds",
-            maximise=config.method == "max-product",
-            sample=RayLattice.of(sample),
-            samples=sample > 1,
-            scouts=RayLattice.of(scouts),
-            thins=scouts > 1,
-            clear_sigmas=config.end_sigmas,
-            clear_voxels=CLEAR_VOXELS,
+            segment_lengths=self.limits.segment_lengths,
         )
 
     def take_moved(self, keyframe: Keyframe, pool: BrickPool) -> NDArray[np.int32]:
@@ -233,9 +210,7 @@ class Sweeper:
             if no_returns is not None:
                 rays, widest = rays + no_returns.image.rays, max(widest, no_returns.ray_list.widest)
             bricks = window.bricks_of(visible.cells)
-            finest = finest_scale(image.camera, rays, keyframe.T_world_camera, window, bricks, widest)
-            # A pixel counts for no more than so many.
-            visible.scale = finest / 2.0 ** math.ceil(math.log2(self.inference.free_space_stride))
+            visible.scale = finest_scale(image.camera, rays, keyframe.T_world_camera, window, bricks, widest)
         return visible.scale
 
     def _reserve(self, bricks: int, steps: int, workers: int) -> None:

@@ -11,7 +11,7 @@ Where n rays meet a voxel, about sqrt(n) of them are followed, each of which cou
 colour needs fewer rays than a message.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,12 +72,10 @@ class ColorPass:
             self._bw = ti.ndarray(ti.i64, n * VOXELS)
         self._bw.fill(0)
         # Beliefs that have a date are no sums of messages: there the keyframe's own evidence stays in.
-        messages = (
-            keyframe.messages if pool.dated is None else new_messages(visible, s.inference.message_precision)
-        )
+        messages = keyframe.messages if pool.dated is None else new_messages(visible, s.limits.precision)
         with s.casting(keyframe, pool.belief, messages, pool.prior_log_odds) as cast:
             scale = cast.swept.scale * COLOR_SHARE
-            model = replace(s.model(), maximise=False)
+            model = s.model()
             free_logs = FreeLogs.with_bricks(cast.swept.log_free, n, pool.prior_log_odds, model)
             spread = _Spread(
                 _pixels(color), image.camera.width, cast.swept.sums, self._bw, scale, cast.trace,

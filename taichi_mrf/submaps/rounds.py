@@ -20,6 +20,7 @@ from taichi_mrf.export.chunk_store import ChunkStore, new_store
 from taichi_mrf.export.store_header import COLORS, FIRST, SURFACE, StoreHeader
 from taichi_mrf.geometry.up import up_from_name, up_name
 from taichi_mrf.inference.prior import log_odds_without_bricks
+from taichi_mrf.inference.ray_model import Limits
 from taichi_mrf.submaps.job import PLAN_FILE, Job, Sequence
 from taichi_mrf.submaps.plan import plan_submaps
 from taichi_mrf.submaps.round_files import (
@@ -239,7 +240,7 @@ def _merge(folder: Path, job: Job, round: int, path: Path) -> None:
     alone, so each is written once, and only one submap's core is in memory at a time. Raises MapFileError."""
     files = [round_path(folder, round, number) for number in range(len(job.plan.submaps))]
     config, up = job.config, up_from_name(job.up) if job.up else None
-    log_odds = log_odds_without_bricks(config.inference, config.voxel_size)
+    log_odds = log_odds_without_bricks(config.inference, config.voxel_size, Limits().message)
     header = StoreHeader.of(config, *log_odds, config.volume.min_evidence, up)
     chunks = [np.unique(np.concatenate(read_places(file)) // CHUNK, axis=0) for file in files]
     with new_store(path) as place:

@@ -220,13 +220,13 @@ def test_the_files_of_a_run_open_elsewhere(room: tuple[Path, str]) -> None:
 
 
 def test_flags_come_before_the_file_and_the_file_before_the_defaults(tmp_path: Path) -> None:
-    (tmp_path / "my.yaml").write_text("voxel_size: 0.2\ninference: {sweeps: 1, damping: 0.1}\n")
+    (tmp_path / "my.yaml").write_text("voxel_size: 0.2\ninference: {sweeps: 1, free_share: 0.1}\n")
     out = tmp_path / "out"
     arguments = ("--config", tmp_path / "my.yaml", "--inference.sweeps", "2")
     mapped(ROOM, "--out", out, "--limit", "2", "--no-pictures", *arguments)
     config = load(out / "config.yaml")
-    assert (config.voxel_size, config.inference.sweeps, config.inference.damping) == (0.2, 2, 0.1)
-    assert config.inference.message_clamp == 6.9
+    assert (config.voxel_size, config.inference.sweeps, config.inference.free_share) == (0.2, 2, 0.1)
+    assert config.inference.ray_density == 2.5
 
 
 def test_a_run_of_other_parameters_is_replaced_only_if_asked(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import typing
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from taichi_mrf import MRFMap
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import (
@@ -61,10 +63,9 @@ configs = st.builds(
     inference=st.builds(
         InferenceConfig,
         sweeps=st.integers(0, 10),
-        damping=numbers(0, 0.99),
+        renew_tolerance=numbers(0, 0.99),
         prior=st.none() | numbers(0.01, 0.99),
         outlier_floor=numbers(0, 1),
-        average=st.sampled_from(["probability", "log_odds"]),
     ),
     keyframes=st.builds(KeyframeConfig, rotation=numbers(0, 4), against=st.sampled_from(["last", "all"])),
     volume=st.just(VolumeConfig()) | st.just(VolumeConfig(lower=(-1.0, -2.0, -3.0), upper=(1.0, 2.0, 3.0))),
@@ -76,6 +77,23 @@ def written(tmp_path: Path, text: str) -> Path:
     path = tmp_path / "config.yaml"
     path.write_text(text, encoding="utf-8")
     return path
+
+
+def test_a_parameter_of_an_earlier_version_is_read_with_a_warning(tmp_path: Path) -> None:
+    path = written(tmp_path, "inference: {damping: 0.3, sweeps: 2}\n")
+    with pytest.warns(UserWarning, match=r"yaml: inference: damping is no longer a parameter: messages"):
+        assert load(path) == dataclasses.replace(Config(), inference=InferenceConfig(sweeps=2))
+
+
+def test_its_former_default_needs_no_warning(tmp_path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert load(written(tmp_path, "inference: {damping: 0.0, return_pass: replay}\n")) == Config()
+
+
+def test_what_became_of_a_parameter_is_told_in_python_too() -> None:
+    with pytest.raises(ConfigError, match="plane_window is no longer a parameter"):
+        MRFMap(0.1, plane_window=2.0)
 
 
 @pytest.mark.parametrize("to_text", [to_yaml, commented_yaml])
@@ -153,9 +171,9 @@ def test_the_default_sensor_is_the_kinect_1(repository: Path) -> None:
         ("voxel_size: [1]", "voxel_size must be of type float"),
         ("inference: {sweeps: 2.5}", "sweeps must be of type int"),
         ("inference: {sweeps: true}", "sweeps must be of type int"),
-        ("inference: {damping: 1.0}", "damping must be at least 0 and less than 1"),
+        ("inference: {free_share: 1.5}", "free_share must lie between 0 and 1"),
         ("inference: {prior: 1.5}", "prior must lie between 0 and 1"),
-        ("inference: {average: mean}", "average must be one of probability, log_odds, not 'mean'"),
+        ("keyframes: {against: mean}", "against must be one of last, all, not 'mean'"),
         ("inference: 3", "inference: expected a mapping"),
         ("sensor: {sigma: 0.1}", "sigma must be a list"),
         ("sensor: {sigma: []}", "sigma needs at least one coefficient"),

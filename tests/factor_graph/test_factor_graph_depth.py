@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
-from one_pixel import EXACT, ONE_PIXEL, VOXEL, allocated, image, look_along, marginals, well_cut
+from one_pixel import ONE_PIXEL, VOXEL, ExactMap, allocated, image, look_along, marginals, well_cut
 from oracles import inference as reference
 from oracles.forward import Noise
 
@@ -32,17 +32,15 @@ def crossing(
     """Keyframes of one ray each, which meet in one voxel, and the rays of the oracle."""
     rng = np.random.default_rng(seed)
     shared = (rng.integers(-20, 20, 3) + rng.uniform(0.2, 0.8, 3)) * VOXEL
-    config = InferenceConfig(prior=prior, **EXACT)
+    config = InferenceConfig(prior=prior, free_share=0.0)
     poses, rays = [], []
     for depth in depths:
         direction = rng.normal(size=3)
         direction /= np.linalg.norm(direction)
         poses.append(look_along(shared - direction * rng.uniform(0.05, 0.3), direction, rng))
-        rays += reference.cast(
-            image(depth), poses[-1], ONE_PIXEL, VOXEL, Noise((sigma,)), config, max_depth=0.4
-        )
+        rays += reference.cast(image(depth), poses[-1], ONE_PIXEL, VOXEL, Noise((sigma,)), max_depth=0.4)
     assume(well_cut(rays, 9))
-    m = MRFMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=0.4)
+    m = ExactMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=0.4)
     for depth, T in zip(depths, poses, strict=True):
         m.add_keyframe(image(depth), T, ONE_PIXEL)
     assume({s.voxel for ray in rays for s in ray.segments} <= allocated(m))
@@ -111,27 +109,17 @@ def test_energies_are_those_of_the_joint_distribution_and_bounds_bound_them(
 
 @pytest.mark.usefixtures("one_backend")
 @settings(max_examples=8, suppress_health_check=[HealthCheck.filter_too_much])
-@given(seed=seeds, depths=st.lists(shallow, min_size=3, max_size=5), method=st.sampled_from(["sum", "max"]))
-def test_with_one_ray_in_each_keyframe_the_map_is_the_graphs(
-    seed: int, depths: list[float], method: str
-) -> None:
+@given(seed=seeds, depths=st.lists(shallow, min_size=3, max_size=5))
+def test_with_one_ray_in_each_keyframe_the_map_is_the_graphs(seed: int, depths: list[float]) -> None:
     """An average of one message is that message, so the approximation is none."""
     m, rays, _ = crossing(seed, tuple(depths), 0.3, 0.2)
     graph = m.factor_graph()
-    name = "bp" if method == "sum" else "max-product"
-    solver = LaserConfig(method=name, **CONVERGED)  # type: ignore[arg-type]
     voxels = sorted({s.voxel for ray in rays for s in ray.segments})
-    report = m.infer(sweeps=60, tolerance=0.0, method="sum-product" if method == "sum" else "max-product")
+    report = m.infer(sweeps=60)
     assume(report.residual == 0)
-    if method == "sum":
-        found = solve(graph, solver).marginals
-        assert found is not None
-        np.testing.assert_allclose(at_voxels(graph, found, voxels), marginals(m, voxels), atol=2e-3)
-    else:
-        labels = at_voxels(graph, solve(graph, solver).labels, voxels)
-        odds = marginals(m, voxels)
-        clear = np.abs(odds - 0.5) > 0.01
-        np.testing.assert_array_equal(labels[clear], odds[clear] > 0.5)
+    found = solve(graph, LaserConfig(method="bp", **CONVERGED)).marginals  # type: ignore[arg-type]
+    assert found is not None
+    np.testing.assert_allclose(at_voxels(graph, found, voxels), marginals(m, voxels), atol=2e-3)
 
 
 def room_map(**parameters: object) -> MRFMap:
@@ -170,7 +158,7 @@ def test_what_a_ray_crosses_is_what_the_oracle_crosses() -> None:
     for keyframe in keyframes:
         cast = reference.cast(
             keyframe.depth_m, keyframe.T_world_camera, keyframe.camera, m.voxel_size, noise,
-            m.config.inference, m.sensor.max_depth,
+            m.sensor.max_depth,
         )  # fmt: skip
         for ray in cast:
             wanted = [s.voxel for s in ray.segments if s.voxel in existing]
@@ -230,21 +218,3 @@ def test_a_map_answers_with_what_it_has_adopted_until_it_infers_again() -> None:
     np.testing.assert_allclose(m.occupancy(centres), 1 / (1 + np.exp(-log_odds)), atol=1e-5)
     m.infer()
     np.testing.assert_array_equal(m.voxels(0.5)[0], before)
-
-
-def test_max_product_becomes_the_maps_own_method() -> None:
-    m = room_map()
-    m.infer()
-    sums, _ = m.voxels(0.5)
-    m.infer(method="max-product")
-    best, _ = m.voxels(0.5)
-    assert m.config.inference.method == "max-product"
-    assert len(best) > 0
-    assert sorted(best.tolist()) != sorted(sums.tolist())
-    same = room_map(method="max-product")
-    same.infer()
-    np.testing.assert_array_equal(same.voxels(0.5)[0], best)
-    m.infer(method="sum-product")
-    np.testing.assert_array_equal(m.voxels(0.5)[0], sums)
-    with pytest.raises(ConfigError, match=r"MRFMap\.infer: method"):
-        m.infer(method="best")  # type: ignore[arg-type]

@@ -22,6 +22,7 @@ from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.inference.footprint import find_footprint, visible_box
 from taichi_mrf.inference.keyframe import DepthImage, Footprint, RayList
 from taichi_mrf.inference.ray_list import RayBundler
+from taichi_mrf.inference.ray_model import END_SIGMAS
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import F32, I32, AnyArray, I32Array, Struct, Template, Vec3
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -37,7 +38,6 @@ pytestmark = pytest.mark.usefixtures("backend")
 CAMERA = PinholeCamera(width=26, height=19, fx=22, fy=23, cx=12.3, cy=9.4)
 NOISE = Noise((0.02, 0.0, 0.004), (0.01, -0.02))
 VOXEL = 0.05
-INFERENCE = InferenceConfig()
 SENSOR = SensorConfig(max_depth=6.0)
 
 GRAZING = 1e-3
@@ -83,7 +83,7 @@ def rays_of(image: DepthImage, T: Pose, window: Window, max_depth: float, noise:
     measured = image.to_numpy().reshape(-1).astype(np.float64)
     seen = measured > 0
     directions = image.camera.rays().reshape(-1, 3)[seen] @ T[:3, :3].T / window.voxel_size
-    sigmas = INFERENCE.end_sigmas
+    sigmas = END_SIGMAS
     end = noise.depth_of_deviation(measured[seen], -sigmas)
     surface = noise.depth_of_deviation(measured[seen], sigmas)
     return Rays(window.to_voxels(T[:3, 3]), directions, surface, np.minimum(end, max_depth))
@@ -134,7 +134,7 @@ def every_ray(image: DepthImage) -> RayList:
 def footprint_of(
     image: DepthImage, T: Pose, volume: VolumeConfig | None = None, sensor: SensorConfig = SENSOR
 ) -> Footprint:
-    return find_footprint(image, every_ray(image), T, VOXEL, sensor, INFERENCE, volume or VolumeConfig())
+    return find_footprint(image, every_ray(image), T, VOXEL, sensor, volume or VolumeConfig())
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -176,9 +176,7 @@ def test_surfaces_are_where_the_measurement_may_have_come_from() -> None:
 def test_rays_can_go_on_beyond_their_end(beyond: float) -> None:
     """As if every ray ended so many metres of axial depth further away; surfaces begin where they did."""
     image, T = uploaded(scene(5)), POSES["oblique"]
-    footprint = find_footprint(
-        image, every_ray(image), T, VOXEL, SENSOR, INFERENCE, VolumeConfig(), beyond_m=beyond
-    )
+    footprint = find_footprint(image, every_ray(image), T, VOXEL, SENSOR, VolumeConfig(), beyond_m=beyond)
     rays = rays_of(image, T, footprint.window, 1e9)
     further = replace(rays, end=np.minimum(rays.end + beyond, SENSOR.max_depth))
     assert_between(footprint, further, whole(footprint.window))
@@ -241,7 +239,7 @@ def test_a_volume_behind_the_camera_is_not_seen() -> None:
 def test_a_view_with_too_many_bricks_is_an_error() -> None:
     image = uploaded(np.full(CAMERA.shape, 5.0))
     with pytest.raises(CapacityError, match="voxel size of 1e-05 m"):
-        find_footprint(image, every_ray(image), POSES["oblique"], 1e-5, SENSOR, INFERENCE, VolumeConfig())
+        find_footprint(image, every_ray(image), POSES["oblique"], 1e-5, SENSOR, VolumeConfig())
 
 
 @ti.dataclass
@@ -306,7 +304,7 @@ def ray_ends(image: DepthImage, T: Pose, noise_of: dict[Noise, NDArray], max_dep
     measured = image.to_numpy().reshape(-1).astype(np.float64)
     end = np.zeros(len(measured))
     for noise, pixels in noise_of.items():
-        end[pixels] = noise.depth_of_deviation(measured[pixels], -INFERENCE.end_sigmas)
+        end[pixels] = noise.depth_of_deviation(measured[pixels], -END_SIGMAS)
     seen = measured > 0
     local = image.camera.rays().reshape(-1, 3)[seen] * np.minimum(end[seen], max_depth)[:, None]
     return local @ T[:3, :3].T + T[:3, 3]
@@ -328,7 +326,7 @@ def test_the_visible_box_holds_all_ray_ends(noise: Noise, pose: str, max_depth: 
     depth = random.uniform(0.3, 5, camera.shape) * (random.random(camera.shape) < 0.7)
     image = uploaded(depth, PolynomialNoise(noise.sigma, noise.bias), camera)
     T = POSES[pose]
-    box = visible_box(image, T, max_depth, INFERENCE.end_sigmas)
+    box = visible_box(image, T, max_depth, END_SIGMAS)
     assert_holds(
         box, np.concatenate([T[None, :3, 3], ray_ends(image, T, {noise: np.arange(depth.size)}, max_depth)])
     )
@@ -350,4 +348,4 @@ def test_the_visible_box_holds_all_ray_ends_with_a_learnt_table(shared_data: Pat
               for i, (s, b) in enumerate(zip(sigma, bias, strict=True))}  # fmt: skip
     ends = ray_ends(image, T, pixels, 10.0)
     assert len(ends) > 500
-    assert_holds(visible_box(image, T, 10.0, INFERENCE.end_sigmas), ends)
+    assert_holds(visible_box(image, T, 10.0, END_SIGMAS), ends)

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import lidar_street
 import numpy as np
@@ -12,7 +11,16 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from live_scene import marginals
 from numpy.typing import NDArray
-from one_pixel import EXACT, ONE_PIXEL, VOXEL, allocated, image, look_along, random_pose
+from one_pixel import (
+    ONE_PIXEL,
+    VOXEL,
+    ExactMap,
+    ExactMapWithLengths,
+    allocated,
+    image,
+    look_along,
+    random_pose,
+)
 from one_pixel import marginals as marginals_at
 from oracles import inference as reference
 from oracles.forward import Noise
@@ -45,7 +53,6 @@ MODEL = SensorConfig(
 FLOOR = 1e-9
 """For measurements. Missing returns have none."""
 
-Method = Literal["sum-product", "max-product"]
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -79,11 +86,10 @@ def in_bricks(ray: reference.Ray, voxels: set[reference.Voxel]) -> reference.Ray
 @settings(max_examples=12, suppress_health_check=[HealthCheck.filter_too_much])
 @given(
     seed=seeds, depth=st.floats(0.3, 0.6), prior=st.floats(0.05, 0.6),
-    method=st.sampled_from(["sum-product", "max-product"]),
     sensor=st.sampled_from([MODEL, replace(MODEL, no_return="free", no_return_depth=0.5)]),
 )  # fmt: skip
 def test_a_measured_and_a_missing_return_equal_enumeration(
-    seed: int, depth: float, prior: float, method: Method, sensor: SensorConfig
+    seed: int, depth: float, prior: float, sensor: SensorConfig
 ) -> None:
     """Two rays with one voxel in common: the graph is a tree."""
     rng = np.random.default_rng(seed)
@@ -92,12 +98,12 @@ def test_a_measured_and_a_missing_return_equal_enumeration(
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     poses = [look_along(shared - d * rng.uniform(0.2, 0.3), d, rng) for d in directions]
     sensor = replace(sensor, max_depth=0.5)
-    inference = InferenceConfig(prior=prior, outlier_floor=FLOOR, method=method, sweeps=5, **EXACT)
+    inference = InferenceConfig(prior=prior, outlier_floor=FLOOR, sweeps=5, free_share=0.0)
     (measured,) = reference.cast(
-        image(depth), poses[0], ONE_PIXEL, VOXEL, Noise(sensor.sigma), inference, sensor.max_depth
+        image(depth), poses[0], ONE_PIXEL, VOXEL, Noise(sensor.sigma), sensor.max_depth
     )
     (missing,) = unreturned(poses[1], ONE_PIXEL, law_of(sensor))
-    m = MRFMap.from_config(Config(voxel_size=VOXEL, sensor=sensor, inference=inference), ONE_PIXEL)
+    m = ExactMap.from_config(Config(voxel_size=VOXEL, sensor=sensor, inference=inference), ONE_PIXEL)
     m.add_keyframe(image(depth), poses[0], ONE_PIXEL)
     m.add_keyframe(image(0.0), poses[1], ONE_PIXEL, no_return=np.ones((1, 1), bool))
     voxels = allocated(m)
@@ -105,7 +111,7 @@ def test_a_measured_and_a_missing_return_equal_enumeration(
     assume(len({s.voxel for s in rays[0].segments} & {s.voxel for s in rays[1].segments}) == 1)
     assume(all(s.length > 0.02 for ray in (measured, missing) for s in ray.segments))
     m.infer()
-    exact = reference.enumerate_marginals(rays, prior, FLOOR, method == "max-product")
+    exact = reference.enumerate_marginals(rays, prior, FLOOR)
     tolerance = 1e-4 if sensor.no_return == "model" else 2e-3  # chances of 0 are bounded by the clamp
     np.testing.assert_allclose(marginals_at(m, list(exact)), list(exact.values()), atol=tolerance)
 
@@ -120,15 +126,13 @@ def test_both_kinds_of_rays_of_a_keyframe_equal_the_numpy_schedule(
     depth = rng.uniform(0.3, 0.6, (2, 2)).astype(np.float32)
     missing = np.array([[True, False], [False, True]])
     depth[missing] = 0.0
-    inference = InferenceConfig(
-        sweeps=sweeps, outlier_floor=FLOOR,
-        return_pass="retrace" if lengths else "replay", **{**EXACT, "segment_lengths": lengths},
-    )  # fmt: skip
-    m = MRFMap.from_config(Config(voxel_size=VOXEL, sensor=MODEL, inference=inference), camera)
+    made_by = ExactMapWithLengths if lengths else ExactMap
+    inference = InferenceConfig(sweeps=sweeps, outlier_floor=FLOOR, free_share=0.0)
+    m = made_by.from_config(Config(voxel_size=VOXEL, sensor=MODEL, inference=inference), camera)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(keyframe_allocator, "SCOUTS", 1)
         m.add_keyframe(depth, T, camera, no_return=missing)
-    rays = reference.cast(depth, T, camera, VOXEL, Noise(MODEL.sigma), inference, MODEL.max_depth)
+    rays = reference.cast(depth, T, camera, VOXEL, Noise(MODEL.sigma), MODEL.max_depth)
     without = unreturned(T, camera, law_of(MODEL))
     # What measured rays of the keyframe cross is not told by missing ones.
     crossed = {s.voxel for ray in rays for s in ray.segments}
@@ -137,7 +141,8 @@ def test_both_kinds_of_rays_of_a_keyframe_equal_the_numpy_schedule(
     assume(all(s.length > 0.01 for ray in rays for s in ray.segments))
     voxels = allocated(m)
     m.infer()
-    expected = reference.infer([rays], voxels, prior_probability(inference, VOXEL), inference)
+    prior = prior_probability(inference, VOXEL)
+    expected = reference.infer([rays], voxels, prior, inference, made_by.LIMITS)
     seen = sorted({s.voxel for ray in rays for s in ray.segments} & voxels)
     assume(len(told & set(seen)) > 0)
     np.testing.assert_allclose(

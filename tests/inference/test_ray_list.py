@@ -112,27 +112,6 @@ def test_every_pixel_with_a_measurement_has_a_ray(parameters: dict[str, float]) 
     assert rays.number == len(measured)
 
 
-@pytest.mark.parametrize("wanted", [1.0, 4.0, 9.0])
-def test_rays_are_thinned_by_what_a_voxel_covers(wanted: float) -> None:
-    depth = np.random.default_rng(1).uniform(0.2, 3.0, (48, 64)).astype(np.float32)
-    depth[::5, ::7] = 0
-    rays = listed(depth, ray_density=wanted / 10, ray_choice="thin")
-    v, u = np.mgrid[:48, :64]
-    with np.errstate(divide="ignore"):
-        stride = VOXEL * 50.0 / np.sqrt(wanted) / depth.astype(np.float64)  # pixels along a voxel's side
-    kept = (
-        (depth > 0) & (u % np.maximum(1, np.floor(stride)) == 0) & (v % np.maximum(1, np.floor(stride)) == 0)
-    )
-    found = np.zeros(depth.shape, bool)
-    for (u0, v0, *size), z in blocks_of(rays, 64):
-        assert (size, z) == ([1, 1], depth[v0, u0])
-        found[v0, u0] = True
-    # float32 may round a quotient that lies next to a whole number to its other side.
-    stride[depth == 0] = 0.5
-    clear = np.abs(stride % 1 - 0.5) < 0.499
-    np.testing.assert_array_equal(found[clear], kept[clear])
-
-
 def test_rays_of_a_tile_stand_together() -> None:
     depth = np.full((70, 90), 2.0, np.float32)
     tiles = [(v // TILE, u // TILE) for (u, v, _, _), _ in blocks_of(listed(depth, ray_density=0.0), 90)]

@@ -86,7 +86,7 @@ def test_rays_find_what_numpy_finds(seed: int, sigma: float, enough: float, pass
         patch.setattr(keyframe_allocator, "SCOUTS", 1)
         m.add_keyframe(depth, T, CAMERA)
     m.infer()
-    rays = reference.cast(depth, T, CAMERA, VOXEL, Noise((sigma,)), config, max_depth=MAX_DEPTH)
+    rays = reference.cast(depth, T, CAMERA, VOXEL, Noise((sigma,)), max_depth=MAX_DEPTH)
     assume(well_cut(rays[::2], 99))
     voxels = sorted(allocated(m))
     p = dict(zip(voxels, marginals(m, voxels).tolist(), strict=True))

@@ -1,13 +1,24 @@
 """The marginals against brute force where the graph is a tree, and against float64 NumPy where it is not."""
 
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import small_room
 from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
-from one_pixel import EXACT, ONE_PIXEL, VOXEL, allocated, image, look_along, marginals, random_pose, well_cut
+from one_pixel import (
+    ONE_PIXEL,
+    VOXEL,
+    ExactMap,
+    ExactMapWithLengths,
+    allocated,
+    image,
+    look_along,
+    marginals,
+    random_pose,
+    well_cut,
+)
 from oracles import inference as reference
 from oracles.forward import Noise
 
@@ -21,11 +32,6 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
 
 pytestmark = pytest.mark.usefixtures("backend")
-
-Likelihood = Literal["auto", "segment", "centre"]
-Average = Literal["probability", "log_odds"]
-Method = Literal["sum-product", "max-product"]
-
 
 # A sigma wide enough that every voxel of the short ray lies in a brick near the measured surface.
 wide = st.floats(0.25, 0.6)
@@ -41,8 +47,6 @@ priors = st.floats(0.02, 0.6)
     sigma=wide,
     prior=priors,
     bias=st.floats(-0.05, 0.05),
-    method=st.sampled_from(["sum-product", "max-product"]),
-    return_pass=st.sampled_from(["replay", "retrace"]),
     pass_through=st.sampled_from([0.0, 0.3]),
 )
 def test_one_ray_equals_enumeration(
@@ -51,67 +55,49 @@ def test_one_ray_equals_enumeration(
     sigma: float,
     prior: float,
     bias: float,
-    method: Method,
-    return_pass: Literal["replay", "retrace"],
     pass_through: float,
 ) -> None:
     rng = np.random.default_rng(seed)
     T = random_pose(rng)
-    maximise = method == "max-product"
-    config = InferenceConfig(prior=prior, return_pass=return_pass, pass_through=pass_through, **EXACT)
+    config = InferenceConfig(prior=prior, pass_through=pass_through, free_share=0.0)
     sensor = Noise((sigma,), (bias,))
-    rays = reference.cast(image(depth), T, ONE_PIXEL, VOXEL, sensor, config, max_depth=0.75)
+    rays = reference.cast(image(depth), T, ONE_PIXEL, VOXEL, sensor, max_depth=0.75)
     assume(well_cut(rays, 12))
-    m = MRFMap(VOXEL, PolynomialNoise((sigma,), (bias,)), inference=config, max_depth=0.75)
+    m = ExactMap(VOXEL, PolynomialNoise((sigma,), (bias,)), inference=config, max_depth=0.75)
     m.add_keyframe(image(depth), T, ONE_PIXEL)
-    m.infer(sweeps=2, method=method)
-    passes = 0.0 if maximise else pass_through
-    exact = reference.enumerate_marginals(rays, prior, config.floor, maximise, passes)
+    m.infer(sweeps=2)
+    exact = reference.enumerate_marginals(rays, prior, config.floor, pass_through)
     np.testing.assert_allclose(marginals(m, list(exact)), list(exact.values()), atol=1e-4)
 
 
 @settings(max_examples=40, suppress_health_check=[HealthCheck.filter_too_much])
 @given(
     seed=seeds, depths=st.tuples(shallow, shallow), sigma=wide, prior=priors,
-    method=st.sampled_from(["sum-product", "max-product"]),
 )  # fmt: skip
 def test_two_rays_that_share_one_voxel_equal_enumeration(
     seed: int,
     depths: tuple[float, float],
     sigma: float,
     prior: float,
-    method: Method,
 ) -> None:
     rng = np.random.default_rng(seed)
     shared = (rng.integers(-20, 20, 3) + rng.uniform(0.2, 0.8, 3)) * VOXEL
-    sensor, config = Noise((sigma,)), InferenceConfig(prior=prior, **EXACT)
+    sensor, config = Noise((sigma,)), InferenceConfig(prior=prior, free_share=0.0)
     poses, rays = [], []
     for depth in depths:
         direction = rng.normal(size=3)
         direction /= np.linalg.norm(direction)
         poses.append(look_along(shared - direction * rng.uniform(0.05, 0.3), direction, rng))
-        rays += reference.cast(image(depth), poses[-1], ONE_PIXEL, VOXEL, sensor, config, max_depth=0.4)
+        rays += reference.cast(image(depth), poses[-1], ONE_PIXEL, VOXEL, sensor, max_depth=0.4)
     common = {s.voxel for s in rays[0].segments} & {s.voxel for s in rays[1].segments}
     assume(len(common) == 1 and well_cut(rays, 9))
-    m = MRFMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=0.4)
+    m = ExactMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=0.4)
     for depth, T in zip(depths, poses, strict=True):
         m.add_keyframe(image(depth), T, ONE_PIXEL)
     assume({s.voxel for ray in rays for s in ray.segments} <= allocated(m))
-    m.infer(sweeps=6, method=method)
-    exact = reference.enumerate_marginals(rays, prior, config.floor, method == "max-product")
+    m.infer(sweeps=6)
+    exact = reference.enumerate_marginals(rays, prior, config.floor)
     np.testing.assert_allclose(marginals(m, list(exact)), list(exact.values()), atol=1e-4)
-
-
-COMPILED_VARIANTS = [
-    ("auto", "probability", False, "sum-product", 1.0, 0.0),
-    ("segment", "log_odds", True, "sum-product", 0.3, 0.2),
-    ("centre", "probability", True, "max-product", 1.0, 0.0),
-    ("segment", "probability", False, "max-product", 0.5, 0.0),
-    ("centre", "log_odds", False, "sum-product", 1.0, 0.0),
-]
-"""Likelihood, average, lengths, method, the correlation of rays (1 or less) and what passes an occupied voxel
-(0 or more), each of which means a kernel of its own: every pair of values is there at least once but for a
-few."""
 
 
 @settings(max_examples=30)
@@ -120,44 +106,32 @@ few."""
     pixels=st.sampled_from([(1, 1), (2, 1), (2, 2)]),
     count=st.integers(1, 4),
     sigma=st.floats(0.02, 0.3),
-    compiled=st.sampled_from(COMPILED_VARIANTS),
-    damping=st.sampled_from([0.0, 0.3]),
+    made_by=st.sampled_from([ExactMap, ExactMapWithLengths]),
+    pass_through=st.sampled_from([0.0, 0.2]),
     sweeps=st.integers(1, 5),
     free_share=st.sampled_from([0.0, 0.25, 1.0]),
 )
 @example(
-    seed=420930, pixels=(2, 1), count=3, sigma=0.0625, compiled=COMPILED_VARIANTS[0],
-    damping=0.0, sweeps=1, free_share=0.0,
+    seed=420930, pixels=(2, 1), count=3, sigma=0.0625, made_by=ExactMap,
+    pass_through=0.0, sweeps=1, free_share=0.0,
 )  # fmt: skip
 def test_loops_equal_the_numpy_schedule(
     seed: int,
     pixels: tuple[int, int],
     count: int,
     sigma: float,
-    compiled: tuple[Likelihood, Average, bool, Method, float, float],
-    damping: float,
+    made_by: type[ExactMap | ExactMapWithLengths],
+    pass_through: float,
     sweeps: int,
     free_share: float,
 ) -> None:
-    likelihood, average, lengths, method, ray_correlation, pass_through = compiled
     rng = np.random.default_rng(seed)
     camera = PinholeCamera(pixels[0], pixels[1], 8.0, 8.0, (pixels[0] - 1) / 2, (pixels[1] - 1) / 2)
     config = InferenceConfig(
-        method=method,
-        sweeps=sweeps,
-        likelihood=likelihood,
-        average=average,
-        segment_lengths=lengths,
-        ray_correlation=ray_correlation,
-        pass_through=pass_through,
-        damping=damping,
-        message_precision="float32",
-        min_length=0.0,
-        outlier_floor=1e-3,
-        free_share=free_share,
+        sweeps=sweeps, pass_through=pass_through, outlier_floor=1e-3, free_share=free_share
     )
     sensor = Noise((sigma,), (0.01,))
-    m = MRFMap(VOXEL, PolynomialNoise((sigma,), (0.01,)), inference=config, max_depth=1.5)
+    m = made_by(VOXEL, PolynomialNoise((sigma,), (0.01,)), inference=config, max_depth=1.5)
     rays = {}
     middle = rng.uniform(-1, 1, 3)
     for _ in range(count):
@@ -169,12 +143,13 @@ def test_loops_equal_the_numpy_schedule(
             # Rays of so small an image are no neighbours: each may cross bricks that no other one does.
             patch.setattr(keyframe_allocator, "SCOUTS", 1)
             id = m.add_keyframe(depth, T, camera)
-        rays[id] = reference.cast(depth, T, camera, VOXEL, sensor, config, max_depth=1.5)
+        rays[id] = reference.cast(depth, T, camera, VOXEL, sensor, max_depth=1.5)
     assume(all(s.length > 0.01 for cast in rays.values() for ray in cast for s in ray.segments))
     order = sorted(m.keyframes.values(), key=content_key)
     voxels = allocated(m)
     m.infer()
-    expected = reference.infer([rays[k.id] for k in order], voxels, prior_probability(config, VOXEL), config)
+    prior = prior_probability(config, VOXEL)
+    expected = reference.infer([rays[k.id] for k in order], voxels, prior, config, made_by.LIMITS)
     seen = sorted({s.voxel for cast in rays.values() for ray in cast for s in ray.segments} & voxels)
     got = marginals(m, seen)
     np.testing.assert_allclose(got, [reference.logistic(expected[v]) for v in seen], atol=1e-3)
@@ -190,10 +165,10 @@ def test_messages_with_lengths_are_those_of_the_factor(
     rng = np.random.default_rng(seed)
     T = random_pose(rng)
     sensor = Noise((sigma,))
-    config = InferenceConfig(prior=prior, **{**EXACT, "segment_lengths": True})
-    (ray,) = reference.cast(image(depth), T, ONE_PIXEL, VOXEL, sensor, config, max_depth=0.75)
+    config = InferenceConfig(prior=prior, free_share=0.0)
+    (ray,) = reference.cast(image(depth), T, ONE_PIXEL, VOXEL, sensor, max_depth=0.75)
     assume(well_cut([ray], 12))
-    m = MRFMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=0.75)
+    m = ExactMapWithLengths(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=0.75)
     m.add_keyframe(image(depth), T, ONE_PIXEL)
     m.infer(sweeps=1)
     stops = np.array([1 - (1 - prior) ** s.length for s in ray.segments])
@@ -212,11 +187,17 @@ def test_messages_with_lengths_are_those_of_the_factor(
     np.testing.assert_allclose(marginals(m, voxels), expected, atol=1e-4)
 
 
+class Fine(MRFMap):
+    """With messages in float32."""
+
+    LIMITS = replace(MRFMap.LIMITS, precision="float32")
+
+
 def test_float16_messages_move_beliefs_a_little() -> None:
     """What the default precision costs, against the same map in float32."""
     rng = np.random.default_rng(3)
     camera = PinholeCamera(24, 18, 20.0, 20.0, 11.5, 8.5)
-    maps = {p: MRFMap(VOXEL, PolynomialNoise((0.03,)), message_precision=p) for p in ("float16", "float32")}
+    maps = {made_by.LIMITS.precision: made_by(VOXEL, PolynomialNoise((0.03,))) for made_by in (MRFMap, Fine)}
     for _ in range(4):
         T = random_pose(rng, 0.1)
         depth = (1.5 / np.abs(camera.rays() @ T[:3, :3].T).max(axis=-1)).astype(np.float32)
@@ -227,21 +208,6 @@ def test_float16_messages_move_beliefs_a_little() -> None:
     voxels = sorted(allocated(maps["float32"]))
     difference = np.abs(marginals(maps["float16"], voxels) - marginals(maps["float32"], voxels))
     assert 0 < difference.max() < 0.01
-
-
-@pytest.mark.parametrize("average", ["log_odds", "probability"])
-def test_rays_followed_twice_say_what_their_trace_says(average: Average) -> None:
-    marginals = []
-    for return_pass in ("replay", "retrace"):
-        m = MRFMap(small_room.VOXEL_SIZE, average=average, return_pass=return_pass)
-        for frame in small_room.frames()[:2]:
-            small_room.add(m, frame)
-        m.infer()
-        marginals.append(m.voxels(0.0)[1])
-    # Differences of sums in float32 are not the sums of the rest.
-    apart = np.abs(marginals[1] - marginals[0])
-    assert 0 < apart.max() < 0.02
-    assert np.quantile(apart, 0.999) < 1e-3
 
 
 def test_the_host_waits_for_no_step_of_a_sweep(backend: str) -> None:

@@ -64,7 +64,7 @@ def test_voxels_are_called_as_the_rays_vote(seed: int, count: int, sigma: float)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(keyframe_allocator, "SCOUTS", 1)
             m.add_keyframe(depth, T, camera)
-        rays += reference.cast(depth, T, camera, VOXEL, Noise((sigma,)), config, max_depth=1.5)
+        rays += reference.cast(depth, T, camera, VOXEL, Noise((sigma,)), max_depth=1.5)
     m.infer()
     voxels = sorted(allocated(m))
     before = marginals(m, voxels)

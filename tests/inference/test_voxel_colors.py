@@ -1,5 +1,6 @@
 """Colours by posterior: against NumPy ray by ray, and what edits and hidden surfaces must not change."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import colored_scene as scene
@@ -36,13 +37,19 @@ def cavities(m: MRFMap, k: Keyframe) -> dict[reference.Voxel, float]:
     return dict(zip(map(tuple, voxels.tolist()), found.tolist(), strict=True))
 
 
+class Fine(MRFMap):
+    """With messages in float32."""
+
+    LIMITS = replace(MRFMap.LIMITS, precision="float32")
+
+
 def spread(ray: reference.Ray, cavity: dict, config: InferenceConfig, prior: float) -> dict:
     """The posterior of each voxel of a ray that it is what the pixel sees."""
     lowest = reference.logit(config.free_share * prior)
     visibility, found = 1.0, {}
     for segment, density in zip(ray.segments, ray.densities, strict=True):
         if segment.voxel in cavity:
-            m = reference.logistic(min(config.cavity_clamp, max(lowest, cavity[segment.voxel])))
+            m = reference.logistic(min(Fine.LIMITS.cavity, max(lowest, cavity[segment.voxel])))
             free = (1 - m) ** segment.length
             found[segment.voxel] = (1 - free) * density * visibility
             visibility *= free
@@ -55,8 +62,8 @@ def spread(ray: reference.Ray, cavity: dict, config: InferenceConfig, prior: flo
 def test_colours_are_those_of_the_posterior(seed: int, count: int, sigma: float) -> None:
     rng = np.random.default_rng(seed)
     camera = PinholeCamera(2, 2, 8.0, 8.0, 0.5, 0.5)
-    config = InferenceConfig(message_precision="float32", outlier_floor=1e-3, ray_density=0.0)
-    m = MRFMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=1.5)
+    config = InferenceConfig(outlier_floor=1e-3, ray_density=0.0)
+    m = Fine(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=1.5)
     rays, images = {}, {}
     middle = rng.uniform(-1, 1, 3)
     for _ in range(count):
@@ -68,7 +75,7 @@ def test_colours_are_those_of_the_posterior(seed: int, count: int, sigma: float)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(keyframe_allocator, "SCOUTS", 1)
             id = m.add_keyframe(depth, T, camera, color=color)
-        rays[id] = reference.cast(depth, T, camera, VOXEL, Noise((sigma,)), config, max_depth=1.5)
+        rays[id] = reference.cast(depth, T, camera, VOXEL, Noise((sigma,)), max_depth=1.5)
         images[id] = color.reshape(-1, 3).astype(float)
     assume(all(s.length > 0.01 for cast in rays.values() for ray in cast for s in ray.segments))
     m.infer()

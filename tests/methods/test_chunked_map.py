@@ -14,6 +14,7 @@ from taichi_mrf.errors import ConfigError, MapFileError, TaichiMRFError
 from taichi_mrf.export.chunk_blocks import write_chunks
 from taichi_mrf.export.chunk_store import CHUNK_BYTES, ChunkStore, StoreHeader, new_store
 from taichi_mrf.export.formats import export_map
+from taichi_mrf.inference.ray_model import Limits
 from taichi_mrf.methods.chunked import ChunkedMap
 from taichi_mrf.methods.chunked_part import take_part
 from taichi_mrf.methods.protocol import OccupancyMap
@@ -179,9 +180,8 @@ def test_damage_and_newer_formats_are_told(stores: dict[str, Path], tmp_path: Pa
 
 
 def test_the_method_says_what_seen_free_space_holds(stores: dict[str, Path]) -> None:
-    config = room_map("mrf").config
     header = ChunkStore.open(stores["mrf"]).header
-    assert header.seen_free_log_odds == header.prior_log_odds - config.inference.message_clamp
+    assert header.seen_free_log_odds == header.prior_log_odds - Limits().message
     header = ChunkStore.open(stores["log_odds"]).header  # all bricks that rays cross exist
     assert header.seen_free_log_odds == header.prior_log_odds
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from live_scene import FakeLink, RoomFrames, finished, marginals, session_of
 from numpy.typing import NDArray
-from one_pixel import EXACT, VOXEL, allocated, random_pose
+from one_pixel import VOXEL, ExactMap, allocated, random_pose
 from oracles import inference as reference
 from oracles.forward import Noise
 
@@ -87,16 +87,17 @@ def test_messages_equal_those_of_numpy_with_a_noise_for_each_ray(seed: int) -> N
     camera, T = PinholeCamera(2, 2, 4.0, 4.0, 0.5, 0.5), random_pose(rng)
     depth = rng.uniform(0.5, 1.0, (2, 2)).astype(np.float32)
     sigma = rng.uniform(0.03, 0.3, (2, 2)).astype(np.float32)
-    config = InferenceConfig(sweeps=1, **EXACT)
+    config = InferenceConfig(sweeps=1, free_share=0.0)
     rays = []
     for v, u in np.ndindex(2, 2):
         one = np.zeros_like(depth)
         one[v, u] = depth[v, u]
-        rays += reference.cast(one, T, camera, VOXEL, Noise((float(sigma[v, u]),), (0.02,)), config, 1.5)
-    m = MRFMap(VOXEL, PolynomialNoise((0.1,), (0.02,)), inference=config, max_depth=1.5)
+        rays += reference.cast(one, T, camera, VOXEL, Noise((float(sigma[v, u]),), (0.02,)), 1.5)
+    m = ExactMap(VOXEL, PolynomialNoise((0.1,), (0.02,)), inference=config, max_depth=1.5)
     m.add_keyframe(depth, T, camera, sigma_m=sigma)
     m.infer()
-    expected = reference.infer([rays], allocated(m), prior_probability(config, VOXEL), config)
+    prior = prior_probability(config, VOXEL)
+    expected = reference.infer([rays], allocated(m), prior, config, ExactMap.LIMITS)
     p = np.array([reference.logistic(x) for x in expected.values()])
     found = m.occupancy((np.array(list(expected)) + 0.5) * VOXEL)
     assert np.mean(np.abs(found - p) < 1e-3) > 0.98  # float32 may take the other way round a corner

@@ -120,12 +120,11 @@ def test_a_pinhole_as_a_table_makes_the_same_map_but_for_rounding() -> None:
 @pytest.mark.parametrize(
     "m",
     [
-        lambda: MRFMap(VOXEL, PolynomialNoise((SIGMA,)), return_pass="retrace", ray_density=0.3),
-        lambda: MRFMap(VOXEL, PolynomialNoise((SIGMA,)), method="max-product"),
+        lambda: MRFMap(VOXEL, PolynomialNoise((SIGMA,)), ray_density=0.3),
         lambda: MRFMap(VOXEL, PixelNoise(np.full(CAMERA.shape, SIGMA, np.float32), UniformLaw)),
         lambda: LogOddsMap(VOXEL, PolynomialNoise((SIGMA,))),
     ],
-    ids=["bundled and retraced", "max-product", "another law", "LogOddsMap"],
+    ids=["bundled", "another law", "LogOddsMap"],
 )
 def test_so_do_other_methods_and_another_law(m: Callable[[], MRFMap | LogOddsMap]) -> None:
     check_surface(mapped(m()))

@@ -1,8 +1,11 @@
 """Cameras of one pixel, whose maps can be enumerated by brute force."""
 
+from dataclasses import replace
+
 import numpy as np
 from oracles import inference as reference
 
+from taichi_mrf.inference.ray_model import AS_PRINTED
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -12,14 +15,19 @@ VOXEL = 0.1
 ONE_PIXEL = PinholeCamera(1, 1, 100.0, 100.0, 0.0, 0.0)
 
 
-EXACT = {
-    "segment_lengths": False,
-    "message_precision": "float32",
-    "message_clamp": 25.0,
-    "cavity_clamp": 25.0,
-    "free_share": 0.0,
-    "min_length": 0.0,
-}
+WITH_LENGTHS = replace(AS_PRINTED, segment_lengths=True)
+
+
+class ExactMap(MRFMap):
+    """A map by the equations as they are printed; ``free_share`` is left to its parameters."""
+
+    LIMITS = AS_PRINTED
+
+
+class ExactMapWithLengths(MRFMap):
+    """The same, but a voxel counts by the length of the ray in it."""
+
+    LIMITS = WITH_LENGTHS
 
 
 def random_pose(rng: np.random.Generator, reach: float = 2.0) -> np.ndarray:

@@ -36,7 +36,6 @@ def test_the_first_try_is_where_the_search_begins() -> None:
     assert set(differences(CONFIG, second)) == {
         "inference.surface_density",
         "inference.outlier_floor",
-        "inference.message_clamp",
         "inference.free_share",
         "sensor.sigma_scale",
     }

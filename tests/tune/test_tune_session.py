@@ -89,7 +89,7 @@ def test_the_map_on_the_page_is_that_of_the_last_try() -> None:
 
 
 def test_a_map_on_the_same_grid_takes_the_place_of_the_one_before_without_a_new_beginning() -> None:
-    clamped = dataclasses.replace(CONFIG, inference=InferenceConfig(message_clamp=2.0))
+    clamped = dataclasses.replace(CONFIG, inference=InferenceConfig(surface_density=0.5))
     sharp = dataclasses.replace(CONFIG, sensor=SensorConfig(sigma=(0.001,)))
     session, link = run(script(Try(clamped), Try(sharp)))
     assert len(link.of_type(Hello)) == 1

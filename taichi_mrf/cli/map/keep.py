@@ -23,7 +23,6 @@ from taichi_mrf.system.atomic import write_text
 
 MAY_CHANGE = (
     "inference.sweeps",
-    "inference.tolerance",
     "poses.follow_",
     "runtime.",
     "volume.memory_limit_gb",

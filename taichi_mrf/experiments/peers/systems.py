@@ -11,9 +11,6 @@ from taichi_mrf.experiments.peers.tsdf import TsdfPeer
 ALONE = {"renew_tolerance": NO_OTHERS}
 """Earlier keyframes keep their messages."""
 
-SCOUTS = {"free_space_stride": 16}
-"""One ray in 16 is followed through free space."""
-
 MRF = "MRFMap"
 
 
@@ -31,8 +28,7 @@ def _mrf(lidar: bool) -> System:
         coarse,
         Knob("1/8, 0.5 rays per cm, alone", 8, {"ray_density": 0.5, **ALONE, **beam}),
         Knob("1/4, 1 ray per cm, alone", 4, {"ray_density": 1.0, **ALONE, **beam}),
-        Knob("1/4, 1 ray per cm, alone, scouts", 4, {"ray_density": 1.0, **SCOUTS, **ALONE, **beam}),
-        Knob("1/2, re-inference, scouts", 2, {"first_sweep_stride": 4, **SCOUTS, **beam}),
+        Knob("1/2, re-inference", 2, beam),
         Knob("all pixels, alone", 1, {**ALONE, **beam}),
         standard.of_keyframes(),
         standard,

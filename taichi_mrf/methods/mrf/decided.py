@@ -97,7 +97,7 @@ class Decisions:
         visible = self._registry.visible(keyframe.footprint)
         part = self._registry.pool.part(visible.slots)
         seen = (keyframe, replace(visible, slots=part.in_use, arrays=None))
-        model = replace(self._sweeper.model(), maximise=False)
+        model = self._sweeper.model()
         votes = count_votes([seen], part, model, self._sweeper.volume)
         add_votes(visible.slots, votes.to_numpy()[: len(visible.slots) * VOXELS], self._votes)
 

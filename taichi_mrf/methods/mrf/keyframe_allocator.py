@@ -3,7 +3,6 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference import leave
@@ -33,8 +32,8 @@ class KeyframeAllocator:
     registry: BrickRegistry
     bundler: RayBundler
     sensor: SensorConfig
-    inference: InferenceConfig
     volume: VolumeConfig
+    precision: str
     bounds: KeyframeBounds
     budget: MemoryBudget
     dated: DatedBelief | None = None
@@ -59,7 +58,7 @@ class KeyframeAllocator:
         no_returns: NoReturnRays | None,
     ) -> Keyframe:  # fmt: skip
         """Find the footprint of rays and claim it, if there is enough memory."""
-        parts = (self.registry.voxel_size, self.sensor, self.inference, self.volume)
+        parts = (self.registry.voxel_size, self.sensor, self.volume)
         footprint = find_footprint(image, rays, T_world_camera, *parts, scouts=SCOUTS, no_returns=no_returns)
         of_no_returns = 0 if no_returns is None else no_returns.nbytes
         self.budget.check(footprint, image.nbytes + 4 * rays.blocks.shape[0] + rays.nbytes + of_no_returns)
@@ -145,7 +144,7 @@ class KeyframeAllocator:
             keyframe.entry_depths = unknown_entry_depths(keyframe.ray_list)
             keyframe.entry_depths_known = False
         if old_messages is None or keyframe.visible is not old:
-            keyframe.messages = new_messages(keyframe.visible, self.inference.message_precision)
+            keyframe.messages = new_messages(keyframe.visible, self.precision)
             self.budget.mark_allocated(keyframe.id)
             keyframe.revision = -1
             if old_messages is None:

@@ -6,7 +6,7 @@ The class manages keyframes, bricks and messages. The computation itself is infe
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +18,6 @@ from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
 from taichi_mrf.config.time import TimeConfig
-from taichi_mrf.config.values import overridden
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.factor_graph.depth_graph import depth_graph
 from taichi_mrf.factor_graph.graph import FactorGraph
@@ -28,6 +27,7 @@ from taichi_mrf.inference.keyframe import DepthImage, Keyframe, checked_color, c
 from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
 from taichi_mrf.inference.prior import log_odds_without_bricks, prior_probability
 from taichi_mrf.inference.ray_list import RayBundler
+from taichi_mrf.inference.ray_model import Limits
 from taichi_mrf.inference.schedule import InferReport, InferSteps, Progress, content_key, driven, sweep_steps
 from taichi_mrf.inference.sweep import Sweeper, unknown_entry_depths
 from taichi_mrf.methods.brick_map import check_inference, own_parameters, own_section
@@ -46,9 +46,14 @@ from taichi_mrf.queries.occlusion import Occlusion, doubting
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel, warn_of_bad_sigma
 from taichi_mrf.sensor.own_evidence import checked_evidence, checked_no_return
-from taichi_mrf.sensor.plane_window import PlaneWindow
-from taichi_mrf.sensor.tails import Tails
 from taichi_mrf.voxels.layout import VOXELS
+
+DOUBT_FREE = 0.01
+"""Lower bound on a voxel's probability where measurements are predicted, as a share of its prior: poses and
+noise are never quite right. By default that is 0.02 surfaces per metre."""
+
+DOUBT_OCCUPIED = 0.01
+"""Chance that a predicted ray passes a voxel that was seen to be occupied, however often."""
 
 
 class MRFMap(PosedMRF):
@@ -59,6 +64,8 @@ class MRFMap(PosedMRF):
     """
 
     METHOD: ClassVar[Method] = METHOD
+    LIMITS: ClassVar[Limits] = Limits()
+    """Comparisons with exact inference have their own."""
 
     def __init__(
         self,
@@ -85,17 +92,17 @@ class MRFMap(PosedMRF):
     def _set_up(self, config: Config, noise: NoiseModel | None) -> None:
         inference = config.inference
         self.prior = prior_probability(inference, config.voxel_size)
-        log_odds = log_odds_without_bricks(inference, config.voxel_size)
-        doubt = doubting(inference.doubt_free, inference.doubt_occupied, self.prior)
+        log_odds = log_odds_without_bricks(inference, config.voxel_size, self.LIMITS.message)
+        doubt = doubting(DOUBT_FREE, DOUBT_OCCUPIED, self.prior)
         self._make_bricks(config, noise, *log_odds, config.volume, Occlusion(), doubt)
         bundler = RayBundler(self.voxel_size, inference)
         bounds = KeyframeBounds()
-        parts = (self.sensor, inference, self.config.volume)
+        parts = (self.sensor, self.config.volume, self.LIMITS.precision)
         self._keyframes: dict[int, Keyframe] = {}
         self._date(config.time)
-        budget = MemoryBudget(self._pool, inference.message_precision)
+        budget = MemoryBudget(self._pool, self.LIMITS.precision)
         self._allocator = KeyframeAllocator(self._registry, bundler, *parts, bounds, budget, self._dated)
-        self._sweeper = Sweeper(self.voxel_size, self.sensor, inference, self.config.volume)
+        self._sweeper = Sweeper(self.voxel_size, self.sensor, inference, self.config.volume, self.LIMITS)
         note_sweep = None if self._dated is None else self._dated.note_sweep
         kept = (bounds, self._allocator.look_again, self._allocator.refresh, inference.renew_tolerance)
         self._incremental = IncrementalInference(self._pool, self._sweeper, *kept, note_sweep)
@@ -195,33 +202,29 @@ class MRFMap(PosedMRF):
         tolerance: float | None = None,
         keyframes: Iterable[int] | None = None,
         progress: Progress | None = None,
-        method: Literal["sum-product", "max-product"] | None = None,
     ) -> InferReport:
         """Compute the marginals by loopy belief propagation.
 
         Without ``keyframes`` it starts without messages and sweeps all keyframes in an order that follows
         from their content, so the map is a function of the set of keyframes. With ``keyframes`` (ids) it
-        starts from the present messages and sweeps only those. ``sweeps`` and ``tolerance`` override the
-        configuration for this call, ``method`` from now on. ``progress`` is called after each keyframe;
-        returning False stops. Raises ConfigError for an impossible argument, KeyframeError for an unknown id.
+        starts from the present messages and sweeps only those. ``sweeps`` overrides the configuration for
+        this call. Inference ends early once a sweep has changed at most the share ``tolerance`` of the voxels
+        seen by more than 0.01. ``progress`` is called after each keyframe; returning False stops. Raises
+        ConfigError for an impossible argument, KeyframeError for an unknown id.
         """
-        return driven(self.infer_steps(sweeps, tolerance, keyframes, method), progress)
+        return driven(self.infer_steps(sweeps, tolerance, keyframes), progress)
 
     def infer_steps(
         self,
         sweeps: int | None = None,
         tolerance: float | None = None,
         keyframes: Iterable[int] | None = None,
-        method: Literal["sum-product", "max-product"] | None = None,
     ) -> InferSteps:
         """:meth:`infer` as a generator, which yields an InferProgress after each keyframe. Between two steps
         the map may be queried but not changed."""
         chosen_ids = check_inference(sweeps, tolerance, keyframes)
-        if method is not None and method != self.config.inference.method:
-            self._use(method)
-        config = self.config.inference
-        sweeps = config.sweeps if sweeps is None else sweeps
-        tolerance = config.tolerance if tolerance is None else tolerance
+        configured = self.config.inference.sweeps
+        sweeps, tolerance = configured if sweeps is None else sweeps, tolerance or 0.0
         if chosen_ids is None:
             chosen = sorted(self._keyframes.values(), key=content_key)
             self._pool.restart()
@@ -239,7 +242,7 @@ class MRFMap(PosedMRF):
                 self._allocator.refresh(keyframe)
         for keyframe in chosen:
             self._pool.touch(keyframe.visible.slots)
-        as_configured = keyframes is None and (sweeps, tolerance) == (config.sweeps, config.tolerance)
+        as_configured = keyframes is None and (sweeps, tolerance) == (configured, 0.0)
         complete = False
         try:
             note = None if self._dated is None or chosen_ids is None else self._dated.note_sweep
@@ -332,22 +335,10 @@ class MRFMap(PosedMRF):
         depth, own = checked_evidence(depth, camera, noise, sigma_m, pose_covariance)
         if self.sensor.no_return != "ignore":
             own = replace(own, no_return=checked_no_return(no_return, depth_m, camera))
-        inference = self.config.inference
-        wide = inference.plane_window
-        window = PlaneWindow(wide * self.voxel_size, self.voxel_size) if wide > 0 else None
-        tails = Tails(inference.tail_share, inference.tail_sigmas) if inference.tail_share > 0 else None
-        image = DepthImage.upload(depth, camera, self.noise, checked_color(color, camera), own, window, tails)
+        image = DepthImage.upload(depth, camera, self.noise, checked_color(color, camera), own)
         if not self._keyframes:
             warn_of_bad_sigma(image.noise_table, self.sensor.min_depth, self.sensor.max_depth)
         return image
-
-    def _use(self, method: str) -> None:
-        """Switch the inference method. All messages so far are of the other method, so all are outdated."""
-        inference = overridden(self.config.inference, {"method": method}, "MRFMap.infer")
-        self.config = replace(self.config, **{self.METHOD.section: inference})
-        self._sweeper.inference = inference
-        for keyframe in self._keyframes.values():
-            keyframe.revision = -1
 
     def _restore_messages(self) -> None:
         """Compute the messages of a loaded map: its file holds none, because they follow from the images."""

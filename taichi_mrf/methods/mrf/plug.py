@@ -14,7 +14,6 @@ METHOD = Method(
     section_help="How the marginals are computed.",
     map_class="taichi_mrf.methods.mrf.map:MRFMap",
     sliders=(
-        Slider("method"),
         Slider(
             "surface_density",
             Range(0.1, 12.0, 0.1),
@@ -25,7 +24,6 @@ METHOD = Method(
         ),
         Slider("prior", Range(0.005, 0.6, 0.005), counts=lambda section: section.prior is not None),
         Slider("sweeps", Range(1, 6, 1)),
-        Slider("likelihood"),
         Slider(
             "outlier_floor",
             Range(-9.0, 0.0, 0.25),
@@ -34,8 +32,6 @@ METHOD = Method(
             decades=True,
             searched=True,
         ),
-        Slider("message_clamp", Range(0.5, 14.0, 0.1), "log-odds", searched=True),
-        Slider("cavity_clamp", Range(0.5, 20.0, 0.1), "log-odds"),
         Slider(
             "pass_through", Range(0.0, 0.5, 0.01), counts=lambda section: section.pass_through is not None
         ),

@@ -126,7 +126,7 @@ class WithSurface(BrickMap):
         """Keep what a keyframe's rays say of the surface, if that is wanted; it is about to be frozen."""
         if self._kept.wanted:
             visible = self._registry.visible(keyframe.footprint)
-            models = _model_of(self), replace(self._sweeper.model(), maximise=False)
+            models = _model_of(self), self._sweeper.model()
             share = self._kept.freeze(keyframe, visible, self._pool, models, self.config.volume)
             if self._registry.before_claim is not None:  # what is outside of the window comes back
                 self._registry.before_claim(share.distances.bricks)
@@ -148,4 +148,4 @@ def surface_field_of(
 
 
 def _model_of(m: WithSurface) -> RayModel:
-    return replace(m._sweeper.model(), maximise=False, floor=OUTLIERS / m.sensor.max_depth)
+    return replace(m._sweeper.model(), floor=OUTLIERS / m.sensor.max_depth)

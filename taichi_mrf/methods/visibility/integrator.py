@@ -55,11 +55,10 @@ class VisibilityIntegrator:
     def reach(self, image: DepthImage, T_world_camera: Pose) -> Footprint:
         """The bricks that a scan's rays cross if everything up to their ends is visible. ``surface`` equals
         ``crossed``, so that all are allocated. Raises CapacityError if there is not enough memory."""
-        to_its_end = InferenceConfig(end_sigmas=visibility_scan.SURE_SIGMAS)
         beyond_m = visibility_scan.BEYOND_VOXELS * self.voxel_size
         footprint = find_footprint(
-            image, self.bundler.rays_of(image), T_world_camera, self.voxel_size, self.sensor, to_its_end,
-            self.volume, beyond_m,
+            image, self.bundler.rays_of(image), T_world_camera, self.voxel_size, self.sensor,
+            self.volume, visibility_scan.SURE_SIGMAS, beyond_m,
         )  # fmt: skip
         voxels = len(footprint.crossed) * VOXELS
         check_memory(
