@@ -5,8 +5,7 @@
 Runs the tests that use a backend, then measures, on frames of 640 x 480 of the built-in room, made on the
 fly: a new keyframe with three sweeps at 2 and 1 cm (kernels by Taichi's profiler, and wall time), the share
 of the memory's bandwidth that its kernels achieve, full inference of 100 keyframes at 1 cm, how often the
-host waits for the device, rays' return passes replayed from a trace against followed a
-second time, and OctoMap on one CPU core. Each part is a process of its own with a time of its
+host waits for the device, and OctoMap on one CPU core. Each part is a process of its own with a time of its
 own: a part that fails or takes too long is named, and the others still run. ``--arch cpu --quick`` shows in a
 minute or two that the script works, and nothing else.
 """
@@ -177,7 +176,6 @@ def wall(options: Options) -> dict[str, Any]:
         median = Seconds.median([a + s for a, s in zip(added, swept, strict=True)][len(added) // 2 :])
         row = {"voxel_size": size, "seconds": median.wall, "waits_in_a_sweep": launches.waits}
         row |= {"launches_in_a_sweep": launches.number, "keyframes": len(m.keyframes)}
-        row["sweep_seconds"] = _return_passes(m)
         if last:
             m.infer(sweeps=1)
             row["full_seconds"] = timed(m.infer).wall
@@ -190,22 +188,6 @@ def _sweep_again(m: Any, keyframe: Any) -> None:
     for _ in range(SWEEPS):
         keyframe.revision = -1
         m.infer(sweeps=1, keyframes=[keyframe.id])
-
-
-def _return_passes(m: Any) -> dict[str, float]:
-    """Seconds of one sweep over all keyframes, for each value of inference.return_pass."""
-    from taichi_mrf.benchmark.keyframe_cost import timed
-    from taichi_mrf.methods.mrf.map import MRFMap
-
-    seconds = {}
-    for return_pass in ("replay", "retrace"):
-        inference = dataclasses.replace(m.config.inference, return_pass=return_pass)
-        other = MRFMap(m.voxel_size, m.noise, inference=inference, volume=m.config.volume)
-        for keyframe in m.keyframes.values():
-            other.add_keyframe(keyframe.depth_m, keyframe.T_world_camera, keyframe.camera)
-        other.infer(sweeps=1)  # compiled, and the rays' entry depths known
-        seconds[return_pass] = timed(lambda: other.infer(sweeps=1)).wall  # noqa: B023
-    return seconds
 
 
 def octomap(options: Options) -> dict[str, Any]:
@@ -260,8 +242,6 @@ def _table(report: dict[str, Any], options: Options) -> list[str]:
             f"{_target(least, 'ms')}; a sweep has {row['launches_in_a_sweep']} launches, "
             f"{row['waits_in_a_sweep']} of which the host waits for"
         )
-        ways = ", ".join(f"{name} {s * 1e3:.1f} ms" for name, s in row["sweep_seconds"].items())
-        lines.append(f"{_cm(row)}: a sweep over {row['keyframes']} keyframes, rays' return pass {ways}")
         if "full_seconds" in row:
             full = f"{_cm(row)}: {row['keyframes']} keyframes fully inferred, {row['full_seconds']:.2f} s"
             lines.append(full + _target(FULL_TARGET_S, "s"))

@@ -15,7 +15,6 @@ def main() -> None:
     frames = list(tm.open_dataset("synthetic:room?frames=16&width=160&height=120"))
     maps = {
         "MRFMap": tm.MRFMap(voxel_size=0.05),
-        "MRFMap, max-product": tm.MRFMap(voxel_size=0.05, method="max-product"),
         "OctoMap-style log-odds": tm.LogOddsMap(voxel_size=0.05),
         "visibility map": tm.VisibilityMap(voxel_size=0.05),
     }

@@ -26,8 +26,6 @@ EVERY_PIXEL = mrf("every pixel", ray_density=0.0)
 WANTED = (0.5, 1.0, 2.5, 5.0)
 """Rays a voxel for each centimetre of its side."""
 
-THINNED = (1.0, 2.5)
-
 VIEWS = 12
 """Of each scene, evenly spread, or as many as it has; every JUDGED-th is kept out and judged."""
 
@@ -49,9 +47,7 @@ class _Point:
 
 def ray_contenders() -> Sequence[Contender]:
     """Every pixel, and each choice of rays."""
-    bundled = [mrf(f"bundles, {n:g} per cm", ray_density=n) for n in WANTED]
-    thinned = [mrf(f"thinned, {n:g} per cm", ray_density=n, ray_choice="thin") for n in THINNED]
-    return [EVERY_PIXEL, *bundled, *thinned]
+    return [EVERY_PIXEL, *(mrf(f"bundles, {n:g} per cm", ray_density=n) for n in WANTED)]
 
 
 def run_rays(experiment: Experiment) -> tuple[list[Table], list[Path]]:

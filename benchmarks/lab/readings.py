@@ -3,7 +3,7 @@
 Every pixel of held-out views follows its ray to the first voxel that is called occupied, and is judged as
 omega's answer is (evaluation/accuracy.py). Beside that, how far the probabilities can be trusted: their
 reliability on the voxels that measured rays saw, without and with those behind the surface, for the
-calibrated reading and for marginals as ``inference.ray_correlation`` varies.
+calibrated reading and for marginals.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,6 @@ from taichi_mrf.experiments.judging import build
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import (
     OFF_THE_GRID_M,
-    TURNED,
     Scene,
     coffin_scene,
     house_scene,
@@ -42,9 +41,6 @@ from taichi_mrf.queries.view import View
 from taichi_mrf.sensor.simulate import simulate_model
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
-
-CORRELATIONS = (1.0, 0.5, 0.3)
-"""Values of ``inference.ray_correlation``."""
 
 VIEWS = 40
 """Of each scene, at most: every second one is a keyframe, every fourth of the others is judged."""
@@ -82,23 +78,21 @@ def run_readings(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     for make in makers:
         scene, mesh = make()
         require_views(scene, 4)
-        correlations = CORRELATIONS[:1] if scene.name.endswith(TURNED) else CORRELATIONS
-        for voxel_size in experiment.voxel_sizes:
-            for number, correlation in enumerate(correlations):
-                contender = mrf(f"rho {correlation:g}", ray_density=2.5, ray_correlation=correlation)
-                experiment.report(f"{scene.name}, {contender.name}", number, len(correlations))
-                figures = experiment.ledger.result(
-                    fold_key(scene, 0, contender, voxel_size, f"{len(scene.views)} views, three readings"),
-                    lambda c=contender, s=scene, t=mesh, size=voxel_size: _figures(c, s, t, size),  # type: ignore[misc]
-                )
-                head: list[Entry] = [f"{voxel_size * 100:g} cm", scene.name, correlation]
-                readings += [[*head, *row] for row in figures["readings"]]
-                trust += [[*head, *row] for row in figures["trust"]]
+        contender = mrf(ray_density=2.5)
+        for number, voxel_size in enumerate(experiment.voxel_sizes):
+            experiment.report(scene.name, number, len(experiment.voxel_sizes))
+            figures = experiment.ledger.result(
+                fold_key(scene, 0, contender, voxel_size, f"{len(scene.views)} views, three readings"),
+                lambda c=contender, s=scene, t=mesh, size=voxel_size: _figures(c, s, t, size),  # type: ignore[misc]
+            )
+            head: list[Entry] = [f"{voxel_size * 100:g} cm", scene.name]
+            readings += [[*head, *row] for row in figures["readings"]]
+            trust += [[*head, *row] for row in figures["trust"]]
     tables = [
         Table(
             "readings",
             "What is called occupied, and omega's answer",
-            ["voxels", "scene", "ray correlation", "reading", "1.5sigma", "5cm", "unanswered", "precision",
+            ["voxels", "scene", "reading", "1.5sigma", "5cm", "unanswered", "precision",
              "recall"],
             readings,
             ["Precision and recall are of the voxels called occupied, as in Table II."],
@@ -106,7 +100,7 @@ def run_readings(experiment: Experiment) -> tuple[list[Table], list[Path]]:
         Table(
             "trust",
             "How far probabilities can be trusted",
-            ["voxels", "scene", "ray correlation", "reading", "judged", "precision", "recall",
+            ["voxels", "scene", "reading", "judged", "precision", "recall",
              "log-likelihood", "largest gap", *(f"{i / BINS:g}" for i in range(BINS))],
             trust,
             ["The last columns: observed share minus mean probability in each bin of at least "
