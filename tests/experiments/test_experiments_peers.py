@@ -18,7 +18,7 @@ from taichi_mrf.experiments.peers.plots import Point, frontier
 from taichi_mrf.experiments.peers.systems import systems
 from taichi_mrf.experiments.peers.truth import FREE_A_PIXEL, KnownPoints, along_rays, cell_scores
 from taichi_mrf.experiments.peers.tsdf import TsdfPeer
-from taichi_mrf.experiments.run import run_experiment
+from taichi_mrf.experiments.run import EXPERIMENTS, run_experiment
 from taichi_mrf.experiments.scenes import Scene, SceneView
 
 pytestmark = pytest.mark.usefixtures("one_backend")
@@ -184,7 +184,15 @@ def test_the_comparison_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest
     def evaluate() -> tuple[list, list[Path]]:
         parts = ("kitchen, 10 cm, *", "house*")
         return run_experiment(
-            "peers", data, tmp_path, (0.1,), (0,), None, lambda what, *_: done.append(what), parts
+            "peers",
+            EXPERIMENTS["peers"],
+            data,
+            tmp_path,
+            (0.1,),
+            (0,),
+            None,
+            lambda what, *_: done.append(what),
+            parts,
         )
 
     (budgets, settings, states, profile), paths = evaluate()
