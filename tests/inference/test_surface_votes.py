@@ -134,6 +134,19 @@ def test_a_new_keyframe_adds_its_votes_to_those_of_before() -> None:
     np.testing.assert_array_equal(m.decided.occupancy(centres), scene.decided.occupancy(centres))
 
 
+def test_votes_states_and_the_surface_count_as_memory() -> None:
+    m = uncertain_wall(2)
+    before = m.statistics().memory_mb
+    m.first_surfaces()
+    counted = m.statistics().memory_mb
+    assert counted - before >= 4e-6 * 512 * (m.view.pool.capacity - 1)
+    m.decide()
+    decided = m.statistics().memory_mb
+    assert decided - counted >= 4e-6 * 512 * m.view.pool.capacity
+    m.render_depth(next(iter(m.keyframes.values())).camera, np.eye(4))
+    assert m.statistics().memory_mb > decided
+
+
 def test_an_empty_map_can_be_read() -> None:
     m = MRFMap(VOXEL)
     assert len(m.decided.voxels()[0]) == 0

@@ -44,6 +44,11 @@ class Decisions:
         self._shown: PoolSnapshot | None = None
         self._exact = False
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the votes."""
+        return 4 * int(self._votes.shape[0])
+
     def log_odds(self, settled: bool, between: Callable[[], object] = lambda: None) -> "ti.Ndarray":
         """Log-odds (capacity * 512) above 0 in occupied voxels, the marginals' in all others. In a
         ``settled`` map they follow from the keyframes alone. ``between`` is called after each keyframe; what
