@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.queries.clusters import find_clusters
-from taichi_mrf.voxels.layout import BRICK, VOXELS, grid_keys
+from taichi_mrf.voxels.layout import BRICK, VOXELS, grid_keys, rows_around
 from taichi_mrf.voxels.pool import BrickPool
 
 SLACK_VOXELS = 3
@@ -17,7 +17,6 @@ SLACK_VOXELS = 3
 CORE_VOXELS = 8
 """A cluster of voxels is told of if so many of it are further than that from all surfaces."""
 
-_AROUND = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1).astype(np.int32) - 1
 _BRICKS_AT_ONCE = 4096
 
 
@@ -38,16 +37,11 @@ class Surfaces:
         slots = pool.in_use
         keys = grid_keys(pool.bricks[slots])
         order = np.argsort(keys)
-        self._keys, self._slots = keys[order], slots[order]
+        self._keys, self._slots = keys[order], np.append(slots[order], np.int32(-1))
 
     def _around(self, bricks: NDArray[np.int32]) -> NDArray[np.int32]:
         """The slots of bricks (n, 3) and of the 26 around each, (n, 27); -1 where there is none."""
-        keys = grid_keys((bricks[:, None] + _AROUND).reshape(-1, 3))
-        if not len(self._keys):
-            return np.full((len(bricks), len(_AROUND)), -1, np.int32)
-        rows = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
-        found = np.where(self._keys[rows] == keys, self._slots[rows], np.int32(-1))
-        return found.reshape(-1, len(_AROUND)).astype(np.int32)
+        return self._slots[rows_around(bricks, self._keys)]
 
     def clear(self, voxels: NDArray[np.int32]) -> NDArray[np.bool_]:
         """Which voxels, coordinates (n, 3), have no surface within SLACK_VOXELS, (n,)."""
@@ -66,7 +60,7 @@ class Surfaces:
     ) -> NDArray[np.bool_]:
         """The same for voxels of some bricks (k, 3), each by its ``owner`` among them (n,)."""
         slots, place = np.unique(self._around(bricks), return_inverse=True)
-        place = place.reshape(-1, len(_AROUND))
+        place = place.reshape(-1, 27)
         occupied = np.zeros((len(slots), VOXELS), np.bool_)
         occupied[slots >= 0] = self._pool.read(self._channel, slots[slots >= 0]) >= 0
         clear = np.ones(len(voxels), np.bool_)

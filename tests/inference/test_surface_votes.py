@@ -12,7 +12,7 @@ from uncertain_wall import WALL_M, uncertain_wall
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.inference.surface_votes import CALLED, GRAZED
-from taichi_mrf.methods.mrf import keyframe_allocator
+from taichi_mrf.methods.mrf import decided, keyframe_allocator
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.queries.cast import cast_rays
 from taichi_mrf.queries.points import OCCUPIED
@@ -132,6 +132,30 @@ def test_a_new_keyframe_adds_its_votes_to_those_of_before() -> None:
     assert same.mean() > 0.97  # votes of the first two are those of before
     m.infer()
     np.testing.assert_array_equal(m.decided.occupancy(centres), scene.decided.occupancy(centres))
+
+
+def test_keyframes_counted_together_vote_as_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[int] = []
+    together = uncertain_wall(3)
+    together.decide(lambda: calls.append(1))
+    assert len(calls) == 3
+    monkeypatch.setattr(decided, "AT_ONCE", 1)
+    alone = uncertain_wall(3)
+    assert together.first_surfaces().any()
+    np.testing.assert_array_equal(together.first_surfaces(), alone.first_surfaces())
+
+
+def test_votes_states_and_the_surface_count_as_memory() -> None:
+    m = uncertain_wall(2)
+    before = m.statistics().memory_mb
+    m.first_surfaces()
+    counted = m.statistics().memory_mb
+    assert counted - before >= 4e-6 * 512 * (m.view.pool.capacity - 1)
+    m.decide()
+    decided = m.statistics().memory_mb
+    assert decided - counted >= 4e-6 * 512 * m.view.pool.capacity
+    m.render_depth(next(iter(m.keyframes.values())).camera, np.eye(4))
+    assert m.statistics().memory_mb > decided
 
 
 def test_an_empty_map_can_be_read() -> None:

@@ -114,8 +114,14 @@ class ReadableMRF(WithSurface):
 
     @property
     def _left_bytes(self) -> int:
-        """Bytes of the colours, and of what frozen keyframes measured."""
-        return self._colors.nbytes + self._kept.share.nbytes
+        """Bytes of the colours, of what frozen keyframes measured, and of the states and the surface that
+        were asked for."""
+        asked = self._decisions.nbytes
+        if self._decided is not None:
+            asked += 4 * int(self._decided[1].shape[0])
+        if self._rendered is not None:
+            asked += self._rendered[1].nbytes
+        return self._colors.nbytes + self._kept.share.nbytes + asked
 
     def _prepare_colors(self) -> None:
         if not self._colors.is_current:
