@@ -130,7 +130,8 @@ class ShownMap:
     def _changes(self) -> list[Bricks]:
         found = [self.publisher.changes()]
         if self._dynamic is not None:
-            before, self._moving = self._moving.slots, Moving.of(self._pool, self._shown_pool)
+            before, size = self._moving.slots, self.map.voxel_size
+            self._moving = Moving.of(self._pool, self._shown_pool, size)
             slots = np.union1d(before, self._moving.slots).astype(np.int32)
             found.append(self._dynamic.changes(slots[self._pool.owners[slots] > 0]))
         return [bricks for bricks in found if bricks is not None]
