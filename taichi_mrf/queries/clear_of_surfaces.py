@@ -28,7 +28,7 @@ CORE_VOXELS = 16
 """A cluster is told of if so many of its voxels are further than the slack from all surfaces."""
 
 _BRICKS_AT_ONCE = 4096
-_STEPS_AT_ONCE = 64
+_STEPS_AT_ONCE = 16
 
 
 @cache
