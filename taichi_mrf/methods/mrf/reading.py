@@ -184,7 +184,7 @@ class ReadableMRF(WithSurface):
             rays = None if stamp_s is None else RaysThen(shown, stamp_s, LEAST * self.prior, with_frozen)
             return MapReading(self, shown, rays)
         dynamic = which == "dynamic"
-        belief = layer_of(pool, shown, dynamic)
+        belief = layer_of(pool, shown, dynamic, self.voxel_size)
         # All that is dynamic is occupied; what the layer does not know is at the prior.
         least, judging = (0.5, shown) if dynamic else (LEAST * self.prior, belief)
         reading = MapReading(self, belief, RaysThen(judging, stamp_s, least, with_frozen))

@@ -2,13 +2,13 @@
 the slider's. No page is needed to import it."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 from taichi_mrf.config.sliders import Range
 
 ColorBy = Literal["marginal", "height", "uncertainty", "keyframes", "photo"]
-UNPAINTED: tuple[ColorBy, ...] = tuple(each for each in get_args(ColorBy) if each != "photo")
-"""What the colour can show of a map that no camera has seen in colour."""
+OF_BELIEFS: tuple[ColorBy, ...] = ("marginal", "height", "uncertainty")
+"""What the colour can show of every map."""
 Show = Literal["surface", "voxels"]
 CutAxis = Literal["none", "x", "y", "z"]
 
