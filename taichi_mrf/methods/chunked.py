@@ -88,6 +88,11 @@ class ChunkedMap:
         """The map in a folder such as map.zarr. Raises MapFileError, TaichiMRFError without zarr."""
         return cls(ChunkStore.open(path), cache_mb)
 
+    @property
+    def holds_marginals(self) -> bool:
+        """Whether the log-odds are those of the marginals."""
+        return self._by == "marginal"
+
     @cached_property
     def decided(self) -> "ChunkedMap":
         """The map by what is occupied, as MRFMap.decided; itself if the store holds no votes of rays."""

@@ -27,7 +27,8 @@ from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.change import MapChange, compare_maps
 from taichi_mrf.system import tensors
 from taichi_mrf.system.compiler import ti
-from taichi_mrf.voxels.pool import copied
+from taichi_mrf.voxels.pool import BrickPool, copied
+from taichi_mrf.voxels.topology import Topology
 
 ItemT = TypeVar("ItemT")
 
@@ -44,6 +45,7 @@ class ReadableMRF(WithSurface):
     _dated: DatedBelief | None
     _decisions: Decisions
     _decided: "tuple[MadeOf, ti.Ndarray] | None" = None
+    _calibrated: "tuple[MadeOf, ti.Ndarray] | None" = None
 
     @property
     def keyframes(self) -> Mapping[int, Keyframe]:
@@ -214,10 +216,22 @@ class ReadableMRF(WithSurface):
     def calibrated(self, between: Callable[[], object] = lambda: None) -> MapReading:
         """The map by the probability that each voxel holds a surface, from the distances of all rays
         (methods.mrf.calibrated), which can be trusted as a probability; the marginals are more cautious.
-        ``between`` is called after each keyframe. Raises CapacityError if there is not enough memory."""
-        log_odds = copied(self._pool.belief)
-        log_odds.from_numpy(calibrated_log_odds(self.surface_field(between), self._pool).reshape(-1))
-        return MapReading(self, log_odds)
+        Found once for each state of the map. ``between`` is called after each keyframe. Raises CapacityError
+        if there is not enough memory."""
+        return MapReading(self, self._calibrated_log_odds(between))
+
+    def _calibrated_log_odds(self, between: Callable[[], object] = lambda: None) -> "ti.Ndarray":
+        made_of = MadeOf(self)
+        if self._calibrated is None or self._calibrated[0] != made_of:
+            self._calibrated = None
+            log_odds = copied(self._pool.belief)
+            log_odds.from_numpy(calibrated_log_odds(self.surface_field(between), self._pool).reshape(-1))
+            self._calibrated = made_of, log_odds
+        return self._calibrated[1]
+
+    def _likely_grid(self) -> tuple[float, Topology, BrickPool, float]:
+        """Calibrated where distances are at hand, else the marginals."""
+        return self.calibrated()._grid() if self.has_surface else self._grid()
 
     def first_surfaces(self) -> NDArray[np.bool_]:
         """Which voxels of ``view.pool`` win the vote of the rays for their first surface, (slots, 512)."""
