@@ -17,7 +17,7 @@ from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import count_observations
 from taichi_mrf.inference.sweep import Sweeper
-from taichi_mrf.methods.mrf.calibrated import calibrated_log_odds
+from taichi_mrf.methods.mrf.calibrated import calibrated_log_odds, carried
 from taichi_mrf.methods.mrf.decided import Decisions
 from taichi_mrf.methods.mrf.kept_rays import RayShare
 from taichi_mrf.methods.mrf.layers import layer_of
@@ -196,8 +196,10 @@ class ReadableMRF(WithSurface):
         Besides the voxels whose marginal is over one half it has those that win the vote of the rays: each
         measured ray votes for the voxel that most likely is its first surface, and against those in front of
         it (inference.surface_votes). A wall that is seen with a sigma of several voxels has no voxel that is
-        more likely occupied than not. The log-odds of winners are raised to just above even odds, all others
-        are the marginals'. Votes of frozen keyframes are kept with ``keep_surface``, else they have none.
+        more likely occupied than not. Log-odds are the calibrated ones (:meth:`calibrated`) as far as the
+        states allow, once the map is settled and has a surface; else those of winners are raised to just
+        above even odds, and all others are the marginals'. Votes of frozen keyframes are kept with
+        ``keep_surface``, else they have none.
         """
         return self.decide()
 
@@ -207,7 +209,12 @@ class ReadableMRF(WithSurface):
         made_of = MadeOf(self)
         if self._decided is None or self._decided[0] != made_of:
             self._decided = None  # its memory, before there is another
-            self._decided = made_of, self._decisions.log_odds(self._settled, between)
+            log_odds = self._decisions.log_odds(self._settled, between)
+            if self._settled and self.has_surface:
+                likely, pool = self._calibrated_log_odds(between).to_numpy(), self._pool
+                known = pool.prior_log_odds, self.view.volume.min_evidence
+                log_odds.from_numpy(carried(likely, log_odds.to_numpy(), *known))
+            self._decided = made_of, log_odds
         # Not kept: a reading keeps the map, whose memory would then wait for the collector of cycles.
         reading = MapReading(self, self._decided[1])
         reading.view.index = self.view.index
