@@ -22,7 +22,7 @@ class ViewOptions:
     surface is made when no frames are read, at the end or while paused; until then voxels are shown."""
 
     color_by: ColorBy = "height"
-    """What the colour shows: the marginal probability, the height, the uncertainty (of a voxel its entropy,
+    """What the colour shows: the probability, the height, the uncertainty (of a voxel its entropy,
     of the surface its standard deviation), the number of keyframes whose rays pass through the voxel, or what
     cameras saw (photo)."""
 
