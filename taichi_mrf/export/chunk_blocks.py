@@ -13,6 +13,7 @@ from taichi_mrf.export.store_header import COLORS, FIRST, SURFACE
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.queries.colored import ColoredMap
 from taichi_mrf.queries.known_bricks import BrickReader, Bricks, QueriedMap, known_bricks
+from taichi_mrf.queries.points import OCCUPIED, classify
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, by_chunk
 
 
@@ -101,7 +102,9 @@ def write_chunks(
                 colors = colored.colors_in(reader.slots(bricks[rows]))
                 store.write_extra(COLORS, chunk, extra_block(chunk, bricks[rows], colors))
             if deciding is not None:
-                found = deciding.log_odds(bricks[rows]) > log_odds
+                known = deciding.pool.prior_log_odds, m.view.volume.min_evidence
+                decided, own = (classify(x, *known) for x in (deciding.log_odds(bricks[rows]), log_odds))
+                found = (decided == OCCUPIED) & (own != OCCUPIED)
                 store.write_extra(FIRST, chunk, first_block(chunk, bricks[rows], found))
         for x, y, z in places.tolist():
             assert surface is not None

@@ -37,7 +37,7 @@ def write_voxels(
     """
     comments = [
         f"voxel_size {voxel_size:.9g} metres",
-        "occupancy is the marginal probability that the voxel is occupied",
+        "occupancy is the probability that the voxel is occupied",
         MARGINAL_NOTE if colors is None else PHOTO_NOTE,
     ]
     extra = {"occupancy": np.asarray(probability, "<f4")}

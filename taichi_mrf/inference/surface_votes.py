@@ -10,7 +10,7 @@ voxel that it crosses before it. A voxel wins that more than two fifths of the r
 take for their surface. Rays whose measurement the map holds for an outlier do not vote.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from taichi_mrf.config.schema import VolumeConfig
@@ -43,9 +43,10 @@ def count_votes(
     pool: BrickPool | PoolPart,
     model: RayModel,
     volume: VolumeConfig,
+    between: Callable[[], object] = lambda: None,
 ) -> "ti.Ndarray":
     """The votes for and against each voxel, (capacity * 512) int32, of keyframes with their lists of visible
-    bricks; ``model`` are the parameters of their rays."""
+    bricks; ``model`` are the parameters of their rays. ``between`` is called after each keyframe."""
     learnt = pool.prior_log_odds + volume.min_evidence
     index = WindowIndex()
     votes = ti.ndarray(ti.i32, pool.belief.shape)
@@ -62,7 +63,8 @@ def count_votes(
                 model, free_logs, workers_without_trace(), vote,
             )  # fmt: skip
             index.clear(window, visible.cells)
-    runtime.settle()
+            runtime.settle()
+        between()
     return votes
 
 

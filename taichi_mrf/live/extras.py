@@ -74,7 +74,7 @@ class Extras:
             return True
         if self._run.renew_past() or self._make_images() or self._list_changes() or self._send_colors():
             return True
-        if self._send_surface(go_on) or self._decide(go_on):
+        if self._decide(go_on) or self._send_surface(go_on):
             return True
         if not self._watch.baseline:
             if self._baseline is not None:
@@ -164,6 +164,7 @@ class Extras:
         except Exception as error:  # marginals are shown instead
             run.send(Notice(f"shown by marginals: {error}", "error"))
             shown.give_up_deciding()
+            run.publish()
         return True
 
     @property

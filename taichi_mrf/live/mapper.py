@@ -22,7 +22,7 @@ from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.refinement import PoseRefiner
 from taichi_mrf.mapping.selection import surplus
 from taichi_mrf.mapping.settling import FullInference
-from taichi_mrf.methods.capabilities import can_freeze, has_dates, has_messages, window_of
+from taichi_mrf.methods.capabilities import can_freeze, has_messages, window_of
 from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap
 from taichi_mrf.sensor.own_evidence import NOTHING
 from taichi_mrf.viewer import messages
@@ -54,12 +54,11 @@ class Mapper:
             self.roster.add(
                 keyframe, keyframe.rays, thumbnail(keyframe.camera, keyframe.depth_m), id, keyframe.stamp_s
             )
-        self.shown = ShownMap(m)
         # A map from a file has beliefs but no messages; an edit needs full inference first.
         self.lacks_messages = bool(m.keyframes) and has_messages(m)
         self.saved_unsettled = bool(m.keyframes) and not m.settled
-        # What moves, and the past, follow from messages.
-        self.unsettled = self.saved_unsettled or self.stale or (self.lacks_messages and has_dates(m))
+        self.unsettled = self.saved_unsettled or self.stale
+        self.shown = ShownMap(m, opened=self.lacks_messages and not self.unsettled)
         self.edited = False
         self.unaligned = False
         self.cavities_changed = False

@@ -17,7 +17,13 @@ from taichi_mrf.live.source import Source, saved_unsettled
 from taichi_mrf.mapping.follow import follower_of
 from taichi_mrf.mapping.intake import Intake
 from taichi_mrf.mapping.result import MappingResult
-from taichi_mrf.methods.capabilities import can_freeze, measures_surface, window_of
+from taichi_mrf.methods.capabilities import (
+    can_freeze,
+    has_messages,
+    measures_surface,
+    takes_colors,
+    window_of,
+)
 from taichi_mrf.queries.colored import is_colored
 from taichi_mrf.runs.files import MAP_FILE
 from taichi_mrf.runs.folder import RunFacts
@@ -100,8 +106,10 @@ class Run(SessionCore):
                 parameters=to_yaml(self.source.config),
                 can_freeze=can_freeze(m),
                 has_dates=self.mapper.shown.has_dates,
-                has_colors=self.source.config.color or is_colored(m),
+                has_colors=takes_colors(m) and (self.source.config.color or is_colored(m)),
                 has_surface=measures_surface(m),
+                counts_keyframes=has_messages(m),
+                has_frames=self.source.new_replay is not None,
             )
         )
         if self.mapper.saved_unsettled and self.mapper.unsettled:

@@ -126,8 +126,11 @@ class Session:
     @property
     def _needs_messages(self) -> bool:
         """Whether an edit or what the page shows waits for the messages of a map from a file."""
-        wanted = self.state.inbox.has_edits() or self._extras.need_messages
-        return self.state.mapper.lacks_messages and wanted
+        mapper = self.state.mapper
+        wanted = (
+            self.state.inbox.has_edits() or self._extras.need_messages or mapper.shown.stamp_s is not None
+        )
+        return mapper.lacks_messages and wanted
 
     def _follow(self, exactly: bool = False) -> bool:
         """Move keyframes whose poses have changed, for a limited time, and show them; returns whether any

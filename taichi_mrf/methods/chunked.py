@@ -19,7 +19,7 @@ from taichi_mrf.export.store_header import COLORS, FIRST, SURFACE
 from taichi_mrf.geometry.up import Up, up_from_name
 from taichi_mrf.inference.surface_votes import called
 from taichi_mrf.methods.map_file import check_registered
-from taichi_mrf.methods.mrf.calibrated import calibrated_block
+from taichi_mrf.methods.mrf.calibrated import calibrated_block, carried
 from taichi_mrf.methods.stored_distances import StoredDistances
 from taichi_mrf.queries.box import BoxOfVoxels, voxels_of_box
 from taichi_mrf.queries.points import checked_points, classify, probability
@@ -87,6 +87,11 @@ class ChunkedMap:
     def open(cls, path: str | Path, cache_mb: float = 256.0) -> "ChunkedMap":
         """The map in a folder such as map.zarr. Raises MapFileError, TaichiMRFError without zarr."""
         return cls(ChunkStore.open(path), cache_mb)
+
+    @property
+    def holds_marginals(self) -> bool:
+        """Whether the log-odds are those of the marginals."""
+        return self._by == "marginal"
 
     @cached_property
     def decided(self) -> "ChunkedMap":
@@ -253,19 +258,26 @@ class ChunkedMap:
 
     def _read_by_rays(self, chunk: Chunk, block: NDArray[np.float32]) -> NDArray[np.float32]:
         """Log-odds of a chunk by the rule of the map, from the marginals'."""
-        prior = self.header.prior_log_odds
+        if self._by == "marginal":
+            return block
+        likely = self._calibrated_chunk(chunk, block) if self.has_surface else None
         if self._by == "decided":
+            prior, min_evidence = self.header.prior_log_odds, self.header.min_evidence
             first = self.store.read_extra(FIRST, chunk)[..., 0] > 0
-            block[first] = np.maximum(block[first], called(prior, self.header.min_evidence))
-        elif self._by == "calibrated":
-            unknown = np.isnan(block)
-            bricks = np.where(unknown, np.float32(prior), block).reshape((CHUNK, BRICK) * 3)
-            # Free space away from surfaces has no voxels, and stays as it is, as does what is unknown.
-            away = np.abs(bricks - self.header.seen_free_log_odds) < _SAME_LOG_ODDS
-            near = ~(away | unknown.reshape(bricks.shape)).all(axis=(1, 3, 5), keepdims=True)
-            place = np.array(chunk, np.int64) * CHUNK_VOXELS
-            field = self.distances(place - BRICK, place + CHUNK_VOXELS + BRICK)
-            found = calibrated_block(field, place // CHUNK_VOXELS, bricks.reshape(block.shape), prior)
-            changed = np.where(near, found.reshape(bricks.shape), bricks).reshape(block.shape)
-            block = np.where(unknown & (changed == np.float32(prior)), np.float32(np.nan), changed)
-        return block
+            block[first] = np.maximum(block[first], called(prior, min_evidence))
+            return block if likely is None else carried(likely, block, prior, min_evidence)
+        assert likely is not None  # calibrated() has seen to it
+        return likely
+
+    def _calibrated_chunk(self, chunk: Chunk, block: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Calibrated log-odds of a chunk's voxels, from the marginals'; NaN where these are unknown."""
+        prior, unknown = self.header.prior_log_odds, np.isnan(block)
+        bricks = np.where(unknown, np.float32(prior), block).reshape((CHUNK, BRICK) * 3)
+        # Free space away from surfaces has no voxels, and stays as it is, as does what is unknown.
+        away = np.abs(bricks - self.header.seen_free_log_odds) < _SAME_LOG_ODDS
+        near = ~(away | unknown.reshape(bricks.shape)).all(axis=(1, 3, 5), keepdims=True)
+        place = np.array(chunk, np.int64) * CHUNK_VOXELS
+        field = self.distances(place - BRICK, place + CHUNK_VOXELS + BRICK)
+        found = calibrated_block(field, place // CHUNK_VOXELS, bricks.reshape(block.shape), prior)
+        changed = np.where(near, found.reshape(bricks.shape), bricks).reshape(block.shape)
+        return np.where(unknown & (changed == np.float32(prior)), np.float32(np.nan), changed)

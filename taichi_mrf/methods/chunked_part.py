@@ -83,6 +83,14 @@ class MapPart:
             return self
         return take_part(by_votes, self.lowest * brick_m, self.after * brick_m)
 
+    @cached_property
+    def _likely(self) -> "MapPart":
+        """The part with calibrated probabilities where the map holds what rays measured, else itself."""
+        if not self.source.holds_marginals or not self.has_surface:
+            return self
+        brick_m = BRICK * self.voxel_size
+        return take_part(self.source.calibrated(), self.lowest * brick_m, self.after * brick_m)
+
     @tensors.in_kind("points")
     def state(self, points: ArrayLike) -> NDArray[np.int8]:
         """UNKNOWN, FREE or OCCUPIED at (N, 3) points in metres, (N,)."""
@@ -142,13 +150,13 @@ class MapPart:
     def occupied_within(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
         """The probability that something lies within ``radius_m`` of points (N, 3) in metres, (N,), as
         OccupancyMap.occupied_within."""
-        return occupied_within(points, radius_m, *self._grid())
+        return occupied_within(points, radius_m, *self._likely._grid())
 
     @tensors.in_kind("points")
     def path_collision(self, points: ArrayLike, radius_m: float) -> NDArray[np.float32]:
         """The probability that a ball hits something on its way along paths (..., N, 3), as
         OccupancyMap.path_collision."""
-        return path_collision(points, radius_m, *self._grid())
+        return path_collision(points, radius_m, *self._likely._grid())
 
     def _grid(self) -> tuple[float, "_PartIndex", BrickPool, float]:
         index = _PartIndex(BrickReader(self), self.free_bricks)

@@ -45,7 +45,7 @@ def without_slack(change: MapChange, a: QueriedMap, b: QueriedMap, core: int = C
     kept = np.zeros(len(voxels), np.bool_)
     for before, after, other in ((FREE, OCCUPIED, a), (OCCUPIED, FREE, b)):
         rows = np.flatnonzero((change.before == before) & (change.after == after))
-        kept[rows] = stands_clear(voxels[rows], Surfaces(other.view.pool), core)
+        kept[rows] = stands_clear(voxels[rows], Surfaces(other.view.pool, other.voxel_size), core)
     return replace(
         change,
         points=change.points[kept],

@@ -61,6 +61,11 @@ class MeasuredDepth:
             _blend(field.weight.reshape(-1), field.distance.reshape(-1), around, self._mean)
             runtime.settle()
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes in memory."""
+        return 4 * (self._mean.shape[0] + self._index.bricks.shape[0])
+
     def near(
         self, depth_m: NDArray[np.float32], camera: Camera, T_world_camera: Pose, max_depth: float
     ) -> NDArray[np.float32]:

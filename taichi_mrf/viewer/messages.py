@@ -63,6 +63,10 @@ class Hello(Update):
     """Whether voxels have the colours that cameras saw."""
     has_surface: bool = False
     """Whether the map can make the surface that its keyframes measured."""
+    counts_keyframes: bool = True
+    """Whether the map knows how many keyframes see a voxel."""
+    has_frames: bool = True
+    """Whether the map is made from frames, and is not one from a file."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, grid_keys
+from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, grid_keys, rows_around
 
 Sums = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 """Weights, and distances and excesses times weight."""
@@ -90,11 +90,7 @@ class DistanceField:
 
     def rows_around(self) -> NDArray[np.int32]:
         """The rows of the 27 bricks in and around each, (n, 27), x slowest; -1 where there is none."""
-        steps = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1) - 1
-        wanted = grid_keys((self.bricks[:, None] + steps).reshape(-1, 3))
-        rows = np.minimum(np.searchsorted(self._keys, wanted), len(self._keys) - 1)
-        rows = np.where(self._keys[rows] == wanted, rows, -1)
-        return rows.astype(np.int32).reshape(-1, 27)
+        return rows_around(self.bricks, self._keys)
 
     @cached_property
     def _keys(self) -> NDArray[np.int64]:

@@ -40,6 +40,17 @@ def grid_keys(cells: NDArray[np.integer] | NDArray[np.floating]) -> NDArray[np.i
     return (i << 42) | (j << 21) | k
 
 
+def rows_around(cells: NDArray[np.int32], keys: NDArray[np.int64], reach: int = 1) -> NDArray[np.int32]:
+    """Where cells (n, 3) and those up to ``reach`` away along each axis stand among ascending ``keys``
+    (:func:`grid_keys`): (n, (2 reach + 1)^3), x slowest, -1 where there is none."""
+    steps = np.indices((2 * reach + 1,) * 3).reshape(3, -1).T - reach
+    wanted = grid_keys((cells[:, None] + steps).reshape(-1, 3))
+    if not len(keys):
+        return np.full((len(cells), len(steps)), -1, np.int32)
+    rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return np.where(keys[rows] == wanted, rows, -1).astype(np.int32).reshape(-1, len(steps))
+
+
 def by_chunk(bricks: NDArray[np.int32]) -> Iterator[tuple[tuple[int, int, int], NDArray[np.int64]]]:
     """The chunks that bricks (n, 3) lie in, each with the rows of its bricks."""
     chunks, owner = np.unique(bricks // CHUNK, axis=0, return_inverse=True)

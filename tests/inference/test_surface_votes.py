@@ -12,10 +12,11 @@ from uncertain_wall import WALL_M, uncertain_wall
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.errors import KeyframeError
 from taichi_mrf.inference.surface_votes import CALLED, GRAZED
-from taichi_mrf.methods.mrf import keyframe_allocator
+from taichi_mrf.methods.mrf import decided, keyframe_allocator
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.methods.mrf.map_reading import MapReading
 from taichi_mrf.queries.cast import cast_rays
-from taichi_mrf.queries.points import OCCUPIED
+from taichi_mrf.queries.points import FREE, OCCUPIED
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
 
@@ -78,7 +79,7 @@ def test_voxels_are_called_as_the_rays_vote(seed: int, count: int, sigma: float)
     assume(len(doubtful) < len(voxels))
     called = reference.logistic(CALLED)
     expected = {v: max(p[v], called) if votes.get(v, 0) > 0 else p[v] for v in voxels if v not in doubtful}
-    got = marginals(m.decided, list(expected))
+    got = marginals(MapReading(m, m._decisions.log_odds(settled=True)), list(expected))
     np.testing.assert_allclose(got, list(expected.values()), atol=1e-5)
     np.testing.assert_array_equal(marginals(m.layer(), voxels), before)
     event(f"{sum(votes.get(v, 0) > 0 for v in expected)} voxels called")
@@ -100,12 +101,25 @@ def test_a_wall_that_no_voxel_is_sure_of_stops_rays() -> None:
 
 def test_what_marginals_call_occupied_stays_so() -> None:
     m = uncertain_wall()
-    centres, before = m.voxels(0.0)
-    after = m.decided.occupancy(centres)
-    assert (after >= before).all()
-    raised = after > before
-    assert raised.any()
-    assert (after[raised] < 0.51).all()
+    centres, _ = m.voxels(0.0)
+    before, after = m.layer().state(centres), m.decided.state(centres)
+    assert (after[before == OCCUPIED] == OCCUPIED).all()
+    assert (before != OCCUPIED)[after == OCCUPIED].any()
+    np.testing.assert_array_equal(after[after != OCCUPIED], before[after != OCCUPIED])
+
+
+def test_what_is_occupied_shows_calibrated_probabilities_as_far_as_its_state_allows() -> None:
+    m = uncertain_wall()
+    centres, marginal = m.voxels(0.0)
+    state, shown, likely = m.state(centres), m.decided.occupancy(centres), m.calibrated().occupancy(centres)
+    occupied, free = state == OCCUPIED, state == FREE
+    np.testing.assert_allclose(
+        shown[occupied], np.maximum(likely[occupied], reference.logistic(CALLED)), atol=1e-5
+    )
+    assert shown[occupied].max() > 0.6
+    assert (shown[free] <= likely[free] + 1e-6).all()
+    unseen = marginal == marginal[np.abs(marginal - m.prior).argmin()]
+    np.testing.assert_array_equal(shown[unseen], marginal[unseen])
 
 
 def test_a_reading_follows_edits() -> None:
@@ -132,6 +146,30 @@ def test_a_new_keyframe_adds_its_votes_to_those_of_before() -> None:
     assert same.mean() > 0.97  # votes of the first two are those of before
     m.infer()
     np.testing.assert_array_equal(m.decided.occupancy(centres), scene.decided.occupancy(centres))
+
+
+def test_keyframes_counted_together_vote_as_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[int] = []
+    together = uncertain_wall(3)
+    together.decide(lambda: calls.append(1))
+    assert len(calls) == 3
+    monkeypatch.setattr(decided, "AT_ONCE", 1)
+    alone = uncertain_wall(3)
+    assert together.first_surfaces().any()
+    np.testing.assert_array_equal(together.first_surfaces(), alone.first_surfaces())
+
+
+def test_votes_states_and_the_surface_count_as_memory() -> None:
+    m = uncertain_wall(2)
+    before = m.statistics().memory_mb
+    m.first_surfaces()
+    counted = m.statistics().memory_mb
+    assert counted - before >= 4e-6 * 512 * (m.view.pool.capacity - 1)
+    m.decide()
+    decided = m.statistics().memory_mb
+    assert decided - counted >= 4e-6 * 512 * m.view.pool.capacity
+    m.render_depth(next(iter(m.keyframes.values())).camera, np.eye(4))
+    assert m.statistics().memory_mb > decided
 
 
 def test_an_empty_map_can_be_read() -> None:

@@ -139,7 +139,7 @@ def test_the_colour_menu_changes_the_colours(page: LivePage) -> None:
     first = page.look()
     known = {first.colors}
     for mode, legend in [
-        ("marginal", "marginal probability"),
+        ("marginal", "probability"),
         ("uncertainty", "bits"),
         ("keyframes", "see the voxel"),
     ]:

@@ -348,7 +348,9 @@ def test_a_map_from_a_file_is_shown_and_can_be_edited(tmp_path: Path) -> None:
     assert "its own parameters" in notes[0]
     link = FakeLink()
     session = Session(opened, link, Policy(leave_when_done=True))
-    assert shown(link.sent).voxels() == map_voxels(built(range(4)).layer())
+    assert link.of_type(Bricks) == [], "nothing is shown before what is occupied"
+    finished(session)
+    assert shown(link.sent).voxels() == map_voxels(built(range(4)))
     link.ask(Switch(1, on=False))
     assert marginals(finished(session)) == marginals(built([0, 2, 3]))
     assert_shown_is(session, link)

@@ -1,6 +1,7 @@
 """The live page's past and present: what is sent of a map whose world may change, and what is listed."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,11 +9,15 @@ import small_room
 from live_scene import CONFIG, FakeLink, RoomFrames, Shown, finished, map_voxels, session_of, shown
 
 from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.live.run import Policy
+from taichi_mrf.live.session import Session
 from taichi_mrf.live.shown_map import ShownMap
+from taichi_mrf.live.source import Source
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.mrf.reading import MapReading
+from taichi_mrf.methods.registry import load_map
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.viewer.messages import SceneChanges, ShowTime, Switch, TimeSpan
+from taichi_mrf.viewer.messages import Bricks, SceneChanges, ShowTime, Switch, TimeSpan
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 
@@ -127,6 +132,25 @@ def test_an_edit_returns_to_now() -> None:
     m = finished(session)
     assert link.of_type(TimeSpan)[-1].shown_s is None
     assert shown(link.sent).voxels() == voxels(m)
+
+
+def test_a_saved_map_is_done_at_once_with_what_moves_and_its_past_brings_its_messages(tmp_path: Path) -> None:
+    path, before_s = tmp_path / "map.npz", START_S + EMPTY - 1
+    m = visited_map(DATED.time)
+    m.save(path)
+    link = FakeLink()
+    session = Session(Source("map.npz", DATED, lambda: load_map(path)), link, Policy(leave_when_done=True))
+    assert link.of_type(Bricks) == [], "nothing is shown before what is occupied"
+    finished(session)
+    assert session.state.mapper.inferred is None
+    assert shown(link.sent).voxels() == voxels(m)
+    assert shown(link.sent).voxels("dynamic") == voxels(m.dynamic) != set()
+    link.ask(ShowTime(before_s))
+    finished(session)
+    assert session.state.mapper.inferred is not None
+    session._extras.work(lambda step: True)
+    assert shown(link.sent).voxels() == voxels(m.at(before_s))
+    assert link.errors() == []
 
 
 def test_what_appears_is_listed_once_with_its_time(monkeypatch: pytest.MonkeyPatch) -> None:

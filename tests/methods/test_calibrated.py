@@ -89,3 +89,29 @@ def test_the_reading_follows_edits() -> None:
         edited.calibrated().occupancy(centres), plain.calibrated().occupancy(centres)
     )
     assert len(MRFMap(VOXEL).calibrated().voxels()[0]) == 0
+
+
+def test_balls_and_paths_are_asked_by_calibrated_probabilities_found_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    m = uncertain_wall()
+    ball, way = np.array([[0.05, 0.02, WALL_M - 0.25]]), [[0.05, 0.02, 1.0], [0.05, 0.02, WALL_M - 0.25]]
+    found, path = m.occupied_within(ball, 0.15), m.path_collision(way, 0.15)
+    calibrated = m.calibrated()
+    assert found == calibrated.occupied_within(ball, 0.15)
+    assert path == calibrated.path_collision(way, 0.15)
+    assert abs(found - m.layer().occupied_within(ball, 0.15)) > 0.01
+    with monkeypatch.context() as patch:
+        patch.setattr(m, "surface_field", lambda between: pytest.fail("the distances are found again"))
+        assert m.occupied_within(ball, 0.15) == found
+    m.remove_keyframe(1)
+    m.infer()
+    assert m.occupied_within(ball, 0.15) != found
+
+
+def test_without_distances_balls_are_asked_by_marginals() -> None:
+    m = uncertain_wall()
+    m.freeze_keyframe(0)
+    ball = np.array([[0.05, 0.02, WALL_M - 0.25]])
+    assert not m.has_surface
+    assert m.occupied_within(ball, 0.15) == m.layer().occupied_within(ball, 0.15)

@@ -117,6 +117,22 @@ def test_a_method_that_cannot_freeze_has_no_button_for_it(handled: HandledPage) 
     assert list(handled.page.panel._edits.options) == ["On/off", "Move", "Put back"]
 
 
+def test_a_map_from_a_file_has_no_controls_of_a_replay(handled: HandledPage) -> None:
+    panel = handled.page.panel
+    assert (list(panel._run.options), panel.speed.visible) == (["Play", "Pause", "Step", "Reset"], True)
+    handled.take(replace(HELLO, has_frames=False))
+    assert (list(panel._run.options), panel.speed.visible) == (["Reset"], False)
+    assert (list(panel.view.options), panel.view.value) == (["chosen keyframe"], "chosen keyframe")
+    assert not panel._page_options.handles["follow"].visible
+
+
+def test_a_method_that_counts_no_keyframes_is_not_coloured_by_them(handled: HandledPage) -> None:
+    colors = handled.page.panel._map_options.handles["color_by"]
+    assert list(colors.options) == ["marginal", "height", "uncertainty", "keyframes"]
+    handled.take(replace(HELLO, counts_keyframes=False, has_colors=True))
+    assert list(colors.options) == ["marginal", "height", "uncertainty", "photo"]
+
+
 def test_reset_asks_before_it_deletes_a_map(handled: HandledPage, browser: RawClient) -> None:
     client = handled.client_id()
     handled.act(Action.RESET, client)

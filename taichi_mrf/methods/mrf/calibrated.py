@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.inference.surface_votes import CALLED, called
 from taichi_mrf.voxels.distance_field import MARGIN, DistanceSource, blended_sums
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS, grid_keys
 from taichi_mrf.voxels.pool import BrickPool
@@ -65,6 +66,21 @@ def calibrated_block(
 ) -> NDArray[np.float32]:
     """The same for the voxels of a chunk (3,), whose marginals' log-odds are (64, 64, 64)."""
     return _combined(*_around(field, chunk), marginal, prior)
+
+
+def carried(
+    likely: NDArray[np.float32], decided: NDArray[np.float32], prior: float, min_evidence: float
+) -> NDArray[np.float32]:
+    """Calibrated log-odds ``likely`` as far as the states by ``decided``, of the same shape, allow: occupied
+    voxels stay just over even odds or above, free ones below what is known, those between stay there, and
+    what is unknown keeps its own."""
+    known, least = prior + min_evidence, called(prior, min_evidence)
+    free = np.minimum(likely, np.float32(prior - min_evidence - CALLED))
+    between = np.maximum(np.minimum(likely, np.float32(-CALLED)), np.float32(known))
+    found = np.where(decided > 0, np.maximum(likely, np.float32(least)), between)
+    found = np.where(decided < prior - min_evidence, free, found)
+    known_one = np.abs(decided - prior) > min_evidence  # not NaN either
+    return np.where(known_one, found, decided)
 
 
 def _around(field: DistanceSource, chunk: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:

@@ -7,7 +7,7 @@ anew, so states follow from the set of keyframes alone. While keyframes come, th
 counted before stay as they were, and a new keyframe costs its own rays.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +22,9 @@ from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool, PoolSnapshot, copied
+
+AT_ONCE = 16
+"""Keyframes whose votes are counted together: they share what their rays read of the map."""
 
 
 class Decisions:
@@ -43,6 +46,11 @@ class Decisions:
         self._restarts = -1  # of the pool when votes were counted; -1 while they are not complete
         self._shown: PoolSnapshot | None = None
         self._exact = False
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the votes."""
+        return 4 * int(self._votes.shape[0])
 
     def log_odds(self, settled: bool, between: Callable[[], object] = lambda: None) -> "ti.Ndarray":
         """Log-odds (capacity * 512) above 0 in occupied voxels, the marginals' in all others. In a
@@ -76,10 +84,10 @@ class Decisions:
             self._follow_bricks()
         new = {id: k for id, k in self._keyframes.items() if id not in self._counted}
         self._exact = settled if new else self._exact
-        for id, keyframe in new.items():
-            self._add(keyframe)
-            self._counted[id] = keyframe
-            between()
+        for begin in range(0, len(new), AT_ONCE):
+            some = dict(list(new.items())[begin : begin + AT_ONCE])
+            self._add(list(some.values()), between)
+            self._counted.update(some)
         self._restarts, self._shown = pool.restarts, pool.shown
 
     def _start_over(self) -> None:
@@ -92,14 +100,16 @@ class Decisions:
             slots = self._registry.topology.slots(kept.bricks)
             add_votes(slots[slots >= 0], kept.sums[slots >= 0].reshape(-1), self._votes)
 
-    def _add(self, keyframe: Keyframe) -> None:
-        """Add the votes of a keyframe's rays. Only the bricks that it sees are looked at."""
-        visible = self._registry.visible(keyframe.footprint)
-        part = self._registry.pool.part(visible.slots)
-        seen = (keyframe, replace(visible, slots=part.in_use, arrays=None))
+    def _add(self, keyframes: Sequence[Keyframe], between: Callable[[], object]) -> None:
+        """Add the votes of some keyframes' rays. Only the bricks that they see are looked at."""
+        lists = [self._registry.visible(keyframe.footprint) for keyframe in keyframes]
+        slots = np.unique(np.concatenate([visible.slots for visible in lists]))
+        part = self._registry.pool.part(slots)
+        places = [np.searchsorted(slots, visible.slots).astype(np.int32) for visible in lists]
+        seen = [replace(visible, slots=at, arrays=None) for visible, at in zip(lists, places, strict=True)]
         model = self._sweeper.model()
-        votes = count_votes([seen], part, model, self._sweeper.volume)
-        add_votes(visible.slots, votes.to_numpy()[: len(visible.slots) * VOXELS], self._votes)
+        votes = count_votes(zip(keyframes, seen, strict=True), part, model, self._sweeper.volume, between)
+        add_votes(slots, votes.to_numpy()[: len(slots) * VOXELS], self._votes)
 
     def _follow_bricks(self) -> None:
         """Forget the votes of bricks that are gone, and make room for new ones."""

@@ -23,7 +23,7 @@ class Moving:
     voxels: NDArray[np.bool_]
 
     @staticmethod
-    def of(pool: BrickPool, shown: BrickPool) -> "Moving":
+    def of(pool: BrickPool, shown: BrickPool, voxel_size: float) -> "Moving":
         """What moves in a pool whose beliefs are those of ``shown``, the same bricks: what is occupied,
         although all evidence together makes it less likely than the prior, and stands clear of the surfaces
         of all evidence."""
@@ -35,7 +35,7 @@ class Moving:
         moving &= pool.read("total", slots) < pool.prior_log_odds
         row, number = np.nonzero(moving)
         voxels = pool.bricks[slots[row]] * BRICK + offsets_in_brick()[number]
-        moving[row, number] = stands_clear(voxels, Surfaces(pool, "total"))
+        moving[row, number] = stands_clear(voxels, Surfaces(pool, voxel_size, "total"))
         some = moving.any(axis=1)
         return Moving(slots[some], moving[some])
 
@@ -43,12 +43,12 @@ class Moving:
 NOTHING_MOVES = Moving(np.zeros(0, np.int32), np.zeros((0, VOXELS), np.bool_))
 
 
-def layer_of(pool: BrickPool, shown: "ti.Ndarray", dynamic: bool) -> "ti.Ndarray":
+def layer_of(pool: BrickPool, shown: "ti.Ndarray", dynamic: bool, voxel_size: float) -> "ti.Ndarray":
     """One layer of dated beliefs ``shown``, (capacity * 512): the dynamic one, or the static one. Where a
     voxel is dynamic the static layer reads all evidence together; everywhere else the dynamic one reads the
     prior."""
     then, out = pool.showing_others(shown), copied(shown)
-    moving = Moving.of(pool, then)
+    moving = Moving.of(pool, then, voxel_size)
     belief = then.read("belief", moving.slots)
     if dynamic:
         out.fill(pool.prior_log_odds)

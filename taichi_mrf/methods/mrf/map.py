@@ -321,6 +321,8 @@ class MRFMap(PosedMRF):
             if m._dated is not None and contents.frozen_dated is not None:
                 m._dated.restore_frozen(slots, *contents.frozen_dated)
             m._show(slots, contents.belief)
+            if m._dated is not None and contents.total is not None:
+                m._pool.write("total", slots, contents.total)
             m._colors.show(slots, contents.colors)
         m._next_id, m._up = header.next_id, header.up
         m._messages_lost, m._settled = bool(m._keyframes), header.settled

@@ -17,7 +17,7 @@ from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import count_observations
 from taichi_mrf.inference.sweep import Sweeper
-from taichi_mrf.methods.mrf.calibrated import calibrated_log_odds
+from taichi_mrf.methods.mrf.calibrated import calibrated_log_odds, carried
 from taichi_mrf.methods.mrf.decided import Decisions
 from taichi_mrf.methods.mrf.kept_rays import RayShare
 from taichi_mrf.methods.mrf.layers import layer_of
@@ -27,7 +27,8 @@ from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.change import MapChange, compare_maps
 from taichi_mrf.system import tensors
 from taichi_mrf.system.compiler import ti
-from taichi_mrf.voxels.pool import copied
+from taichi_mrf.voxels.pool import BrickPool, copied
+from taichi_mrf.voxels.topology import Topology
 
 ItemT = TypeVar("ItemT")
 
@@ -44,6 +45,7 @@ class ReadableMRF(WithSurface):
     _dated: DatedBelief | None
     _decisions: Decisions
     _decided: "tuple[MadeOf, ti.Ndarray] | None" = None
+    _calibrated: "tuple[MadeOf, ti.Ndarray] | None" = None
 
     @property
     def keyframes(self) -> Mapping[int, Keyframe]:
@@ -114,8 +116,14 @@ class ReadableMRF(WithSurface):
 
     @property
     def _left_bytes(self) -> int:
-        """Bytes of the colours, and of what frozen keyframes measured."""
-        return self._colors.nbytes + self._kept.share.nbytes
+        """Bytes of the colours, of what frozen keyframes measured, and of the states and the surface that
+        were asked for."""
+        asked = self._decisions.nbytes
+        if self._decided is not None:
+            asked += 4 * int(self._decided[1].shape[0])
+        if self._rendered is not None:
+            asked += self._rendered[1].nbytes
+        return self._colors.nbytes + self._kept.share.nbytes + asked
 
     def _prepare_colors(self) -> None:
         if not self._colors.is_current:
@@ -178,7 +186,7 @@ class ReadableMRF(WithSurface):
             rays = None if stamp_s is None else RaysThen(shown, stamp_s, LEAST * self.prior, with_frozen)
             return MapReading(self, shown, rays)
         dynamic = which == "dynamic"
-        belief = layer_of(pool, shown, dynamic)
+        belief = layer_of(pool, shown, dynamic, self.voxel_size)
         # All that is dynamic is occupied; what the layer does not know is at the prior.
         least, judging = (0.5, shown) if dynamic else (LEAST * self.prior, belief)
         reading = MapReading(self, belief, RaysThen(judging, stamp_s, least, with_frozen))
@@ -194,8 +202,10 @@ class ReadableMRF(WithSurface):
         Besides the voxels whose marginal is over one half it has those that win the vote of the rays: each
         measured ray votes for the voxel that most likely is its first surface, and against those in front of
         it (inference.surface_votes). A wall that is seen with a sigma of several voxels has no voxel that is
-        more likely occupied than not. The log-odds of winners are raised to just above even odds, all others
-        are the marginals'. Votes of frozen keyframes are kept with ``keep_surface``, else they have none.
+        more likely occupied than not. Log-odds are the calibrated ones (:meth:`calibrated`) as far as the
+        states allow, once the map is settled and has a surface; else those of winners are raised to just
+        above even odds, and all others are the marginals'. Votes of frozen keyframes are kept with
+        ``keep_surface``, else they have none.
         """
         return self.decide()
 
@@ -205,7 +215,12 @@ class ReadableMRF(WithSurface):
         made_of = MadeOf(self)
         if self._decided is None or self._decided[0] != made_of:
             self._decided = None  # its memory, before there is another
-            self._decided = made_of, self._decisions.log_odds(self._settled, between)
+            log_odds = self._decisions.log_odds(self._settled, between)
+            if self._settled and self.has_surface:
+                likely, pool = self._calibrated_log_odds(between).to_numpy(), self._pool
+                known = pool.prior_log_odds, self.view.volume.min_evidence
+                log_odds.from_numpy(carried(likely, log_odds.to_numpy(), *known))
+            self._decided = made_of, log_odds
         # Not kept: a reading keeps the map, whose memory would then wait for the collector of cycles.
         reading = MapReading(self, self._decided[1])
         reading.view.index = self.view.index
@@ -214,10 +229,22 @@ class ReadableMRF(WithSurface):
     def calibrated(self, between: Callable[[], object] = lambda: None) -> MapReading:
         """The map by the probability that each voxel holds a surface, from the distances of all rays
         (methods.mrf.calibrated), which can be trusted as a probability; the marginals are more cautious.
-        ``between`` is called after each keyframe. Raises CapacityError if there is not enough memory."""
-        log_odds = copied(self._pool.belief)
-        log_odds.from_numpy(calibrated_log_odds(self.surface_field(between), self._pool).reshape(-1))
-        return MapReading(self, log_odds)
+        Found once for each state of the map. ``between`` is called after each keyframe. Raises CapacityError
+        if there is not enough memory."""
+        return MapReading(self, self._calibrated_log_odds(between))
+
+    def _calibrated_log_odds(self, between: Callable[[], object] = lambda: None) -> "ti.Ndarray":
+        made_of = MadeOf(self)
+        if self._calibrated is None or self._calibrated[0] != made_of:
+            self._calibrated = None
+            log_odds = copied(self._pool.belief)
+            log_odds.from_numpy(calibrated_log_odds(self.surface_field(between), self._pool).reshape(-1))
+            self._calibrated = made_of, log_odds
+        return self._calibrated[1]
+
+    def _likely_grid(self) -> tuple[float, Topology, BrickPool, float]:
+        """Calibrated where distances are at hand, else the marginals."""
+        return self.calibrated()._grid() if self.has_surface else self._grid()
 
     def first_surfaces(self) -> NDArray[np.bool_]:
         """Which voxels of ``view.pool`` win the vote of the rays for their first surface, (slots, 512)."""

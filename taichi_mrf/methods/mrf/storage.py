@@ -2,7 +2,8 @@
 
 The file holds the parameters, the bricks with their beliefs, and the keyframes' images and poses. It does not
 hold the messages: they are the largest part of a map in memory and can be computed from the rest. It holds
-the beliefs so that a loaded map answers queries at once.
+the beliefs so that a loaded map answers queries at once, and with dates also what all evidence says together,
+from which what moves follows.
 """
 
 from collections.abc import Iterable, Sequence
@@ -36,7 +37,8 @@ _BEFORE_ALL = float(np.finfo(np.float64).min)
 @dataclass(frozen=True)
 class MapContents:
     """The contents of an MRFMap's file. ``belief`` and ``evidence`` are (n, 512) log-odds of the ``bricks``
-    (n, 3); ``frozen_dated`` is what frozen keyframes say of the voxels of a dated map, and as of when (n);
+    (n, 3); of a dated map ``total`` (n, 512) are those of all evidence together, whatever its age, and
+    ``frozen_dated`` is what frozen keyframes say of the voxels, and as of when (n);
     ``frozen_owners`` (n,) counts the frozen keyframes that own each brick, ``frozen_crossed`` (m, 3)
     are the bricks that they crossed, and ``frozen`` their names by id. ``parked`` names the files of the
     chunks that are not in memory (parked_chunks.py). ``colors`` (n, 512, 4) are those of the voxels, or (0,
@@ -46,6 +48,7 @@ class MapContents:
     bricks: NDArray[np.int32]
     belief: NDArray[np.float32]
     evidence: NDArray[np.float32] | None
+    total: NDArray[np.float32] | None
     frozen_dated: tuple[NDArray[np.float32], NDArray[np.float64]] | None
     frozen_owners: NDArray[np.int32]
     frozen_crossed: NDArray[np.int32]
@@ -77,6 +80,7 @@ def contents_of(
         pool.bricks[slots],
         pool.read("belief", slots),
         None if pool.evidence is None else pool.read("evidence", slots),
+        None if dated is None else pool.read("total", slots),
         None if dated is None else dated.read_frozen(slots),
         pool.owners[slots] - live[slots],
         registry.frozen_crossed,
@@ -101,6 +105,8 @@ def write_contents(path: Path, contents: MapContents) -> None:
     }
     if contents.evidence is not None:
         arrays["evidence"] = contents.evidence
+    if contents.total is not None:
+        arrays["total"] = contents.total
     if contents.parked:
         arrays["parked"] = np.array(contents.parked, np.str_)
     if contents.frozen_dated is not None:
@@ -123,6 +129,7 @@ def read_contents(path: Path) -> MapContents:
             bricks,
             belief,
             file.array("evidence", "f", (n, VOXELS)) if "evidence" in file else None,
+            file.array("total", "f", (n, VOXELS)).astype(np.float32) if "total" in file else None,
             read_dated(file, n),
             file.array("frozen_owners", "i", (n,)).astype(np.int32),
             file.array("frozen_crossed", "i", (None, 3)).astype(np.int32),

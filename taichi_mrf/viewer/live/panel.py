@@ -11,7 +11,7 @@ from taichi_mrf.viewer.live.actions import Action
 from taichi_mrf.viewer.live.time_folder import TimeFolder
 from taichi_mrf.viewer.messages import Hello, Images, KeyframeInfo, Status
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Tell, rows_html
-from taichi_mrf.viewer.scene.options import UNPAINTED, ColorBy, Show, ViewOptions
+from taichi_mrf.viewer.scene.options import OF_BELIEFS, ColorBy, Show, ViewOptions
 from taichi_mrf.viewer.scene.ray_plot import RayPlot
 from taichi_mrf.viewer.scene.safe_text import in_html, in_markdown
 from taichi_mrf.viewer.scene.widgets import OptionWidgets
@@ -102,7 +102,7 @@ class Panel(BasePanel):
         super().__init__(gui, tell)
         self._names: dict[str, int] = {}
         self._questions: dict[int, Any] = {}
-        self.add_buttons("Run", RUN_BUTTONS)
+        self._run: Any = self.add_buttons("Run", RUN_BUTTONS)
         self.speed: Any = gui.add_dropdown(
             "Speed", list(SPEEDS), hint="Replay the recording at this multiple of its own pace."
         )
@@ -144,7 +144,7 @@ class Panel(BasePanel):
         """Show the source, the backend and the parameters."""
         self._hello = hello
         self.time.begin(hello.has_dates)
-        self._map_options.offer("color_by", get_args(ColorBy) if hello.has_colors else UNPAINTED)
+        self._map_options.offer("color_by", _colors_of(hello))
         self._map_options.offer("show", get_args(Show) if hello.has_surface else ("voxels",))
         self._parameters.content = (
             '<div style="margin:0.5em 0.75em;font-size:0.85em">Parameters'
@@ -153,7 +153,15 @@ class Panel(BasePanel):
         self._edits.options = tuple(
             label for label, action in EDIT_BUTTONS.items() if hello.can_freeze or action is not Action.FREEZE
         )
+        self._offer_replay(hello.has_frames)
         self.clear_notices()
+
+    def _offer_replay(self, has_frames: bool) -> None:
+        """Offer what needs frames to come, or that have come: a map from a file can only be opened anew."""
+        self._run.options = tuple(RUN_BUTTONS) if has_frames else ("Reset",)
+        self.view.options = (CURRENT_CAMERA, CHOSEN_KEYFRAME) if has_frames else (CHOSEN_KEYFRAME,)
+        for widget in (self.speed, self._page_options.handles["follow"]):
+            widget.visible = has_frames
 
     def color_by_photo(self) -> None:
         """Show the colours that cameras saw, unless a user has chosen other colours than the first ones."""
@@ -288,3 +296,13 @@ class Panel(BasePanel):
         self._rendered = gui.add_image(black, label="depth rendered from the map", visible=False)
         label = "accuracy: right (blue), wrong (orange), no surface (light), not judged (dark)"
         self._accuracy = gui.add_image(black, label=label, visible=False)
+
+
+def _colors_of(hello: Hello) -> tuple[ColorBy, ...]:
+    """What the colour can show of a map."""
+    found = list(OF_BELIEFS)
+    if hello.counts_keyframes:
+        found.append("keyframes")
+    if hello.has_colors:
+        found.append("photo")
+    return tuple(found)

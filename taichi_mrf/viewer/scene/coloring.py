@@ -78,7 +78,7 @@ def scale_of(
     if color_by == "uncertainty":
         return Scale(color_by, colors, 0.0, 1.0, "uncertainty: entropy (bits)", _numbers(_entropy(p)))
     low = LOWEST if threshold >= LOWEST else 0.0
-    return Scale(color_by, colors, low, 1.0, "marginal probability", _numbers((p - low) / (1.0 - low)))
+    return Scale(color_by, colors, low, 1.0, "probability", _numbers((p - low) / (1.0 - low)))
 
 
 @cache

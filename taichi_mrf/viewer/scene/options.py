@@ -2,13 +2,13 @@
 the slider's. No page is needed to import it."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 from taichi_mrf.config.sliders import Range
 
 ColorBy = Literal["marginal", "height", "uncertainty", "keyframes", "photo"]
-UNPAINTED: tuple[ColorBy, ...] = tuple(each for each in get_args(ColorBy) if each != "photo")
-"""What the colour can show of a map that no camera has seen in colour."""
+OF_BELIEFS: tuple[ColorBy, ...] = ("marginal", "height", "uncertainty")
+"""What the colour can show of every map."""
 Show = Literal["surface", "voxels"]
 CutAxis = Literal["none", "x", "y", "z"]
 
@@ -22,7 +22,7 @@ class ViewOptions:
     surface is made when no frames are read, at the end or while paused; until then voxels are shown."""
 
     color_by: ColorBy = "height"
-    """What the colour shows: the marginal probability, the height, the uncertainty (of a voxel its entropy,
+    """What the colour shows: the probability, the height, the uncertainty (of a voxel its entropy,
     of the surface its standard deviation), the number of keyframes whose rays pass through the voxel, or what
     cameras saw (photo)."""
 

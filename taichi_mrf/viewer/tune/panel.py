@@ -9,7 +9,7 @@ import viser
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
 from taichi_mrf.viewer.scene.base_panel import BasePanel, Tell, rows_html
-from taichi_mrf.viewer.scene.options import UNPAINTED, ViewOptions
+from taichi_mrf.viewer.scene.options import OF_BELIEFS, ViewOptions
 from taichi_mrf.viewer.scene.safe_text import in_markdown
 from taichi_mrf.viewer.scene.widgets import OptionWidgets
 from taichi_mrf.viewer.tune.actions import Action, KnobMoved
@@ -69,7 +69,7 @@ class TunePanel(BasePanel):
         with tabs.add_tab("Map", viser.Icon.CUBE):
             self.add_legend()
             self._options = OptionWidgets(gui, ViewOptions(), self.options_moved, MAP_OPTIONS)
-            self._options.offer("color_by", UNPAINTED)
+            self._options.offer("color_by", OF_BELIEFS)
         with tabs.add_tab("Frames", viser.Icon.MOVIE):
             self._frame_text = gui.add_markdown("")
             self._frames = OptionWidgets(gui, FrameChoice(), lambda: None)
