@@ -272,7 +272,7 @@ def finish(
             packed = sums[i + k]
             if packed != 0 and length_sum(packed, scale) > least_length:
                 old = ti.cast(messages[i + k], ti.f32)
-                messages[i + k] = old + (clamp * (2.0 * mean_message(packed) - 1.0) - old)
+                messages[i + k] = clamp * (2.0 * mean_message(packed) - 1.0)
                 # The belief takes what was stored, not what was meant, so that it stays the sum of messages.
                 change = ti.cast(messages[i + k], ti.f32) - old
                 before = belief[j + k]
