@@ -222,7 +222,7 @@ def _spread(indices: range, most: int = FRAMES, runs: int = RUNS) -> list[int]:
     return [indices[start + k * stride] for start in starts for k in range(each)]
 
 
-def _with(config: Config, law: SigmaLaw, prior: dict[str, float]) -> Config:
+def _with(config: Config, law: SigmaLaw, prior: dict[str, Any]) -> Config:
     sensor = replace(config.sensor, sigma_scale=_rounded(law.scale), sigma_added=_rounded(law.added_m))
     changed: dict[str, Any] = {"sensor": sensor}
     if prior:

@@ -40,7 +40,7 @@ def run_eval(options: Eval, experiments: Mapping[str, Any] | None = None) -> int
         output_folder(options.out),
         stop_on_signals(lambda text: console.print_line(text, "yellow")) as request,
     ):
-        runtime.init(options.runtime.arch, options.runtime.threads, options.runtime.debug)
+        runtime.init(options.runtime.arch, options.runtime.threads)
         failed = 0
         for name in names:
             try:

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from taichi_mrf.config.places import has_flag
 from taichi_mrf.config.text import field_help
 
 _INDENT = 26
@@ -43,7 +44,7 @@ def flags_of(options: type, prefix: str = "", pairs_off: bool = False) -> Iterat
     """Every flag of an options dataclass, those of nested dataclasses included, in the order of the help."""
     hints = typing.get_type_hints(options, include_extras=True)
     texts = field_help(options)
-    for field in dataclasses.fields(options):
+    for field in filter(has_flag, dataclasses.fields(options)):
         hint: Any = hints[field.name]
         metadata: Sequence[Any] = ()
         if typing.get_origin(hint) is Annotated:

@@ -10,7 +10,7 @@ import textwrap
 import typing
 from collections.abc import Sequence
 from difflib import get_close_matches
-from functools import reduce
+from functools import partial, reduce
 from operator import or_
 from typing import Annotated, Any
 
@@ -21,8 +21,10 @@ from taichi_mrf.calibration import options as calibration_options
 from taichi_mrf.cli.commands import COMMANDS, Command
 from taichi_mrf.cli.flag_list import brief_help, flags_of
 from taichi_mrf.cli.shared.terminal import PROGRAM
+from taichi_mrf.config import inference, time
 from taichi_mrf.config import schema as config
-from taichi_mrf.config.registry import METHODS
+from taichi_mrf.config.gone import note_gone
+from taichi_mrf.config.places import has_flag, is_in_files
 from taichi_mrf.config.text import field_help
 from taichi_mrf.config.values import nearest
 from taichi_mrf.errors import ConfigError
@@ -30,7 +32,8 @@ from taichi_mrf.factor_graph import config as factor_graph_config
 
 DEFINITIONS = (
     config.__name__,
-    *(method.section_class.__module__ for method in METHODS.values()),
+    inference.__name__,
+    time.__name__,
     calibration_options.__name__,
     factor_graph_config.__name__,
 )
@@ -100,7 +103,27 @@ def _refuse_unknown_flags(program: str, command: Command, arguments: Sequence[st
         if flag.startswith("--") and flag not in known:
             near = get_close_matches(flag, known, n=1)
             hint = f"did you mean {near[0]}?" if near else f"'{program} {_HELP_ALL}' explains all flags"
+            if "--config" in known:
+                hint = _set_elsewhere(flag) or hint
             raise ConfigError(f"{program.removeprefix(PROGRAM).strip()}: unknown flag {flag}; {hint}")
+
+
+def _set_elsewhere(flag: str) -> str:
+    """Where a mapping parameter is set that has no flag, or what became of it; "" for all other flags."""
+    owner: Any = config.Config
+    flagged = filed = True
+    path = flag.removeprefix("--").replace("-", "_")
+    for name in path.split("."):
+        fields = {field.name: field for field in dataclasses.fields(owner)}
+        if name not in fields:
+            return note_gone(owner.__name__, name, None) or ""
+        flagged, filed = flagged and has_flag(fields[name]), filed and is_in_files(fields[name])
+        hint = typing.get_type_hints(owner)[name]
+        if not dataclasses.is_dataclass(hint):
+            in_python = f"it is set in Python, {owner.__name__}({name}=...)"
+            return "" if flagged else f"set {path} in the file of --config" if filed else in_python
+        owner = hint
+    return ""
 
 
 def overview() -> str:
@@ -130,13 +153,13 @@ def _print_completion(arguments: Sequence[str]) -> None:
 
 @registry.struct_rule
 def configuration_flags(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """One flag a field for the dataclasses of DEFINITIONS; nothing for any other type."""
+    """One flag a field that has one for the dataclasses of DEFINITIONS; nothing for any other type."""
     if not (dataclasses.is_dataclass(info.type) and info.type.__module__ in DEFINITIONS):
         return None
     hints, texts = typing.get_type_hints(info.type), field_help(info.type)
     defaults = info.default if isinstance(info.default, info.type) else info.type()
     fields = (
         StructFieldSpec(field.name, hints[field.name], getattr(defaults, field.name), texts[field.name])
-        for field in dataclasses.fields(info.type)
+        for field in filter(has_flag, dataclasses.fields(info.type))
     )
-    return StructConstructorSpec(info.type, tuple(fields))
+    return StructConstructorSpec(partial(dataclasses.replace, defaults), tuple(fields))

@@ -43,7 +43,7 @@ def run_tune(options: Tune) -> int:
         from taichi_mrf.tune.search import DEFAULT_SEARCH, Search
         from taichi_mrf.tune.session import Policy, TuneSession
 
-        runtime.init(settings.runtime.arch, settings.runtime.threads, settings.runtime.debug)
+        runtime.init(settings.runtime.arch, settings.runtime.threads)
         dataset = open_dataset(options.source, color=False, **options.reading.keywords())
         if dataset.tracked:
             raise DatasetError(f"{options.source}: tune needs poses: map it, and give poses=trajectory.txt")

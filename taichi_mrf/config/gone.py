@@ -30,6 +30,15 @@ GONE: dict[str, dict[str, tuple[Any, str]]] = {
         "return_pass": ("replay", "rays are replayed from a trace"),
         "message_precision": ("float16", _ALWAYS.format("float16")),
     },
+    "KeyframeConfig": {"against": ("last", "a frame is compared with the last keyframe, as in the paper")},
+    "PoseConfig": {
+        "rounds": (2, "keyframes are aligned with each other in at most 2 rounds"),
+        "use_color": (True, "a camera is tracked by its colour images too, where it has any"),
+        "carry_unnamed": (True, "frames without a pose move with the last one before them that has one"),
+        "follow_budget_s": (0.2, "keyframes follow a file for about 0.2 s between two frames"),
+        "follow_quiet_s": (10.0, "poses that follow a file are final after 10 s without a change"),
+    },
+    "RuntimeConfig": {"debug": (False, "taichi_mrf.init takes it as an argument")},
 }
 """By the name of the dataclass that had it: a parameter's default, which needs no warning, and what became of
 it."""

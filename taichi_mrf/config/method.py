@@ -24,13 +24,10 @@ class Method:
     """The heading of its sliders on the tuning page."""
 
     section: str
-    """The field of ``Config`` that holds its parameters."""
+    """The field of ``Config`` that holds its parameters, its own or those of a method that it resembles."""
 
     section_class: type
     """The dataclass of that section. All its fields have defaults."""
-
-    section_help: str
-    """The help text of the section, one sentence."""
 
     map_class: str
     """Where the class of its maps is, ``package.module:Class``. It is imported when the first map is made,

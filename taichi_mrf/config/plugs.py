@@ -1,4 +1,5 @@
-"""The mapping methods that there are. To add one, add its folder and a line here.
+"""The mapping methods that there are. To add one, add its folder and a line here, and
+where it has parameters of its own a field to ``Config`` (schema.py).
 
 A plug is a module with a ``METHOD`` (method.py). It stands above this package, so it is named here and
 imported by name. It must not import Taichi: every ``taichi-mrf --help`` loads it. A program that brings a

@@ -1,8 +1,8 @@
 """All parameters of mapping a sequence, and the sections that every mapping method shares.
 
 YAML files, the command line and the sliders are made from these dataclasses: a field's docstring is its
-help text, its default is the default, and its range is checked here. The section of a mapping method is
-defined by its plug (registry.py). Nothing in this file needs Taichi, so that ``taichi-mrf --help`` answers at
+help text, its default is the default, and its range is checked here. Where a field can be set besides Python,
+places.py says. Nothing in this file needs Taichi, so that ``taichi-mrf --help`` answers at
 once.
 """
 
@@ -10,15 +10,18 @@ import dataclasses
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import yaml
 
 from taichi_mrf.config.arguments import real
+from taichi_mrf.config.baselines import LogOddsConfig, VisibilityConfig, WavemapConfig
 from taichi_mrf.config.files import find_config, read_yaml
+from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.places import IN_FILES, IN_PYTHON, in_files, in_python
 from taichi_mrf.config.registry import METHODS, MethodName, methods_with
 from taichi_mrf.config.time import TimeConfig
-from taichi_mrf.config.values import check_field, from_dict
+from taichi_mrf.config.values import check_field, from_dict, in_files_alone
 
 Arch = Literal["auto", "cuda", "vulkan", "cpu"]
 
@@ -36,25 +39,25 @@ class SensorConfig:
     bias: tuple[float, ...] = (0.0,)
     """Mean of measured minus true depth in metres: coefficients in ascending powers of the true depth."""
 
-    sigma_table: str | None = None
+    sigma_table: str | None = in_files(None)
     """A .npy file of shape (patches, degree + 1) with a sigma polynomial for each pixel patch, row by row.
     Overrides ``sigma``. A relative path starts at the YAML file's folder."""
 
-    bias_table: str | None = None
+    bias_table: str | None = in_files(None)
     """A .npy file of the same shape with a bias polynomial for each pixel patch. Overrides ``bias``."""
 
-    patch: int = 20
+    patch: int = in_files(20)
     """Side of the tables' square pixel patches, in pixels."""
 
     pixel_sigma: bool = True
     """Use the standard deviation that frames state for each pixel, as stereo matching does. Otherwise
     ``sigma`` or its table holds for all pixels."""
 
-    sigma_scale: float = 1.0
+    sigma_scale: float = in_files(1.0)
     """Factor on every standard deviation that is stated: by ``sigma``, its table, or frames. With
     ``sigma_added`` it is what ``map --noise auto`` learns from a recording."""
 
-    sigma_added: float = 0.0
+    sigma_added: float = in_files(0.0)
     """Metres added to every standard deviation after that: what poses and voxels add at all depths."""
 
     min_depth: float = 0.1
@@ -69,14 +72,14 @@ class SensorConfig:
     gives by ``no_return_share``, ``no_return_depth`` and ``no_return_width``. A log-odds map knows ``free``
     alone."""
 
-    no_return_share: float = 0.3
+    no_return_share: float = in_files(0.3)
     """Chance that a near surface gives no return, below 0.5: the share of dark, wet and shiny ones."""
 
     no_return_depth: float = 10.0
     """``free``: depth in metres up to which nothing stands where there is no return. ``model``: depth at
     which half of the surfaces that return when they are near do so no more."""
 
-    no_return_width: float = 2.0
+    no_return_width: float = in_files(2.0)
     """Metres over which that share falls: at one width more it is 27%, at two 12%."""
 
     def __post_init__(self) -> None:
@@ -97,7 +100,7 @@ class SensorConfig:
 
 @dataclass(frozen=True)
 class KeyframeConfig:
-    """Which frames become keyframes (section V): those taken far enough from the keyframes so far."""
+    """Which frames become keyframes (section V): those taken far enough from the last one."""
 
     rotation: float = 0.0
     """A frame rotated by more than this (radians, tangent norm) becomes a keyframe. 0 ignores rotation."""
@@ -105,10 +108,6 @@ class KeyframeConfig:
     translation: float = 0.0
     """A frame translated by more than this (metres) becomes a keyframe. 0 ignores translation. If rotation
     and translation are both 0, every frame becomes a keyframe."""
-
-    against: Literal["last", "all"] = "last"
-    """Compare a frame with the last keyframe, as in the paper, or with all keyframes, so that a second visit
-    to a place adds none."""
 
     def __post_init__(self) -> None:
         check_field(self.rotation >= 0, "keyframes.rotation", "must not be negative")
@@ -119,48 +118,30 @@ class KeyframeConfig:
 class PoseConfig:
     """Refinement of recorded poses by aligning depth images (methods that can align keyframes: mrf)."""
 
-    refine: bool = False
+    refine: bool = in_files(False)
     """Align each new keyframe with the earlier ones, and at the end all keyframes with each other. The first
     keyframe keeps its pose."""
 
-    close_loops: bool = True
+    close_loops: bool = in_files(True)
     """When poses are tracked: correct the whole trajectory when the camera comes back to a place that it has
     seen, and at the end align all keyframes with each other."""
 
-    rounds: int = 2
-    """Maximum number of rounds in which all keyframes are aligned with each other at the end."""
-
-    translation_sigma: float = 0.03
+    translation_sigma: float = in_files(0.03)
     """Standard deviation of recorded positions along each axis (metres). It weighs recorded poses against
     depth; directions that depth does not determine keep the recorded value."""
 
-    rotation_sigma: float = 0.02
+    rotation_sigma: float = in_files(0.02)
     """Standard deviation of recorded orientations about each axis (radians)."""
 
-    max_translation: float = 0.2
+    max_translation: float = in_python(0.2)
     """Do not move a keyframe further than this (metres)."""
 
-    max_rotation: float = 0.1
+    max_rotation: float = in_python(0.1)
     """Do not turn a keyframe by more than this (radians)."""
 
-    use_color: bool = True
-    """Track a camera without poses by its colour images too, where it has any."""
-
-    min_overlap: float = 0.3
+    min_overlap: float = in_python(0.3)
     """Do not move a keyframe if less than this share of its points lies near surfaces that other keyframes
     measured."""
-
-    carry_unnamed: bool = True
-    """Frames without a pose in the file of --poses move with the last frame before them that has one, instead
-    of staying where they were recorded."""
-
-    follow_budget_s: float = 0.2
-    """Move keyframes for about this long, at most, between two frames, while poses follow a file (--follow;
-    seconds)."""
-
-    follow_quiet_s: float = 10.0
-    """Poses that follow a file are final once the recording is over and the file has not changed for this
-    long (seconds)."""
 
     doubt_translation: float = 0.0
     """Standard deviation of each keyframe's position along each axis, against the keyframes that see the same
@@ -172,9 +153,6 @@ class PoseConfig:
     exact."""
 
     def __post_init__(self) -> None:
-        check_field(self.follow_budget_s >= 0, "poses.follow_budget_s", "must not be negative")
-        check_field(self.follow_quiet_s >= 0, "poses.follow_quiet_s", "must not be negative")
-        check_field(self.rounds >= 0, "poses.rounds", "must not be negative")
         check_field(self.translation_sigma > 0, "poses.translation_sigma", "must be positive")
         check_field(self.rotation_sigma > 0, "poses.rotation_sigma", "must be positive")
         check_field(self.max_translation > 0, "poses.max_translation", "must be positive")
@@ -195,7 +173,7 @@ class VolumeConfig:
     upper: tuple[float, float, float] | None = None
     """Highest corner of the mapped box in metres."""
 
-    dense_bricks: int = 256
+    dense_bricks: int = in_python(256)
     """Vulkan only, because it has no sparse fields: bricks along each side of the volume around the first
     keyframe. 256 bricks at 2 cm cover 41 m and need 128 MB."""
 
@@ -207,7 +185,7 @@ class VolumeConfig:
     further is frozen and written to disk, and comes back when the camera returns, so that memory is bounded
     on an endless run (methods that can freeze keyframes: mrf). 0 keeps the whole map in memory."""
 
-    min_evidence: float = 0.1
+    min_evidence: float = in_python(0.1)
     """A voxel counts as unknown if its log-odds differ from the prior by less than this."""
 
     def __post_init__(self) -> None:
@@ -244,16 +222,13 @@ class RuntimeConfig:
     threads: int = 0
     """CPU threads, at most one for each core. 0 means all cores."""
 
-    debug: bool = False
-    """Check array bounds in kernels (slow)."""
-
     def __post_init__(self) -> None:
         check_field(self.threads >= 0, "runtime.threads", "must not be negative")
 
 
 @dataclass(frozen=True)
-class _Head:
-    """The fields before the methods' sections in YAML and in help texts."""
+class Config:
+    """All parameters of mapping a sequence: those that every method shares, and a section for each method."""
 
     voxel_size: float = 0.05
     """Side of a voxel in metres."""
@@ -268,10 +243,17 @@ class _Head:
     sensor: SensorConfig = field(default_factory=SensorConfig)
     """The sensor's noise and range."""
 
+    inference: InferenceConfig = field(default_factory=InferenceConfig)
+    """How the marginals are computed."""
 
-@dataclass(frozen=True)
-class _Tail:
-    """The fields after them."""
+    log_odds: LogOddsConfig = field(default_factory=LogOddsConfig, metadata=IN_FILES)
+    """Occupancy mapping by independent log-odds (method log_odds)."""
+
+    visibility: VisibilityConfig = field(default_factory=VisibilityConfig, metadata=IN_PYTHON)
+    """Visibility-aware occupancy mapping (method visibility)."""
+
+    wavemap: WavemapConfig = field(default_factory=WavemapConfig, metadata=IN_PYTHON)
+    """Occupancy mapping by wavemap's measurement model (method wavemap)."""
 
     color: bool = False
     """Read the recording's colour images too, and give voxels and surfaces the colours of the pixels that see
@@ -299,32 +281,6 @@ class _Tail:
     runtime: RuntimeConfig = field(default_factory=RuntimeConfig)
     """The device that runs the kernels."""
 
-
-if TYPE_CHECKING:
-    _MethodSections: Any
-else:
-    _MethodSections = dataclasses.make_dataclass(
-        "_MethodSections",
-        [
-            (
-                m.section,
-                m.section_class,
-                field(default_factory=m.section_class, metadata={"help": m.section_help}),
-            )
-            for m in METHODS.values()
-        ],
-        frozen=True,
-    )
-
-
-@dataclass(frozen=True)
-class Config(_Tail, _MethodSections, _Head):
-    """All parameters of mapping a sequence: those that every method shares, and a section for each method.
-
-    A dataclass takes its fields from its last base first, so YAML begins with the head. A type checker sees a
-    method's section as Any, because methods are listed in plugs.py alone.
-    """
-
     def __post_init__(self) -> None:
         ok = 0 < real(self.voxel_size, "voxel_size") < math.inf
         check_field(ok, "voxel_size", f"must be a positive number of metres, not {self.voxel_size}")
@@ -349,7 +305,8 @@ def load(path: str | Path) -> Config:
     """Read a YAML file, or the shipped one of that name, such as ``kinect1``. Table paths in it are relative
     to its folder. Raises ConfigError, which names the file and the parameter."""
     path = find_config(path)
-    return with_absolute_tables(from_dict(Config, read_yaml(path), str(path)), path.parent)
+    values = in_files_alone(Config, read_yaml(path), str(path))
+    return with_absolute_tables(from_dict(Config, values, str(path)), path.parent)
 
 
 def with_absolute_tables(config: Config, folder: Path) -> Config:

@@ -12,6 +12,8 @@ from typing import Any
 
 import yaml
 
+from taichi_mrf.config.places import is_in_files
+
 _WIDTH = 100
 
 
@@ -42,7 +44,7 @@ def _docstrings(cls: type) -> dict[str, str]:
 
 
 def commented_yaml(config: Any) -> str:
-    """All parameters of a configuration dataclass as commented YAML, which reads back unchanged."""
+    """The parameters that a file may set as commented YAML, which reads back unchanged."""
     return "".join(_section(config, ""))
 
 
@@ -62,7 +64,7 @@ def _section(section: Any, indent: str) -> list[str]:
     """The lines of one dataclass; nested ones are indented below their names."""
     lines: list[str] = []
     texts = field_help(type(section))
-    for field in dataclasses.fields(section):
+    for field in filter(is_in_files, dataclasses.fields(section)):
         value = getattr(section, field.name)
         lines.append("\n" if lines else "")
         lines += [f"{indent}# {line}\n" for line in textwrap.wrap(texts[field.name], _WIDTH - len(indent))]

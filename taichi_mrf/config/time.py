@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+from taichi_mrf.config.places import in_files
 from taichi_mrf.config.values import check_field
 
 LIVE_HALF_LIFE_S = 14400.0
@@ -19,11 +20,11 @@ class TimeConfig:
     14400 (four hours) a few views are enough to see what is new, whatever was there before. 0 is a world
     that never changes, for surveys."""
 
-    moving_share: float = 1e-6
+    moving_share: float = in_files(1e-6)
     """Share of space that things which come and go fill. The smaller it is, the more views it takes until a
     surface that was seen often counts as gone. Only mrf uses it."""
 
-    glimpse_half_life_s: float = 2.0
+    glimpse_half_life_s: float = in_files(2.0)
     """Seconds after which half of a single view's claim is forgotten, if it contradicts what was known to be
     free: a person who walks past. Later views confirm or deny it. Only mrf uses it."""
 

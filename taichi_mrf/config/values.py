@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from typing import Any, Literal, TypeVar
 
 from taichi_mrf.config.gone import note_gone
+from taichi_mrf.config.places import is_in_files
 from taichi_mrf.errors import ArgumentTypeError, ConfigError
 
 T = TypeVar("T")
@@ -92,6 +93,32 @@ def from_dict(cls: type[T], values: Any, where: str) -> T:
         return cls(**arguments)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
+
+
+def in_files_alone(cls: type, values: Any, where: str) -> Any:
+    """The values of a file of parameters without those that only Python sets. Warns of one that differs from
+    its default: earlier versions read it from files. Raises ConfigError as :func:`from_dict` does."""
+    if not isinstance(values, dict):
+        return values
+    fields, hints, kept = {f.name: f for f in dataclasses.fields(cls)}, typing.get_type_hints(cls), {}
+    for key, value in values.items():
+        field, place = fields.get(key), f"{where}: {key}"
+        section: Any = hints[key] if field and dataclasses.is_dataclass(hints[key]) else None
+        if field is None or is_in_files(field):
+            kept[key] = in_files_alone(section, value, place) if section else value
+        elif section:
+            given = from_dict(section, value, place)
+            for each in dataclasses.fields(section):
+                _note_python(section, each, getattr(given, each.name), where)
+        else:
+            _note_python(cls, field, _convert(value, hints[key], place), where)
+    return kept
+
+
+def _note_python(cls: Any, field: "dataclasses.Field[Any]", value: Any, where: str) -> None:
+    if value != field.default:
+        now = f"set it in Python, {cls.__name__}({field.name}={value!r})"
+        warnings.warn(f"{where}: {field.name} is no longer read from files: {now}", stacklevel=4)
 
 
 def _convert(value: Any, hint: Any, where: str) -> Any:

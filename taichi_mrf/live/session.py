@@ -30,6 +30,7 @@ from taichi_mrf.live.requests import Requests, resumes_replay
 from taichi_mrf.live.run import Policy, Run
 from taichi_mrf.live.session_core import EDITS, WAIT_SECONDS
 from taichi_mrf.live.source import Source
+from taichi_mrf.mapping.follow import BETWEEN_FRAMES_S
 from taichi_mrf.mapping.intake import Added, Full, Lost, Skipped, UnreadableFrame
 from taichi_mrf.mapping.loops import Closure
 from taichi_mrf.mapping.refinement import PoseRefiner
@@ -146,8 +147,8 @@ class Session:
                 return
             if follower.left > 1:
                 state.show_activity(f"moving keyframes to new poses: {follower.left} left", 0.0)
-            budget_s, least = follower.config.follow_budget_s, 0.0 if exactly else None
-            ids = follower.move(budget_s, least, mapper.placed_by_hand())
+            least = 0.0 if exactly else None
+            ids = follower.move(BETWEEN_FRAMES_S, least, mapper.placed_by_hand())
             moved.extend(mapper.follow(ids))
             for entry in moved:
                 state.send(mapper.describe(entry))

@@ -84,7 +84,7 @@ def open_source(
 
     Raises TaichiMRFError: DatasetError, MapFileError, BackendError, ConfigError.
     """
-    runtime.init(config.runtime.arch, config.runtime.threads, config.runtime.debug)
+    runtime.init(config.runtime.arch, config.runtime.threads)
     path = Path(name)
     if path.suffix == ".npz" and is_file(path) and not frames_npz.FORMAT.recognises(path):
         if poses is not None:
@@ -108,8 +108,7 @@ def open_source(
         return Source(path.name, parameters, lambda: load_map(path)), notes
     keywords = (reading or SourceFlags()).keywords()
     color = wants_color(config, name, track)
-    keywords |= {"follow": follow, "carry": config.poses.carry_unnamed}
-    dataset = open_posed(name, poses, track=track, color=color, **keywords)
+    dataset = open_posed(name, poses, follow=follow, track=track, color=color, **keywords)
     if not config.color and METHODS[config.method].has_colors:
         note_unused_color(dataset, name, reading or SourceFlags())
     config = with_recorded_noise(config, dataset)

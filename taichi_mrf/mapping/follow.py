@@ -19,6 +19,12 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.methods.capabilities import has_messages
 from taichi_mrf.methods.protocol import OccupancyMap
 
+BETWEEN_FRAMES_S = 0.2
+"""Keyframes are moved for about this long, at most, between two frames (seconds)."""
+
+FINAL_AFTER_S = 10.0
+"""Poses are final once the recording is over and their file has not changed for this long (seconds)."""
+
 
 @dataclass
 class Followed:
@@ -65,8 +71,8 @@ class PoseFollower:
 
     @property
     def is_final(self) -> bool:
-        """Whether the source has been unchanged for the configured time and all keyframes have moved."""
-        return not self._left and self.quiet_s >= self.config.follow_quiet_s
+        """Whether the source has been unchanged for FINAL_AFTER_S and all keyframes have moved."""
+        return not self._left and self.quiet_s >= FINAL_AFTER_S
 
     def look(self, stamp_s: float = math.inf) -> bool:
         """Ask the source, at a time of the recording in seconds; returns whether keyframes are to be moved.

@@ -18,7 +18,7 @@ from taichi_mrf.datasets import Dataset
 from taichi_mrf.errors import CapacityError, DatasetError, FrameError
 from taichi_mrf.inference.keyframe import checked_depth
 from taichi_mrf.inference.schedule import InferProgress
-from taichi_mrf.mapping.follow import PoseFollower, follower_of
+from taichi_mrf.mapping.follow import BETWEEN_FRAMES_S, FINAL_AFTER_S, PoseFollower, follower_of
 from taichi_mrf.mapping.intake import (
     HELD_OUT,
     Added,
@@ -175,12 +175,12 @@ class _BatchRun:
                     return
 
     def follow_until_final(self) -> None:
-        """Let keyframes follow poses that change until these have been unchanged for the configured time,
+        """Let keyframes follow poses that change until these have been unchanged for FINAL_AFTER_S,
         then put each exactly where its frame was taken."""
         follower = self.follower
         if follower is None:
             return
-        final_s = follower.config.follow_quiet_s
+        final_s = FINAL_AFTER_S
         self._follow(math.inf)
         while not (follower.is_final or self._is_stopped() or self.result.full):
             self.listener(WaitingForPoses(min(follower.quiet_s, final_s), final_s))
@@ -200,7 +200,7 @@ class _BatchRun:
             return
         with self._following():
             if follower.look(stamp_s):
-                follower.move(follower.config.follow_budget_s)
+                follower.move(BETWEEN_FRAMES_S)
         for text in follower.news():
             warnings.warn(text, stacklevel=2)
 

@@ -21,6 +21,9 @@ LOSS = 0.1
 after the other fit each other a little better than all together, where recorded poses count too; if they do
 not fit, more is lost by far. Of a tracked camera nothing may be lost."""
 
+MOST_ROUNDS = 2
+"""After that many rounds keyframes stay where they are."""
+
 SETTLED = 0.02
 """Share of a voxel: rounds end when no keyframe was moved further."""
 
@@ -72,24 +75,23 @@ class AlignmentRounds(Settling[RoundStep, bool]):
 
     def __init__(self, refiner: PoseRefiner, mover: KeyframeMover, fixed: Collection[int] = ()) -> None:
         """Align all keyframes with each other and with where they were recorded, but for the ``fixed`` ones
-        (ids), until they stay where they are or the configuration's rounds are over. A round that makes
+        (ids), until they stay where they are or MOST_ROUNDS are over. A round that makes
         their depth less likely is undone."""
         self._map, self._refiner, self._mover = refiner.map, refiner, mover
-        self._step = RoundStep(0, refiner.config.rounds, 0, len(refiner.map.keyframes))
+        self._step = RoundStep(0, MOST_ROUNDS, 0, len(refiner.map.keyframes))
         super().__init__(self._rounds(fixed))
 
     def _rounds(self, fixed: Collection[int]) -> Generator[RoundStep, None, bool]:
         stood: dict[int, Pose] = {}
-        rounds = self._refiner.config.rounds
         try:
-            before = (yield from self._log_likelihood()) if rounds else 0.0
-            for round in range(1, rounds + 1):
+            before = yield from self._log_likelihood()
+            for round in range(1, MOST_ROUNDS + 1):
                 stood = {id: keyframe.T_world_camera for id, keyframe in self._map.keyframes.items()}
-                self._step = RoundStep(round, rounds, 0, len(stood))
+                self._step = RoundStep(round, MOST_ROUNDS, 0, len(stood))
                 found = yield from self._each(self._refiner.joint(fixed))
                 for number, (id, T_world_camera) in enumerate(found.items(), start=1):
                     self._mover.move(id, T_world_camera)
-                    self._step = RoundStep(round, rounds, number, len(stood))
+                    self._step = RoundStep(round, MOST_ROUNDS, number, len(stood))
                     yield self._step
                 if has_settled(self._map, stood):
                     break

@@ -17,23 +17,21 @@ def is_held_out(number: int, hold_out: int) -> bool:
 class KeyframeSelector:
     """Selects a frame when the tangent norm of its rotation or of its translation is larger than a threshold.
 
-    The norm is taken against the last keyframe, as in the paper, or against every earlier one, in which
-    case a frame must be far from all of them. With both thresholds at 0 every frame is a keyframe; with
-    one of them at 0 only the other counts. Of several sensors each has keyframes of its own, which alone
-    its frames are compared with.
+    The norm is taken against the last keyframe, as in the paper. With both thresholds at 0 every frame is a
+    keyframe; with one of them at 0 only the other counts. Of several sensors each has keyframes of its own,
+    which alone its frames are compared with.
     """
 
     def __init__(self, config: KeyframeConfig) -> None:
         self._config = config
-        self._accepted: dict[str, list[Pose]] = {}  # of each sensor those that frames are compared with
+        self._last: dict[str, Pose] = {}  # of each sensor, T_world_camera of its last keyframe
 
     def wants(self, T_world_camera: Pose, sensor: str = "") -> bool:
         """Whether a frame of a sensor with this pose, (4, 4), should become a keyframe. Does not change the
         selector."""
         if self._config.rotation == 0 and self._config.translation == 0:
             return True
-        accepted = self._accepted.get(sensor, [])
-        return all(self._is_far(T_world_keyframe, T_world_camera) for T_world_keyframe in accepted)
+        return sensor not in self._last or self._is_far(self._last[sensor], T_world_camera)
 
     def objection(self, T_world_camera: Pose, measured: bool, sensor: str = "") -> str | None:
         """Why a frame with this pose, (4, 4), does not become a keyframe; None if it does. ``measured``: its
@@ -44,10 +42,7 @@ class KeyframeSelector:
 
     def accept(self, T_world_camera: Pose, sensor: str = "") -> None:
         """Note the pose of a frame that has become a keyframe."""
-        accepted = self._accepted.setdefault(sensor, [])
-        if self._config.against == "last":
-            accepted.clear()  # an endless run has no end of poses
-        accepted.append(T_world_camera)
+        self._last[sensor] = T_world_camera
 
     def _is_far(self, T_world_keyframe: Pose, T_world_camera: Pose) -> bool:
         rotation, translation = tangent_norms(T_world_keyframe, T_world_camera)

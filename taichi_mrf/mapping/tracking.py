@@ -177,7 +177,7 @@ class Tracker:
         if around is None and self._lost:
             guesses += self._known_places(small_picture(depth_m, frame.color))
         config = self._config if turn is None or self._lost else self._gyro_config
-        colors = partial(self._pictures.compared_with, frame, m.keyframes) if self._config.use_color else None
+        colors = partial(self._pictures.compared_with, frame, m.keyframes)
         located = self._from_flow(image, frame, config, colors)
         if located is None or located.T_world_camera is None:
             located = self._locator.locate(image, guesses, m.keyframes, config, around, colors)
@@ -213,7 +213,7 @@ class Tracker:
         assert self._last is not None
         T_world_camera, before = self.map.keyframes[keyframe].T_world_camera, self._last
         self._keyframe = keyframe
-        if self._frame is not None and self._config.use_color:
+        if self._frame is not None:
             self._pictures.keep(keyframe, self._frame)
         color = None if self._frame is None else self._frame.color
         self._note_appearance(keyframe, color)
@@ -344,4 +344,4 @@ def keyframe_steps(config: KeyframeConfig) -> KeyframeConfig:
 def wants_color(config: Config, source: str, track: bool) -> bool:
     """Whether the colour images of a source are to be read: for the map, or to ``track`` the camera."""
     tracked = track or f"poses={TRACK}" in source or (source.startswith(CAMERA) and "poses=" not in source)
-    return config.color or (tracked and config.poses.use_color)
+    return config.color or tracked

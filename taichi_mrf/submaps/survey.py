@@ -53,7 +53,7 @@ class SurveyedFrame:
 def survey_frames(task: SurveyTask) -> list[SurveyedFrame]:
     """Read frames and follow their rays, one frame in memory at a time. Raises DatasetError, ConfigError."""
     config = task.config
-    runtime.init(config.runtime.arch, config.runtime.threads, config.runtime.debug)
+    runtime.init(config.runtime.arch, config.runtime.threads)
     dataset = task.sequence.open()
     m = PartialMap.from_config(config, dataset.camera)
     found = []

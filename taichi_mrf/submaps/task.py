@@ -93,7 +93,7 @@ def is_idle(task: SubmapTask) -> bool:
 def _inferred(task: SubmapTask, job: Job, on_step: Callable[[InferProgress], None]) -> RoundResult:
     begin = time.perf_counter()
     settings = job.config.runtime
-    runtime.init(settings.arch, settings.threads, settings.debug)
+    runtime.init(settings.arch, settings.threads)
     reset_peak_memory()
     m, id_of = _with_keyframes(job, task.submap)
     core = _core(job, task.submap, m.bricks())

@@ -24,7 +24,7 @@ BACKENDS = ("cuda", "vulkan", "cpu")
 
 ABILITIES = {
     "cuda": "sparse map without bounds",
-    "vulkan": "map within a bounded volume (volume.dense_bricks)",
+    "vulkan": "map within a bounded volume (VolumeConfig.dense_bricks)",
     "cpu": "sparse map without bounds",
 }
 """The kind of map that each backend supports: Vulkan has no sparse fields."""

@@ -330,7 +330,7 @@ class DenseTopology:
             extent = self.side * BRICK * voxel_size
             raise CapacityError(
                 f"the map would leave its volume of {extent:g} m around the first keyframe, which is "
-                f"bounded on Vulkan; raise volume.dense_bricks (now {self.side}) or use the CPU"
+                f"bounded on Vulkan; use the CPU, or raise VolumeConfig.dense_bricks (now {self.side})"
             )
 
     def drop_chunks(self, chunks: Bricks) -> None:

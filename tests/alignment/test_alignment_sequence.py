@@ -27,9 +27,7 @@ from taichi_mrf.sensor.noise import PolynomialNoise
 pytestmark = pytest.mark.usefixtures("one_backend")
 
 COUNT = 8
-REFINE = Config(
-    voxel_size=0.1, poses=PoseConfig(refine=True, rounds=1), evaluation=EvaluationConfig(hold_out=0)
-)
+REFINE = Config(voxel_size=0.1, poses=PoseConfig(refine=True), evaluation=EvaluationConfig(hold_out=0))
 
 
 @cache

@@ -55,7 +55,7 @@ def test_map_follows_a_file_and_makes_the_map_of_its_last_poses(recording: Path,
     poses, out = tmp_path / "slam.txt", tmp_path / "followed"
     write_poses(poses, 0.2)
     flags = ("--poses", str(poses), *FAST, "--evaluation.hold-out", "0")
-    waits = ("--follow", "--poses.follow-quiet-s", "4", "--keep-every", "0")
+    waits = ("--follow", "--keep-every", "0")
     command = ["map", str(recording), "--out", str(out), *flags, *waits]
     with subprocess.Popen(
         [sys.executable, "-m", "taichi_mrf", *command],

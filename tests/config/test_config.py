@@ -14,7 +14,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from taichi_mrf import MRFMap
+from taichi_mrf.config.baselines import LogOddsConfig, VisibilityConfig
 from taichi_mrf.config.inference import InferenceConfig
+from taichi_mrf.config.places import is_in_files
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import (
     Config,
@@ -29,6 +31,7 @@ from taichi_mrf.config.schema import (
 )
 from taichi_mrf.config.text import commented_yaml, differences, field_help
 from taichi_mrf.config.time import TimeConfig
+from taichi_mrf.config.values import from_dict
 from taichi_mrf.errors import ConfigError
 
 SECTIONS = (
@@ -67,9 +70,9 @@ configs = st.builds(
         prior=st.none() | numbers(0.01, 0.99),
         outlier_floor=numbers(0, 1),
     ),
-    keyframes=st.builds(KeyframeConfig, rotation=numbers(0, 4), against=st.sampled_from(["last", "all"])),
+    keyframes=st.builds(KeyframeConfig, rotation=numbers(0, 4)),
     volume=st.just(VolumeConfig()) | st.just(VolumeConfig(lower=(-1.0, -2.0, -3.0), upper=(1.0, 2.0, 3.0))),
-    runtime=st.builds(RuntimeConfig, threads=st.integers(0, 64), debug=st.booleans()),
+    runtime=st.builds(RuntimeConfig, threads=st.integers(0, 64)),
 )
 
 
@@ -109,11 +112,53 @@ def test_the_default_file_is_the_defaults_with_every_field_and_its_help(reposito
     assert load(repository / "configs" / "default.yaml") == Config()
     assert text.endswith(commented_yaml(Config()))  # if not: python docs/make_default_yaml.py
     values = yaml.safe_load(text)
-    assert set(values) == {field.name for field in dataclasses.fields(Config)}
-    for field in dataclasses.fields(Config):
+    assert set(values) == names_in_files(Config)
+    for field in filter(is_in_files, dataclasses.fields(Config)):
         section = getattr(Config(), field.name)
         if dataclasses.is_dataclass(section):
-            assert set(values[field.name]) == {each.name for each in dataclasses.fields(section)}
+            assert set(values[field.name]) == names_in_files(type(section))
+
+
+def names_in_files(cls: type) -> set[str]:
+    return {field.name for field in dataclasses.fields(cls) if is_in_files(field)}
+
+
+def test_a_file_has_at_most_fifty_parameters() -> None:
+    values = yaml.safe_load(commented_yaml(Config()))
+    assert sum(len(value) if isinstance(value, dict) else 1 for value in values.values()) <= 50
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("visibility: {q_max: 0.8}", r"set it in Python, VisibilityConfig\(q_max=0.8\)"),
+        ("log_odds: {update: ray, hit: 0.8}", r"set it in Python, LogOddsConfig\(update='ray'\)"),
+        ("volume: {min_evidence: 1}", r"set it in Python, VolumeConfig\(min_evidence=1.0\)"),
+        ("keyframes: {against: all}", "against is no longer a parameter: a frame is compared with the last"),
+        (
+            "poses: {carry_unnamed: false}",
+            "carry_unnamed is no longer a parameter: frames without",
+        ),
+    ],
+)
+def test_what_files_no_longer_set_is_said_with_what_to_do(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.warns(UserWarning, match=said):
+        found = load(written(tmp_path, text))
+    hit = LogOddsConfig(hit=0.8 if "hit" in text else LogOddsConfig.hit)
+    assert found == dataclasses.replace(Config(), log_odds=hit)
+
+
+def test_the_defaults_of_what_they_no_longer_set_need_no_warning(tmp_path: Path) -> None:
+    old = "visibility: {q_max: 0.7}\nwavemap: {beams: neighbours, max_range: 0}\nruntime: {debug: false}\n"
+    old += "poses: {rounds: 2, max_rotation: 0.1, follow_quiet_s: 10}\nvolume: {dense_bricks: 256}\n"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert load(written(tmp_path, old)) == Config()
+
+
+def test_map_files_hold_what_python_alone_sets() -> None:
+    config = Config(0.1, "visibility", visibility=VisibilityConfig(q_max=0.8))
+    assert from_dict(Config, yaml.safe_load(to_yaml(config)), "a map") == config
 
 
 @pytest.mark.parametrize("cls", SECTIONS, ids=lambda cls: cls.__name__)
@@ -173,7 +218,9 @@ def test_the_default_sensor_is_the_kinect_1(repository: Path) -> None:
         ("inference: {sweeps: true}", "sweeps must be of type int"),
         ("inference: {free_share: 1.5}", "free_share must lie between 0 and 1"),
         ("inference: {prior: 1.5}", "prior must lie between 0 and 1"),
-        ("keyframes: {against: mean}", "against must be one of last, all, not 'mean'"),
+        ("sensor: {no_return: mean}", "no_return must be one of ignore, free, model, not 'mean'"),
+        ("visibility: {q_mex: 0.5}", "visibility: unknown parameter 'q_mex'; did you mean 'q_max'"),
+        ("volume: {min_evidence: much}", "volume: min_evidence must be a number, not 'much'"),
         ("inference: 3", "inference: expected a mapping"),
         ("sensor: {sigma: 0.1}", "sigma must be a list"),
         ("sensor: {sigma: []}", "sigma needs at least one coefficient"),

@@ -261,11 +261,11 @@ def test_frames_take_the_poses_of_a_file_and_the_others_keep_theirs(tmp_path: Pa
         posed_by(sequence(4), open_pose_source(tmp_path / "missing.txt"))
 
 
-def test_unnamed_frames_may_be_carried_along(tmp_path: Path) -> None:
+def test_unnamed_frames_are_carried_along(tmp_path: Path) -> None:
     path = tmp_path / "graph.g2o"
     path.write_text(g2o({1: POSES[1], 3: POSES[3]}))
     frames = sequence(6, broken=(4,))
-    posed = posed_by(frames, open_pose_source(path), carry=True)
+    posed = posed_by(frames, open_pose_source(path))
     recorded = [sequence(6).read(index).T_world_camera for index in range(6)]
     for index, carrier in ((0, None), (1, 1), (2, 1), (3, 3), (5, 3)):
         T = recorded[index]
@@ -273,7 +273,7 @@ def test_unnamed_frames_may_be_carried_along(tmp_path: Path) -> None:
             T = POSES[carrier] @ np.linalg.inv(recorded[carrier]) @ T
         np.testing.assert_allclose(posed.read(index).T_world_camera, T, atol=1e-12)
     path.write_text(g2o({4: POSES[2]}))  # which cannot be read: nothing says where it was recorded
-    posed = posed_by(frames, open_pose_source(path), carry=True)
+    posed = posed_by(frames, open_pose_source(path))
     np.testing.assert_array_equal(posed.read(5).T_world_camera, recorded[5])
 
 

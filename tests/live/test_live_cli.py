@@ -238,13 +238,13 @@ def test_a_saved_map_is_shown_with_its_own_parameters(
 
 
 def test_the_parameters_of_a_file_hold_unless_a_flag_says_otherwise(tmp_path: Path) -> None:
-    (tmp_path / "mine.yaml").write_text("voxel_size: 0.2\ninference: {sweeps: 1, damping: 0.1}\n")
+    (tmp_path / "mine.yaml").write_text("voxel_size: 0.2\ninference: {sweeps: 1, free_share: 0.3}\n")
     out = tmp_path / "out"
     flags = ("--config", tmp_path / "mine.yaml", "--inference.sweeps", "2", "--port", "0")
     done = live(ROOM, "--limit", "2", "--exit-when-done", "--out", out, *flags)
     assert done.returncode == 0, done.stderr
     written = (out / "config.yaml").read_text()
-    for line in ("voxel_size: 0.2", "sweeps: 2", "damping: 0.1"):
+    for line in ("voxel_size: 0.2", "sweeps: 2", "free_share: 0.3"):
         assert line in written
 
 

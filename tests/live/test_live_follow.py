@@ -8,7 +8,6 @@ import pytest
 import small_room
 from live_scene import CONFIG, FakeLink, assert_shown_is, built, finished, marginals, room, shown, source
 
-from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.datasets.pose_sources.base import CallbackPoses, ChangedPoses
 from taichi_mrf.datasets.pose_sources.posed import posed_by
 from taichi_mrf.geometry.poses import Pose
@@ -41,7 +40,7 @@ class Told:
 
 
 def following(link: FakeLink, told: Told, method: str = "mrf") -> Session:
-    config = replace(CONFIG, method=method, poses=PoseConfig(follow_quiet_s=0.0, follow_budget_s=0.0))
+    config = replace(CONFIG, method=method)
     dataset = posed_by(room(), CallbackPoses(told), follow=True)
     made = replace(source(dataset, config), dataset=dataset)
     return Session(made, link, Policy(leave_when_done=True))

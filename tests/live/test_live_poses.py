@@ -56,9 +56,7 @@ from taichi_mrf.viewer.messages import (
 pytestmark = pytest.mark.usefixtures("one_backend")
 
 COUNT = 6
-REFINE = Config(
-    voxel_size=0.1, poses=PoseConfig(refine=True, rounds=1), evaluation=EvaluationConfig(hold_out=0)
-)
+REFINE = Config(voxel_size=0.1, poses=PoseConfig(refine=True), evaluation=EvaluationConfig(hold_out=0))
 
 
 @cache

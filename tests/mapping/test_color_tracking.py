@@ -32,10 +32,15 @@ def along_the_wall(index: int) -> Frame:
     )
 
 
-def tracked(walk: list[Frame], config: PoseConfig) -> tuple[list[Pose], list[int]]:
+def blind(walk: list[Frame]) -> list[Frame]:
+    """The frames without their colours."""
+    return [replace(frame, color=None) for frame in walk]
+
+
+def tracked(walk: list[Frame]) -> tuple[list[Pose], list[int]]:
     """Poses and determined directions of some frames, every third of which becomes a keyframe."""
     m = MRFMap.from_config(CONFIG, walk[0].camera)
-    tracker = Tracker(m, config)
+    tracker = Tracker(m, PoseConfig())
     poses, directions = [], []
     for i, frame in enumerate(walk):
         found, told = tracker.follow(frame)
@@ -49,11 +54,11 @@ def tracked(walk: list[Frame], config: PoseConfig) -> tuple[list[Pose], list[int
 def test_colour_shows_the_way_along_a_flat_wall() -> None:
     walk = [along_the_wall(i) for i in range(8)]
     way = np.array([frame.T_world_camera[:3, 3] for frame in walk])
-    poses, directions = tracked(walk, PoseConfig())
+    poses, directions = tracked(walk)
     assert np.abs(np.array(poses)[:, :3, 3] - way).max() < 0.005
     assert directions == [6] * 8
-    blind, undetermined = tracked(walk, PoseConfig(use_color=False))
-    assert np.abs(np.array(blind)[:, :3, 3] - way).max() > 0.1
+    lost, undetermined = tracked(blind(walk))
+    assert np.abs(np.array(lost)[:, :3, 3] - way).max() > 0.1
     assert max(undetermined[1:]) == 3
 
 
@@ -63,7 +68,7 @@ def test_without_texture_poses_are_those_of_depth_bit_for_bit() -> None:
     for frame in gray:
         assert frame.color is not None
         frame.color[frame.depth_m == 0] = 0  # as where a colour camera is registered
-    np.testing.assert_array_equal(tracked(plain, PoseConfig())[0], tracked(gray, PoseConfig())[0])
+    np.testing.assert_array_equal(tracked(plain)[0], tracked(gray)[0])
 
 
 def test_colours_are_read_where_they_are_tracked() -> None:
@@ -73,15 +78,13 @@ def test_colours_are_read_where_they_are_tracked() -> None:
     assert not wants_color(CONFIG, "realsense:?poses=still", track=False)
     assert not wants_color(CONFIG, "recording", track=False)
     assert wants_color(replace(CONFIG, color=True), "recording", track=False)
-    blind = replace(CONFIG, poses=PoseConfig(use_color=False))
-    assert not wants_color(blind, "recording", track=True)
 
 
 def test_steps_that_change_along_a_wall_are_followed() -> None:
     """Neither standing still nor going on as before is near where the camera is."""
     walk = [along_the_wall(i) for i in (0, 5, 2, 9, 6, 12)]
     way = np.array([frame.T_world_camera[:3, 3] for frame in walk])
-    poses, _ = tracked(walk, PoseConfig())
+    poses, _ = tracked(walk)
     assert np.abs(np.array(poses)[:, :3, 3] - way).max() < 0.01
 
 
@@ -90,5 +93,5 @@ def test_where_flow_misleads_the_other_guesses_count() -> None:
     room = frames()[:2]
     pictures = [along_the_wall(i).color for i in (0, 17)]
     walk = [replace(frame, color=color) for frame, color in zip(room, pictures, strict=True)]
-    poses, _ = tracked(walk, PoseConfig())
-    np.testing.assert_allclose(poses[1], tracked(room, PoseConfig(use_color=False))[0][1], atol=0.02)
+    poses, _ = tracked(walk)
+    np.testing.assert_allclose(poses[1], tracked(blind(room))[0][1], atol=0.02)

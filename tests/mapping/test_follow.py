@@ -17,7 +17,8 @@ from taichi_mrf.datasets.pose_sources.posed import posed_by
 from taichi_mrf.datasets.pose_sources.registry import open_pose_source
 from taichi_mrf.datasets.pose_sources.watched import WatchedFile
 from taichi_mrf.errors import CapacityError, ConfigError, DatasetError
-from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.geometry.poses import Pose, inverse
+from taichi_mrf.mapping import follow, pipeline
 from taichi_mrf.mapping.follow import PoseFollower
 from taichi_mrf.mapping.pipeline import Event, WaitingForPoses, map_sequence
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -29,7 +30,15 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:.* stay where they were recorded"),
 ]
 
-AT_ONCE = replace(ALL_FRAMES, poses=PoseConfig(follow_quiet_s=0.0))
+
+@pytest.fixture(autouse=True)
+def _final_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    final_after(monkeypatch, 0.0)
+
+
+def final_after(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
+    for module in (follow, pipeline):
+        monkeypatch.setattr(module, "FINAL_AFTER_S", seconds)
 
 
 def shifted(index: int, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> Pose:
@@ -50,18 +59,25 @@ class Versions:
 
 
 def followed(
-    versions: Sequence[ChangedPoses | None], config: Config = AT_ONCE, **options: object
+    versions: Sequence[ChangedPoses | None], config: Config = ALL_FRAMES, **options: object
 ) -> OccupancyMap:
     dataset = posed_by(sequence(), CallbackPoses(Versions(versions)), follow=True)
     return map_sequence(dataset, config, **options).map  # type: ignore[arg-type]
 
 
-def anew(poses: dict[int, Pose], config: Config = AT_ONCE) -> OccupancyMap:
-    """The map of the frames at these poses, by index, and of the others where they were recorded."""
+def anew(poses: dict[int, Pose], config: Config = ALL_FRAMES) -> OccupancyMap:
+    """The map of the frames at these poses, by index, and of the others where the last of these before them
+    carries them."""
     m = create_map(config, sequence().camera)
+    carry: Pose = np.eye(4)
     for index in range(len(sequence())):
         frame = sequence().read(index)
-        m.add_keyframe(frame.depth_m, poses.get(index, frame.T_world_camera), frame.camera, frame.name)
+        T = poses.get(index)
+        if T is not None:
+            carry = T @ inverse(frame.T_world_camera)
+        else:
+            T = carry @ frame.T_world_camera
+        m.add_keyframe(frame.depth_m, T, frame.camera, frame.name)
     m.infer()
     return m
 
@@ -90,23 +106,20 @@ def test_the_map_is_that_made_anew_with_the_last_poses(versions: list[dict | Non
     assert_same_map(followed([*told, {f"frame {i}": T for i, T in last.items()}]), anew(last))
 
 
-def test_keyframes_that_are_not_named_stay_or_are_carried() -> None:
-    for carry in (False, True):
-        source = CallbackPoses(
-            Versions([None, None, None, {1: shifted(1, 0.0, 0.1, 0.0)}, {1: shifted(1, 0.0, 0.2)}])
-        )
-        dataset = posed_by(sequence(), source, follow=True, carry=carry)
-        m = map_sequence(dataset, AT_ONCE).map
-        last = {index: shifted(index, 0.0, 0.2) for index in (range(1, 6) if carry else (1,))}
-        places = [keyframe.T_world_camera for keyframe in m.keyframes.values()]
-        for index, T in enumerate(places):
-            np.testing.assert_allclose(T, last.get(index, shifted(index)), atol=1e-12)
-        assert_same_map(m, anew(dict(enumerate(places))))
+def test_keyframes_that_are_not_named_are_carried() -> None:
+    source = CallbackPoses(
+        Versions([None, None, None, {1: shifted(1, 0.0, 0.1, 0.0)}, {1: shifted(1, 0.0, 0.2)}])
+    )
+    m = map_sequence(posed_by(sequence(), source, follow=True), ALL_FRAMES).map
+    places = [keyframe.T_world_camera for keyframe in m.keyframes.values()]
+    for index, T in enumerate(places):
+        np.testing.assert_allclose(T, shifted(index, 0.0, 0.2) if index else shifted(0), atol=1e-12)
+    assert_same_map(m, anew(dict(enumerate(places))))
 
 
 @pytest.mark.parametrize("method", ["log_odds", "visibility"])
 def test_every_method_follows(method: str) -> None:
-    config = replace(AT_ONCE, method=method)
+    config = replace(ALL_FRAMES, method=method)
     last = {2: shifted(2, 0.2, 0.0, 0.1), 4: shifted(4, 0.0, 0.1, 0.0)}
     versions = [{2: shifted(2, 0.1, 0.0, 0.0)}, None, last]
     assert_same_map(followed(versions, config), anew(last, config))
@@ -121,7 +134,7 @@ def test_keyframes_move_between_frames_and_new_frames_come_at_the_new_poses() ->
             seen.setdefault(id, []).append(keyframe.T_world_camera[:3, 3])
 
     dataset = posed_by(sequence(), CallbackPoses(source), follow=True)
-    result = map_sequence(dataset, AT_ONCE, keep=keep)
+    result = map_sequence(dataset, ALL_FRAMES, keep=keep)
     assert [place[0] for place in seen[0][:3]] == pytest.approx([0.0, 0.0, 0.2])
     np.testing.assert_allclose(seen[3][0], (0.3, 0.3, 0.0))  # read after the change
     assert source.stamps[0] == -math.inf
@@ -132,9 +145,9 @@ def test_keyframes_move_between_frames_and_new_frames_come_at_the_new_poses() ->
     assert "following" in result.seconds
 
 
-def test_a_run_waits_for_a_file_that_still_changes(tmp_path: Path) -> None:
+def test_a_run_waits_for_a_file_that_still_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "graph.g2o"
-    config = replace(ALL_FRAMES, poses=PoseConfig(follow_quiet_s=0.3))
+    final_after(monkeypatch, 0.3)
     last, told = {1: shifted(1, 0.1, 0.2, 0.0)}, []
 
     def listen(event: Event) -> None:
@@ -145,15 +158,16 @@ def test_a_run_waits_for_a_file_that_still_changes(tmp_path: Path) -> None:
                 path.write_text(f"VERTEX_SE3:QUAT 1 {x} {y} {z} 0 0 0 1\n")
 
     dataset = posed_by(sequence(), open_pose_source(path), follow=True)  # which is not there yet
-    m = map_sequence(dataset, config, listen).map
+    m = map_sequence(dataset, ALL_FRAMES, listen).map
     assert_same_map(m, anew(last))
     assert max(told) <= 0.3
 
 
-def test_poses_are_final_once_they_are_unchanged_for_long_enough() -> None:
+def test_poses_are_final_once_they_are_unchanged_for_long_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    final_after(monkeypatch, 10.0)
     now, source = [0.0], Versions([None, None, {0: shifted(0)}])
     dataset = posed_by(sequence(), CallbackPoses(source), follow=True)
-    follower = PoseFollower(MRFMap(0.1), dataset, PoseConfig(follow_quiet_s=10.0), lambda: now[0])
+    follower = PoseFollower(MRFMap(0.1), dataset, PoseConfig(), lambda: now[0])
     final = []
     for now[0] in (9.0, 11.0, 20.0, 21.0):
         follower.look()
@@ -161,11 +175,11 @@ def test_poses_are_final_once_they_are_unchanged_for_long_enough() -> None:
     assert final == [False, False, False, True]
 
 
-def test_a_stop_ends_the_waiting() -> None:
+def test_a_stop_ends_the_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    final_after(monkeypatch, 1e6)
     stop = StopAfter(WaitingForPoses, 1)
     dataset = posed_by(sequence(), CallbackPoses(Versions([])), follow=True)
-    config = replace(ALL_FRAMES, poses=PoseConfig(follow_quiet_s=1e6))
-    result = map_sequence(dataset, config, stop.listen, should_stop=stop)
+    result = map_sequence(dataset, ALL_FRAMES, stop.listen, should_stop=stop)
     assert result.interrupted
     assert result.sweeps == 1
     assert names(result.map) == [f"frame {index}" for index in range(6)]  # type: ignore[arg-type]
@@ -203,13 +217,13 @@ def test_a_pose_for_which_there_is_no_memory_ends_the_run_with_the_map_so_far(
 
     monkeypatch.setattr(MRFMap, "update_poses", full)
     dataset = posed_by(sequence(), CallbackPoses(Versions([None, {0: shifted(0, 0.2)}])), follow=True)
-    result = map_sequence(dataset, AT_ONCE)
+    result = map_sequence(dataset, ALL_FRAMES)
     assert result.full == "moving keyframes to their new poses does not fit: 4 GB are needed"
     assert names(result.map) == ["frame 0"]  # type: ignore[arg-type]
     assert result.sweeps > 0
 
 
 def test_refinement_and_following_exclude_each_other() -> None:
-    config = replace(AT_ONCE, poses=PoseConfig(refine=True))
+    config = replace(ALL_FRAMES, poses=PoseConfig(refine=True))
     with pytest.raises(ConfigError, match="choose one"):
         followed([], config)

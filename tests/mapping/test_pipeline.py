@@ -154,7 +154,7 @@ def test_a_stop_before_the_first_keyframe_is_an_error() -> None:
 def test_a_resumed_run_ends_in_the_map_of_an_undisturbed_one(stop_after: int) -> None:
     config = replace(
         ALL_FRAMES,
-        keyframes=KeyframeConfig(translation=0.15, against="all"),
+        keyframes=KeyframeConfig(translation=0.15),
         evaluation=EvaluationConfig(hold_out=5),
     )
     whole = map_sequence(sequence(12), config)

@@ -115,8 +115,8 @@ def test_flags_of_a_run_are_in_its_map_and_on_the_page_opened_from_it(tmp_path: 
         "0.05",
         "--sensor.bias",
         "0.01",
-        "--poses.rounds",
-        "7",
+        "--poses.doubt-rotation",
+        "0.001",
         "--keyframes.rotation",
         "0.1",
     ]
@@ -127,7 +127,7 @@ def test_flags_of_a_run_are_in_its_map_and_on_the_page_opened_from_it(tmp_path: 
     assert code == 0
     config = load_map(tmp_path / "run" / "map.npz").config
     assert config.sensor == SensorConfig(sigma=(0.05,), bias=(0.01,))
-    assert (config.poses.rounds, config.keyframes.rotation, config.voxel_size) == (7, 0.1, 0.2)
+    assert (config.poses.doubt_rotation, config.keyframes.rotation, config.voxel_size) == (0.001, 0.1, 0.2)
     opened, notes = open_source(
         str(tmp_path / "run" / "map.npz"), Config(), every=1, limit=None, speed=1.0, loop=False
     )

@@ -115,7 +115,7 @@ def run_bench(options: Bench) -> int:
     """Measure, print, write and draw; always 0. Raises TaichiMRFError."""
     console = open_terminal(options.printing)
     wanted = options.settings.runtime
-    runtime.init(wanted.arch, wanted.threads, wanted.debug, options.profile)
+    runtime.init(wanted.arch, wanted.threads, profile=options.profile)
     with ProgressBar(console, options.printing) as progress:
         run = _Run(options, console, progress)
         mode = next((name for name in MODES if getattr(options, name)), "stages")

@@ -57,7 +57,7 @@ def run_laser(options: Laser) -> int:
             if len(beams) == 0:
                 raise DatasetError(f"{options.scans}: no beam of the {len(scans)} scans says anything")
         with _timed(seconds, "graph"):
-            runtime.init(options.runtime.arch, options.runtime.threads, options.runtime.debug)
+            runtime.init(options.runtime.arch, options.runtime.threads)
             graph = build_graph(beams, options.settings.cell_size, options.memory_limit_gb)
         with _timed(seconds, "inference"), ProgressBar(console, options.printing) as bar:
             outcomes = _solve_all(options, graph, scans, registration, bar, request)

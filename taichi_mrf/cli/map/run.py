@@ -87,7 +87,7 @@ def map_to_folder(
     """
     start = time.perf_counter()
     settings = task.settings
-    runtime.init(settings.runtime.arch, settings.runtime.threads, settings.runtime.debug)
+    runtime.init(settings.runtime.arch, settings.runtime.threads)
     dataset = task.open(wants_color(settings, task.source, task.poses.track_poses))
     if not settings.color and METHODS[settings.method].has_colors:
         note_unused_color(dataset, task.source, task.reading)

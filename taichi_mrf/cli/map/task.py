@@ -48,7 +48,6 @@ class MapTask:
         """Open the sequence. Raises DatasetError."""
         flags = self.poses
         how = {"follow": flags.follow, "track": flags.track_poses, "color": color}
-        how["carry"] = self.settings.poses.carry_unnamed
         return open_posed(self.source, flags.file, **how, **self.reading.keywords())
 
 

@@ -15,7 +15,7 @@ class PoseFlags:
 
     refine_poses: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Align each new keyframe with those before it, and all with each other at the end; the same as
-    --poses.refine."""
+    poses.refine in a file."""
 
     track_poses: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Find the pose of each frame by aligning it with the map so far; SOURCE's own poses, if any, are
@@ -28,7 +28,7 @@ class PoseFlags:
 
     follow: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """The file of --poses changes while SOURCE is mapped: keyframes follow it. map ends when the recording is
-    over and the file has been unchanged for --poses.follow-quiet-s."""
+    over and the file has been unchanged for 10 s."""
 
     def __post_init__(self) -> None:
         if self.follow and self.file is None:

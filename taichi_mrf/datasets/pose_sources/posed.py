@@ -23,13 +23,12 @@ from taichi_mrf.sensor.frame import Frame
 
 @dataclass
 class PosedFrames(Derived):
-    """The frames of ``source`` at the poses of ``poses``. One without a pose there keeps the recorded one; if
-    frames are ``carried``, it moves with the last frame before it that has one. ``follows``: the poses change
-    while the frames are mapped. ``kept`` are the source's indices of the frames."""
+    """The frames of ``source`` at the poses of ``poses``. One without a pose there moves with the last frame
+    before it that has one. ``follows``: the poses change while the frames are mapped. ``kept`` are the
+    source's indices of the frames."""
 
     poses: FramePoses = field(kw_only=True)
     follows: bool = False
-    carried: bool = False
     kept: Sequence[int] = field(kw_only=True)
 
     def __post_init__(self) -> None:
@@ -58,8 +57,7 @@ class PosedFrames(Derived):
         if not 0 <= index < len(self.kept):
             raise IndexError(f"{self.name} has {len(self.kept)} frames, there is no frame {index}")
         frame = self.source.read(self.kept[index])
-        if self.carried:
-            self._recorded[self.kept[index]] = frame.T_world_camera
+        self._recorded[self.kept[index]] = frame.T_world_camera
         T_world_camera = self.pose_now(frame.name, frame.stamp)
         return frame if T_world_camera is None else replace(frame, T_world_camera=T_world_camera)
 
@@ -68,7 +66,7 @@ class PosedFrames(Derived):
         the recorded one."""
         T_world_camera = self.poses.of(name, stamp_s)
         index = self._index_of.get(name)
-        if T_world_camera is not None or not self.carried or index is None:
+        if T_world_camera is not None or index is None:
             return T_world_camera
         carrier = int(self._carrier_of()[index])
         T_recorded, T_carrier = self._recorded_pose(index), self._recorded_pose(carrier)
@@ -107,17 +105,15 @@ def posed_by(
     source: PoseSource,
     *,
     follow: bool = False,
-    carry: bool = False,
     largest_gap_s: float | None = None,
     has_poses: bool = True,
 ) -> PosedFrames:
     """The frames of a dataset at the poses of a source.
 
-    Frames that the source has no pose for keep the recorded one, or with ``carry`` move with the last frame
-    before them that has one; they are left out if the recording has none (``has_poses``). With ``follow``
-    mapping asks the source again and again, and moves keyframes (mapping/follow.py); it may then begin
-    without any pose. Between two stamps a pose is interpolated, if both are at most ``largest_gap_s`` seconds
-    away.
+    Frames that the source has no pose for move with the last frame before them that has one; they are left
+    out if the recording has none (``has_poses``). With ``follow`` mapping asks the source again and again,
+    and moves keyframes (mapping/follow.py); it may then begin without any pose. Between two stamps a pose is
+    interpolated, if both are at most ``largest_gap_s`` seconds away.
 
     Raises DatasetError if the source cannot be read or has a pose for no frame, and for frames whose poses
     are found while mapping or are those of several sensors.
@@ -148,9 +144,8 @@ def posed_by(
         notes = [f"poses of {len(posed)} frames from {source.name}"]
         notes += [] if poses.warning is None else [poses.warning]
         if others and has_poses:
-            keep = "keep the recorded one"
-            keep = "move with the last one before them" if carry else keep
-            notes.append(f"{others} of {len(names)} frames have no pose there, and {keep}")
+            moved = "move with the last one before them"
+            notes.append(f"{others} of {len(names)} frames have no pose there, and {moved}")
         elif others:
             notes.append(f"{others} of {len(names)} frames dropped: no pose in {source.name}")
             kept = posed
@@ -163,7 +158,6 @@ def posed_by(
         source=dataset,
         poses=poses,
         follows=follow,
-        carried=carry,
         kept=kept,
     )
 
@@ -173,13 +167,12 @@ def open_posed(
     poses: str | Path | None,
     *,
     follow: bool = False,
-    carry: bool = False,
     track: bool = False,
     max_time_gap: float | None = None,
     **reading: Any,
 ) -> Dataset:
     """Open a recording, with the poses of a file if one is given; without ``follow`` it then need not have
-    poses of its own. ``follow`` and ``carry`` are those of :func:`posed_by`, ``track`` and ``reading`` are
+    poses of its own. ``follow`` is that of :func:`posed_by`, ``track`` and ``reading`` are
     keywords of :func:`open_dataset`. Raises DatasetError."""
     if poses is None:
         return open_dataset(source, track=track, max_time_gap=max_time_gap, **reading)
@@ -196,6 +189,4 @@ def open_posed(
         if follow:
             raise DatasetError(f"poses that change need some to begin with: {problem}") from problem
         dataset.tracked = has_poses = False
-    return posed_by(
-        dataset, opened, follow=follow, carry=carry, largest_gap_s=max_time_gap, has_poses=has_poses
-    )
+    return posed_by(dataset, opened, follow=follow, largest_gap_s=max_time_gap, has_poses=has_poses)

@@ -11,7 +11,6 @@ METHOD = Method(
     title="Inference (mrf)",
     section="inference",
     section_class=InferenceConfig,
-    section_help="How the marginals are computed.",
     map_class="taichi_mrf.methods.mrf.map:MRFMap",
     sliders=(
         Slider(

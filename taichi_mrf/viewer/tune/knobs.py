@@ -95,7 +95,6 @@ KNOBS = (
     *(knob for method in METHODS.values() for knob in _knobs_of(method)),
     Knob("keyframes.rotation", "keyframes", Range(0.0, 1.0, 0.01), "rad"),
     Knob("keyframes.translation", "keyframes", Range(0.0, 2.0, 0.02), "m"),
-    Knob("keyframes.against", "keyframes"),
     Knob("sensor.sigma[0]", "sensor", Range(0.0, 0.1, 0.0005), "m", counts=_has_no_sigma_table),
     Knob("sensor.sigma[1]", "sensor", Range(-0.05, 0.05, 0.0005), counts=_has_no_sigma_table),
     Knob("sensor.sigma[2]", "sensor", Range(-0.01, 0.05, 0.0001), "per m", counts=_has_no_sigma_table),

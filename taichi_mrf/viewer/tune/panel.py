@@ -34,7 +34,11 @@ MAP_OPTIONS = (
     "color_by", "threshold", "size", "shade", "cut_axis", "cut_at", "bricks", "pictures", "dark",
 )  # fmt: skip
 
-_FOLDERS = {"map": "Map", **{m.section: m.title for m in METHODS.values()}, "keyframes": "Keyframes"}
+_FOLDERS = {
+    "map": "Map",
+    **{m.section: m.title for m in METHODS.values() if m.sliders},
+    "keyframes": "Keyframes",
+}
 _FOLDED = ("keyframes",)
 _MOST_TRIES = 200
 """Of the latest tries, how many the dropdown offers."""
@@ -101,10 +105,10 @@ class TunePanel(BasePanel):
         """Show what belongs to a configuration: its method's sliders, its noise curves."""
         for each in self._knobs:
             each.follow(config)
-        for method in METHODS.values():
-            folder = self._folders[method.section]
-            if folder.visible != (config.method == method.name):
-                folder.visible = config.method == method.name
+        own = METHODS[config.method].section
+        for section in {method.section for method in METHODS.values() if method.sliders}:
+            if self._folders[section].visible != (section == own):
+                self._folders[section].visible = section == own
         self.noise.follow(config.sensor)
 
     def show_tuning(self, tuning: Tuning) -> None:

@@ -10,21 +10,23 @@ PLUGS.append("toy_method.plug")
 
 
 def main(folder: Path) -> None:
-    """Ask YAML, flags, sliders, map files and a live run's mapper; ``folder`` takes the files."""
+    """Ask YAML, flags, map files and a live run's mapper; ``folder`` takes the files."""
     import small_room
 
     import taichi_mrf
     from taichi_mrf.cli.main import parse
+    from taichi_mrf.config.baselines import LogOddsConfig
     from taichi_mrf.config.schema import Config, load
     from taichi_mrf.config.text import commented_yaml
     from taichi_mrf.errors import TaichiMRFError
     from taichi_mrf.live.mapper import Mapper
     from taichi_mrf.methods.registry import create_map, load_map
-    from taichi_mrf.viewer.tune.knobs import KNOBS
 
     taichi_mrf.init("cpu")
-    (folder / "config.yaml").write_text(commented_yaml(Config(method="toy")), encoding="utf-8")
-    flags = ["map", "anything", "--out", "x", "--method", "toy", "--toy.boldness", "0.8"]
+    (folder / "config.yaml").write_text(
+        commented_yaml(Config(method="toy", log_odds=LogOddsConfig(hit=0.8))), encoding="utf-8"
+    )
+    flags = ["map", "anything", "--out", "x", "--method", "toy", "--config", str(folder / "config.yaml")]
     _, options = parse(flags)
     settings = options.settings
     frames = small_room.frames()[:2]
@@ -44,15 +46,13 @@ def main(folder: Path) -> None:
     loaded = load_map(folder / "map.npz")
     found = {
         "yaml": load(folder / "config.yaml").method,
-        "yaml_keys": list(vars(Config())),
         "method": settings.method,
-        "boldness": settings.toy.boldness,
-        "sliders": [knob.name for knob in KNOBS if knob.applies(settings) and knob.method],
+        "hit": settings.log_odds.hit,
         "refused": refused,
         "stale": stale,
         "settled": settled,
         "loaded": type(loaded).__name__,
-        "loaded_boldness": loaded.config.toy.boldness,
+        "loaded_hit": loaded.config.log_odds.hit,
         "keyframes": len(loaded.keyframes),
     }
     print(json.dumps(found))
