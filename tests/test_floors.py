@@ -6,6 +6,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 
 import taichi_mrf
@@ -121,3 +122,15 @@ def test_every_package_says_what_it_is_for() -> None:
 def test_no_file_grows_past_400_lines() -> None:
     lengths = {name: len(path.read_text("utf-8").splitlines()) for name, path in modules().items()}
     assert not {name: length for name, length in lengths.items() if length > 400}
+
+
+def test_no_package_grows_over_its_lines(capsys: pytest.CaptureFixture[str]) -> None:
+    today = dict.fromkeys(FLOORS, 0)
+    for name, path in modules().items():
+        if room(name) in today:
+            today[room(name)] += len(path.read_text("utf-8").splitlines())
+    allowed = {name: floor["lines"] for name, floor in FLOORS.items()}
+    with capsys.disabled():
+        print(f"\nlines: {sum(today.values()):,} of {sum(allowed.values()):,} allowed")
+    over = {name: f"{today[name]:,} of {allowed[name]:,}" for name in FLOORS if today[name] > allowed[name]}
+    assert not over, f"packages over the lines that docs/floors.yaml allows: {over}; all: {today}"
