@@ -13,6 +13,7 @@ import numpy as np
 from benchmarks.lab.learnt_noise import learnt_law, with_law
 from benchmarks.lab.lidar_rivals import TUNED, contender_of, in_words, tuned_parameters
 from benchmarks.lab.lidar_roc import roc_table
+from taichi_mrf.config.baselines import WavemapConfig
 from taichi_mrf.datasets.lidar.recording import LIDAR_SIGMA_M
 from taichi_mrf.evaluation.accuracy import judge_view
 from taichi_mrf.evaluation.tables import Entry, Spread, Table, write_table
@@ -22,7 +23,6 @@ from taichi_mrf.experiments.judging import build, judge_all
 from taichi_mrf.experiments.ledger import Result
 from taichi_mrf.experiments.scenes import Scene, lidar_scene
 from taichi_mrf.experiments.tuning import tuned_contender
-from taichi_mrf.methods.wavemap.plug import WavemapConfig
 
 OPAQUE = "MRFMap, no beam passes"
 

@@ -7,8 +7,8 @@ ranges are, and how much of their evidence counts.
 from collections.abc import Callable
 from dataclasses import asdict, replace
 
+from taichi_mrf.config.baselines import WavemapConfig
 from taichi_mrf.experiments.contenders import Contender, wavemap
-from taichi_mrf.methods.wavemap.plug import WavemapConfig
 
 TUNED = "wavemap-style, tuned"
 

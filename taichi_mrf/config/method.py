@@ -26,9 +26,6 @@ class Method:
     section: str
     """The field of ``Config`` that holds its parameters, its own or those of a method that it resembles."""
 
-    section_class: type
-    """The dataclass of that section. All its fields have defaults."""
-
     map_class: str
     """Where the class of its maps is, ``package.module:Class``. It is imported when the first map is made,
     because it brings Taichi and its kernels."""

@@ -21,7 +21,7 @@ from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.places import IN_FILES, IN_PYTHON, in_files, in_python
 from taichi_mrf.config.registry import METHODS, MethodName, methods_with
 from taichi_mrf.config.time import TimeConfig
-from taichi_mrf.config.values import check_field, from_dict, in_files_alone
+from taichi_mrf.config.values import as_files_set_it, check_field, from_dict
 
 Arch = Literal["auto", "cuda", "vulkan", "cpu"]
 
@@ -305,8 +305,8 @@ def load(path: str | Path) -> Config:
     """Read a YAML file, or the shipped one of that name, such as ``kinect1``. Table paths in it are relative
     to its folder. Raises ConfigError, which names the file and the parameter."""
     path = find_config(path)
-    values = in_files_alone(Config, read_yaml(path), str(path))
-    return with_absolute_tables(from_dict(Config, values, str(path)), path.parent)
+    config = from_dict(Config, read_yaml(path), str(path))
+    return with_absolute_tables(as_files_set_it(config, str(path)), path.parent)
 
 
 def with_absolute_tables(config: Config, folder: Path) -> Config:

@@ -95,30 +95,19 @@ def from_dict(cls: type[T], values: Any, where: str) -> T:
         raise ConfigError(f"{where}: {error}") from error
 
 
-def in_files_alone(cls: type, values: Any, where: str) -> Any:
-    """The values of a file of parameters without those that only Python sets. Warns of one that differs from
-    its default: earlier versions read it from files. Raises ConfigError as :func:`from_dict` does."""
-    if not isinstance(values, dict):
-        return values
-    fields, hints, kept = {f.name: f for f in dataclasses.fields(cls)}, typing.get_type_hints(cls), {}
-    for key, value in values.items():
-        field, place = fields.get(key), f"{where}: {key}"
-        section: Any = hints[key] if field and dataclasses.is_dataclass(hints[key]) else None
-        if field is None or is_in_files(field):
-            kept[key] = in_files_alone(section, value, place) if section else value
-        elif section:
-            given = from_dict(section, value, place)
-            for each in dataclasses.fields(section):
-                _note_python(section, each, getattr(given, each.name), where)
-        else:
-            _note_python(cls, field, _convert(value, hints[key], place), where)
-    return kept
-
-
-def _note_python(cls: Any, field: "dataclasses.Field[Any]", value: Any, where: str) -> None:
-    if value != field.default:
-        now = f"set it in Python, {cls.__name__}({field.name}={value!r})"
-        warnings.warn(f"{where}: {field.name} is no longer read from files: {now}", stacklevel=4)
+def as_files_set_it(config: Any, where: str, in_files: bool = True) -> Any:
+    """A dataclass read from a file without what only Python sets (places.py). Warns of each value that
+    differs from its default, because files of earlier versions set it."""
+    kept = {}
+    for field in dataclasses.fields(config):
+        value, allowed = getattr(config, field.name), in_files and is_in_files(field)
+        if dataclasses.is_dataclass(value):
+            kept[field.name] = as_files_set_it(value, where, allowed)
+        elif not allowed and value != field.default:
+            instead = f"set it in Python, {type(config).__name__}({field.name}={value!r})"
+            warnings.warn(f"{where}: {field.name} is not read from files; {instead}", stacklevel=2)
+            kept[field.name] = field.default
+    return dataclasses.replace(config, **kept)
 
 
 def _convert(value: Any, hint: Any, where: str) -> Any:

@@ -48,7 +48,7 @@ class PoseFollower:
         """Raises ConfigError if the keyframes' poses are to be refined as well."""
         if config.refine:
             raise ConfigError("poses.refine and poses that follow a file both move keyframes: choose one")
-        self.map, self.config, self.done = m, config, Followed()
+        self.map, self.done = m, Followed()
         self._dataset, self._poses, self._clock = dataset, dataset.poses, clock
         self._left: dict[int, Pose] = {}
         self._changed_at = clock()

@@ -180,10 +180,9 @@ class _BatchRun:
         follower = self.follower
         if follower is None:
             return
-        final_s = FINAL_AFTER_S
         self._follow(math.inf)
         while not (follower.is_final or self._is_stopped() or self.result.full):
-            self.listener(WaitingForPoses(min(follower.quiet_s, final_s), final_s))
+            self.listener(WaitingForPoses(min(follower.quiet_s, FINAL_AFTER_S), FINAL_AFTER_S))
             if not follower.left:
                 time.sleep(LOOK_AGAIN_S)
             self._follow(math.inf)

@@ -14,10 +14,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from taichi_mrf import MRFMap
-from taichi_mrf.config.baselines import LogOddsConfig, VisibilityConfig
+from taichi_mrf.config.baselines import LogOddsConfig, VisibilityConfig, WavemapConfig
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.places import is_in_files
-from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import (
     Config,
     EvaluationConfig,
@@ -43,7 +42,10 @@ SECTIONS = (
     VolumeConfig,
     EvaluationConfig,
     RuntimeConfig,
-    *(method.section_class for method in METHODS.values()),
+    InferenceConfig,
+    LogOddsConfig,
+    VisibilityConfig,
+    WavemapConfig,
 )
 Depths = NDArray[np.float64]
 DEPTHS = np.linspace(0.4, 5.0, 50)

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from oracles.traversal import segments
 
+from taichi_mrf.config.baselines import LogOddsConfig
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import CapacityError, ConfigError
 from taichi_mrf.geometry.poses import Pose, look_at
 from taichi_mrf.inference.keyframe import DepthImage, checked_depth
 from taichi_mrf.methods.log_odds.map import LogOddsMap
-from taichi_mrf.methods.log_odds.plug import LogOddsConfig
 from taichi_mrf.methods.log_odds.scan import ScanIntegrator, count_rays, weigh
 from taichi_mrf.methods.recursive_update import LEAST_LOG_ODDS, log_odds
 from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN

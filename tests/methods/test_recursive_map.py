@@ -9,6 +9,7 @@ import small_room
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from taichi_mrf.config.baselines import VisibilityConfig
 from taichi_mrf.config.schema import Config, SensorConfig
 from taichi_mrf.errors import KeyframeError, MapFileError
 from taichi_mrf.inference.schedule import InferProgress
@@ -17,7 +18,6 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.recursive import RecursiveMap
 from taichi_mrf.methods.registry import create_map, load_map
 from taichi_mrf.methods.visibility.map import VisibilityMap
-from taichi_mrf.methods.visibility.plug import VisibilityConfig
 from taichi_mrf.queries.points import FREE, OCCUPIED, UNKNOWN
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.atomic import write_npz

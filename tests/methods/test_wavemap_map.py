@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from oracles import wavemap as reference
 
+from taichi_mrf.config.baselines import WavemapConfig
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.errors import ConfigError
 from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import F32, F32Array
 from taichi_mrf.methods.wavemap.map import WavemapMap
 from taichi_mrf.methods.wavemap.model import BeamModel, cumulative
-from taichi_mrf.methods.wavemap.plug import WavemapConfig
 from taichi_mrf.queries.points import UNKNOWN
 from taichi_mrf.sensor.camera import Camera, PinholeCamera
 from taichi_mrf.sensor.origins import points_at

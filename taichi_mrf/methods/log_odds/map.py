@@ -6,13 +6,14 @@ here each voxel is stored by itself, which changes no value.
 
 from typing import Any, ClassVar
 
+from taichi_mrf.config.baselines import LogOddsConfig
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
 from taichi_mrf.config.time import TimeConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import DepthImage
 from taichi_mrf.methods.brick_map import own_parameters, own_section
-from taichi_mrf.methods.log_odds.plug import METHOD, LogOddsConfig
+from taichi_mrf.methods.log_odds.plug import METHOD
 from taichi_mrf.methods.log_odds.scan import RayFootprint, ScanIntegrator
 from taichi_mrf.methods.recursive import RecursiveMap, Scan
 from taichi_mrf.sensor.no_return import NoReturnLaw

@@ -1,6 +1,5 @@
 """The entry of the method log_odds. No Taichi here: this is imported for a --help."""
 
-from taichi_mrf.config.baselines import LogOddsConfig
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.sliders import Range, Slider
 
@@ -9,7 +8,6 @@ METHOD = Method(
     summary="independent log-odds as in OctoMap",
     title="Log-odds (OctoMap)",
     section="log_odds",
-    section_class=LogOddsConfig,
     map_class="taichi_mrf.methods.log_odds.map:LogOddsMap",
     sliders=(
         Slider("hit", Range(0.51, 0.98, 0.01)),

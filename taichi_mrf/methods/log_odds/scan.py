@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.config.baselines import LogOddsConfig
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.accumulators import low_half
@@ -31,7 +32,6 @@ from taichi_mrf.kernels.types import (
     Vec3,
     Vec4,
 )
-from taichi_mrf.methods.log_odds.plug import LogOddsConfig
 from taichi_mrf.methods.log_odds.ray_ends import (
     HIT,
     MissingReturns,

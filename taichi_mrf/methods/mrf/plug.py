@@ -1,7 +1,6 @@
 """The entry of the method mrf; its parameters are config/inference.py. No Taichi here: this is imported for a
 --help."""
 
-from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.sliders import Range, Slider
 
@@ -10,7 +9,6 @@ METHOD = Method(
     summary="MRFMap, belief propagation on rays",
     title="Inference (mrf)",
     section="inference",
-    section_class=InferenceConfig,
     map_class="taichi_mrf.methods.mrf.map:MRFMap",
     sliders=(
         Slider(

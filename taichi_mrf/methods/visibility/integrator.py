@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.config.baselines import VisibilityConfig
 from taichi_mrf.config.inference import InferenceConfig
 from taichi_mrf.config.schema import SensorConfig, VolumeConfig
 from taichi_mrf.geometry.poses import Pose
@@ -13,7 +14,6 @@ from taichi_mrf.inference.keyframe import DepthImage, Footprint
 from taichi_mrf.inference.ray_list import RayBundler
 from taichi_mrf.methods.recursive_update import log_odds
 from taichi_mrf.methods.visibility import scan as visibility_scan
-from taichi_mrf.methods.visibility.plug import VisibilityConfig
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory

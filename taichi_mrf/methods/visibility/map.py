@@ -7,6 +7,7 @@ by scan.
 
 from typing import Any, ClassVar
 
+from taichi_mrf.config.baselines import VisibilityConfig
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
 from taichi_mrf.config.time import TimeConfig
@@ -15,7 +16,7 @@ from taichi_mrf.inference.keyframe import DepthImage, Footprint
 from taichi_mrf.methods.brick_map import own_parameters, own_section
 from taichi_mrf.methods.recursive import RecursiveMap, Scan
 from taichi_mrf.methods.visibility.integrator import VisibilityIntegrator
-from taichi_mrf.methods.visibility.plug import METHOD, VisibilityConfig
+from taichi_mrf.methods.visibility.plug import METHOD
 from taichi_mrf.sensor.noise import NoiseModel
 
 

@@ -11,7 +11,6 @@ METHOD = Method(
     summary="visibility-aware, by Schauwecker and Zell",
     title="Visibility (Schauwecker & Zell)",
     section="visibility",
-    section_class=VisibilityConfig,
     map_class="taichi_mrf.methods.visibility.map:VisibilityMap",
     prior_is_unknown=True,
     if_empty="map more frames: the known space grows from frame to frame",

@@ -6,6 +6,7 @@ that keep within an error bound. Here each voxel is updated by itself, which is 
 
 from typing import Any, ClassVar
 
+from taichi_mrf.config.baselines import WavemapConfig
 from taichi_mrf.config.method import Method
 from taichi_mrf.config.schema import Config, SensorConfig, VolumeConfig
 from taichi_mrf.config.time import TimeConfig
@@ -13,7 +14,7 @@ from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.keyframe import DepthImage
 from taichi_mrf.methods.brick_map import own_parameters, own_section
 from taichi_mrf.methods.recursive import RecursiveMap, Scan
-from taichi_mrf.methods.wavemap.plug import METHOD, WavemapConfig
+from taichi_mrf.methods.wavemap.plug import METHOD
 from taichi_mrf.methods.wavemap.scan import BeamFootprint, BeamIntegrator
 from taichi_mrf.sensor.noise import NoiseModel
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.config.baselines import WavemapConfig
 from taichi_mrf.config.schema import VolumeConfig
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.inference.footprint import visible_box, window_around
@@ -31,7 +32,7 @@ from taichi_mrf.kernels.types import (
 from taichi_mrf.methods.recursive_update import log_odds, updated
 from taichi_mrf.methods.wavemap.beams import NEIGHBOURS, Beams, beams_of, upright_axes, visit_near
 from taichi_mrf.methods.wavemap.model import BeamModel
-from taichi_mrf.methods.wavemap.plug import REACH_SIGMAS, WavemapConfig
+from taichi_mrf.methods.wavemap.plug import REACH_SIGMAS
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.system.memory import check_memory
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS

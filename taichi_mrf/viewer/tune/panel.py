@@ -34,11 +34,8 @@ MAP_OPTIONS = (
     "color_by", "threshold", "size", "shade", "cut_axis", "cut_at", "bricks", "pictures", "dark",
 )  # fmt: skip
 
-_FOLDERS = {
-    "map": "Map",
-    **{m.section: m.title for m in METHODS.values() if m.sliders},
-    "keyframes": "Keyframes",
-}
+_OWN = {m.section: m.title for m in METHODS.values() if m.sliders}
+_FOLDERS = {"map": "Map", **_OWN, "keyframes": "Keyframes"}
 _FOLDED = ("keyframes",)
 _MOST_TRIES = 200
 """Of the latest tries, how many the dropdown offers."""
@@ -105,10 +102,10 @@ class TunePanel(BasePanel):
         """Show what belongs to a configuration: its method's sliders, its noise curves."""
         for each in self._knobs:
             each.follow(config)
-        own = METHODS[config.method].section
-        for section in {method.section for method in METHODS.values() if method.sliders}:
-            if self._folders[section].visible != (section == own):
-                self._folders[section].visible = section == own
+        for section in _OWN:
+            folder, visible = self._folders[section], METHODS[config.method].section == section
+            if folder.visible != visible:
+                folder.visible = visible
         self.noise.follow(config.sensor)
 
     def show_tuning(self, tuning: Tuning) -> None:
