@@ -14,6 +14,7 @@ from api_page import api_page
 from floor_plan import floor_plan
 from mkdocs.structure.files import File, Files
 
+from taichi_mrf.config.places import is_in_files
 from taichi_mrf.config.schema import Config
 from taichi_mrf.config.text import field_help
 from taichi_mrf.factor_graph.config import LaserConfig
@@ -65,8 +66,8 @@ def parameters_page() -> str:
     """Every parameter with its default and its help, from the dataclasses."""
     sections = [
         "# Parameters\n",
-        "A YAML file sets any of these, and needs to hold only what it changes (`--config FILE`). Each is a "
-        "flag as well: `taichi-mrf map --help-all` lists them.\n",
+        "A YAML file sets any of these, and needs to hold only what it changes (`--config FILE`). What "
+        "changes from run to run is a flag as well: `taichi-mrf map --help-all` lists them.\n",
         *_section(Config(), "", "Maps from depth images"),
         "`taichi-mrf laser` has its own parameters:\n",
         *_section(LaserConfig(), "", "Maps from laser scans"),
@@ -79,7 +80,7 @@ def _section(section: Any, prefix: str, title: str) -> list[str]:
     texts = field_help(type(section))
     rows: list[str] = []
     nested: list[str] = []
-    for field in dataclasses.fields(section):
+    for field in filter(is_in_files, dataclasses.fields(section)):
         value, name = getattr(section, field.name), f"{prefix}{field.name}"
         if dataclasses.is_dataclass(value):
             nested += _section(value, f"{name}.", name)

@@ -54,7 +54,7 @@ class Tune:
 
     search: Annotated[str, tyro.conf.arg(metavar="NAME,...")] = ""
     """Parameters to search, separated by commas; sensor.sigma_scale multiplies all coefficients of
-    sensor.sigma. By default prior, outlier floor, message clamp, free share and sigma's scale."""
+    sensor.sigma. By default prior, outlier floor, free share and sigma's scale."""
 
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Seed of the search's random numbers."""
