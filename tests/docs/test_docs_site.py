@@ -14,6 +14,7 @@ import yaml
 
 import taichi_mrf
 import taichi_mrf.errors
+from taichi_mrf.config.places import is_in_files
 from taichi_mrf.config.schema import Config
 from taichi_mrf.factor_graph.config import LaserConfig
 
@@ -21,7 +22,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 def names(section: Any, prefix: str = "") -> Iterator[str]:
-    for field in dataclasses.fields(section):
+    for field in filter(is_in_files, dataclasses.fields(section)):
         value = getattr(section, field.name)
         if dataclasses.is_dataclass(value):
             yield from names(value, f"{prefix}{field.name}.")
