@@ -32,14 +32,12 @@ def cell_of(number: I32) -> IVec3:
 def blended(weight: Template, distance: Template, around: Template, place: I32, cell: IVec3) -> Vec2:
     """The sums of weights and of distances times weight of a voxel, blended with its surroundings;
     ``weight`` and ``distance`` are (rows * 512)."""
-    own = Vec2(0.0)
-    sums = Vec2(0.0)
-    for x, y, z in ti.ndrange((-1, 2), (-1, 2), (-1, 2)):
+    own, sums = Vec2(0.0), Vec2(0.0)
+    for x, y, z in ti.static(ti.ndrange((-1, 2), (-1, 2), (-1, 2))):
         voxel = voxel_around(around, place, cell + IVec3(x, y, z))
         if voxel >= 0:
             here = Vec2(weight[voxel], distance[voxel])
-            steps = ti.abs(x) + ti.abs(y) + ti.abs(z)
-            sums += here / (1 << steps)
-            if steps == 0:
+            sums += here * 0.5 ** (abs(x) + abs(y) + abs(z))
+            if ti.static(x == y == z == 0):
                 own = here
     return own + BLENDED_BELOW / (BLENDED_BELOW + own[0]) * sums

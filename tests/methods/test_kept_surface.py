@@ -42,18 +42,18 @@ def assert_same(ours: FusedSurface, theirs: FusedSurface) -> None:
 def test_a_frozen_keyframe_keeps_its_part() -> None:
     m = build([0, 1, 2, 3])
     before, colors = m.surface(), m.colors(scene.probes())
-    occupancy = m.decided.occupancy(scene.probes())
+    state = m.decided.state(scene.probes())
     for id in (1, 2):
         m.freeze_keyframe(id)
     assert m.has_surface
     assert "of 4 keyframes" in str(export_note(m, Path("mesh.glb")))
     assert_same(m.surface(), before)
-    np.testing.assert_array_equal(m.decided.occupancy(scene.probes()), occupancy)
+    np.testing.assert_array_equal(m.decided.state(scene.probes()), state)
     np.testing.assert_array_equal(m.colors(scene.probes()), colors)
     for id in (0, 3):
         m.freeze_keyframe(id)
     assert_same(m.surface(), before)
-    np.testing.assert_array_equal(m.decided.occupancy(scene.probes()), occupancy)
+    np.testing.assert_array_equal(m.decided.state(scene.probes()), state)
     # What is kept is part of the map's size: 12 bytes a voxel for distances, 4 for votes.
     assert m._kept.share.nbytes < 14 * 512 * (len(m._kept.share.distances.bricks) + m.statistics().bricks)
 
