@@ -2,7 +2,8 @@
 
 A voxel is *occupied* if a surface passes through it and a clean ray ends there. It is *free* if a clean ray
 crosses it and no surface touches it. All other voxels are not judged: no view shows what lies inside solids
-or is hidden, and for a surface in the plane between two voxels rounding alone decides which of them holds it.
+or is hidden, and a surface in the plane between two voxels is in neither: which of them holds it is a matter
+of rounding.
 A voxel is *hidden* if no clean ray reaches it and no surface touches it: a map that is occupied there has
 walls that are too thick. Voxels are those of the map's grid: voxel i covers [i, i + 1) times the voxel size
 along each axis.
@@ -69,7 +70,7 @@ def occupancy_truth(
     FrameError for images and poses that do not fit, CapacityError for a space of too many voxels.
     """
     seen = seen_voxels(clean_depths_m, poses, camera, voxel_size)
-    surface = _surface_marks(mesh, seen.window, 0.0)
+    surface = _surface_marks(mesh, seen.window, -SLACK)
     touched = _surface_marks(mesh, seen.window, SLACK)
     hidden = ~(seen.crossed | seen.ended | touched)
     return OccupancyTruth(seen.window, surface & seen.ended, seen.crossed & ~touched, hidden)

@@ -19,13 +19,13 @@ from taichi_mrf.export.store_header import COLORS, FIRST, SURFACE
 from taichi_mrf.geometry.up import Up, up_from_name
 from taichi_mrf.inference.surface_votes import called
 from taichi_mrf.methods.map_file import check_registered
-from taichi_mrf.methods.mrf.calibrated import calibrated_block, carried
+from taichi_mrf.methods.mrf.calibrated import calibrate, carry
 from taichi_mrf.methods.stored_distances import StoredDistances
 from taichi_mrf.queries.box import BoxOfVoxels, voxels_of_box
 from taichi_mrf.queries.points import checked_points, classify, probability
-from taichi_mrf.system import tensors
+from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.memory import check_memory
-from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS
+from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, join_bricks, split_bricks
 
 _BYTES_PER_VOXEL = 9
 """Log-odds, states, and temporary arrays."""
@@ -257,27 +257,33 @@ class ChunkedMap:
         return self._cache[chunk]
 
     def _read_by_rays(self, chunk: Chunk, block: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Log-odds of a chunk by the rule of the map, from the marginals'."""
+        """Log-odds of a chunk by the rule of the map, from the marginals'; NaN for unknown."""
         if self._by == "marginal":
             return block
-        likely = self._calibrated_chunk(chunk, block) if self.has_surface else None
+        prior, min_evidence = self.header.prior_log_odds, self.header.min_evidence
+        unknown = np.isnan(block)
+        shown = np.where(unknown, np.float32(prior), block)
+        likely = self._calibrated_chunk(chunk, shown) if self.has_surface else shown
         if self._by == "decided":
-            prior, min_evidence = self.header.prior_log_odds, self.header.min_evidence
-            first = self.store.read_extra(FIRST, chunk)[..., 0] > 0
-            block[first] = np.maximum(block[first], called(prior, min_evidence))
-            return block if likely is None else carried(likely, block, prior, min_evidence)
-        assert likely is not None  # calibrated() has seen to it
-        return likely
+            least = called(prior, min_evidence)
+            first = ~unknown & (self.store.read_extra(FIRST, chunk)[..., 0] > 0)
+            shown[first] = np.maximum(shown[first], least)
+            if self.has_surface:
+                carry(likely.reshape(-1), shown.reshape(-1), prior, min_evidence, least)
+        else:
+            shown = likely
+        return np.where(unknown & (shown == np.float32(prior)), np.float32(np.nan), shown)
 
     def _calibrated_chunk(self, chunk: Chunk, block: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Calibrated log-odds of a chunk's voxels, from the marginals'; NaN where these are unknown."""
-        prior, unknown = self.header.prior_log_odds, np.isnan(block)
-        bricks = np.where(unknown, np.float32(prior), block).reshape((CHUNK, BRICK) * 3)
+        """Calibrated log-odds of a chunk's voxels, from the marginals'."""
+        runtime.init()
+        first = np.array(chunk, np.int64) * CHUNK
+        log_odds, places = split_bricks(block), np.indices((CHUNK,) * 3).reshape(3, -1).T
         # Free space away from surfaces has no voxels, and stays as it is, as does what is unknown.
-        away = np.abs(bricks - self.header.seen_free_log_odds) < _SAME_LOG_ODDS
-        near = ~(away | unknown.reshape(bricks.shape)).all(axis=(1, 3, 5), keepdims=True)
-        place = np.array(chunk, np.int64) * CHUNK_VOXELS
-        field = self.distances(place - BRICK, place + CHUNK_VOXELS + BRICK)
-        found = calibrated_block(field, place // CHUNK_VOXELS, bricks.reshape(block.shape), prior)
-        changed = np.where(near, found.reshape(bricks.shape), bricks).reshape(block.shape)
-        return np.where(unknown & (changed == np.float32(prior)), np.float32(np.nan), changed)
+        away = np.abs(log_odds - self.header.seen_free_log_odds) < _SAME_LOG_ODDS
+        away |= log_odds == np.float32(self.header.prior_log_odds)
+        near = np.flatnonzero(~away.all(axis=1)).astype(np.int32)
+        field = self.distances((first - 1) * BRICK, (first + CHUNK + 1) * BRICK).field()
+        bricks = (places[near] + first).astype(np.int32)
+        calibrate(field, bricks, near, log_odds.reshape(-1), self.header.prior_log_odds)
+        return join_bricks(log_odds, block.shape)

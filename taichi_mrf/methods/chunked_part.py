@@ -27,7 +27,7 @@ from taichi_mrf.sensor.camera import Camera, check_camera
 from taichi_mrf.sensor.origins import widened
 from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.owner import owned_attribute
-from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, grid_keys
+from taichi_mrf.voxels.layout import BRICK, CHUNK, VOXELS, grid_keys, split_bricks
 from taichi_mrf.voxels.pool import BrickPool
 
 _MARGIN = BRICK
@@ -223,7 +223,7 @@ def take_part(m: ChunkedMap, lower: ArrayLike | None = None, upper: ArrayLike | 
     pool = BrickPool(m.header.prior_log_odds, m.config.volume.memory_limit_gb)
     free = [np.zeros((0, 3), np.int32)]
     for chunk, block in m.blocks(*corners):
-        values = block.reshape((CHUNK, BRICK) * 3).transpose(0, 2, 4, 1, 3, 5).reshape(-1, VOXELS)
+        values = split_bricks(block)
         bricks = np.indices((CHUNK,) * 3).reshape(3, -1).T + np.array(chunk) * CHUNK
         inside = ((bricks >= lowest) & (bricks < after)).all(axis=1)
         # Free and unknown space away from surfaces needs no voxels: occupancy() and state() read the chunks.

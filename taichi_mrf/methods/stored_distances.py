@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from taichi_mrf.export.chunk_store import Chunk, ChunkStore
 from taichi_mrf.export.store_header import SURFACE
-from taichi_mrf.voxels.distance_field import VALUES, Sums
-from taichi_mrf.voxels.layout import CHUNK_VOXELS
+from taichi_mrf.voxels.distance_field import VALUES, DistanceField, Sums
+from taichi_mrf.voxels.layout import BRICK, CHUNK_VOXELS, split_bricks
 
 _HELD = 64
 """Chunks whose distances are in memory together, 3 MB each."""
@@ -52,6 +52,15 @@ class StoredDistances:
                     ]
         weight, distance, excess = (np.ascontiguousarray(sums[..., i]) for i in range(VALUES))
         return weight, distance, excess
+
+    def field(self) -> DistanceField:
+        """All of them in memory, of the bricks that have some. ``first`` and ``after`` must be borders of
+        bricks, as far apart along each axis."""
+        sides = (self.after - self.first).tolist()
+        sums = np.stack([split_bricks(each) for each in self.box(self.first, sides[0])], axis=-1)
+        bricks = np.indices([side // BRICK for side in sides]).reshape(3, -1).T + self.first // BRICK
+        some = sums[..., 0].any(axis=1)
+        return DistanceField.of(bricks[some].astype(np.int32), sums[some])
 
 
 def _between(low: NDArray[np.int64], high: NDArray[np.int64]) -> tuple[slice, ...]:

@@ -21,7 +21,8 @@ from taichi_mrf.sensor.model import Sensor
 from taichi_mrf.sensor.noise import NoiseTable
 from taichi_mrf.system import runtime
 from taichi_mrf.system.compiler import ti
-from taichi_mrf.voxels.distance_field import BLENDED_BELOW, LEAST_WEIGHT, DistanceField
+from taichi_mrf.voxels.blended_field import blended, cell_of
+from taichi_mrf.voxels.distance_field import LEAST_WEIGHT, DistanceField
 from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.numbering import flat, voxel_number
 from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, within
@@ -96,25 +97,11 @@ def _blend(weight: F32Array, distance: F32Array, around: I32Array, mean: F32Arra
     ``distance`` times weight, blended as voxels.distance_field.blended_sums has it. ``around`` (bricks * 27)
     are the rows of the bricks around each, -1 where there is none."""
     for i in range(mean.shape[0]):
-        own = weight[i]
         mean[i] = NONE
-        if own > 0.0:
-            number = i % VOXELS
-            here = IVec3(number // (BRICK * BRICK), number // BRICK % BRICK, number % BRICK)
-            total, moment = 0.0, 0.0
-            for x, y, z in ti.ndrange((-1, 2), (-1, 2), (-1, 2)):
-                at = here + IVec3(x, y, z)
-                brick = (at >> 3) + 1
-                row = around[(i // VOXELS) * 27 + flat(brick, IVec3(3))]
-                if row >= 0:
-                    j = row * VOXELS + voxel_number(at & 7)
-                    share = 1.0 / (1 << (ti.abs(x) + ti.abs(y) + ti.abs(z)))
-                    total += share * weight[j]
-                    moment += share * distance[j]
-            blend = BLENDED_BELOW / (BLENDED_BELOW + own)
-            total = own + blend * total
-            if total > LEAST_WEIGHT:
-                mean[i] = (distance[i] + blend * moment) / total
+        if weight[i] > 0.0:
+            sums = blended(weight, distance, around, i // VOXELS, cell_of(i % VOXELS))
+            if sums[0] > LEAST_WEIGHT:
+                mean[i] = sums[1] / sums[0]
 
 
 @kernel

@@ -56,6 +56,11 @@ class DistanceField:
     excess: NDArray[np.float32]
 
     @property
+    def nbytes(self) -> int:
+        """Bytes in memory."""
+        return self.bricks.nbytes + self.weight.nbytes + self.distance.nbytes + self.excess.nbytes
+
+    @property
     def sums(self) -> NDArray[np.float32]:
         """All three, (n, 512, VALUES)."""
         return np.stack([self.weight, self.distance, self.excess], axis=-1)
@@ -63,7 +68,7 @@ class DistanceField:
     @staticmethod
     def of(bricks: NDArray[np.int32], sums: NDArray[np.float32]) -> "DistanceField":
         """From bricks (n, 3) and their :attr:`sums` (n, 512, VALUES)."""
-        return DistanceField(bricks, sums[..., 0], sums[..., 1], sums[..., 2])
+        return DistanceField(bricks, *(np.ascontiguousarray(sums[..., i]) for i in range(VALUES)))
 
     @property
     def chunks(self) -> NDArray[np.int32]:

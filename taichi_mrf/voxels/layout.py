@@ -6,6 +6,7 @@ is integer arithmetic with floor division, so negative coordinates need no speci
 """
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,20 @@ VOXELS = BRICK**3
 def offsets_in_brick() -> NDArray[np.int32]:
     """(512, 3): the voxel of each number within a brick, the inverse of ``voxel_number``."""
     return np.stack(np.unravel_index(np.arange(VOXELS), (BRICK,) * 3), axis=1).astype(np.int32)
+
+
+def split_bricks(dense: NDArray[Any]) -> NDArray[Any]:
+    """Voxels of a box of whole bricks, (8 a, 8 b, 8 c) -> (a * b * c, 512)."""
+    a, b, c = (side // BRICK for side in dense.shape)
+    split = dense.reshape(a, BRICK, b, BRICK, c, BRICK).transpose(0, 2, 4, 1, 3, 5)
+    return np.ascontiguousarray(split).reshape(-1, VOXELS)
+
+
+def join_bricks(bricks: NDArray[Any], shape: tuple[int, int, int]) -> NDArray[Any]:
+    """The inverse: bricks (a * b * c, 512) of a box of ``shape`` voxels."""
+    a, b, c = (side // BRICK for side in shape)
+    joined = bricks.reshape(a, b, c, BRICK, BRICK, BRICK).transpose(0, 3, 1, 4, 2, 5)
+    return joined.reshape(shape)
 
 
 def grid_keys(cells: NDArray[np.integer] | NDArray[np.floating]) -> NDArray[np.int64]:

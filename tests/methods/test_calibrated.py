@@ -4,22 +4,30 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from one_pixel import VOXEL
 from uncertain_wall import WALL_M, uncertain_wall
 
-from taichi_mrf.export.fused_surface import MARGIN, blended_sums
+from taichi_mrf.inference.surface_votes import CALLED
+from taichi_mrf.methods.mrf import calibrated
 from taichi_mrf.methods.mrf.calibrated import (
     BLUR,
     DOUBT,
+    FLATTEST,
+    LEAST_WEIGHT,
     MARGINAL,
     NOISE,
     PRIOR,
     REACH,
-    calibrated_log_odds,
-    surface_evidence,
+    STEEPEST,
+    SUREST,
+    UNLIKELIEST,
+    calibrate,
+    carry,
 )
 from taichi_mrf.methods.mrf.map import MRFMap
-from taichi_mrf.voxels.layout import BRICK
+from taichi_mrf.voxels.distance_field import BLENDED_BELOW, MARGIN, DistanceField, blended_sums
+from taichi_mrf.voxels.layout import BRICK, VOXELS, grid_keys, offsets_in_brick
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 
@@ -33,26 +41,89 @@ def by_hand(d: float, extent: float, steep: float, weight: float) -> float:
 
 
 @pytest.mark.parametrize("weight", [0.02, 3.0])
-def test_a_plane_gives_what_the_formula_says(weight: float) -> None:
-    normal, steep, offset = np.array([0.8, 0.0, -0.6]), 1.3, 0.4
-    centre = np.indices((7, 7, 7)).reshape(3, -1).T - 3.0
-    distance = steep * (centre @ normal - offset)  # along rays that meet the plane at an angle
-    sums = np.full((7, 7, 7), weight, np.float32)
-    found, behind = surface_evidence(sums, (weight * distance).reshape(7, 7, 7).astype(np.float32))
-    expected = np.array([by_hand(d / steep, 0.7, steep, weight) for d in distance]).reshape(7, 7, 7)
+def evidence_of(weight: NDArray, distance: NDArray) -> tuple[NDArray, NDArray]:
+    """The oracle: log(z / (1 - z)) of the voxels of a box without its outermost, from the sums of weights and
+    of distances times weight, and whether each is behind the surface; NaN where there is no distance."""
+    seen = weight > LEAST_WEIGHT
+    mean = np.where(seen, distance / np.maximum(weight, LEAST_WEIGHT), 0.0)
     inner = (slice(1, -1),) * 3
-    np.testing.assert_allclose(found, expected[inner], atol=2e-3)
-    np.testing.assert_array_equal(behind, (distance < 0).reshape(7, 7, 7)[inner])
-    assert found.min() < -1
-    assert (found > 2).any() == (weight > 1)
+    normal = np.stack([part[inner] for part in np.gradient(mean)])
+    steep = np.sqrt((normal * normal).sum(axis=0))
+    extent = 0.5 * np.abs(normal).sum(axis=0) / np.maximum(steep, 1e-6)
+    steep = np.clip(steep, FLATTEST, STEEPEST)
+    d, w = mean[inner] / steep, np.maximum(weight[inner], LEAST_WEIGHT)
+    s = np.sqrt(NOISE / (16.0 * w * steep * steep) + BLUR**2)
+    z = 0.5 * (np.tanh(0.5 * (d + REACH * extent) / s) - np.tanh(0.5 * (d - REACH * extent) / s))
+    z = np.clip(z, UNLIKELIEST, 1.0 - UNLIKELIEST)
+    return np.where(seen[inner], np.log(z / (1.0 - z)), np.nan), d < 0
+
+
+def calibrated_by_hand(field: DistanceField, brick: NDArray, marginal: NDArray, prior: float) -> NDArray:
+    """The oracle's log-odds of a brick's voxels, (512,), by themselves: a chunk ends nowhere."""
+    first = brick.astype(np.int64) * BRICK - 1 - MARGIN
+    sums = [each.astype(np.float64) for each in field.box(first, BRICK + 2 + 2 * MARGIN)[:2]]
+    evidence, behind = (each.reshape(-1) for each in evidence_of(*blended_sums(*sums)))
+    expected = evidence - DOUBT + PRIOR * prior + MARGINAL * np.clip(marginal - prior, -SUREST, SUREST)
+    expected[behind] = np.maximum(expected[behind], np.minimum(marginal, prior)[behind])
+    return np.where(np.isnan(evidence), marginal, expected)
+
+
+def plane(at: float, weight: float, normal: NDArray, steep: float) -> DistanceField:
+    """A field in one brick."""
+    centre = offsets_in_brick() - 3.5
+    distance = (steep * (centre @ normal - at)).astype(np.float32)
+    sums = np.full((1, VOXELS), weight, np.float32)
+    return DistanceField(np.zeros((1, 3), np.int32), sums, sums * distance, np.zeros_like(sums))
+
+
+def calibrated_of(field: DistanceField, marginal: NDArray, prior: float) -> NDArray:
+    """Calibrated log-odds (n, 512) of a field's own bricks, from marginals of that shape."""
+    found = marginal.astype(np.float32)
+    slots = np.arange(len(field.bricks), dtype=np.int32)
+    calibrate(field, field.bricks, slots, found.reshape(-1), prior)
+    return found
+
+
+@pytest.mark.parametrize("weight", [0.02, 3.0])
+def test_a_plane_gives_what_the_formula_says(weight: float) -> None:
+    normal, steep, at = np.array([0.8, 0.0, -0.6]), 1.3, 0.4  # along rays that meet the plane at an angle
+    found = calibrated_of(plane(at, weight, normal, steep), np.zeros((1, VOXELS)), 0.0)[0]
+    blended_weight = weight + 8 * weight * BLENDED_BELOW / (BLENDED_BELOW + weight)
+    inner = np.flatnonzero(((offsets_in_brick() > 1) & (offsets_in_brick() < 6)).all(axis=1))
+    d = (offsets_in_brick()[inner] - 3.5) @ normal - at
+    expected = np.array([by_hand(each, 0.7, steep, blended_weight) for each in d]) - DOUBT
+    expected[d < 0] = np.maximum(expected[d < 0], 0.0)
+    np.testing.assert_allclose(found[inner], expected, atol=2e-3)
+    assert expected.min() < -1
+    assert expected.max() > 1
 
 
 def test_without_distances_there_is_no_answer() -> None:
-    weight = np.ones((5, 5, 5), np.float32)
-    weight[2, 2, 2] = 0.0
-    found, _ = surface_evidence(weight, np.zeros_like(weight))
-    assert np.isnan(found[1, 1, 1])
-    assert np.isfinite(found).sum() == 26
+    field = plane(0.0, 1.0, np.array([1.0, 0.0, 0.0]), 1.0)
+    none = DistanceField(field.bricks, 0 * field.weight, 0 * field.distance, field.excess)
+    marginal = np.random.default_rng(0).normal(size=(1, VOXELS)).astype(np.float32)
+    np.testing.assert_array_equal(calibrated_of(none, marginal, -2.0), marginal)
+    other = marginal.copy()
+    calibrate(field, np.array([[2, 0, 0]], np.int32), np.zeros(1, np.int32), other.reshape(-1), -2.0)
+    np.testing.assert_array_equal(other, marginal)
+
+
+def test_bricks_beside_the_fields_own_follow_the_formula(monkeypatch: pytest.MonkeyPatch) -> None:
+    random = np.random.default_rng(1)
+    offsets = np.indices((3, 3, 3)).reshape(3, -1).T - 1
+    bricks = offsets[random.permutation(27)[:9]].astype(np.int32)
+    bricks = bricks[np.argsort(grid_keys(bricks))]
+    weight = random.uniform(0, 0.5, (9, VOXELS)) * (random.uniform(size=(9, VOXELS)) > 0.3)
+    distance = weight * random.normal(size=weight.shape)
+    field = DistanceField(bricks, *(x.astype(np.float32) for x in (weight, distance, 0 * weight)))
+    around = (np.indices((5, 5, 5)).reshape(3, -1).T - 2).astype(np.int32)[random.permutation(125)]
+    marginal = random.normal(size=(125, VOXELS)).astype(np.float32)
+    monkeypatch.setattr(calibrated, "BRICKS_AT_ONCE", 40)
+    found = marginal.copy()
+    calibrate(field, around, np.arange(125, dtype=np.int32), found.reshape(-1), -1.5)
+    expected = [calibrated_by_hand(field, b, own, -1.5) for b, own in zip(around, marginal, strict=True)]
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+    assert (found != marginal).any(axis=1).sum() > 27
 
 
 def test_an_uncertain_wall_is_where_it_was_measured() -> None:
@@ -66,18 +137,22 @@ def test_an_uncertain_wall_is_where_it_was_measured() -> None:
 
 def test_evidence_and_marginals_are_joined() -> None:
     m = uncertain_wall()
-    field, pool = m.surface_field(), m.view.pool
-    found = calibrated_log_odds(field, pool)
-    prior, marginals = pool.prior_log_odds, pool.belief.to_numpy().reshape(found.shape)
-    for slot in pool.in_use:  # each brick by itself: a chunk ends nowhere
-        first = pool.bricks[slot].astype(np.int64) * BRICK - 1 - MARGIN
-        evidence, behind = surface_evidence(*blended_sums(*field.box(first, BRICK + 2 + 2 * MARGIN)[:2]))
-        evidence, behind = evidence.reshape(-1), behind.reshape(-1)
-        expected = evidence - DOUBT + PRIOR * prior + MARGINAL * np.clip(marginals[slot] - prior, -10, 10)
-        expected[behind] = np.maximum(expected[behind], np.minimum(marginals[slot], prior)[behind])
-        none = np.isnan(evidence)
-        expected[none] = marginals[slot][none]
-        np.testing.assert_allclose(found[slot], expected, atol=1e-5)
+    pool = m.view.pool
+    found = m.calibrated().view.pool.belief.to_numpy().reshape(-1, VOXELS)
+    marginals = pool.belief.to_numpy().reshape(found.shape)
+    for slot in pool.in_use:
+        bricks = pool.bricks[slot], marginals[slot]
+        expected = calibrated_by_hand(m.surface_field(), *bricks, pool.prior_log_odds)
+        np.testing.assert_allclose(found[slot], expected, atol=2e-3)
+
+
+def test_what_is_shown_keeps_its_state() -> None:
+    prior, min_evidence, least = -2.0, 0.1, 0.01
+    decided = np.array([0.01, 0.01, 3.0, -3.0, -3.0, -1.0, -1.0, -1.0, -2.05, prior], np.float32)
+    likely = np.array([2.0, -4.0, 1.0, -4.0, 1.0, 2.0, -1.5, -3.0, 2.0, 1.0], np.float32)
+    carry(likely, decided, prior, min_evidence, least)
+    expected = [2.0, 0.01, 1.0, -4.0, -2.1 - CALLED, -CALLED, -1.5, -1.9, -2.05, prior]
+    np.testing.assert_allclose(decided, expected, atol=1e-6)
 
 
 def test_the_reading_follows_edits() -> None:

@@ -92,7 +92,9 @@ def test_it_is_saved_with_the_map(tmp_path: Path) -> None:
     again = MRFMap.load(tmp_path / "map.npz")
     assert again.has_surface
     np.testing.assert_array_equal(again.surface().vertices_m, m.surface().vertices_m)
-    np.testing.assert_array_equal(again.decided.state(scene.probes()), m.decided.state(scene.probes()))
+    np.testing.assert_array_equal(
+        again.decided.occupancy(scene.probes()), m.decided.occupancy(scene.probes())
+    )
     broken = KeptRays(True)
     negative = BrickSums(m._kept.share.distances.bricks, -m._kept.share.distances.sums)
     broken.share = RayShare(negative, m._kept.share.votes)

@@ -116,3 +116,13 @@ def test_a_field_without_bricks_answers_nothing() -> None:
     empty = DistanceField(np.zeros((0, 3), np.int32), *np.zeros((3, 0, VOXELS), np.float32))
     found = MeasuredDepth(empty, 0.1).near(np.ones(CAMERA.shape, np.float32), CAMERA, np.eye(4), 10.0)
     assert np.isnan(found).all()
+
+
+def test_a_field_of_sums_that_lie_together_is_the_same() -> None:
+    field = field_of(*plane(np.array([0.6, 0.0, 0.8]), 12.0, np.random.default_rng(0)))
+    depth = np.full(CAMERA.shape, 1.2, np.float32)
+    ours, theirs = (
+        MeasuredDepth(each, 0.1).near(depth, CAMERA, np.eye(4), 5.0)
+        for each in (DistanceField.of(field.bricks, field.sums), field)
+    )
+    np.testing.assert_array_equal(ours, theirs)

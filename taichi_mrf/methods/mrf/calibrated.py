@@ -17,15 +17,19 @@ Where no ray measured a distance, the marginal stays. docs/evaluation.md says ho
 be trusted.
 """
 
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.inference.surface_votes import CALLED, called
-from taichi_mrf.voxels.distance_field import MARGIN, DistanceSource, blended_sums
-from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS, grid_keys
-from taichi_mrf.voxels.pool import BrickPool
+from taichi_mrf.inference.surface_votes import CALLED
+from taichi_mrf.kernels.bundles import kernel
+from taichi_mrf.kernels.types import F32, I32, AnyArray, F32Array, I32Array, IVec3, Template, Vec3
+from taichi_mrf.system import runtime
+from taichi_mrf.system.compiler import ti
+from taichi_mrf.voxels.blended_field import blended, cell_of, voxel_around
+from taichi_mrf.voxels.distance_field import DistanceField
+from taichi_mrf.voxels.layout import VOXELS, grid_keys, rows_around
 
 NOISE, BLUR, REACH = 0.41, 0.17, 1.67
 DOUBT, PRIOR, MARGINAL = 0.56, 0.55, 0.29
@@ -43,84 +47,117 @@ UNLIKELIEST = 1e-4
 SUREST = 10.0
 """Bound on how far a marginal's log-odds may be from the prior's."""
 
+BRICKS_AT_ONCE = 1 << 14
+"""Bricks whose blended distances are in memory together: at most 130 MB."""
 
-def calibrated_log_odds(field: DistanceSource, pool: BrickPool) -> NDArray[np.float32]:
-    """Log-odds of the voxels of a map, (capacity, 512), by the distances of its rays and the marginals."""
-    log_odds: NDArray[np.float32] = pool.belief.to_numpy().reshape(-1, VOXELS)
-    in_use = pool.in_use
-    bricks = pool.bricks[in_use]
-    chunk_of = grid_keys(bricks // CHUNK)
-    for chunk in field.chunks.astype(np.int64):
-        rows = np.flatnonzero(chunk_of == grid_keys(chunk[None].astype(np.int32)))
-        if len(rows):
-            evidence, behind = _around(field, chunk)
-            x, y, z = (bricks[rows] - chunk * CHUNK).T
-            found = _of_bricks(evidence)[x, y, z], _of_bricks(behind)[x, y, z]
-            slots = in_use[rows]
-            log_odds[slots] = _combined(*found, log_odds[slots], pool.prior_log_odds)
-    return log_odds
+_FACES = np.array([[0, 0, 0], *np.eye(3, dtype=np.int32), *-np.eye(3, dtype=np.int32)], np.int32)
 
 
-def calibrated_block(
-    field: DistanceSource, chunk: NDArray[np.int64], marginal: NDArray[np.float32], prior: float
-) -> NDArray[np.float32]:
-    """The same for the voxels of a chunk (3,), whose marginals' log-odds are (64, 64, 64)."""
-    return _combined(*_around(field, chunk), marginal, prior)
+def calibrate(
+    field: DistanceField,
+    bricks: NDArray[np.int32],
+    slots: NDArray[np.int32],
+    log_odds: "AnyArray",
+    prior: float,
+) -> None:
+    """Make marginals' ``log_odds`` (slots * 512) the calibrated ones in some ``bricks`` (n, 3), which are
+    distinct, in ``slots`` (n)."""
+    sums = field.weight.reshape(-1), field.distance.reshape(-1)
+    keys = grid_keys(field.bricks)
+    for rows in _near(bricks, keys):
+        blended_bricks = _distinct((bricks[rows, None] + _FACES).reshape(-1, 3))
+        around = rows_around(blended_bricks, keys)
+        near = (around >= 0).any(axis=1)
+        blended_bricks, around = blended_bricks[near], around[near]
+        total, mean = (ti.ndarray(ti.f32, len(around) * VOXELS) for _ in range(2))
+        _blend(*sums, around.reshape(-1), total, mean)
+        around = rows_around(bricks[rows], grid_keys(blended_bricks))
+        _combine(total, mean, around.reshape(-1), slots[rows], log_odds, prior)
+        runtime.settle()
 
 
-def carried(
-    likely: NDArray[np.float32], decided: NDArray[np.float32], prior: float, min_evidence: float
-) -> NDArray[np.float32]:
-    """Calibrated log-odds ``likely`` as far as the states by ``decided``, of the same shape, allow: occupied
-    voxels stay just over even odds or above, free ones below what is known, those between stay there, and
-    what is unknown keeps its own."""
-    known, least = prior + min_evidence, called(prior, min_evidence)
-    free = np.minimum(likely, np.float32(prior - min_evidence - CALLED))
-    between = np.maximum(np.minimum(likely, np.float32(-CALLED)), np.float32(known))
-    found = np.where(decided > 0, np.maximum(likely, np.float32(least)), between)
-    found = np.where(decided < prior - min_evidence, free, found)
-    known_one = np.abs(decided - prior) > min_evidence  # not NaN either
-    return np.where(known_one, found, decided)
+@kernel
+def carry(likely: F32Array, log_odds: F32Array, prior: F32, min_evidence: F32, least: F32) -> None:
+    """Bring ``log_odds`` (n), by which voxels have their states, to the calibrated ``likely`` (n) as far as
+    the states allow: occupied voxels stay at ``least`` (surface_votes.called) or above, free ones below what
+    is known, those between stay there, and what is unknown keeps its own."""
+    for i in log_odds:
+        decided = log_odds[i]
+        if ti.abs(decided - prior) > min_evidence:
+            if decided > 0.0:
+                log_odds[i] = ti.max(likely[i], least)
+            elif decided < prior:
+                log_odds[i] = ti.min(likely[i], prior - min_evidence - CALLED)
+            else:
+                log_odds[i] = ti.max(ti.min(likely[i], -CALLED), prior + min_evidence)
 
 
-def _around(field: DistanceSource, chunk: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """What surface_evidence says of the voxels of a chunk, (64, 64, 64)."""
-    first = chunk * CHUNK_VOXELS - 1 - MARGIN  # gradients and blending need the voxels around
-    weight, distance, _ = field.box(first, CHUNK_VOXELS + 2 + 2 * MARGIN)
-    weight, distance = blended_sums(weight, distance)
-    return surface_evidence(weight, distance)
+def _near(bricks: NDArray[np.int32], keys: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    """The rows of the bricks (n, 3) whose voxels may have distances, by those of a field's bricks: some at
+    once, which lie together."""
+    near = np.flatnonzero((rows_around(bricks, keys) >= 0).any(axis=1))
+    near = near[np.argsort(grid_keys(bricks[near]))]
+    for begin in range(0, len(near), BRICKS_AT_ONCE):
+        yield near[begin : begin + BRICKS_AT_ONCE]
 
 
-def _combined(
-    evidence: NDArray[np.float32], behind: NDArray[np.bool_], marginal: NDArray[np.float32], prior: float
-) -> NDArray[np.float32]:
-    """Log-odds of voxels from what surface_evidence says of them and their marginals, of one shape."""
-    likely = evidence - DOUBT + PRIOR * prior + MARGINAL * np.clip(marginal - prior, -SUREST, SUREST)
-    likely = np.where(behind, np.maximum(likely, np.minimum(marginal, prior)), likely)
-    return np.where(np.isnan(evidence), marginal, likely)
+def _distinct(bricks: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Each of some bricks (n, 3) once, ascending."""
+    return bricks[np.unique(grid_keys(bricks), return_index=True)[1]]
 
 
-def surface_evidence(
-    weight: NDArray[np.float32], distance: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """log(z / (1 - z)) of the voxels of a box without its outermost, from the sums of weights and of
-    distances times weight, and whether each is behind the surface; NaN where there is no distance."""
-    seen = weight > LEAST_WEIGHT
-    mean = np.where(seen, distance / np.maximum(weight, LEAST_WEIGHT), np.float32(0))
-    inner = (slice(1, -1),) * 3
-    normal = np.stack([part[inner] for part in np.gradient(mean)])
-    steep = np.sqrt((normal * normal).sum(axis=0))
-    extent = 0.5 * np.abs(normal).sum(axis=0) / np.maximum(steep, 1e-6)
-    steep = np.clip(steep, FLATTEST, STEEPEST)
-    d, w = mean[inner] / steep, np.maximum(weight[inner], LEAST_WEIGHT)
-    s = np.sqrt(NOISE / (16.0 * w * steep * steep) + BLUR**2)
-    z = 0.5 * (np.tanh(0.5 * (d + REACH * extent) / s) - np.tanh(0.5 * (d - REACH * extent) / s))
-    z = np.clip(z, UNLIKELIEST, 1.0 - UNLIKELIEST)
-    evidence = np.where(seen[inner], np.log(z / (1.0 - z)), np.nan)
-    return evidence.astype(np.float32), d < 0
+@kernel
+def _blend(weight: F32Array, distance: F32Array, around: I32Array, total: F32Array, mean: F32Array) -> None:
+    """The blended weight and mean distance of the voxels of some bricks, (n * 512) each, 0 where there is no
+    distance, from a field's sums. ``around`` (n * 27) are the field's rows around each brick."""
+    for i in mean:
+        total[i] = mean[i] = 0.0
+        sums = blended(weight, distance, around, i // VOXELS, cell_of(i % VOXELS))
+        if sums[0] > LEAST_WEIGHT:
+            total[i], mean[i] = sums[0], sums[1] / sums[0]
 
 
-def _of_bricks(voxels: NDArray[Any]) -> NDArray[Any]:
-    """Values of a chunk's voxels, (64, 64, 64) -> (8, 8, 8, 512) of its bricks."""
-    split = voxels.reshape(CHUNK, BRICK, CHUNK, BRICK, CHUNK, BRICK).transpose(0, 2, 4, 1, 3, 5)
-    return split.reshape(CHUNK, CHUNK, CHUNK, VOXELS)
+@kernel
+def _combine(
+    total: F32Array, mean: F32Array, around: I32Array, slots: I32Array, log_odds: F32Array, prior: F32
+) -> None:
+    """Calibrated ``log_odds`` (slots * 512) of the bricks in ``slots`` (n) instead of the marginals', by the
+    blended weights and distances; ``around`` (n * 27) are the rows of these around each brick."""
+    for i in range(slots.shape[0] * VOXELS):
+        place, cell = i // VOXELS, cell_of(i % VOXELS)
+        own = voxel_around(around, place, cell)
+        if own >= 0 and total[own] > 0.0:
+            slope = Vec3(0.0)
+            for axis in ti.static(range(3)):
+                step = ti.Vector.unit(3, axis, ti.i32)
+                before = _mean_at(mean, around, place, cell - step)
+                slope[axis] = 0.5 * (_mean_at(mean, around, place, cell + step) - before)
+            voxel = slots[place] * VOXELS + i % VOXELS
+            marginal = log_odds[voxel]
+            told = ti.max(ti.min(marginal - prior, SUREST), -SUREST)
+            likely = _evidence(total[own], mean[own], slope) - DOUBT + PRIOR * prior + MARGINAL * told
+            if mean[own] < 0.0:  # behind the surface
+                likely = ti.max(likely, ti.min(marginal, prior))
+            log_odds[voxel] = likely
+
+
+@ti.func
+def _mean_at(mean: Template, around: Template, place: I32, cell: IVec3) -> F32:
+    voxel = voxel_around(around, place, cell)
+    found = 0.0
+    if voxel >= 0:
+        found = mean[voxel]
+    return found
+
+
+@ti.func
+def _evidence(weight: F32, mean: F32, slope: Vec3) -> F32:
+    """log(z / (1 - z)) of a voxel from its weight, mean distance and gradient."""
+    steep = slope.norm()
+    extent = 0.5 * ti.abs(slope).sum() / ti.max(steep, 1e-6)
+    steep = ti.max(ti.min(steep, STEEPEST), FLATTEST)
+    d = mean / steep
+    s = ti.sqrt(NOISE / (16.0 * weight * steep * steep) + BLUR * BLUR)
+    z = 0.5 * (ti.tanh(0.5 * (d + REACH * extent) / s) - ti.tanh(0.5 * (d - REACH * extent) / s))
+    z = ti.max(ti.min(z, 1.0 - UNLIKELIEST), UNLIKELIEST)
+    return ti.log(z / (1.0 - z))

@@ -16,8 +16,9 @@ from taichi_mrf.inference.color_sums import ColorShare
 from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.inference.messages import count_observations
+from taichi_mrf.inference.surface_votes import called
 from taichi_mrf.inference.sweep import Sweeper
-from taichi_mrf.methods.mrf.calibrated import calibrated_log_odds, carried
+from taichi_mrf.methods.mrf.calibrated import calibrate, carry
 from taichi_mrf.methods.mrf.decided import Decisions
 from taichi_mrf.methods.mrf.kept_rays import RayShare
 from taichi_mrf.methods.mrf.layers import layer_of
@@ -25,7 +26,7 @@ from taichi_mrf.methods.mrf.map_reading import MapReading, RaysThen
 from taichi_mrf.methods.mrf.surfacing import LEAST, MadeOf, WithSurface
 from taichi_mrf.methods.statistics import MapStatistics, measure
 from taichi_mrf.queries.change import MapChange, compare_maps
-from taichi_mrf.system import tensors
+from taichi_mrf.system import runtime, tensors
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.pool import BrickPool, copied
 from taichi_mrf.voxels.topology import Topology
@@ -121,8 +122,12 @@ class ReadableMRF(WithSurface):
         asked = self._decisions.nbytes
         if self._decided is not None:
             asked += 4 * int(self._decided[1].shape[0])
+        if self._calibrated is not None:
+            asked += 4 * int(self._calibrated[1].shape[0])
         if self._rendered is not None:
             asked += self._rendered[1].nbytes
+        if self._measured is not None:
+            asked += self._measured[1].nbytes
         return self._colors.nbytes + self._kept.share.nbytes + asked
 
     def _prepare_colors(self) -> None:
@@ -210,16 +215,16 @@ class ReadableMRF(WithSurface):
         return self.decide()
 
     def decide(self, between: Callable[[], object] = lambda: None) -> MapReading:
-        """:attr:`decided`; ``between`` is called after each keyframe whose votes are counted, and what it
-        raises ends the work. Raises CapacityError if there is not enough memory."""
+        """:attr:`decided`; ``between`` is called after each keyframe whose votes or distances are found, and
+        what it raises ends the work. Raises CapacityError if there is not enough memory."""
         made_of = MadeOf(self)
         if self._decided is None or self._decided[0] != made_of:
             self._decided = None  # its memory, before there is another
             log_odds = self._decisions.log_odds(self._settled, between)
             if self._settled and self.has_surface:
-                likely, pool = self._calibrated_log_odds(between).to_numpy(), self._pool
-                known = pool.prior_log_odds, self.view.volume.min_evidence
-                log_odds.from_numpy(carried(likely, log_odds.to_numpy(), *known))
+                known = self._pool.prior_log_odds, self.view.volume.min_evidence
+                carry(self._calibrated_log_odds(between), log_odds, *known, called(*known))
+                runtime.settle()
             self._decided = made_of, log_odds
         # Not kept: a reading keeps the map, whose memory would then wait for the collector of cycles.
         reading = MapReading(self, self._decided[1])
@@ -237,8 +242,9 @@ class ReadableMRF(WithSurface):
         made_of = MadeOf(self)
         if self._calibrated is None or self._calibrated[0] != made_of:
             self._calibrated = None
-            log_odds = copied(self._pool.belief)
-            log_odds.from_numpy(calibrated_log_odds(self.surface_field(between), self._pool).reshape(-1))
+            pool = self._pool
+            log_odds, slots = copied(pool.belief), pool.in_use
+            calibrate(self.surface_field(between), pool.bricks[slots], slots, log_odds, pool.prior_log_odds)
             self._calibrated = made_of, log_odds
         return self._calibrated[1]
 

@@ -58,6 +58,7 @@ class WithSurface(BrickMap):
     _kept: KeptRays
     _colors: MapColors
     _settled: bool
+    _measured: tuple[MadeOf, DistanceField] | None = None
     _rendered: tuple[MadeOf, MeasuredDepth] | None = None
 
     @property
@@ -89,9 +90,14 @@ class WithSurface(BrickMap):
         return sorted_bricks(np.concatenate([np.zeros((0, 3), np.int32), *found]))
 
     def surface_field(self, between: Callable[[], object] = lambda: None) -> DistanceField:
-        """The signed distances that the keyframes measured, as of the last :meth:`infer`. ``between`` is
-        called after each keyframe. Raises CapacityError if there is not enough memory."""
-        return surface_field_of(self, self._pool, self._keyframes, between=between)
+        """The signed distances that the keyframes measured, as of the last :meth:`infer`: found once for each
+        state of the map, and not to be written to. ``between`` is called after each keyframe. Raises
+        CapacityError if there is not enough memory."""
+        made_of = MadeOf(self)
+        if self._measured is None or self._measured[0] != made_of:
+            self._measured = None  # its memory, before there is another
+            self._measured = made_of, surface_field_of(self, self._pool, self._keyframes, between=between)
+        return self._measured[1]
 
     def surface(self, between: Callable[[], object] = lambda: None) -> FusedSurface:
         """The surface that the keyframes measured, by marching cubes through the mean of their signed
