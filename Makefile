@@ -16,6 +16,10 @@ CANDIDATES := python3.13 python3.12 python3.11 python3.10 python3.14 python3 pyt
 PYTHON ?= $(shell for python in $(CANDIDATES); do \
 	$$python -c "$(USABLE)" >/dev/null 2>&1 && { echo $$python; break; }; done)
 
+# Python keeps the compiled modules of the package and of its tests, whatever the shell says: each start without
+# them takes seconds more, and the tests start hundreds of processes.
+export PYTHONDONTWRITEBYTECODE :=
+
 .PHONY: run check test lint clean
 
 run: $(VENV)/.installed

@@ -1,6 +1,6 @@
 """Run the test suite once for each backend that there is here: the CPU with all tests, the others with
-those that use a backend. Where a second compiler of kernels is installed, the CPU's tests that are marked
-`compilers` run with that too.
+those that are marked `backends`, `compilers` or `smoke`. Where a second compiler of kernels is installed, the
+CPU's tests that are marked `compilers` or `smoke` run with that too.
 
     python tests/backends.py [options of pytest]
 

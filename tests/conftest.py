@@ -1,7 +1,8 @@
 """What all tests share: the Taichi backend they run on, and where the real recordings lie.
 
 Taichi can be started once in a process, so each backend is a run of its own: ``pytest --arch vulkan``
-runs only the tests that use the ``backend`` fixture, on Vulkan (a software device will do).
+runs only the tests of kernels that are marked for it (``backends``, ``compilers``, ``smoke``), on Vulkan (a
+software device will do).
 """
 
 import contextlib
@@ -97,7 +98,8 @@ def _taken_tests(folder: Path, items: list[pytest.Item]) -> Iterator[pytest.Item
 
 
 def _is_for_every_backend(item: pytest.Item) -> bool:
-    return _uses(item, "backend") and not _uses(item, "one_backend")
+    marked = any(item.get_closest_marker(name) for name in ("backends", "compilers", "smoke"))
+    return marked and _uses(item, "backend") and not _uses(item, "one_backend")
 
 
 def _uses(item: pytest.Item, fixture: str) -> bool:

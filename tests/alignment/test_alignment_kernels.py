@@ -15,7 +15,7 @@ from taichi_mrf.inference.keyframe import DepthImage
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.backends]
 
 CAMERA = PinholeCamera(width=80, height=60, fx=200.0, fy=190.0, cx=38.0, cy=31.0)
 HALF = 3  # pixels, at this focal length

@@ -13,7 +13,7 @@ from taichi_mrf.inference.first_occupied import NEVER, left_alone, message, next
 from taichi_mrf.kernels.types import I32, F32Array, Template
 from taichi_mrf.system.compiler import ti
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.backends]
 
 
 @ti.kernel

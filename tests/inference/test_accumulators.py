@@ -16,6 +16,8 @@ from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, offsets_in_brick
 from taichi_mrf.voxels.window import Window
 
+pytestmark = pytest.mark.backends
+
 VOXELS = 40
 
 Floats = NDArray[np.float32]

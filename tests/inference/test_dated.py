@@ -78,6 +78,7 @@ def test_the_rate_follows_from_the_half_life() -> None:
             TimeConfig(**{field: -1.0})
 
 
+@pytest.mark.backends
 @pytest.mark.usefixtures("backend")
 def test_the_channel_is_that_of_the_oracle() -> None:
     evidence = np.linspace(-60, 60, 241)
@@ -107,6 +108,7 @@ def test_thirty_old_views_do_not_outvote_three_new_ones() -> None:
     assert newcomer > 0
 
 
+@pytest.mark.backends
 @pytest.mark.usefixtures("backend")
 def test_beliefs_are_the_fold_of_the_messages() -> None:
     m = dated_room([0, 3, 1, 2])

@@ -23,7 +23,7 @@ from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.window import WindowIndex
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.backends]
 
 CAMERA = PinholeCamera(3, 1, 8.0, 8.0, 1.0, 0.0)
 MAX_DEPTH = 0.7

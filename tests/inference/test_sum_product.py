@@ -31,7 +31,7 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.backends]
 
 # A sigma wide enough that every voxel of the short ray lies in a brick near the measured surface.
 wide = st.floats(0.25, 0.6)

@@ -20,7 +20,7 @@ from taichi_mrf.queries.points import FREE, OCCUPIED
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.noise import PolynomialNoise
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.backends]
 
 
 def vote(ray: reference.Ray, p: dict, learnt: float, floor: float, votes: dict) -> bool:

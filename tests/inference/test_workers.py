@@ -10,7 +10,7 @@ from taichi_mrf.kernels.bundles import kernel
 from taichi_mrf.kernels.types import I32, I32Array
 from taichi_mrf.system.compiler import ti
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.backends]
 
 
 @kernel

@@ -28,7 +28,7 @@ from taichi_mrf.sensor.noise import PolynomialNoise
 from taichi_mrf.system.compiler import ti
 from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.backends]
 
 CAMERA = PinholeCamera(width=26, height=19, fx=22, fy=23, cx=12.3, cy=9.4)
 VOXEL = 0.05

@@ -22,7 +22,7 @@ from taichi_mrf.voxels.layout import BRICK, VOXELS
 from taichi_mrf.voxels.traversal import Space
 from taichi_mrf.voxels.window import Window, WindowIndex
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.backends]
 
 VOXEL = 0.2
 MODEL = (TABLE_I.hit_if_occupied, TABLE_I.hit_if_free, TABLE_I.hit_if_hidden)

@@ -51,6 +51,7 @@ def trimmed(values: np.ndarray, max_m: float = MAX_M, voxel_size: float = VOXEL)
     return values[(slice(margin, -margin),) * 3]
 
 
+@pytest.mark.backends
 @pytest.mark.parametrize("unknown", RULES)
 def test_distances_at_the_centres_are_those_of_scipys_transform(hand: HandMap, unknown: Any) -> None:
     points = centres(np.array([-72, -8, -56]), np.array([24, 88, 40]), VOXEL)
@@ -190,6 +191,7 @@ def edited(backend: str) -> Edited:
     return Edited(backend)
 
 
+@pytest.mark.backends
 @settings(max_examples=40)  # each makes up to four fields
 @example(190558, [1], "occupied", 0.04)  # bricks that are seen to be free, and hardly any others
 @given(

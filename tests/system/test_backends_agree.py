@@ -9,6 +9,7 @@ import pytest
 import small_room
 
 
+@pytest.mark.backends
 def test_this_backend_agrees_with_the_cpu(backend: str, tmp_path: Path) -> None:
     if backend == "cpu":
         pytest.skip("the CPU is what the other backends are compared with (pytest --arch vulkan, cuda)")

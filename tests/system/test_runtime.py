@@ -182,6 +182,7 @@ def test_the_versions_are_those_that_are_installed() -> None:
     assert {"python", compiler.name(), "opencv-python-headless"} <= versions.keys()
 
 
+@pytest.mark.backends
 def test_the_backend_of_this_run_is_the_one_asked_for(backend: str, request: pytest.FixtureRequest) -> None:
     assert backend == runtime.active() == request.config.getoption("--arch")
 

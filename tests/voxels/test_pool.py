@@ -11,7 +11,7 @@ from taichi_mrf.voxels import pool as pool_module
 from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.pool import BrickPool
 
-pytestmark = pytest.mark.usefixtures("backend")
+pytestmark = [pytest.mark.usefixtures("backend"), pytest.mark.backends]
 
 PRIOR = -2.25
 

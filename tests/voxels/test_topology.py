@@ -14,6 +14,8 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.voxels.layout import BRICK, CHUNK
 from taichi_mrf.voxels.topology import DenseTopology, SparseTopology, Topology, create_topology, recycle
 
+pytestmark = pytest.mark.backends
+
 SIDE = 64
 """Bricks along each side of the dense volume."""
 

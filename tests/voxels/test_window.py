@@ -10,6 +10,8 @@ from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.voxels.layout import BRICK, CHUNK, CHUNK_VOXELS, VOXELS
 from taichi_mrf.voxels.window import Window, WindowIndex
 
+pytestmark = pytest.mark.backends
+
 sizes = st.sampled_from([0.01, 0.02, 0.05, 0.3])
 metres = st.floats(-200, 200)
 points = st.tuples(metres, metres, metres).map(np.array)
