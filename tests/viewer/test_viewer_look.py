@@ -17,7 +17,7 @@ from taichi_mrf.viewer.messages import LOG_ODDS_STEP, KeyframeInfo, RayAnswer, p
 from taichi_mrf.viewer.scene.coloring import legend_html, scale_of, voxel_colors
 from taichi_mrf.viewer.scene.keyframe_layer import FRUSTUM_M, RING_M, Placement
 from taichi_mrf.viewer.scene.look import look_of
-from taichi_mrf.viewer.scene.options import UNPAINTED, ColorBy, ViewOptions
+from taichi_mrf.viewer.scene.options import OF_BELIEFS, ColorBy, ViewOptions
 from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
 from taichi_mrf.viewer.scene.ray_plot import curves
 from taichi_mrf.viewer.scene.rings import border
@@ -96,7 +96,7 @@ def test_a_photo_shows_what_cameras_saw_and_grey_where_none_did() -> None:
     np.testing.assert_array_equal(voxel_colors(scale, left, np.zeros(512)), colors[1])
 
 
-@pytest.mark.parametrize("color_by", UNPAINTED)
+@pytest.mark.parametrize("color_by", (*OF_BELIEFS, "keyframes"))
 def test_every_mode_has_a_legend_with_its_ends(color_by: ColorBy) -> None:
     scale = scale_of(color_by, 0.5, HEIGHTS)
     text = legend_html(scale)
