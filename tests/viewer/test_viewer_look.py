@@ -96,7 +96,7 @@ def test_a_photo_shows_what_cameras_saw_and_grey_where_none_did() -> None:
     np.testing.assert_array_equal(voxel_colors(scale, left, np.zeros(512)), colors[1])
 
 
-@pytest.mark.parametrize("color_by", (*OF_BELIEFS, "keyframes"))
+@pytest.mark.parametrize("color_by", [*OF_BELIEFS, "keyframes"])
 def test_every_mode_has_a_legend_with_its_ends(color_by: ColorBy) -> None:
     scale = scale_of(color_by, 0.5, HEIGHTS)
     text = legend_html(scale)
