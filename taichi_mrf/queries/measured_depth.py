@@ -4,7 +4,8 @@ The likeliest voxel of a ray (eq. 18) is as coarse as the grid, and lies before 
 wider than a voxel. The measured surface is where the mean of the signed distances passes through 0
 (inference/surface_rays.py). It is more exact, but has holes, through which a ray meets what is behind. So a
 ray is followed around its likeliest voxel alone: it ends where it comes from a positive distance to a
-negative one, if that is near the voxel along the surface's normal.
+negative one, if that is near the voxel along the surface's normal, and not in the midst of free space, where
+rays with a large sigma leave such places in front of a surface.
 """
 
 from typing import Literal
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.kernels.bundles import kernel
-from taichi_mrf.kernels.types import F32, F32Array, I32Array, IVec3, Template, Vec3, Vec4
+from taichi_mrf.kernels.types import F32, I32, F32Array, I32Array, IVec3, Template, Vec3, Vec4
 from taichi_mrf.queries.view import viewed_box
 from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.model import Sensor
@@ -40,8 +41,15 @@ GRAZING = 3.0
 """A ray is followed so many times that far to either side of its likeliest voxel: those that meet a surface
 at less than 19 degrees may end in the voxel instead."""
 
+AROUND = 2
+"""There is no surface where the map takes all voxels for free that the ray crosses up to so many voxel sizes
+before and behind it."""
+
 STEP = 0.5
 """Voxels between the places at which a ray reads its distance."""
+
+WORDS = VOXELS // 32
+"""Words of 32 bits that have a bit for each voxel of a brick."""
 
 NONE = 1e6
 """Stands for a distance that no ray measured."""
@@ -52,9 +60,13 @@ _NO_NOISE = NoiseTable(np.zeros((1, 2, 5), np.float32), 1 << 30, 1)
 class MeasuredDepth:
     """The surface of a field of signed distances, as rays meet it."""
 
-    def __init__(self, field: DistanceField, voxel_size: float) -> None:
-        """``voxel_size`` is in metres."""
+    def __init__(self, field: DistanceField, free: NDArray[np.bool_], voxel_size: float) -> None:
+        """``free`` are the voxels of the field's bricks, (bricks, 512), that the map takes for free;
+        ``voxel_size`` is in metres."""
         self._bricks, self._voxel_size = field.bricks, voxel_size
+        self._free = ti.ndarray(ti.i32, max(1, len(field.bricks)) * WORDS)
+        if len(field.bricks):
+            self._free.from_numpy(np.packbits(free, axis=1, bitorder="little").view("<i4").reshape(-1))
         self._mean = ti.ndarray(ti.f32, max(1, len(field.bricks)) * VOXELS)
         self._index = WindowIndex()
         if len(field.bricks):
@@ -65,7 +77,7 @@ class MeasuredDepth:
     @property
     def nbytes(self) -> int:
         """Bytes in memory."""
-        return 4 * (self._mean.shape[0] + self._index.bricks.shape[0])
+        return 4 * (self._mean.shape[0] + self._free.shape[0] + self._index.bricks.shape[0])
 
     def near(
         self, depth_m: NDArray[np.float32], camera: Camera, T_world_camera: Pose, max_depth: float
@@ -83,7 +95,7 @@ class MeasuredDepth:
             self._index.fill(window, cells, rows.astype(np.int32))
             _meet(
                 _NO_NOISE.sensor(camera), window.viewpoint(T_world_camera), self._index.space(window),
-                self._mean, np.nan_to_num(depth_m).astype(np.float32).reshape(-1),
+                self._mean, self._free, np.nan_to_num(depth_m).astype(np.float32).reshape(-1),
                 max(NEAR_VOXELS, NEAR_M / self._voxel_size), found.reshape(-1),
             )  # fmt: skip
             runtime.settle()
@@ -106,19 +118,23 @@ def _blend(weight: F32Array, distance: F32Array, around: I32Array, mean: F32Arra
 
 @kernel
 def _meet(
-    sensor: Sensor, view: Viewpoint, space: Space, mean: F32Array, depth: F32Array, near: F32, found: F32Array
-) -> None:
+    sensor: Sensor, view: Viewpoint, space: Space, mean: F32Array, free: I32Array, depth: F32Array, near: F32,
+    found: F32Array,
+) -> None:  # fmt: skip
     """The depth of the surface on the ray of each pixel, into ``found`` (H * W), 0 where there is none near
-    the likeliest voxel at ``depth`` (H * W), both in metres; ``near`` is in voxels."""
+    the likeliest voxel at ``depth`` (H * W), both in metres; ``near`` is in voxels, and ``free`` (bricks *
+    WORDS) has a bit for each voxel."""
     for pixel in range(found.shape[0]):
         found[pixel] = 0.0
         if depth[pixel] > 0.0:
             u, v = sensor.pixel(pixel)
-            found[pixel] = _crossing(pixel_ray(sensor, view, u, v), depth[pixel], near, space, mean)
+            found[pixel] = _crossing(pixel_ray(sensor, view, u, v), depth[pixel], near, space, mean, free)
 
 
 @ti.func
-def _crossing(ray: Template, likeliest: F32, near: F32, space: Template, mean: Template) -> F32:
+def _crossing(
+    ray: Template, likeliest: F32, near: F32, space: Template, mean: Template, free: Template
+) -> F32:
     """The first depth around the likeliest at which a ray meets the surface from the front, 0 if it does
     not."""
     to_voxels = ray.direction.norm()
@@ -133,11 +149,26 @@ def _crossing(ray: Template, likeliest: F32, near: F32, space: Template, mean: T
             meets = t - step * here[0] / (here[0] - before)
             gradient = Vec3(here[1], here[2], here[3])
             along = ti.abs(gradient.dot(ray.direction)) / ti.max(gradient.norm(), 1e-6)
-            if ti.abs(meets - likeliest) * along <= near:
+            if ti.abs(meets - likeliest) * along <= near and _may_be(ray, meets, to_voxels, space, free) == 1:
                 found = meets
         before = here[0]
         t += step
     return found
+
+
+@ti.func
+def _may_be(ray: Template, depth: F32, to_voxels: F32, space: Template, free: Template) -> I32:
+    """Whether the map does not take all voxels of a ray around a depth for free."""
+    may = 0
+    for k in range(-AROUND, AROUND + 1):
+        voxel = ti.cast(ti.floor(ray.origin + (depth + k / to_voxels) * ray.direction), ti.i32)
+        brick = voxel >> 3
+        if within(brick, space.shape):
+            row = space.bricks[flat(brick, space.shape)]
+            if row >= 0:
+                number = voxel_number(voxel & 7)
+                may |= 1 - ((free[row * WORDS + (number >> 5)] >> (number & 31)) & 1)
+    return may
 
 
 @ti.func

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_mrf.queries.measured_depth import GRAZING, NEAR_M, NEAR_VOXELS, NONE, STEP, MeasuredDepth
+from taichi_mrf.queries.measured_depth import AROUND, GRAZING, NEAR_M, NEAR_VOXELS, NONE, STEP, MeasuredDepth
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.voxels.distance_field import LEAST_WEIGHT, MARGIN, DistanceField, blended_sums
 from taichi_mrf.voxels.layout import BRICK, VOXELS, offsets_in_brick
@@ -21,6 +21,12 @@ def field_of(weight: NDArray, distance: NDArray) -> DistanceField:
     w = weight[x, y, z].reshape(-1, VOXELS).astype(np.float32)
     d = (weight * distance)[x, y, z].reshape(-1, VOXELS).astype(np.float32)
     return DistanceField(bricks, w, d, np.zeros_like(w))
+
+
+def by_brick(voxels: NDArray) -> NDArray:
+    """Values of a box (24, 24, 24) as those of its bricks, (27, 512)."""
+    split = voxels.reshape((SIDE, BRICK) * 3).transpose(0, 2, 4, 1, 3, 5)
+    return split.reshape(SIDE**3, VOXELS)
 
 
 def plane(normal: NDArray, at: float, random: np.random.Generator) -> tuple[NDArray, NDArray]:
@@ -59,7 +65,9 @@ def distance_at(mean: NDArray, place: NDArray) -> tuple[float, NDArray]:
     return float(value), np.array(gradient)
 
 
-def crossing(mean: NDArray, origin: NDArray, direction: NDArray, likeliest: float, near: float) -> float:
+def crossing(
+    mean: NDArray, free: NDArray, origin: NDArray, direction: NDArray, likeliest: float, near: float
+) -> float:
     """The oracle's depth of the surface on a ray in voxels, NaN without one."""
     to_voxels = float(np.linalg.norm(direction))
     step, before = STEP / to_voxels, NONE
@@ -73,7 +81,9 @@ def crossing(mean: NDArray, origin: NDArray, direction: NDArray, likeliest: floa
         if here <= 0 < before < NONE:
             meets = t - step * here / (here - before)
             along = abs(gradient @ direction) / max(float(np.linalg.norm(gradient)), 1e-6)
-            if abs(meets - likeliest) * along <= near:
+            steps = (meets + np.arange(-AROUND, AROUND + 1) / to_voxels)[:, None] * direction
+            i, j, k = np.floor(origin + steps).astype(int).T
+            if abs(meets - likeliest) * along <= near and not free[i, j, k].all():
                 return meets
         before, t = here, t + step
     return float("nan")
@@ -93,12 +103,14 @@ def test_rays_end_where_the_blended_distance_changes_its_sign(voxel_size: float)
     off = random.uniform(-2, 2, len(true)) * near * voxel_size / np.abs(rays @ normal) / voxel_size
     likeliest = (true + off).astype(np.float32)
     likeliest[:5] = np.nan
-    found = MeasuredDepth(field, voxel_size).near(
+    free = np.ones((SIDE * BRICK,) * 3, bool)
+    free[11:] = random.uniform(size=free[11:].shape) < 0.5
+    found = MeasuredDepth(field, by_brick(free), voxel_size).near(
         likeliest.reshape(CAMERA.shape), CAMERA, T, 100 * voxel_size
     )
     expected = np.array(
         [
-            np.nan if np.isnan(d) else crossing(mean, origin, r, d, near)
+            np.nan if np.isnan(d) else crossing(mean, free, origin, r, d, near)
             for r, d in zip(rays, likeliest, strict=True)
         ]
     )
@@ -114,7 +126,9 @@ def test_rays_end_where_the_blended_distance_changes_its_sign(voxel_size: float)
 
 def test_a_field_without_bricks_answers_nothing() -> None:
     empty = DistanceField(np.zeros((0, 3), np.int32), *np.zeros((3, 0, VOXELS), np.float32))
-    found = MeasuredDepth(empty, 0.1).near(np.ones(CAMERA.shape, np.float32), CAMERA, np.eye(4), 10.0)
+    found = MeasuredDepth(empty, np.zeros((0, VOXELS), bool), 0.1).near(
+        np.ones(CAMERA.shape, np.float32), CAMERA, np.eye(4), 10.0
+    )
     assert np.isnan(found).all()
 
 
@@ -122,7 +136,7 @@ def test_a_field_of_sums_that_lie_together_is_the_same() -> None:
     field = field_of(*plane(np.array([0.6, 0.0, 0.8]), 12.0, np.random.default_rng(0)))
     depth = np.full(CAMERA.shape, 1.2, np.float32)
     ours, theirs = (
-        MeasuredDepth(each, 0.1).near(depth, CAMERA, np.eye(4), 5.0)
+        MeasuredDepth(each, np.zeros((SIDE**3, VOXELS), bool), 0.1).near(depth, CAMERA, np.eye(4), 5.0)
         for each in (DistanceField.of(field.bricks, field.sums), field)
     )
     np.testing.assert_array_equal(ours, theirs)

@@ -15,7 +15,7 @@ from taichi_mrf.geometry.up import Up
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.brick_map import BrickMap
 from taichi_mrf.methods.mrf.coloring import MapColors
-from taichi_mrf.methods.mrf.surfacing import WithSurface, surface_field_of
+from taichi_mrf.methods.mrf.surfacing import WithSurface, measured_depth_of, surface_field_of
 from taichi_mrf.methods.protocol import MappedKeyframe
 from taichi_mrf.queries.colored import blended_colors
 from taichi_mrf.queries.measured_depth import MeasuredDepth
@@ -110,7 +110,8 @@ class MapReading(BrickMap):
 
     @cached_property
     def _own_surface(self) -> MeasuredDepth:
-        return MeasuredDepth(self.surface_field(), self.voxel_size)
+        assert self._rays is not None
+        return measured_depth_of(self, self.surface_field(), self._rays.least)
 
     def surface(self) -> FusedSurface:
         """The surface as of the time that is read, or that of the layer, as MRFMap.surface. Raises

@@ -17,8 +17,9 @@ from taichi_mrf.methods.brick_map import BrickMap
 from taichi_mrf.methods.mrf.coloring import MapColors
 from taichi_mrf.methods.mrf.kept_rays import KeptRays
 from taichi_mrf.queries.colored import blended_colors, is_colored
-from taichi_mrf.queries.known_bricks import sorted_bricks
+from taichi_mrf.queries.known_bricks import BrickReader, QueriedMap, sorted_bricks
 from taichi_mrf.queries.measured_depth import MeasuredDepth
+from taichi_mrf.queries.points import probability
 from taichi_mrf.voxels.distance_field import DistanceField
 from taichi_mrf.voxels.pool import BrickPool
 
@@ -28,6 +29,10 @@ OUTLIERS = 0.01
 
 LEAST = 0.5
 """Where no marginal reaches this share of the prior, there is no surface."""
+
+FREE = 0.05
+"""A ray passes a surface in the midst of voxels below this share of the prior. It is lower than LEAST, since
+poses that are off leave surfaces in voxels that other keyframes saw through."""
 
 
 class MadeOf:
@@ -122,7 +127,7 @@ class WithSurface(BrickMap):
             return None
         made_of = MadeOf(self)
         if self._rendered is None or self._rendered[0] != made_of:
-            self._rendered = made_of, MeasuredDepth(self.surface_field(), self.voxel_size)
+            self._rendered = made_of, measured_depth_of(self, self.surface_field(), FREE * self.prior)
         return self._rendered[1]
 
     def _prepare_colors(self) -> None:
@@ -137,6 +142,13 @@ class WithSurface(BrickMap):
             if self._registry.before_claim is not None:  # what is outside of the window comes back
                 self._registry.before_claim(share.distances.bricks)
             self._kept.restore(share)
+
+
+def measured_depth_of(m: QueriedMap, field: DistanceField, least: float) -> MeasuredDepth:
+    """The surface of a field as rays meet it. A map, or a reading of it, takes voxels for free whose
+    probability is below ``least``."""
+    free = probability(BrickReader(m).log_odds(field.bricks)) < least
+    return MeasuredDepth(field, free, m.voxel_size)
 
 
 def surface_field_of(
