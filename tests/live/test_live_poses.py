@@ -33,6 +33,7 @@ from taichi_mrf.geometry.poses import Pose, tangent_norms
 from taichi_mrf.live.replay import Replay
 from taichi_mrf.live.run import Policy
 from taichi_mrf.live.session import Session
+from taichi_mrf.mapping import rounds
 from taichi_mrf.mapping.loops import Closure, LoopCloser
 from taichi_mrf.mapping.pipeline import map_sequence
 from taichi_mrf.methods.mrf.map import MRFMap
@@ -143,11 +144,11 @@ def test_keyframes_are_aligned_as_they_come_and_together_at_the_end() -> None:
         np.testing.assert_array_equal(keyframe.T_home, keyframe.T_world_camera)
 
 
-def test_live_places_keyframes_as_map_does() -> None:
+def test_live_places_keyframes_as_map_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rounds, "MOST_ROUNDS", 0)
     link = FakeLink()
-    config = replace(REFINE, poses=replace(REFINE.poses, rounds=0))
-    finished(session_of(link, wrong(), config))
-    mapped = map_sequence(wrong(), config)
+    finished(session_of(link, wrong(), REFINE))
+    mapped = map_sequence(wrong(), REFINE)
     for change in mapped.poses:
         np.testing.assert_allclose(told_poses(link)[change.keyframe], change.T_refined, atol=1e-9)
 

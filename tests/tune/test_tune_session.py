@@ -89,9 +89,9 @@ def test_the_map_on_the_page_is_that_of_the_last_try() -> None:
 
 
 def test_a_map_on_the_same_grid_takes_the_place_of_the_one_before_without_a_new_beginning() -> None:
-    clamped = dataclasses.replace(CONFIG, inference=InferenceConfig(surface_density=0.5))
+    wide = dataclasses.replace(CONFIG, sensor=SensorConfig(sigma=(0.05,)))
     sharp = dataclasses.replace(CONFIG, sensor=SensorConfig(sigma=(0.001,)))
-    session, link = run(script(Try(clamped), Try(sharp)))
+    session, link = run(script(Try(wide), Try(sharp)))
     assert len(link.of_type(Hello)) == 1
     direct = run_trial(sharp, session.frames)
     assert direct is not None
