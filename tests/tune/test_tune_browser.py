@@ -28,7 +28,7 @@ def page() -> Iterator[LivePage]:
         chromium() as browser,
         LivePage(browser, program.address(), height=1000) as opened,
     ):
-        opened.until_settled()
+        opened.until(lambda seen: seen.settled and seen.voxels, "a settled map")
         yield opened
         assert opened.problems == []
         assert program.end() == 130
