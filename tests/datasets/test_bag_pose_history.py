@@ -60,6 +60,8 @@ def test_a_path_that_is_sent_again_corrects_earlier_poses(tmp_path: Path, kind: 
     assert_poses(source.poll(float("inf")), {s: T @ T_body_camera for s, T in last.items()})
     assert source.poll(float("inf")) is None
 
+    # Frames that the last message does not name move with the last one that it does.
+    last |= {stamp(i): offset(0.0, 0.3, 0.3) @ world_body(i) for i in range(4, COUNT)}
     followed = open_posed(path, path, follow=True)
     assert isinstance(followed, PosedFrames)
     for now, known in ((stamp(0), {}), (stamp(2), first), (stamp(3), last)):
