@@ -1,7 +1,5 @@
 """The marginals against brute force where the graph is a tree, and against float64 NumPy where it is not."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import small_room
@@ -12,6 +10,7 @@ from one_pixel import (
     VOXEL,
     ExactMap,
     ExactMapWithLengths,
+    FineMap,
     allocated,
     image,
     look_along,
@@ -187,17 +186,13 @@ def test_messages_with_lengths_are_those_of_the_factor(
     np.testing.assert_allclose(marginals(m, voxels), expected, atol=1e-4)
 
 
-class Fine(MRFMap):
-    """With messages in float32."""
-
-    LIMITS = replace(MRFMap.LIMITS, precision="float32")
-
-
 def test_float16_messages_move_beliefs_a_little() -> None:
     """What the default precision costs, against the same map in float32."""
     rng = np.random.default_rng(3)
     camera = PinholeCamera(24, 18, 20.0, 20.0, 11.5, 8.5)
-    maps = {made_by.LIMITS.precision: made_by(VOXEL, PolynomialNoise((0.03,))) for made_by in (MRFMap, Fine)}
+    maps = {
+        made_by.LIMITS.precision: made_by(VOXEL, PolynomialNoise((0.03,))) for made_by in (MRFMap, FineMap)
+    }
     for _ in range(4):
         T = random_pose(rng, 0.1)
         depth = (1.5 / np.abs(camera.rays() @ T[:3, :3].T).max(axis=-1)).astype(np.float32)

@@ -1,6 +1,5 @@
 """Colours by posterior: against NumPy ray by ray, and what edits and hidden surfaces must not change."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import colored_scene as scene
@@ -8,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from one_pixel import VOXEL, look_along
+from one_pixel import VOXEL, FineMap, look_along
 from oracles import inference as reference
 from oracles.forward import Noise
 
@@ -37,19 +36,13 @@ def cavities(m: MRFMap, k: Keyframe) -> dict[reference.Voxel, float]:
     return dict(zip(map(tuple, voxels.tolist()), found.tolist(), strict=True))
 
 
-class Fine(MRFMap):
-    """With messages in float32."""
-
-    LIMITS = replace(MRFMap.LIMITS, precision="float32")
-
-
 def spread(ray: reference.Ray, cavity: dict, config: InferenceConfig, prior: float) -> dict:
     """The posterior of each voxel of a ray that it is what the pixel sees."""
     lowest = reference.logit(config.free_share * prior)
     visibility, found = 1.0, {}
     for segment, density in zip(ray.segments, ray.densities, strict=True):
         if segment.voxel in cavity:
-            m = reference.logistic(min(Fine.LIMITS.cavity, max(lowest, cavity[segment.voxel])))
+            m = reference.logistic(min(FineMap.LIMITS.cavity, max(lowest, cavity[segment.voxel])))
             free = (1 - m) ** segment.length
             found[segment.voxel] = (1 - free) * density * visibility
             visibility *= free
@@ -63,7 +56,7 @@ def test_colours_are_those_of_the_posterior(seed: int, count: int, sigma: float)
     rng = np.random.default_rng(seed)
     camera = PinholeCamera(2, 2, 8.0, 8.0, 0.5, 0.5)
     config = InferenceConfig(outlier_floor=1e-3, ray_density=0.0)
-    m = Fine(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=1.5)
+    m = FineMap(VOXEL, PolynomialNoise((sigma,)), inference=config, max_depth=1.5)
     rays, images = {}, {}
     middle = rng.uniform(-1, 1, 3)
     for _ in range(count):

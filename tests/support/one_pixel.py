@@ -18,6 +18,12 @@ ONE_PIXEL = PinholeCamera(1, 1, 100.0, 100.0, 0.0, 0.0)
 WITH_LENGTHS = replace(AS_PRINTED, segment_lengths=True)
 
 
+class FineMap(MRFMap):
+    """A map with messages in float32."""
+
+    LIMITS = replace(MRFMap.LIMITS, precision="float32")
+
+
 class ExactMap(MRFMap):
     """A map by the equations as they are printed; ``free_share`` is left to its parameters."""
 
