@@ -10,6 +10,10 @@ from fuzz_case import run_case
 from fuzz_loaders import LOADERS
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from inputs_bags import plain, writing
+
+from taichi_mrf.datasets.registry import open_dataset
+from taichi_mrf.errors import DatasetError
 
 pytestmark = pytest.mark.usefixtures("one_backend")
 
@@ -34,8 +38,20 @@ def test_a_damaged_file_is_refused_or_read_rightly(name: str, seed: int, root: P
         ("TUM RGB-D", 22406),  # a folder's
         ("MCAP", 22624),  # a word for a number in the metadata
         ("mesh PLY", 20692),  # a word of thousands of characters, which the reader of meshes repeats
-        ("ROS 1 bag", 21833),  # an index that points to another topic's message
     ],
 )
 def test_what_once_went_wrong_is_refused(name: str, seed: int, root: Path) -> None:
     assert run_case(name, seed, root).kind == "refused"
+
+
+def test_an_index_that_points_to_another_topics_message_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "walk.bag"
+    with writing(path, "ros1") as bag:
+        plain(bag)
+    opening = b"op=\x04\x08\x00\x00\x00ver=\x01\x00\x00\x00\t\x00\x00\x00conn="
+    first, second = (opening + bytes((topic, 0, 0, 0)) for topic in range(2))
+    content = path.read_bytes()
+    assert content.count(first) == 1
+    path.write_bytes(content.replace(first, second))
+    with pytest.raises(DatasetError, match="cannot be read: contains a sensor_msgs/msg/CameraInfo"):
+        open_dataset(path)

@@ -51,9 +51,9 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def voxels(saved: Path) -> int:
-    """How many voxels the saved map has."""
+    """How many voxels of the saved map are occupied."""
     runtime.init("cpu")
-    return len(MRFMap.load(saved).voxels(0.5)[0])
+    return len(MRFMap.load(saved).decided.voxels(0.5)[0])
 
 
 @pytest.fixture(scope="module")
@@ -175,7 +175,7 @@ def slider_id(page: LivePage) -> str | None:
 def until_reconnected(page: LivePage, slider_before: str | None, voxels: int) -> None:
     """Wait until the page shows the whole map of another viewer, and see that its slider is answered."""
     page.until(lambda seen: slider_id(page) != slider_before, "another viewer")
-    page.until(lambda seen: seen.settled and seen.voxels == voxels, "the whole map")
+    assert page.until_settled().voxels == voxels
     page.nudge("Threshold", "ArrowRight")
     page.until(lambda seen: seen.agrees and seen.voxels < voxels, "fewer voxels")
     page.nudge("Threshold", "ArrowLeft")

@@ -30,13 +30,13 @@ SCRIPT = (
     """(() => {
 const EVERY_MS = 1000, PATIENCE_MS = 3000, MOST_IN_VAIN = 20;
 document.hasFocus = () => true;  // viser's client connects again only where the page has the focus
-let timer, wasOpen = false, closed = false, inVain = 0;
+let timer, wasOpen = false, closed = false, hasClosed = false, inVain = 0;
 window.Worker = class extends Worker {  // viser's socket lives in one, which tells of it
   constructor(...given) {
     super(...given);
     this.addEventListener("message", ({data}) => {
       if (data?.type === "connected") [wasOpen, closed] = [true, false];
-      if (data?.type === "closed") closed = true;
+      if (data?.type === "closed") [closed, hasClosed] = [true, true];
     });
   }
 };
@@ -62,7 +62,9 @@ const ask = async () => {
     const answer = await fetch("alive", {cache: "no-store", signal: AbortSignal.timeout(PATIENCE_MS)});
     if (!answer.ok) throw new Error(answer.statusText);
     const {mapper} = await answer.json();
-    inVain = closed ? inVain + 1 : 0;  // answers of a server to which the socket does not come back
+    // Answers of a server to which the socket does not come back. A full server opens and closes it at once.
+    inVain = closed || hasClosed ? inVain + 1 : 0;
+    hasClosed = false;
     if (wasOpen && inVain > MOST_IN_VAIN) return location.reload();
     say(closed ? GONE : mapper ? "" : "the mapper does not answer");
   } catch {
