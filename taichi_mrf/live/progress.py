@@ -53,7 +53,7 @@ class Progress:
             replay.paused if replay else False,
             replay.finished if replay else True,
             waiting or mapper.edited,
-            replay.speed if replay else 0.0,
+            replay.speed if replay and replay.has_pace else None,
         )
 
     def _rate(self) -> float:

@@ -52,6 +52,8 @@ class Replay:
         """Stamp of the last frame so far, and the time since the one before, in seconds."""
         self._later_s = 0.0
         """How much later than recorded the frames of this pass are."""
+        self.has_pace = not dataset.endless
+        """Whether frames can come faster or slower: not those of a camera, or without a stamp."""
         self._begin: tuple[float, float] | None = None
         """A time on the clock, and the stamp of the frame that was due then."""
         self.set_speed(speed)
@@ -120,9 +122,11 @@ class Replay:
         frame = self._ahead or self._read()
         self._ahead = None
         self._readable = self._readable or isinstance(frame, Frame)
-        if isinstance(frame, Frame) and math.isfinite(frame.stamp):
-            self._note(frame.stamp)
-            frame = replace(frame, stamp=frame.stamp + self._later_s)
+        if isinstance(frame, Frame):
+            self.has_pace = not self._dataset.endless and math.isfinite(frame.stamp)
+            if math.isfinite(frame.stamp):
+                self._note(frame.stamp)
+                frame = replace(frame, stamp=frame.stamp + self._later_s)
         self.number, self._next = self._next, self._next + 1
         self._find_next()
         if isinstance(frame, UnreadableFrame) and frame.last:

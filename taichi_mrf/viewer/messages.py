@@ -168,7 +168,7 @@ class CurrentCamera(Update):
 class Status(Update):
     """Progress and figures. ``activity`` says what is being done, ``share`` how much of it is done (0 to 1),
     ``pending`` whether inference after an edit is not finished, ``speed`` is the multiple of the recording's
-    pace (0: as fast as possible)."""
+    pace (0: as fast as possible), None where frames have none."""
 
     activity: str
     share: float
@@ -183,7 +183,7 @@ class Status(Update):
     paused: bool
     finished: bool
     pending: bool
-    speed: float = 0.0
+    speed: float | None = None
 
 
 @dataclass(frozen=True)

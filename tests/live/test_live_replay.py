@@ -169,6 +169,21 @@ def test_what_is_no_speed_is_refused(speed: float) -> None:
     assert replay.speed == 3.0
 
 
+@pytest.mark.parametrize(
+    ("source", "has_pace"),
+    [
+        (recording(0.0, 1.0), True),
+        (recording(math.nan, math.nan), False),
+        (Camera("camera", CAMERA, stamps=(0.0, 1.0)), False),
+    ],
+    ids=["stamps", "no stamps", "camera"],
+)
+def test_frames_of_a_camera_and_without_stamps_have_no_pace(source: Recording, has_pace: bool) -> None:
+    replay = Replay(source)
+    replay.take()
+    assert replay.has_pace is has_pace
+
+
 def test_broken_frames_come_in_their_place_and_at_once() -> None:
     replay = Replay(recording(0.0, 9.0, 18.0, 27.0, broken=[1], wrong=[2]), speed=1.0, clock=Clock())
     replay.due_in()

@@ -119,11 +119,19 @@ def test_a_method_that_cannot_freeze_has_no_button_for_it(handled: HandledPage) 
 
 def test_a_map_from_a_file_has_no_controls_of_a_replay(handled: HandledPage) -> None:
     panel = handled.page.panel
-    assert (list(panel._run.options), panel.speed.visible) == (["Play", "Pause", "Step", "Reset"], True)
+    assert list(panel._run.options) == ["Play", "Pause", "Step", "Reset"]
     handled.take(replace(HELLO, has_frames=False))
-    assert (list(panel._run.options), panel.speed.visible) == (["Reset"], False)
+    assert list(panel._run.options) == ["Reset"]
     assert (list(panel.view.options), panel.view.value) == (["chosen keyframe"], "chosen keyframe")
     assert not panel._page_options.handles["follow"].visible
+
+
+def test_a_speed_is_offered_for_frames_that_have_a_pace(handled: HandledPage) -> None:
+    speed = handled.page.panel.speed
+    status = m.Status("", 1.0, 1, 1, 1, 0, 0.0, 512, 1, 1.0, paused=False, finished=True, pending=False)
+    for factor, name in ((None, None), (2.0, "2x"), (3.0, "3x")):
+        handled.take(replace(status, speed=factor))
+        assert (speed.value if speed.visible else None) == name
 
 
 def test_a_method_that_counts_no_keyframes_is_not_coloured_by_them(handled: HandledPage) -> None:

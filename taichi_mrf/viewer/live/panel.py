@@ -160,8 +160,7 @@ class Panel(BasePanel):
         """Offer what needs frames to come, or that have come: a map from a file can only be opened anew."""
         self._run.options = tuple(RUN_BUTTONS) if has_frames else ("Reset",)
         self.view.options = (CURRENT_CAMERA, CHOSEN_KEYFRAME) if has_frames else (CHOSEN_KEYFRAME,)
-        for widget in (self.speed, self._page_options.handles["follow"]):
-            widget.visible = has_frames
+        self._page_options.handles["follow"].visible = has_frames
 
     def color_by_photo(self) -> None:
         """Show the colours that cameras saw, unless a user has chosen other colours than the first ones."""
@@ -189,8 +188,12 @@ class Panel(BasePanel):
             }
         )
 
-    def _show_speed(self, factor: float) -> None:
+    def _show_speed(self, factor: float | None) -> None:
         """Set the dropdown to the speed in force, also one that only the command line offers."""
+        if self.speed.visible != (factor is not None):
+            self.speed.visible = factor is not None
+        if factor is None:
+            return
         name = next((name for name, each in SPEEDS.items() if each == factor), f"{factor:g}x")
         names = list(SPEEDS) if name in SPEEDS else [*SPEEDS, name]
         if list(self.speed.options) != names:
