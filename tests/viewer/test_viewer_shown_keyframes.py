@@ -4,7 +4,7 @@ import numpy as np
 
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.viewer.messages import KeyframeInfo, KeyframeState
-from taichi_mrf.viewer.scene.shown_keyframes import MOST_FROZEN, MOST_WAYPOINTS, ShownKeyframes
+from taichi_mrf.viewer.scene.keyframe_layer import MOST_FROZEN, MOST_WAYPOINTS, ShownKeyframes
 
 CAMERA = PinholeCamera(8, 6, 5.0, 5.0, 3.5, 2.5)
 
