@@ -146,6 +146,11 @@ def note_maker() -> tuple[Any, str]:
     return getattr(_inner("lang.ast.ast_transformer_utils"), compiler.context), compiler.note
 
 
+def decorators() -> Any:
+    """The module of ``ti.func`` and ``ti.kernel``."""
+    return _inner("lang.kernel_impl")
+
+
 def compilation_error() -> type[Exception]:
     """The exception for source that is not in the language."""
     return getattr(_inner("lang.exception"), f"{title()}CompilationError")

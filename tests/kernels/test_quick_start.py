@@ -1,12 +1,13 @@
-# ruff: noqa: ANN202 - Taichi does not allow `-> None` on a kernel or a func.
-"""Notes of where a part of a kernel stands: short while it compiles, whole in an error."""
+# ruff: noqa: ANN201, ANN202 - Taichi does not allow `-> None` on a kernel or a func.
+"""Notes of where a part of a kernel stands: short while it compiles, whole in an error; kernels that are
+methods."""
 
 import ast
 from typing import Any
 
 import pytest
 
-import taichi_mrf.kernels.bundles  # noqa: F401 - shortens the notes
+import taichi_mrf.kernels.bundles  # noqa: F401 - hastens the compiler
 from taichi_mrf.system import compiler
 from taichi_mrf.system.compiler import ti
 
@@ -36,3 +37,24 @@ def test_notes_are_a_line_and_an_error_shows_the_source(monkeypatch: pytest.Monk
     before = [text for text in noted if text not in str(caught.value)]
     assert before
     assert all(text.count("\n") == 1 and text.startswith(f'File "{__file__}", line ') for text in before)
+
+
+@ti.data_oriented
+class Adder:
+    """Kernels and functions that are methods, which the compiler knows by the line that opens the class."""
+
+    def __init__(self, step: int) -> None:
+        self.step = step
+
+    @ti.func
+    def raised(self, x: ti.i32):
+        return x + self.step
+
+    @ti.kernel
+    def twice_raised(self, x: ti.i32) -> ti.i32:
+        return self.raised(self.raised(x))
+
+
+@pytest.mark.usefixtures("backend")
+def test_methods_are_known_as_such() -> None:
+    assert Adder(3).twice_raised(1) == 7
