@@ -21,14 +21,14 @@ from taichi_mrf import Config, Frame, MRFMap
 from taichi_mrf.benchmark.kernel_floors import FLOORS, Work
 from taichi_mrf.benchmark.keyframe_cost import live_stages, timed, warm_up
 from taichi_mrf.benchmark.launches import count_launches
-from taichi_mrf.kernels import positions
+from taichi_mrf.kernels import quick_start
 from taichi_mrf.system import compiler, runtime
 from taichi_mrf.system.compiler import ti
 
 PACKAGE = str(Path(taichi_mrf.__file__).parent)
 TAICHI = str(Path(ti.__file__).parent)
 WATCH = count_launches.__wrapped__.__code__.co_filename  # type: ignore[attr-defined]
-WITHIN_TAICHI = (WATCH, positions.__file__)
+WITHIN_TAICHI = (WATCH, quick_start.__file__)
 """Files of this package that Taichi calls, or that stand for it: their time is Taichi's."""
 IN_TAICHI = "Taichi: launches, arguments, copies"
 OTHERS = "Python: called by none of these"

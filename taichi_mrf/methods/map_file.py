@@ -28,7 +28,8 @@ from taichi_mrf.sensor.camera import Camera
 from taichi_mrf.sensor.noise import NoiseModel
 from taichi_mrf.sensor.own_evidence import NOTHING, OwnEvidence
 from taichi_mrf.system.npz_file import NpzFile, open_npz
-from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.layout import VOXELS, grid_keys
+from taichi_mrf.voxels.topology import SparseTopology
 
 FORMAT = 3
 """The newest format. Format 2 added the manifest, format 3 cameras that are no pinholes."""
@@ -198,7 +199,7 @@ def read_header(path: Path, file: NpzFile) -> MapHeader:
         place = as_pose(poses[i]), camera, float(stamps[i])
         own = read_evidence(file, f"keyframe_{i}_", camera)
         keyframes.append(StoredKeyframe(id, names[i], depth_m, *place, color, own))
-    next_id = file.scalar("next_id", "i")
+    next_id = file.integers("next_id", (), 0, 2**53).item()
     if len(set(ids.tolist())) < n or not all(0 <= id < next_id for id in ids.tolist()):
         raise MapFileError(f"{path}: damaged: the ids of its keyframes are not valid")
     config, noise = _config(path, file), read_noise(file)
@@ -210,10 +211,17 @@ def read_header(path: Path, file: NpzFile) -> MapHeader:
 
 def read_bricks(path: Path, file: NpzFile) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """The coordinates of a map's bricks, (n, 3), and their beliefs, log-odds (n, 512)."""
-    bricks = file.array("bricks", "i", (None, 3))
-    if len(np.unique(bricks, axis=0)) < len(bricks):
-        raise MapFileError(f"{path}: damaged: a brick appears twice")
-    return bricks.astype(np.int32), file.array("belief", "f", (len(bricks), VOXELS)).astype(np.float32)
+    bricks = read_places(path, file, "bricks")
+    return bricks, file.array("belief", "f", (len(bricks), VOXELS)).astype(np.float32)
+
+
+def read_places(path: Path, file: NpzFile, name: str) -> NDArray[np.int32]:
+    """An array of bricks, (n, 3), each of which a map can hold, and none twice."""
+    span = SparseTopology.HALF_SPAN
+    bricks = file.integers(name, (None, 3), -span, span - 1).astype(np.int32)
+    if len(np.unique(grid_keys(bricks))) < len(bricks):
+        raise MapFileError(f"{path}: damaged: {name} holds a brick twice")
+    return bricks
 
 
 def _up(path: Path, file: NpzFile, keyframes: list[StoredKeyframe]) -> Up | None:

@@ -15,6 +15,7 @@ from taichi_mrf.system.atomic import write_npz
 from taichi_mrf.system.npz_file import NpzFile, open_npz
 from taichi_mrf.voxels.distance_field import VALUES, DistanceField
 from taichi_mrf.voxels.layout import VOXELS
+from taichi_mrf.voxels.topology import SparseTopology
 
 Bricks = NDArray[np.int32]
 LogOdds = NDArray[np.float32]
@@ -105,7 +106,8 @@ def _opened(path: Path) -> Iterator[NpzFile]:
 
 
 def _bricks(file: NpzFile, name: str) -> Bricks:
-    return file.array(name, "i", (None, 3))
+    span = SparseTopology.HALF_SPAN
+    return file.integers(name, (None, 3), -span, span - 1)
 
 
 def _halo(file: NpzFile, bricks: str, log_odds: str) -> Halo:

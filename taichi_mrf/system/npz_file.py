@@ -99,6 +99,15 @@ class NpzFile:
             raise self._problem(name, "holds a character outside Unicode")
         return found
 
+    def integers(self, name: str, shape: Sequence[int | None], least: int, most: int) -> NDArray[Any]:
+        """An array of this shape of whole numbers from ``least`` to ``most``; raises the file's error for any
+        other array."""
+        found = self.array(name, "iu", shape)
+        beyond = (found < least) | (found > most)
+        if beyond.any():
+            raise self._problem(name, f"holds {found[beyond][0]}, which is not from {least} to {most}")
+        return found
+
     def scalar(self, name: str, kinds: str) -> Any:
         """One value of one of these kinds."""
         return self.array(name, kinds, ()).item()

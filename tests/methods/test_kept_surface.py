@@ -99,7 +99,9 @@ def test_it_is_saved_with_the_map(tmp_path: Path) -> None:
     negative = BrickSums(m._kept.share.distances.bricks, -m._kept.share.distances.sums)
     broken.share = RayShare(negative, m._kept.share.votes)
     header = read_contents(tmp_path / "map.npz").header
-    write_contents(tmp_path / "bad.npz", contents_of(header, m._registry, [], m._frozen, kept=broken))
+    write_contents(
+        tmp_path / "bad.npz", contents_of(header, m._registry, m.keyframes.values(), m._frozen, kept=broken)
+    )
     with pytest.raises(MapFileError, match="what frozen keyframes measured"):
         MRFMap.load(tmp_path / "bad.npz")
 

@@ -17,6 +17,7 @@ from taichi_mrf.alignment.surfels import Surfels
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.export.chunk_store import Chunk
 from taichi_mrf.inference.color_sums import ColorShare
+from taichi_mrf.methods.map_file import read_places
 from taichi_mrf.methods.mrf.kept_rays import RayShare
 from taichi_mrf.methods.mrf.storage import (
     color_arrays,
@@ -85,7 +86,7 @@ def read_parked(path: Path, chunk: Chunk, voxel_size: float) -> ParkedChunk:
     """Read a chunk's file back. Raises MapFileError, which names the file and what is wrong."""
     with open_npz(path, MapFileError, "a readable chunk of a map") as file:
         file.check_manifest()
-        bricks = file.array("bricks", "i", (None, 3)).astype(np.int32)
+        bricks = read_places(path, file, "bricks")
         n = len(bricks)
         total, evidence = (
             file.array(name, "f", (n, VOXELS)).astype(np.float32) for name in ("total", "evidence")
@@ -95,18 +96,16 @@ def read_parked(path: Path, chunk: Chunk, voxel_size: float) -> ParkedChunk:
             bricks,
             total,
             evidence,
-            file.array("owners", "i", (n,)).astype(np.int32),
-            file.array("crossed", "i", (None, 3)).astype(np.int32),
+            file.integers("owners", (n,), 1, np.iinfo(np.int32).max).astype(np.int32),
+            read_places(path, file, "crossed"),
             read_dated(file, n),
             Surfels(keys, file.array("surfel_sums", "f", (len(keys), 7)).astype(np.float64), voxel_size),
             read_color_share(path, file, bricks),
             read_rays(path, file),
         )
     for places in (found.bricks, found.crossed, found.rays.distances.bricks, found.rays.votes.bricks):
-        if (places // CHUNK != chunk).any() or len(np.unique(places, axis=0)) < len(places):
-            raise MapFileError(f"{path}: damaged: it names a brick twice, or one of another chunk")
+        if (places // CHUNK != chunk).any():
+            raise MapFileError(f"{path}: damaged: it names a brick of another chunk")
     if (np.diff(found.surfels.keys) <= 0).any() or (found.surfels.cells // CHUNK_VOXELS != chunk).any():
         raise MapFileError(f"{path}: damaged: its surfels are not in order, or of another chunk")
-    if (found.owners < 1).any():
-        raise MapFileError(f"{path}: damaged: a brick has no owner")
     return found

@@ -20,13 +20,14 @@ from taichi_mrf.inference.dated import DatedBelief
 from taichi_mrf.inference.dated_channels import NEVER
 from taichi_mrf.inference.keyframe import Keyframe
 from taichi_mrf.methods.brick_registry import BrickRegistry
-from taichi_mrf.methods.map_file import MapHeader, open_map_file, read_bricks, read_header
+from taichi_mrf.methods.map_file import MapHeader, open_map_file, read_bricks, read_header, read_places
 from taichi_mrf.methods.mrf.coloring import MapColors
 from taichi_mrf.methods.mrf.kept_rays import KeptRays, RayShare
 from taichi_mrf.system.atomic import write_npz
 from taichi_mrf.system.npz_file import NpzFile
 from taichi_mrf.voxels.distance_field import VALUES
 from taichi_mrf.voxels.layout import VOXELS, grid_keys
+from taichi_mrf.voxels.topology import SparseTopology
 
 _SHARE = ("bricks", "numbers", "rg", "bw")
 
@@ -123,27 +124,27 @@ def read_contents(path: Path) -> MapContents:
         header = read_header(path, file)
         bricks, belief = read_bricks(path, file)
         n = len(bricks)
-        frozen_ids = file.array("frozen_ids", "i", (None,)).tolist()
-        contents = MapContents(
+        frozen_ids = file.integers("frozen_ids", (None,), 0, header.next_id - 1).tolist()
+        live = [keyframe.id for keyframe in header.keyframes]
+        if len({*frozen_ids, *live}) < len(frozen_ids) + len(live):
+            raise MapFileError(f"{path}: damaged: frozen_ids holds a keyframe's id twice")
+        return MapContents(
             header,
             bricks,
             belief,
             file.array("evidence", "f", (n, VOXELS)) if "evidence" in file else None,
             file.array("total", "f", (n, VOXELS)).astype(np.float32) if "total" in file else None,
             read_dated(file, n),
-            file.array("frozen_owners", "i", (n,)).astype(np.int32),
-            file.array("frozen_crossed", "i", (None, 3)).astype(np.int32),
+            file.integers("frozen_owners", (n,), 0, len(frozen_ids)).astype(np.int32),
+            read_places(path, file, "frozen_crossed"),
             dict(zip(frozen_ids, file.array("frozen_names", "U", (len(frozen_ids),)).tolist(), strict=True)),
             file.array("parked", "U", (None,)).tolist() if "parked" in file else [],
-            file.array("colors", "u", (n, VOXELS, 4)).astype(np.uint8)
+            file.integers("colors", (n, VOXELS, 4), 0, 255).astype(np.uint8)
             if "colors" in file
             else np.zeros((0, VOXELS, 4), np.uint8),
             read_color_share(path, file, bricks),
             read_rays(path, file),
         )
-    if (contents.frozen_owners < 0).any():
-        raise MapFileError(f"{path}: damaged: frozen_owners holds a negative number")
-    return contents
 
 
 def dated_arrays(belief: NDArray[np.float32], stamps: NDArray[np.float64]) -> dict[str, NDArray]:
@@ -170,16 +171,16 @@ def read_color_share(path: Path, file: NpzFile, bricks: NDArray[np.int32]) -> Co
     """The same from a file whose bricks (n, 3) are given. Raises MapFileError if it names others."""
     if "frozen_color_numbers" not in file:
         return ColorShare.nothing()
-    numbers = file.array("frozen_color_numbers", "i", (None,)).astype(np.int32)
-    n = len(numbers)
+    numbers = file.integers("frozen_color_numbers", (None,), 0, VOXELS - 1).astype(np.int32)
+    n, span = len(numbers), SparseTopology.HALF_SPAN
     share = ColorShare(
-        file.array("frozen_color_bricks", "i", (n, 3)).astype(np.int32),
+        file.integers("frozen_color_bricks", (n, 3), -span, span - 1).astype(np.int32),
         numbers,
         file.array("frozen_color_rg", "i", (n,)).astype(np.int64),
         file.array("frozen_color_bw", "i", (n,)).astype(np.int64),
     )
     known = np.isin(grid_keys(share.bricks), grid_keys(bricks)).all()
-    if not known or ((numbers < 0) | (numbers >= VOXELS)).any() or (share.bw <= 0).any():
+    if not known or (share.bw <= 0).any():
         raise MapFileError(f"{path}: damaged: the colours of frozen keyframes are not those of its voxels")
     return share
 
@@ -201,11 +202,8 @@ def read_rays(path: Path, file: NpzFile) -> RayShare:
 def _read_sums(path: Path, file: NpzFile, name: str, values: int) -> BrickSums:
     if f"frozen_{name}_bricks" not in file:
         return BrickSums.nothing(values)
-    bricks = file.array(f"frozen_{name}_bricks", "i", (None, 3)).astype(np.int32)
-    sums = file.array(f"frozen_{name}_sums", "i", (len(bricks), VOXELS, values))
-    beyond = (np.abs(sums.astype(np.int64)) > LARGEST).any() or (
-        values == VALUES and (sums[..., 0] < 0).any()
-    )
-    if beyond or (np.diff(grid_keys(bricks)) <= 0).any():
+    bricks = read_places(path, file, f"frozen_{name}_bricks")
+    sums = file.integers(f"frozen_{name}_sums", (len(bricks), VOXELS, values), -LARGEST, LARGEST)
+    if (values == VALUES and (sums[..., 0] < 0).any()) or (np.diff(grid_keys(bricks)) <= 0).any():
         raise MapFileError(f"{path}: damaged: what frozen keyframes measured is not in order")
     return BrickSums(bricks, sums.astype(np.int32))
