@@ -1,9 +1,9 @@
-"""What a map calls occupied, by marginal, by the rays' vote and calibrated, against what its omega answers.
+"""What a map calls occupied, by its marginals, states and calibrated probabilities, beside what rays end on.
 
-Every pixel of held-out views follows its ray to the first voxel that is called occupied, and is judged as
-omega's answer is (evaluation/accuracy.py). Beside that, how far the probabilities can be trusted: their
-reliability on the voxels that measured rays saw, without and with those behind the surface, for the
-calibrated reading and for marginals.
+Every pixel of held-out views follows its ray to the first voxel that is called occupied, and is judged as the
+answers by the measured surface and by omega are (evaluation/accuracy.py). Beside that, how far the
+probabilities can be trusted: their reliability on the voxels that measured rays saw, without and with those
+behind the surface, for calibrated probabilities and for marginals.
 """
 
 from collections.abc import Callable
@@ -63,7 +63,7 @@ Judged = tuple[Scene, TriangleMesh]
 
 
 def run_readings(experiment: Experiment) -> tuple[list[Table], list[Path]]:
-    """One table of readings and one of marginals."""
+    """One table of what is occupied and one of probabilities."""
     makers: tuple[Callable[[], Judged], ...] = (
         lambda: _house(experiment, "Kinect"),
         lambda: _house(experiment, "D435"),
@@ -82,7 +82,7 @@ def run_readings(experiment: Experiment) -> tuple[list[Table], list[Path]]:
         for number, voxel_size in enumerate(experiment.voxel_sizes):
             experiment.report(scene.name, number, len(experiment.voxel_sizes))
             figures = experiment.ledger.result(
-                fold_key(scene, 0, contender, voxel_size, f"{len(scene.views)} views, three readings"),
+                fold_key(scene, 0, contender, voxel_size, f"{len(scene.views)} views, by answer"),
                 lambda c=contender, s=scene, t=mesh, size=voxel_size: _figures(c, s, t, size),  # type: ignore[misc]
             )
             head: list[Entry] = [f"{voxel_size * 100:g} cm", scene.name]
@@ -91,8 +91,8 @@ def run_readings(experiment: Experiment) -> tuple[list[Table], list[Path]]:
     tables = [
         Table(
             "readings",
-            "What is called occupied, and omega's answer",
-            ["voxels", "scene", "reading", "1.5sigma", "5cm", "unanswered", "precision",
+            "What is called occupied, and what rays end on",
+            ["voxels", "scene", "answer", "1.5sigma", "5cm", "unanswered", "precision",
              "recall"],
             readings,
             ["Precision and recall are of the voxels called occupied, as in Table II."],
@@ -100,7 +100,7 @@ def run_readings(experiment: Experiment) -> tuple[list[Table], list[Path]]:
         Table(
             "trust",
             "How far probabilities can be trusted",
-            ["voxels", "scene", "reading", "judged", "precision", "recall",
+            ["voxels", "scene", "probability", "judged", "precision", "recall",
              "log-likelihood", "largest gap", *(f"{i / BINS:g}" for i in range(BINS))],
             trust,
             ["The last columns: observed share minus mean probability in each bin of at least "
@@ -120,10 +120,15 @@ def _figures(contender: Any, scene: Scene, mesh: TriangleMesh, voxel_size: float
     truth = _truth(scene, mesh, keyframes, voxel_size)
     centres, occupied = _seen(truth, scene)
     behind = _hidden(truth, m)
-    maps: dict[str, MRFMap | MapReading] = {"marginal": m}
-    if contender.name == "rho 1":
-        maps |= {"surface": m.decided, "calibrated": m.calibrated()}
-    readings: list[list[Entry]] = [["omega", *_accuracy(m, scene, judged, m.view), None, None]]
+    maps: dict[str, MRFMap | MapReading] = {
+        "marginal": m,
+        "occupied": m.decided,
+        "calibrated": m.calibrated(),
+    }
+    readings: list[list[Entry]] = [
+        ["surface", *_accuracy(m, scene, judged, None), None, None],
+        ["omega", *_accuracy(m, scene, judged, m.view), None, None],
+    ]
     trust: list[list[Entry]] = []
     for name, shown in maps.items():
         p = shown.occupancy(centres).astype(np.float64)
@@ -131,7 +136,7 @@ def _figures(contender: Any, scene: Scene, mesh: TriangleMesh, voxel_size: float
         found = float((called & occupied).sum())
         precision, recall = found / max(1, called.sum()), found / occupied.sum()
         readings.append([name, *_accuracy(m, scene, judged, _solid(m, shown)), precision, recall])
-        if name != "surface":
+        if name != "occupied":
             trust.append([name, "seen", *_trust(p, occupied, m.prior)])
             p = np.concatenate([p, shown.occupancy(behind)])
             trust.append([name, "all", *_trust(p, np.append(occupied, np.zeros(len(behind), bool)), m.prior)])
@@ -161,8 +166,9 @@ def _solid(m: MRFMap, shown: MRFMap | MapReading) -> View:
     return MapReading(m, solid).view.with_occlusion(empty_below=0.0)
 
 
-def _accuracy(m: MRFMap, scene: Scene, judged: list[int], view: View) -> list[float]:
-    """Means over views: within 1.5 voxels, within 5 cm, unanswered."""
+def _accuracy(m: MRFMap, scene: Scene, judged: list[int], view: View | None) -> list[float]:
+    """Means over views: within 1.5 voxels, within 5 cm, unanswered; by the measured surface without a
+    ``view``."""
     found = []
     for index in judged:
         each = scene.views[index]
