@@ -19,18 +19,22 @@ MOST_PIXELS = 1 << 27
 
 
 def read_depth(
-    path: Path, steps_per_metre: float, sentinel: int | None = None, camera: PinholeCamera | None = None
+    path: Path, steps_per_metre: float, camera: PinholeCamera | None = None
 ) -> NDArray[np.float32]:
     """Axial depth in metres, (H, W) float32, from a 16-bit grey image; 0 means no measurement.
 
-    ``sentinel`` is a second value that means no measurement. Raises DatasetError, whose text names the file,
-    for an image that is missing, damaged, no 16-bit grey image, or of another size than the camera's.
+    Raises DatasetError, whose text names the file, for an image that is missing, damaged, no 16-bit grey
+    image, or of another size than the camera's.
     """
-    image = decode_16_bit(_image_file(path), str(path), camera)
-    depth_m = image.astype(np.float32) / np.float32(steps_per_metre)
-    if sentinel is not None:
-        depth_m[image == sentinel] = 0.0
-    return depth_m
+    return decode_16_bit(_image_file(path), str(path), camera).astype(np.float32) / np.float32(
+        steps_per_metre
+    )
+
+
+def measured(steps: NDArray[np.unsignedinteger]) -> NDArray[np.unsignedinteger]:
+    """Depth in whole steps with 0 where there is no measurement: in no format is the largest value of the
+    type one. Cameras and drivers write it for what is too far, too near or unknown."""
+    return np.where(steps == np.iinfo(steps.dtype).max, steps.dtype.type(0), steps)
 
 
 def read_color(path: Path, camera: PinholeCamera | None = None) -> NDArray[np.uint8]:
@@ -51,8 +55,9 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def decode_16_bit(data: bytes, where: str, camera: PinholeCamera | None = None) -> NDArray[np.uint16]:
-    """The grey values, (H, W) uint16, of an encoded image. Raises DatasetError, whose text begins with
-    ``where``, if it is damaged, no 16-bit grey image, or of another size than the camera's."""
+    """Depth in steps, (H, W) uint16, of an encoded image, 0 where there is no measurement. Raises
+    DatasetError, whose text begins with ``where``, if it is damaged, no 16-bit grey image, or of another size
+    than the camera's."""
     image = _decode(data, where, cv2.IMREAD_UNCHANGED, camera)
     if image.ndim != 2 or image.dtype != np.uint16:
         channels = 1 if image.ndim == 2 else image.shape[2]
@@ -60,7 +65,7 @@ def decode_16_bit(data: bytes, where: str, camera: PinholeCamera | None = None) 
             f"{where}: not a depth image: expected 16-bit grey, "
             f"found {8 * image.dtype.itemsize}-bit with {channels} channel{'s' if channels > 1 else ''}"
         )
-    return image
+    return measured(image)
 
 
 def decode_unchanged(data: bytes, where: str) -> NDArray:

@@ -43,9 +43,9 @@ class Recording(Dataset):
     """Frames in files, read on request.
 
     ``steps_per_metre`` is the scale of the depth images and ``scale_source`` where it comes from; if it is
-    ``scale_assumed``, no file says so and :meth:`check_scale` may find another. ``sentinel`` is a value of
-    the images that means no measurement (beside 0). ``color_camera`` took the colour images, unless they are
-    registered to depth. ``confidence`` tells what images of confidence mean, where there are some.
+    ``scale_assumed``, no file says so and :meth:`check_scale` may find another. ``color_camera`` took the
+    colour images, unless they are registered to depth. ``confidence`` tells what images of confidence mean,
+    where there are some.
     """
 
     camera: PinholeCamera
@@ -53,7 +53,6 @@ class Recording(Dataset):
     steps_per_metre: float = 1000.0
     scale_source: str = "the format's"
     scale_assumed: bool = False
-    sentinel: int | None = None
     color: bool = True
     color_camera: ColorCamera | None = None
     confidence: Confidence | None = None
@@ -104,7 +103,7 @@ class Recording(Dataset):
             raise FrameError(f"frame {recorded.name}: {error}") from error
         color = sigma_m = None
         try:
-            depth_m = read_depth(recorded.depth_file, self.steps_per_metre, self.sentinel, self.camera)
+            depth_m = read_depth(recorded.depth_file, self.steps_per_metre, self.camera)
             if self.color and recorded.color_file is not None:
                 color = self._read_color(recorded.color_file, depth_m)
             if self.confidence is not None and recorded.confidence_file is not None:
@@ -141,7 +140,7 @@ class Recording(Dataset):
         found = gather(
             len(self.frames) if poses_are_used else min(1, len(self.frames)),
             lambda index: self.frames[index].read_pose(),
-            lambda index: read_depth(self.frames[index].depth_file, 1.0, self.sentinel, self.camera),
+            lambda index: read_depth(self.frames[index].depth_file, 1.0, self.camera),
             self.camera,
             tuple(dict.fromkeys((own, *USUAL))),
         )

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.trajectories import read_trajectory, rotation_of
-from taichi_mrf.errors import DatasetError, KeyframeError
+from taichi_mrf.datasets.trajectories import read_trajectory, rotation_of, valid_poses
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 
 INTERPOLATION_GAP = 0.1
@@ -131,15 +131,10 @@ def read_timed_poses(path: Path) -> TimedPoses:
     """A file of ``stamp tx ty tz qx qy qz qw`` lines (TUM RGB-D), T_world_camera.
 
     The lines may come in any order; a blank or a comma separates values. Raises DatasetError, whose text
-    names the file and the line, if it is missing, of another layout, or contains an invalid pose.
+    names the file and the line, if it is missing, of another layout, or contains no valid pose; warns of
+    invalid ones, which are left out.
     """
     trajectory = read_trajectory(path)
     if trajectory.layout != "stamped":
         raise DatasetError(f"{path}: poses without stamps; expected stamp tx ty tz qx qy qz qw on each line")
-    poses = []
-    for pose in trajectory.poses:
-        try:
-            poses.append(pose.T_world_camera())
-        except KeyframeError as error:
-            raise DatasetError(f"{pose.source}: {error}") from error
-    return TimedPoses([pose.key for pose in trajectory.poses], poses)
+    return TimedPoses(*valid_poses(trajectory))

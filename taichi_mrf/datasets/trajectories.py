@@ -5,12 +5,13 @@
 - ``log``: Choi's format (Redwood): a line of three integers, the first being the frame's number, then
   the four rows of the 4 x 4 matrix
 
-Lines that are empty or start with ``#`` are left out. A broken layout is an error at
-once; a pose that is not a rigid transform is an error only when that pose is read, so that a recording
-with one bad pose can still be used.
+A blank, a comma, a semicolon or a tab separates numbers. Lines that are empty or start with ``#`` are left
+out, and so is a first line of words, which names the columns. A broken layout is an error at once; a pose
+that is not a rigid transform is an error only when that pose is read, so that a recording with one bad pose
+can still be used.
 """
 
-import io
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
-from taichi_mrf.system.files import is_file, open_regular, read_text
+from taichi_mrf.system.files import decoded, is_file, open_regular, read_text
 
 Layout = Literal["stamped", "rows", "log"]
 Line = tuple[int, list[float]]
@@ -76,13 +77,31 @@ def read_trajectory(path: Path) -> Trajectory:
     )
 
 
+def valid_poses(trajectory: Trajectory) -> tuple[list[float], list[Pose]]:
+    """The keys of the poses that are rigid transforms, and these, (4, 4). Where tracking was lost, programs
+    write NaN or zeros: warns of how many are left out. Raises DatasetError if all are."""
+    keys, poses, problems = [], [], []
+    for pose in trajectory.poses:
+        try:
+            poses.append(pose.T_world_camera())
+            keys.append(pose.key)
+        except KeyframeError as error:
+            problems.append(f"{pose.source}: {error}")
+    if not poses:
+        raise DatasetError(problems[0])
+    if problems:
+        left_out = f"{len(problems)} of {len(trajectory.poses)} poses of {trajectory.path} are left out"
+        warnings.warn(f"{left_out}, first {problems[0]}", stacklevel=2)
+    return keys, poses
+
+
 def is_trajectory(path: Path) -> bool:
     """Whether the first lines of a text file look like one of the layouts."""
     try:
         with open_regular(path, DatasetError) as file:
             # Of a file without line ends, no more than this is read either.
-            lines = [line.decode("utf-8") for line in io.BytesIO(file.read(1 << 16)).readlines(4096)]
-        head = [_numbers(line) for line in lines if _content(line)][:5]
+            lines = decoded(file.read(1 << 16), "ignore").splitlines()
+        head = [_numbers(line) for _, line in _content(lines)[:5]]
     except (DatasetError, ValueError):
         return False
     columns = [len(numbers) for numbers in head]
@@ -164,20 +183,33 @@ def _expect(path: Path, line: Line, count: int) -> None:
 
 
 def _read_numbers(path: Path) -> list[Line]:
-    text = read_text(path, DatasetError)
     lines = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        if _content(line):
-            try:
-                lines.append((number, _numbers(line)))
-            except ValueError:
-                raise DatasetError(f"{path} line {number}: contains something that is not a number") from None
+    for number, line in _content(read_text(path, DatasetError).splitlines()):
+        try:
+            lines.append((number, _numbers(line)))
+        except ValueError:
+            raise DatasetError(f"{path} line {number}: contains something that is not a number") from None
     return lines
 
 
-def _content(line: str) -> bool:
-    return bool(line.strip()) and not line.lstrip().startswith("#")
+def _content(lines: list[str]) -> list[tuple[int, str]]:
+    """The lines that hold numbers, with their own (from 1)."""
+    found = [(n, line) for n, line in enumerate(lines, start=1) if line.strip() and line.lstrip()[0] != "#"]
+    names_columns = found and not any(map(_is_number, _words(found[0][1])))
+    return found[1:] if names_columns else found
+
+
+def _words(line: str) -> list[str]:
+    return line.replace(",", " ").replace(";", " ").split()
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _numbers(line: str) -> list[float]:
-    return [float(word) for word in line.replace(",", " ").split()]
+    return [float(word) for word in _words(line)]

@@ -5,6 +5,7 @@ opened. The tests for a path answer False where the system would raise, such as 
 opening such a path gives the reason.
 """
 
+import codecs
 import os
 import stat
 from collections.abc import Callable
@@ -104,10 +105,16 @@ def read_text(
     missing: str = "there is no such file",
     most_bytes: int | None = None,
 ) -> str:
-    """A UTF-8 text file, its line ends as ``\\n``. Raises as :func:`read_bytes` does, and ``error`` for a
-    file that is no text."""
+    """A text file, its line ends as ``\\n``. Raises as :func:`read_bytes` does, and ``error`` for a file that
+    is no text."""
     try:
-        text = read_bytes(path, error, missing, most_bytes).decode("utf-8")
+        text = decoded(read_bytes(path, error, missing, most_bytes))
     except UnicodeDecodeError as problem:
         raise error(f"{path}: not a text file: {problem}") from problem
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def decoded(data: bytes, errors: str = "strict") -> str:
+    """UTF-8, or UTF-16 with a byte-order mark, without the mark. Raises UnicodeDecodeError."""
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return data.decode("utf-16" if wide else "utf-8-sig", errors)

@@ -1,6 +1,7 @@
 """Recordings written in every folder format are recognised and come back as they were written."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -8,15 +9,22 @@ import pytest
 from datasets_recordings import (
     CAMERA_TXT,
     Content,
+    arrays,
     stamped_line,
     write_log,
+    write_npz,
     write_numbered,
+    write_replica,
     write_rows,
+    write_scannet,
     write_seven_scenes,
     write_tum,
 )
+from inputs_bags import writing
+from rtabmap_database import rvl
 
 from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.datasets.rtabmap.depth import decode_depth
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -151,12 +159,55 @@ def test_camera_files(tmp_path: Path, file: str, text: str, expected: PinholeCam
     assert dataset.read(1).depth_m.shape == (12, 16)
 
 
-def test_seven_scenes_sentinel_and_order(tmp_path: Path) -> None:
+def write_steps(folder: Path, content: Content) -> Path:
+    """An .npz of whole numbers."""
+    whole = {"depth_m": np.stack(content.depth), "depth_scale": np.array(1000.0)}
+    return write_npz(folder.with_suffix(".npz"), arrays(content) | whole)
+
+
+def write_bag(packed: bool, folder: Path, content: Content) -> Path:
+    """A ROS 1 bag with the depth images of a recording, as they are or packed."""
+    path = folder.with_suffix(".bag")
+    with writing(path, "ros1") as bag:
+        bag.camera_info("/depth/camera_info", "optical", CAMERA)
+        for i, image in enumerate(content.depth):
+            if packed:
+                bag.compressed_depth("/depth/image/compressedDepth", 1 + 0.1 * i, "optical", image)
+            else:
+                bag.image("/depth/image", 1 + 0.1 * i, "optical", image, "16UC1")
+            bag.pose_stamped("/pose", 1 + 0.1 * i, "map", content.poses[i])
+    return path
+
+
+WHOLE_NUMBERS: dict[str, Callable[[Path, Content], Path]] = {
+    **{name: writer for name, (writer, _, _) in FORMATS.items()},
+    "scannet": write_scannet,
+    "replica": lambda folder, content: write_replica(folder, content, folder.parent / "cam_params.json"),
+    "npz": write_steps,
+    "bag": partial(write_bag, False),
+    "bag, packed": partial(write_bag, True),
+}
+
+
+@pytest.mark.parametrize("name", WHOLE_NUMBERS)
+def test_the_largest_number_is_no_measurement_in_any_format(tmp_path: Path, name: str) -> None:
+    content = Content(2)
+    for image in content.depth:
+        image[3, 4:7] = 65535, 65534, 65535
+    for frame in open_dataset(WHOLE_NUMBERS[name](tmp_path / "recording", content)):
+        assert frame.depth_m[3, 5] > 6
+        assert np.flatnonzero(frame.depth_m == 0).tolist() == [0, 3 * 16 + 4, 3 * 16 + 6]
+
+
+def test_the_largest_number_is_no_measurement_in_a_packed_image() -> None:
+    image = np.array([[500, 65535], [65534, 0]], np.uint16)
+    np.testing.assert_allclose(decode_depth(rvl(image), "image", 1000.0), [[0.5, 0], [65.534, 0]])
+
+
+def test_seven_scenes_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     content = Content(12)
-    content.depth[11][3, 4] = 65535
     dataset = open_dataset(write_seven_scenes(tmp_path, content))
     assert list(dataset.frame_names[:3]) == ["frame-000000", "frame-000010", "frame-000020"]
-    assert dataset.read(11).depth_m[3, 4] == 0
     assert dataset.read(11).stamp == pytest.approx(110 / 30)
 
 

@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.trajectories import is_trajectory, read_matrix_file, read_trajectory
+from taichi_mrf.datasets.trajectories import is_trajectory, read_matrix_file, read_trajectory, valid_poses
 from taichi_mrf.errors import DatasetError, KeyframeError
 
 
@@ -129,9 +129,32 @@ def test_a_bad_pose_fails_alone_and_knows_its_line(tmp_path: Path, line: str, pr
         np.testing.assert_array_equal(good.T_world_camera()[:3, 3], [1, 2, 3])
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize(("separator", "end"), [(" ", "\n"), (",", "\r\n"), (";", "\n"), ("\t", "\r")])
+@pytest.mark.parametrize("head", ["", "# stamp tx ty tz\n", "timestamp,tx,ty,tz,qx,qy,qz,qw\n"])
+def test_tables_of_other_programs_are_read(
+    tmp_path: Path, encoding: str, separator: str, end: str, head: str
+) -> None:
+    path = tmp_path / "poses.txt"
+    text = head + f"{GOOD}\n2{GOOD[1:]}\n".replace(" ", separator)
+    path.write_bytes(text.replace("\n", end).encode(encoding))
+    assert is_trajectory(path)
+    assert [pose.key for pose in read_trajectory(path).poses] == [0, 2]
+
+
+def test_poses_of_a_lost_camera_are_left_out_with_a_warning(tmp_path: Path) -> None:
+    lost = "1 nan nan nan nan nan nan nan"
+    path = write(tmp_path / "poses.txt", GOOD, lost, f"2{GOOD[1:]}", "3 0 0 0 0 0 0 0")
+    with pytest.warns(UserWarning, match=r"2 of 4 poses of .* are left out, first .*txt line 2: .*NaN"):
+        keys, poses = valid_poses(read_trajectory(path))
+    assert (keys, len(poses)) == ([0, 2], 2)
+    with pytest.raises(DatasetError, match=r"line 1: .*not finite"):
+        valid_poses(read_trajectory(write(path, lost)))
+
+
 def test_a_file_that_is_no_text_or_not_there(tmp_path: Path) -> None:
     binary = tmp_path / "poses.txt"
-    binary.write_bytes(b"\xff\xfe\x00\x81")
+    binary.write_bytes(b"\x00\xff\xfe\x81")
     with pytest.raises(DatasetError, match=r"poses\.txt: not a text file"):
         read_trajectory(binary)
     with pytest.raises(DatasetError, match=r"none\.txt: there is no such file"):

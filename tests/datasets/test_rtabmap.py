@@ -111,7 +111,7 @@ def test_depth_may_be_float_and_smaller_than_the_colour_image(tmp_path: Path) ->
 
 def test_depth_may_be_packed_as_rvl_or_inverse(tmp_path: Path) -> None:
     holes = np.where(RANDOM.random(CAMERA.shape) < 0.4, 0, DEPTH[0]).astype(np.uint16)
-    holes[-1] = 65535
+    holes[-1] = 65534
     for image in (DEPTH[0], holes, np.zeros_like(holes)):
         np.testing.assert_array_equal(decode_depth(rvl(image), "here", 1.0), image.astype(np.float32))
         data = rvl(image)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset, Format, start_pose
+from taichi_mrf.datasets.images import measured
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeError
 from taichi_mrf.geometry.poses import as_pose
@@ -76,7 +77,8 @@ class FramesNpz(Dataset):
             raise FrameError(f"frame {name}: {part.path}: {POSE}: {error}") from error
         except DatasetError as error:
             raise FrameError(f"frame {name}: {error}") from error
-        depth_m = depth[i].astype(np.float32) / np.float32(part.steps_per_metre)
+        values = measured(depth[i]) if depth.dtype.kind == "u" else depth[i]
+        depth_m = values.astype(np.float32) / np.float32(part.steps_per_metre)
         depth_m[~np.isfinite(depth_m) | (depth_m < 0)] = 0.0
         image = None if color is None else color[i]
         return Frame(depth_m, T_world_camera, self.camera, float(part.stamps[i]), name, image)

@@ -38,7 +38,6 @@ COLOR = ColorCamera(
 """Found on 20 frames of the red kitchen: the gradient of the colour image at edges of depth is 2.6 times its
 mean, and without registration 1.4 times. The angles are so small that their sines stand for them."""
 STEPS_PER_METRE = 1000.0
-NO_DEPTH = 65535
 FRAMES_PER_SECOND = 30.0
 
 _FILE = re.compile(r"(frame-(\d+))\.(depth\.png|pose\.txt)")
@@ -71,7 +70,6 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         frames=frames,
         steps_per_metre=options.depth_scale or STEPS_PER_METRE,
         scale_source="--depth-scale" if options.depth_scale else NAME,
-        sentinel=NO_DEPTH,
         color=options.color,
         color_camera=COLOR if camera == CAMERA else None,
     )

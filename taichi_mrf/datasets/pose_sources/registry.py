@@ -13,22 +13,16 @@ from taichi_mrf.datasets.pose_sources.graph_file import SUFFIXES, is_pose_graph,
 from taichi_mrf.datasets.pose_sources.watched import WatchedFile
 from taichi_mrf.datasets.ros.pose_history import KIND as BAG
 from taichi_mrf.datasets.rtabmap.recording import KIND as RTABMAP
-from taichi_mrf.datasets.trajectories import Trajectory, read_trajectory
-from taichi_mrf.errors import DatasetError, KeyframeError
-from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.datasets.trajectories import Trajectory, read_trajectory, valid_poses
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.system.files import exists, is_folder
 
 
 def _poses_in(trajectory: Trajectory) -> ChangedPoses:
-    """The poses of a trajectory by stamp, or by number. Raises DatasetError, which names the line."""
-    poses: dict[FrameKey, Pose] = {}
-    for pose in trajectory.poses:
-        key: FrameKey = float(pose.key) if trajectory.layout == "stamped" else int(pose.key)
-        try:
-            poses[key] = pose.T_world_camera()
-        except KeyframeError as error:
-            raise DatasetError(f"{pose.source}: {error}") from error
-    return poses
+    """The valid poses of a trajectory by stamp, or by number. Raises DatasetError if there is none."""
+    keys, poses = valid_poses(trajectory)
+    kind: type[FrameKey] = float if trajectory.layout == "stamped" else int
+    return dict(zip(map(kind, keys), poses, strict=True))
 
 
 def _watched(read: Callable[[Path], ChangedPoses]) -> Callable[[Path, str], PoseSource]:

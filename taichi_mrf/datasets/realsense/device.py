@@ -16,6 +16,7 @@ from typing import Any, overload
 import numpy as np
 
 from taichi_mrf.datasets.base import BuiltIn, Dataset, start_pose
+from taichi_mrf.datasets.images import measured
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.realsense.motion import MotionModule, motion_or_note, recorded_motion
 from taichi_mrf.datasets.realsense.recorded import Player, RealSenseRecording, aligned_images
@@ -124,7 +125,7 @@ class RealSenseCamera(Dataset):
         self.misses = 0
         if steps.shape != self.camera.shape:
             raise FrameError(f"{name}: the image has the shape {steps.shape}, not {self.camera.shape}")
-        depth_m = (steps * np.float32(self.depth_scale)).astype(np.float32)
+        depth_m = (measured(steps) * np.float32(self.depth_scale)).astype(np.float32)
         stamp, gyro, acceleration = image.get_timestamp() / 1000.0, None, None
         if self.motion is not None:
             clock = image.get_frame_timestamp_domain()

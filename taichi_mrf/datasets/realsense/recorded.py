@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.images import measured
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.acceleration import AccelerationSamples
@@ -145,6 +146,6 @@ class RealSenseRecording(Dataset):
         steps = np.asanyarray(image.get_data())
         if steps.shape != self.camera.shape:
             raise FrameError(f"frame {name}: the image has the shape {steps.shape}, not {self.camera.shape}")
-        depth_m = (steps * np.float32(self.player.depth_scale)).astype(np.float32)
+        depth_m = (measured(steps) * np.float32(self.player.depth_scale)).astype(np.float32)
         parts = (self.poses[index], self.camera, wanted.stamp, name, color)
         return Frame(depth_m, *parts, gyro=self.gyro, acceleration=self.acceleration)

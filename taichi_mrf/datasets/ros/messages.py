@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.images import PNG_SIGNATURE, decode_16_bit, decode_color
+from taichi_mrf.datasets.images import PNG_SIGNATURE, decode_16_bit, decode_color, measured
 from taichi_mrf.datasets.options import DISTORTION_COUNTS
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
 from taichi_mrf.errors import ConfigError, DatasetError
@@ -83,7 +83,8 @@ def _raw(message: Any) -> tuple[NDArray, float]:
         raise DatasetError(f"encoding {message.encoding!r} is not depth; supported are {ENCODINGS}")
     kind, steps = kinds[message.encoding]
     dtype = np.dtype(f"{'>' if message.is_bigendian else '<'}{kind}")
-    return _rows(message, dtype.itemsize).view(dtype), steps
+    values = _rows(message, dtype.itemsize).view(dtype)
+    return (measured(values) if kind == "u2" else values), steps
 
 
 def _rows(message: Any, pixel_bytes: int) -> NDArray[np.uint8]:

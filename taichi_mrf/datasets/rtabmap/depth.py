@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.image_header import PNG_SIGNATURE, claimed_size
-from taichi_mrf.datasets.images import MOST_PIXELS, decode_16_bit, decode_unchanged
+from taichi_mrf.datasets.images import MOST_PIXELS, decode_16_bit, decode_unchanged, measured
 from taichi_mrf.errors import DatasetError
 
 RVL, INVERSE = b"DEPTHRVL", b"DEPTHINV"
@@ -76,7 +76,7 @@ def _whole(data: bytes, where: str) -> NDArray[np.uint16]:
         pixels[np.concatenate(places)] = np.cumsum((zigzag >> 1) ^ -(zigzag & 1))
     if pixels.min(initial=0) < 0 or pixels.max(initial=0) > np.iinfo(np.uint16).max:
         raise DatasetError(f"{where}: the image is damaged (a depth out of range)")
-    return pixels.astype(np.uint16).reshape(size[1], size[0])
+    return measured(pixels.astype(np.uint16)).reshape(size[1], size[0])
 
 
 def _whole_numbers(data: bytes) -> NDArray[np.int64]:
