@@ -1,6 +1,7 @@
 """Run the test suite once for each backend that there is here: the CPU with all tests, the others with
 those that are marked `backends`, `compilers` or `smoke`. Where a second compiler of kernels is installed, the
-CPU's tests that are marked `compilers` or `smoke` run with that too.
+CPU's tests that are marked `compilers` or `smoke` run with that too, and all of these with kernels that are
+optimised as users have them: the CPU's other tests do without, because it takes most of their time.
 
     python tests/backends.py [options of pytest]
 
@@ -21,6 +22,8 @@ from taichi_mrf.system import compiler, runtime
 
 PROCESSES = 3
 
+OPTIMISED = "cpu, with kernels as users have them"
+
 Run = tuple[str, subprocess.Popen[bytes], IO[bytes]]
 
 
@@ -40,7 +43,8 @@ def main() -> int:
         share = [*command, first, f"--queue={queue}"]  # one word: pytest takes a folder for tests
         beside = {arch: [*command, arch] for arch in others}
         beside |= {_name(first, number): share for number in range(2, PROCESSES + 1)}
-        beside |= {name: [*command, "cpu", "-m", "compilers or smoke"] for name in _other_compilers()}
+        whole = [*command, "cpu", "--optimised", "-m", "compilers or smoke"]
+        beside |= {name: whole for name in (OPTIMISED, *_other_compilers())}
         runs = []
         for name, its_command in beside.items():
             output = stack.enter_context(tempfile.TemporaryFile())

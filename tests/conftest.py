@@ -19,7 +19,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from taichi_mrf.errors import BackendError
-from taichi_mrf.system import runtime
+from taichi_mrf.system import compiler, runtime
 
 SETTINGS_OF_A_TEST = "_hypothesis_internal_use_settings"
 """Where hypothesis keeps what @settings said; it has no public way to ask."""
@@ -50,6 +50,20 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="store_true",
         help="leave out tests that start Taichi or a process, but run the smoke test of each mapping method",
     )
+
+    parser.addoption(
+        "--optimised",
+        action="store_true",
+        help="compile kernels as users have them; the CPU's are compiled without optimisation otherwise",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Most of a run is the compiling of kernels, and two thirds of that are optimisations. Runs on other
+    backends, and one of the CPU's in tests/backends.py, have them. Processes that tests start do as this one."""
+    chosen = ("optimised", "quick")
+    if config.getoption("--arch") == "cpu" and not any(map(config.getoption, chosen)):
+        os.environ.setdefault(compiler.variable("ADVANCED_OPTIMIZATION"), "0")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

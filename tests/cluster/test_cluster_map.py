@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from cluster_dask import dask_cluster
 from taichi_mrf.cli.main import main
 from taichi_mrf.cli.map.process import Outcome
 from taichi_mrf.cli.map.summary import summary_line, summary_row
+from taichi_mrf.system import compiler
 
 SOURCES = tuple(f"synthetic:room?frames={frames}&width=80&height=60" for frames in (3, 4, 5))
 NAMES = tuple(f"synthetic_room_frames_{frames}_width_80_height_60" for frames in (3, 4, 5))
@@ -76,6 +77,14 @@ def child_in_the_middle(parent: int, out: Path, program: "subprocess.Popen[str]"
     child = wait_for(psutil.Process(parent).children, program)[0]
     child.send_signal(signal.SIGSTOP)
     return child
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """For all processes: each number of threads has compiled kernels of its own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(compiler.variable("CPU_MAX_NUM_THREADS"), "1")
+        yield
 
 
 @pytest.fixture(scope="module")
