@@ -44,7 +44,7 @@ def main() -> int:
         beside = {arch: [*command, arch] for arch in others}
         beside |= {_name(first, number): share for number in range(2, PROCESSES + 1)}
         whole = [*command, "cpu", "--optimised", "-m", "compilers or smoke"]
-        beside |= {name: whole for name in (OPTIMISED, *_other_compilers())}
+        beside |= dict.fromkeys((OPTIMISED, *_other_compilers()), whole)
         runs = []
         for name, its_command in beside.items():
             output = stack.enter_context(tempfile.TemporaryFile())

@@ -60,13 +60,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Most of a run is the compiling of kernels, and two thirds of that are optimisations. Runs on other
-    backends, and one of the CPU's in tests/backends.py, have them. Processes that tests start do as this one."""
-    chosen = ("optimised", "quick")
-    if config.getoption("--arch") == "cpu" and not any(map(config.getoption, chosen)):
+    backends, and one of the CPU's in tests/backends.py, have them. Processes that tests start inherit it."""
+    wanted = config.getoption("--optimised") or config.getoption("--quick")
+    if config.getoption("--arch") == "cpu" and not wanted:
         os.environ.setdefault(compiler.variable("ADVANCED_OPTIMIZATION"), "0")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if "soak" not in config.option.markexpr:
+        soak = [item for item in items if item.get_closest_marker("soak")]
+        config.hook.pytest_deselected(items=soak)
+        items[:] = [item for item in items if item not in set(soak)]
     if config.getoption("--quick"):
         left_out = [item for item in items if _uses(item, "backend") and not _is_smoke(item)]
         config.hook.pytest_deselected(items=left_out)

@@ -330,17 +330,8 @@ def test_the_command(exchanged: Path, tmp_path: Path) -> None:
     shutil.copytree(exchanged / "submaps", tmp_path / "submaps")
     flags = ["--voxel-size", "0.1", "--evaluation.hold-out", "0", "--color", "--keep-surface"]
     flags += ["--submap-size", "12.8", "--rounds", "1", "--inference.outlier-floor", "1e-6"]
-    command = [
-        sys.executable,
-        "-m",
-        "taichi_mrf",
-        "map",
-        SOURCE,
-        "--out",
-        str(tmp_path),
-        "--resume",
-        "--json",
-    ]
+    command = [sys.executable, "-m", "taichi_mrf", "map", SOURCE, "--out", str(tmp_path)]
+    command += ["--resume", "--json"]
     done = subprocess.run([*command, *flags], capture_output=True, text=True, check=True)
     report = json.loads(done.stdout)
     assert report == json.loads((tmp_path / "report.json").read_text())
