@@ -20,7 +20,7 @@ PYTHON ?= $(shell for python in $(CANDIDATES); do \
 # them takes seconds more, and the tests start hundreds of processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: run check test lint clean
+.PHONY: run check test soak lint clean
 
 run: $(VENV)/.installed
 	@$(BIN)/taichi-mrf map "$(SOURCE)" --out "$(OUT)"
@@ -30,6 +30,9 @@ check: lint
 
 test: lint
 	@$(BIN)/python tests/backends.py
+
+soak: $(VENV)/.installed-dev
+	@$(BIN)/python -m pytest -m soak
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

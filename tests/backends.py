@@ -4,7 +4,7 @@ CPU's tests that are marked `compilers` or `smoke` run with that too.
 
     python tests/backends.py [options of pytest]
 
-Some processes run the CPU's tests; each takes the next file of tests that is not taken yet. All run side by
+Some processes run the CPU's tests; each takes the next folder of tests that is not taken yet. All run side by
 side, because tests of pages and processes wait more than they compute. Each one's output is printed in one
 piece: that of the first as it comes, the others' when that is done.
 """

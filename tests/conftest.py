@@ -5,7 +5,6 @@ runs only the tests of kernels that are marked for it (``backends``, ``compilers
 software device will do).
 """
 
-import contextlib
 import importlib.util
 import multiprocessing.process
 import os
@@ -53,6 +52,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if "soak" not in config.option.markexpr:
+        soak = [item for item in items if item.get_closest_marker("soak")]
+        config.hook.pytest_deselected(items=soak)
+        items[:] = [item for item in items if item not in set(soak)]
     if config.getoption("--quick"):
         left_out = [item for item in items if _uses(item, "backend") and not _is_smoke(item)]
         config.hook.pytest_deselected(items=left_out)
@@ -85,16 +88,35 @@ def pytest_runtestloop(session: pytest.Session) -> bool | None:
     return True
 
 
-def _taken_tests(folder: Path, items: list[pytest.Item]) -> Iterator[pytest.Item]:
-    """The tests of the files that this process is the first to take. Large files come first, so that all
-    processes end at about the same time."""
+def _taken_tests(queue: Path, items: list[pytest.Item]) -> Iterator[pytest.Item]:
+    """The tests of the files that this process is the first to take. It takes those of a folder together,
+    because they use the same kernels, which each process compiles; at the end it helps with the folders of
+    others. Large ones come first, so that all processes end at about the same time."""
     files: dict[Path, list[pytest.Item]] = {}
     for item in items:
         files.setdefault(item.path, []).append(item)
-    for path in sorted(files, key=lambda path: path.stat().st_size, reverse=True):
-        with contextlib.suppress(FileExistsError):
-            (folder / "-".join(path.relative_to(REPOSITORY).parts)).touch(exist_ok=False)
+    paths = sorted(files, key=lambda path: path.stat().st_size, reverse=True)
+    folders: dict[Path, list[Path]] = {}
+    for path in paths:
+        folders.setdefault(path.parent, []).append(path)
+    sizes = {folder: sum(path.stat().st_size for path in inside) for folder, inside in folders.items()}
+    for folder in sorted(folders, key=sizes.__getitem__, reverse=True):
+        if _is_first(queue, folder):
+            for path in folders[folder]:
+                if _is_first(queue, path):
+                    yield from files[path]
+    for path in paths:
+        if _is_first(queue, path):
             yield from files[path]
+
+
+def _is_first(queue: Path, path: Path) -> bool:
+    """Whether this process is the first to take a file or folder of tests."""
+    try:
+        (queue / "-".join(path.relative_to(REPOSITORY).parts)).touch(exist_ok=False)
+    except FileExistsError:
+        return False
+    return True
 
 
 def _is_for_every_backend(item: pytest.Item) -> bool:

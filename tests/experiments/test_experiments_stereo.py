@@ -314,6 +314,7 @@ def test_on_the_real_street_a_sigma_for_each_pixel_predicts_better(street: Scene
     assert log_likelihood(of_stated, plain, street) > log_likelihood(of_plain, plain, street)
 
 
+@pytest.mark.soak
 @pytest.mark.shared_data
 @pytest.mark.usefixtures("one_backend")
 def test_a_real_pair_grows_like_the_corridor(street: Scene) -> None:

@@ -200,6 +200,7 @@ def test_a_misplaced_scan_in_motion_is_put_right() -> None:
     np.testing.assert_allclose(refined.T_world_camera, true, atol=0.01)
 
 
+@pytest.mark.soak
 def test_poses_of_columns_make_a_better_map_than_points_moved_to_one_centre() -> None:
     scans = [scan(number, 2, lidar(48, 512), 1.0) for number in range(2)]
     found = {known: score(mapped(scans, known, 0.05), 1) for known in WAYS}

@@ -95,6 +95,7 @@ def test_distances_between_centres_are_off_by_less_than_half_a_voxel(hand: HandM
     assert len(away) == len(points)
 
 
+@settings(max_examples=25)  # of 20 points each
 @given(st.integers(0, 2**32 - 1))
 def test_the_gradient_is_that_of_the_distance(hand: HandMap, seed: int) -> None:
     random = np.random.default_rng(seed)
