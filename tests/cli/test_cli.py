@@ -9,7 +9,7 @@ import resource
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -347,15 +347,20 @@ def test_an_output_that_cannot_be_written_is_found_before_mapping(tmp_path: Path
         assert_refused(done, str(tmp_path / "closed"), "Permission denied")
 
 
-def test_a_full_disk_names_the_file_and_leaves_no_half(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def allow_small_files_only() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+@pytest.fixture
+def small_files_only() -> Iterator[None]:
+    """No file can grow beyond 20 kB: writing fails in the middle, as on a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
-    monkeypatch.setenv(compiler.variable("OFFLINE_CACHE"), "0")  # its files would meet the limit first
+
+# The kernels of the first run are compiled: files of their cache would meet the limit first.
+@pytest.mark.usefixtures("room", "small_files_only")
+def test_a_full_disk_names_the_file_and_leaves_no_half(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    done = taichi_mrf("map", ROOM, "--out", out, *FAST, "--quiet", before=allow_small_files_only)
+    done = taichi_mrf("map", ROOM, "--out", out, *FAST, "--quiet")
     assert_refused(done, str(out / "map.npz"), "cannot be written")
     assert not out.exists()
 
@@ -366,7 +371,7 @@ def interrupted_run(out: Path, number: int, presses: int = 1, flags: tuple[str, 
     SIGHUP comes with the end of the terminal, as when a connection breaks.
     """
     main_end, program_end = pty.openpty()
-    source = "synthetic:room?frames=300&width=160&height=120"
+    source = "synthetic:room?frames=300&width=80&height=60"
     with subprocess.Popen(
         [sys.executable, "-m", "taichi_mrf", "map", source, "--out", out, *flags],
         stdin=program_end,

@@ -1,7 +1,6 @@
 """``--poses FILE`` and ``--follow`` on the command line."""
 
-import subprocess
-import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets.pose_sources.posed import PosedFrames
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.live.source import open_source
+from taichi_mrf.mapping import follow, pipeline
 from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.methods.registry import load_map
 
@@ -51,22 +51,24 @@ def write_poses(path: Path, offset_m: float) -> None:
     path.write_text("".join(lines))
 
 
-def test_map_follows_a_file_and_makes_the_map_of_its_last_poses(recording: Path, tmp_path: Path) -> None:
+def test_map_follows_a_file_and_makes_the_map_of_its_last_poses(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     poses, out = tmp_path / "slam.txt", tmp_path / "followed"
     write_poses(poses, 0.2)
     flags = ("--poses", str(poses), *FAST, "--evaluation.hold-out", "0")
-    waits = ("--follow", "--keep-every", "0")
-    command = ["map", str(recording), "--out", str(out), *flags, *waits]
-    with subprocess.Popen(
-        [sys.executable, "-m", "taichi_mrf", *command],
-        stderr=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as program:
-        wait_for(lambda: (out / "report.json").exists() or program.poll() is not None, "the first keyframe")
-        write_poses(poses, 0.05)  # the loop is closed
-        printed, errors = program.communicate(timeout=120)
-    assert program.returncode == 0, printed + errors
+    for module in (follow, pipeline):
+        monkeypatch.setattr(module, "FINAL_AFTER_S", 2.0)
+
+    def close_the_loop() -> None:
+        wait_for((out / "report.json").exists, "the first keyframe")
+        write_poses(poses, 0.05)
+
+    closing = threading.Thread(target=close_the_loop)
+    closing.start()
+    done = taichi_mrf("map", recording, "--out", out, *flags, "--follow", "--keep-every", "0")
+    closing.join()
+    assert done.returncode == 0, done.stderr
     report = report_of(out)
     assert report["followed"]["changes"] == 1
     assert (report["poses_from"], report["follow"]) == (str(poses), True)

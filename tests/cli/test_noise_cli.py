@@ -1,13 +1,12 @@
 """``--noise auto`` of map, live and tune: sigma from the recording, and the word about a noise that held-out
 frames doubt."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from console import COARSE, FAST, as_process, assert_refused, taichi_mrf
+from console import COARSE, FAST, assert_refused, mapped, report_of, taichi_mrf
 
 from taichi_mrf.calibration.from_recording import LearntSigma
 from taichi_mrf.cli.map import run
@@ -23,20 +22,26 @@ from taichi_mrf.evaluation.noise_fit import SigmaLaw
 from taichi_mrf.tune.working_set import read_working_set
 from taichi_mrf.viewer.tune.messages import FrameChoice
 
-ROOM = "synthetic:room?frames=12&width=160&height=120"
-FINE = ("--voxel-size", "0.03", "--runtime.arch", "cpu")
+ROOM = "synthetic:room?frames=12&width=80&height=60"
+FINE = ("--voxel-size", "0.05", "--runtime.arch", "cpu")
 FLAGS = (*FINE, "--no-pictures", "--evaluation.hold-out", "4")
 TOO_SMALL = ("--sensor.sigma", "0.0003", "-0.0003", "0.00038")
 """A fifth of the simulated one."""
 
 
-def report_of(folder: Path) -> dict[str, Any]:
-    report: dict[str, Any] = json.loads((folder / "report.json").read_text())
-    return report
+LEARN = (*FLAGS, *TOO_SMALL, "--noise", "auto")
 
 
-def test_a_wrong_noise_is_named_learnt_and_used_again(tmp_path: Path) -> None:
-    wrong, auto, again = (tmp_path / name for name in ("wrong", "auto", "again"))
+@pytest.fixture(scope="module")
+def learnt(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that learns."""
+    out = tmp_path_factory.mktemp("learnt")
+    mapped(ROOM, "--out", out, *LEARN)
+    return out
+
+
+def test_a_wrong_noise_is_named(tmp_path: Path) -> None:
+    wrong = tmp_path / "wrong"
     done = taichi_mrf("map", ROOM, "--out", wrong, *FLAGS, *TOO_SMALL)
     assert done.returncode == 0, done.stderr
     noise = report_of(wrong)["noise"]
@@ -45,20 +50,20 @@ def test_a_wrong_noise_is_named_learnt_and_used_again(tmp_path: Path) -> None:
     assert any("--noise auto learns it" in note for note in report_of(wrong)["notes"])
     assert not (wrong / "sensor.yaml").exists()
 
-    learn = ("map", ROOM, "--out", auto, *FLAGS, *TOO_SMALL, "--noise", "auto")
-    done = taichi_mrf(*learn)
-    assert done.returncode == 0, done.stderr
-    report = report_of(auto)
+
+def test_a_noise_is_learnt_and_used_again(tmp_path: Path, learnt: Path) -> None:
+    again = tmp_path / "again"
+    report = report_of(learnt)
     assert report["noise_from"] == "auto"
     assert not report["noise"]["wrong"]
     assert report["noise"]["learnt"]["factor"] > 3
     assert "learning noise" in report["seconds"]
-    sensor = load(auto / "config.yaml").sensor
+    sensor = load(learnt / "config.yaml").sensor
     assert (sensor.sigma_scale, sensor.sigma_added) != (1.0, 0.0)
-    assert yaml.safe_load((auto / "sensor.yaml").read_text())["sensor"]["sigma_scale"] == sensor.sigma_scale
-    assert "holds this run already" in taichi_mrf(*learn).stdout
+    assert yaml.safe_load((learnt / "sensor.yaml").read_text())["sensor"]["sigma_scale"] == sensor.sigma_scale
+    assert "holds this run already" in mapped(ROOM, "--out", learnt, *LEARN)
 
-    done = taichi_mrf("map", ROOM, "--out", again, *FLAGS, "--config", auto / "sensor.yaml")
+    done = taichi_mrf("map", ROOM, "--out", again, *FLAGS, "--config", learnt / "sensor.yaml")
     assert done.returncode == 0, done.stderr
     assert load(again / "config.yaml").sensor == sensor
     assert report_of(again)["accuracy"] == report["accuracy"]
@@ -78,27 +83,25 @@ def noise_in(path: Path) -> Any:
     return yaml.safe_load(path.read_text())["sensor"]
 
 
-def test_live_learns_what_map_learns(tmp_path: Path) -> None:
+def test_live_learns_what_map_learns(tmp_path: Path, learnt: Path) -> None:
     """In a static world, as map's is."""
     flags = (*FINE, "--evaluation.hold-out", "4", "--time.half-life-s", "0", *TOO_SMALL, "--noise", "auto")
-    done = taichi_mrf("map", ROOM, "--out", tmp_path / "map", "--no-pictures", *flags)
-    assert done.returncode == 0, done.stderr
-    done = as_process("live", ROOM, "--out", tmp_path / "live", "--exit-when-done", "--port", "0", *flags)
+    done = taichi_mrf("live", ROOM, "--out", tmp_path / "live", "--exit-when-done", "--port", "0", *flags)
     assert done.returncode == 0, done.stderr
     assert "Sigma was learnt from" in done.stdout
-    learnt = noise_in(tmp_path / "live" / "sensor.yaml")
-    assert learnt == noise_in(tmp_path / "map" / "sensor.yaml")
-    assert (learnt["sigma_scale"], learnt["sigma_added"]) != (1.0, 0.0)
+    noise = noise_in(tmp_path / "live" / "sensor.yaml")
+    assert noise == noise_in(learnt / "sensor.yaml")
+    assert (noise["sigma_scale"], noise["sigma_added"]) != (1.0, 0.0)
     used = load(tmp_path / "live" / "config.yaml").sensor
-    assert (used.sigma_scale, used.sigma_added) == (learnt["sigma_scale"], learnt["sigma_added"])
+    assert (used.sigma_scale, used.sigma_added) == (noise["sigma_scale"], noise["sigma_added"])
     report = report_of(tmp_path / "live")
     assert report["noise_from"] == "auto"
-    assert report["noise"]["learnt"] == report_of(tmp_path / "map")["noise"]["learnt"]
+    assert report["noise"]["learnt"] == report_of(learnt)["noise"]["learnt"]
 
 
 def test_tune_begins_with_what_it_learns(tmp_path: Path) -> None:
     pytest.importorskip("optuna", reason="the search needs Optuna (extra: auto)")
-    done = as_process(
+    done = taichi_mrf(
         "tune", ROOM, "--no-viewer", "--auto", "1", "--search", "sensor.sigma_scale", "--out", tmp_path,
         "--noise", "auto", *FINE, *TOO_SMALL,
     )  # fmt: skip
@@ -162,6 +165,6 @@ def test_noise_is_not_learnt_without_poses() -> None:
 def test_a_saved_map_keeps_its_noise(tmp_path: Path) -> None:
     done = taichi_mrf("map", ROOM, "--out", tmp_path, "--limit", "2", *FAST)
     assert done.returncode == 0, done.stderr
-    done = as_process("live", tmp_path / "map.npz", "--noise", "auto", "--port", "0", "--runtime.arch", "cpu")
+    done = taichi_mrf("live", tmp_path / "map.npz", "--noise", "auto", "--port", "0", "--runtime.arch", "cpu")
     assert done.returncode == 2
     assert "map.npz: is a saved map, which keeps its noise: --noise auto is for a recording" in done.stderr

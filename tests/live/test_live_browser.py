@@ -1,7 +1,9 @@
 """The live page in a real Chromium: what it shows, counted in the browser, and what its widgets do."""
 
 import re
+import signal
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
@@ -30,31 +32,39 @@ def browser() -> Iterator["Browser"]:
 
 
 @pytest.fixture(scope="module")
-def program(browser: "Browser") -> Iterator[LiveProgram]:
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the run."""
+    return tmp_path_factory.mktemp("out")
+
+
+@pytest.fixture(scope="module")
+def program(out: Path, browser: "Browser") -> Iterator[LiveProgram]:
     """The room at a twentieth of its pace: one frame in four seconds, which a busy machine can draw. It
     begins when Chromium is there to see it."""
-    with LiveProgram(ROOM, "--voxel-size", "0.08", "--runtime.arch", "cpu", "--speed", "0.05") as running:
+    options = ("--voxel-size", "0.08", "--runtime.arch", "cpu", "--speed", "0.05", "--out", out)
+    with LiveProgram(ROOM, *options) as running:
         yield running
 
 
 @pytest.fixture(scope="module")
-def saved(program: LiveProgram, browser: "Browser", tmp_path_factory: pytest.TempPathFactory) -> MRFMap:
-    """The map as the page's button saves it, once it is complete. Whoever asks for it first sees it grow."""
-    path = tmp_path_factory.mktemp("saved") / "map.npz"
-    with LivePage(browser, program.address) as page:
-        page.until_settled()
-        page.tab("Save")
-        page.download("Map").save_as(path)
-    runtime.init("cpu")
-    return MRFMap.load(path)
+def late_page(program: LiveProgram, browser: "Browser") -> Iterator[LivePage]:
+    """A page that was loaded when the map was complete. Whoever asks for it first sees the map grow."""
+    with LivePage(browser, program.address) as opened:
+        opened.until_settled()
+        opened.page.reload()
+        opened.until_settled()
+        yield opened
 
 
 @pytest.fixture(scope="module")
-def late_page(program: LiveProgram, saved: MRFMap, browser: "Browser") -> Iterator[LivePage]:
-    """A page that was opened when the map was complete."""
-    with LivePage(browser, program.address) as opened:
-        opened.until_settled()
-        yield opened
+def saved(late_page: LivePage, tmp_path_factory: pytest.TempPathFactory) -> MRFMap:
+    """The map as the page's button saves it."""
+    path = tmp_path_factory.mktemp("saved") / "map.npz"
+    late_page.tab("Save")
+    late_page.download("Map").save_as(path)
+    late_page.tab("Map")
+    runtime.init("cpu")
+    return MRFMap.load(path)
 
 
 @pytest.fixture
@@ -75,18 +85,20 @@ def test_voxels_appear_as_keyframes_arrive(program: LiveProgram, browser: "Brows
     equal_counts, keyframes = set(), set()
     with LivePage(browser, program.address) as page:
 
-        def complete(seen: Seen) -> bool:
+        def grown(seen: Seen) -> bool:
             if seen.agrees and seen.voxels:
                 equal_counts.add(seen.voxels)
             keyframes.add(len(seen.keyframes))
-            return seen.settled
+            return seen.settled or min(len(equal_counts), len(keyframes)) >= 3
 
-        final = page.until(complete, "a complete map")
+        page.until(grown, "a map that grows")
+        page.select("Speed", "as fast as possible")
+        final = page.until(lambda seen: seen.settled, "a complete map")
         page.screenshot("complete_early_page")
         assert page.problems == []
     assert len(equal_counts) >= 3, "the scene was equal to the page's count only now and then"
     assert len(keyframes) >= 3
-    assert max(keyframes) == len(final.keyframes) == 5  # one frame in six is kept out
+    assert max(keyframes) <= len(final.keyframes) == 5  # one frame in six is kept out
 
 
 def test_a_late_joiner_sees_the_whole_map(page: LivePage, saved: MRFMap) -> None:
@@ -328,6 +340,7 @@ def reset(page: LivePage) -> None:
 def test_the_view_follows_the_camera(page: LivePage) -> None:
     away = np.linalg.norm(np.subtract(page.position(), page.position("/camera")))
     page.tick("Follow")
+    page.select("Speed", "0.25x")  # or a machine that draws slowly sees only the end
     reset(page)
     places = set()
 
@@ -347,3 +360,19 @@ def test_the_view_follows_the_camera(page: LivePage) -> None:
     page.page.reload()
     page.until(lambda seen: seen.settled and np.allclose(page.position(), behind, atol=0.01), "the same view")
     page.tick("Follow", on=False)
+
+
+def test_a_signal_ends_it_while_a_page_watches_and_keeps_what_is_mapped(
+    program: LiveProgram, browser: "Browser", out: Path
+) -> None:
+    with LivePage(browser, program.address) as page:
+        page.select("Speed", "0.25x")
+        reset(page)
+        page.until(lambda seen: seen.agrees and seen.voxels and len(seen.keyframes) < 3, "the first voxels")
+        status, _ = program.end(signal.SIGINT)
+    assert status == 128 + signal.SIGINT
+    program.wait_until_nothing_is_left()
+    assert {path.name for path in out.iterdir()} == {"map.npz", "voxels.ply", "config.yaml", "report.json"}
+    m = MRFMap.load(out / "map.npz")
+    assert 1 <= len(m.keyframes) < 5
+    assert len(m.voxels(0.5)[0]) > 0

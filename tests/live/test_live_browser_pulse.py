@@ -1,4 +1,7 @@
-"""A page without a server or a mapping process behind it, in a real Chromium: it says so, and comes back."""
+"""A page without a server or a mapping process behind it, in a real Chromium: it says so, and comes back.
+
+The tests of one program follow each other; the last one ends it.
+"""
 
 import os
 import signal
@@ -8,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from browser import LivePage, chromium, missing
-from live_program import LiveProgram, wait_for
+from live_program import LiveProgram, wait_for, with_shortest_life
 
 from taichi_mrf.viewer.transport import server as viewer_server
 from taichi_mrf.viewer.transport.server import start_server
@@ -23,6 +26,13 @@ DISCONNECTED = "disconnected: reload"
 SILENT = "the mapper does not answer"
 DONE = "up to date"
 
+NO_SERVER = ("WebSocket connection to", "Failed to open WebSocket", "Failed to load resource: net::ERR")
+"""Beginnings of what a browser reports while there is no server, as it must."""
+
+WITHOUT_FOCUS = "Document.prototype.hasFocus = () => false;"
+HURRIED = "const later = setTimeout; setTimeout = (call, ms, ...given) => later(call, ms / 5, ...given);"
+"""Scripts that run before those of the page: one lets it wait for a fifth of the time."""
+
 pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
 
 
@@ -30,6 +40,23 @@ pytestmark = pytest.mark.skipif(missing() is not None, reason=str(missing()))
 def browser() -> Iterator["Browser"]:
     with chromium() as running:
         yield running
+
+
+@pytest.fixture(scope="module")
+def program() -> Iterator[LiveProgram]:
+    """One that starts each viewer again, however young. Its port is none of those that the system gives away,
+    or another program could be given it while nobody listens."""
+    port = 20000 + os.getpid() % 10000
+    with LiveProgram(*ARGUMENTS, port=port, start=with_shortest_life(0.0)) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def page(program: LiveProgram, browser: "Browser") -> Iterator[LivePage]:
+    """A page that never has the focus."""
+    with LivePage(browser, program.address, script=WITHOUT_FOCUS) as opened:
+        opened.until_settled()
+        yield opened
 
 
 def until_it_says(page: LivePage, *words: str) -> None:
@@ -58,35 +85,58 @@ def has_reloaded(page: LivePage) -> bool:
         return False
 
 
-def test_a_page_says_what_does_not_answer_and_comes_back(browser: "Browser") -> None:
-    with LiveProgram(*ARGUMENTS) as program, LivePage(browser, program.address) as page:
-        page.until_settled()
-        page.page.evaluate("() => { window.isTheSame = true; }")
-        (viewer,) = (pid for pid, command in program.group().items() if "spawn_main" in command)
-        for stopped, words in ((viewer, DISCONNECTED), (program.pid, SILENT)):
-            until_it_says(page, DONE)
-            os.kill(stopped, signal.SIGSTOP)
-            until_it_says(page, words)
-            page.screenshot(words.replace(" ", "_").replace(":", ""))
-            os.kill(stopped, signal.SIGCONT)
+def until_reconnected(page: LivePage, slider_before: str | None, voxels: int) -> None:
+    """Wait until the page shows the whole map of another viewer, and see that its slider is answered."""
+    page.until(lambda seen: slider_id(page) != slider_before, "another viewer")
+    until_it_says(page, DONE)
+    assert page.until_settled().voxels == voxels
+    page.nudge("Threshold", "ArrowRight")
+    page.until(lambda seen: seen.agrees and seen.voxels < voxels, "fewer voxels")
+    page.nudge("Threshold", "ArrowLeft")
+    page.until(lambda seen: seen.agrees and seen.voxels == voxels, "all voxels")
+    assert all(problem.startswith(NO_SERVER) for problem in page.problems), page.problems
+
+
+def slider_id(page: LivePage) -> str | None:
+    """Of the slider of the threshold; another viewer gives it another one."""
+    return page.input("Threshold").get_attribute("id")
+
+
+def viewer_of(program: LiveProgram) -> int:
+    """The process of the page."""
+    (viewer,) = (pid for pid, command in program.group().items() if "spawn_main" in command)
+    return viewer
+
+
+def test_a_page_says_what_does_not_answer(program: LiveProgram, page: LivePage) -> None:
+    page.page.evaluate("() => { window.isTheSame = true; }")
+    for stopped, words in ((viewer_of(program), DISCONNECTED), (program.pid, SILENT)):
         until_it_says(page, DONE)
-        assert page.page.evaluate("() => window.isTheSame")
-        os.kill(program.pid, signal.SIGKILL)
-        until_it_says(page, DISCONNECTED)
-        program.wait_until_nothing_is_left()
-        with LiveProgram(*ARGUMENTS, port=program.port):
-            until_it_says(page, DONE)
-            page.until_settled()
+        os.kill(stopped, signal.SIGSTOP)
+        until_it_says(page, words)
+        page.screenshot(words.replace(" ", "_").replace(":", ""))
+        os.kill(stopped, signal.SIGCONT)
+    until_it_says(page, DONE)
+    assert not has_reloaded(page)
 
 
-def test_a_page_without_the_focus_connects_again(browser: "Browser") -> None:
-    with LiveProgram(*ARGUMENTS) as program, LivePage(browser, program.address) as page:
-        page.page.evaluate("() => { Document.prototype.hasFocus = () => false; }")
-        page.until_settled()
-        program.end()
-        until_it_says(page, DISCONNECTED)
-        with LiveProgram(*ARGUMENTS, port=program.port):
-            until_it_says(page, DONE)
+def test_a_viewer_that_dies_is_started_again(program: LiveProgram, page: LivePage) -> None:
+    voxels, slider, viewer = page.until_settled().voxels, slider_id(page), viewer_of(program)
+    os.kill(viewer, signal.SIGKILL)
+    wait_for(lambda: viewer not in program.group(), "its end")
+    until_reconnected(page, slider, voxels)
+
+
+def test_a_server_that_is_killed_and_restarted_is_found_again(program: LiveProgram, page: LivePage) -> None:
+    voxels, slider = page.until_settled().voxels, slider_id(page)
+    os.kill(program.pid, signal.SIGKILL)
+    assert program.wait() == -signal.SIGKILL
+    until_it_says(page, DISCONNECTED)
+    program.wait_until_nothing_is_left()
+    with LiveProgram(*ARGUMENTS, port=program.port) as again:
+        assert again.port == program.port
+        until_reconnected(page, slider, voxels)
+        page.screenshot("server_restarted")
 
 
 def test_a_page_whose_socket_does_not_come_back_reloads(
@@ -94,7 +144,7 @@ def test_a_page_whose_socket_does_not_come_back_reloads(
 ) -> None:
     server = start_server("127.0.0.1", 0, "Full")
     try:
-        with LivePage(browser, f"http://127.0.0.1:{server.get_port()}") as page:
+        with LivePage(browser, f"http://127.0.0.1:{server.get_port()}", script=HURRIED) as page:
             wait_for(server.get_clients, "the page", page.pause)
             monkeypatch.setattr(viewer_server, "MOST_CLIENTS", 0)
             page.page.evaluate("() => { window.isTheSame = true; }")

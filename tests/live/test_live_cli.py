@@ -16,8 +16,8 @@ from typing import Any
 
 import pytest
 import trimesh
-from console import assert_refused, complaints, taichi_mrf
-from live_program import DEADLINE_S
+from console import Done, as_process, assert_refused, complaints, mapped, taichi_mrf
+from live_program import DEADLINE_S, PROGRAM, with_shortest_life
 from new_interpreter import obey_hangups
 
 from taichi_mrf.cli.parser import parse
@@ -30,22 +30,12 @@ PICTURES = {"surface.png", "top_view.png", "depth.png"}
 linux_only = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs the list in /proc")
 
 
-PROGRAM = ("-m", "taichi_mrf")
-EVER_YOUNG = (
-    "-c",
-    "import sys; from taichi_mrf.cli import live; live.SHORTEST_LIFE_SECONDS = 1e9; "
-    "from taichi_mrf.cli.main import main; sys.exit(main(sys.argv[1:]))",
-)
-"""The program, for which no viewer has lived long enough to be started again, however slow the machine."""
+EVER_YOUNG = with_shortest_life(1e9)
+"""No viewer has lived long enough to be started again, however slow the machine."""
 
 
 def command(*arguments: str | Path, start: tuple[str, str] = PROGRAM) -> list[str]:
     return [sys.executable, *start, *map(str, arguments)]
-
-
-def live(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """Run ``live`` until it ends by itself."""
-    return subprocess.run(command("live", *arguments), capture_output=True, text=True, check=False)
 
 
 class Running:
@@ -130,22 +120,20 @@ def read_report(folder: Path) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def ended(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, "subprocess.CompletedProcess[str]"]:
+def ended(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Done]:
     """A run that ended by itself: its folder, and what it printed."""
     out = tmp_path_factory.mktemp("ended") / "live"
-    return out, live(ROOM, "--exit-when-done", "--out", out, "--time.half-life-s", "0", *FLAGS)
+    return out, as_process("live", ROOM, "--exit-when-done", "--out", out, "--time.half-life-s", "0", *FLAGS)
 
 
 def test_a_run_that_ends_by_itself_leaves_the_map_that_map_makes(
-    tmp_path: Path, ended: tuple[Path, "subprocess.CompletedProcess[str]"]
+    tmp_path: Path, ended: tuple[Path, Done]
 ) -> None:
     out, done = ended
     assert (done.returncode, complaints(done.stderr)) == (0, "")
     assert re.search(r"The map is at http://127\.0\.0\.1:\d+ ", done.stdout)
     assert {path.name for path in out.iterdir()} == FILES | PICTURES
-    batch = command("map", ROOM, "--out", tmp_path / "batch", *FLAGS[:-2])
-    subprocess.run(batch, check=True, capture_output=True)
-    assert {path.name for path in (tmp_path / "batch").iterdir()} == FILES | PICTURES
+    mapped(ROOM, "--out", tmp_path / "batch", "--no-pictures", *FLAGS[:-2])
     live_report, batch_report = (read_report(folder) for folder in (out, tmp_path / "batch"))
     assert live_report.keys() == batch_report.keys()
     different = {key for key in live_report if live_report[key] != batch_report[key]}
@@ -200,15 +188,15 @@ def test_a_busy_port_is_told_with_the_one_that_was_taken() -> None:
         other.bind(("127.0.0.1", 0))
         other.listen()
         busy = other.getsockname()[1]
-        done = live(ROOM, "--limit", "1", "--exit-when-done", *FLAGS[:-1], str(busy))
+        done = taichi_mrf("live", ROOM, "--limit", "1", "--exit-when-done", *FLAGS[:-1], str(busy))
     assert done.returncode == 0, done.stderr
     taken = re.search(rf"Port {busy} is busy, so the page took (\d+)\.", done.stdout)
     assert taken is not None
     assert f"http://127.0.0.1:{taken.group(1)} " in done.stdout
 
 
-def test_a_page_for_everybody_is_warned_of(ended: tuple[Path, "subprocess.CompletedProcess[str]"]) -> None:
-    done = live(ROOM, "--limit", "1", "--exit-when-done", "--host", "0.0.0.0", *FLAGS)
+def test_a_page_for_everybody_is_warned_of(ended: tuple[Path, Done]) -> None:
+    done = taichi_mrf("live", ROOM, "--limit", "1", "--exit-when-done", "--host", "0.0.0.0", *FLAGS)
     assert done.returncode == 0, done.stderr
     for words in ("Warning", "no password", "ssh -L"):
         assert words in done.stdout
@@ -221,17 +209,17 @@ def test_the_folder_of_another_run_is_replaced_only_if_asked(tmp_path: Path) -> 
     refused = taichi_mrf("live", ROOM, "--exit-when-done", "--out", tmp_path, *FLAGS)
     assert_refused(refused, f"{tmp_path}: holds a run: choose another --out, or add --overwrite")
     assert (tmp_path / "map.npz").read_bytes() == b"of another run"
-    done = live(ROOM, "--limit", "1", "--exit-when-done", "--out", tmp_path, "--overwrite", *FLAGS)
+    done = taichi_mrf(
+        "live", ROOM, "--limit", "1", "--exit-when-done", "--out", tmp_path, "--overwrite", *FLAGS
+    )
     assert (done.returncode, complaints(done.stderr)) == (0, "")
     assert {path.name for path in tmp_path.iterdir()} == FILES | PICTURES
     assert (tmp_path / "top_view.png").read_bytes() != b"of another run"
 
 
-def test_a_saved_map_is_shown_with_its_own_parameters(
-    tmp_path: Path, ended: tuple[Path, "subprocess.CompletedProcess[str]"]
-) -> None:
+def test_a_saved_map_is_shown_with_its_own_parameters(tmp_path: Path, ended: tuple[Path, Done]) -> None:
     first, _ = ended
-    again = live(first / "map.npz", "--exit-when-done", "--out", tmp_path / "again", *FLAGS[2:])
+    again = taichi_mrf("live", first / "map.npz", "--exit-when-done", "--out", tmp_path / "again", *FLAGS[2:])
     assert (again.returncode, complaints(again.stderr)) == (0, "")
     assert "its own parameters are in force" in again.stdout
     assert voxels(tmp_path / "again") == voxels(first)
@@ -292,7 +280,5 @@ def test_bad_input_ends_in_one_line(arguments: list[str], words: list[str]) -> N
 
 def test_a_damaged_map_is_named(tmp_path: Path) -> None:
     (tmp_path / "map.npz").write_bytes(b"not a map")
-    done = live(tmp_path / "map.npz")
-    assert done.returncode == 2
-    assert str(tmp_path / "map.npz") in done.stderr
-    assert done.stderr.count("\n") == 1
+    done = taichi_mrf("live", tmp_path / "map.npz")
+    assert_refused(done, str(tmp_path / "map.npz"))

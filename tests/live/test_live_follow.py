@@ -13,9 +13,16 @@ from taichi_mrf.datasets.pose_sources.posed import posed_by
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.live.run import Policy
 from taichi_mrf.live.session import Session
+from taichi_mrf.mapping import follow
 from taichi_mrf.viewer.messages import KeyframeInfo, Move, Status, Switch
 
 pytestmark = pytest.mark.usefixtures("one_backend")
+
+
+@pytest.fixture(autouse=True)
+def _soon_final(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poses are final when they have not changed for a moment."""
+    monkeypatch.setattr(follow, "FINAL_AFTER_S", 0.3)
 
 
 def shifted(index: int, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> Pose:

@@ -222,38 +222,30 @@ def test_both_commands_take_the_flag() -> None:
     assert not PoseFlags().parameters(Config()).poses.refine
 
 
-def tracked_session(link: FakeLink, dataset: Dataset, out: Path | None = None) -> Session:
+def tracked_session(link: FakeLink, dataset: Dataset) -> Session:
     tracked = replace(source(dataset, tracked_room.CONFIG), tracked=True)
-    return Session(tracked, link, Policy(out=out, leave_when_done=True))
+    return Session(tracked, link, Policy(leave_when_done=True))
 
 
-def test_a_tracked_camera_gives_the_map_of_its_batch_run(tmp_path: Path) -> None:
-    link = FakeLink()
-    session = tracked_session(link, walk(range(12)), tmp_path)
-    finished(session)
-    assert link.errors() == []
-    batch = map_sequence(walk(range(12)), tracked_room.CONFIG)
-    assert marginals(session.state.mapper.map) == marginals(batch.map)
-    write_run(tmp_path, session.state.result(), session.state.facts, pictures=False)
-    found = read_timed_poses(tmp_path / TRAJECTORY_FILE)
-    assert len(found) == 12
-    assert errors(dict(enumerate(found.poses)))[:, 1].max() < 0.05
-
-
-def test_held_out_frames_of_a_tracked_camera_have_poses_as_in_a_batch_run(tmp_path: Path) -> None:
+def test_a_tracked_camera_gives_the_map_and_the_poses_of_its_batch_run(tmp_path: Path) -> None:
+    """Those of held-out frames too."""
     config = replace(tracked_room.CONFIG, evaluation=EvaluationConfig(hold_out=4))
-    dataset = walk(range(12))
+    dataset, link = walk(range(12)), FakeLink()
     replayed = replace(
         source(dataset, config), new_replay=lambda: Replay(dataset), tracked=True, dataset=dataset
     )
-    session = Session(replayed, FakeLink(), Policy(out=tmp_path, leave_when_done=True))
+    session = Session(replayed, link, Policy(out=tmp_path, leave_when_done=True))
     finished(session)
+    assert link.errors() == []
     batch = map_sequence(walk(range(12)), config)
     result = session.state.result()
     assert marginals(result.map) == marginals(batch.map)
     assert result.held_out == batch.held_out == [2, 6, 10]
     report, _ = write_run(tmp_path, result, session.state.facts, pictures=False)
     assert report["accuracy"]["frames"] == 3
+    found = read_timed_poses(tmp_path / TRAJECTORY_FILE)
+    assert len(found) == 12
+    assert errors(dict(enumerate(found.poses)))[:, 1].max() < 0.05
 
 
 def test_the_page_is_told_once_that_tracking_is_lost_and_that_it_goes_on() -> None:

@@ -193,8 +193,12 @@ class Seen:
 class LivePage:
     """A page in a browser. ``problems`` are the errors that it has reported."""
 
-    def __init__(self, browser: "Browser", address: str, width: int = 1280, height: int = 800) -> None:
+    def __init__(
+        self, browser: "Browser", address: str, width: int = 1280, height: int = 800, script: str = ""
+    ) -> None:
+        """``script`` runs before those of the page."""
         self.page = browser.new_page(viewport={"width": width, "height": height}, accept_downloads=True)
+        self.page.add_init_script(script)
         self.page.set_default_timeout(1000 * DEADLINE_S)
         self.problems: list[str] = []
         self.page.on("console", lambda message: self._note(message.text) if message.type == "error" else None)

@@ -14,6 +14,18 @@ from types import TracebackType
 DEADLINE_S = 120.0
 """For what takes seconds, on a machine that is busy with something else."""
 
+PROGRAM = ("-m", "taichi_mrf")
+
+
+def with_shortest_life(seconds: float) -> tuple[str, str]:
+    """The program, which starts a viewer again that has ended if it has lived for so long."""
+    program = (
+        f"import sys; from taichi_mrf.cli import live; live.SHORTEST_LIFE_SECONDS = {seconds!r}; "
+        "from taichi_mrf.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    )
+    return "-c", program
+
+
 _ADDRESS = re.compile(r"The map is at (http://\S+)")
 
 
@@ -21,9 +33,10 @@ class LiveProgram:
     """The running program; use it as a context. ``address`` is where its page is, ``said`` what it has
     printed so far, line by line."""
 
-    def __init__(self, *arguments: str | Path, port: int = 0) -> None:
-        """Start it, on any free port unless told, and wait for its address."""
-        command = [sys.executable, "-m", "taichi_mrf", "live", *map(str, arguments), "--port", str(port)]
+    def __init__(self, *arguments: str | Path, port: int = 0, start: tuple[str, str] = PROGRAM) -> None:
+        """Start it, on any free port unless told, and wait for its address. ``start`` are the interpreter's
+        arguments."""
+        command = [sys.executable, *start, "live", *map(str, arguments), "--port", str(port)]
         self.said: list[str] = []
         # A session of its own, so that whatever it starts can be found by the number of its group.
         self._process = subprocess.Popen(

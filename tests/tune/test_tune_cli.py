@@ -2,12 +2,10 @@
 
 import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from console import complaints
+from console import assert_refused, complaints, mapped, taichi_mrf
 from live_program import wait_for
 from tune_program import TuneProgram
 
@@ -18,17 +16,12 @@ ROOM = "synthetic:room?frames=9&width=80&height=60"
 FLAGS = ("--voxel-size", "0.1", "--stride", "1", "--runtime.arch", "cpu")
 
 
-def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "taichi_mrf", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
 @pytest.fixture(scope="module")
 def searched(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The folder that a short search left, and what it said."""
     pytest.importorskip("optuna", reason="the search needs Optuna (extra: auto)")
     out = tmp_path_factory.mktemp("tuned")
-    done = run("tune", ROOM, "--no-viewer", "--auto", "3", "--out", out, *FLAGS)
+    done = taichi_mrf("tune", ROOM, "--no-viewer", "--auto", "3", "--out", out, *FLAGS)
     assert done.returncode == 0, done.stderr
     assert complaints(done.stderr) == ""
     return out, done.stdout
@@ -46,11 +39,8 @@ def test_a_search_without_a_page_leaves_parameters_table_and_verdict(searched: t
 
 def test_map_accepts_what_was_found(searched: tuple[Path, str], tmp_path: Path) -> None:
     out, _ = searched
-    done = run(
-        "map", ROOM, "--config", out / "best.yaml", "--out", tmp_path, "--limit", "2", "--no-pictures",
-        "--evaluation.hold-out", "0",
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    flags = ("--limit", "2", "--no-pictures", "--evaluation.hold-out", "0")
+    mapped(ROOM, "--config", out / "best.yaml", "--out", tmp_path, *flags)
     found, used = config.load(out / "best.yaml"), config.load(tmp_path / "config.yaml")
     assert used.inference == found.inference
     assert used.sensor == found.sensor
@@ -76,11 +66,9 @@ def test_ctrl_c_keeps_what_was_found(tmp_path: Path) -> None:
     ],
 )
 def test_bad_input_gets_one_line(arguments: list[str], said: str) -> None:
-    done = run("tune", ROOM, "--runtime.arch", "cpu", *arguments)
-    assert done.returncode == 2
+    done = taichi_mrf("tune", ROOM, "--runtime.arch", "cpu", *arguments)
+    assert_refused(done, said)
     assert done.stderr.startswith("taichi-mrf: ")
-    assert said in done.stderr
-    assert len(done.stderr.splitlines()) == 1
 
 
 @pytest.mark.skipif(not hasattr(os, "getpriority"), reason="Windows has no such priorities")
