@@ -56,6 +56,7 @@ def page(program: LiveProgram, browser: "Browser") -> Iterator[LivePage]:
     """A page that never has the focus."""
     with LivePage(browser, program.address, script=WITHOUT_FOCUS) as opened:
         opened.until_settled()
+        opened.page.evaluate("() => { window.isTheSame = true; }")
         yield opened
 
 
@@ -86,9 +87,10 @@ def has_reloaded(page: LivePage) -> bool:
 
 
 def until_reconnected(page: LivePage, slider_before: str | None, voxels: int) -> None:
-    """Wait until the page shows the whole map of another viewer, and see that its slider is answered."""
+    """Wait until the same page shows the whole map of another viewer, and see that its slider is answered."""
     page.until(lambda seen: slider_id(page) != slider_before, "another viewer")
     until_it_says(page, DONE)
+    assert not has_reloaded(page)
     assert page.until_settled().voxels == voxels
     page.nudge("Threshold", "ArrowRight")
     page.until(lambda seen: seen.agrees and seen.voxels < voxels, "fewer voxels")
@@ -109,7 +111,6 @@ def viewer_of(program: LiveProgram) -> int:
 
 
 def test_a_page_says_what_does_not_answer(program: LiveProgram, page: LivePage) -> None:
-    page.page.evaluate("() => { window.isTheSame = true; }")
     for stopped, words in ((viewer_of(program), DISCONNECTED), (program.pid, SILENT)):
         until_it_says(page, DONE)
         os.kill(stopped, signal.SIGSTOP)
