@@ -19,6 +19,9 @@ from taichi_mrf.geometry.poses import Pose
 INTERPOLATION_GAP = 0.1
 """Default of the largest time in seconds between an image and a neighbouring pose: poses at 5 Hz and more."""
 
+_SAME = 1e-7
+"""Poses differ by less, metres and elements of a rotation, where one is written again and again."""
+
 _NEARLY_EQUAL = 1e-9
 """Below this angle (radians) the chord stands for the arc, whose formula divides by its sine."""
 
@@ -40,6 +43,11 @@ class TimedPoses:
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+    @property
+    def stands_still(self) -> bool:
+        """Whether several poses are all the same."""
+        return len(self) > 1 and np.allclose(self.poses, self.poses[0], rtol=0, atol=_SAME)
 
     def at(self, stamp: float, largest_gap: float) -> Pose | None:
         """The pose (4, 4) at a time, or None.

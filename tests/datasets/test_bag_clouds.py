@@ -107,6 +107,23 @@ def test_a_lidar_that_stands_still_keeps_its_image(tmp_path: Path) -> None:
     assert open_dataset(tmp_path / "walk").read(0).camera.shape == CAMERA.shape
 
 
+@pytest.mark.parametrize("with_tf", [False, True])
+def test_clouds_in_the_worlds_frame_are_cast_from_the_sensor(tmp_path: Path, with_tf: bool) -> None:
+    with writing(tmp_path / "walk", "mcap") as bag:
+        for scan in range(SCANS):
+            T_odom_lidar = pose(stamp(scan))
+            send(bag, stamp(scan), points(scan) @ T_odom_lidar[:3, :3].T + T_odom_lidar[:3, 3], frame="odom")
+            bag.odometry("/odom", stamp(scan), "odom", "body", T_odom_lidar)
+            if with_tf:
+                bag.tf("/tf", stamp(scan), "odom", "body", T_odom_lidar)
+    dataset = open_dataset(tmp_path / "walk")
+    assert any("of body, from where the data were moved to odom" in note for note in dataset.notes)
+    for scan, frame in enumerate(dataset):
+        np.testing.assert_allclose(frame.T_world_camera, pose(stamp(scan)), atol=1e-9)
+        expected = np.linalg.norm(points(scan), axis=-1)[~LOST]
+        np.testing.assert_allclose(np.sort(frame.depth_m[frame.depth_m > 0]), np.sort(expected), rtol=1e-5)
+
+
 def test_depth_images_come_first_and_points_can_be_chosen(tmp_path: Path) -> None:
     with writing(tmp_path / "walk", "mcap") as bag:
         images(bag)

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from datasets_recordings import stamped_line
@@ -144,10 +145,89 @@ def test_the_frame_of_a_topic_can_be_left_for_another(make: Callable[..., Path])
     np.testing.assert_allclose(frame.T_world_camera, T_map_odom @ world_body(1) @ T_body_camera, atol=1e-9)
 
 
-def test_a_pose_without_a_mounting_is_the_cameras(make: Callable[..., Path]) -> None:
-    dataset = open_dataset(make(images, odometry))
-    np.testing.assert_allclose(dataset.read(1).T_world_camera, world_body(1), atol=1e-9)
-    assert any(f"no transform from {BODY} to {FRAME}" in note for note in dataset.notes)
+def test_a_pose_without_a_mounting_is_not_taken_for_the_cameras(make: Callable[..., Path]) -> None:
+    path = make(images, odometry)
+    said = refused(path)
+    assert (
+        f"topic /odom: the poses are of {BODY}, and no transform from there to {FRAME} is in the bag" in said
+    )
+    assert f"?body={FRAME}" in said
+    named = make(images, lambda bag: odometry(bag, child="camera"), name="camera")
+    for source, note in (
+        (f"{path}?body={FRAME}", f", of {FRAME}"),
+        (named, "assumed to be of the camera itself"),
+    ):
+        dataset = open_dataset(str(source))
+        np.testing.assert_allclose(dataset.read(1).T_world_camera, world_body(1), atol=1e-9)
+        assert any(note in each for each in dataset.notes)
+
+
+def test_a_mounting_that_is_sent_now_and_then_holds_all_the_time(make: Callable[..., Path]) -> None:
+    def write(bag: Bag) -> None:
+        images(bag)
+        for i in range(COUNT):
+            bag.tf("/tf", stamp(i), "odom", BODY, world_body(i))
+        for seconds in (0.2, 1.2):
+            bag.tf("/tf", seconds, BODY, FRAME, T_body_camera)
+
+    dataset = open_dataset(make(write))
+    assert len(dataset) == COUNT
+    for i in range(COUNT):
+        np.testing.assert_allclose(dataset.read(i).T_world_camera, world_body(i) @ T_body_camera, atol=1e-9)
+
+
+@pytest.mark.parametrize("frame", ["", "cam"])
+def test_images_of_a_frame_that_tf_lacks_name_the_remedy(make: Callable[..., Path], frame: str) -> None:
+    def write(bag: Bag) -> None:
+        bag.camera_info("/camera/depth/camera_info", frame, CAMERA)
+        mounted(bag)
+        for i in range(COUNT):
+            bag.image("/camera/depth/image_raw", stamp(i), frame, steps(i), "16UC1")
+            bag.tf("/tf", stamp(i), "odom", BODY, world_body(i))
+
+    path = make(write)
+    assert f"?optical=FRAME says which of tf's frames ({BODY}, {FRAME}, odom) is the sensor's" in refused(
+        path
+    )
+    dataset = open_dataset(f"{path}?optical={FRAME}")
+    np.testing.assert_allclose(dataset.read(1).T_world_camera, world_body(1) @ T_body_camera, atol=1e-9)
+
+
+def test_the_camera_of_another_frame_is_not_taken(make: Callable[..., Path]) -> None:
+    other = PinholeCamera(16, 12, 20.0, 20.0, 7.5, 5.5)
+
+    def write(bag: Bag) -> None:
+        images(bag, "/camera/aligned/image_raw", info=False)
+        odometry(bag, child=FRAME)
+        bag.camera_info("/camera/aligned/camera_info", "another_frame", other)
+
+    path = make(write)
+    assert f"are of the frame {FRAME}, but the CameraInfo of /camera/aligned/camera_info" in refused(path)
+    assert open_dataset(f"{path}?info=/camera/aligned/camera_info").camera == other
+    both = make(write, lambda bag: bag.camera_info("/elsewhere/camera_info", FRAME, CAMERA), name="both")
+    assert open_dataset(both).camera == CAMERA
+
+
+def test_depth_of_the_plain_transport_is_found_as_png_and_refused_as_jpeg(make: Callable[..., Path]) -> None:
+    def write(bag: Bag) -> None:
+        bag.camera_info("/cam/depth/camera_info", FRAME, CAMERA)
+        odometry(bag, child=FRAME)
+        for kind in ("png", "jpg"):
+            for i in range(COUNT):
+                image = steps(i) if kind == "png" else (steps(i) // 256).astype(np.uint8)
+                data = np.frombuffer(cv2.imencode(f".{kind}", image)[1].tobytes(), np.uint8)
+                header, words = (
+                    bag.header(stamp(i), FRAME),
+                    f"16UC1; {kind.replace('jpg', 'jpeg')} compressed ",
+                )
+                topic = f"/cam/depth/{kind}/compressed"
+                bag.send(
+                    topic, "sensor_msgs/msg/CompressedImage", stamp(i), header=header, format=words, data=data
+                )
+
+    path = make(write)
+    np.testing.assert_allclose(open_dataset(path).read(2).depth_m, steps(2) / 1000, rtol=1e-6)
+    assert "JPEG keeps 8 bits" in refused(f"{path}?depth=/cam/depth/jpg/compressed")
 
 
 def test_the_body_of_a_pose_can_be_named(make: Callable[..., Path]) -> None:
@@ -220,7 +300,7 @@ def test_the_distortion_of_a_camera_is_undone_unless_told_otherwise(make: Callab
 
     def write(bag: Bag) -> None:
         images(bag, info=False)
-        odometry(bag)
+        odometry(bag, child=FRAME)
         bag.camera_info("/camera/depth/camera_info", FRAME, CAMERA, lens)
 
     path = make(write)
@@ -237,7 +317,7 @@ def test_rectified_images_have_the_projections_camera(make: Callable[..., Path])
     def write(bag: Bag) -> None:
         for topic in ("/camera/image_rect", "/camera/image_raw"):
             images(bag, topic, info=False)
-        odometry(bag)
+        odometry(bag, child=FRAME)
         bag.camera_info(
             "/camera/camera_info", FRAME, CAMERA, (-0.2, 0.05, 0.0, 0.0, 0.0), "plumb_bob", rectified
         )
@@ -251,7 +331,7 @@ def test_rectified_images_have_the_projections_camera(make: Callable[..., Path])
 def test_a_lens_that_is_not_opencvs_is_named(make: Callable[..., Path]) -> None:
     def write(bag: Bag) -> None:
         images(bag, info=False)
-        odometry(bag)
+        odometry(bag, child=FRAME)
         bag.camera_info("/camera/depth/camera_info", FRAME, CAMERA, (0.1, 0.0, 0.0, 0.1), "equidistant")
 
     said = refused(make(write))
@@ -261,7 +341,7 @@ def test_a_lens_that_is_not_opencvs_is_named(make: Callable[..., Path]) -> None:
 
 
 def test_without_a_camera_the_user_can_give_one(make: Callable[..., Path]) -> None:
-    path = make(lambda bag: images(bag, info=False), odometry)
+    path = make(lambda bag: images(bag, info=False), odometry, mounted)
     assert "--camera fx,fy,cx,cy" in refused(path)
     dataset = open_dataset(path, intrinsics=(14.0, 15.0, 7.5, 5.5))
     assert dataset.camera == CAMERA
@@ -272,7 +352,7 @@ def test_several_cameras_are_chosen_among(make: Callable[..., Path]) -> None:
 
     def write(bag: Bag) -> None:
         images(bag, "/camera/depth/image_raw", info=False)
-        odometry(bag)
+        odometry(bag, child=FRAME)
         bag.camera_info("/camera/a/camera_info", FRAME, CAMERA)
         bag.camera_info("/camera/b/camera_info", FRAME, other)
 
@@ -283,7 +363,7 @@ def test_several_cameras_are_chosen_among(make: Callable[..., Path]) -> None:
 
 def uncalibrated(bag: Bag) -> None:
     images(bag, info=False)
-    odometry(bag)
+    odometry(bag, child=FRAME)
     camera = PinholeCamera(16, 12, 1.0, 1.0, 0.0, 0.0)
     object.__setattr__(camera, "fx", 0.0)
     object.__setattr__(camera, "fy", 0.0)
@@ -293,7 +373,7 @@ def uncalibrated(bag: Bag) -> None:
 def only_color(bag: Bag) -> None:
     bag.camera_info("/camera/color/camera_info", FRAME, CAMERA)
     bag.image("/camera/color/image_raw", 1.0, FRAME, np.zeros((12, 16, 3), np.uint8), "rgb8")
-    odometry(bag)
+    odometry(bag, child=FRAME)
 
 
 BAD: dict[str, tuple[tuple[Write, ...], str, tuple[str, ...]]] = {
@@ -376,7 +456,7 @@ def test_messages_of_one_moment_are_kept_apart(make: Callable[..., Path]) -> Non
 
     def write(bag: Bag) -> None:
         mounted(bag)
-        odometry(bag)
+        odometry(bag, child=FRAME)
         bag.camera_info("/camera/depth/camera_info", FRAME, CAMERA)
         for i in range(COUNT):
             bag.latency = 3.0 - stamp(i)

@@ -33,8 +33,9 @@ def points(scan: int) -> NDArray[np.float64]:
 
 
 def send(
-    bag: Bag, at: float, xyz: NDArray, topic: str = "/points", big: bool = False, **more: NDArray
-) -> None:
+    bag: Bag, at: float, xyz: NDArray, topic: str = "/points", big: bool = False, frame: str = LIDAR,
+    **more: NDArray,
+) -> None:  # fmt: skip
     """A PointCloud2 of points (H, W, 3) and other fields (H, W), with padding behind each point and row."""
     height, width = xyz.shape[:2]
     columns = {axis: xyz[..., i].astype(np.float32) for i, axis in enumerate("xyz")} | more
@@ -63,7 +64,7 @@ def send(
         topic,
         "sensor_msgs/msg/PointCloud2",
         at,
-        header=bag.header(at, LIDAR),
+        header=bag.header(at, frame),
         height=height,
         width=width,
         fields=fields,

@@ -175,6 +175,11 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
     depth = _depth_topic(reader, chosen.depth)
     camera, distortion = _camera(reader, depth, chosen.info, options)
     found = find_poses(reader, depth.frame, chosen)
+    if found.registered:
+        raise DatasetError(
+            f"{reader.path}: the images of {depth.name} say that they are in {depth.frame}, the frame that "
+            "the poses are in: ?optical=FRAME names the camera's own"
+        )
     entries = sorted((entry for entry, _ in reader.messages(depth.name)), key=lambda entry: entry.stamp)
     posed, notes = _posed(reader, depth.name, "images", entries, found, options)
     dropped = len(entries) - len(posed)
@@ -227,7 +232,7 @@ def _open_lidar(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> 
     if tracked:
         found = replace(found, at=lambda stamp, largest_gap: np.eye(4))
     posed, notes = _posed(reader, topic, "clouds", entries, found, options)
-    gap = _gap(options)
+    gap, deskews = _gap(options), chosen.deskew and not tracked and not found.registered
     bag = LidarBag(
         name=reader.path.stem,
         camera=RayTable([[1.0, 0.0, 0.0]]),
@@ -238,7 +243,8 @@ def _open_lidar(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> 
         entries=[entry for _, entry, _ in posed],
         poses=[pose for _, _, pose in posed],
         names=[f"{i:06d}" for i, _, _ in posed],
-        at=(lambda stamp: found.at(stamp, gap)) if chosen.deskew and not tracked else None,
+        at=(lambda stamp: found.at(stamp, gap)) if deskews else None,
+        registered=found.registered,
         tracked=tracked,
     )
     bag.look_at_first()
@@ -305,6 +311,13 @@ def _camera(
     message = reader.first(name)
     if message is None or reader.topics[name].type != messages.CAMERA_INFO:
         raise DatasetError(f"{reader.path}: topic {name} contains no {messages.CAMERA_INFO}")
+    frame = frame_name(message.header.frame_id)
+    if not wanted and frame and depth.frame and frame != depth.frame:
+        raise DatasetError(
+            f"{reader.path}: the images of {depth.name} are of the frame {depth.frame}, but the CameraInfo "
+            f"of {name} is of {frame}, maybe another camera's; pass --camera fx,fy,cx,cy, or ?info={name} to "
+            "take it all the same"
+        )
     try:
         return messages.camera_of(message, depth.rectified)
     except DatasetError as error:

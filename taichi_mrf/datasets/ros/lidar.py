@@ -6,7 +6,7 @@ lidar moved meanwhile, each ray starts where the lidar was at that time.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,8 @@ from taichi_mrf.sensor.ray_table import RayTable
 @dataclass
 class LidarBag(LidarRecording):
     """The point clouds of one topic, each with its pose. ``at`` gives the lidar's pose at a time in seconds,
-    or None; if it is None itself, points are left where they are."""
+    or None; if it is None itself, points are left where they are. ``registered`` points are in the world's
+    frame, and are taken back into the lidar's."""
 
     reader: RosReader = field(kw_only=True)
     topic: str = field(kw_only=True)
@@ -34,6 +35,7 @@ class LidarBag(LidarRecording):
     poses: Sequence[Pose] = field(kw_only=True)
     names: Sequence[str] = field(kw_only=True)
     at: PoseAt | None = None
+    registered: bool = False
 
     @property
     def frame_names(self) -> Sequence[str]:
@@ -65,6 +67,9 @@ class LidarBag(LidarRecording):
         if not measured.any():
             raise FrameError(f"frame {name}: {where}: none of {measured.size} points is a measurement")
         pose = self.poses[index]
+        if self.registered:
+            own = (cloud.points_m.astype(np.float64) - pose[:3, 3]) @ pose[:3, :3]
+            cloud = replace(cloud, points_m=own.astype(cloud.points_m.dtype))
         motion = None if self.at is None else Motion(entry.stamp, pose, self.at)
         scan = _image(cloud, motion) or _free(cloud, motion)
         return Frame(scan.range_m, pose, scan.camera, entry.stamp, name, no_return=scan.no_return)

@@ -59,9 +59,22 @@ def encoding(message: Any) -> str:
 
 def check_depth(encoding: str) -> None:
     """Raises DatasetError, which does not name the topic, if an image of this encoding is not depth."""
-    kind = encoding.split(";")[0].strip()
+    kind, _, packing = map(str.strip, encoding.partition(";"))
     if kind not in (*MILLIMETRES, METRES, PNG):
         raise DatasetError(f"encoding {encoding!r} is not depth; supported are {ENCODINGS}")
+    if packing.startswith(("jpeg", "jpg")):
+        raise DatasetError(f"encoding {encoding!r} is no longer depth: JPEG keeps 8 bits of it, with losses")
+
+
+def is_depth(encoding: str, topic: str) -> bool:
+    """Whether images of this encoding on a topic are depth. mono16 and plain PNG count if the topic's name
+    contains depth, because infrared images are so too."""
+    kind = encoding.partition(";")[0].strip()
+    try:
+        check_depth(encoding)
+    except DatasetError:
+        return False
+    return kind in (MILLIMETRES[0], METRES) or "depth" in topic.lower()
 
 
 def depth_image(message: Any, depth_scale: float | None) -> NDArray[np.float32]:

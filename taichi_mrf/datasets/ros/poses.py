@@ -53,11 +53,13 @@ class PoseChoice:
 @dataclass
 class BagPoses:
     """``at(stamp, largest_gap)`` is T_fixed_camera, (4, 4), or None; ``source`` names the origin of the
-    poses and the time that they span."""
+    poses and the time that they span. ``registered``: the sensor's data are not in its own frame but in the
+    fixed one, where an odometry has put them."""
 
     at: Callable[[float, float], Pose | None]
     source: str
     notes: list[str] = field(default_factory=list)
+    registered: bool = False
 
 
 def pose_candidates(reader: RosReader, tree: TransformTree, optical: str) -> list[str]:
@@ -82,7 +84,14 @@ def find_poses(reader: RosReader, frame: str, choice: PoseChoice) -> BagPoses:
     optical = choice.optical or frame
     candidates = pose_candidates(reader, tree, optical)
     if not candidates and not choice.pose:
-        raise DatasetError(NO_POSES.format(path=reader.path, frame=optical or "camera frame"))
+        problem = NO_POSES.format(path=reader.path, frame=optical or "camera frame")
+        if tree.frames and optical not in tree.frames:
+            known = f"frame '{optical}', which tf does not have" if optical else "a frame that has no name"
+            problem += (
+                f". The messages are of {known}: ?optical=FRAME says which of tf's frames "
+                f"({', '.join(tree.frames)}) is the sensor's"
+            )
+        raise DatasetError(problem)
     if choice.pose == FROM_TF or (not choice.pose and candidates == [FROM_TF]):
         return _from_tree(reader, tree, optical, choice)
     name = choose(reader, "pose", choice.pose, candidates, "topics of poses")
@@ -111,8 +120,15 @@ def _from_topic(
     timed, parent, child, notes = _read_poses(reader, name)
     if choice.body:
         must_connect(reader, tree, choice.body, optical)
-    body, body_note = body_of(tree, optical, choice.body or child)
     fixed = choice.frame or parent
+    if optical and not choice.optical and optical == parent == fixed:
+        body = choice.body or child or "the sensor"
+        notes.append(f"poses in {fixed} from {name}, of {body}, from where the data were moved to {fixed}")
+        return BagPoses(timed.at, f"{name}: {_span(timed)}", notes, registered=True)
+    try:
+        body, body_note = body_of(tree, optical, choice.body or child)
+    except DatasetError as error:
+        raise DatasetError(f"{reader.path}: topic {name}: {error}") from error
     if choice.frame:
         must_connect(reader, tree, fixed, parent)
     notes.append(f"poses in {fixed or 'an unnamed frame'} from {name}{body_note}")
@@ -153,7 +169,9 @@ def _read_poses(reader: RosReader, name: str) -> tuple[TimedPoses, str, str, lis
 
 
 def body_of(tree: TransformTree, optical: str, named: str) -> tuple[str, str]:
-    """The frame that a topic's poses are of, so that it is connected to the camera's, and a note."""
+    """The frame that a topic's poses are of, so that it is connected to the sensor's, and a note. Raises
+    DatasetError, which does not name the file, if that frame is another body's and no transform leads from
+    there to the sensor."""
     if not named:
         body = tree.body(optical)
         if body == optical:
@@ -163,11 +181,23 @@ def body_of(tree: TransformTree, optical: str, named: str) -> tuple[str, str]:
             )
         return body, f", assumed to be of {body}, to which {optical} is fixed (?body=FRAME sets another)"
     if named != optical and not tree.connects(named, optical):
+        if not _is_cameras(named):
+            same = f"?body={optical}" if optical else f"?optical={named}"
+            raise DatasetError(
+                f"the poses are of {named}, and no transform from there to {optical or 'the sensor'} is in "
+                f"the bag: {same} takes them for the sensor's own, ?poses=FILE takes others"
+            )
         return optical, (
             f", of {named}, assumed to be of the camera itself: "
             f"no transform from {named} to {optical} is in the bag"
         )
     return named, f", of {named}" + (f", from there to {optical} by tf" if named != optical else "")
+
+
+def _is_cameras(frame: str) -> bool:
+    """Whether a frame's name may be that of a camera's optical axes; by REP 105 a link has a body's."""
+    name = frame.lower()
+    return ("cam" in name or "optical" in name) and "link" not in name and "base" not in name
 
 
 def must_connect(reader: RosReader, tree: TransformTree, a: str, b: str) -> None:

@@ -37,18 +37,11 @@ class DepthTopic:
 
 
 def depth_topics(reader: RosReader) -> list[DepthTopic]:
-    """The topics whose first message is a depth image. mono16 counts if the topic's name contains depth:
-    infrared images are mono16 too."""
+    """The topics whose first message is a depth image (messages.is_depth)."""
     images = (messages.IMAGE, messages.COMPRESSED_IMAGE)
     names = [topic.name for topic in reader.topics.values() if topic.type in images and topic.messages]
     found = [described(reader, name) for name in names]
-    return [
-        topic
-        for topic in found
-        if topic.encoding in ("16UC1", messages.METRES)
-        or "compressedDepth" in topic.encoding
-        or (topic.encoding == "mono16" and "depth" in topic.name.lower())
-    ]
+    return [topic for topic in found if messages.is_depth(topic.encoding, topic.name)]
 
 
 def cloud_topics(reader: RosReader) -> list[str]:
@@ -72,13 +65,15 @@ def described(reader: RosReader, name: str) -> DepthTopic:
     if message is None:
         raise DatasetError(f"{reader.path}: topic {name} contains no message")
     frame = frame_name(message.header.frame_id)
-    return DepthTopic(name, messages.encoding(message), frame, _camera_topics(reader, name))
+    return DepthTopic(name, messages.encoding(message), frame, _camera_topics(reader, name, frame))
 
 
-def _camera_topics(reader: RosReader, depth: str) -> tuple[str, ...]:
-    """The CameraInfo topics that share the longest beginning of their names with a depth topic's: one in most
-    bags, since drivers put camera_info beside the image."""
-    names = [t.name for t in reader.topics.values() if t.type == messages.CAMERA_INFO and t.messages]
+def _camera_topics(reader: RosReader, depth: str, frame: str) -> tuple[str, ...]:
+    """The CameraInfo topics of a depth topic: of those in its images' ``frame``, or of all if none is, those
+    that share the longest beginning of their names with it. One is left in most bags, since drivers put
+    camera_info beside the image."""
+    every = [t.name for t in reader.topics.values() if t.type == messages.CAMERA_INFO and t.messages]
+    names = [name for name in every if frame and message_frame(reader, name) == frame] or every
     shared = {name: _shared_parts(name, depth) for name in names}
     most = max(shared.values(), default=0)
     return tuple(name for name in names if shared[name] == most)

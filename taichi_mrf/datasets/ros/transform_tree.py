@@ -18,6 +18,7 @@ class TransformTree:
 
     def __init__(self, edges: Mapping[str, tuple[str, Edge]]) -> None:
         self.edges = dict(edges)
+        self._held: dict[str, Pose | None] = {}
 
     @property
     def frames(self) -> list[str]:
@@ -48,11 +49,12 @@ class TransformTree:
         return [self.edges[frame][1] for frame in (*up, *down)]
 
     def body(self, frame: str) -> str:
-        """The highest frame that the frame is fixed to: that of the vehicle that carries a camera."""
-        for child in self.ancestors(frame):
-            if child not in self.edges or isinstance(self.edges[child][1], TimedPoses):
-                return child
-        return frame
+        """The highest frame that the frame is fixed to: that of the vehicle that carries a camera. A
+        transform that is sent again and again holds a mounting, if one above it moves."""
+        path = self.ancestors(frame)
+        timed = [each for each in path[:-1] if isinstance(self.edges[each][1], TimedPoses)]
+        moving = [each for each in timed if self._holds(each) is None]
+        return (moving or timed or path[-1:])[0]
 
     def lookup(self, target: str, source: str, stamp: float, largest_gap: float) -> Pose | None:
         """T_target_source, (4, 4), at a time in seconds; None where a moving transform on the way has no pose
@@ -70,11 +72,20 @@ class TransformTree:
         common = next(frame for frame in of_a if frame in of_b)
         return of_a[: of_a.index(common)], of_b[: of_b.index(common)]
 
+    def _holds(self, frame: str) -> Pose | None:
+        """T_parent_frame if it is the same at all times: fixed, or sent again and again without a change."""
+        if frame not in self._held:
+            edge = self.edges[frame][1]
+            still = edge.poses[0] if isinstance(edge, TimedPoses) and edge.stands_still else None
+            self._held[frame] = still if isinstance(edge, TimedPoses) else edge
+        return self._held[frame]
+
     def _chain(self, frames: list[str], stamp: float, largest_gap: float) -> Pose | None:
         T = np.eye(4)
         for frame in frames:
-            edge = self.edges[frame][1]
-            step = edge.at(stamp, largest_gap) if isinstance(edge, TimedPoses) else edge
+            step, edge = self._holds(frame), self.edges[frame][1]
+            if step is None and isinstance(edge, TimedPoses):
+                step = edge.at(stamp, largest_gap)
             if step is None:
                 return None
             T = step @ T
