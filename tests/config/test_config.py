@@ -249,7 +249,7 @@ def test_what_is_wrong_is_named_in_one_line(tmp_path: Path, text: str, words: st
 def test_a_file_that_is_not_there_or_not_text(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such file"):
         load(tmp_path / "missing.yaml")
-    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x81")
+    (tmp_path / "binary.yaml").write_bytes(b"\x00\xff\xfe\x81")
     with pytest.raises(ConfigError, match="not a text file"):
         load(tmp_path / "binary.yaml")
 

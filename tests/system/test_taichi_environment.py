@@ -98,10 +98,10 @@ def test_a_folder_that_others_can_write_to_is_not_trusted(
     assert Path(other).parent == tmp_path
 
 
-def test_without_any_folder_taichi_is_not_started(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_any_folder_taichi_is_not_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(CACHE, "/dev/null/x")
     assert f"set {CACHE}" in str(taichi_environment.cache_problem())
-    monkeypatch.setenv(CACHE, "/tmp/x")
+    monkeypatch.setenv(CACHE, str(tmp_path / "x"))
     assert taichi_environment.cache_problem() is None
 
 
