@@ -361,13 +361,50 @@ def test_several_cameras_are_chosen_among(make: Callable[..., Path]) -> None:
     assert open_dataset(f"{path}?info=/camera/b/camera_info").camera == other
 
 
-def uncalibrated(bag: Bag) -> None:
-    images(bag, info=False)
-    odometry(bag, child=FRAME)
+def send_zeros(bag: Bag) -> None:
+    """The CameraInfo of a driver that does not know its camera."""
     camera = PinholeCamera(16, 12, 1.0, 1.0, 0.0, 0.0)
     object.__setattr__(camera, "fx", 0.0)
     object.__setattr__(camera, "fy", 0.0)
     bag.camera_info("/camera/depth/camera_info", FRAME, camera)
+
+
+def test_each_image_has_the_camera_of_its_time(make: Callable[..., Path]) -> None:
+    zoomed = PinholeCamera(16, 12, 20.0, 20.0, 7.5, 5.5)
+    small = PinholeCamera(8, 6, 7.0, 7.5, 3.5, 2.5)
+    cameras = [CAMERA, CAMERA, zoomed, small, small][:COUNT]
+
+    def write(bag: Bag) -> None:
+        odometry(bag, child=FRAME)
+        send_zeros(bag)
+        for i, camera in enumerate(cameras):
+            bag.camera_info("/camera/depth/camera_info", FRAME, camera, stamp=stamp(i))
+            bag.image(
+                "/camera/depth/image", stamp(i), FRAME, steps(i)[: camera.height, : camera.width], "16UC1"
+            )
+
+    dataset = open_dataset(make(write))
+    assert dataset.camera == CAMERA
+    assert [frame.camera for frame in dataset] == cameras
+    assert f"the camera changes {len(set(cameras)) - 1} times, by its CameraInfo" in dataset.notes
+
+
+def test_a_distorted_camera_that_changes_is_refused(make: Callable[..., Path]) -> None:
+    def write(bag: Bag) -> None:
+        images(bag, info=False)
+        odometry(bag, child=FRAME)
+        for i, focal in enumerate((14.0, 20.0)):
+            camera = PinholeCamera(16, 12, focal, focal, 7.5, 5.5)
+            bag.camera_info("/camera/depth/camera_info", FRAME, camera, (0.1, 0, 0, 0, 0), stamp=stamp(i))
+
+    said = refused(make(write))
+    assert f"the camera changes at {START + stamp(1):.3f} s and its lens is distorted; --camera" in said
+
+
+def uncalibrated(bag: Bag) -> None:
+    images(bag, info=False)
+    odometry(bag, child=FRAME)
+    send_zeros(bag)
 
 
 def only_color(bag: Bag) -> None:

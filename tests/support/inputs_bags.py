@@ -108,6 +108,7 @@ class Bag:
         distortion: tuple[float, ...] = (),
         model: str = "plumb_bob",
         projection: PinholeCamera | None = None,
+        stamp: float = 0.0,
     ) -> None:
         """A CameraInfo; ``projection`` is that of the rectified images."""
         roi = self.message(
@@ -126,8 +127,8 @@ class Bag:
         self.send(
             topic,
             "sensor_msgs/msg/CameraInfo",
-            0.0,
-            header=self.header(0.0, frame),
+            stamp,
+            header=self.header(stamp, frame),
             height=camera.height,
             width=camera.width,
             distortion_model=model,

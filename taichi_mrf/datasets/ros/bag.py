@@ -8,6 +8,7 @@ counted. ``poses=track`` finds all poses from the images while mapping. Reading 
 """
 
 import weakref
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -27,7 +28,14 @@ from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.point_cloud import POINT_CLOUD
 from taichi_mrf.datasets.ros.poses import BagPoses, PoseChoice, find_poses
 from taichi_mrf.datasets.ros.reader import METADATA, SUFFIXES, Entry, RosReader, is_bag
-from taichi_mrf.datasets.ros.topics import DepthTopic, choose, cloud_topics, depth_topics, described
+from taichi_mrf.datasets.ros.topics import (
+    DepthTopic,
+    choose,
+    cloud_topics,
+    depth_topics,
+    described,
+    message_frame,
+)
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
@@ -71,7 +79,8 @@ class BagOptions(PoseChoice):
 
 @dataclass
 class RosBag(Dataset):
-    """The depth images of one topic, each with its pose; ``entries`` says where in the bag they are."""
+    """The depth images of one topic, each with its pose; ``entries`` says where in the bag they are.
+    ``cameras`` took them, each from a time in seconds on; ``camera`` is the first."""
 
     camera: PinholeCamera
     reader: RosReader = field(kw_only=True)
@@ -79,6 +88,7 @@ class RosBag(Dataset):
     entries: Sequence[Entry] = field(kw_only=True)
     poses: Sequence[Pose] = field(kw_only=True)
     names: Sequence[str] = field(kw_only=True)
+    cameras: Sequence[tuple[float, PinholeCamera]] = field(kw_only=True)
     depth_scale: float | None = None
     colors: BagColors | None = None
     confidence: BagConfidence | None = None
@@ -126,21 +136,28 @@ class RosBag(Dataset):
             depth_m = messages.depth_image(message, self.depth_scale)
         except DatasetError as error:
             raise FrameError(f"frame {name}: {where}: {error}") from error
-        if depth_m.shape != self.camera.shape:
+        stamp = self.entries[index].stamp
+        camera = self._camera_at(stamp)
+        if depth_m.shape != camera.shape:
             raise FrameError(
                 f"frame {name}: {where}: the image has {depth_m.shape[1]} x {depth_m.shape[0]} pixels, "
-                f"the camera {self.camera.width} x {self.camera.height}"
+                f"the camera {camera.width} x {camera.height}"
             )
         color = sigma_m = None
         try:
             if self.colors is not None:
-                color = self.colors.read(index, depth_m, self.camera)
+                color = self.colors.read(index, depth_m, camera)
             if self.confidence is not None:
-                sigma_m = self.confidence.read(index, depth_m, self.camera)
+                sigma_m = self.confidence.read(index, depth_m, camera)
         except DatasetError as error:
             raise FrameError(f"frame {name}: {error}") from error
-        parts = (self.poses[index], self.camera, self.entries[index].stamp, name, color, sigma_m)
+        parts = (self.poses[index], camera, stamp, name, color, sigma_m)
         return Frame(depth_m, *parts, gyro=self.gyro, acceleration=self.acceleration)
+
+    def _camera_at(self, stamp: float) -> PinholeCamera:
+        """The camera that took an image."""
+        since = [begin for begin, _ in self.cameras]
+        return self.cameras[max(0, bisect_right(since, stamp) - 1)][1]
 
 
 def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
@@ -173,7 +190,8 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
     if chosen.points or (not chosen.depth and cloud_topics(reader) and not depth_topics(reader)):
         return _open_lidar(reader, chosen, options)
     depth = _depth_topic(reader, chosen.depth)
-    camera, distortion = _camera(reader, depth, chosen.info, options)
+    cameras, distortion = _cameras(reader, depth, chosen.info, options)
+    camera = cameras[0][1]
     found = find_poses(reader, depth.frame, chosen)
     if found.registered:
         raise DatasetError(
@@ -189,6 +207,9 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
         notes += said
     confidence, said = find_confidence(reader, chosen.confidence, depth, camera, stamps, options.max_time_gap)
     notes += said
+    if len(cameras) > 1:
+        times = "once" if len(cameras) == 2 else f"{len(cameras) - 1} times"
+        notes.append(f"the camera changes {times}, by its CameraInfo")
     tracked, imu = chosen.poses == TRACK, BagImu()
     poses = [pose for _, _, pose in posed]
     if tracked:
@@ -198,6 +219,7 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
     return RosBag(
         name=reader.path.stem,
         camera=camera,
+        cameras=cameras,
         notes=notes,
         dropped=dropped,
         distortion=distortion,
@@ -297,31 +319,45 @@ def _depth_topic(reader: RosReader, wanted: str) -> DepthTopic:
     return topic
 
 
-def _camera(
+def _cameras(
     reader: RosReader, depth: DepthTopic, wanted: str, options: ReadOptions
-) -> tuple[PinholeCamera, tuple[float, ...]]:
-    """The camera of a topic's images and the distortion in its CameraInfo."""
+) -> tuple[list[tuple[float, PinholeCamera]], tuple[float, ...]]:
+    """The cameras of a topic's images, each with the time in seconds from which on it took them, and the
+    distortion in their CameraInfo."""
     if options.camera is not None:
-        return options.camera, ()
+        return [(0.0, options.camera)], ()
     if options.intrinsics is not None:
-        return PinholeCamera(*_size(reader, depth), *options.intrinsics), ()
+        return [(0.0, PinholeCamera(*_size(reader, depth), *options.intrinsics))], ()
     if not (wanted or depth.info):
         raise DatasetError(f"{reader.path}: contains no CameraInfo; pass --camera fx,fy,cx,cy")
     name = choose(reader, "info", wanted, depth.info, f"topics of the CameraInfo of {depth.name}")
-    message = reader.first(name)
-    if message is None or reader.topics[name].type != messages.CAMERA_INFO:
+    if reader.first(name) is None or reader.topics[name].type != messages.CAMERA_INFO:
         raise DatasetError(f"{reader.path}: topic {name} contains no {messages.CAMERA_INFO}")
-    frame = frame_name(message.header.frame_id)
+    frame = message_frame(reader, name)
     if not wanted and frame and depth.frame and frame != depth.frame:
         raise DatasetError(
             f"{reader.path}: the images of {depth.name} are of the frame {depth.frame}, but the CameraInfo "
             f"of {name} is of {frame}, maybe another camera's; pass --camera fx,fy,cx,cy, or ?info={name} to "
             "take it all the same"
         )
-    try:
-        return messages.camera_of(message, depth.rectified)
-    except DatasetError as error:
-        raise DatasetError(f"{reader.path}: topic {name}: {error}") from error
+    found: list[tuple[float, PinholeCamera, tuple[float, ...]]] = []
+    problems = []  # a driver that warms up may send zeros first
+    for entry, message in reader.messages(name):
+        try:
+            camera, distortion = messages.camera_of(message, depth.rectified)
+        except DatasetError as error:
+            problems.append(str(error))
+            continue
+        if not found or found[-1][1:] != (camera, distortion):
+            found.append((entry.stamp, camera, distortion))
+    if not found:
+        raise DatasetError(f"{reader.path}: topic {name}: {problems[0]}")
+    if len(found) > 1 and any(distortion for _, _, distortion in found):
+        raise DatasetError(
+            f"{reader.path}: topic {name}: the camera changes at {found[1][0]:.3f} s and its lens is "
+            "distorted; --camera fx,fy,cx,cy takes one for all images, with --undistort"
+        )
+    return [(stamp, camera) for stamp, camera, _ in found], found[0][2]
 
 
 def _size(reader: RosReader, depth: DepthTopic) -> tuple[int, int]:
