@@ -515,6 +515,46 @@ def test_without_its_library_one_line_says_what_to_install(
     assert "pip install 'taichi-mrf[ros]'" in refused(path)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("names", [("walk_0", "walk_1"), ("2026-11-25-10-00-00_0", "2026-11-25-10-00-03_1")])
+def test_the_files_of_a_split_recording_are_read_together(
+    tmp_path: Path, kind: Kind, names: tuple[str, str]
+) -> None:
+    """The mounting is in the first file only."""
+    halves = (range(COUNT // 2), range(COUNT // 2, COUNT))
+    suffix = {"ros1": ".bag", "sqlite": ".db3", "mcap": ".mcap"}[kind]
+    folder = tmp_path / "rec"
+    folder.mkdir()
+    for number, (name, half) in enumerate(zip(names, halves, strict=True)):
+        path = folder / (name + suffix) if kind == "ros1" else tmp_path / name
+        with writing(path, kind) as bag:
+            bag.camera_info("/camera/depth/camera_info", FRAME, CAMERA, stamp=stamp(half[0]))
+            if number == 0:
+                mounted(bag)
+            for i in half:
+                bag.image("/camera/depth/image_raw", stamp(i), FRAME, steps(i), "16UC1")
+                bag.odometry("/odom", stamp(i), "odom", BODY, world_body(i))
+        if kind != "ros1":
+            (data,) = path.glob(f"*{suffix}")
+            data.rename(folder / (name + suffix))
+    dataset = open_dataset(folder)
+    assert len(dataset) == COUNT
+    assert f"{names[0]}{suffix} to {names[1]}{suffix}: 2 files are read as one recording" in dataset.notes
+    for i in range(COUNT):
+        np.testing.assert_allclose(dataset.read(i).T_world_camera, world_body(i) @ T_body_camera, atol=1e-9)
+        np.testing.assert_allclose(dataset.read(i).depth_m, steps(i) / 1000, rtol=1e-6)
+
+
+def test_numbered_bags_that_do_not_follow_each_other_are_several(tmp_path: Path) -> None:
+    (tmp_path / "runs").mkdir()
+    for number, later in enumerate((0.0, 60.0)):
+        with writing(tmp_path / "runs" / f"run_{number}.bag", "ros1") as bag:
+            bag.image("/camera/depth/image_raw", later, FRAME, steps(0), "16UC1")
+    said = refused(tmp_path / "runs")
+    assert "contains several recordings (run_1.bag begins 60.0 s after the end of the one before)" in said
+    assert "pass one of: run_0.bag, run_1.bag" in said
+
+
 def test_a_folder_of_bags_names_them(make: Callable[..., Path], tmp_path: Path) -> None:
     make(plain)
     make(plain, kind="mcap", name="second")

@@ -182,6 +182,9 @@ def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
     except DatasetError:
         reader.close()
         raise
+    if reader.parts:
+        first, last = reader.parts[0].name, reader.parts[-1].name
+        bag.notes.append(f"{first} to {last}: {len(reader.parts)} files are read as one recording")
     weakref.finalize(bag, reader.close)
     return bag
 
@@ -371,7 +374,7 @@ def _size(reader: RosReader, depth: DepthTopic) -> tuple[int, int]:
 
 FORMAT = Format(
     name="ROS bag",
-    looks_for=f"{', '.join(SUFFIXES)} or the folder of a ROS 2 bag with {METADATA}",
+    looks_for=f"{', '.join(SUFFIXES)} or the folder of a ROS 2 bag with {METADATA}, or of a split one",
     recognises=is_bag,
     open=lambda path, options: open_bag(path, "", options),
     open_with_query=open_bag,

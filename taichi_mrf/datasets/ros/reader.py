@@ -5,6 +5,7 @@ DatasetError here; the rest of the package sees topics by name and messages as o
 """
 
 import contextlib
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,12 @@ from taichi_mrf.system.libraries import library
 SUFFIXES = (".bag", ".mcap", ".db3")
 METADATA = "metadata.yaml"
 """A folder with this file is a ROS 2 bag."""
+
+LONGEST_PAUSE_S = 5.0
+"""Between the files of a recording that was split while it ran."""
+
+_NUMBERED = re.compile(r"(.*?)(?:\d{4}(?:-\d\d){5})?_(\d+)")
+"""The name of such a file: a beginning, for ROS 1 the time at which it was opened, and its number."""
 
 _NANOSECONDS = 1_000_000_000
 
@@ -47,12 +54,13 @@ class RosReader:
     messages are objects with the fields of their type."""
 
     def __init__(self, path: Path) -> None:
-        """Open a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag.
+        """Open a .bag, .mcap or .db3 file, the folder of a ROS 2 bag, or one with the files of a recording
+        that was split.
 
         Raises DatasetError, whose text names the file, if it is cut short, damaged or of a kind that is not
-        known, and if rosbags is not installed.
+        known, if files do not follow each other in time, and if rosbags is not installed.
         """
-        self.path = path
+        self.path, self.parts = path, parts_of(path)
         for file in path.iterdir() if is_folder(path) else [path]:
             if not is_folder(file):
                 check_regular(file, DatasetError)
@@ -61,7 +69,7 @@ class RosReader:
             bound_unpacking()
             # Before ROS Iron, bags hold no definitions of their messages; those read here never changed.
             types = typesys.get_typestore(typesys.Stores.LATEST)
-            self._reader = highlevel.AnyReader([path], default_typestore=types)
+            self._reader = highlevel.AnyReader(self.parts or [path], default_typestore=types)
             self._reader.open()
             self._connections: dict[str, list[Any]] = {}
             for connection in self._reader.connections:
@@ -78,6 +86,15 @@ class RosReader:
                 f"{path}: cannot be read as a bag, it may be cut short: {said(error)}"
             ) from error
         self._open = True
+        times = [(each.start_time, each.end_time) for each in self._reader.readers]
+        for (_, ended), (began, _), part in zip(times, times[1:], self.parts[1:], strict=False):
+            if abs(began - ended) > LONGEST_PAUSE_S * _NANOSECONDS:
+                self.close()
+                raise DatasetError(
+                    f"{path}: contains several recordings ({part.name} begins {(began - ended) / 1e9:.1f} s "
+                    "after the end of the one before); pass one of: "
+                    f"{', '.join(each.name for each in self.parts)}"
+                )
 
     def close(self) -> None:
         """Close the file."""
@@ -117,8 +134,21 @@ class RosReader:
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path looks like a bag: a file by its name, a folder by its metadata."""
-    return path.suffix in SUFFIXES if is_file(path) else is_file(path / METADATA)
+    """Whether a path looks like a bag: a file by its name, a folder by its metadata or its split files."""
+    return path.suffix in SUFFIXES if is_file(path) else is_file(path / METADATA) or bool(parts_of(path))
+
+
+def parts_of(path: Path) -> list[Path]:
+    """The files of a recording that was split, NAME_0.bag, NAME_1.bag, ..., in a folder without metadata, in
+    their order; none for any other path."""
+    if not is_folder(path) or is_file(path / METADATA):
+        return []
+    files = [file for file in path.iterdir() if file.suffix in SUFFIXES]
+    found = {file: _NUMBERED.fullmatch(file.stem) for file in files}
+    parts = {int(match[2]): file for file, match in found.items() if match is not None}
+    kinds = {(match[1], file.suffix) for file, match in found.items() if match is not None}
+    is_one = len(kinds) == 1 and len(files) > 1 and sorted(parts) == list(range(len(files)))
+    return [parts[number] for number in sorted(parts)] if is_one else []
 
 
 def _library(name: str) -> Any:
