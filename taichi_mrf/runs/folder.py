@@ -98,7 +98,7 @@ class RunFacts:
         report = run_report(result, self.dataset, self.source, check)
         report["noise"] = noise_report(self.config.sensor, noise, self.learnt)
         report["notes"] += noise_notes(self.config.sensor, noise, self.learnt)
-        report["notes"] += [str(warning.message) for warning in self.warned]
+        report["notes"] += dict.fromkeys(str(warning.message) for warning in self.warned)
         report["skipped_frames"] = self.skipped_before | report["skipped_frames"]
         return report | self.choice
 

@@ -1,6 +1,7 @@
 """Point clouds in files: PCD of three encodings, PLY, npz and KITTI's, whole and damaged."""
 
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -50,6 +51,23 @@ def test_velodyne(tmp_path: Path) -> None:
     (tmp_path / "1.bin").write_bytes(bytes(17))
     with pytest.raises(DatasetError, match=r"1\.bin: has 17 bytes, which is no whole number of points"):
         read_cloud(tmp_path / "1.bin")
+
+
+@pytest.mark.parametrize("columns", [3, 4, 5, 6])
+def test_numbers_of_a_point_are_found_by_what_fits(tmp_path: Path, columns: int) -> None:
+    """In a room, with reflectance, ring and time. The size of 960 points fits all numbers of columns."""
+    random = np.random.default_rng(columns)
+    points = random.uniform([-3, -2, -1], [3, 2, 1.5], (960, 3))
+    more = [random.uniform(0, 1, 960), np.arange(960) % 24, np.linspace(0, 0.1, 960)]
+    table = np.column_stack([points, *more])[:, :columns].astype("<f4")
+    table.tofile(tmp_path / "0.bin")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        np.testing.assert_array_equal(read_cloud(tmp_path / "0.bin"), table[:, :3])
+    said = (
+        [f".bin files with {columns} numbers a point, of which the first are x y z"] if columns != 4 else []
+    )
+    assert [str(each.message) for each in caught] == said
 
 
 @settings(max_examples=30, deadline=None)

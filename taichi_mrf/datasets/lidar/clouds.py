@@ -1,6 +1,7 @@
-"""Point clouds in files, by their endings: .npz, .ply, .pcd, .las, .laz, and KITTI's .bin."""
+"""Point clouds in files, by their endings: .npz, .ply, .pcd, .las, .laz, and .bin of plain numbers."""
 
 import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,7 +19,16 @@ ARRAYS = ("points_m", "points", "xyz")
 """Arrays of points (N, 3) in metres in an npz; xyz_2mm are steps of 2 mm."""
 
 _STEPS = re.compile(r"(?:xyz|points)_(\d+)mm")
-_VELODYNE_BYTES = 16
+
+_COLUMNS = (4, 3, 5, 6)
+"""Numbers of a point in a .bin file: KITTI has x y z and reflectance, others leave that out, or have a ring
+and a time too (nuScenes: 5). The first that fits counts, unless another one fits clearly better."""
+
+_CLEARLY = 0.1
+"""Mean logarithm of the variance within columns by which another number has to fit better: 6 columns fit
+points of 3 as well."""
+
+_LEAST_POINTS = 200
 
 
 def read_cloud(path: Path) -> NDArray[np.float64]:
@@ -58,14 +68,29 @@ def _array_name(file: NpzFile) -> str | None:
     return next((name for name in file.names if name in ARRAYS or _STEPS.fullmatch(name)), None)
 
 
-def _velodyne_points(path: Path) -> NDArray[np.float64]:
-    """KITTI's: x y z and reflectance of each point, as little-endian float32."""
+def _float_points(path: Path) -> NDArray[np.float64]:
+    """x y z, and as many more numbers as each point has (_COLUMNS), as little-endian float32."""
     data = read_bytes(path, DatasetError, "the scan is missing")
-    if len(data) % _VELODYNE_BYTES:
+    fitting = [count for count in _COLUMNS if len(data) % (4 * count) == 0]
+    if not fitting:
         raise DatasetError(
-            f"{path}: has {len(data)} bytes, which is no whole number of points of {_VELODYNE_BYTES} bytes"
+            f"{path}: has {len(data)} bytes, which is no whole number of points of "
+            f"{', '.join(str(4 * count) for count in sorted(_COLUMNS))} bytes"
         )
-    return np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3].astype(np.float64)
+    values = np.frombuffer(data, "<f4")
+    spread = {count: _spread(values.reshape(-1, count)) for count in fitting}
+    best = min(spread.values())
+    count = next(count for count in fitting if spread[count] < best + _CLEARLY)
+    if count != _COLUMNS[0]:
+        warnings.warn(f".bin files with {count} numbers a point, of which the first are x y z", stacklevel=2)
+    return values.reshape(-1, count)[:, :3].astype(np.float64)
+
+
+def _spread(table: NDArray[np.float32]) -> float:
+    """How much the numbers of a column differ: the mean logarithm of the variances. With a wrong number of
+    columns each is a mixture of x, y, z and the others, whose variances are larger."""
+    rows = table[np.isfinite(table).all(axis=1) & (np.abs(table) < 1e6).all(axis=1)].astype(np.float64)
+    return float(np.log(rows.var(axis=0) + 1e-4).mean()) if len(rows) >= _LEAST_POINTS else 0.0
 
 
 def _pcd_points(path: Path) -> NDArray[np.float64]:
@@ -76,7 +101,7 @@ READERS: dict[str, Callable[[Path], NDArray[np.float64]]] = {
     ".npz": _npz_points,
     ".ply": read_ply_points,
     ".pcd": _pcd_points,
-    ".bin": _velodyne_points,
+    ".bin": _float_points,
     ".las": read_las,
     ".laz": read_las,
 }
