@@ -6,6 +6,7 @@ first entry that recognises a folder or a file opens it.
 
 import difflib
 import re
+import warnings
 from pathlib import Path
 
 from taichi_mrf.datasets import several_sensors
@@ -74,20 +75,24 @@ def open_dataset(
 ) -> Dataset:
     """Open a recording (a folder or a file) or a built-in source such as ``synthetic:room?frames=60``.
 
-    The keywords are the fields of :class:`ReadOptions`. Raises DatasetError, which names the source and the
-    formats that were looked for.
+    The keywords are the fields of :class:`ReadOptions`. Warnings of this package become notes. Raises
+    DatasetError, which names the source and the formats that were looked for.
     """
     options = ReadOptions(camera, depth_scale, color, max_time_gap, intrinsics, undistort, image_scale, track)
     path = Path(source)
     scheme = re.match(r"([a-z][a-z0-9_]+):", str(source))  # two letters at least: C:\ is a folder
-    try:
-        if scheme and not exists(path):
-            dataset = _open_built_in(str(source), options)
-        else:
-            dataset = _open_path(str(source), options)
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
-    return _as_asked(dataset, options)
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.filterwarnings("always", category=UserWarning, module="taichi_mrf")
+        try:
+            if scheme and not exists(path):
+                dataset = _open_built_in(str(source), options)
+            else:
+                dataset = _open_path(str(source), options)
+        except OSError as error:
+            raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
+        dataset = _as_asked(dataset, options)
+    dataset.notes = list(dict.fromkeys([*dataset.notes, *(str(warning.message) for warning in warned)]))
+    return dataset
 
 
 def recognise(path: Path) -> Format | None:

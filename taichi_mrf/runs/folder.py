@@ -98,7 +98,8 @@ class RunFacts:
         report = run_report(result, self.dataset, self.source, check)
         report["noise"] = noise_report(self.config.sensor, noise, self.learnt)
         report["notes"] += noise_notes(self.config.sensor, noise, self.learnt)
-        report["notes"] += dict.fromkeys(str(warning.message) for warning in self.warned)
+        told = (str(warning.message) for warning in self.warned)
+        report["notes"] = list(dict.fromkeys([*report["notes"], *told]))
         report["skipped_frames"] = self.skipped_before | report["skipped_frames"]
         return report | self.choice
 

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from point_clouds import Walk, las_head, lzf, write_pcd, write_ply
 
+from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.lidar.clouds import is_cloud, natural, read_cloud
 from taichi_mrf.datasets.lidar.lzf import unpack
 from taichi_mrf.datasets.lidar.pcd_file import read_pcd
@@ -68,6 +69,19 @@ def test_numbers_of_a_point_are_found_by_what_fits(tmp_path: Path, columns: int)
         [f".bin files with {columns} numbers a point, of which the first are x y z"] if columns != 4 else []
     )
     assert [str(each.message) for each in caught] == said
+
+
+def test_what_is_odd_of_a_recording_is_a_note_and_no_warning(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    random = np.random.default_rng(0)
+    for scan in range(2):
+        table = [random.uniform([-3, -2, -1], [3, 2, 1.5], (960, 3)), np.full(960, 12.0), np.arange(960) % 24]
+        np.column_stack(table).astype("<f4").tofile(tmp_path / f"{scan}.bin")
+    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
+    notes = open_dataset(tmp_path).notes
+    assert notes.count(".bin files with 5 numbers a point, of which the first are x y z") == 1
+    assert len(recwarn) == 0
 
 
 @settings(max_examples=30, deadline=None)
