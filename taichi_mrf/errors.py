@@ -1,4 +1,9 @@
-"""The exceptions that the library raises. Only the command line turns them into messages and exit codes."""
+"""The exceptions that the library raises, and what it warns of. Only the command line turns them into
+messages and exit codes."""
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 class TaichiMRFError(Exception):
@@ -70,6 +75,15 @@ def said(error: BaseException) -> str:
 
 
 _LONGEST = 200
+
+
+@contextmanager
+def collected_warnings() -> Iterator[list[warnings.WarningMessage]]:
+    """What this package warns of while the block runs, to be told in a report or as notes."""
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("always", category=UserWarning, module="taichi_mrf")
+        yield warned
 
 
 class CutShortError(Exception):

@@ -26,9 +26,8 @@ def read_depth(
     Raises DatasetError, whose text names the file, for an image that is missing, damaged, no 16-bit grey
     image, or of another size than the camera's.
     """
-    return decode_16_bit(_image_file(path), str(path), camera).astype(np.float32) / np.float32(
-        steps_per_metre
-    )
+    steps = decode_16_bit(_image_file(path), str(path), camera)
+    return steps.astype(np.float32) / np.float32(steps_per_metre)
 
 
 def measured(steps: NDArray[np.unsignedinteger]) -> NDArray[np.unsignedinteger]:

@@ -6,7 +6,6 @@ first entry that recognises a folder or a file opens it.
 
 import difflib
 import re
-import warnings
 from pathlib import Path
 
 from taichi_mrf.datasets import several_sensors
@@ -30,7 +29,7 @@ from taichi_mrf.datasets.ros import bag
 from taichi_mrf.datasets.rtabmap import recording as rtabmap
 from taichi_mrf.datasets.stereo import kitti, rig_file
 from taichi_mrf.datasets.synthetic import corridor, mesh_sequence, ring, room
-from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.errors import ConfigError, DatasetError, collected_warnings
 from taichi_mrf.sensor.camera import PinholeCamera, pinhole
 from taichi_mrf.system.files import exists, is_folder
 
@@ -81,8 +80,7 @@ def open_dataset(
     options = ReadOptions(camera, depth_scale, color, max_time_gap, intrinsics, undistort, image_scale, track)
     path = Path(source)
     scheme = re.match(r"([a-z][a-z0-9_]+):", str(source))  # two letters at least: C:\ is a folder
-    with warnings.catch_warnings(record=True) as warned:
-        warnings.filterwarnings("always", category=UserWarning, module="taichi_mrf")
+    with collected_warnings() as warned:
         try:
             if scheme and not exists(path):
                 dataset = _open_built_in(str(source), options)

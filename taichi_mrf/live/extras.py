@@ -1,5 +1,5 @@
-"""What the page shows beside the map: images of a view, the measured surface, what is occupied, and the same
-keyframes mapped by OctoMap's method."""
+"""Extras that the page shows beside the map: images of a view, the measured surface, what is occupied,
+colours that cameras saw, and the same keyframes mapped by OctoMap's method."""
 
 import dataclasses
 import hashlib

@@ -5,12 +5,10 @@ import json
 import os
 import pty
 import re
-import resource
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -18,6 +16,7 @@ import numpy as np
 import pytest
 import trimesh
 from console import COARSE, FAST, ROOM, as_process, assert_refused, mapped, report_of, taichi_mrf
+from full_disk import files_up_to
 from new_interpreter import obey_hangups, output
 
 from taichi_mrf.cli.commands import COMMANDS
@@ -348,23 +347,11 @@ def test_an_output_that_cannot_be_written_is_found_before_mapping(tmp_path: Path
         assert_refused(done, str(tmp_path / "closed"), "Permission denied")
 
 
-@contextmanager
-def small_files_only() -> Iterator[None]:
-    """No file can grow beyond 20 kB: writing fails in the middle, as on a full disk. Not for a whole test, in
-    which pytest writes to what may be a file."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-
-
 # The kernels of the first run are compiled: files of their cache would meet the limit first.
 @pytest.mark.usefixtures("room")
 def test_a_full_disk_names_the_file_and_leaves_no_half(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with small_files_only():
+    with files_up_to(20_000):
         done = taichi_mrf("map", ROOM, "--out", out, *FAST, "--quiet")
     assert_refused(done, str(out / "map.npz"), "cannot be written")
     assert not out.exists()

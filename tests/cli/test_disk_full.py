@@ -3,13 +3,13 @@
 A limit on the size of files fails in the middle of writing as a full disk does.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import small_room
+from full_disk import files_up_to
 
 from taichi_mrf.errors import MapFileError
 from taichi_mrf.evaluation.pictures.run_pictures import write_pictures
@@ -20,7 +20,6 @@ from taichi_mrf.methods.mrf.map import MRFMap
 from taichi_mrf.system.atomic import write_text
 
 pytestmark = pytest.mark.usefixtures("one_backend")
-resource = pytest.importorskip("resource", reason="file-size limits are a POSIX feature")
 
 LEVEL = ExportOptions(z_min=-0.5, z_max=0.5)
 
@@ -30,21 +29,11 @@ def m() -> MRFMap:
     return small_room.build([0, 1])
 
 
-@contextmanager
-def full_disk() -> Iterator[None]:
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (50, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-
-
 def refused(write: Callable[[], object], folder: Path) -> None:
     """Write on a disk that takes files first, so that the old ones must stay, and then does not."""
     write()
     before = contents(folder)
-    with full_disk(), pytest.raises(MapFileError, match="cannot be written: ") as caught:
+    with files_up_to(50), pytest.raises(MapFileError, match="cannot be written: ") as caught:
         write()
     assert str(folder) in str(caught.value)
     assert "\n" not in str(caught.value)

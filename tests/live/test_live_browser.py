@@ -14,7 +14,6 @@ from live_program import LiveProgram
 
 from taichi_mrf import MRFMap
 from taichi_mrf.datasets import open_dataset
-from taichi_mrf.system import runtime
 from taichi_mrf.viewer.messages import LOG_ODDS_STEP
 
 if TYPE_CHECKING:
@@ -59,12 +58,9 @@ def late_page(program: LiveProgram, browser: "Browser") -> Iterator[LivePage]:
 @pytest.fixture(scope="module")
 def saved(late_page: LivePage, tmp_path_factory: pytest.TempPathFactory) -> MRFMap:
     """The map as the page's button saves it."""
-    path = tmp_path_factory.mktemp("saved") / "map.npz"
-    late_page.tab("Save")
-    late_page.download("Map").save_as(path)
+    m = late_page.saved_map(tmp_path_factory.mktemp("saved"))
     late_page.tab("Map")
-    runtime.init("cpu")
-    return MRFMap.load(path)
+    return m
 
 
 @pytest.fixture

@@ -18,7 +18,6 @@ from browser import LivePage, Seen, chromium, missing
 from live_program import LiveProgram
 
 from taichi_mrf import MRFMap
-from taichi_mrf.system import runtime
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -69,7 +68,7 @@ def page(opened_page: LivePage, request: pytest.FixtureRequest) -> Iterator[Live
 def edited(page: LivePage, tmp_path: Path) -> MRFMap:
     """The map that the page shows, as a copy to edit; the page's tab of keyframes is in front."""
     page.until_settled()
-    copy = saved_map(page, tmp_path)
+    copy = page.saved_map(tmp_path)
     count = len(copy.decided.voxels(0.5)[0])  # votes of rays are counted when there is nothing else to do
     page.until(lambda seen: seen.settled and seen.voxels == count, "what is occupied")
     page.tab("Keyframes")
@@ -82,15 +81,6 @@ def edited(page: LivePage, tmp_path: Path) -> MRFMap:
 def number_of(m: MRFMap) -> int:
     """The number that a map gives the keyframe that is edited."""
     return next(id for id, keyframe in m.keyframes.items() if keyframe.name == NAME)
-
-
-def saved_map(page: LivePage, folder: Path) -> MRFMap:
-    """The map as the page's button saves it now."""
-    path = folder / "now.npz"
-    page.tab("Save")
-    page.download("Map").save_as(path)
-    runtime.init("cpu")
-    return MRFMap.load(path)
 
 
 def settled_count(m: MRFMap) -> int:
@@ -172,7 +162,7 @@ def test_a_keyframe_is_moved_by_its_position_and_put_back(
     page.fill("Position (m)", x)  # at once: between keys, a slow machine takes what is typed so far
     until_at(x, "typed")
     page.until(lambda seen: seen.settled and seen.voxels != before.voxels, "another map")
-    moved = saved_map(page, tmp_path)
+    moved = page.saved_map(tmp_path)
     T = moved.keyframes[number_of(moved)].T_world_camera
     np.testing.assert_allclose(T[:3, 3], [x, start[1], start[2]], atol=1e-4)
     edited.move_keyframe(number_of(edited), T)
@@ -230,8 +220,8 @@ def drag(page: LivePage, start: np.ndarray, end: np.ndarray) -> None:
 
 def test_the_saved_map_is_the_one_that_is_shown(page: LivePage, tmp_path: Path, out: Path) -> None:
     shown = at_rest(page)
-    assert len(saved_map(page, tmp_path).decided.voxels(0.5)[0]) == shown.voxels
-    assert (out / "map.npz").read_bytes() == (tmp_path / "now.npz").read_bytes()
+    assert len(page.saved_map(tmp_path).decided.voxels(0.5)[0]) == shown.voxels
+    assert (out / "map.npz").read_bytes() == (tmp_path / "saved.npz").read_bytes()
 
 
 def test_the_voxels_open_as_ply(page: LivePage, tmp_path: Path) -> None:
@@ -300,7 +290,7 @@ def test_reset_begins_anew_and_ends_the_same(page: LivePage) -> None:
 
 def test_a_frozen_keyframe_stays_in_the_map(page: LivePage, tmp_path: Path) -> None:
     before = page.until_settled()
-    m = saved_map(page, tmp_path)
+    m = page.saved_map(tmp_path)
     page.tab("Keyframes")
     page.press("Freeze")
     page.press("Freeze it")

@@ -9,7 +9,6 @@ from live_program import LiveProgram
 
 from taichi_mrf import MRFMap
 from taichi_mrf.methods.mrf.reading import MapReading
-from taichi_mrf.system import runtime
 from taichi_mrf.viewer.scene.coloring import DYNAMIC_COLOR
 
 WALKER = "synthetic:room?moving=walker&width=80&height=60"
@@ -46,11 +45,7 @@ def page() -> Iterator[LivePage]:
 @pytest.fixture(scope="module")
 def saved(page: LivePage, tmp_path_factory: pytest.TempPathFactory) -> MRFMap:
     """The map as the page's button saves it."""
-    path = tmp_path_factory.mktemp("saved") / "map.npz"
-    page.tab("Save")
-    page.download("Map").save_as(path)
-    runtime.init("cpu")
-    return MRFMap.load(path)
+    return page.saved_map(tmp_path_factory.mktemp("saved"))
 
 
 def voxels_of(m: MRFMap | MapReading) -> int:

@@ -15,6 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 from live_program import DEADLINE_S, wait_for
 
+from taichi_mrf import MRFMap
+from taichi_mrf.system import runtime
+
 if TYPE_CHECKING:  # an extra that only these tests need
     from playwright.sync_api import Browser, Download, Locator
 
@@ -282,6 +285,14 @@ class LivePage:
         with self.page.expect_download() as waiting:
             self.press(button)
         return waiting.value
+
+    def saved_map(self, folder: Path) -> MRFMap:
+        """The map as the page's button saves it now; the tab Save is left open."""
+        path = folder / "saved.npz"
+        self.tab("Save")
+        self.download("Map").save_as(path)
+        runtime.init("cpu")
+        return MRFMap.load(path)
 
     def places(
         self, prefix: str, kind: str, local: tuple[float, float, float] = (0, 0, 0)

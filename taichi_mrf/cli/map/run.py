@@ -2,9 +2,6 @@
 
 import math
 import time
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +21,7 @@ from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.unused_color import note_unused_color
+from taichi_mrf.errors import collected_warnings
 from taichi_mrf.mapping.intake import Added
 from taichi_mrf.mapping.pipeline import Event, FrameOffered, Listener, WaitingForPoses, map_sequence
 from taichi_mrf.mapping.rounds import RoundStep
@@ -96,7 +94,7 @@ def map_to_folder(
     skipped = skipped_before(task.out) if task.resume else {}
     opening = time.perf_counter() - start
 
-    with _collected_warnings() as warned:
+    with collected_warnings() as warned:
         start = time.perf_counter()
         learnt = _learn_noise(task, dataset, settings, progress, request)
         if learnt is not None:
@@ -154,15 +152,6 @@ def listener_of(progress: ProgressBar) -> Listener:
             progress.advance("Inferring", done, event.sweeps * event.keyframes, 1)
 
     return listen
-
-
-@contextmanager
-def _collected_warnings() -> Iterator[list[warnings.WarningMessage]]:
-    """What this package warns of while the block runs, for the report instead of the terminal."""
-    with warnings.catch_warnings(record=True) as warned:
-        warnings.simplefilter("ignore")
-        warnings.filterwarnings("always", category=UserWarning, module="taichi_mrf")
-        yield warned
 
 
 def exit_status(request: StopRequest, did_not_fit: str | None = None) -> int:

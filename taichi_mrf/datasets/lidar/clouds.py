@@ -29,6 +29,7 @@ _CLEARLY = 0.1
 points of 3 as well."""
 
 _LEAST_POINTS = 200
+"""Of fewer the variances say nothing, and 4 numbers a point count."""
 
 
 def read_cloud(path: Path) -> NDArray[np.float64]:

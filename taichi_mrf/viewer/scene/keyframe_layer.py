@@ -1,5 +1,5 @@
-"""Keyframes in the scene: small frusta or rings with their depth images, the camera's path, the current
-camera."""
+"""Keyframes that the page keeps, and in the scene: small frusta or rings with their depth images, the
+camera's path, the current camera."""
 
 from dataclasses import dataclass
 
