@@ -21,7 +21,7 @@ from taichi_mrf.datasets.formats import (
     tum_rgbd,
 )
 from taichi_mrf.datasets.hints import hint_for
-from taichi_mrf.datasets.lidar import kitti_velodyne, las_trajectory, ouster, pcd_viewpoints, scan_folder
+from taichi_mrf.datasets.lidar import kitti_velodyne, las_trajectory, ouster, scan_folder
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.realsense import device
 from taichi_mrf.datasets.resampled import resampled
@@ -46,7 +46,6 @@ FORMATS: tuple[Format, ...] = (
     bag.FORMAT,
     kitti_velodyne.FORMAT,
     scan_folder.FORMAT,
-    pcd_viewpoints.FORMAT,
     las_trajectory.FORMAT,
     ouster.FORMAT,
     rtabmap.FORMAT,
