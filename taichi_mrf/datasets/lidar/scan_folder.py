@@ -122,8 +122,8 @@ def _poses_beside(folder: Path) -> bool:
 
 def _viewpoints(path: Path, clouds: list[Path], at_origin: bool) -> dict[Path, ScanPose]:
     """The sensor's poses in the headers of PCDs. Raises DatasetError if they are not known: all of several
-    are the origin, or the points of one cannot have been measured there; not if the caller says that they were
-    (``at_origin``)."""
+    are the origin, or the points of one cannot have been measured there; not if the caller says that they
+    were (``at_origin``)."""
     unknown = not at_origin and all(map(_is_at_origin, clouds))
     if unknown and len(clouds) == 1:
         try:
