@@ -1,12 +1,12 @@
 """Text files of poses, in the layouts that depth-camera recordings use.
 
-- ``stamped``: ``stamp tx ty tz qx qy qz qw`` a line (TUM RGB-D, the freiburg files of ICL-NUIM)
-- ``rows``: the 3 x 4 or 4 x 4 matrix, row by row, in one line for each frame
+- ``stamped``: ``stamp tx ty tz qx qy qz qw`` a line (TUM RGB-D, the freiburg files of ICL-NUIM), or by the
+  names of columns (EuRoC). Stamps are seconds; ms, us or ns since 1970 are told by their size
+- ``rows``: the 3 x 4 or 4 x 4 matrix, row by row, or tx ty tz qx qy qz qw, in one line for each frame
 - ``log``: Choi's format (Redwood): a line of three integers, the first being the frame's number, then
   the four rows of the 4 x 4 matrix
 
-A blank, a comma, a semicolon or a tab separates numbers. Lines that are empty or start with ``#`` are left
-out, and so is a first line of words, which names the columns. A broken layout is an error at once; a pose
+Separators, comments and names of columns: pose_text.py. A broken layout is an error at once; a pose
 that is not a rigid transform is an error only when that pose is read, so that a recording with one bad pose
 can still be used.
 """
@@ -19,14 +19,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_mrf.datasets.pose_text import Line, in_seconds, lines_of_numbers, numbers_in, split
 from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.system.files import decoded, is_file, open_regular, read_text
+from taichi_mrf.system.files import decoded, is_file, open_regular
 
 Layout = Literal["stamped", "rows", "log"]
-Line = tuple[int, list[float]]
-"""A line's number in its file (from 1) and its numbers."""
+
+_UNIT_LENGTH = 0.01
+"""Seven numbers are a pose if the last four are of length 1, up to so much."""
 
 
 @dataclass(frozen=True)
@@ -58,25 +60,28 @@ class Trajectory:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Read a file of poses, recognising its layout by the first line.
+    """Read a file of poses, recognising its layout by the first line. Warns of stamps that come twice.
 
     Raises DatasetError, whose text names the file and the line, if it cannot be read, contains no pose,
     or a line has too few or too many numbers or something that is not a number.
     """
-    lines = _read_numbers(path)
+    lines = lines_of_numbers(path)
     if not lines:
         raise DatasetError(f"{path}: contains no pose")
     columns = len(lines[0][1])
     if columns == 8:
-        return Trajectory(path, "stamped", tuple(_stamped(path, line) for line in lines))
-    if columns in (12, 16):
+        poses = tuple(_stamped(path, line) for line in lines)
+        _warn_of_twice(path, poses)
+        return Trajectory(path, "stamped", poses)
+    if columns in (7, 12, 16):
         return Trajectory(path, "rows", tuple(_row(path, i, line) for i, line in enumerate(lines)))
     if columns == 3:
         blocks = (lines[i : i + 5] for i in range(0, len(lines), 5))
         return Trajectory(path, "log", tuple(_log_block(path, block) for block in blocks))
     raise DatasetError(
-        f"{path} line {lines[0][0]}: {columns} numbers; expected 8 (stamp, position, quaternion), "
-        "12 or 16 (a matrix), or 3 (the head of a .log block)"
+        f"{path} line {lines[0][0]}: {columns} numbers; expected 8 (stamp, position, quaternion), 7 (without "
+        "stamp), 12 or 16 (a matrix), or 3 (the head of a .log block); a first line such as "
+        "'stamp,tx,ty,tz,qw,qx,qy,qz' may name other columns"
     )
 
 
@@ -104,11 +109,14 @@ def is_trajectory(path: Path) -> bool:
         with open_regular(path, DatasetError) as file:
             # Of a file without line ends, no more than this is read either.
             lines = decoded(file.read(1 << 16), "ignore").splitlines()
-        head = [_numbers(line) for _, line in _content(lines)[:5]]
-    except (DatasetError, ValueError):
+        columns, found = split(lines)
+        head = [numbers_in(text, columns) for _, text in found[:5]]
+    except (DatasetError, ValueError, IndexError):
         return False
-    columns = [len(numbers) for numbers in head]
-    return columns == [3, 4, 4, 4, 4] or (bool(columns) and columns[0] in (8, 12, 16))
+    counts = [len(numbers) for numbers in head]
+    if counts[:1] == [7]:
+        return bool(abs(np.linalg.norm(head[0][3:]) - 1) < _UNIT_LENGTH)
+    return counts == [3, 4, 4, 4, 4] or (bool(counts) and counts[0] in (8, 12, 16))
 
 
 def read_matrix_file(path: Path) -> Pose:
@@ -119,7 +127,7 @@ def read_matrix_file(path: Path) -> Pose:
     """
     if not is_file(path):
         raise DatasetError(f"{path}: the pose is missing")
-    numbers = [number for _, row in _read_numbers(path) for number in row]
+    numbers = [number for _, row in lines_of_numbers(path) for number in row]
     if len(numbers) not in (12, 16):
         raise DatasetError(f"{path}: contains {len(numbers)} numbers; a pose is a 4 x 4 matrix")
     return as_pose(np.reshape(numbers, (-1, 4)))
@@ -157,20 +165,33 @@ def _stamped(path: Path, line: Line) -> RecordedPose:
     _expect(path, line, 8)
     if not np.isfinite(values[0]):
         raise DatasetError(f"{path} line {number}: the stamp is not finite")
-    return RecordedPose(values[0], np.array(values[1:]), f"{path} line {number}")
+    return RecordedPose(in_seconds(values[0]), np.array(values[1:], float), f"{path} line {number}")
 
 
 def _row(path: Path, index: int, line: Line) -> RecordedPose:
     number, values = line
-    if len(values) not in (12, 16):
+    if len(values) not in (7, 12, 16):
         _expect(path, line, 12)
-    return RecordedPose(index, np.reshape(values, (-1, 4)), f"{path} line {number}")
+    pose = np.array(values, float)
+    return RecordedPose(index, pose if len(pose) == 7 else pose.reshape(-1, 4), f"{path} line {number}")
+
+
+def _warn_of_twice(path: Path, poses: tuple[RecordedPose, ...]) -> None:
+    """Name a stamp that several poses have, of which the last counts."""
+    seen: dict[float, RecordedPose] = {}
+    twice = [pose for pose in poses if seen.setdefault(pose.key, pose) is not pose]
+    if twice:
+        warnings.warn(
+            f"{len(twice)} of {len(poses)} poses of {path} have the stamp of one before, first "
+            f"{twice[0].source}: {twice[0].key:.6f}",
+            stacklevel=3,
+        )
 
 
 def _log_block(path: Path, block: list[Line]) -> RecordedPose:
     number, head = block[0]
     _expect(path, block[0], 3)
-    if not head[0].is_integer():
+    if not float(head[0]).is_integer():
         raise DatasetError(f"{path} line {number}: a .log block starts with integers, not {head[0]}")
     for line in block[1:]:
         _expect(path, line, 4)
@@ -183,36 +204,3 @@ def _expect(path: Path, line: Line, count: int) -> None:
     number, values = line
     if len(values) != count:
         raise DatasetError(f"{path} line {number}: {len(values)} numbers, expected {count}")
-
-
-def _read_numbers(path: Path) -> list[Line]:
-    lines = []
-    for number, line in _content(read_text(path, DatasetError).splitlines()):
-        try:
-            lines.append((number, _numbers(line)))
-        except ValueError:
-            raise DatasetError(f"{path} line {number}: contains something that is not a number") from None
-    return lines
-
-
-def _content(lines: list[str]) -> list[tuple[int, str]]:
-    """The lines that hold numbers, with their own (from 1)."""
-    found = [(n, line) for n, line in enumerate(lines, start=1) if line.strip() and line.lstrip()[0] != "#"]
-    names_columns = found and not any(map(_is_number, _words(found[0][1])))
-    return found[1:] if names_columns else found
-
-
-def _words(line: str) -> list[str]:
-    return line.replace(",", " ").replace(";", " ").split()
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
-def _numbers(line: str) -> list[float]:
-    return [float(word) for word in _words(line)]

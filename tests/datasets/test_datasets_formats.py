@@ -11,6 +11,7 @@ from datasets_recordings import (
     Content,
     arrays,
     stamped_line,
+    write_image,
     write_log,
     write_npz,
     write_numbered,
@@ -301,3 +302,25 @@ def test_reading_is_lazy_and_repeatable(tmp_path: Path) -> None:
         dataset.read(3)
     with pytest.raises(IndexError):
         dataset.read(-1)
+
+
+@pytest.mark.parametrize("images", [10**3, 10**6, 10**9])
+@pytest.mark.parametrize("poses", [1, 10**9])
+def test_names_of_images_that_are_times_find_their_poses(tmp_path: Path, images: int, poses: int) -> None:
+    """In ms, us or ns since 1970; poses are in seconds or in ns, 4 ms later."""
+    content = Content(3)
+    times = [1_600_000_000.5 + 0.25 * i for i in range(3)]
+    for time, depth in zip(times, content.depth, strict=True):
+        write_image(tmp_path / "depth" / f"{round(time * images)}.png", depth)
+    (tmp_path / "camera.txt").write_text(CAMERA_TXT)
+    lines = []
+    for time, pose in zip([*times, 1_600_000_900.0], [*content.poses, content.poses[0]], strict=True):
+        _, values = stamped_line(0.0, pose).split(maxsplit=1)
+        lines.append(
+            f"{time + 0.004:.3f} {values}" if poses == 1 else f"{round((time + 0.004) * 1000)}000000 {values}"
+        )
+    (tmp_path / "poses.txt").write_text("\n".join(lines))
+    dataset = open_dataset(tmp_path)
+    assert list(dataset.stamps()) == pytest.approx(times)
+    for frame, pose in zip(dataset, content.poses, strict=True):
+        np.testing.assert_allclose(frame.T_world_camera, pose, atol=1e-9)

@@ -121,7 +121,7 @@ def test_a_broken_layout_names_file_and_line(tmp_path: Path, lines: list[str], p
     ],
 )
 def test_a_bad_pose_fails_alone_and_knows_its_line(tmp_path: Path, line: str, problem: str) -> None:
-    first, second, third = read_trajectory(write(tmp_path / "poses.txt", GOOD, line, GOOD)).poses
+    first, second, third = read_trajectory(write(tmp_path / "poses.txt", GOOD, line, "2 1 2 3 0 0 0 1")).poses
     with pytest.raises(KeyframeError, match=problem):
         second.T_world_camera()
     assert second.source == f"{tmp_path / 'poses.txt'} line 2"
@@ -174,3 +174,63 @@ def test_what_counts_as_a_trajectory(tmp_path: Path) -> None:
     assert not is_trajectory(write(tmp_path / "e.txt", "585 0 320", "0 585 240", "0 0 1"))
     assert not is_trajectory(write(tmp_path / "f.txt", "0 depth/0.png 0 rgb/0.png"))
     assert not is_trajectory(write(tmp_path / "g.txt", ""))
+
+
+STAMP, PLACE, TURN = "12.5", ["1", "2", "3"], ["0", "0.6", "0", "0.8"]
+EUROC = (
+    "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], "
+    "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], b_w_RS_S_x [rad s^-1], b_w_RS_S_y [rad s^-1], "
+    "b_w_RS_S_z [rad s^-1], b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], b_a_RS_S_z [m s^-2]"
+)
+ROS = (
+    "%time,field.header.frame_id,field.pose.position.x,field.pose.position.y,field.pose.position.z,"
+    "field.pose.orientation.x,field.pose.orientation.y,field.pose.orientation.z,field.pose.orientation.w"
+)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        [EUROC, "12500000000,1,2,3,0.8,0,0.6,0,9,9,9,9,9,9,9,9,9"],
+        [ROS, "12.5,world,1,2,3,0,0.6,0,0.8"],
+        ["# a walk", "# timestamp qw qx qy qz tx ty tz", "12.5 0.8 0 0.6 0 1 2 3"],
+        ["A walk", '"px";"py";"pz";"qx";"qy";"qz";"qw";"Time (s)"', '1;2;"3";"0";"0.6";"0";"0.8";"12.5"'],
+        ["header.stamp.sec,header.stamp.nanosec,x,y,z,qx,qy,qz,qw", "12,500000000,1,2,3,0,.6,0,.8"],
+        ["// no names", "12.5\t1\t2\t3\t0\t0.6\t0\t0.8\t"],
+        ["% stamp x y z qx qy qz qw", "12.5, 1, 2, 3, 0, 0.6, 0, 0.8,"],
+        ["stamp_ms,pos_x,pos_y,pos_z,rot_w,rot_x,rot_y,rot_z", "12500,1,2,3,.8,0,.6,0"],
+    ],
+)  # fmt: skip
+def test_columns_are_found_by_their_names(tmp_path: Path, lines: list[str]) -> None:
+    path = write(tmp_path / "poses.csv", *lines)
+    assert is_trajectory(path)
+    (pose,) = read_trajectory(path).poses
+    assert pose.key == pytest.approx(12.5)
+    np.testing.assert_array_equal(pose.values, [1, 2, 3, 0, 0.6, 0, 0.8])
+
+
+@pytest.mark.parametrize("unit", [1, 10**3, 10**6, 10**9])
+def test_stamps_since_1970_are_seconds(tmp_path: Path, unit: int) -> None:
+    path = write(tmp_path / "poses.txt", f"{1_600_000_000 * unit + unit // 8} 1 2 3 0 0.6 0 0.8")
+    assert read_trajectory(path).poses[0].key == 1_600_000_000 + (0.125 if unit > 1 else 0)
+
+
+def test_seven_columns_are_poses_in_their_order(tmp_path: Path) -> None:
+    path = write(tmp_path / "poses.txt", "tx ty tz qw qx qy qz", "1 2 3 0.8 0 0.6 0", "4 5 6 1 0 0 0")
+    trajectory = read_trajectory(path)
+    assert is_trajectory(path)
+    assert (trajectory.layout, [pose.key for pose in trajectory.poses]) == ("rows", [0, 1])
+    np.testing.assert_array_equal(trajectory.poses[0].values, [1, 2, 3, 0, 0.6, 0, 0.8])
+    np.testing.assert_array_equal(trajectory.poses[1].T_world_camera()[:3, 3], [4, 5, 6])
+    assert not is_trajectory(write(tmp_path / "boxes.txt", "1 2 3 10 20 30 40"))
+
+
+def test_a_line_shorter_than_its_header_and_a_stamp_that_comes_twice_are_named(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"line 2: 3 numbers, expected 17 as the header names"):
+        read_trajectory(write(tmp_path / "a.csv", EUROC, "1,2,3"))
+    with pytest.raises(DatasetError, match=r"line 2: 9 numbers, expected 8 as the header names"):
+        read_trajectory(write(tmp_path / "c.csv", "# t x y z qx qy qz qw", "1 2 3 4 5 0 0 0 1"))
+    with pytest.warns(
+        UserWarning, match=r"1 of 3 poses .* have the stamp of one before, first .* line 3: 1\.0"
+    ):
+        read_trajectory(write(tmp_path / "b.txt", "1 0 0 0 0 0 0 1", "2 0 0 0 0 0 0 1", "1 9 0 0 0 0 0 1"))

@@ -67,6 +67,12 @@ def pcds_with_viewpoints(folder: Path) -> Path:
     return folder
 
 
+def plies_with_times(folder: Path) -> Path:
+    plies_with_rows(folder)
+    (folder / "times.txt").write_text("3.5\n4.0\n4.5\n")
+    return folder
+
+
 def velodyne(folder: Path) -> Path:
     return write_velodyne(folder, WALK, T_CAMERA_LIDAR)
 
@@ -104,6 +110,7 @@ def test_a_layout_is_read_rightly(tmp_path: Path, layout: Callable[[Path], Path]
     [
         (npz_scans, [5.0, 6.0, 7.0]),
         (plies_with_rows, [0.0, 0.1, 0.2]),
+        (plies_with_times, [3.5, 4.0, 4.5]),
         (plies_named_by_time, [1_600_000_000.5, 1_600_000_001.5, 1_600_000_002.5]),
         (pcds_with_viewpoints, [0.0, 0.1, 0.2]),
         (velodyne, [0.0, 0.25, 0.5]),

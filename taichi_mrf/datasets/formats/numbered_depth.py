@@ -25,9 +25,11 @@ import numpy as np
 
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.formats.open3d_json import is_trajectory_json, read_trajectory_json
+from taichi_mrf.datasets.formats.tum_rgbd import LARGEST_GAP, associate
 from taichi_mrf.datasets.hints import pose_files_hint
 from taichi_mrf.datasets.intrinsics import CAMERA_FILES, PRIMESENSE, find_camera, own_cameras
 from taichi_mrf.datasets.options import ReadOptions
+from taichi_mrf.datasets.pose_text import in_seconds
 from taichi_mrf.datasets.recording import RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory, is_trajectory, read_trajectory
 from taichi_mrf.errors import DatasetError
@@ -53,7 +55,8 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     """List the images in the order of their numbers, each with its pose of the trajectory."""
     images = _numbered_images(folder)
     trajectory = _find_trajectory(folder, list(images.values()))
-    poses, notes = _poses_by_number(list(images), trajectory)
+    gap = LARGEST_GAP if options.max_time_gap is None else options.max_time_gap
+    poses, notes = _poses_by_number(list(images), trajectory, gap)
     left_handed = trajectory.path.suffix == ".freiburg"
     if left_handed:
         notes.append(f"{trajectory.path.name}: mirrored in y, out of ICL-NUIM's left-handed world")
@@ -121,15 +124,22 @@ def _find_trajectory(folder: Path, images: Sequence[Path]) -> Trajectory:
 
 
 def _poses_by_number(
-    numbers: list[int], trajectory: Trajectory
+    numbers: list[int], trajectory: Trajectory, gap: float
 ) -> tuple[dict[int, RecordedPose | None], list[str]]:
     """The pose of each image number, None where one is missing, and notes for the report.
 
-    Numbers outside a stamped trajectory are left out. Poses without stamps go with the images in their
+    Numbers outside a stamped trajectory are left out, and so are those that are times (ms, us or ns since
+    1970) without a pose within the ``gap`` in seconds. Poses without stamps go with the images in their
     order if there are as many, else by number.
     """
     poses, name = trajectory.poses, trajectory.path.name
     by_key = {pose.key: pose for pose in poses}
+    if trajectory.layout == "stamped" and in_seconds(numbers[0]) != numbers[0]:
+        partners = associate([in_seconds(number) for number in numbers], [pose.key for pose in poses], gap)
+        timed = {n: poses[i] for n, i in zip(numbers, partners, strict=True) if i is not None}
+        dropped = len(numbers) - len(timed)
+        note = f"{dropped} of {len(numbers)} images dropped: no unused pose within {gap:g} s in {name}"
+        return dict(timed), [note] if dropped else []
     if trajectory.layout == "stamped":
         first_key, last_key = min(by_key), max(by_key)
         inside = [number for number in numbers if first_key <= number <= last_key]
@@ -164,6 +174,8 @@ def _stamp(path: Path, number: int, trajectory: Trajectory) -> float:
     named = _IMAGE.fullmatch(path.name)
     if named is not None and named[2] is not None:
         return int(named[2][1:]) / 1e6
+    if in_seconds(number) != number:
+        return in_seconds(number)
     return float(number) if trajectory.layout == "rows" else number / FRAMES_PER_SECOND
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.intrinsics import PRIMESENSE, find_camera
 from taichi_mrf.datasets.options import ReadOptions
+from taichi_mrf.datasets.pose_text import in_seconds
 from taichi_mrf.datasets.recording import RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose, read_trajectory
 from taichi_mrf.errors import DatasetError
@@ -155,7 +156,7 @@ def _read_list(path: Path) -> list[tuple[float, Path]]:
         longest = max((len(os.fsencode(part)) for part in file.parts), default=0)
         if longest > LONGEST_NAME:
             raise DatasetError(f"{path} line {number}: no file has a name of {longest} bytes")
-        entries.append((stamp, file))
+        entries.append((in_seconds(stamp), file))
     if not entries:
         raise DatasetError(f"{path}: lists no image")
     return sorted(entries)

@@ -14,6 +14,8 @@ import numpy as np
 from taichi_mrf.datasets.lidar.clouds import number_of
 from taichi_mrf.datasets.lidar.scans import SECONDS_PER_SCAN
 from taichi_mrf.datasets.options import ReadOptions
+from taichi_mrf.datasets.pose_text import in_seconds
+from taichi_mrf.datasets.stereo.pairs import read_times
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, read_timed_poses
 from taichi_mrf.datasets.trajectories import is_trajectory, read_trajectory
 from taichi_mrf.errors import DatasetError
@@ -24,7 +26,6 @@ from taichi_mrf.system.npz_file import open_npz
 POSES_NPZ = "poses.npz"
 TEXTS = (".txt", ".log", ".tum", ".csv", ".freiburg")
 _MATRICES = ("T_world_lidar", "T_world_sensor", "T_world_camera")
-_YEAR_2000_NS = 946_684_800 * 10**9
 
 
 @dataclass(frozen=True)
@@ -77,12 +78,18 @@ def poses_of(
     else:
         numbers = _numbers_of(path, clouds)
     by_number = {int(pose.key): pose for pose in trajectory.poses}
+    times = path.with_name("times.txt")
+    seconds = read_times(times) if is_file(times) else []
+    known = len(seconds) == len(trajectory.poses) > max(by_number)
     found = {
-        cloud: ScanPose(SECONDS_PER_SCAN * number, pose.T_world_camera, pose.source)
+        cloud: ScanPose(
+            seconds[number] if known else SECONDS_PER_SCAN * number, pose.T_world_camera, pose.source
+        )
         for cloud, number in zip(clouds, numbers, strict=True)
         if (pose := by_number.get(number)) is not None
     }
-    return found, [f"no stamps in {path.name}: assumed {SECONDS_PER_SCAN:g} s from one scan to the next"]
+    note = f"no stamps in {path.name}: assumed {SECONDS_PER_SCAN:g} s from one scan to the next"
+    return found, [] if known else [note]
 
 
 def _check_one_map(path: Path, clouds: Sequence[Path], poses: int) -> None:
@@ -138,7 +145,7 @@ def _from_npz(path: Path, clouds: Sequence[Path]) -> tuple[dict[Path, ScanPose],
 
 
 def _stamp_of(cloud: Path) -> float | None:
-    """The time in seconds that is a file's name: seconds with a point, or nanoseconds since 1970."""
+    """The time in seconds that is a file's name: seconds with a point, or ms, us or ns since 1970."""
     try:
         stamp = float(cloud.stem)
     except ValueError:
@@ -146,7 +153,8 @@ def _stamp_of(cloud: Path) -> float | None:
     if not np.isfinite(stamp):
         return None
     if cloud.stem.isdecimal():
-        return int(cloud.stem) / 1e9 if int(cloud.stem) > _YEAR_2000_NS else None
+        seconds = in_seconds(int(cloud.stem))
+        return seconds if seconds < int(cloud.stem) else None
     return stamp
 
 
