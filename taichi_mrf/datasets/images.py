@@ -107,9 +107,17 @@ def _check_size(where: str, width: int, height: int, camera: PinholeCamera | Non
     if camera is not None and (height, width) != camera.shape:
         raise DatasetError(
             f"{where}: the image has {width} x {height} pixels, the camera {camera.width} x {camera.height}"
+            + at_size(camera, width, height)
         )
     if width * height > MOST_PIXELS:
         raise DatasetError(f"{where}: {width} x {height} pixels; at most {MOST_PIXELS:,} are read")
+
+
+def at_size(camera: PinholeCamera, width: int, height: int) -> str:
+    """The intrinsics of a camera whose images were scaled to another size, in words; empty if the two have
+    other proportions."""
+    scaled = camera.scaled(width / camera.width)
+    return f"; scaled to this size it is {scaled.flag()}" if scaled.shape == (height, width) else ""
 
 
 def _png_damage(data: bytes) -> str | None:

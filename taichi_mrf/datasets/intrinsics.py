@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +10,16 @@ import numpy as np
 from taichi_mrf.config.files import parse_yaml
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.datasets.formats.open3d_json import read_intrinsics
-from taichi_mrf.datasets.images import image_size
+from taichi_mrf.datasets.images import at_size, image_size
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.errors import ConfigError, DatasetError, said
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import read_text
 
 _NAMED = re.compile(r"\b(fx|fy|cx|cy|width|height|skew|s)\b\s*[:=]\s*([-+.\w]+)", re.IGNORECASE)
+
+_OTHER_SIZE, _SAME_PROPORTIONS = 0.75, 1.05
+"""A principal point is off the middle of images of its own size by less, as a share of the size."""
 
 PRIMESENSE = PinholeCamera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
 """The defaults of PrimeSense drivers (Kinect 1, Xtion), which ROS uses too."""
@@ -65,7 +68,7 @@ def find_camera(
         raise DatasetError(
             f"{folder}: the images have {size[0]} x {size[1]} pixels, the camera of {default_name} has "
             f"{k.width} x {k.height}, and there is no camera file: pass --camera fx,fy,cx,cy, or put K.txt "
-            "(the 3 x 3 matrix) or camera.txt (width height fx fy cx cy) into the folder"
+            "(the 3 x 3 matrix) or camera.txt (width height fx fy cx cy) into the folder" + at_size(k, *size)
         )
     note = (
         f"no camera file such as K.txt in {folder}: assumed the camera of {default_name}, "
@@ -109,13 +112,14 @@ def read_camera(path: Path, default: PinholeCamera, depth_files: Iterable[Path])
         if len(numbers) == 6:
             return _camera_from_numbers(numbers)
         if len(numbers) == 4:
-            return PinholeCamera(*_image_size(default, depth_files), *numbers)
+            return of_this_size(PinholeCamera(*_image_size(default, depth_files), *numbers))
         if len(numbers) in (9, 12, 16):
             K = np.reshape(numbers, (3 if len(numbers) < 16 else 4, -1))[:3, :3]
             try:
-                return PinholeCamera.from_matrix(*_image_size(default, depth_files), K)
+                camera = PinholeCamera.from_matrix(*_image_size(default, depth_files), K)
             except ConfigError as error:
                 raise ConfigError(f"line {_line_of_numbers(text)}: {error}") from error
+            return of_this_size(camera)
     except ConfigError as error:
         raise DatasetError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
     except ValueError as error:
@@ -123,6 +127,26 @@ def read_camera(path: Path, default: PinholeCamera, depth_files: Iterable[Path])
     raise DatasetError(
         f"{path}: contains {len(numbers)} numbers; expected width height fx fy cx cy, fx fy cx cy, or a "
         "3 x 3 or 4 x 4 matrix"
+    )
+
+
+def of_this_size(camera: PinholeCamera) -> PinholeCamera:
+    """The same camera, whose intrinsics came without the size of their images. Raises ConfigError if that is
+    another: the principal point is off the middle along both sides, in the same way."""
+    c, size = camera, (2 * camera.cx + 1, 2 * camera.cy + 1)
+    if min(size) < 1:
+        return camera
+    lower, upper = sorted((c.width / size[0], c.height / size[1]))
+    if upper > _OTHER_SIZE and lower < 1 / _OTHER_SIZE:
+        return camera
+    remedy = "pass the intrinsics of these images: --camera fx,fy,cx,cy"
+    if upper < _SAME_PROPORTIONS * lower:
+        scale = c.width / size[0]
+        scaled = replace(c, fx=c.fx * scale, fy=c.fy * scale, cx=(c.width - 1) / 2, cy=(c.height - 1) / 2)
+        remedy = f"scaled to these they are {scaled.flag()}; {c.flag()} takes them as they are"
+    raise ConfigError(
+        f"the intrinsics are those of images of about {size[0]:.0f} x {size[1]:.0f} pixels, by the principal "
+        f"point {c.cx:g} {c.cy:g}, but images have {c.width} x {c.height}: {remedy}"
     )
 
 
@@ -147,7 +171,7 @@ def _camera_from_names(
     intrinsics = (values["fx"], values["fy"], values["cx"], values["cy"])
     if "width" in values and "height" in values:
         return _camera_from_numbers([values["width"], values["height"], *intrinsics])
-    return PinholeCamera(*_image_size(default, depth_files), *intrinsics)
+    return of_this_size(PinholeCamera(*_image_size(default, depth_files), *intrinsics))
 
 
 def _camera_from_numbers(numbers: list[float]) -> PinholeCamera:

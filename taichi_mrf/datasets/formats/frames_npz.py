@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset, Format, start_pose
 from taichi_mrf.datasets.images import measured
-from taichi_mrf.datasets.intrinsics import own_cameras
+from taichi_mrf.datasets.intrinsics import of_this_size, own_cameras
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeError
 from taichi_mrf.geometry.poses import as_pose
@@ -199,7 +199,7 @@ def _cameras(
     known: list[PinholeCamera | None] = []
     for index, K in enumerate(matrices):
         try:
-            known.append(PinholeCamera.from_matrix(*size, K) if K[:2].any() else None)
+            known.append(of_this_size(PinholeCamera.from_matrix(*size, K)) if K[:2].any() else None)
         except ConfigError as error:
             of = f" of frame {index}" if len(matrices) > 1 else ""
             raise DatasetError(f"{path}: {MATRIX}{of}: {error}") from error
