@@ -2,6 +2,7 @@
 
 import struct
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,12 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import read_bytes
 from taichi_mrf.system.npz_file import DEFLATE_RATIO
 
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff")
+"""Of depth images that folders may hold."""
+
+_MANY = 0.03
+"""Share of pixels with the largest value of which a note is made."""
+
 MOST_PIXELS = 1 << 27
 """Far more than a camera has; a packed image of a few megabytes may claim a hundred times as many."""
 
@@ -21,13 +28,39 @@ MOST_PIXELS = 1 << 27
 def read_depth(
     path: Path, steps_per_metre: float, camera: PinholeCamera | None = None
 ) -> NDArray[np.float32]:
-    """Axial depth in metres, (H, W) float32, from a 16-bit grey image; 0 means no measurement.
+    """Axial depth in metres, (H, W) float32, from a grey image of 16 bits or of floats, 0 for none.
 
-    Raises DatasetError, whose text names the file, for an image that is missing, damaged, no 16-bit grey
-    image, or of another size than the camera's.
+    Raises DatasetError, whose text names the file, for an image that is missing, damaged, of another kind, or
+    of another size than the camera's.
     """
-    steps = decode_16_bit(_image_file(path), str(path), camera)
+    steps = _decode(_image_file(path), str(path), cv2.IMREAD_UNCHANGED, camera)
+    if steps.ndim == 2 and steps.dtype.kind == "f":
+        steps = np.where(np.isfinite(steps) & (steps > 0), steps, 0)
+    else:
+        steps = _of_16_bit(steps, str(path))
     return steps.astype(np.float32) / np.float32(steps_per_metre)
+
+
+def look_at_depth(path: Path) -> tuple[bool, float]:
+    """Whether a depth image has floats, and the share of its pixels that have the largest whole number;
+    (False, 0) for one that cannot be read."""
+    try:
+        steps = _decode(_image_file(path), str(path), cv2.IMREAD_UNCHANGED)
+    except DatasetError:  # reported when its frame is read
+        return False, 0.0
+    return steps.dtype.kind == "f", share_of_largest(steps)
+
+
+def share_of_largest(steps: NDArray) -> float:
+    """The share of pixels that have the largest value of whole numbers."""
+    return float((steps == np.iinfo(steps.dtype).max).mean()) if steps.dtype.kind == "u" else 0.0
+
+
+def note_of_largest(shares: Sequence[float]) -> list[str]:
+    """A note, if a good part of the pixels of the frames that were looked at have the largest value."""
+    share = float(np.mean(shares)) if len(shares) else 0.0
+    said = f"{share:.0%} of the pixels of {len(shares)} frames looked at have the largest number there is"
+    return [f"depth: {said}, which is no measurement"] if share > _MANY else []
 
 
 def measured(steps: NDArray[np.unsignedinteger]) -> NDArray[np.unsignedinteger]:
@@ -57,7 +90,10 @@ def decode_16_bit(data: bytes, where: str, camera: PinholeCamera | None = None) 
     """Depth in steps, (H, W) uint16, of an encoded image, 0 where there is no measurement. Raises
     DatasetError, whose text begins with ``where``, if it is damaged, no 16-bit grey image, or of another size
     than the camera's."""
-    image = _decode(data, where, cv2.IMREAD_UNCHANGED, camera)
+    return _of_16_bit(_decode(data, where, cv2.IMREAD_UNCHANGED, camera), where)
+
+
+def _of_16_bit(image: NDArray, where: str) -> NDArray[np.uint16]:
     if image.ndim != 2 or image.dtype != np.uint16:
         channels = 1 if image.ndim == 2 else image.shape[2]
         raise DatasetError(

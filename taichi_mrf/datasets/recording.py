@@ -14,11 +14,17 @@ from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.color_camera import ColorCamera, without_black
 from taichi_mrf.datasets.confidence import Confidence
 from taichi_mrf.datasets.depth_scale import PLAUSIBLE_MEDIAN_M, USUAL, Evidence, gather
-from taichi_mrf.datasets.images import read_color, read_depth, read_grey
+from taichi_mrf.datasets.images import look_at_depth, note_of_largest, read_color, read_depth, read_grey
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
+
+ASKED = "--depth-scale"
+"""Where a scale comes from that the caller gives."""
+
+_LOOKED_AT = 4
+"""Images of which the kind and the share of the largest value are found when a recording is opened."""
 
 
 @dataclass(frozen=True)
@@ -141,6 +147,10 @@ class Recording(Dataset):
         An assumed scale is replaced by a usual one with which neighbouring frames agree clearly better; one
         that a file or the caller gives is kept, and a note says that another would agree better.
         """
+        apart = max(1, len(self.frames) // _LOOKED_AT)
+        looked = [look_at_depth(frame.depth_file) for frame in self.frames[::apart][:_LOOKED_AT]]
+        if looked and looked[0][0] and self.scale_source != ASKED:
+            self.steps_per_metre, self.scale_source = 1.0, "metres, as the images hold floats"
         own = self.steps_per_metre
         found = gather(
             len(self.frames) if poses_are_used else min(1, len(self.frames)),
@@ -149,7 +159,7 @@ class Recording(Dataset):
             self.camera,
             tuple(dict.fromkeys((own, *USUAL))),
         )
-        notes = []
+        notes = note_of_largest([share for _, share in looked])
         better = found.better_than(own)
         if better is not None and self.scale_assumed:
             self.steps_per_metre = better

@@ -1,5 +1,6 @@
 """Recordings written in every folder format are recognised and come back as they were written."""
 
+import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -324,3 +325,34 @@ def test_names_of_images_that_are_times_find_their_poses(tmp_path: Path, images:
     assert list(dataset.stamps()) == pytest.approx(times)
     for frame, pose in zip(dataset, content.poses, strict=True):
         np.testing.assert_allclose(frame.T_world_camera, pose, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", [name for name in WHOLE_NUMBERS if "bag" not in name])
+def test_many_largest_numbers_are_a_note(tmp_path: Path, name: str) -> None:
+    content = Content(6)
+    for image in content.depth:
+        image[:3] = 65535
+    notes = open_dataset(WHOLE_NUMBERS[name](tmp_path / "recording", content)).notes
+    assert len([note for note in notes if re.search(r"25% of the pixels of \d frames looked at", note)]) == 1
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".tiff"])
+@pytest.mark.parametrize("kind", [np.uint16, np.float32])
+def test_depth_images_may_be_tiff(tmp_path: Path, suffix: str, kind: type) -> None:
+    """Of 16 bits, or of floats, which are metres."""
+    content = Content(3)
+    for i, depth in enumerate(content.depth):
+        values = depth if kind is np.uint16 else depth / np.float32(1000)
+        if kind is not np.uint16:
+            values[2, :2] = np.nan, -1.0
+        write_image(tmp_path / f"depth/{i}{suffix}", values)
+    (tmp_path / "camera.txt").write_text(CAMERA_TXT)
+    write_log(tmp_path / "trajectory.log", content.poses)
+    for scale in (None, 500.0):
+        dataset = open_dataset(tmp_path, depth_scale=scale)
+        for frame, depth in zip(dataset, content.depth, strict=True):
+            expected = depth.astype(np.float32)
+            if kind is np.float32:
+                expected[2, :2] = 0
+            metres = 1000 if kind is np.float32 or scale is None else 1
+            np.testing.assert_allclose(frame.depth_m, expected / metres / (scale or 1), rtol=1e-6)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset, Format, start_pose
-from taichi_mrf.datasets.images import measured
+from taichi_mrf.datasets.images import measured, note_of_largest, share_of_largest
 from taichi_mrf.datasets.intrinsics import of_this_size, own_cameras
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeError
@@ -66,6 +66,14 @@ class FramesNpz(Dataset):
     def stamps(self) -> Sequence[float]:
         """When each frame was taken, in seconds."""
         return [float(part.stamps[i]) for part, i in self._places]
+
+    def check_scale(self, poses_are_used: bool) -> list[str]:
+        """A note of whole numbers that are no measurements; the unit is known."""
+        try:
+            depth, _ = self._images(self.parts[0])
+        except DatasetError:  # reported when a frame is read
+            return []
+        return note_of_largest([share_of_largest(image) for image in depth[:: max(1, len(depth) // 4)]])
 
     def read(self, index: int) -> Frame:
         """Read one frame. Raises FrameError, which names frame, file and field, for damaged images and

@@ -30,7 +30,7 @@ from taichi_mrf.datasets.hints import pose_files_hint
 from taichi_mrf.datasets.intrinsics import CAMERA_FILES, PRIMESENSE, find_camera, own_cameras
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.pose_text import in_seconds
-from taichi_mrf.datasets.recording import RecordedFrame, Recording
+from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory, is_trajectory, read_trajectory
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
@@ -42,7 +42,7 @@ ICL_NUIM = PinholeCamera(width=640, height=480, fx=481.2, fy=480.0, cx=319.5, cy
 FRAMES_PER_SECOND = 30.0
 COLOR_FOLDERS = ("rgb", "color", "image")
 
-_IMAGE = re.compile(r"(\d+)(-\d+)?\.png")  # Redwood's own scans append a stamp in microseconds
+_IMAGE = re.compile(r"(\d+)(-\d+)?\.(?:png|tiff?)")  # Redwood's own scans append a stamp in microseconds
 _MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
@@ -84,7 +84,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         dropped=len(images) - len(frames),
         frames=frames,
         steps_per_metre=options.depth_scale or (1000.0 if trajectory.layout == "log" else 5000.0),
-        scale_source="--depth-scale" if options.depth_scale else f"assumed as {name} has it",
+        scale_source=ASKED if options.depth_scale else f"assumed as {name} has it",
         scale_assumed=options.depth_scale is None,
         color=options.color,
     )

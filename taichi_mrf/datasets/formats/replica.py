@@ -12,7 +12,7 @@ from pathlib import Path
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.intrinsics import find_camera
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.datasets.recording import RecordedFrame, Recording
+from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose, read_trajectory
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -56,7 +56,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         notes=notes,
         frames=[_frame(path, pose) for path, pose in zip(images, trajectory.poses, strict=True)],
         steps_per_metre=options.depth_scale or steps,
-        scale_source="--depth-scale" if options.depth_scale else str(parameters or NAME),
+        scale_source=ASKED if options.depth_scale else str(parameters or NAME),
         color=options.color,
     )
 

@@ -18,9 +18,10 @@ import numpy as np
 
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.color_camera import ColorCamera
+from taichi_mrf.datasets.images import DEPTH_SUFFIXES
 from taichi_mrf.datasets.intrinsics import find_camera, own_cameras, read_camera
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.datasets.recording import RecordedFrame, Recording
+from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import read_matrix_file
 from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, inverse
@@ -51,7 +52,11 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     """List the tracked images in the order of their numbers. One whose pose is missing is listed, and named
     in an error when it is read."""
     images = sorted(
-        (path for path in (folder / "depth").iterdir() if path.suffix == ".png" and path.stem.isdecimal()),
+        (
+            path
+            for path in (folder / "depth").iterdir()
+            if path.suffix in DEPTH_SUFFIXES and path.stem.isdecimal()
+        ),
         key=lambda path: int(path.stem),
     )
     if not images:
@@ -81,7 +86,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         dropped=dropped,
         frames=frames,
         steps_per_metre=options.depth_scale or STEPS_PER_METRE,
-        scale_source="--depth-scale" if options.depth_scale else NAME,
+        scale_source=ASKED if options.depth_scale else NAME,
         color=color_camera is not None,
         color_camera=color_camera,
     )

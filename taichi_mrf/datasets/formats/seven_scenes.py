@@ -17,7 +17,7 @@ from taichi_mrf.datasets.color_camera import ColorCamera
 from taichi_mrf.datasets.hints import pose_files_hint
 from taichi_mrf.datasets.intrinsics import find_camera
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.datasets.recording import RecordedFrame, Recording
+from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import read_matrix_file
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -69,7 +69,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         notes=notes,
         frames=frames,
         steps_per_metre=options.depth_scale or STEPS_PER_METRE,
-        scale_source="--depth-scale" if options.depth_scale else NAME,
+        scale_source=ASKED if options.depth_scale else NAME,
         color=options.color,
         color_camera=COLOR if camera == CAMERA else None,
     )

@@ -20,7 +20,7 @@ from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.confidence import ARKIT
 from taichi_mrf.datasets.intrinsics import own_cameras
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.datasets.recording import RecordedFrame, Recording
+from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -70,7 +70,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         dropped=dropped,
         frames=frames,
         steps_per_metre=options.depth_scale or 1000.0,
-        scale_source="--depth-scale" if options.depth_scale else "Stray Scanner",
+        scale_source=ASKED if options.depth_scale else "Stray Scanner",
         color=False,
         confidence=ARKIT,
     )

@@ -17,7 +17,7 @@ from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.intrinsics import PRIMESENSE, find_camera
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.pose_text import in_seconds
-from taichi_mrf.datasets.recording import RecordedFrame, Recording
+from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose, read_trajectory
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -80,7 +80,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         dropped=dropped,
         frames=frames,
         steps_per_metre=options.depth_scale or STEPS_PER_METRE,
-        scale_source="--depth-scale" if options.depth_scale else NAME,
+        scale_source=ASKED if options.depth_scale else NAME,
         color=options.color,
     )
 
