@@ -1,5 +1,5 @@
-"""Hints for data that no reader supports: laser scans, clouds without poses, meshes, maps, a text for each
-image."""
+"""Hints for data that no reader supports: laser scans, clouds without poses, meshes, maps, films, archives,
+colours without depth, a text for each image."""
 
 import re
 import shlex
@@ -8,13 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
+from taichi_mrf.datasets.images import holds_depth
 from taichi_mrf.datasets.laser.readers import holds_scans
+from taichi_mrf.datasets.lidar.ply_file import read_ply_header
+from taichi_mrf.datasets.trajectories import is_trajectory
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.system.files import is_file, is_folder, read_text
+from taichi_mrf.system.npz_file import open_npz
 
-_LIDAR = (".las", ".laz", ".bin", ".velodyne")
 _MESHES = (".ply", ".obj", ".stl", ".glb", ".off")
-_OCTOMAPS = (".bt", ".ot")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 ONE_FILE = (
     "write them into poses.txt in this folder, for each image a line of the 12 numbers of the first three "
@@ -28,6 +30,50 @@ LIDAR_POSES = (
 _POSE_TEXTS = (".txt", ".pose", ".cam", ".info")
 
 
+AS_NPZ = (
+    "write them as an .npz with depth_m (N, H, W) in metres, T_world_camera (N, 4, 4) and K (3, 3), or as "
+    "16-bit PNGs NNNN.png with camera.txt (width height fx fy cx cy) and poses.txt (for each image the 12 "
+    "numbers of the first three rows of T_world_camera)"
+)
+_BY_ENDING = {
+    **dict.fromkeys((".las", ".laz", ".bin", ".velodyne"), LIDAR_POSES),
+    **dict.fromkeys(
+        (".xyz", ".pts", ".asc", ".ptx", ".e57"),
+        "is a point cloud in a format that is not read; convert each scan to a .ply or .pcd of its own, and "
+        "put a file of the sensor's poses beside them",
+    ),
+    **dict.fromkeys(
+        (".bt", ".ot"), "contains an OctoMap ({name}), not depth images; taichi-mrf import reads it"
+    ),
+    **dict.fromkeys(
+        (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".7z", ".rar"),
+        "is an archive; unpack it, and pass the folder or the file in it",
+    ),
+    **dict.fromkeys(
+        (".mp4", ".mov", ".avi", ".webm", ".m4v"),
+        "is a film: it has colours, and a map is made of depth; pass the folder of the recording with "
+        "its depth images",
+    ),
+    **dict.fromkeys(
+        (".mkv", ".svo", ".svo2", ".oni", ".klg", ".rrd"),
+        "is a camera maker's own format, which is not read; record or convert it to a ROS bag with depth, "
+        "camera_info and poses, or " + AS_NPZ,
+    ),
+    **dict.fromkeys(
+        (".hdf5", ".h5", ".mat", ".npy", ".pkl", ".pt", ".exr", ".pfm", ".raw"),
+        "holds arrays or images in a format that is not read ({name}); " + AS_NPZ,
+    ),
+    **dict.fromkeys(
+        (".fbx", ".dae", ".gltf", ".usd", ".usdz", ".x3d"),
+        "contains a mesh ({name}), not depth images; converted to .ply or .glb, 'mesh:FILE?poses=FILE' "
+        "renders depth images of it",
+    ),
+    ".sens": "is ScanNet's packed format; extract it to depth/, pose/ and intrinsic/ with ScanNet's tools",
+}
+_IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".pgm", ".ppm")
+_LOOKED_AT = 20
+
+
 def hint_for(path: Path) -> str | None:
     """What a file, or most of a folder, holds instead of depth images, and which command reads it; None if
     it is unknown."""
@@ -36,31 +82,78 @@ def hint_for(path: Path) -> str | None:
             "contains scans of a 2D laser scanner, not depth images; map them with: "
             f"taichi-mrf laser {shlex.quote(str(path))} --out DIR"
         )
-    if is_folder(path):
-        children = [child for child in sorted(path.iterdir()) if is_file(child)]
-        scans = [child for child in children if holds_scans(child)]
-        if scans:
-            names = ", ".join(child.name for child in scans[:8])
-            return f"contains 2D laser scans; pass one of {names} to taichi-mrf laser"
-        kinds = {kind for child in children if (kind := _kind(child))}
-        return kinds.pop() if len(kinds) == 1 else None
-    return _kind(path)
+    if not is_folder(path):
+        return image_hint([path], "is one image") if path.suffix.lower() in _IMAGES else _kind(path)
+    children = [child for child in sorted(path.iterdir()) if is_file(child)]
+    scans = [child for child in children if holds_scans(child)]
+    if scans:
+        names = ", ".join(child.name for child in scans[:8])
+        return f"contains 2D laser scans; pass one of {names} to taichi-mrf laser"
+    kinds = {kind for child in children if (kind := _kind(child))}
+    if len(kinds) == 1:
+        return kinds.pop()
+    below = [file for child in sorted(path.iterdir()) if is_folder(child) for file in _first_files(child)]
+    unread = [
+        file for file in children[:_LOOKED_AT] + below if file.suffix.lower() in (".exr", ".npy", ".pfm")
+    ]
+    if unread:
+        return _kind(unread[0])
+    images = [file for file in children[:_LOOKED_AT] + below if file.suffix.lower() in _IMAGES]
+    return image_hint(images, "holds images") if images else None
+
+
+def image_hint(images: Sequence[Path], what: str) -> str:
+    """What is missing for images, of which some are looked at, to be a recording."""
+    depth = next((path for path in images if holds_depth(path)), None)
+    if depth is None:
+        return (
+            f"{what} ({images[0].name}), but no depth image (16-bit grey, or floats): a map is made of "
+            "depth, which colours do not tell; pass the folder that has the depth images too"
+        )
+    return (
+        f"{what} of depth ({depth.name}) in a layout that is not read: a recording is a folder with all of "
+        f"them, their poses and their camera; {AS_NPZ}"
+    )
+
+
+def _first_files(folder: Path) -> list[Path]:
+    return [child for child in sorted(folder.iterdir()) if is_file(child)][:_LOOKED_AT]
 
 
 def _kind(path: Path) -> str | None:
     suffix = path.suffix.lower()
-    if suffix in _LIDAR:
+    if suffix == ".ply" and _is_cloud(path):
         return LIDAR_POSES
     if suffix in _MESHES:
         return (
             f"contains a mesh or points ({path.name}), not depth images; "
             f"'mesh:{path}?poses=FILE' renders depth images of a mesh; a lidar's scans need poses beside them"
         )
-    if suffix in _OCTOMAPS:
-        return f"contains an OctoMap ({path.name}), not depth images; taichi-mrf import reads it"
-    if suffix == ".sens":
-        return "is ScanNet's packed format; extract it to depth/, pose/ and intrinsic/ with ScanNet's tools"
-    return None
+    if suffix in (".txt", ".csv", ".json", ".log", ".tum", ".freiburg") and is_trajectory(path):
+        return (
+            f"contains poses ({path.name}) and no depth images; pass the recording that they are of, with "
+            f"--poses {shlex.quote(str(path))}"
+        )
+    if suffix == ".npz":
+        return _other_arrays(path)
+    found = _BY_ENDING.get(suffix)
+    return found and found.replace("{name}", path.name)
+
+
+def _other_arrays(path: Path) -> str | None:
+    try:
+        with open_npz(path, DatasetError, "an npz file that can be read") as file:
+            held = ", ".join(file.names[:8]) or "nothing"
+    except DatasetError:
+        return None
+    return f"contains {held}, and not depth_m, T_world_camera and K of frames, nor points or xyz of a scan"
+
+
+def _is_cloud(path: Path) -> bool:
+    try:
+        return read_ply_header(path).faces == 0
+    except DatasetError:
+        return False
 
 
 def pose_files_hint(folder: Path, images: Sequence[Path], remedy: str = ONE_FILE) -> str | None:

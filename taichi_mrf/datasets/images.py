@@ -41,11 +41,20 @@ def read_depth(
     return steps.astype(np.float32) / np.float32(steps_per_metre)
 
 
-def look_at_depth(path: Path) -> tuple[bool, float]:
+def holds_depth(path: Path) -> bool:
+    """Whether a file is an image that may be one of depth: grey of 16 bits or of floats."""
+    try:
+        steps = _decode(_image_file(path), str(path), cv2.IMREAD_UNCHANGED)
+    except DatasetError:
+        return False
+    return steps.ndim == 2 and (steps.dtype == np.uint16 or steps.dtype.kind == "f")
+
+
+def look_at_depth(path: Path, camera: PinholeCamera) -> tuple[bool, float]:
     """Whether a depth image has floats, and the share of its pixels that have the largest whole number;
     (False, 0) for one that cannot be read."""
     try:
-        steps = _decode(_image_file(path), str(path), cv2.IMREAD_UNCHANGED)
+        steps = _decode(_image_file(path), str(path), cv2.IMREAD_UNCHANGED, camera)
     except DatasetError:  # reported when its frame is read
         return False, 0.0
     return steps.dtype.kind == "f", share_of_largest(steps)
@@ -149,11 +158,20 @@ def _check_size(where: str, width: int, height: int, camera: PinholeCamera | Non
         raise DatasetError(f"{where}: {width} x {height} pixels; at most {MOST_PIXELS:,} are read")
 
 
+def as_numbers(camera: PinholeCamera) -> str:
+    """A camera as --camera takes it."""
+    return f"{camera.fx:g},{camera.fy:g},{camera.cx:g},{camera.cy:g}"
+
+
 def at_size(camera: PinholeCamera, width: int, height: int) -> str:
     """The intrinsics of a camera whose images were scaled to another size, in words; empty if the two have
     other proportions."""
     scaled = camera.scaled(width / camera.width)
-    return f"; scaled to this size it is {scaled.flag()}" if scaled.shape == (height, width) else ""
+    return (
+        f"; scaled to this size it is --camera {as_numbers(scaled)}"
+        if scaled.shape == (height, width)
+        else ""
+    )
 
 
 def _png_damage(data: bytes) -> str | None:

@@ -10,7 +10,7 @@ import numpy as np
 from taichi_mrf.config.files import parse_yaml
 from taichi_mrf.config.values import from_dict
 from taichi_mrf.datasets.formats.open3d_json import read_intrinsics
-from taichi_mrf.datasets.images import at_size, image_size
+from taichi_mrf.datasets.images import as_numbers, at_size, image_size
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.errors import ConfigError, DatasetError, said
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -143,7 +143,9 @@ def of_this_size(camera: PinholeCamera) -> PinholeCamera:
     if upper < _SAME_PROPORTIONS * lower:
         scale = c.width / size[0]
         scaled = replace(c, fx=c.fx * scale, fy=c.fy * scale, cx=(c.width - 1) / 2, cy=(c.height - 1) / 2)
-        remedy = f"scaled to these they are {scaled.flag()}; {c.flag()} takes them as they are"
+        remedy = (
+            f"scaled to these they are {as_numbers(scaled)}; --camera fx,fy,cx,cy sets those of depth images"
+        )
     raise ConfigError(
         f"the intrinsics are those of images of about {size[0]:.0f} x {size[1]:.0f} pixels, by the principal "
         f"point {c.cx:g} {c.cy:g}, but images have {c.width} x {c.height}: {remedy}"

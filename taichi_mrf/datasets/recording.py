@@ -148,7 +148,10 @@ class Recording(Dataset):
         that a file or the caller gives is kept, and a note says that another would agree better.
         """
         apart = max(1, len(self.frames) // _LOOKED_AT)
-        looked = [look_at_depth(frame.depth_file) for frame in self.frames[::apart][:_LOOKED_AT]]
+        looked = [
+            look_at_depth(frame.depth_file, frame.camera or self.camera)
+            for frame in self.frames[::apart][:_LOOKED_AT]
+        ]
         if looked and looked[0][0] and self.scale_source != ASKED:
             self.steps_per_metre, self.scale_source = 1.0, "metres, as the images hold floats"
         own = self.steps_per_metre

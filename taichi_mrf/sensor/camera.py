@@ -118,10 +118,6 @@ class PinholeCamera:
             raise ConfigError("not the matrix of a pinhole camera: fx 0 cx / 0 fy cy / 0 0 1")
         return cls(width, height, fx, float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
 
-    def flag(self) -> str:
-        """The flag that sets these intrinsics on the command line."""
-        return f"--camera {self.fx:g},{self.fy:g},{self.cx:g},{self.cy:g}"
-
     @property
     def shape(self) -> tuple[int, int]:
         """(height, width), the shape of this camera's images."""

@@ -19,6 +19,7 @@ from datasets_recordings import (
     write_tum,
 )
 from laser_logs import write_npz
+from point_clouds import write_ply
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.errors import DatasetError, FrameError
@@ -54,10 +55,62 @@ def test_an_empty_folder_says_what_was_looked_for(tmp_path: Path) -> None:
 
 
 def test_a_folder_of_something_else(tmp_path: Path) -> None:
-    (tmp_path / "holiday.jpg").write_bytes(b"")
+    (tmp_path / "holiday.odt").write_bytes(b"")
     text = refused(tmp_path)
     assert str(tmp_path) in text
     assert "frame-NNNNNN.depth.png" in text
+
+
+UNREAD = {
+    "a.exr": "not read (a.exr); write them as an .npz with depth_m",
+    "a.hdf5": "not read (a.hdf5)",
+    "a.npy": "not read (a.npy)",
+    "a.zip": "is an archive; unpack it",
+    "a.tar.gz": "is an archive; unpack it",
+    "a.mp4": "is a film: it has colours, and a map is made of depth",
+    "a.svo": "a camera maker's own format",
+    "a.fbx": "converted to .ply or .glb",
+    "a.obj": "renders depth images of a mesh",
+    "a.glb": "renders depth images of a mesh",
+    "a.xyz": "convert each scan to a .ply or .pcd",
+}
+
+
+@pytest.mark.parametrize("name", UNREAD)
+def test_what_is_not_read_names_a_remedy(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"something")
+    for source in (tmp_path / name, tmp_path):
+        assert UNREAD[name] in refused(source)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tiff"])
+@pytest.mark.parametrize("place", [".", "rgb", "numbered"])
+def test_only_colours(tmp_path: Path, suffix: str, place: str) -> None:
+    for i, image in enumerate(Content(2).color):
+        write_image(tmp_path / (f"{i}{suffix}" if place == "numbered" else f"{place}/view{i}{suffix}"), image)
+    assert "but no depth image (16-bit grey, or floats)" in refused(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff"])
+def test_depth_images_of_other_names(tmp_path: Path, suffix: str) -> None:
+    for i, image in enumerate(Content(2).depth):
+        write_image(tmp_path / f"view{i}{suffix}", image)
+    assert f"of depth (view0{suffix}) in a layout that is not read" in refused(tmp_path)
+    assert f"is one image of depth (view0{suffix})" in refused(tmp_path / f"view0{suffix}")
+
+
+def test_poses_and_points_alone(tmp_path: Path) -> None:
+    (tmp_path / "poses.csv").write_text("timestamp,tx,ty,tz,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n")
+    assert f"with --poses {tmp_path / 'poses.csv'}" in refused(tmp_path / "poses.csv")
+    cloud = write_ply(tmp_path / "cloud.ply", np.zeros((3, 3)))
+    assert "contains lidar point clouds without poses" in refused(cloud)
+
+
+def test_depth_of_another_kind_in_scannet_s_folders(tmp_path: Path) -> None:
+    (tmp_path / "pose").mkdir()
+    (tmp_path / "depth").mkdir()
+    (tmp_path / "depth" / "0.exr").write_bytes(b"something")
+    assert "not read (0.exr)" in refused(tmp_path)
 
 
 def test_a_file_in_place_of_a_folder(folder: Path) -> None:

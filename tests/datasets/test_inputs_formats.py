@@ -119,7 +119,7 @@ def test_scannets_colours_without_their_camera(tmp_path: Path, content: Content)
     K_large = np.diag([1170.0, 1170.0, 1.0, 1.0])
     K_large[:2, 2] = 647.5, 483.5
     (folder / "intrinsic/intrinsic_color.txt").write_text(text_of(K_large))
-    assert "647.5 483.5 is not that of images of 16 x 12 pixels" in refused(folder)
+    assert "principal point 647.5 483.5, but images have 16 x 12" in refused(folder)
     (folder / "intrinsic/intrinsic_color.txt").unlink()
     dataset = open_dataset(folder)
     assert dataset.read(0).color is None
@@ -233,8 +233,6 @@ def test_a_folder_of_npz_is_one_sequence(tmp_path: Path, content: Content) -> No
     dataset = open_dataset(tmp_path)
     assert list(dataset.frame_names) == ["a-000000", "a-000001", "b2", "b3", "b4"]
     assert_same(dataset, content, 1000.0, colored=True)
-    write_npz(tmp_path / "c.npz", {**both, "K": np.diag([2, 2, 1]) @ K})
-    assert "c.npz: has another camera than a.npz" in refused(tmp_path)
 
 
 def test_frames_without_stamps_are_a_second_apart(tmp_path: Path, content: Content) -> None:
@@ -260,7 +258,7 @@ def test_missing_depth_is_zero(tmp_path: Path, content: Content) -> None:
         ({"T_world_camera": None}, "T_world_camera is missing"),
         ({"K": None}, "needs K (3, 3), or fx, fy, cx, cy; fx, fy, cx, cy missing"),
         ({"K": np.eye(4)}, "K is (4, 4)"),
-        ({"K": np.zeros((3, 3))}, "K: not the matrix of a pinhole camera"),
+        ({"K": np.zeros((3, 3))}, "its intrinsics are all zero"),
         ({"K": K + 0.5 * np.eye(3, k=1) * (np.arange(3) == 1)}, "K: the matrix has skew 0.5"),
         ({"stamp": np.array([0.0, 0.1, np.nan, 0.3, 0.4])}, "stamp of frame 2 is nan"),
         ({"T_world_camera": np.zeros((4, 4, 4))}, "T_world_camera is (4, 4, 4); expected (5, 4, 4)"),
@@ -299,7 +297,8 @@ def test_a_damaged_npz_is_named(tmp_path: Path, content: Content, share: float) 
     data = bytearray(path.read_bytes())
     path.write_bytes(data[: int(len(data) * share)])
     assert str(path) in refused(path)
-    large = {"depth_m": np.ones((5, 60, 80)), "T_world_camera": np.stack(content.poses), "K": K}
+    large = {"depth_m": np.ones((5, 60, 80)), "T_world_camera": np.stack(content.poses)}
+    large["K"] = np.diag([5, 5, 1]) @ K
     np.savez(path, **large)  # type: ignore[arg-type]
     data = bytearray(path.read_bytes())
     position = data.find(b"depth_m.npy") + 50_000
@@ -311,7 +310,7 @@ def test_a_damaged_npz_is_named(tmp_path: Path, content: Content, share: float) 
 
 def test_other_files_are_not_taken_for_frames(tmp_path: Path) -> None:
     path = write_npz(tmp_path / "other.npz", {"values": np.zeros(3)})
-    assert "unsupported file type" in refused(path)
+    assert "contains values, and not depth_m, T_world_camera and K" in refused(path)
     assert "no such folder or file" in refused(tmp_path / "nowhere.npz")
     frames = write_npz(tmp_path / "frames.npz", {"depth_m": np.zeros((3, 4))})
     assert "takes no options after a question mark" in refused(f"{frames}?depth=/camera")  # type: ignore[arg-type]

@@ -26,7 +26,8 @@ import numpy as np
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.formats.open3d_json import is_trajectory_json, read_trajectory_json
 from taichi_mrf.datasets.formats.tum_rgbd import LARGEST_GAP, associate
-from taichi_mrf.datasets.hints import pose_files_hint
+from taichi_mrf.datasets.hints import image_hint, pose_files_hint
+from taichi_mrf.datasets.images import holds_depth
 from taichi_mrf.datasets.intrinsics import CAMERA_FILES, PRIMESENSE, find_camera, own_cameras
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.pose_text import in_seconds
@@ -111,6 +112,8 @@ def _find_trajectory(folder: Path, images: Sequence[Path]) -> Trajectory:
     ]
     if len(candidates) != 1 and (hint := pose_files_hint(folder, images)):
         raise DatasetError(f"{folder}: {hint}")
+    if not candidates and not any(map(holds_depth, images[:2])):
+        raise DatasetError(f"{folder}: {image_hint(images[:2], 'holds images')}")
     if not candidates:
         raise DatasetError(f"{folder}: numbered images without a trajectory; looked for {LOOKS_FOR}")
     if len(candidates) > 1:

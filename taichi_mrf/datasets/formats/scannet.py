@@ -18,6 +18,7 @@ import numpy as np
 
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.color_camera import ColorCamera
+from taichi_mrf.datasets.hints import hint_for
 from taichi_mrf.datasets.images import DEPTH_SUFFIXES
 from taichi_mrf.datasets.intrinsics import find_camera, own_cameras, read_camera
 from taichi_mrf.datasets.options import ReadOptions
@@ -60,7 +61,8 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         key=lambda path: int(path.stem),
     )
     if not images:
-        raise DatasetError(f"{folder / 'depth'}: contains no N.png")
+        hint = hint_for(folder / "depth")
+        raise DatasetError(f"{folder / 'depth'}: {hint or 'contains no N.png'}")
     tracked = [path for path in images if not _lost(folder / "pose" / f"{path.stem}.txt")]
     if not tracked:
         raise DatasetError(f"{folder / 'pose'}: tracking was lost in all {len(images)} images")
@@ -101,11 +103,6 @@ def _color_camera(folder: Path, frames: Sequence[RecordedFrame]) -> ColorCamera 
     if first is None or not path.is_file():
         return None
     camera = read_camera(path, COLOR_CAMERA, (first, *images))
-    if not (camera.width / 4 < camera.cx < camera.width * 3 / 4):
-        raise DatasetError(
-            f"{path}: the principal point {camera.cx:g} {camera.cy:g} is not that of images of "
-            f"{camera.width} x {camera.height} pixels such as {first}: scale the intrinsics to the images"
-        )
     T_base_depth, T_base_color = (_extrinsics(folder, name) for name in ("depth", "color"))
     return ColorCamera(camera, inverse(T_base_color) @ T_base_depth)
 
