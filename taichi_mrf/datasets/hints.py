@@ -10,6 +10,7 @@ import numpy as np
 
 from taichi_mrf.datasets.images import holds_depth
 from taichi_mrf.datasets.laser.readers import holds_scans
+from taichi_mrf.datasets.lidar.clouds import is_cloud
 from taichi_mrf.datasets.lidar.ply_file import read_ply_header
 from taichi_mrf.datasets.trajectories import is_trajectory
 from taichi_mrf.errors import DatasetError
@@ -135,7 +136,7 @@ def _kind(path: Path) -> str | None:
             f"--poses {shlex.quote(str(path))}"
         )
     if suffix == ".npz":
-        return _other_arrays(path)
+        return LIDAR_POSES if is_cloud(path) else _other_arrays(path)
     found = _BY_ENDING.get(suffix)
     return found and found.replace("{name}", path.name)
 
@@ -146,7 +147,7 @@ def _other_arrays(path: Path) -> str | None:
             held = ", ".join(file.names[:8]) or "nothing"
     except DatasetError:
         return None
-    return f"contains {held}, and not depth_m, T_world_camera and K of frames, nor points or xyz of a scan"
+    return f"contains {held}, and not depth_m, T_world_camera and K of frames, nor xyz of a scan"
 
 
 def _is_cloud(path: Path) -> bool:
