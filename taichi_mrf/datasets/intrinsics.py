@@ -1,7 +1,7 @@
 """Finding a recording's camera: the caller's, else a file's in the folder, else the format's default."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
 
@@ -73,6 +73,19 @@ def find_camera(
         "sets another"
     )
     return default, [note]
+
+
+def own_cameras(
+    found: Sequence[PinholeCamera | None], options: ReadOptions
+) -> Sequence[PinholeCamera | None]:
+    """The cameras of frames that have their own: where one is not known, that of the frame before, or of the
+    first that has one. None for all if the caller gives one, or none is known."""
+    known = next((camera for camera in found if camera is not None), None)
+    cameras: list[PinholeCamera | None] = []
+    for camera in found:
+        known = camera or known
+        cameras.append(known if options.camera is None and options.intrinsics is None else None)
+    return cameras
 
 
 def read_camera(path: Path, default: PinholeCamera, depth_files: Iterable[Path]) -> PinholeCamera:

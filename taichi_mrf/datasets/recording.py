@@ -26,7 +26,8 @@ class RecordedFrame:
     """The files of one frame.
 
     ``read_pose`` gives T_world_camera. It raises DatasetError, which names the file, or KeyframeError
-    for an invalid pose; ``pose_source`` then names the file, or the file and the line.
+    for an invalid pose; ``pose_source`` then names the file, or the file and the line. ``camera`` is its own,
+    None for the recording's.
     """
 
     name: str
@@ -36,6 +37,7 @@ class RecordedFrame:
     pose_source: str
     color_file: Path | None = None
     confidence_file: Path | None = None
+    camera: PinholeCamera | None = None
 
 
 @dataclass
@@ -105,35 +107,38 @@ class Recording(Dataset):
         if not 0 <= index < len(self.frames):
             raise IndexError(f"{self.name} has {len(self.frames)} frames, there is no frame {index}")
         recorded = self.frames[index]
+        camera = recorded.camera or self.camera
         T_world_camera = self.pose(index)
         color = sigma_m = None
         try:
-            depth_m = read_depth(recorded.depth_file, self.steps_per_metre, self.camera)
+            depth_m = read_depth(recorded.depth_file, self.steps_per_metre, camera)
             if self.color and recorded.color_file is not None:
-                color = self._read_color(recorded.color_file, depth_m)
+                color = self._read_color(recorded.color_file, depth_m, camera)
             if self.confidence is not None and recorded.confidence_file is not None:
-                sigma_m = self._read_sigma(recorded.confidence_file, depth_m, self.confidence)
+                sigma_m = self._read_sigma(recorded.confidence_file, depth_m, self.confidence, camera)
         except DatasetError as error:
             raise FrameError(f"frame {recorded.name}: {error}") from error
-        parts = (self.camera, recorded.stamp, recorded.name, color, sigma_m)
+        parts = (camera, recorded.stamp, recorded.name, color, sigma_m)
         return Frame(depth_m, T_world_camera, *parts)
 
     def _read_sigma(
-        self, path: Path, depth_m: NDArray[np.float32], confidence: Confidence
+        self, path: Path, depth_m: NDArray[np.float32], confidence: Confidence, camera: PinholeCamera
     ) -> NDArray[np.float32]:
         """The sigma of each pixel, from an image of its confidence. Raises DatasetError."""
         levels = read_grey(path)
         try:
-            return confidence.sigma_m(levels, depth_m, self.camera)
+            return confidence.sigma_m(levels, depth_m, camera)
         except DatasetError as error:
             raise DatasetError(f"{path}: {error}") from error
 
-    def _read_color(self, path: Path, depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
+    def _read_color(
+        self, path: Path, depth_m: NDArray[np.float32], camera: PinholeCamera
+    ) -> NDArray[np.uint8]:
         """The colours of the depth image's pixels. Raises DatasetError."""
         if self.color_camera is None:
-            return without_black(read_color(path, self.camera))
+            return without_black(read_color(path, camera))
         color = read_color(path, self.color_camera.camera)
-        return self.color_camera.registered(color, depth_m, self.camera)
+        return self.color_camera.registered(color, depth_m, camera)
 
     def check_scale(self, poses_are_used: bool) -> list[str]:
         """Compare neighbouring frames at the recorded poses, and note which scale is used and why.

@@ -22,7 +22,7 @@ from taichi_mrf.datasets.formats import (
     tum_rgbd,
 )
 from taichi_mrf.datasets.hints import hint_for
-from taichi_mrf.datasets.lidar import kitti_velodyne, las_trajectory, ouster, pcd_viewpoints, scan_folder
+from taichi_mrf.datasets.lidar import kitti_velodyne, las_trajectory, ouster, scan_folder
 from taichi_mrf.datasets.mended import mended
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.realsense import device
@@ -48,7 +48,6 @@ FORMATS: tuple[Format, ...] = (
     bag.FORMAT,
     kitti_velodyne.FORMAT,
     scan_folder.FORMAT,
-    pcd_viewpoints.FORMAT,
     las_trajectory.FORMAT,
     ouster.FORMAT,
     rtabmap.FORMAT,

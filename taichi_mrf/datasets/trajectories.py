@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
+from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import decoded, is_file, open_regular, read_text
 
 Layout = Literal["stamped", "rows", "log"]
@@ -34,11 +35,13 @@ class RecordedPose:
 
     ``key`` is its stamp in seconds, or the frame's number where the layout counts frames. ``values``
     are tx ty tz qx qy qz qw, (7,), or a matrix, (3, 4) or (4, 4). ``source`` is the file and the line.
+    ``camera`` took the frame, where the file holds its intrinsics.
     """
 
     key: float
     values: NDArray[np.float64]
     source: str
+    camera: PinholeCamera | None = None
 
     def T_world_camera(self) -> Pose:
         """The pose, (4, 4), its rotation projected. Raises KeyframeError if it is no rigid transform."""

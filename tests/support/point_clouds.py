@@ -153,3 +153,32 @@ def las_head(number: int, packed: bool = False, /, **changes: int) -> bytes:
     table = changes.get("table", begin + 8 + 100)
     chunks = struct.pack("<II", 0, changes.get("chunks", 1))
     return head + packing + struct.pack("<q", table) + bytes(100) + chunks + bytes(20)
+
+
+class RoomWalk(Walk):
+    """Scans of a lidar that drives through a room of 6 x 5 x 2.6 m with a pillar, and turns."""
+
+    def __post_init__(self) -> None:
+        low, high = np.array([-3.0, -2.5, 0.0]), np.array([3.0, 2.5, 2.6])
+        pillar = np.array([0.6, -0.4, -1.0]), np.array([1.4, 0.4, 4.0])
+        elevation, azimuth = np.radians(np.arange(-33.0, 34, 6))[:, None], np.radians(np.arange(0.0, 360, 4))
+        level = np.cos(elevation)
+        rays = [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation) + 0 * azimuth]
+        d = np.stack(rays, axis=-1).reshape(-1, 3) + 1e-9
+        self.poses, self.clouds = [], []
+        for share in np.linspace(0, 1, self.count):
+            T = np.eye(4)
+            yaw = 0.5 * np.sin(3 * share)
+            T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+            T[:3, 3] = [-2.3 + 2.4 * share, 1.6 * np.cos(2.5 * share), 0.9]
+            turned = d @ T[:3, :3].T
+            walls = np.where(turned > 0, (high - T[:3, 3]) / turned, (low - T[:3, 3]) / turned).min(axis=1)
+            a, b = ((face - T[:3, 3]) / turned for face in pillar)
+            near, far = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+            range_m = np.where((near < far) & (near > 0), np.minimum(near, walls), walls)
+            self.clouds.append((d * range_m[:, None]).astype(np.float32))
+            self.poses.append(T)
+
+    def in_world(self) -> list[Points]:
+        """The clouds in the world's frame."""
+        return [cloud @ T[:3, :3].T + T[:3, 3] for cloud, T in zip(self.clouds, self.poses, strict=True)]

@@ -2,8 +2,9 @@
 
 ``depth_m`` (N, H, W) float is axial depth in metres, 0 or NaN where there is none, or uint16 with
 ``depth_scale``, its steps per metre; ``T_world_camera`` is (N, 4, 4) or (N, 3, 4); ``K`` (3, 3), or ``fx``,
-``fy``, ``cx``, ``cy``. ``stamp`` (N,) in seconds and ``color`` (N, H, W, 3) uint8 RGB may be left out, and
-so may poses with ``ReadOptions.track``. Without the N, a file is one frame.
+``fy``, ``cx``, ``cy``, and with a first axis of N each frame's own, where zeros stand for those of the frame
+before. ``stamp`` (N,) in seconds and ``color`` (N, H, W, 3) uint8 RGB may be left out, and so may poses with
+``ReadOptions.track``. Without the N, a file is one frame.
 """
 
 import math
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset, Format, start_pose
 from taichi_mrf.datasets.images import measured
+from taichi_mrf.datasets.intrinsics import own_cameras
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeError
 from taichi_mrf.geometry.poses import as_pose
@@ -31,21 +33,23 @@ DEPTH, POSE, MATRIX, STAMP, COLOR, SCALE = "depth_m", "T_world_camera", "K", "st
 
 @dataclass(frozen=True)
 class Part:
-    """One file's frames: their poses (N, 4, 4), stamps (N,), the camera, and the depth's steps per metre."""
+    """One file's frames: their poses (N, 4, 4), stamps (N,), cameras, and the depth's steps per metre."""
 
     path: Path
     poses: NDArray[np.float64]
     stamps: NDArray[np.float64]
-    camera: PinholeCamera
+    cameras: Sequence[PinholeCamera]
     steps_per_metre: float
 
 
 @dataclass
 class FramesNpz(Dataset):
-    """The frames of one or more files. The images of the file that was read last are kept in memory."""
+    """The frames of one or more files, with cameras of their ``own`` unless the caller's holds for all. The
+    images of the file that was read last are kept in memory."""
 
     parts: Sequence[Part] = field(kw_only=True)
     color: bool = True
+    own: bool = False
     _loaded: tuple[Path, NDArray, NDArray | None] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -81,22 +85,24 @@ class FramesNpz(Dataset):
         depth_m = values.astype(np.float32) / np.float32(part.steps_per_metre)
         depth_m[~np.isfinite(depth_m) | (depth_m < 0)] = 0.0
         image = None if color is None else color[i]
-        return Frame(depth_m, T_world_camera, self.camera, float(part.stamps[i]), name, image)
+        camera = part.cameras[i] if self.own else self.camera
+        return Frame(depth_m, T_world_camera, camera, float(part.stamps[i]), name, image)
 
     def _images(self, part: Part) -> tuple[NDArray, NDArray | None]:
         if self._loaded is None or self._loaded[0] != part.path:
             with _opened(part.path) as file:
                 count = len(part.poses)
                 depth = _numbers(file, part.path, DEPTH)
-                if depth.shape[-2:] != self.camera.shape:
+                camera = part.cameras[0] if self.own else self.camera
+                if depth.shape[-2:] != camera.shape:
                     raise DatasetError(
                         f"{part.path}: {DEPTH} is {depth.shape}, the camera has "
-                        f"{self.camera.width} x {self.camera.height} pixels"
+                        f"{camera.width} x {camera.height} pixels"
                     )
-                depth = depth.reshape(count, *self.camera.shape)
+                depth = depth.reshape(count, *camera.shape)
                 color = None
                 if self.color and COLOR in file:
-                    color = file[COLOR].reshape(count, *self.camera.shape, 3)
+                    color = file[COLOR].reshape(count, *camera.shape, 3)
             self._loaded = part.path, depth, color
         return self._loaded[1], self._loaded[2]
 
@@ -122,11 +128,8 @@ def open_npz_frames(path: Path, options: ReadOptions) -> FramesNpz:
     parts: list[Part] = []
     for each in paths:
         parts.append(_read_part(each, options, first=sum(len(part.poses) for part in parts)))
-    camera = options.camera or parts[0].camera
-    for part in parts:
-        if part.camera != parts[0].camera:
-            raise DatasetError(f"{part.path}: has another camera than {parts[0].path.name}")
-    return FramesNpz(name, camera, parts=parts, color=options.color)
+    own = options.camera is None and options.intrinsics is None
+    return FramesNpz(name, parts[0].cameras[0], parts=parts, color=options.color, own=own)
 
 
 def _read_part(path: Path, options: ReadOptions, first: int) -> Part:
@@ -161,37 +164,49 @@ def _read_part(path: Path, options: ReadOptions, first: int) -> Part:
             path,
             poses.reshape(count, *poses.shape[-2:]).astype(np.float64),
             stamps.astype(np.float64),
-            _camera(path, file, width, height, options),
+            _cameras(path, file, count, (width, height), options),
             _steps_per_metre(path, file, dtype, options),
         )
 
 
-def _camera(path: Path, file: NpzFile, width: int, height: int, options: ReadOptions) -> PinholeCamera:
+def _cameras(
+    path: Path, file: NpzFile, count: int, size: tuple[int, int], options: ReadOptions
+) -> Sequence[PinholeCamera]:
+    """The camera of each frame, for images of ``size`` (width, height)."""
     if options.camera is not None:
-        return options.camera
-    names = ("fx", "fy", "cx", "cy")
+        return [options.camera] * count
     if options.intrinsics is not None:
-        intrinsics = options.intrinsics
-    elif MATRIX in file:
-        K = _numbers(file, path, MATRIX)
-        if K.shape != (3, 3):
-            raise DatasetError(f"{path}: {MATRIX} is {K.shape}; expected (3, 3)")
-        try:
-            return PinholeCamera.from_matrix(width, height, K)
-        except ConfigError as error:
-            raise DatasetError(f"{path}: {MATRIX}: {error}") from error
+        return [PinholeCamera(*size, *options.intrinsics)] * count
+    if MATRIX in file:
+        matrices = _numbers(file, path, MATRIX)
+        if matrices.shape not in ((3, 3), (count, 3, 3)):
+            raise DatasetError(f"{path}: {MATRIX} is {matrices.shape}; expected (3, 3), or ({count}, 3, 3)")
     else:
+        names = ("fx", "fy", "cx", "cy")
         missing = [name for name in names if name not in file]
         if missing:
             raise DatasetError(
                 f"{path}: needs {MATRIX} (3, 3), or fx, fy, cx, cy; {', '.join(missing)} missing"
             )
-        fx, fy, cx, cy = (_number(file, path, name) for name in names)
-        intrinsics = (fx, fy, cx, cy)
-    try:
-        return PinholeCamera(width, height, *intrinsics)
-    except ConfigError as error:
-        raise DatasetError(f"{path}: {error}") from error
+        numbers = [_numbers(file, path, name).reshape(-1) for name in names]
+        for name, values in zip(names, numbers, strict=True):
+            if len(values) not in (1, count):
+                raise DatasetError(f"{path}: {name} has {len(values)} numbers; expected one, or {count}")
+        fx, fy, cx, cy = np.broadcast_arrays(*numbers)
+        matrices = np.zeros((len(fx), 3, 3))
+        matrices[:, [0, 1, 0, 1, 2], [0, 1, 2, 2, 2]] = np.stack([fx, fy, cx, cy, np.ones(len(fx))], axis=1)
+    matrices = matrices.reshape(-1, 3, 3)
+    known: list[PinholeCamera | None] = []
+    for index, K in enumerate(matrices):
+        try:
+            known.append(PinholeCamera.from_matrix(*size, K) if K[:2].any() else None)
+        except ConfigError as error:
+            of = f" of frame {index}" if len(matrices) > 1 else ""
+            raise DatasetError(f"{path}: {MATRIX}{of}: {error}") from error
+    found = [camera for camera in own_cameras(known, options) if camera is not None]
+    if not found:
+        raise DatasetError(f"{path}: its intrinsics are all zero; --camera fx,fy,cx,cy sets them")
+    return found * max(1, count // len(found))
 
 
 def _steps_per_metre(path: Path, file: NpzFile, dtype: np.dtype, options: ReadOptions) -> float:

@@ -17,6 +17,7 @@ against the poses (depth_scale.py), and the notes name what was assumed.
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -25,7 +26,7 @@ import numpy as np
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.formats.open3d_json import is_trajectory_json, read_trajectory_json
 from taichi_mrf.datasets.hints import pose_files_hint
-from taichi_mrf.datasets.intrinsics import CAMERA_FILES, PRIMESENSE, find_camera
+from taichi_mrf.datasets.intrinsics import CAMERA_FILES, PRIMESENSE, find_camera, own_cameras
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.recording import RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory, is_trajectory, read_trajectory
@@ -51,25 +52,28 @@ def recognises(folder: Path) -> bool:
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     """List the images in the order of their numbers, each with its pose of the trajectory."""
     images = _numbered_images(folder)
-    trajectory, recorded = _find_trajectory(folder, list(images.values()))
+    trajectory = _find_trajectory(folder, list(images.values()))
     poses, notes = _poses_by_number(list(images), trajectory)
     left_handed = trajectory.path.suffix == ".freiburg"
     if left_handed:
         notes.append(f"{trajectory.path.name}: mirrored in y, out of ICL-NUIM's left-handed world")
+    posed = [number for number in images if number in poses]
+    found = [poses[number] for number in posed]
+    own = own_cameras([None if pose is None else pose.camera for pose in found], options)
     frames = [
-        _frame(folder, number, path, trajectory, poses[number], left_handed)
-        for number, path in images.items()
-        if number in poses
+        _frame(folder, number, images[number], trajectory, poses[number], left_handed) for number in posed
     ]
     if not frames:
         raise DatasetError(f"{trajectory.path}: has a pose for none of the {len(images)} images in {folder}")
     redwood = trajectory.layout == "log" or (trajectory.layout == "rows" and "icl" not in folder.name.lower())
     default, name = (PRIMESENSE, "Redwood") if redwood else (ICL_NUIM, "ICL-NUIM")
+    recorded = own[0]
     camera, assumed = find_camera(
         folder, options, recorded or default, name, (frame.depth_file for frame in frames)
     )
     if recorded is not None and camera == recorded:
         assumed = []
+        frames = [replace(frame, camera=each) for frame, each in zip(frames, own, strict=True)]
     return Recording(
         name=folder.name,
         camera=camera,
@@ -93,8 +97,8 @@ def _numbered_images(folder: Path) -> dict[int, Path]:
     return {}
 
 
-def _find_trajectory(folder: Path, images: Sequence[Path]) -> tuple[Trajectory, PinholeCamera | None]:
-    """The only trajectory of a recording, and the camera in it, if there is one."""
+def _find_trajectory(folder: Path, images: Sequence[Path]) -> Trajectory:
+    """The only trajectory of a recording."""
     suffixes = (".txt", ".log", ".freiburg")
     candidates = [
         path
@@ -113,7 +117,7 @@ def _find_trajectory(folder: Path, images: Sequence[Path]) -> tuple[Trajectory, 
         )
     if candidates[0].suffix == ".json":
         return read_trajectory_json(candidates[0])
-    return read_trajectory(candidates[0]), None
+    return read_trajectory(candidates[0])
 
 
 def _poses_by_number(

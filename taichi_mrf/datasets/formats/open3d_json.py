@@ -32,8 +32,8 @@ def is_trajectory_json(path: Path) -> bool:
         return False
 
 
-def read_trajectory_json(path: Path) -> tuple[Trajectory, PinholeCamera | None]:
-    """The poses of a trajectory, counted from 0, and its first image's camera if it holds one.
+def read_trajectory_json(path: Path) -> Trajectory:
+    """The poses of a trajectory, counted from 0, with the cameras of their images where it holds some.
 
     Raises DatasetError, whose text names the file and the entry, if a matrix is missing or has not 16
     numbers, or if there is no entry.
@@ -42,9 +42,7 @@ def read_trajectory_json(path: Path) -> tuple[Trajectory, PinholeCamera | None]:
     entries = values.get(_LISTS[values["class_name"]])
     if not isinstance(entries, list) or not entries:
         raise DatasetError(f"{path}: contains no pose")
-    poses = [_pose(path, index, entry) for index, entry in enumerate(entries)]
-    camera = _camera(path, entries[0]["intrinsic"]) if "intrinsic" in entries[0] else None
-    return Trajectory(path, "log", tuple(poses)), camera
+    return Trajectory(path, "log", tuple(_pose(path, index, entry) for index, entry in enumerate(entries)))
 
 
 def _pose(path: Path, index: int, entry: Any) -> RecordedPose:
@@ -59,10 +57,18 @@ def _pose(path: Path, index: int, entry: Any) -> RecordedPose:
             matrix = inverse(as_pose(matrix))
         except KeyframeError:
             matrix = np.full((4, 4), np.nan)  # reported when its frame is read
-    return RecordedPose(index, matrix, source)
+    intrinsic = entry.get("intrinsic")
+    # A focal length of zero stands for a camera that is not known.
+    unknown = intrinsic is None or (isinstance(intrinsic, dict) and _focal(intrinsic) == 0)
+    return RecordedPose(index, matrix, source, None if unknown else _camera(source, intrinsic))
 
 
-def _camera(path: Path, values: Any) -> PinholeCamera:
+def _focal(intrinsic: dict[str, Any]) -> Any:
+    matrix = intrinsic.get("intrinsic_matrix")
+    return matrix[0] if isinstance(matrix, list) and matrix else None
+
+
+def _camera(path: Path | str, values: Any) -> PinholeCamera:
     try:
         width, height = int(values["width"]), int(values["height"])
         columns = np.array([float(value) for value in values["intrinsic_matrix"]]).reshape(3, 3)

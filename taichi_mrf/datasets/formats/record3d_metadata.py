@@ -55,8 +55,13 @@ class Metadata:
             raise DatasetError(
                 f"{self.where}: {name} has {len(self.intrinsics)} entries, none for frame {max(numbers)}"
             )
+        # Zeros stand for intrinsics that are not known.
+        known = np.flatnonzero(self.intrinsics.any(axis=1))
+        if len(known) == 0:
+            return None
+        rows = known[np.maximum(np.searchsorted(known, numbers, "right") - 1, 0)]
         try:
-            return [PinholeCamera(*size, *map(float, self.intrinsics[number])) for number in numbers]
+            return [PinholeCamera(*size, *map(float, self.intrinsics[row])) for row in rows]
         except ConfigError as error:
             raise DatasetError(f"{self.where}: {name}: {error}") from error
 

@@ -2,13 +2,14 @@
 
 Depth is 16-bit millimetres; ``pose/N.txt`` holds T_world_camera of the depth camera as a 4 x 4 matrix, of
 -inf where tracking was lost: such images are left out and counted. ``intrinsic/intrinsic_depth.txt`` is the
-camera's 4 x 4 matrix.
+camera's 4 x 4 matrix. Where each image has intrinsics of its own, they are ``intrinsic/N.txt``.
 
 ``color/N.jpg`` (or .png) has a camera of its own, ``intrinsic/intrinsic_color.txt``, and is registered to
 depth. ``extrinsic_depth.txt`` and ``extrinsic_color.txt`` take points of the two cameras to a common frame;
 a file that is missing stands for the identity.
 """
 
+import re
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,7 @@ import numpy as np
 
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.color_camera import ColorCamera
-from taichi_mrf.datasets.intrinsics import find_camera, read_camera
+from taichi_mrf.datasets.intrinsics import find_camera, own_cameras, read_camera
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.recording import RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import read_matrix_file
@@ -63,7 +64,10 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         notes: list[str] = []
     else:
         camera, notes = find_camera(folder, options, CAMERA, NAME, iter(tracked))
-    frames = [_frame(folder, path) for path in tracked]
+    own = own_cameras([_own_camera(folder, path) for path in tracked], options)
+    if own[0] is not None:
+        camera, notes = own[0], []
+    frames = [_frame(folder, path, each) for path, each in zip(tracked, own, strict=True)]
     color_camera = _color_camera(folder, frames) if options.color else None
     if color_camera is None and options.color and any(frame.color_file for frame in frames):
         notes.append(f"colours are not read: there is no {folder / COLOR_INTRINSICS}")
@@ -112,7 +116,15 @@ def _extrinsics(folder: Path, camera: str) -> Pose:
         raise DatasetError(f"{path}: {error}") from error
 
 
-def _frame(folder: Path, path: Path) -> RecordedFrame:
+def _own_camera(folder: Path, image: Path) -> PinholeCamera | None:
+    """The camera of one image, None if there is no file of it, or its focal length is zero."""
+    path = folder / "intrinsic" / f"{image.stem}.txt"
+    if not path.is_file() or re.match(r"[\s\[]*0[0.]*(e\S*)?[\s,]", read_text(path, DatasetError)):
+        return None
+    return read_camera(path, CAMERA, iter([image]))
+
+
+def _frame(folder: Path, path: Path, camera: PinholeCamera | None) -> RecordedFrame:
     pose_file = folder / "pose" / f"{path.stem}.txt"
     colors = (folder / "color" / f"{path.stem}.{suffix}" for suffix in ("jpg", "png"))
     return RecordedFrame(
@@ -122,6 +134,7 @@ def _frame(folder: Path, path: Path) -> RecordedFrame:
         read_pose=partial(read_matrix_file, pose_file),
         pose_source=str(pose_file),
         color_file=next((color for color in colors if color.is_file()), None),
+        camera=camera,
     )
 
 

@@ -4,7 +4,8 @@
 - ``confidence/NNNNNN.png``: 8-bit, ARKit's levels 0 (low), 1 and 2 (high)
 - ``camera_matrix.csv``: the 3 x 3 matrix of the colour camera at 1920 x 1440 pixels, to which depth is
 registered
-- ``odometry.csv``: with a header; the columns timestamp, frame, x, y, z, qx, qy, qz, qw are T_world_camera
+- ``odometry.csv``: with a header; the columns timestamp, frame, x, y, z, qx, qy, qz, qw are T_world_camera;
+fx, fy, cx, cy, where there are some, are each frame's in place of the matrix
 
 Level 2 leaves the sigma, level 1 doubles it, and pixels of level 0 are no measurements. The colour images are
 a film, which is not read.
@@ -17,6 +18,7 @@ import numpy as np
 
 from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.confidence import ARKIT
+from taichi_mrf.datasets.intrinsics import own_cameras
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.recording import RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose
@@ -27,6 +29,7 @@ from taichi_mrf.system.files import is_file, is_folder, read_text
 DEPTH, CONFIDENCE, MATRIX, ODOMETRY = "depth", "confidence", "camera_matrix.csv", "odometry.csv"
 COLOR_SIZE, DEPTH_WIDTH = (1920, 1440), 256
 _COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
+_INTRINSICS = ("fx", "fy", "cx", "cy")
 
 
 def recognises(folder: Path) -> bool:
@@ -40,7 +43,9 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     images = {int(p.stem): p for p in (folder / DEPTH).iterdir() if p.suffix == ".png" and p.stem.isdecimal()}
     poses = _read_odometry(folder / ODOMETRY)
     frames = []
-    for number in sorted(images.keys() & poses.keys()):
+    posed = sorted(images.keys() & poses.keys())
+    own = own_cameras([poses[number].camera for number in posed], options)
+    for number, camera in zip(posed, own, strict=True):
         path, pose = images[number], poses[number]
         confidence = folder / CONFIDENCE / path.name
         frames.append(
@@ -51,6 +56,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
                 pose.T_world_camera,
                 pose.source,
                 confidence_file=confidence if is_file(confidence) else None,
+                camera=camera,
             )
         )
     if not frames:
@@ -59,7 +65,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     notes = [f"{dropped} of {len(images)} images dropped: {ODOMETRY} has no pose for them"] if dropped else []
     return Recording(
         name=folder.name,
-        camera=options.camera or _camera(folder / MATRIX),
+        camera=options.camera or own[0] or _camera(folder / MATRIX),
         notes=notes,
         dropped=dropped,
         frames=frames,
@@ -97,18 +103,29 @@ def _read_odometry(path: Path) -> dict[int, RecordedPose]:
     if missing:
         raise DatasetError(f"{path}: its first line names no column {', '.join(missing)}")
     places = [names.index(name) for name in _COLUMNS]
+    own = [names.index(name) for name in _INTRINSICS if name in names]
     poses = {}
     for number, words in enumerate(lines[1:], start=2):
         if not words:
             continue
         try:
             stamp, frame, *values = (float(words[place]) for place in places)
-            poses[int(frame)] = RecordedPose(stamp, np.array(values), f"{path} line {number}")
+            camera = _own_camera([float(words[place]) for place in own])
+            poses[int(frame)] = RecordedPose(stamp, np.array(values), f"{path} line {number}", camera)
             if not np.isfinite(stamp):
                 raise ValueError
         except (ValueError, IndexError, OverflowError):
             raise DatasetError(f"{path} line {number}: expected {len(names)} numbers") from None
     return poses
+
+
+def _own_camera(intrinsics: list[float]) -> PinholeCamera | None:
+    """The depth camera of one frame; None if its intrinsics are not known, for which zeros stand too."""
+    try:
+        own = PinholeCamera(*COLOR_SIZE, *intrinsics) if len(intrinsics) == len(_INTRINSICS) else None
+    except ConfigError:
+        return None
+    return own and own.scaled(DEPTH_WIDTH / COLOR_SIZE[0])
 
 
 FORMAT = Format(

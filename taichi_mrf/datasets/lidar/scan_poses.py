@@ -60,6 +60,7 @@ def poses_of(
         stamps = {cloud: stamp for cloud in clouds if (stamp := _stamp_of(cloud)) is not None}
         if len(stamps) == len(clouds):
             return _at_stamps(path, stamps, options), []
+        _check_one_map(path, clouds, len(trajectory.poses))
         if len(trajectory.poses) != len(clouds):
             raise DatasetError(
                 f"{path}: contains {len(trajectory.poses)} poses with stamps for {len(clouds)} scans, whose "
@@ -70,6 +71,7 @@ def poses_of(
             cloud: ScanPose(pose.key, pose.T_world_camera, pose.source)
             for cloud, pose in zip(clouds, trajectory.poses, strict=True)
         }, []
+    _check_one_map(path, clouds, len(trajectory.poses))
     if trajectory.layout == "rows" and len(trajectory.poses) == len(clouds):
         numbers = list(range(len(clouds)))
     else:
@@ -81,6 +83,16 @@ def poses_of(
         if (pose := by_number.get(number)) is not None
     }
     return found, [f"no stamps in {path.name}: assumed {SECONDS_PER_SCAN:g} s from one scan to the next"]
+
+
+def _check_one_map(path: Path, clouds: Sequence[Path], poses: int) -> None:
+    """Raise DatasetError for one cloud with many poses: from which were its points measured?"""
+    if len(clouds) == 1 < poses:
+        raise DatasetError(
+            f"{path}: contains {poses} poses for one cloud, {clouds[0].name}, which does not tell from where "
+            "each of its points was measured: give each scan a file of its own, with its pose, or a .las "
+            "with gps_time"
+        )
 
 
 def _numbers_of(path: Path, clouds: Sequence[Path]) -> list[int]:
