@@ -28,7 +28,7 @@ def run_diff(options: Diff) -> int:
     if options.out is not None:
         report["changes"] = {
             "file": str(options.out),
-            "points": write_changes(options.out, found, a.voxel_size),
+            "points": write_changes(options.out, found, a.voxel_size, a.config.volume.origin),
         }
     if options.json:
         print(json.dumps(report, indent=2))

@@ -188,6 +188,10 @@ class VolumeConfig:
     min_evidence: float = in_python(0.1)
     """A voxel counts as unknown if its log-odds differ from the prior by less than this."""
 
+    origin: tuple[float, float, float] = in_files((0.0, 0.0, 0.0))
+    """Where the map's origin is in the recorded world (metres), which is far away if that is a country's.
+    A recording sets it; files with room for it have coordinates of the recorded world."""
+
     def __post_init__(self) -> None:
         check_field((self.lower is None) == (self.upper is None), "volume.lower", "goes with volume.upper")
         if self.lower is not None and self.upper is not None:

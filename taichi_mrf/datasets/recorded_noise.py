@@ -36,13 +36,24 @@ LOOKED_AT = 3
 
 
 def with_recorded_noise(settings: Config, dataset: Dataset) -> Config:
-    """The parameters with the recording's own sigma, reach, ``pass_through`` and density of outliers in place
-    of the defaults; adds notes to the dataset.
+    """The parameters with the recording's own origin, sigma, reach, ``pass_through`` and density of outliers
+    in place of the defaults; adds notes to the dataset.
 
     What the user has set stays, and a sigma or sigma table that is set is that of all pixels.
     """
-    settings = _with_reach(_with_sigma(settings, dataset), dataset)
+    settings = _with_reach(_with_sigma(_with_origin(settings, dataset), dataset), dataset)
     return _with_floor(_with_pass_through(settings, dataset), dataset)
+
+
+def _with_origin(settings: Config, dataset: Dataset) -> Config:
+    """The recording's origin; a box that is given in the recorded world moves with it."""
+    origin, volume = dataset.origin_m, settings.volume
+    by_m = origin - volume.origin
+    if not by_m.any():
+        return settings
+    lower, upper = ((None if c is None else tuple((c - by_m).tolist())) for c in (volume.lower, volume.upper))
+    volume = replace(volume, origin=tuple(origin.tolist()), lower=lower, upper=upper)
+    return replace(settings, volume=volume)
 
 
 def _with_sigma(settings: Config, dataset: Dataset) -> Config:

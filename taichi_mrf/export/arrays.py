@@ -3,7 +3,8 @@
 ``voxels`` (n, 3) int32: coordinates of all known voxels; voxel i covers [i, i + 1) times ``voxel_size``, in
 metres, along each axis. ``probability`` (n,) float32: of being occupied. ``state`` (n,) int8: 1 free, 2
 occupied. ``free_bricks`` (k, 3) int32: free cubes of 8 voxels a side, whose voxels are not listed; brick i
-covers [8 i, 8 i + 8) voxels. ``prior``: the probability of unknown voxels.
+covers [8 i, 8 i + 8) voxels. ``prior``: the probability of unknown voxels. ``origin`` (3,): where
+the map's origin is in the recorded world, unless that is 0.
 """
 
 from pathlib import Path
@@ -45,4 +46,6 @@ def write_arrays(path: str | Path, m: QueriedMap) -> None:
         "voxel_size": np.asarray(m.voxel_size),
         "prior": probability(np.array([reader.pool.prior_log_odds], np.float32)).reshape(()),
     }
+    if any(m.config.volume.origin):
+        arrays["origin"] = np.array(m.config.volume.origin)
     write_npz(path, arrays)

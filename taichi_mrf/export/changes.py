@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.export.ply import write_points
+from taichi_mrf.export.ply import NO_ORIGIN, write_points
 from taichi_mrf.queries.change import STATES, MapChange
 from taichi_mrf.queries.points import OCCUPIED
 
@@ -12,8 +12,14 @@ APPEARED, VANISHED = (213, 94, 0), (0, 114, 178)
 """RGB of voxels that are occupied only in the second map, and only in the first."""
 
 
-def write_changes(path: str | Path, change: MapChange, voxel_size: float) -> int:
-    """Write the voxels that are occupied in one of the maps only; returns how many. Raises MapFileError.
+def write_changes(
+    path: str | Path,
+    change: MapChange,
+    voxel_size: float,
+    origin_m: tuple[float, float, float] = NO_ORIGIN,
+) -> int:
+    """Write the voxels that are occupied in one of the maps only; returns how many. Their origin is
+    ``origin_m`` in the recorded world. Raises MapFileError.
 
     Besides its position and colour a point has the properties ``before`` and ``after``, its states, and
     ``difference``, by how much its probability has grown.
@@ -32,5 +38,5 @@ def write_changes(path: str | Path, change: MapChange, voxel_size: float) -> int
         f"before and after are states: {states}",
         f"color is {APPEARED} where a surface has appeared, {VANISHED} where one has vanished",
     ]
-    write_points(path, change.points[shown], colors, extra, comments)
+    write_points(path, change.points[shown], colors, extra, comments, origin_m)
     return int(shown.sum())

@@ -82,6 +82,10 @@ def writer_of(path: str | Path) -> Writer:
     raise ConfigError(f"{path}: unknown export format {suffix}; did you mean {near}? known are {known}")
 
 
+_WITH_ORIGIN = (".ply", ".obj", ".pgm", ".yaml")
+"""Files that have coordinates of the recorded world, however far its origin is."""
+
+
 def require_libraries(path: str | Path) -> None:
     """Raises TaichiMRFError if the format of a file's extension needs a library that is not installed, and
     ConfigError for an unknown one."""
@@ -98,7 +102,15 @@ def extensions() -> Sequence[str]:
 
 
 def export_note(m: ExportedMap, path: str | Path, options: ExportOptions = _DEFAULTS) -> str | None:
-    """A note for the user on a written file: what a mesh shows, how a floor plan lies in the world."""
+    """A note for the user on a written file: what a mesh shows, how a floor plan lies in the world, and that
+    its coordinates are not the recording's, if that is so."""
+    origin, suffix = m.config.volume.origin, Path(path).suffix.lower()
+    local = any(origin) and suffix not in _WITH_ORIGIN
+    told = "its coordinates begin at {:.0f} {:.0f} {:.0f} of the recorded world".format(*origin)
+    return "; ".join(filter(None, [_shown_note(m, path, options), told if local else None])) or None
+
+
+def _shown_note(m: ExportedMap, path: str | Path, options: ExportOptions) -> str | None:
     writer = _WRITERS.get(Path(path).suffix.lower())
     if writer is _surface or (writer is _points_or_surface and options.mesh):
         if options.cubes or not hasattr(m, "has_surface"):
@@ -140,7 +152,7 @@ def _points_or_surface(m: ExportedMap, path: Path, options: ExportOptions) -> li
         sizes = np.concatenate([sizes, *(np.full(len(each), each.side * m.voxel_size) for each in cells)])
     colored = _photo(m, path, options)
     colors = None if colored is None else shown_colors(colored, centres)
-    write_voxels(path, centres, p, m.voxel_size, colors, sizes)
+    write_voxels(path, centres, p, m.voxel_size, colors, sizes, m.config.volume.origin)
     return [path]
 
 
@@ -157,7 +169,7 @@ def _surface(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:
     if colored is not None:
         surface = photographed(colored, surface, options.cubes)
     T_gltf_world = y_up(_up(m, options)) if path.suffix.lower() == ".glb" else None
-    write_mesh(path, surface, m.voxel_size, T_gltf_world)
+    write_mesh(path, surface, m.voxel_size, T_gltf_world, m.config.volume.origin)
     return [path]
 
 
@@ -193,8 +205,9 @@ def _level_map(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]
     up = _up(m, options)
     found = level_map(m.decided, options.z_min, options.z_max, options.occupied_from, options.free_below, up)
     image = grey_image(found.state == OCCUPIED, found.state != UNKNOWN)
-    note = _plan_note(up)
-    return write_map_server(path.parent, image, found.cell_size, found.lower_corner_m, path.stem, note)
+    (x_m, y_m), (x, y), origin_m = found.lower_corner_m, found.axes, m.config.volume.origin
+    corner_m = x_m + origin_m[x], y_m + origin_m[y]
+    return write_map_server(path.parent, image, found.cell_size, corner_m, path.stem, _plan_note(up))
 
 
 def _arrays(m: ExportedMap, path: Path, options: ExportOptions) -> list[Path]:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.export.ply import write_surface
+from taichi_mrf.export.ply import NO_ORIGIN, write_surface
 from taichi_mrf.export.surface import Surface
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.system.atomic import atomic_path
@@ -13,13 +13,18 @@ from taichi_mrf.system.libraries import library
 
 
 def write_mesh(
-    path: str | Path, surface: Surface, voxel_size: float, T_gltf_world: Pose | None = None
+    path: str | Path,
+    surface: Surface,
+    voxel_size: float,
+    T_gltf_world: Pose | None = None,
+    origin_m: tuple[float, float, float] = NO_ORIGIN,
 ) -> None:
     """Write a surface in the format of the file's extension: .ply, .glb, .obj or .stl, which has no colours.
 
     ``T_gltf_world`` is where the world stands in a .glb, in which y is up; the vertices stay in the world,
-    and the file's only node holds it. Raises MapFileError, and TaichiMRFError without trimesh for all but
-    .ply.
+    and the file's only node holds it. A .ply and an .obj have coordinates of the recorded world, in which the
+    map's origin is ``origin_m``; the numbers of the others are too short for a far one. Raises MapFileError,
+    and TaichiMRFError without trimesh for all but .ply.
     """
     suffix = Path(path).suffix.lower()
     if suffix == ".ply":
@@ -29,11 +34,13 @@ def write_mesh(
             extra |= dict(zip(("nx", "ny", "nz"), surface.normals.T, strict=True))
         if surface.std_m is not None:
             extra["std_m"] = surface.std_m
-        write_surface(path, surface.vertices_m, surface.triangles, surface.colors, extra, comments)
+        write_surface(path, surface.vertices_m, surface.triangles, surface.colors, extra, comments, origin_m)
         return
     trimesh = library("trimesh", f"{suffix} files need", "mesh")
+    far = suffix == ".obj" and any(origin_m)
+    vertices_m = surface.vertices_m.astype(np.float64) + origin_m if far else surface.vertices_m
     mesh = trimesh.Trimesh(
-        surface.vertices_m, surface.triangles, vertex_normals=surface.normals,
+        vertices_m, surface.triangles, vertex_normals=surface.normals,
         vertex_colors=surface.colors, process=False, validate=False,
     )  # fmt: skip
     whole = mesh

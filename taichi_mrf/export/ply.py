@@ -14,10 +14,10 @@ from taichi_mrf.queries.known_bricks import QueriedMap
 from taichi_mrf.system.atomic import atomic_path
 from taichi_mrf.voxels.colors import MARGINAL_NOTE, PHOTO_NOTE, marginal_colors
 
-_PLACE = [(name, "<f4") for name in ("x", "y", "z")]
 _COLOR = [(name, "u1") for name in ("red", "green", "blue")]
 _TRIANGLE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
-_PLY_TYPES = {"f": "float", "u": "uchar"}
+_PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar"}
+NO_ORIGIN = (0.0, 0.0, 0.0)
 
 
 def write_voxels(
@@ -27,13 +27,14 @@ def write_voxels(
     voxel_size: float,
     colors: NDArray[np.uint8] | None = None,
     sizes: NDArray[np.floating] | None = None,
+    origin_m: tuple[float, float, float] = NO_ORIGIN,
 ) -> None:
     """Write voxels as one coloured point each. Raises MapFileError.
 
     ``centres`` (N, 3) and ``voxel_size`` are in metres, world frame. Besides its position a vertex has
     the property ``occupancy``, its marginal (N,), and its colour: of ``colors`` (N, 3), which cameras saw, or
     the one that stands for the marginal. With ``sizes`` (N,), in metres, some are cells of several voxels,
-    and ``size`` is a property too.
+    and ``size`` is a property too. Positions are in a world whose origin is ``origin_m`` in the recorded one.
     """
     comments = [
         f"voxel_size {voxel_size:.9g} metres",
@@ -44,7 +45,8 @@ def write_voxels(
     if sizes is not None:
         extra["size"] = np.asarray(sizes, "<f4")
         comments.append("size is the side in metres of the voxel, or of a cell that stands in for several")
-    write_points(path, centres, marginal_colors(probability) if colors is None else colors, extra, comments)
+    shown = marginal_colors(probability) if colors is None else colors
+    write_points(path, centres, shown, extra, comments, origin_m)
 
 
 def photo_at(m: QueriedMap, points: NDArray[np.floating]) -> NDArray[np.uint8] | None:
@@ -59,10 +61,11 @@ def write_points(
     colors: NDArray[np.uint8],
     extra: dict[str, NDArray],
     comments: Sequence[str],
+    origin_m: tuple[float, float, float] = NO_ORIGIN,
 ) -> None:
     """Write points (N, 3) in metres with colours (N, 3) and further properties (N,) by name, float32 or
     uint8 each. Raises MapFileError."""
-    _write(path, _vertices(points, colors, extra), None, comments)
+    _write(path, _vertices(points, colors, extra, origin_m), None, comments)
 
 
 def write_surface(
@@ -72,19 +75,27 @@ def write_surface(
     colors: NDArray[np.uint8],
     extra: dict[str, NDArray],
     comments: Sequence[str],
+    origin_m: tuple[float, float, float] = NO_ORIGIN,
 ) -> None:
     """Write triangles (T, 3) over vertices (V, 3) in metres, with colours (V, 3) and further properties (V,)
     by name. Raises MapFileError."""
     faces = np.empty(len(triangles), _TRIANGLE)
     faces["count"], faces["corners"] = 3, triangles
-    _write(path, _vertices(vertices_m, colors, extra), faces, comments)
+    _write(path, _vertices(vertices_m, colors, extra, origin_m), faces, comments)
 
 
-def _vertices(points: NDArray[np.floating], colors: NDArray[np.uint8], extra: dict[str, NDArray]) -> NDArray:
-    dtype = np.dtype([*_PLACE, *_COLOR, *((name, values.dtype) for name, values in extra.items())])
+def _vertices(
+    points: NDArray[np.floating],
+    colors: NDArray[np.uint8],
+    extra: dict[str, NDArray],
+    origin_m: tuple[float, float, float],
+) -> NDArray:
+    """A row a point, in the recorded world: far from its origin 32 bits would round to decimetres."""
+    place = [(name, "<f8" if any(origin_m) else "<f4") for name in "xyz"]
+    dtype = np.dtype([*place, *_COLOR, *((name, values.dtype) for name, values in extra.items())])
     vertices = np.empty(len(points), dtype=dtype)
     for axis, name in enumerate("xyz"):
-        vertices[name] = points[:, axis]
+        vertices[name] = points[:, axis] + origin_m[axis] if any(origin_m) else points[:, axis]
     for channel, name in enumerate(("red", "green", "blue")):
         vertices[name] = colors[:, channel]
     for name, values in extra.items():
@@ -94,7 +105,7 @@ def _vertices(points: NDArray[np.floating], colors: NDArray[np.uint8], extra: di
 
 def _write(path: str | Path, vertices: NDArray, faces: NDArray | None, comments: Sequence[str]) -> None:
     properties = [
-        f"property {_PLY_TYPES[vertices.dtype[name].kind]} {name}" for name in vertices.dtype.names or ()
+        f"property {_PLY_TYPES[vertices.dtype[name].str[1:]]} {name}" for name in vertices.dtype.names or ()
     ]
     surface = (
         [f"element face {len(faces)}", "property list uchar int vertex_indices"] if faces is not None else []

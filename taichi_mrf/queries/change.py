@@ -71,6 +71,13 @@ def compare_maps(a: QueriedMap, b: QueriedMap, bricks: Bricks | None = None) -> 
     States are those of the maps' own log-odds: give ``m.decided`` to compare what is occupied. The maps can
     be of different methods. Raises ConfigError if their voxels are of different sizes.
     """
+    if a.config.volume.origin != b.config.volume.origin:
+        raise ConfigError(
+            "maps with different origins in the recorded world cannot be compared: "
+            "{:.0f} {:.0f} {:.0f} and {:.0f} {:.0f} {:.0f}".format(
+                *a.config.volume.origin, *b.config.volume.origin
+            )
+        )
     if not np.isclose(a.voxel_size, b.voxel_size, rtol=1e-6):
         raise ConfigError(
             f"maps of different voxel sizes cannot be compared: {a.voxel_size:g} m and {b.voxel_size:g} m"

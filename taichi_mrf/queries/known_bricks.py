@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from taichi_mrf.config.schema import Config
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.geometry.up import Up
 from taichi_mrf.queries.points import FREE, classify
@@ -36,6 +37,9 @@ class QueriedMap(Protocol):
 
     voxel_size: float
     view: View
+
+    @property
+    def config(self) -> Config: ...
 
     @property
     def keyframes(self) -> Mapping[int, Placed]: ...

@@ -168,7 +168,9 @@ def write_voxel_file(path: Path, m: OccupancyMap) -> int:
     """Write the occupied voxels, of a map with a window as of its last save, in the colours that cameras saw
     if the map has them; returns their number. Raises MapFileError."""
     centres, probability = (in_chunks(m) or m).decided.voxels(min_probability=0.5)
-    write_voxels(path, centres, probability, m.voxel_size, photo_at(m, centres))
+    write_voxels(
+        path, centres, probability, m.voxel_size, photo_at(m, centres), origin_m=m.config.volume.origin
+    )
     return len(centres)
 
 
@@ -201,7 +203,8 @@ def _write_map(
         if result.track is not None:
             z_up = any(k.camera.up[2] > 0 for k in result.map.keyframes.values())
             poses = result.track.trajectory(result.map)
-            write_trajectory(folder / TRAJECTORY_FILE, poses, LIDAR_AXES if z_up else CAMERA_AXES)
+            axes = LIDAR_AXES if z_up else CAMERA_AXES
+            write_trajectory(folder / TRAJECTORY_FILE, poses, axes, config.volume.origin)
             written.append(folder / TRAJECTORY_FILE)
     return written, occupied
 

@@ -233,6 +233,9 @@ def test_a_folder_of_npz_is_one_sequence(tmp_path: Path, content: Content) -> No
     dataset = open_dataset(tmp_path)
     assert list(dataset.frame_names) == ["a-000000", "a-000001", "b2", "b3", "b4"]
     assert_same(dataset, content, 1000.0, colored=True)
+    write_npz(tmp_path / "c.npz", {**both, "K": np.diag([1.2, 1.2, 1]) @ K})
+    other = open_dataset(tmp_path).read(5).camera
+    assert (other.fx, other.cy) == pytest.approx((1.2 * CAMERA.fx, 1.2 * CAMERA.cy))
 
 
 def test_frames_without_stamps_are_a_second_apart(tmp_path: Path, content: Content) -> None:
@@ -258,7 +261,8 @@ def test_missing_depth_is_zero(tmp_path: Path, content: Content) -> None:
         ({"T_world_camera": None}, "T_world_camera is missing"),
         ({"K": None}, "needs K (3, 3), or fx, fy, cx, cy; fx, fy, cx, cy missing"),
         ({"K": np.eye(4)}, "K is (4, 4)"),
-        ({"K": np.zeros((3, 3))}, "its intrinsics are all zero"),
+        ({"K": np.zeros((3, 3))}, "its intrinsics are all zero; --camera fx,fy,cx,cy sets them"),
+        ({"K": np.diag([0.0, 1.0, 1.0])}, "K: camera focal lengths 0.0, 1.0: both must be positive"),
         ({"K": K + 0.5 * np.eye(3, k=1) * (np.arange(3) == 1)}, "K: the matrix has skew 0.5"),
         ({"stamp": np.array([0.0, 0.1, np.nan, 0.3, 0.4])}, "stamp of frame 2 is nan"),
         ({"T_world_camera": np.zeros((4, 4, 4))}, "T_world_camera is (4, 4, 4); expected (5, 4, 4)"),

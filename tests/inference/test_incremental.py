@@ -1,15 +1,21 @@
 """Incremental inference: who has heard something new, and what comes of sweeping only those."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 import small_room
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from taichi_mrf.inference.incremental import moved_share
+from taichi_mrf.inference.incremental import change_count_seen_by, moved_share
+from taichi_mrf.inference.keyframe import VisibleBricks
 from taichi_mrf.inference.keyframe_bounds import KeyframeBounds
+from taichi_mrf.inference.messages import places_of
 from taichi_mrf.inference.schedule import InferProgress
 from taichi_mrf.methods.mrf.map import MRFMap
+from taichi_mrf.voxels.layout import VOXELS
 from taichi_mrf.voxels.window import Window
 
 pytestmark = pytest.mark.usefixtures("one_backend")
@@ -184,3 +190,27 @@ def test_a_call_that_tolerates_much_does_not_make_others_forgotten() -> None:
         m.renew([small_room.add(m, small_room.frames()[i])], tolerance=1e9)
         twin.infer(sweeps=1, keyframes=[small_room.add(twin, small_room.frames()[i])])
     assert m.renew().sweeps == twin.renew().sweeps > 0
+
+
+def listed(cells: list[int], identity: list[int]) -> VisibleBricks:
+    return VisibleBricks(np.array(cells), np.arange(len(cells), dtype=np.int32), np.array(identity), 0)
+
+
+def test_a_brick_that_is_new_to_a_list_counts_as_changed_in_all_voxels() -> None:
+    """So does one in the place of another, and one that lies beyond all of the older list."""
+    old, newer = listed([2, 5, 9], [20, 50, 90]), listed([1, 2, 5, 9, 11], [10, 20, 51, 90, 110])
+    assert places_of(old, newer).tolist() == [-1, 0, -1, 2, -1]
+    assert places_of(listed([], []), newer).tolist() == [-1] * 5
+    keyframe: Any = SimpleNamespace(visible=old, change_count_at_last_sweep=np.array([7, 8, 9]))
+    seen = change_count_seen_by(keyframe, newer)
+    assert seen is not None
+    assert seen.tolist() == [-VOXELS, 7, -VOXELS, 9, -VOXELS]
+    assert change_count_seen_by(keyframe, old) is keyframe.change_count_at_last_sweep
+
+
+def test_without_a_tolerance_all_sweeps_are_made_even_if_nothing_moves_any_more() -> None:
+    m = MRFMap(small_room.VOXEL_SIZE)
+    small_room.add(m, small_room.frames()[0])
+    report = m.infer(sweeps=4)
+    assert (report.sweeps, report.residual) == (4, 0.0)
+    assert m.infer(sweeps=4, tolerance=1e-6).sweeps == 2

@@ -10,7 +10,7 @@ import numpy as np
 from hand_made import PRIOR, VOXEL, HandMade, made
 from numpy.typing import ArrayLike, NDArray
 
-from taichi_mrf.config.schema import VolumeConfig
+from taichi_mrf.config.schema import Config, VolumeConfig
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.geometry.up import Up, up_of
 from taichi_mrf.methods.log_odds.map import LogOddsMap
@@ -35,6 +35,7 @@ class HandMap:
     crossed: NDArray[np.int32]
     voxel_size: float = VOXEL
     keyframes: dict[int, Any] = field(default_factory=dict)
+    config: Config = field(default_factory=Config)
 
     @property
     def up(self) -> Up | None:

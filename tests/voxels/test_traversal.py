@@ -77,6 +77,15 @@ def _walk(
         counts[r] = record.count
 
 
+@kernel
+def _clip(rays: AnyArray, lower: Vec3, upper: Vec3, found: F32Array) -> None:
+    for r in range(rays.shape[0]):
+        ray = make_ray(Vec3(rays[r, 0], rays[r, 1], rays[r, 2]), Vec3(rays[r, 3], rays[r, 4], rays[r, 5]))
+        begin, end = rays[r, 6], rays[r, 7]
+        clip(ray, begin, end, lower, upper)
+        found[2 * r], found[2 * r + 1] = begin, end
+
+
 @dataclass(frozen=True)
 class Grid:
     """A window of bricks, some of which exist: ``slots`` (bricks,) holds -1 where none does."""
@@ -384,3 +393,23 @@ def test_an_interval_outside_the_window_meets_nothing() -> None:
     away = [[70, 5, 5, 1, 0, 0, 0, 50], [-9, 5, 5, 1, 0, 0, 0, 8], [5, 5, 5, 1, 1, 1, 9, 9]]
     in_upper_face = [[5, 64, 5, 1, 0, 0, 0, 50]]
     assert walk(grid, np.array(away + in_upper_face, np.float32)).counts.tolist() == [0, 0, 0, 0]
+
+
+def test_clip_keeps_the_part_inside_the_box() -> None:
+    """Rays that begin or end inside, pass through, and miss the box."""
+    random = np.random.default_rng(3)
+    rays = random.uniform(-3, 3, (500, 8)).astype(np.float32)
+    rays[:, 6], rays[:, 7] = random.uniform(0, 0.5, 500), random.uniform(0.5, 6, 500)
+    lower, upper = np.array([-1.0, -2.0, -1.5]), np.array([1.5, 1.0, 2.0])
+    found = np.zeros(1000, np.float32)
+    _clip(rays, ti.Vector(lower.tolist(), ti.f32), ti.Vector(upper.tolist(), ti.f32), found)
+    expected = np.array(
+        [clip_to_box(r[:3], r[3:6], r[6], r[7], lower, upper) for r in rays.astype(np.float64)]
+    )
+    inside = expected[:, 0] < expected[:, 1]
+    assert 50 < inside.sum() < 400
+    assert (
+        len({(a == r[6], b == r[7]) for (a, b), r in zip(expected[inside], rays[inside], strict=True)}) == 4
+    )
+    np.testing.assert_allclose(found.reshape(-1, 2)[inside], expected[inside], rtol=1e-5, atol=1e-5)
+    assert (found.reshape(-1, 2)[~inside, 0] >= found.reshape(-1, 2)[~inside, 1]).all()
