@@ -94,7 +94,7 @@ def test_encodings(make: Callable[..., Path], big: bool) -> None:
         bag.compressed_depth("/c/depth/compressedDepth", 1.0, FRAME, steps(0))
         bag.compressed_depth("/d/depth/compressedDepth", 1.0, FRAME, metres, "32FC1")
         bag.image("/e/depth", 1.0, FRAME, steps(0), "mono16", big)
-        bag.pose_stamped("/pose", 1.0, "map", np.eye(4))
+        bag.pose_stamped("/camera/pose", 1.0, "map", np.eye(4))
 
     path = make(write)
     exact = metres.copy()
@@ -269,7 +269,7 @@ def test_images_without_poses_are_left_out_and_counted(make: Callable[..., Path]
     def write(bag: Bag) -> None:
         images(bag)
         for seconds in (1.08, 1.12, 1.19, 1.32):
-            bag.pose_stamped("/pose", seconds, "map", look_at([seconds, 0, 0], [9, 0, 0]))
+            bag.pose_stamped("/camera/pose", seconds, "map", look_at([seconds, 0, 0], [9, 0, 0]))
 
     path = make(write)
     dataset = open_dataset(path, max_time_gap=0.05)

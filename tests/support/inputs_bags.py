@@ -29,9 +29,11 @@ def nanoseconds(stamp: float) -> int:
 
 
 class Bag:
-    """A bag in the making. Stamps are seconds after START; messages are recorded ``latency`` later."""
+    """A bag in the making. Stamps are seconds after START; messages are recorded ``latency`` later, in ROS 1
+    from the node ``node``."""
 
     latency = 0.05
+    node = ""
 
     def __init__(self, kind: Kind, writer: Any) -> None:
         self.kind, self.writer = kind, writer
@@ -43,13 +45,13 @@ class Bag:
 
     def send(self, topic: str, name: str, stamp: float, **fields: Any) -> None:
         """Record a message of a type such as sensor_msgs/msg/Image."""
-        if topic not in self.connections:
-            self.connections[topic] = self.writer.add_connection(topic, name, typestore=self.types)
+        key = topic + self.node
+        if key not in self.connections:
+            node = {"callerid": self.node} if self.node else {}
+            self.connections[key] = self.writer.add_connection(topic, name, typestore=self.types, **node)
         message = self.message(name, **fields)
         serialize = self.types.serialize_ros1 if self.kind == "ros1" else self.types.serialize_cdr
-        self.writer.write(
-            self.connections[topic], nanoseconds(stamp + self.latency), serialize(message, name)
-        )
+        self.writer.write(self.connections[key], nanoseconds(stamp + self.latency), serialize(message, name))
 
     def message(self, name: str, /, **fields: Any) -> Any:
         return self.types.types[name](**fields)
@@ -109,10 +111,19 @@ class Bag:
         model: str = "plumb_bob",
         projection: PinholeCamera | None = None,
         stamp: float = 0.0,
+        binning: tuple[int, int] = (0, 0),
+        part: tuple[int, int, int, int] = (0, 0, 0, 0),
     ) -> None:
-        """A CameraInfo; ``projection`` is that of the rectified images."""
+        """A CameraInfo; ``projection`` is that of the rectified images, ``part`` the region of interest as x,
+        y, width and height."""
+        x, y, width, height = part
         roi = self.message(
-            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+            "sensor_msgs/msg/RegionOfInterest",
+            x_offset=x,
+            y_offset=y,
+            height=height,
+            width=width,
+            do_rectify=False,
         )
         P = np.zeros((3, 4))
         P[:, :3] = matrix(projection or camera)
@@ -132,8 +143,8 @@ class Bag:
             height=camera.height,
             width=camera.width,
             distortion_model=model,
-            binning_x=0,
-            binning_y=0,
+            binning_x=binning[0],
+            binning_y=binning[1],
             roi=roi,
             **arrays,
         )

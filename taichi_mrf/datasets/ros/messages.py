@@ -1,4 +1,4 @@
-"""Decoding the messages of depth cameras and trackers: images to metres, CameraInfo to a camera, poses.
+"""Decoding the messages of depth cameras and trackers: images to metres, poses.
 
 ROS calls depth images by their encodings: 16UC1 (and mono16, as RealSense writes it) are millimetres, 32FC1
 metres (REP 118). A CompressedImage of the transport ``compressedDepth`` is a PNG behind 12 bytes: an integer
@@ -12,11 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.images import PNG_SIGNATURE, decode_16_bit, decode_color, measured
-from taichi_mrf.datasets.options import DISTORTION_COUNTS
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
-from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.sensor.camera import PinholeCamera
 
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
@@ -49,7 +47,6 @@ _COMPRESSED_COLOR = ("jpeg", "jpg", "png", "rgb8;", "bgr8;")
 """Beginnings of the formats of CompressedImages in colour."""
 
 _HEADER_BYTES = 12
-_LENS_MODELS = ("plumb_bob", "rational_polynomial", "", "none")
 
 
 def encoding(message: Any) -> str:
@@ -157,37 +154,6 @@ def grey_image(message: Any) -> NDArray[np.uint8]:
     if encoding(message) not in GREY:
         raise DatasetError(f"encoding {encoding(message)!r} is not grey of 8 bits ({' or '.join(GREY)})")
     return _rows(message, 1)
-
-
-def camera_of(info: Any, rectified: bool) -> tuple[PinholeCamera, tuple[float, ...]]:
-    """The camera of a CameraInfo and its OpenCV distortion coefficients, () if it has none.
-
-    Images that are ``rectified`` are those of the projection P, and have no distortion left. Raises
-    DatasetError, which does not name the topic, if it is not calibrated, or has a lens model that is not
-    OpenCV's.
-    """
-    K, D, P = (_field(info, name) for name in "kdp")
-    matrix = P.reshape(3, 4)[:, :3] if rectified and P.any() else K.reshape(3, 3)
-    if matrix[0, 0] == 0:
-        raise DatasetError("is not calibrated (K is zero); pass --camera fx,fy,cx,cy")
-    try:
-        camera = PinholeCamera.from_matrix(int(info.width), int(info.height), matrix)
-    except ConfigError as error:
-        raise DatasetError(str(error)) from error
-    if rectified or not D.any():
-        return camera, ()
-    if info.distortion_model not in _LENS_MODELS or len(D) not in DISTORTION_COUNTS:
-        raise DatasetError(
-            f"distortion model {info.distortion_model!r} with {len(D)} coefficients is not supported; "
-            "--undistort 0,0,0,0 uses the images as they are"
-        )
-    return camera, tuple(float(k) for k in D)
-
-
-def _field(message: Any, name: str) -> NDArray[np.float64]:
-    """An array of a CameraInfo, whose names ROS 1 writes in capitals."""
-    values = getattr(message, name) if hasattr(message, name) else getattr(message, name.upper())
-    return np.asarray(values, np.float64)
 
 
 def pose_of(message: Any) -> Pose:

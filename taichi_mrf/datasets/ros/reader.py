@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from taichi_mrf.datasets.ros.messages import header_ns
+from taichi_mrf.datasets.ros.messages import frame_name, header_ns
 from taichi_mrf.datasets.ros.unpacking import bound_unpacking
 from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.system.files import check_regular, is_file, is_folder
@@ -47,6 +47,12 @@ class Entry:
     ordinal: int
     stamp: float
     """The header's stamp in seconds, or the time of recording where there is no header or its stamp is 0."""
+
+    frame: str = ""
+    """The frame in the header."""
+
+    publisher: str = ""
+    """The node that sent it, which only ROS 1 records."""
 
 
 class RosReader:
@@ -105,10 +111,11 @@ class RosReader:
     def messages(self, topic: str) -> Iterator[tuple[Entry, Any]]:
         """All messages of a topic in the order of recording. Raises DatasetError, naming file and topic."""
         previous, ordinal = None, 0
-        for recorded_ns, message in self._read(topic, None, None):
+        for recorded_ns, message, publisher in self._read(topic, None, None):
             ordinal = ordinal + 1 if recorded_ns == previous else 0
             previous = recorded_ns
-            yield Entry(recorded_ns, ordinal, _stamp(message, recorded_ns)), message
+            stamp, frame = _header(message, recorded_ns)
+            yield Entry(recorded_ns, ordinal, stamp, frame, publisher), message
 
     def first(self, topic: str) -> Any | None:
         """The first message of a topic, None if there is none."""
@@ -117,18 +124,19 @@ class RosReader:
     def read(self, topic: str, entry: Entry) -> Any:
         """One message again. Raises DatasetError, which names file and topic."""
         found = self._read(topic, entry.recorded_ns, entry.recorded_ns + 1)
-        for ordinal, (_, message) in enumerate(found):
+        for ordinal, (_, message, _) in enumerate(found):
             if ordinal == entry.ordinal:
                 return message
         raise DatasetError(f"{self.path}: topic {topic}: a message is missing")
 
-    def _read(self, topic: str, start: int | None, stop: int | None) -> Iterator[tuple[int, Any]]:
+    def _read(self, topic: str, start: int | None, stop: int | None) -> Iterator[tuple[int, Any, str]]:
         try:
             found = self._reader.messages(self._connections[topic], start=start, stop=stop)
             for connection, recorded_ns, data in found:
                 if connection.msgtype != self.topics[topic].type:  # in a damaged file
                     raise ValueError(f"contains a {connection.msgtype}")
-                yield recorded_ns, self._reader.deserialize(data, connection.msgtype)
+                publisher = getattr(connection.ext, "callerid", None) or ""
+                yield recorded_ns, self._reader.deserialize(data, connection.msgtype), publisher
         except Exception as error:  # as on opening
             raise DatasetError(f"{self.path}: topic {topic}: cannot be read: {said(error)}") from error
 
@@ -155,7 +163,9 @@ def _library(name: str) -> Any:
     return library(name, "bags need", "ros", DatasetError)
 
 
-def _stamp(message: Any, recorded_ns: int) -> float:
+def _header(message: Any, recorded_ns: int) -> tuple[float, str]:
+    """Stamp and frame of a message."""
     header = getattr(message, "header", None)
-    ns = header_ns(header) if header is not None else 0
-    return (ns or recorded_ns) / _NANOSECONDS
+    if header is None:
+        return recorded_ns / _NANOSECONDS, ""
+    return (header_ns(header) or recorded_ns) / _NANOSECONDS, frame_name(header.frame_id)
