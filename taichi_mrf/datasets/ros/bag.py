@@ -34,6 +34,7 @@ from taichi_mrf.datasets.ros.topics import (
     cloud_topics,
     depth_topics,
     described,
+    packed_otherwise,
 )
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
@@ -264,7 +265,9 @@ def _open_lidar(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> 
 
 def _depth_topic(reader: RosReader, wanted: str) -> DepthTopic:
     topics = {topic.name: topic for topic in depth_topics(reader)}
-    name = choose(reader, "depth", wanted, list(topics), f"topics of depth images ({messages.ENCODINGS})")
+    unread = [] if topics else packed_otherwise(reader)
+    what = f"topics of depth images ({messages.ENCODINGS})"
+    name = choose(reader, "depth", wanted, [*topics, *unread], what)
     topic = topics.get(name) or described(reader, name)
     try:
         messages.check_depth(topic.encoding)

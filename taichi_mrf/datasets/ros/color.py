@@ -14,7 +14,7 @@ from taichi_mrf.datasets.ros.cameras import camera_of
 from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.sensor import BagSensor
-from taichi_mrf.datasets.ros.topics import DepthTopic, choose, described
+from taichi_mrf.datasets.ros.topics import DepthTopic, choose, described, image_topics
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -95,11 +95,7 @@ def find_colors(
 
 
 def _color_topics(reader: RosReader) -> list[DepthTopic]:
-    images = (messages.IMAGE, messages.COMPRESSED_IMAGE)
-    names = [topic.name for topic in reader.topics.values() if topic.type in images and topic.messages]
-    return [
-        topic for topic in (described(reader, name) for name in names) if messages.is_color(topic.encoding)
-    ]
+    return [topic for topic in image_topics(reader) if messages.is_color(topic.encoding)]
 
 
 def _own_camera(

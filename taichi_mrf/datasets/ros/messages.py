@@ -1,8 +1,8 @@
 """Decoding the messages of depth cameras and trackers: images to metres, poses.
 
 ROS calls depth images by their encodings: 16UC1 (and mono16, as RealSense writes it) are millimetres, 32FC1
-metres (REP 118). A CompressedImage of the transport ``compressedDepth`` is a PNG behind 12 bytes: an integer
-that names the compression and two floats, with which a 32FC1 image's inverse depths were made whole numbers.
+metres (REP 118). A CompressedImage of the transport ``compressedDepth`` is a PNG or RVL behind 12 bytes: an
+integer and two floats, with which a 32FC1 image's inverse depths were made whole numbers.
 """
 
 import struct
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.images import PNG_SIGNATURE, decode_16_bit, decode_color, measured
+from taichi_mrf.datasets.ros.rvl import decode_rvl
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
@@ -34,7 +35,7 @@ METRES = "32FC1"
 PNG = "png"
 """The format of a CompressedImage that is a plain 16-bit PNG file: millimetres."""
 
-ENCODINGS = f"{MILLIMETRES[0]} (millimetres), {METRES} (metres), or compressedDepth of the two as PNG"
+ENCODINGS = f"{MILLIMETRES[0]} (millimetres), {METRES} (metres), or compressedDepth of the two as PNG or RVL"
 STEPS_PER_METRE = 1000.0
 
 GREY = ("mono8", "8UC1")
@@ -47,6 +48,9 @@ _COMPRESSED_COLOR = ("jpeg", "jpg", "png", "rgb8;", "bgr8;")
 """Beginnings of the formats of CompressedImages in colour."""
 
 _HEADER_BYTES = 12
+_RVL = "rvl"
+_PACKINGS = ("compressedDepth", "compressed", "png", _RVL)
+"""The words of a CompressedImage's format behind the encoding of its pixels."""
 
 
 def encoding(message: Any) -> str:
@@ -61,6 +65,10 @@ def check_depth(encoding: str) -> None:
         raise DatasetError(f"encoding {encoding!r} is not depth; supported are {ENCODINGS}")
     if packing.startswith(("jpeg", "jpg")):
         raise DatasetError(f"encoding {encoding!r} is no longer depth: JPEG keeps 8 bits of it, with losses")
+    if not set(packing.split()) <= {*_PACKINGS, *MILLIMETRES, METRES}:
+        raise DatasetError(
+            f"encoding {encoding!r} is depth that is packed in another way; supported are {ENCODINGS}"
+        )
 
 
 def is_depth(encoding: str, topic: str) -> bool:
@@ -113,11 +121,16 @@ def _rows(message: Any, pixel_bytes: int) -> NDArray[np.uint8]:
 def _compressed(message: Any) -> tuple[NDArray, float]:
     """The same of a CompressedImage."""
     data = bytes(message.data)
-    kind = message.format.split(";")[0].strip()
-    start = data.find(PNG_SIGNATURE, 0, _HEADER_BYTES + len(PNG_SIGNATURE))
-    if start not in (0, _HEADER_BYTES) or kind not in (*MILLIMETRES, METRES, PNG):
-        raise DatasetError(f"format {message.format!r} is not depth as PNG; supported are {ENCODINGS}")
-    steps = decode_16_bit(data[start:], message.format)
+    check_depth(message.format)
+    kind, _, packing = map(str.strip, message.format.partition(";"))
+    if _RVL in packing.split():
+        start = _HEADER_BYTES
+        steps = measured(decode_rvl(data[start:]))
+    else:
+        start = data.find(PNG_SIGNATURE, 0, _HEADER_BYTES + len(PNG_SIGNATURE))
+        if start not in (0, _HEADER_BYTES):
+            raise DatasetError(f"format {message.format!r} is not depth as PNG; supported are {ENCODINGS}")
+        steps = decode_16_bit(data[start:], message.format)
     if kind != METRES:
         return steps, STEPS_PER_METRE
     if start == 0:

@@ -33,12 +33,22 @@ class DepthTopic:
         return any(part.startswith("image_rect") for part in self.name.split("/"))
 
 
-def depth_topics(reader: RosReader) -> list[DepthTopic]:
-    """The topics whose first message is a depth image (messages.is_depth)."""
+def image_topics(reader: RosReader) -> list[DepthTopic]:
+    """The topics of images as their first messages show them."""
     images = (messages.IMAGE, messages.COMPRESSED_IMAGE)
     names = [topic.name for topic in reader.topics.values() if topic.type in images and topic.messages]
-    found = [described(reader, name) for name in names]
-    return [topic for topic in found if messages.is_depth(topic.encoding, topic.name)]
+    return [described(reader, name) for name in names]
+
+
+def depth_topics(reader: RosReader) -> list[DepthTopic]:
+    """The topics whose first message is a depth image (messages.is_depth)."""
+    return [topic for topic in image_topics(reader) if messages.is_depth(topic.encoding, topic.name)]
+
+
+def packed_otherwise(reader: RosReader) -> list[str]:
+    """The topics of depth images that are packed in a way that is not read."""
+    depth = (messages.MILLIMETRES[0], messages.METRES)
+    return [t.name for t in image_topics(reader) if t.encoding.partition(";")[0].strip() in depth]
 
 
 def cloud_topics(reader: RosReader) -> list[str]:
