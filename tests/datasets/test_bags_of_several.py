@@ -12,6 +12,7 @@ from inputs_bags import (
     COUNT,
     FRAME,
     Bag,
+    Kind,
     T_body_camera,
     images,
     mounted,
@@ -24,6 +25,7 @@ from inputs_bags import (
 
 from taichi_mrf.datasets import open_dataset
 from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.ros.reader import RosReader
 from taichi_mrf.datasets.runs import starts_of_runs
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose, look_at
@@ -329,3 +331,32 @@ def test_colours_and_depth_without_frames_are_not_taken_for_one_camera(make: Cal
     dataset = open_dataset(f"{path}?optical=camera&body=camera")
     np.testing.assert_allclose(dataset.read(1).T_world_camera, world_body(1), atol=1e-9)
     assert any("neither it nor depth names a frame" in note for note in dataset.notes)
+
+
+def text(bag: Bag) -> None:
+    bag.send("/notes", "std_msgs/msg/String", stamp(0), data="hello")
+
+
+@pytest.mark.parametrize(
+    ("kind", "before", "after", "why"),
+    [
+        ("mcap", b"std_msgs/msg/String\x07\0\0\0ros2msg", b"std_msgs/msg/String\x07\0\0\0foreign", ""),
+        ("mcap", b"string data", b"str\xffng\xfe dat", ""),
+        ("mcap", b"/notes\x03\0\0\0cdr", b"/notes\x03\0\0\0bin", "are bin"),
+        ("ros1", b"string data", b"str{ng data", "Could not parse"),
+        ("ros1", b"string data", b"string date", "another definition"),
+    ],
+)
+def test_a_topic_that_cannot_be_read_does_not_matter_to_others(
+    tmp_path: Path, kind: Kind, before: bytes, after: bytes, why: str
+) -> None:
+    path = tmp_path / ("walk.bag" if kind == "ros1" else "walk")
+    with writing(path, kind) as bag:
+        for part in (text, images, odometry, mounted):
+            part(bag)
+    file = path if kind == "ros1" else next(path.glob("*.mcap"))
+    data = file.read_bytes()
+    assert before in data
+    file.write_bytes(data.replace(before, after))
+    assert_poses(open_dataset(file), np.eye(4))
+    assert why in RosReader(file).topics["/notes"].type

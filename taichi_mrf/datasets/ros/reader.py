@@ -4,7 +4,6 @@ It needs no ROS, and comes with the extra ``ros``. Its errors become
 DatasetError here; the rest of the package sees topics by name and messages as objects with their fields.
 """
 
-import contextlib
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
+from taichi_mrf.datasets.ros.tolerance import open_tolerantly
 from taichi_mrf.datasets.ros.unpacking import bound_unpacking
 from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.system.files import check_regular, is_file, is_folder
@@ -32,7 +32,8 @@ _NANOSECONDS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag: its message type as ROS 2 writes it, such as sensor_msgs/msg/Image."""
+    """A topic of a bag: its message type as ROS 2 writes it, such as sensor_msgs/msg/Image, and why if its
+    messages cannot be read."""
 
     name: str
     type: str
@@ -70,28 +71,26 @@ class RosReader:
         for file in path.iterdir() if is_folder(path) else [path]:
             if not is_folder(file):
                 check_regular(file, DatasetError)
-        highlevel, typesys = _library("rosbags.highlevel"), _library("rosbags.typesys")
+        _library("rosbags.highlevel")
         try:
             bound_unpacking()
-            # Before ROS Iron, bags hold no definitions of their messages; those read here never changed.
-            types = typesys.get_typestore(typesys.Stores.LATEST)
-            self._reader = highlevel.AnyReader(self.parts or [path], default_typestore=types)
-            self._reader.open()
-            self._connections: dict[str, list[Any]] = {}
-            for connection in self._reader.connections:
-                self._connections.setdefault(connection.topic, []).append(connection)
-            self.topics = {
-                name: Topic(name, each[0].msgtype, sum(connection.msgcount for connection in each))
-                for name, each in sorted(self._connections.items())
-            }
-            self.duration = max(0, self._reader.duration) / _NANOSECONDS if self.topics else 0.0
+            self._reader, unread = open_tolerantly(self.parts or [path])
         except Exception as error:  # the library raises many kinds of errors
-            with contextlib.suppress(Exception):
-                self._reader.close()
             raise DatasetError(
                 f"{path}: cannot be read as a bag, it may be cut short: {said(error)}"
             ) from error
         self._open = True
+        self._connections: dict[str, list[Any]] = {}
+        for connection in self._reader.connections:
+            self._connections.setdefault(connection.topic, []).append(connection)
+        topics = {
+            name: Topic(name, each[0].msgtype, sum(connection.msgcount for connection in each))
+            for name, each in self._connections.items()
+        }
+        for each, why in unread:
+            topics.setdefault(each.topic, Topic(each.topic, f"{each.msgtype} ({why})", each.msgcount))
+        self.topics = dict(sorted(topics.items()))
+        self.duration = max(0, self._reader.duration) / _NANOSECONDS if self.topics else 0.0
         times = [(each.start_time, each.end_time) for each in self._reader.readers]
         for (_, ended), (began, _), part in zip(times, times[1:], self.parts[1:], strict=False):
             if abs(began - ended) > LONGEST_PAUSE_S * _NANOSECONDS:
