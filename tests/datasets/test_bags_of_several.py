@@ -166,25 +166,33 @@ LONG = 16
 
 
 @pytest.mark.parametrize("by_tf", [True, False], ids=["tf", "topic"])
-def test_a_clock_that_starts_again_begins_a_run(make: Callable[..., Path], by_tf: bool) -> None:
-    """The second run is shorter and elsewhere; late transforms of the first arrive in it."""
+@pytest.mark.parametrize(
+    ("kind", "is_recorders"), [("ros1", False), ("ros1", True), ("sqlite", True), ("mcap", True)]
+)
+def test_a_clock_that_starts_again_begins_a_run(
+    tmp_path: Path, kind: Kind, is_recorders: bool, by_tf: bool
+) -> None:
+    """The second run is shorter and elsewhere. Late transforms of the first arrive in it, or the recorder has
+    the same clock."""
 
     def write(bag: Bag) -> None:
         mounted(bag)
         bag.camera_info("/camera/depth/camera_info", FRAME, CAMERA)
         for run, T in enumerate((np.eye(4), AWAY)):
             for i in range(LONG - run):
-                bag.latency = 10.0 * run + 0.05
+                bag.latency = 0.05 if is_recorders else 10.0 * run + 0.05
                 bag.image("/camera/depth/image_raw", stamp(i), FRAME, steps(i + 7 * run), "16UC1")
             for k in range(4 * LONG + 8):
-                bag.latency = 10.0 * run + (0.5 if run else 3.0)
+                bag.latency = 0.05 if is_recorders else 10.0 * run + (0.5 if run else 3.0)
                 i = 0.25 * k - 1
                 if by_tf:
                     bag.tf("/tf", stamp(i), "odom", BODY, T @ world_body(i))
                 else:
                     bag.odometry("/odom", stamp(i), "odom", BODY, T @ world_body(i))
 
-    path = make(write)
+    path = tmp_path / ("walk.bag" if kind == "ros1" else "walk")
+    with writing(path, kind) as bag:
+        write(bag)
     first = open_dataset(path)
     assert_poses(first, np.eye(4), LONG)
     (note,) = (note for note in first.notes if "clock starts again" in note)

@@ -188,7 +188,7 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
         return _open_lidar(reader, chosen, options)
     depth = _depth_topic(reader, chosen.depth)
     sensor = find_sensor(reader, depth.name, "images", chosen)
-    cameras = find_cameras(reader, depth, sensor.entries, chosen.info, options)
+    cameras = find_cameras(sensor, depth, chosen.info, options)
     found = poses_of(sensor, chosen)
     if any(each.registered for each in found.values()):
         raise DatasetError(

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.options import DISTORTION_COUNTS, ReadOptions
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
+from taichi_mrf.datasets.ros.sensor import BagSensor
 from taichi_mrf.datasets.ros.topics import DepthTopic, choose
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -59,13 +60,11 @@ class BagCameras:
         return (camera.of(shape) if shape is not None else None) or camera.cut
 
 
-def find_cameras(
-    reader: RosReader, depth: DepthTopic, entries: Sequence[Entry], wanted: str, options: ReadOptions
-) -> BagCameras:
+def find_cameras(sensor: BagSensor, depth: DepthTopic, wanted: str, options: ReadOptions) -> BagCameras:
     """The cameras of a topic's images, given by the user or by CameraInfo on the topic ``wanted`` or the only
     one that fits. Raises DatasetError, which names file, topic and remedy, if they are not known or do not
     fit the images."""
-    given = options.camera
+    reader, entries, given = sensor.reader, sensor.entries, options.camera
     if options.intrinsics is not None and given is None:
         given = PinholeCamera(*_first_size(reader, depth), *options.intrinsics)
     if given is not None:
@@ -78,7 +77,9 @@ def find_cameras(
     stated: dict[str, list[tuple[float, StatedCamera, tuple[float, ...]]]] = {}
     problems: dict[str, str] = {}  # a driver that warms up may send zeros first
     early = _half_a_frame(entries)
-    for entry, message in reader.messages(name):
+    sent = dict(reader.messages(name))
+    for entry in sensor.run.of(list(sent)) or sent:
+        message = sent[entry]
         try:
             camera, distortion = camera_of(message, depth.rectified)
         except DatasetError as error:

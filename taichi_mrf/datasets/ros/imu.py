@@ -55,8 +55,8 @@ def find_imu(reader: RosReader, wanted: str, sensor: BagSensor, first_s: float) 
         why = f"tf has no fixed transform from {frame!r} to {optical!r}"
         return BagImu(notes=[f"imu: {name} is not used: {why}"])
     to_optical = T_optical_imu[:3, :3].T
-    part = sensor.run.part([entry.stamp for entry in entries], [entry.recorded_ns for entry in entries])
-    times, first = np.unique([entry.stamp for entry in entries[part]], return_index=True)
+    part = list(sensor.run.part([entry.stamp for entry in entries], [entry.place for entry in entries]))
+    times, first = np.unique([entries[i].stamp for i in part], return_index=True)
     rates_imu = np.array(rates)[part][first]
     valid = np.isfinite(rates_imu).all(axis=1)
     measured = np.array(accelerations)[part][first] @ to_optical

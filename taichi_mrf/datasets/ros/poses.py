@@ -190,7 +190,7 @@ def _read_poses(
     if not sent:
         raise DatasetError(f"{reader.path}: topic {name}: none of its {broken} messages is a valid pose")
     (parent, child), found = _one_body(f"{reader.path}: topic {name}", sent, choice)
-    found = found[run.part([e.stamp for e, _ in found], [e.recorded_ns for e, _ in found])]
+    found = [found[i] for i in run.part([e.stamp for e, _ in found], [e.place for e, _ in found])]
     if not found:
         raise DatasetError(f"{reader.path}: topic {name} contains no pose of the run; ?run=N chooses another")
     stamps, poses = [entry.stamp for entry, _ in found], [pose for _, pose in found]

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from taichi_mrf.datasets.ros.file_order import Place, places_of
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
 from taichi_mrf.datasets.ros.tolerance import open_tolerantly
 from taichi_mrf.datasets.ros.unpacking import bound_unpacking
@@ -55,6 +56,9 @@ class Entry:
     publisher: str = ""
     """The node that sent it, which only ROS 1 records."""
 
+    place: int = 0
+    """Grows in the order of recording: its time, or the place in the file if that time starts again."""
+
 
 class RosReader:
     """An open bag. ``topics`` are those by name, ``duration`` the seconds from the first message to the last;
@@ -79,7 +83,7 @@ class RosReader:
             raise DatasetError(
                 f"{path}: cannot be read as a bag, it may be cut short: {said(error)}"
             ) from error
-        self._open = True
+        self._open, self.by_file = True, False
         self._connections: dict[str, list[Any]] = {}
         for connection in self._reader.connections:
             self._connections.setdefault(connection.topic, []).append(connection)
@@ -110,11 +114,21 @@ class RosReader:
     def messages(self, topic: str) -> Iterator[tuple[Entry, Any]]:
         """All messages of a topic in the order of recording. Raises DatasetError, naming file and topic."""
         previous, ordinal = None, 0
-        for recorded_ns, message, publisher in self._read(topic, None, None):
+        places = self.places(topic) if self.by_file else []
+        for number, (recorded_ns, message, publisher) in enumerate(self._read(topic, None, None)):
             ordinal = ordinal + 1 if recorded_ns == previous else 0
             previous = recorded_ns
             stamp, frame = _header(message, recorded_ns)
-            yield Entry(recorded_ns, ordinal, stamp, frame, publisher), message
+            place = places[number][1] if number < len(places) else recorded_ns
+            yield Entry(recorded_ns, ordinal, stamp, frame, publisher, place), message
+
+    def places(self, topic: str) -> list[Place]:
+        """The places in the file of a topic's messages, in the order of ``messages``; none if its index is
+        damaged."""
+        try:
+            return places_of(self._reader.readers, topic, self.topics[topic].type)
+        except Exception:  # as on opening
+            return []
 
     def first(self, topic: str) -> Any | None:
         """The first message of a topic, None if there is none."""

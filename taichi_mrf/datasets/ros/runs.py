@@ -1,7 +1,7 @@
 """The run of a bag that is mapped, where the clock of its sensor starts again while it is recorded."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.runs import choose_run, starts_of_runs
@@ -10,57 +10,62 @@ NEAR_NS = 5_000_000_000
 """Other topics see the clock start again at most this much before or after the sensor's."""
 
 Gap = tuple[int, int]
-"""The times of recording of the last message of a run and the first of the next, in nanoseconds."""
+"""The places in the order of recording of the last message of a run and the first of the next."""
 
 
 @dataclass(frozen=True)
 class BagRun:
-    """A run, between two gaps; None where the recording begins or ends."""
+    """The ``number`` of a run, from 0, of those between gaps."""
 
-    before: Gap | None = None
-    after: Gap | None = None
+    number: int = 0
+    gaps: tuple[Gap, ...] = ()
 
-    def part(self, stamps: Sequence[float], recorded_ns: Sequence[int]) -> slice:
-        """Which messages of a topic, or transforms of a frame, belong to the run."""
-        if self.before is None and self.after is None:
-            return slice(None)
-        starts = starts_of_runs(stamps)[1:]
-        first = 0 if self.before is None else _bound(self.before, starts, recorded_ns)
-        return slice(first, None if self.after is None else _bound(self.after, starts, recorded_ns))
+    def part(self, stamps: Sequence[float], places: Sequence[int]) -> Sequence[int]:
+        """Which messages of a topic, or transforms of a frame, belong to the run, by their numbers."""
+        if not self.gaps:
+            return range(len(stamps))
+        order = sorted(range(len(stamps)), key=places.__getitem__)
+        starts = starts_of_runs([stamps[i] for i in order])[1:]
+        ordered = [places[i] for i in order]
+        if len(starts) != len(self.gaps):
+            starts = [_bound(gap, starts, ordered) for gap in self.gaps]
+        bounds = [0, *starts, len(order)]
+        return order[bounds[self.number] : bounds[self.number + 1]]
 
-    def of(self, entries: Sequence[Entry]) -> Sequence[Entry]:
+    def of(self, entries: Sequence[Entry]) -> list[Entry]:
         """The messages of a topic that belong to the run."""
-        return entries[
-            self.part([entry.stamp for entry in entries], [entry.recorded_ns for entry in entries])
-        ]
+        part = self.part([entry.stamp for entry in entries], [entry.place for entry in entries])
+        return [entries[i] for i in part]
 
-    def is_over(self, recorded_ns: int) -> bool:
-        """Whether the run ended before this time of recording."""
-        return self.after is not None and recorded_ns >= self.after[1]
+    def is_over(self, place: int) -> bool:
+        """Whether the run ended before this place in the order of recording."""
+        return self.number < len(self.gaps) and place >= self.gaps[self.number][1]
 
 
-def _bound(gap: Gap, starts: Sequence[int], recorded_ns: Sequence[int]) -> int:
-    """The index of the first message after a gap: where the topic's own stamps start again near it, else by
-    the time of recording."""
+def _bound(gap: Gap, starts: Sequence[int], places: Sequence[int]) -> int:
+    """The number of the first message after a gap: where the topic's own stamps start again near it, else by
+    the order of recording."""
     middle = sum(gap) // 2
-    near = [i for i in starts if gap[0] - NEAR_NS <= recorded_ns[i] <= gap[1] + NEAR_NS]
+    near = [i for i in starts if gap[0] - NEAR_NS <= places[i] <= gap[1] + NEAR_NS]
     if near:
-        return min(near, key=lambda i: abs(recorded_ns[i] - middle))
-    return next((i for i, ns in enumerate(recorded_ns) if ns >= gap[1]), len(recorded_ns))
+        return min(near, key=lambda i: abs(places[i] - middle))
+    return next((i for i, place in enumerate(places) if place >= gap[1]), len(places))
 
 
 def run_of(
     reader: RosReader, topic: str, entries: Sequence[Entry], wanted: int, what: str
 ) -> tuple[BagRun, Sequence[Entry], list[str]]:
-    """The run that is read, its messages of the sensor's topic, and a note of the others. ``entries`` are all
-    in the order of recording. Raises DatasetError if there is no such run."""
-    if not entries:
-        return BagRun(), entries, []
+    """The run that is read, its messages of the sensor's topic, and a note of the others. Raises DatasetError
+    if there is no such run."""
+    places = reader.places(topic)
+    if len(starts_of_runs([time / 1e9 for time, _ in sorted(places, key=lambda each: each[1])])) > 1:
+        reader.by_file = True  # the recorder's clock started again as well
+        at = {(entry.recorded_ns, entry.ordinal): entry for entry, _ in reader.messages(topic)}
+        entries = sorted(
+            (replace(entry, place=at[entry.recorded_ns, entry.ordinal].place) for entry in entries),
+            key=lambda entry: entry.place,
+        )
     where = f"{reader.path}: topic {topic}"
     number, bounds, notes = choose_run([entry.stamp for entry in entries], wanted, where, what)
-    gaps: list[Gap | None] = [
-        None,
-        *((entries[i - 1].recorded_ns, entries[i].recorded_ns) for i in bounds[1:-1]),
-        None,
-    ]
-    return BagRun(gaps[number], gaps[number + 1]), entries[bounds[number] : bounds[number + 1]], notes
+    gaps = tuple((entries[i - 1].place, entries[i].place) for i in bounds[1:-1])
+    return BagRun(number, gaps), entries[bounds[number] : bounds[number + 1]], notes

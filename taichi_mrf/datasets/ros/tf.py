@@ -20,13 +20,13 @@ from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
 
-_SAME_M, _SAME_RAD = 0.1, 0.1
+_SAME_M, _SAME_RAD = 0.05, 0.05
 """Publishers agree if their transforms differ by less."""
 
-_FASTEST = 30.0
+_FASTEST = 40.0
 """In units of the two a second: what jumps to and fro faster is not one body."""
 
-_LONGEST_BURST, _LEAST_SHARE = 3, 0.05
+_LONGEST_BURST, _LEAST_SHARE = 3, 0.06
 """Messages that one publisher sends between two of another, and the share of such among all."""
 
 LAST = "last"
@@ -38,7 +38,7 @@ class _Sent:
     parent: str
     pose: Pose
     stamp: float
-    recorded_ns: int
+    place: int
     publisher: str
     is_static: bool
 
@@ -95,7 +95,7 @@ def read_transforms(reader: RosReader) -> dict[str, Transforms]:
                 stamp = messages.header_ns(each.header) / 1e9 or entry.stamp
                 if parent and child:
                     transforms[child].append(
-                        _Sent(parent, pose, stamp, entry.recorded_ns, entry.publisher, is_static)
+                        _Sent(parent, pose, stamp, entry.place, entry.publisher, is_static)
                     )
     return sent
 
@@ -123,7 +123,8 @@ def _edge(child: str, rows: Sequence[_Sent], last: bool, run: BagRun) -> tuple[s
     """The parent and transform of a frame, or what is disputed; None if nothing was sent in the run."""
     by_parent: dict[str, list[_Sent]] = defaultdict(list)
     moving = [each for each in rows if not each.is_static]
-    moving = moving[run.part([each.stamp for each in moving], [each.recorded_ns for each in moving])]
+    part = run.part([each.stamp for each in moving], [each.place for each in moving])
+    moving = [moving[i] for i in part]
     for each in [*moving, *_static(rows, run)]:
         by_parent[each.parent].append(each)
     found = {parent: _one_parent(parent, child, some, last) for parent, some in by_parent.items()}
@@ -140,7 +141,7 @@ def _edge(child: str, rows: Sequence[_Sent], last: bool, run: BagRun) -> tuple[s
 def _static(rows: Sequence[_Sent], run: BagRun) -> list[_Sent]:
     """The fixed transforms that were sent up to the end of the run, or all if they came later."""
     static = [each for each in rows if each.is_static]
-    return [each for each in static if not run.is_over(each.recorded_ns)] or static
+    return [each for each in static if not run.is_over(each.place)] or static
 
 
 def _one_parent(parent: str, child: str, rows: Sequence[_Sent], last: bool) -> Edge | Dispute:
