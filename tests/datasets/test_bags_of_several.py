@@ -88,6 +88,12 @@ def test_each_robot_has_the_tree_of_its_namespace(make: Callable[..., Path]) -> 
     assert_poses(open_dataset(f"{both}?depth=/robot1/depth/image_raw&tf=/robot2"), AWAY)
     shared = make(images, mounted, moving("/robot1/tf", np.eye(4)), moving("/robot2/tf"))
     refused(f"{shared}?tf=/robot3", "names no namespace or publisher", "/robot1/", "/robot2/")
+    refused(shared, f"several trees of frames contain {BODY}", "?tf=/robot1 or ?tf=/robot2")
+    assert_poses(open_dataset(f"{shared}?tf=/robot2"), AWAY)
+    first = (lambda bag: images(bag, "/robot1/depth/image_raw"), mounted)
+    assert_poses(open_dataset(make(*first, moving("/robot1/tf", np.eye(4)), moving("/robot2/tf"))), np.eye(4))
+    others = make(*first, moving("/robot2/tf"), lambda bag: odometry(bag, "/robot2/odom"))
+    refused(others, "contains no poses", "Those of other robots: ?pose=/robot2/odom")
     unplaced = make(
         images,
         *(lambda bag, r=r: bag.tf(f"/{r}/tf_static", 0.0, BODY, FRAME, T_body_camera) for r in "ab"),
@@ -120,7 +126,15 @@ def test_parents_that_differ_are_chosen_among_by_the_fixed_frame(make: Callable[
 
 
 def test_mountings_that_contradict_each_other_are_refused(make: Callable[..., Path]) -> None:
-    path = make(odometry, images, lambda bag: bag.tf("/tf_static", 0.0, BODY, FRAME, AWAY), mounted)
+    def again(bag: Bag) -> None:
+        bag.tf("/tf_static", 0.0, BODY, FRAME, AWAY)
+
+    def masted(bag: Bag) -> None:
+        bag.tf("/tf_static", 0.0, BODY, "mast", AWAY)
+        bag.tf("/tf_static", 0.0, "mast", FRAME, AWAY)
+
+    refused(make(odometry, images, mounted, masted), f"{FRAME} has several parents, {BODY}, mast")
+    path = make(odometry, images, again, mounted)
     refused(path, f"transforms of {FRAME} in {BODY} contradict each other", "?tf=last")
     assert_poses(open_dataset(f"{path}?tf=last"), np.eye(4))
 

@@ -75,11 +75,17 @@ def pose_candidates(reader: RosReader, tree: TransformTree, optical: str) -> lis
     """The values of the option ``pose``: topics, and ``tf`` if the camera's frame moves in the tree; without
     topics also if transforms that may move do not. Raises DatasetError if there are none because publishers
     disagree."""
-    root, topics = tree.ancestors(optical)[-1], pose_topics(reader)
+    root = tree.ancestors(optical)[-1]
+    topics = [name for name in pose_topics(reader) if not _is_apart(name, tree)]
     if not topics:
         tree.check(optical)
     by_tf = tree.moves(root, optical) and (not topics or tree.mounted(root, optical) is None)
     return [*topics, *([FROM_TF] if by_tf else [])]
+
+
+def _is_apart(topic: str, tree: TransformTree) -> bool:
+    """Whether a topic is another robot's."""
+    return any(topic.startswith(f"{space}/") for space in tree.apart)
 
 
 def find_poses(
@@ -105,6 +111,9 @@ def find_poses(
     candidates = pose_candidates(reader, tree, optical)
     if not candidates and not choice.pose:
         problem = NO_POSES.format(path=reader.path, frame=optical or "camera frame")
+        others = [name for name in pose_topics(reader) if _is_apart(name, tree)]
+        if others:
+            problem += f". Those of other robots: ?pose={' or ?pose='.join(others)}"
         if tree.frames and optical not in tree.frames:
             known = f"frame '{optical}', which tf does not have" if optical else "a frame that has no name"
             problem += (
@@ -140,7 +149,7 @@ def _from_topic(
     reader: RosReader, name: str, tree: TransformTree, optical: str, choice: PoseChoice, run: BagRun
 ) -> BagPoses:
     timed, parent, child, notes = _read_poses(reader, name, choice, run)
-    tree = tree.towards(choice.body or child)
+    tree = tree.towards(choice.body or child, named=False)
     if choice.body:
         must_connect(reader, tree, choice.body, optical)
     fixed = choice.frame or parent
@@ -258,6 +267,11 @@ def body_of(
     if named != optical and not tree.connects(named, optical):
         tree.check(named)
         tree.check(optical)
+        if not optical and tree.frames:
+            raise DatasetError(
+                f"the poses are of {named}, and the messages name no frame: ?optical=FRAME says which of "
+                f"tf's frames ({', '.join(tree.frames)}) is the sensor's"
+            )
         if not _is_cameras(named):
             same = f"?body={optical}" if optical else f"?optical={named}"
             raise DatasetError(

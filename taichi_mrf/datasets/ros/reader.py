@@ -79,22 +79,22 @@ class RosReader:
         try:
             bound_unpacking()
             self._reader, unread = open_tolerantly(self.parts or [path])
+            self._connections: dict[str, list[Any]] = {}
+            for connection in self._reader.connections:
+                self._connections.setdefault(connection.topic, []).append(connection)
+            topics = {
+                name: Topic(name, each[0].msgtype, sum(connection.msgcount for connection in each))
+                for name, each in self._connections.items()
+            }
+            for each, why in unread:
+                topics.setdefault(each.topic, Topic(each.topic, f"{each.msgtype} ({why})", each.msgcount))
+            self.topics = dict(sorted(topics.items()))
+            self.duration = max(0, self._reader.duration) / _NANOSECONDS if self.topics else 0.0
         except Exception as error:  # the library raises many kinds of errors
             raise DatasetError(
                 f"{path}: cannot be read as a bag, it may be cut short: {said(error)}"
             ) from error
         self._open, self.by_file = True, False
-        self._connections: dict[str, list[Any]] = {}
-        for connection in self._reader.connections:
-            self._connections.setdefault(connection.topic, []).append(connection)
-        topics = {
-            name: Topic(name, each[0].msgtype, sum(connection.msgcount for connection in each))
-            for name, each in self._connections.items()
-        }
-        for each, why in unread:
-            topics.setdefault(each.topic, Topic(each.topic, f"{each.msgtype} ({why})", each.msgcount))
-        self.topics = dict(sorted(topics.items()))
-        self.duration = max(0, self._reader.duration) / _NANOSECONDS if self.topics else 0.0
         times = [(each.start_time, each.end_time) for each in self._reader.readers]
         for (_, ended), (began, _), part in zip(times, times[1:], self.parts[1:], strict=False):
             if abs(began - ended) > LONGEST_PAUSE_S * _NANOSECONDS:

@@ -82,9 +82,9 @@ def poses_of(sensor: BagSensor, choice: PoseChoice) -> dict[str, BagPoses]:
             if len(frames) > 1 and found[frame].registered:
                 raise DatasetError(f"the data of {frame} are in the frame of the poses")
         except DatasetError as error:
-            if len(frames) == 1:
-                raise
             said = str(error).removeprefix(f"{sensor.reader.path}: ")
+            if len(frames) == 1:
+                raise DatasetError(f"{sensor.reader.path}: {said}") from error
             several = _several(sensor.reader, sensor.topic, sensor.what, frames)
             raise DatasetError(f"{several}: ?optical=FRAME reads those of one; {frame}: {said}") from error
     return found

@@ -5,6 +5,7 @@ Each robot has its own: the tree of a sensor is that of its topic's namespace, /
 frame, or about its parent, leave it disputed; what passes through it asks the user.
 """
 
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -61,20 +62,21 @@ def tree_of(
     publishers = sorted(
         {each.publisher for all_ in sent.values() for some in all_.values() for each in some} - {""}
     )
-    named = tf.rstrip("/") if tf.rstrip("/") in sent else None
+    named = tf.rstrip("/") if tf and tf.rstrip("/") in sent else None
     if tf and named is None and tf not in (*publishers, LAST):
         known = ", ".join([*(f"{space}/" for space in sent), *publishers])
         raise DatasetError(f"?tf={tf} names no namespace or publisher of tf: {known or 'none'}")
     edges: dict[str, tuple[str, Edge]] = {}
     disputed: dict[str, Dispute] = {}
-    for child, rows in _of_sensor(sent, topic, frame, named).items():
+    transforms, apart = _of_sensor(sent, topic, frame, named)
+    for child, rows in transforms.items():
         preferred = [each for each in rows if tf and each.publisher == tf] or rows
         found = _edge(child, preferred, tf == LAST, run or BagRun())
         if isinstance(found, Dispute):
             disputed[child] = found
         elif found is not None:
             edges[child] = found
-    return TransformTree(edges, disputed)
+    return TransformTree(edges, disputed, apart)
 
 
 def read_transforms(reader: RosReader) -> dict[str, Transforms]:
@@ -100,23 +102,35 @@ def read_transforms(reader: RosReader) -> dict[str, Transforms]:
     return sent
 
 
-def _of_sensor(sent: dict[str, Transforms], topic: str, frame: str, named: str | None) -> Transforms:
-    """The transforms of the sensor's namespace, and those of others that give none of the same frames."""
+def _of_sensor(
+    sent: dict[str, Transforms], topic: str, frame: str, named: str | None
+) -> tuple[Transforms, list[str]]:
+    """The transforms of the sensor's namespace with those of others that give none of the same frames, and
+    the namespaces of other robots."""
     around = sorted((space for space in sent if topic.startswith(f"{space}/")), key=len, reverse=True)
     own = named if named is not None else next(iter(around), "")
-    others = [space for space in (around if own else sent) if space != own]
+    apart = [space for space in sent if space != own]
     found = dict(sent.get(own, {}))
-    children = [child for space in others for child in sent[space]]
-    for space in others:
-        if not any(child in found or (not own and children.count(child) > 1) for child in sent[space]):
+    children = [child for space in apart for child in sent[space]]
+    for space in sorted(apart, key=len, reverse=True):
+        is_near = f"{own}/".startswith(f"{space}/") or (not own and not _are_twins(space, topic))
+        if is_near and not any(c in found or (not own and children.count(c) > 1) for c in sent[space]):
             found |= sent[space]
-    holding = [space for space in others if frame in sent[space]]
-    if frame not in found and len(holding) > 1:
-        choices = " or ".join(f"?tf={space or '/'}" for space in holding)
-        raise DatasetError(
-            f"several trees of frames contain {frame}, that of {topic}: choose one with {choices}"
-        )
-    return found
+            apart.remove(space)
+    root = frame
+    for _ in found:
+        root = found[root][0].parent if root in found else root
+    holding = [space for space in apart if root in sent[space]]
+    if not own and named is None and len(holding) > 1:
+        choices = " or ".join(f"?tf={space}" for space in holding)
+        raise DatasetError(f"several trees of frames contain {root}, of {topic}: choose one with {choices}")
+    return found, [space for space in apart if space]
+
+
+def _are_twins(space: str, topic: str) -> bool:
+    """Whether two names begin with those of two robots: /robot1 and /robot2."""
+    a, b = (name.split("/")[1] for name in (f"{space}/", topic if "/" in topic else "/"))
+    return a != b and re.sub(r"\d+", "", a) == re.sub(r"\d+", "", b) != ""
 
 
 def _edge(child: str, rows: Sequence[_Sent], last: bool, run: BagRun) -> tuple[str, Edge] | Dispute | None:

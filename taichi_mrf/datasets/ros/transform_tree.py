@@ -1,7 +1,7 @@
 """A tree of coordinate frames, as ROS keeps it: a fixed or moving transform connects each frame to its
 parent."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,24 +28,32 @@ class Dispute:
 
 class TransformTree:
     """Frames and the transforms between them. ``edges`` maps a frame to its parent and T_parent_frame; frames
-    that are ``disputed`` are roots until one of their parents is chosen."""
+    that are ``disputed`` are roots until one of their parents is chosen. ``apart`` are the namespaces of
+    other robots."""
 
     def __init__(
-        self, edges: Mapping[str, tuple[str, Edge]], disputed: Mapping[str, Dispute] | None = None
+        self,
+        edges: Mapping[str, tuple[str, Edge]],
+        disputed: Mapping[str, Dispute] | None = None,
+        apart: Sequence[str] = (),
     ) -> None:
         self.edges = dict(edges)
         self.disputed = dict(disputed or {})
+        self.apart = tuple(apart)
         self._held: dict[str, Pose | None] = {}
 
-    def towards(self, *frames: str) -> "TransformTree":
+    def towards(self, *frames: str, named: bool = True) -> "TransformTree":
         """The tree in which a disputed frame has the parent that leads to one of some frames, if only one
-        does."""
+        does, or that is one of them, if the user ``named`` them."""
         tree = self
         for child, dispute in self.disputed.items():
-            leading = [p for p in dispute.edges if any(f and f in self.ancestors(p) for f in frames)]
+            leading = [p for p in dispute.edges if named and p in frames] or [
+                p for p in dispute.edges if any(f and f in self.ancestors(p) for f in frames)
+            ]
             if len(leading) == 1:
                 edges = {**tree.edges, child: (leading[0], dispute.edges[leading[0]])}
-                tree = TransformTree(edges, {f: d for f, d in tree.disputed.items() if f != child})
+                disputed = {f: each for f, each in tree.disputed.items() if f != child}
+                tree = TransformTree(edges, disputed, self.apart)
         return tree
 
     def check(self, frame: str) -> None:
