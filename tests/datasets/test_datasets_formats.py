@@ -147,7 +147,7 @@ def write_bag(packed: bool, folder: Path, content: Content) -> Path:
                 bag.compressed_depth("/depth/image/compressedDepth", 1 + 0.1 * i, "optical", image)
             else:
                 bag.image("/depth/image", 1 + 0.1 * i, "optical", image, "16UC1")
-            bag.pose_stamped("/pose", 1 + 0.1 * i, "map", content.poses[i])
+            bag.pose_stamped("/camera/pose", 1 + 0.1 * i, "map", content.poses[i])
     return path
 
 

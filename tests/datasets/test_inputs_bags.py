@@ -22,6 +22,7 @@ from inputs_bags import (
     mounted,
     odometry,
     plain,
+    rvl,
     stamp,
     steps,
     world_body,
@@ -29,6 +30,7 @@ from inputs_bags import (
 )
 
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.ros.rvl import decode_rvl
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -94,7 +96,7 @@ def test_encodings(make: Callable[..., Path], big: bool) -> None:
         bag.compressed_depth("/c/depth/compressedDepth", 1.0, FRAME, steps(0))
         bag.compressed_depth("/d/depth/compressedDepth", 1.0, FRAME, metres, "32FC1")
         bag.image("/e/depth", 1.0, FRAME, steps(0), "mono16", big)
-        bag.pose_stamped("/pose", 1.0, "map", np.eye(4))
+        bag.pose_stamped("/camera/pose", 1.0, "map", np.eye(4))
 
     path = make(write)
     exact = metres.copy()
@@ -230,6 +232,49 @@ def test_depth_of_the_plain_transport_is_found_as_png_and_refused_as_jpeg(make: 
     assert "JPEG keeps 8 bits" in refused(f"{path}?depth=/cam/depth/jpg/compressed")
 
 
+@pytest.mark.parametrize(
+    ("kind", "packing"),
+    [
+        ("16UC1", "compressedDepth"),
+        ("16UC1", "compressedDepth rvl"),
+        ("mono16", "compressedDepth png"),
+        ("32FC1", "compressedDepth"),
+        ("32FC1", "compressedDepth rvl"),
+    ],
+)
+def test_depth_of_the_depth_transport_in_its_formats(
+    make: Callable[..., Path], kind: str, packing: str
+) -> None:
+    image = steps(0)
+    image[3, 4:11] = image[-1, -5:] = 0
+    metres = image / np.float32(1000)
+
+    def write(bag: Bag) -> None:
+        bag.camera_info("/cam/depth/camera_info", FRAME, CAMERA)
+        depth = metres if kind == "32FC1" else image
+        bag.compressed_depth("/cam/depth/compressedDepth", stamp(0), FRAME, depth, kind, packing)
+
+    found = open_dataset(make(write, lambda bag: odometry(bag, child=FRAME))).read(0).depth_m
+    # 32FC1 has inverse depths as whole numbers of 1 / 10100 per metre.
+    np.testing.assert_allclose(found, metres, atol=9.0**2 / 10100 / 2 * 1.01 if kind == "32FC1" else 0)
+    np.testing.assert_array_equal(found == 0, image == 0)
+
+
+@pytest.mark.parametrize("packing", ["compressedDepth zdepth", "tiff compressed"])
+def test_depth_in_an_unknown_format_is_refused_by_its_name(make: Callable[..., Path], packing: str) -> None:
+    def write(bag: Bag) -> None:
+        bag.compressed_depth("/cam/depth/compressedDepth", stamp(0), FRAME, steps(0), "16UC1", packing)
+
+    assert f"topic /cam/depth/compressedDepth: encoding '16UC1; {packing}'" in refused(make(write, odometry))
+
+
+@pytest.mark.parametrize("cut", [-1, 7, 12, 30])
+def test_damaged_rvl_is_refused(cut: int) -> None:
+    data = rvl(steps(0))
+    with pytest.raises(DatasetError, match="RVL"):
+        decode_rvl(data[:cut] if cut > 0 else b"\x01\0\0\0\x01\0\0\0" + b"\xff" * 40)
+
+
 def test_the_body_of_a_pose_can_be_named(make: Callable[..., Path]) -> None:
     def write(bag: Bag) -> None:
         images(bag)
@@ -269,7 +314,7 @@ def test_images_without_poses_are_left_out_and_counted(make: Callable[..., Path]
     def write(bag: Bag) -> None:
         images(bag)
         for seconds in (1.08, 1.12, 1.19, 1.32):
-            bag.pose_stamped("/pose", seconds, "map", look_at([seconds, 0, 0], [9, 0, 0]))
+            bag.pose_stamped("/camera/pose", seconds, "map", look_at([seconds, 0, 0], [9, 0, 0]))
 
     path = make(write)
     dataset = open_dataset(path, max_time_gap=0.05)

@@ -146,7 +146,7 @@ def test_only_what_lies_on_the_way_is_asked_for(tree: TransformTree) -> None:
 def test_the_body_is_what_the_camera_is_fixed_to(tree: TransformTree) -> None:
     assert tree.body("camera") == "base"
     assert tree.body("base") == "base"
-    assert tree.body("light") == "map"
+    assert tree.body("light") == "beacon", "a map is no body"
     assert tree.body("unheard of") == "unheard of"
 
 

@@ -29,9 +29,11 @@ def nanoseconds(stamp: float) -> int:
 
 
 class Bag:
-    """A bag in the making. Stamps are seconds after START; messages are recorded ``latency`` later."""
+    """A bag in the making. Stamps are seconds after START; messages are recorded ``latency`` later, in ROS 1
+    from the node ``node``."""
 
     latency = 0.05
+    node = ""
 
     def __init__(self, kind: Kind, writer: Any) -> None:
         self.kind, self.writer = kind, writer
@@ -43,13 +45,13 @@ class Bag:
 
     def send(self, topic: str, name: str, stamp: float, **fields: Any) -> None:
         """Record a message of a type such as sensor_msgs/msg/Image."""
-        if topic not in self.connections:
-            self.connections[topic] = self.writer.add_connection(topic, name, typestore=self.types)
+        key = topic + self.node
+        if key not in self.connections:
+            node = {"callerid": self.node} if self.node else {}
+            self.connections[key] = self.writer.add_connection(topic, name, typestore=self.types, **node)
         message = self.message(name, **fields)
         serialize = self.types.serialize_ros1 if self.kind == "ros1" else self.types.serialize_cdr
-        self.writer.write(
-            self.connections[topic], nanoseconds(stamp + self.latency), serialize(message, name)
-        )
+        self.writer.write(self.connections[key], nanoseconds(stamp + self.latency), serialize(message, name))
 
     def message(self, name: str, /, **fields: Any) -> Any:
         return self.types.types[name](**fields)
@@ -81,7 +83,13 @@ class Bag:
         )
 
     def compressed_depth(
-        self, topic: str, stamp: float, frame: str, image: NDArray, kind: str = "16UC1"
+        self,
+        topic: str,
+        stamp: float,
+        frame: str,
+        image: NDArray,
+        kind: str = "16UC1",
+        packing: str = "compressedDepth png",
     ) -> None:
         """A CompressedImage as image_transport's compressedDepth plugin writes it; 32FC1 from metres."""
         scale, offset = 0.0, 0.0
@@ -89,14 +97,14 @@ class Bag:
             scale, offset = 100.0 * 101.0, 1 - 100.0 * 101.0 / 10.0
             with np.errstate(divide="ignore"):
                 image = np.where(image > 0, np.rint(scale / image + offset), 0).astype(np.uint16)
-        png = cv2.imencode(".png", image)[1].tobytes()
-        data = struct.pack("<iff", 0, scale, offset) + png
+        packed = rvl(image) if "rvl" in packing else cv2.imencode(".png", image)[1].tobytes()
+        data = struct.pack("<iff", 0, scale, offset) + packed
         self.send(
             topic,
             "sensor_msgs/msg/CompressedImage",
             stamp,
             header=self.header(stamp, frame),
-            format=f"{kind}; compressedDepth png",
+            format=f"{kind}; {packing}",
             data=np.frombuffer(data, np.uint8),
         )
 
@@ -109,10 +117,19 @@ class Bag:
         model: str = "plumb_bob",
         projection: PinholeCamera | None = None,
         stamp: float = 0.0,
+        binning: tuple[int, int] = (0, 0),
+        part: tuple[int, int, int, int] = (0, 0, 0, 0),
     ) -> None:
-        """A CameraInfo; ``projection`` is that of the rectified images."""
+        """A CameraInfo; ``projection`` is that of the rectified images, ``part`` the region of interest as x,
+        y, width and height."""
+        x, y, width, height = part
         roi = self.message(
-            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+            "sensor_msgs/msg/RegionOfInterest",
+            x_offset=x,
+            y_offset=y,
+            height=height,
+            width=width,
+            do_rectify=False,
         )
         P = np.zeros((3, 4))
         P[:, :3] = matrix(projection or camera)
@@ -132,8 +149,8 @@ class Bag:
             height=camera.height,
             width=camera.width,
             distortion_model=model,
-            binning_x=0,
-            binning_y=0,
+            binning_x=binning[0],
+            binning_y=binning[1],
             roi=roi,
             **arrays,
         )
@@ -186,6 +203,31 @@ class Bag:
             ),
         )
         self.send(topic, "tf2_msgs/msg/TFMessage", stamp, transforms=[transform])
+
+
+def rvl(image: NDArray[np.uint16]) -> bytes:
+    """An image in RVL, number by number, as its authors' code writes it."""
+    nibbles: list[int] = []
+
+    def write(value: int) -> None:
+        while True:
+            value, low = value >> 3, value & 7
+            nibbles.append(low | 8 * bool(value))
+            if not value:
+                return
+
+    pixels, at, previous = image.ravel().tolist(), 0, 0
+    while at < len(pixels):
+        for is_zero in (True, False):
+            count = next((k for k, p in enumerate(pixels[at:]) if (p == 0) != is_zero), len(pixels) - at)
+            write(count)
+            for pixel in () if is_zero else pixels[at : at + count]:
+                step, previous = pixel - previous, pixel
+                write(2 * step if step >= 0 else -2 * step - 1)
+            at += count
+    nibbles += [0] * (-len(nibbles) % 8)
+    words = [int("".join(f"{n:x}" for n in nibbles[i : i + 8]), 16) for i in range(0, len(nibbles), 8)]
+    return struct.pack(f"<II{len(words)}I", image.shape[1], image.shape[0], *words)
 
 
 def matrix(camera: PinholeCamera) -> NDArray[np.float64]:

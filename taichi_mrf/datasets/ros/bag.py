@@ -8,7 +8,6 @@ counted. ``poses=track`` finds all poses from the images while mapping. Reading 
 """
 
 import weakref
-from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,23 +19,23 @@ from taichi_mrf.datasets.confidence import L515
 from taichi_mrf.datasets.lidar.scans import refuse_image_options
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
+from taichi_mrf.datasets.ros.cameras import BagCameras, find_cameras
 from taichi_mrf.datasets.ros.color import BagColors, find_colors
 from taichi_mrf.datasets.ros.confidence import BagConfidence, find_confidence
 from taichi_mrf.datasets.ros.imu import BagImu, find_imu
 from taichi_mrf.datasets.ros.lidar import LidarBag
-from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.point_cloud import POINT_CLOUD
-from taichi_mrf.datasets.ros.poses import BagPoses, PoseChoice, find_poses
+from taichi_mrf.datasets.ros.poses import PoseChoice
 from taichi_mrf.datasets.ros.reader import METADATA, SUFFIXES, Entry, RosReader, is_bag
+from taichi_mrf.datasets.ros.sensor import find_sensor, largest_gap, posed_by, poses_of
 from taichi_mrf.datasets.ros.topics import (
     DepthTopic,
     choose,
     cloud_topics,
     depth_topics,
     described,
-    message_frame,
+    packed_otherwise,
 )
-from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP
 from taichi_mrf.errors import DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.acceleration import AccelerationSamples
@@ -80,7 +79,7 @@ class BagOptions(PoseChoice):
 @dataclass
 class RosBag(Dataset):
     """The depth images of one topic, each with its pose; ``entries`` says where in the bag they are.
-    ``cameras`` took them, each from a time in seconds on; ``camera`` is the first."""
+    ``cameras`` took them; ``camera`` is the first."""
 
     camera: PinholeCamera
     reader: RosReader = field(kw_only=True)
@@ -88,7 +87,7 @@ class RosBag(Dataset):
     entries: Sequence[Entry] = field(kw_only=True)
     poses: Sequence[Pose] = field(kw_only=True)
     names: Sequence[str] = field(kw_only=True)
-    cameras: Sequence[tuple[float, PinholeCamera]] = field(kw_only=True)
+    cameras: BagCameras = field(kw_only=True)
     depth_scale: float | None = None
     colors: BagColors | None = None
     confidence: BagConfidence | None = None
@@ -112,7 +111,7 @@ class RosBag(Dataset):
 
     @property
     def frame_names(self) -> Sequence[str]:
-        """The number that each image has in its topic, from 0."""
+        """The number that each image has in its topic, or the run that is read, from 0."""
         return self.names
 
     def stamps(self) -> Sequence[float]:
@@ -141,7 +140,7 @@ class RosBag(Dataset):
         except DatasetError as error:
             raise FrameError(f"frame {name}: {where}: {error}") from error
         stamp = self.entries[index].stamp
-        camera = self._camera_at(stamp)
+        camera = self.cameras.at(self.entries[index], depth_m.shape)
         if depth_m.shape != camera.shape:
             raise FrameError(
                 f"frame {name}: {where}: the image has {depth_m.shape[1]} x {depth_m.shape[0]} pixels, "
@@ -157,11 +156,6 @@ class RosBag(Dataset):
             raise FrameError(f"frame {name}: {error}") from error
         parts = (self.poses[index], camera, stamp, name, color, sigma_m)
         return Frame(depth_m, *parts, gyro=self.gyro, acceleration=self.acceleration)
-
-    def _camera_at(self, stamp: float) -> PinholeCamera:
-        """The camera that took an image."""
-        since = [begin for begin, _ in self.cameras]
-        return self.cameras[max(0, bisect_right(since, stamp) - 1)][1]
 
 
 def open_bag(path: Path, query: str, options: ReadOptions) -> Dataset:
@@ -197,39 +191,36 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
     if chosen.points or (not chosen.depth and cloud_topics(reader) and not depth_topics(reader)):
         return _open_lidar(reader, chosen, options)
     depth = _depth_topic(reader, chosen.depth)
-    cameras, distortion = _cameras(reader, depth, chosen.info, options)
-    camera = cameras[0][1]
-    found = find_poses(reader, depth.frame, chosen)
-    if found.registered:
+    sensor = find_sensor(reader, depth.name, "images", chosen)
+    cameras = find_cameras(sensor, depth, chosen.info, options)
+    found = poses_of(sensor, chosen)
+    if any(each.registered for each in found.values()):
         raise DatasetError(
             f"{reader.path}: the images of {depth.name} say that they are in {depth.frame}, the frame that "
             "the poses are in: ?optical=FRAME names the camera's own"
         )
-    entries = sorted((entry for entry, _ in reader.messages(depth.name)), key=lambda entry: entry.stamp)
-    posed, notes = _posed(reader, depth.name, "images", entries, found, options)
-    dropped = len(entries) - len(posed)
+    posed, notes = posed_by(sensor, found, options)
+    dropped = len(sensor.entries) - len(posed)
     stamps, colors = [entry.stamp for _, entry, _ in posed], None
+    parts = (depth, cameras.first, stamps, options.max_time_gap, sensor)
     if options.color:
-        colors, said = find_colors(reader, chosen.color, depth, camera, stamps, options.max_time_gap)
+        colors, said = find_colors(reader, chosen.color, *parts)
         notes += said
-    confidence, said = find_confidence(reader, chosen.confidence, depth, camera, stamps, options.max_time_gap)
-    notes += said
-    if len(cameras) > 1:
-        times = "once" if len(cameras) == 2 else f"{len(cameras) - 1} times"
-        notes.append(f"the camera changes {times}, by its CameraInfo")
+    confidence, said = find_confidence(reader, chosen.confidence, *parts)
+    notes += said + cameras.notes
     tracked, imu = chosen.poses == TRACK, BagImu()
     poses = [pose for _, _, pose in posed]
     if tracked:
-        imu = find_imu(reader, chosen.imu, chosen.optical or depth.frame, stamps[0])
+        imu = find_imu(reader, chosen.imu, sensor, stamps[0])
         poses = [start_pose(imu.up)] * len(posed)
         notes += imu.notes
     return RosBag(
         name=reader.path.stem,
-        camera=camera,
+        camera=cameras.first,
         cameras=cameras,
         notes=notes,
         dropped=dropped,
-        distortion=distortion,
+        distortion=cameras.distortion,
         reader=reader,
         topic=depth.name,
         entries=[entry for _, entry, _ in posed],
@@ -251,129 +242,42 @@ def _open_lidar(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> 
         raise DatasetError(
             f"{reader.path}: topic {topic} is of type {reader.topics[topic].type}, not {POINT_CLOUD}"
         )
-    frame, entries = "", []
-    for entry, message in reader.messages(topic):
-        frame = frame or frame_name(message.header.frame_id)
-        entries.append(entry)
-    entries.sort(key=lambda entry: entry.stamp)
-    tracked = chosen.poses == TRACK
-    found = find_poses(reader, frame, chosen)
+    sensor = find_sensor(reader, topic, "clouds", chosen)
+    found = poses_of(sensor, chosen)
+    tracked, registered = chosen.poses == TRACK, any(each.registered for each in found.values())
     if tracked:
-        found = replace(found, at=lambda stamp, largest_gap: np.eye(4))
-    posed, notes = _posed(reader, topic, "clouds", entries, found, options)
-    gap, deskews = _gap(options), chosen.deskew and not tracked and not found.registered
+        found = {frame: replace(each, at=lambda stamp, gap: np.eye(4)) for frame, each in found.items()}
+    posed, notes = posed_by(sensor, found, options)
+    gap, deskews = largest_gap(options), chosen.deskew and not tracked and not registered
     bag = LidarBag(
         name=reader.path.stem,
         camera=RayTable([[1.0, 0.0, 0.0]]),
         notes=notes,
-        dropped=len(entries) - len(posed),
+        dropped=len(sensor.entries) - len(posed),
         reader=reader,
         topic=topic,
         entries=[entry for _, entry, _ in posed],
         poses=[pose for _, _, pose in posed],
         names=[f"{i:06d}" for i, _, _ in posed],
-        at=(lambda stamp: found.at(stamp, gap)) if deskews else None,
-        registered=found.registered,
+        at=(lambda frame, stamp: found[frame].at(stamp, gap)) if deskews else None,
+        registered=registered,
         tracked=tracked,
     )
     bag.look_at_first()
     return bag
 
 
-Posed = list[tuple[int, Entry, Pose]]
-"""Messages with their numbers in the topic and their poses."""
-
-
-def _posed(
-    reader: RosReader, topic: str, what: str, entries: Sequence[Entry], found: BagPoses, options: ReadOptions
-) -> tuple[Posed, list[str]]:
-    """The messages that have a pose, and notes. Raises DatasetError if none has."""
-    gap = _gap(options)
-    if not entries:  # in a damaged file, whose index counts some
-        raise DatasetError(f"{reader.path}: topic {topic} contains no message")
-    posed = [
-        (i, entry, pose)
-        for i, entry in enumerate(entries)
-        if (pose := found.at(entry.stamp, gap)) is not None
-    ]
-    if not posed:
-        raise DatasetError(
-            f"{reader.path}: none of {len(entries)} {what} of {topic} ({entries[0].stamp:.3f} to "
-            f"{entries[-1].stamp:.3f} s) has poses within {gap:g} s on both sides ({found.source})"
-        )
-    notes = list(found.notes)
-    dropped = len(entries) - len(posed)
-    if dropped:
-        notes.append(
-            f"{dropped} of {len(entries)} {what} of {topic} dropped: no poses within {gap:g} s on both sides"
-        )
-    return posed, notes
-
-
-def _gap(options: ReadOptions) -> float:
-    """The largest time to a neighbouring pose, in seconds."""
-    return INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
-
-
 def _depth_topic(reader: RosReader, wanted: str) -> DepthTopic:
     topics = {topic.name: topic for topic in depth_topics(reader)}
-    name = choose(reader, "depth", wanted, list(topics), f"topics of depth images ({messages.ENCODINGS})")
+    unread = [] if topics else packed_otherwise(reader)
+    what = f"topics of depth images ({messages.ENCODINGS})"
+    name = choose(reader, "depth", wanted, [*topics, *unread], what)
     topic = topics.get(name) or described(reader, name)
     try:
         messages.check_depth(topic.encoding)
     except DatasetError as error:
         raise DatasetError(f"{reader.path}: topic {name}: {error}") from error
     return topic
-
-
-def _cameras(
-    reader: RosReader, depth: DepthTopic, wanted: str, options: ReadOptions
-) -> tuple[list[tuple[float, PinholeCamera]], tuple[float, ...]]:
-    """The cameras of a topic's images, each with the time in seconds from which on it took them, and the
-    distortion in their CameraInfo."""
-    if options.camera is not None:
-        return [(0.0, options.camera)], ()
-    if options.intrinsics is not None:
-        return [(0.0, PinholeCamera(*_size(reader, depth), *options.intrinsics))], ()
-    if not (wanted or depth.info):
-        raise DatasetError(f"{reader.path}: contains no CameraInfo; pass --camera fx,fy,cx,cy")
-    name = choose(reader, "info", wanted, depth.info, f"topics of the CameraInfo of {depth.name}")
-    if reader.first(name) is None or reader.topics[name].type != messages.CAMERA_INFO:
-        raise DatasetError(f"{reader.path}: topic {name} contains no {messages.CAMERA_INFO}")
-    frame = message_frame(reader, name)
-    if not wanted and frame and depth.frame and frame != depth.frame:
-        raise DatasetError(
-            f"{reader.path}: the images of {depth.name} are of the frame {depth.frame}, but the CameraInfo "
-            f"of {name} is of {frame}, maybe another camera's; pass --camera fx,fy,cx,cy, or ?info={name} to "
-            "take it all the same"
-        )
-    found: list[tuple[float, PinholeCamera, tuple[float, ...]]] = []
-    problems = []  # a driver that warms up may send zeros first
-    for entry, message in reader.messages(name):
-        try:
-            camera, distortion = messages.camera_of(message, depth.rectified)
-        except DatasetError as error:
-            problems.append(str(error))
-            continue
-        if not found or found[-1][1:] != (camera, distortion):
-            found.append((entry.stamp, camera, distortion))
-    if not found:
-        raise DatasetError(f"{reader.path}: topic {name}: {problems[0]}")
-    if len(found) > 1 and any(distortion for _, _, distortion in found):
-        raise DatasetError(
-            f"{reader.path}: topic {name}: the camera changes at {found[1][0]:.3f} s and its lens is "
-            "distorted; --camera fx,fy,cx,cy takes one for all images, with --undistort"
-        )
-    return [(stamp, camera) for stamp, camera, _ in found], found[0][2]
-
-
-def _size(reader: RosReader, depth: DepthTopic) -> tuple[int, int]:
-    """(width, height) of a topic's first image."""
-    try:
-        height, width = messages.depth_image(reader.first(depth.name), None).shape
-    except DatasetError as error:
-        raise DatasetError(f"{reader.path}: topic {depth.name}: {error}") from error
-    return width, height
 
 
 FORMAT = Format(

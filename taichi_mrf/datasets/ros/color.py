@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.color_camera import ColorCamera, without_black
 from taichi_mrf.datasets.formats.tum_rgbd import associate
 from taichi_mrf.datasets.ros import messages
+from taichi_mrf.datasets.ros.cameras import camera_of
 from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
-from taichi_mrf.datasets.ros.topics import DepthTopic, choose, described, placed
+from taichi_mrf.datasets.ros.sensor import BagSensor
+from taichi_mrf.datasets.ros.topics import DepthTopic, choose, described, image_topics
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -65,6 +67,7 @@ def find_colors(
     camera: PinholeCamera,
     stamps: Sequence[float],
     gap: float | None,
+    sensor: BagSensor,
 ) -> tuple[BagColors | None, list[str]]:
     """The colours for depth images of some stamps, and notes for the user: which images are used, how many
     depth images have none, and why none are used although there are some. ``wanted`` is the topic, if the
@@ -76,11 +79,13 @@ def find_colors(
     topic = topics.get(name) or described(reader, name)
     if not messages.is_color(topic.encoding):
         raise DatasetError(f"{reader.path}: topic {name}: encoding {topic.encoding!r} is not colour")
-    found = _own_camera(reader, topic, depth, camera)
+    if len(sensor.frames) > 1:
+        return None, [f"color: {name} is not used: depth is of several sensors"]
+    found = _own_camera(reader, topic, depth, camera, sensor)
     if isinstance(found, str):
         return None, [f"color: {name} is not used: {found}"]
     own, distortion = found
-    entries = [entry for entry, _ in reader.messages(name)]
+    entries = sensor.run.of([entry for entry, _ in reader.messages(name)])
     partners = associate(stamps, [entry.stamp for entry in entries], COLOR_GAP if gap is None else gap)
     paired = [None if partner is None else entries[partner] for partner in partners]
     alone = sum(entry is None for entry in paired)
@@ -90,35 +95,37 @@ def find_colors(
 
 
 def _color_topics(reader: RosReader) -> list[DepthTopic]:
-    images = (messages.IMAGE, messages.COMPRESSED_IMAGE)
-    names = [topic.name for topic in reader.topics.values() if topic.type in images and topic.messages]
-    return [
-        topic for topic in (described(reader, name) for name in names) if messages.is_color(topic.encoding)
-    ]
+    return [topic for topic in image_topics(reader) if messages.is_color(topic.encoding)]
 
 
 def _own_camera(
-    reader: RosReader, topic: DepthTopic, depth: DepthTopic, camera: PinholeCamera
+    reader: RosReader, topic: DepthTopic, depth: DepthTopic, camera: PinholeCamera, sensor: BagSensor
 ) -> tuple[ColorCamera | None, tuple[float, ...]] | str:
     """The camera of a topic of colour images beside the depth camera, None if the images are registered to
     depth, and its distortion; or why it is not known."""
-    if topic.frame == depth.frame:
-        try:
-            height, width = messages.color_image(reader.first(topic.name)).shape[:2]
-        except DatasetError as error:
-            return str(error)
-        if (height, width) == camera.shape:
+    try:
+        height, width = shape = messages.color_image(reader.first(topic.name)).shape[:2]
+    except DatasetError as error:
+        return str(error)
+    same = topic.frame in (depth.frame, sensor.frame)
+    if same and topic.frame:
+        if shape == camera.shape:
             return None, ()
         return f"its images have the depth camera's frame and another size, {width} x {height}"
     infos = [reader.first(name) for name in topic.info]
     own_infos = [info for info in infos if info and frame_name(info.header.frame_id) == topic.frame]
     if not own_infos:
         return "its CameraInfo is not known"
-    T_color_depth = placed(reader, topic.frame, depth.frame)
-    if T_color_depth is None:
-        return f"tf has no fixed transform from {depth.frame!r} to {topic.frame!r}"
     try:
-        own, distortion = messages.camera_of(own_infos[0], topic.rectified)
+        stated, distortion = camera_of(own_infos[0], topic.rectified)
     except DatasetError as error:
         return f"its CameraInfo {error}"
+    own = stated.of(shape)
+    if own is None:
+        return f"its images have {width} x {height} pixels, its CameraInfo has another view"
+    if same:
+        return (None, ()) if own == camera else "neither it nor depth names a frame"
+    T_color_depth = sensor.tree().mounted(topic.frame, sensor.frame)
+    if T_color_depth is None:
+        return f"tf has no fixed transform from {sensor.frame!r} to {topic.frame!r}"
     return ColorCamera(own, T_color_depth), distortion

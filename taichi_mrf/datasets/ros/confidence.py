@@ -16,6 +16,7 @@ from taichi_mrf.datasets.formats.tum_rgbd import associate
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.color import COLOR_GAP
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
+from taichi_mrf.datasets.ros.sensor import BagSensor
 from taichi_mrf.datasets.ros.topics import DepthTopic, choose, described
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -56,6 +57,7 @@ def find_confidence(
     camera: PinholeCamera,
     stamps: Sequence[float],
     gap: float | None,
+    sensor: BagSensor,
 ) -> tuple[BagConfidence | None, list[str]]:
     """The confidence of depth images of some stamps, and notes for the user: which topic is used, how many
     depth images have none, and why none is used although there is one. ``wanted`` is the topic, if the user
@@ -76,7 +78,9 @@ def find_confidence(
         if not fitting:
             return None, [f"confidence: {name} is not used: {problem}" for name, problem in problems.items()]
         name = fitting[0]
-    entries = [entry for entry, _ in reader.messages(name)]
+    if len(sensor.frames) > 1:
+        return None, [f"confidence: {name} is not used: depth is of several sensors"]
+    entries = sensor.run.of([entry for entry, _ in reader.messages(name)])
     partners = associate(stamps, [entry.stamp for entry in entries], COLOR_GAP if gap is None else gap)
     paired = [None if partner is None else entries[partner] for partner in partners]
     alone = sum(entry is None for entry in paired)

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.reader import RosReader
-from taichi_mrf.datasets.ros.topics import choose, placed
+from taichi_mrf.datasets.ros.sensor import BagSensor
+from taichi_mrf.datasets.ros.topics import choose
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.acceleration import AccelerationSamples, upwards_at
 from taichi_mrf.sensor.gyro import GyroSamples
@@ -30,9 +30,9 @@ class BagImu:
     notes: list[str] = field(default_factory=list)
 
 
-def find_imu(reader: RosReader, wanted: str, optical: str, first_s: float) -> BagImu:
-    """The IMU beside a camera whose images are in the frame ``optical`` and begin at ``first_s``. ``wanted``
-    is the topic, if the user named it. Raises DatasetError if that has no angular rates."""
+def find_imu(reader: RosReader, wanted: str, sensor: BagSensor, first_s: float) -> BagImu:
+    """The IMU beside a camera whose images begin at ``first_s``. ``wanted`` is the topic, if the user
+    named it. Raises DatasetError if that has no angular rates."""
     if wanted == NONE:
         return BagImu()
     topics = [
@@ -43,22 +43,23 @@ def find_imu(reader: RosReader, wanted: str, optical: str, first_s: float) -> Ba
     name = choose(reader, "imu", wanted, topics, "topics of an IMU's angular rates")
     if name not in topics:
         raise DatasetError(f"{reader.path}: topic {name} has no angular rates ({messages.IMU})")
-    stamps, rates, accelerations, frame = [], [], [], ""
+    entries, rates, accelerations, frame, optical = [], [], [], "", sensor.frame
     for entry, message in reader.messages(name):
         rate, force = message.angular_velocity, message.linear_acceleration
-        stamps.append(entry.stamp)
+        entries.append(entry)
         rates.append((rate.x, rate.y, rate.z))
         accelerations.append((force.x, force.y, force.z) if _accelerates(message) else (np.nan,) * 3)
-        frame = frame or frame_name(message.header.frame_id)
-    T_optical_imu = np.eye(4) if frame == optical else placed(reader, optical, frame)
+        frame = frame or entry.frame
+    T_optical_imu = np.eye(4) if frame == optical != "" else sensor.tree().mounted(optical, frame)
     if T_optical_imu is None:
         why = f"tf has no fixed transform from {frame!r} to {optical!r}"
         return BagImu(notes=[f"imu: {name} is not used: {why}"])
     to_optical = T_optical_imu[:3, :3].T
-    times, first = np.unique(stamps, return_index=True)
-    rates_imu = np.array(rates)[first]
+    part = list(sensor.run.part([entry.stamp for entry in entries], [entry.place for entry in entries]))
+    times, first = np.unique([entries[i].stamp for i in part], return_index=True)
+    rates_imu = np.array(rates)[part][first]
     valid = np.isfinite(rates_imu).all(axis=1)
-    measured = np.array(accelerations)[first] @ to_optical
+    measured = np.array(accelerations)[part][first] @ to_optical
     felt = np.isfinite(measured).all(axis=1)
     acceleration = AccelerationSamples(times[felt], measured[felt], T_optical_imu[:3, 3])
     up = upwards_at(acceleration, first_s)

@@ -5,13 +5,14 @@ whose pixels without a return are known; any other becomes free rays. Where each
 lidar moved meanwhile, each ray starts where the lidar was at that time.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.lidar.motion import Motion, PoseAt, Scan
+from taichi_mrf.datasets.lidar.motion import Motion, Scan
 from taichi_mrf.datasets.lidar.organised import by_ring, organised
 from taichi_mrf.datasets.lidar.recording import LidarRecording, reach_of
 from taichi_mrf.datasets.lidar.scans import measured_points
@@ -25,16 +26,16 @@ from taichi_mrf.sensor.ray_table import RayTable
 
 @dataclass
 class LidarBag(LidarRecording):
-    """The point clouds of one topic, each with its pose. ``at`` gives the lidar's pose at a time in seconds,
-    or None; if it is None itself, points are left where they are. ``registered`` points are in the world's
-    frame, and are taken back into the lidar's."""
+    """The point clouds of one topic, each with its pose. ``at`` gives the pose of the lidar of a frame at a
+    time in seconds, or None; if it is None itself, points are left where they are. ``registered`` points are
+    in the world's frame, and are taken back into the lidar's."""
 
     reader: RosReader = field(kw_only=True)
     topic: str = field(kw_only=True)
     entries: Sequence[Entry] = field(kw_only=True)
     poses: Sequence[Pose] = field(kw_only=True)
     names: Sequence[str] = field(kw_only=True)
-    at: PoseAt | None = None
+    at: Callable[[str, float], Pose | None] | None = None
     registered: bool = False
 
     @property
@@ -74,7 +75,7 @@ class LidarBag(LidarRecording):
         if self.registered:
             own = (cloud.points_m.astype(np.float64) - pose[:3, 3]) @ pose[:3, :3]
             cloud = replace(cloud, points_m=own.astype(cloud.points_m.dtype))
-        motion = None if self.at is None else Motion(entry.stamp, pose, self.at)
+        motion = None if self.at is None else Motion(entry.stamp, pose, partial(self.at, entry.frame))
         scan = _image(cloud, motion) or _free(cloud, motion)
         return Frame(scan.range_m, pose, scan.camera, entry.stamp, name, no_return=scan.no_return)
 

@@ -1,8 +1,8 @@
-"""Decoding the messages of depth cameras and trackers: images to metres, CameraInfo to a camera, poses.
+"""Decoding the messages of depth cameras and trackers: images to metres, poses.
 
 ROS calls depth images by their encodings: 16UC1 (and mono16, as RealSense writes it) are millimetres, 32FC1
-metres (REP 118). A CompressedImage of the transport ``compressedDepth`` is a PNG behind 12 bytes: an integer
-that names the compression and two floats, with which a 32FC1 image's inverse depths were made whole numbers.
+metres (REP 118). A CompressedImage of the transport ``compressedDepth`` is a PNG or RVL behind 12 bytes: an
+integer and two floats, with which a 32FC1 image's inverse depths were made whole numbers.
 """
 
 import struct
@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.images import PNG_SIGNATURE, decode_16_bit, decode_color, measured
-from taichi_mrf.datasets.options import DISTORTION_COUNTS
+from taichi_mrf.datasets.ros.rvl import decode_rvl
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
-from taichi_mrf.errors import ConfigError, DatasetError
+from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
-from taichi_mrf.sensor.camera import PinholeCamera
 
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
@@ -36,7 +35,7 @@ METRES = "32FC1"
 PNG = "png"
 """The format of a CompressedImage that is a plain 16-bit PNG file: millimetres."""
 
-ENCODINGS = f"{MILLIMETRES[0]} (millimetres), {METRES} (metres), or compressedDepth of the two as PNG"
+ENCODINGS = f"{MILLIMETRES[0]} (millimetres), {METRES} (metres), or compressedDepth of the two as PNG or RVL"
 STEPS_PER_METRE = 1000.0
 
 GREY = ("mono8", "8UC1")
@@ -49,7 +48,9 @@ _COMPRESSED_COLOR = ("jpeg", "jpg", "png", "rgb8;", "bgr8;")
 """Beginnings of the formats of CompressedImages in colour."""
 
 _HEADER_BYTES = 12
-_LENS_MODELS = ("plumb_bob", "rational_polynomial", "", "none")
+_RVL = "rvl"
+_PACKINGS = ("compressedDepth", "compressed", "png", _RVL)
+"""The words of a CompressedImage's format behind the encoding of its pixels."""
 
 
 def encoding(message: Any) -> str:
@@ -64,6 +65,10 @@ def check_depth(encoding: str) -> None:
         raise DatasetError(f"encoding {encoding!r} is not depth; supported are {ENCODINGS}")
     if packing.startswith(("jpeg", "jpg")):
         raise DatasetError(f"encoding {encoding!r} is no longer depth: JPEG keeps 8 bits of it, with losses")
+    if not set(packing.split()) <= {*_PACKINGS, *MILLIMETRES, METRES}:
+        raise DatasetError(
+            f"encoding {encoding!r} is depth that is packed in another way; supported are {ENCODINGS}"
+        )
 
 
 def is_depth(encoding: str, topic: str) -> bool:
@@ -116,11 +121,16 @@ def _rows(message: Any, pixel_bytes: int) -> NDArray[np.uint8]:
 def _compressed(message: Any) -> tuple[NDArray, float]:
     """The same of a CompressedImage."""
     data = bytes(message.data)
-    kind = message.format.split(";")[0].strip()
-    start = data.find(PNG_SIGNATURE, 0, _HEADER_BYTES + len(PNG_SIGNATURE))
-    if start not in (0, _HEADER_BYTES) or kind not in (*MILLIMETRES, METRES, PNG):
-        raise DatasetError(f"format {message.format!r} is not depth as PNG; supported are {ENCODINGS}")
-    steps = decode_16_bit(data[start:], message.format)
+    check_depth(message.format)
+    kind, _, packing = map(str.strip, message.format.partition(";"))
+    if _RVL in packing.split():
+        start = _HEADER_BYTES
+        steps = measured(decode_rvl(data[start:]))
+    else:
+        start = data.find(PNG_SIGNATURE, 0, _HEADER_BYTES + len(PNG_SIGNATURE))
+        if start not in (0, _HEADER_BYTES):
+            raise DatasetError(f"format {message.format!r} is not depth as PNG; supported are {ENCODINGS}")
+        steps = decode_16_bit(data[start:], message.format)
     if kind != METRES:
         return steps, STEPS_PER_METRE
     if start == 0:
@@ -157,37 +167,6 @@ def grey_image(message: Any) -> NDArray[np.uint8]:
     if encoding(message) not in GREY:
         raise DatasetError(f"encoding {encoding(message)!r} is not grey of 8 bits ({' or '.join(GREY)})")
     return _rows(message, 1)
-
-
-def camera_of(info: Any, rectified: bool) -> tuple[PinholeCamera, tuple[float, ...]]:
-    """The camera of a CameraInfo and its OpenCV distortion coefficients, () if it has none.
-
-    Images that are ``rectified`` are those of the projection P, and have no distortion left. Raises
-    DatasetError, which does not name the topic, if it is not calibrated, or has a lens model that is not
-    OpenCV's.
-    """
-    K, D, P = (_field(info, name) for name in "kdp")
-    matrix = P.reshape(3, 4)[:, :3] if rectified and P.any() else K.reshape(3, 3)
-    if matrix[0, 0] == 0:
-        raise DatasetError("is not calibrated (K is zero); pass --camera fx,fy,cx,cy")
-    try:
-        camera = PinholeCamera.from_matrix(int(info.width), int(info.height), matrix)
-    except ConfigError as error:
-        raise DatasetError(str(error)) from error
-    if rectified or not D.any():
-        return camera, ()
-    if info.distortion_model not in _LENS_MODELS or len(D) not in DISTORTION_COUNTS:
-        raise DatasetError(
-            f"distortion model {info.distortion_model!r} with {len(D)} coefficients is not supported; "
-            "--undistort 0,0,0,0 uses the images as they are"
-        )
-    return camera, tuple(float(k) for k in D)
-
-
-def _field(message: Any, name: str) -> NDArray[np.float64]:
-    """An array of a CameraInfo, whose names ROS 1 writes in capitals."""
-    values = getattr(message, name) if hasattr(message, name) else getattr(message, name.upper())
-    return np.asarray(values, np.float64)
 
 
 def pose_of(message: Any) -> Pose:

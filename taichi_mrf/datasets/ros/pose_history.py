@@ -22,13 +22,15 @@ from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import PATH
 from taichi_mrf.datasets.ros.poses import PoseChoice, body_of, find_poses, must_connect, pose_candidates
 from taichi_mrf.datasets.ros.reader import METADATA, SUFFIXES, Entry, RosReader, is_bag
+from taichi_mrf.datasets.ros.runs import BagRun
+from taichi_mrf.datasets.ros.sensor import BagSensor, find_sensor
+from taichi_mrf.datasets.ros.tf import read_transforms, tree_of
 from taichi_mrf.datasets.ros.topics import (
     FROM_TF,
     choose,
     cloud_topics,
     depth_topics,
     message_frame,
-    read_tree,
 )
 from taichi_mrf.datasets.ros.transform_tree import TransformTree
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses
@@ -63,8 +65,9 @@ class PoseHistory:
 
 
 def open_history(path: Path, query: str) -> PoseHistory:
-    """The poses that a bag tells, chosen by options after the question mark: ``pose``, ``body``, ``optical``
-    and ``frame``, as for a bag that is mapped. Raises DatasetError, which names the file and the topic."""
+    """The poses that a bag tells, chosen by options after the question mark: ``pose``, ``body``, ``optical``,
+    ``frame``, ``tf`` and ``run``, as for a bag that is mapped. Raises DatasetError, which names the file
+    and the topic."""
     choice = parse_options(PoseChoice, query, str(path))
     if choice.poses:
         raise DatasetError(f"{path}: ?poses= does not go with --poses; ?pose= names a topic, or tf")
@@ -79,8 +82,11 @@ def open_history(path: Path, query: str) -> PoseHistory:
 
 
 def _open(reader: RosReader, choice: PoseChoice) -> PoseHistory:
-    optical = choice.optical or _sensor_frame(reader)
-    tree = read_tree(reader)
+    sensor = _sensor(reader, choice)
+    optical = sensor.frame if sensor else choice.optical
+    run = sensor.run if sensor else BagRun()
+    tree = sensor.tree() if sensor else tree_of(read_transforms(reader), "", optical, choice.tf)
+    tree = tree.towards(choice.frame, choice.body)
     paths = [topic.name for topic in reader.topics.values() if topic.type == PATH and topic.messages]
     wanted = choice.pose
     if not wanted and len(paths) != 1:
@@ -91,28 +97,34 @@ def _open(reader: RosReader, choice: PoseChoice) -> PoseHistory:
         return _from_tree(reader, tree, optical, choice)
     name = choose(reader, "pose", name, paths, "topics of poses")
     if reader.topics[name].type == PATH:
-        return _from_paths(reader, name, tree, optical, choice)
-    return _from_poses(reader, name, optical, choice)
+        return _from_paths(reader, name, tree, optical, choice, run)
+    return _from_poses(reader, name, optical, choice, tree, run)
 
 
-def _sensor_frame(reader: RosReader) -> str:
-    """The frame of the bag's only topic of depth images or clouds, empty if there is no such topic."""
-    frames = {topic.frame for topic in depth_topics(reader)}
-    frames |= {message_frame(reader, name) for name in cloud_topics(reader)}
-    return frames.pop() if len(frames) == 1 else ""
+def _sensor(reader: RosReader, choice: PoseChoice) -> BagSensor | None:
+    """The sensor of the bag's only topic of depth images or clouds, or of all such topics if they are of one
+    frame; None if there are several or none."""
+    topics = {topic.name: topic.frame for topic in depth_topics(reader)}
+    topics |= {name: message_frame(reader, name) for name in cloud_topics(reader)}
+    if len(set(topics.values())) != 1:
+        return None
+    return find_sensor(reader, next(iter(topics)), "messages", choice)
 
 
 def _from_paths(
-    reader: RosReader, topic: str, tree: TransformTree, optical: str, choice: PoseChoice
+    reader: RosReader, topic: str, tree: TransformTree, optical: str, choice: PoseChoice, run: BagRun
 ) -> PoseHistory:
     """Each message of a Path is a version."""
     if choice.body:
         must_connect(reader, tree, choice.body, optical)
-    body, _ = body_of(tree, optical, choice.body)
-    entries: list[Entry] = [entry for entry, message in reader.messages(topic) if message.poses]
+    try:
+        body, _ = body_of(tree, optical, choice.body, topic, message_frame(reader, topic))
+    except DatasetError as error:
+        raise DatasetError(f"{reader.path}: topic {topic}: {error}") from error
+    entries: Sequence[Entry] = [entry for entry, message in reader.messages(topic) if message.poses]
     if not entries:
         raise DatasetError(f"{reader.path}: topic {topic}: no message contains a pose")
-    entries.sort(key=lambda entry: entry.stamp)
+    entries = sorted(run.of(entries), key=lambda entry: entry.stamp)
 
     def version(number: int) -> ChangedPoses:
         found: dict[FrameKey, ArrayLike] = {}
@@ -136,6 +148,8 @@ def _from_tree(reader: RosReader, tree: TransformTree, optical: str, choice: Pos
     """Each correction of the uppermost transform that moves is a version."""
     if not optical:
         raise DatasetError(f"{reader.path}: ?pose=tf needs the camera's frame: add &optical=FRAME")
+    if not choice.frame:
+        tree.check(optical)
     fixed = choice.frame or tree.ancestors(optical)[-1]
     must_connect(reader, tree, fixed, optical)
     moving = [
@@ -168,10 +182,12 @@ def _from_tree(reader: RosReader, tree: TransformTree, optical: str, choice: Pos
     return PoseHistory(f"{reader.path}: tf from {fixed} to {optical}", since, version)
 
 
-def _from_poses(reader: RosReader, topic: str, optical: str, choice: PoseChoice) -> PoseHistory:
+def _from_poses(
+    reader: RosReader, topic: str, optical: str, choice: PoseChoice, tree: TransformTree, run: BagRun
+) -> PoseHistory:
     """A topic of single poses is one version."""
-    found = find_poses(reader, optical, choice)
-    stamps = [entry.stamp for entry, _ in reader.messages(topic)]
+    found = find_poses(reader, optical, choice, lambda: tree, run)
+    stamps = [entry.stamp for entry in run.of([entry for entry, _ in reader.messages(topic)])]
 
     def version(number: int) -> ChangedPoses:
         poses = {stamp: found.at(stamp, INTERPOLATION_GAP) for stamp in stamps}

@@ -15,8 +15,10 @@ from taichi_mrf.datasets.base import start_pose
 from taichi_mrf.datasets.options import TRACK
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name
-from taichi_mrf.datasets.ros.reader import RosReader
-from taichi_mrf.datasets.ros.topics import FROM_TF, choose, pose_topics, read_tree
+from taichi_mrf.datasets.ros.reader import Entry, RosReader
+from taichi_mrf.datasets.ros.runs import BagRun
+from taichi_mrf.datasets.ros.tf import alternates
+from taichi_mrf.datasets.ros.topics import FROM_TF, choose, pose_topics
 from taichi_mrf.datasets.ros.transform_tree import TransformTree
 from taichi_mrf.datasets.timed_poses import TimedPoses, read_timed_poses
 from taichi_mrf.errors import DatasetError, KeyframeError
@@ -49,6 +51,13 @@ class PoseChoice:
     optical: str = ""
     """The sensor's frame: of a camera x right, y down, z forward; of a lidar z up."""
 
+    tf: str = ""
+    """Whose transforms count: those of a namespace, such as /robot1, where robots have trees of their own;
+    where publishers disagree those of a node (ROS 1); or ``last`` of fixed transforms that disagree."""
+
+    run: int = 0
+    """The run, from 1, where the clock starts again; by default the longest."""
+
 
 @dataclass
 class BagPoses:
@@ -63,14 +72,31 @@ class BagPoses:
 
 
 def pose_candidates(reader: RosReader, tree: TransformTree, optical: str) -> list[str]:
-    """The values of the option ``pose``: topics, and ``tf`` if the camera's frame moves in the tree."""
+    """The values of the option ``pose``: topics, and ``tf`` if the camera's frame moves in the tree; without
+    topics also if transforms that may move do not. Raises DatasetError if there are none because publishers
+    disagree."""
     root = tree.ancestors(optical)[-1]
-    return [*pose_topics(reader), *([FROM_TF] if tree.moves(root, optical) else [])]
+    topics = [name for name in pose_topics(reader) if not _is_apart(name, tree)]
+    if not topics:
+        tree.check(optical)
+    by_tf = tree.moves(root, optical) and (not topics or tree.mounted(root, optical) is None)
+    return [*topics, *([FROM_TF] if by_tf else [])]
 
 
-def find_poses(reader: RosReader, frame: str, choice: PoseChoice) -> BagPoses:
+def _is_apart(topic: str, tree: TransformTree) -> bool:
+    """Whether a topic is another robot's."""
+    return any(topic.startswith(f"{space}/") for space in tree.apart)
+
+
+def find_poses(
+    reader: RosReader,
+    frame: str,
+    choice: PoseChoice,
+    read: Callable[[], TransformTree],
+    run: BagRun | None = None,
+) -> BagPoses:
     """The poses of the sensor whose messages are in ``frame``, as the user chose, else from the only source
-    in the bag.
+    in the bag; ``read`` gives its tree of frames.
 
     Raises DatasetError, whose text names the file and lists the candidates or the frames, if there are none
     or several, or if the named frames are not connected.
@@ -80,11 +106,14 @@ def find_poses(reader: RosReader, frame: str, choice: PoseChoice) -> BagPoses:
     if choice.poses:
         timed = read_timed_poses(Path(choice.poses))
         return BagPoses(timed.at, f"{choice.poses}: {_span(timed)}")
-    tree = read_tree(reader)
+    tree = read().towards(choice.frame, choice.body)
     optical = choice.optical or frame
     candidates = pose_candidates(reader, tree, optical)
     if not candidates and not choice.pose:
         problem = NO_POSES.format(path=reader.path, frame=optical or "camera frame")
+        others = [name for name in pose_topics(reader) if _is_apart(name, tree)]
+        if others:
+            problem += f". Those of other robots: ?pose={' or ?pose='.join(others)}"
         if tree.frames and optical not in tree.frames:
             known = f"frame '{optical}', which tf does not have" if optical else "a frame that has no name"
             problem += (
@@ -95,12 +124,14 @@ def find_poses(reader: RosReader, frame: str, choice: PoseChoice) -> BagPoses:
     if choice.pose == FROM_TF or (not choice.pose and candidates == [FROM_TF]):
         return _from_tree(reader, tree, optical, choice)
     name = choose(reader, "pose", choice.pose, candidates, "topics of poses")
-    return _from_topic(reader, name, tree, optical, choice)
+    return _from_topic(reader, name, tree, optical, choice, run or BagRun())
 
 
 def _from_tree(reader: RosReader, tree: TransformTree, optical: str, choice: PoseChoice) -> BagPoses:
     if optical not in tree.frames:
         raise _unknown_frame(reader, tree, optical)
+    if not choice.frame:
+        tree.check(optical)
     fixed = choice.frame or tree.ancestors(optical)[-1]
     must_connect(reader, tree, fixed, optical)
     note = f"poses in {fixed} from tf, of {optical}"
@@ -115,9 +146,10 @@ def _from_tree(reader: RosReader, tree: TransformTree, optical: str, choice: Pos
 
 
 def _from_topic(
-    reader: RosReader, name: str, tree: TransformTree, optical: str, choice: PoseChoice
+    reader: RosReader, name: str, tree: TransformTree, optical: str, choice: PoseChoice, run: BagRun
 ) -> BagPoses:
-    timed, parent, child, notes = _read_poses(reader, name)
+    timed, parent, child, notes = _read_poses(reader, name, choice, run)
+    tree = tree.towards(choice.body or child, named=False)
     if choice.body:
         must_connect(reader, tree, choice.body, optical)
     fixed = choice.frame or parent
@@ -126,7 +158,7 @@ def _from_topic(
         notes.append(f"poses in {fixed} from {name}, of {body}, from where the data were moved to {fixed}")
         return BagPoses(timed.at, f"{name}: {_span(timed)}", notes, registered=True)
     try:
-        body, body_note = body_of(tree, optical, choice.body or child)
+        body, body_note = body_of(tree, optical, choice.body or child, name, parent)
     except DatasetError as error:
         raise DatasetError(f"{reader.path}: topic {name}: {error}") from error
     if choice.frame:
@@ -144,43 +176,102 @@ def _from_topic(
     return BagPoses(at, f"{name}: {_span(timed)}", notes)
 
 
-def _read_poses(reader: RosReader, name: str) -> tuple[TimedPoses, str, str, list[str]]:
+def _read_poses(
+    reader: RosReader, name: str, choice: PoseChoice, run: BagRun
+) -> tuple[TimedPoses, str, str, list[str]]:
     """A topic's poses, the frame that they are in, the frame that they are of (empty if not given), and
-    notes."""
+    notes. Raises DatasetError if they are of several bodies."""
     topic = reader.topics[name]
     if topic.type not in messages.POSES:
         raise DatasetError(
             f"{reader.path}: topic {name} is of type {topic.type}; poses are {', '.join(messages.POSES)}"
         )
-    stamps, poses, parent, child, broken = [], [], "", "", 0
+    sent: dict[tuple[str, str], list[tuple[Entry, Pose]]] = {}
+    broken = 0
     for entry, message in reader.messages(name):
         try:
-            poses.append(as_pose(messages.pose_of(message)))
+            pose = as_pose(messages.pose_of(message))
         except KeyframeError:
             broken += 1
             continue
-        stamps.append(entry.stamp)
-        parent = parent or frame_name(message.header.frame_id)
-        child = child or frame_name(getattr(message, "child_frame_id", ""))
-    if not poses:
+        child = frame_name(getattr(message, "child_frame_id", ""))
+        sent.setdefault((entry.frame, child), []).append((entry, pose))
+    if not sent:
         raise DatasetError(f"{reader.path}: topic {name}: none of its {broken} messages is a valid pose")
+    (parent, child), found = _one_body(f"{reader.path}: topic {name}", sent, choice)
+    found = [found[i] for i in run.part([e.stamp for e, _ in found], [e.place for e, _ in found])]
+    if not found:
+        raise DatasetError(f"{reader.path}: topic {name} contains no pose of the run; ?run=N chooses another")
+    stamps, poses = [entry.stamp for entry, _ in found], [pose for _, pose in found]
+    if alternates(stamps, poses):
+        raise DatasetError(
+            f"{reader.path}: topic {name}: its poses jump to and fro, as of two publishers or robots: "
+            "?pose=TOPIC or ?poses=FILE takes others"
+        )
     notes = [f"{broken} messages of {name} left out: not finite, or no rotation"] if broken else []
     return TimedPoses(stamps, poses), parent, child, notes
 
 
-def body_of(tree: TransformTree, optical: str, named: str) -> tuple[str, str]:
-    """The frame that a topic's poses are of, so that it is connected to the sensor's, and a note. Raises
-    DatasetError, which does not name the file, if that frame is another body's and no transform leads from
-    there to the sensor."""
+Sent = list[tuple[Entry, Pose]]
+
+
+def _one_body(
+    where: str, sent: dict[tuple[str, str], Sent], choice: PoseChoice
+) -> tuple[tuple[str, str], Sent]:
+    """The poses of one body in one frame, and the two; messages that name neither are of the only ones that
+    others name."""
+    parents, children = ({pair[i] for pair in sent if pair[i]} for i in (0, 1))
+    for named, wanted, option in ((parents, choice.frame, "frame"), (children, choice.body, "body")):
+        if len(named) > 1:
+            if wanted not in named:
+                choices = " or ".join(f"?{option}={each}" for each in sorted(named))
+                what = "in" if option == "frame" else "of"
+                raise DatasetError(f"{where}: poses are {what} several frames: choose one with {choices}")
+            named &= {wanted}
+    (parent,), (child,) = parents or {""}, children or {""}
+    several = len({pair[0] for pair in sent if pair[0]}) > 1, len({pair[1] for pair in sent if pair[1]}) > 1
+    found = [
+        each
+        for pair, some in sent.items()
+        if (pair[0] == parent or not several[0]) and (pair[1] == child or not several[1])
+        for each in some
+    ]
+    return (parent, child), sorted(found, key=lambda each: (each[0].recorded_ns, each[0].ordinal))
+
+
+CAMERAS = ("cam", "lidar")
+"""Parts of a topic's name that say that its poses are the sensor's own."""
+
+
+def body_of(
+    tree: TransformTree, optical: str, named: str, topic: str = "", parent: str = ""
+) -> tuple[str, str]:
+    """The frame that a topic's poses in ``parent`` are of, so that it is connected to the sensor's, and a
+    note. Raises DatasetError, which does not name the file, if that frame is another body's, or is not known,
+    and no transform leads from there to the sensor."""
     if not named:
-        body = tree.body(optical)
+        body = tree.body(optical, parent)
         if body == optical:
+            own = optical or "camera"
+            if optical not in tree.frames and not any(word in topic.lower() for word in CAMERAS):
+                options = f"?body={own}" if optical else f"?optical={own}&body={own}"
+                raise DatasetError(
+                    f"it names no body that its poses are of, and no transform to {optical or 'the sensor'} "
+                    f"is in the bag: {options} takes them for the sensor's own, ?poses=FILE takes others"
+                )
             return (
                 optical,
                 f", assumed to be of the camera ({optical}) itself: the bag has no transform to it",
             )
         return body, f", assumed to be of {body}, to which {optical} is fixed (?body=FRAME sets another)"
     if named != optical and not tree.connects(named, optical):
+        tree.check(named)
+        tree.check(optical)
+        if not optical and tree.frames:
+            raise DatasetError(
+                f"the poses are of {named}, and the messages name no frame: ?optical=FRAME says which of "
+                f"tf's frames ({', '.join(tree.frames)}) is the sensor's"
+            )
         if not _is_cameras(named):
             same = f"?body={optical}" if optical else f"?optical={named}"
             raise DatasetError(
@@ -197,7 +288,8 @@ def body_of(tree: TransformTree, optical: str, named: str) -> tuple[str, str]:
 def _is_cameras(frame: str) -> bool:
     """Whether a frame's name may be that of a camera's optical axes; by REP 105 a link has a body's."""
     name = frame.lower()
-    return ("cam" in name or "optical" in name) and "link" not in name and "base" not in name
+    is_body = any(word in name for word in ("link", "base", "pose", "body", "imu"))
+    return ("cam" in name or "optical" in name) and not is_body
 
 
 def must_connect(reader: RosReader, tree: TransformTree, a: str, b: str) -> None:
@@ -206,6 +298,8 @@ def must_connect(reader: RosReader, tree: TransformTree, a: str, b: str) -> None
         if a != b and frame not in tree.frames:
             raise _unknown_frame(reader, tree, frame)
     if not tree.connects(a, b):
+        tree.check(a)
+        tree.check(b)
         raise DatasetError(f"{reader.path}: tf does not connect {a} and {b}")
 
 

@@ -4,14 +4,15 @@ It needs no ROS, and comes with the extra ``ros``. Its errors become
 DatasetError here; the rest of the package sees topics by name and messages as objects with their fields.
 """
 
-import contextlib
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from taichi_mrf.datasets.ros.messages import header_ns
+from taichi_mrf.datasets.ros.file_order import Place, places_of
+from taichi_mrf.datasets.ros.messages import frame_name, header_ns
+from taichi_mrf.datasets.ros.tolerance import open_tolerantly
 from taichi_mrf.datasets.ros.unpacking import bound_unpacking
 from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.system.files import check_regular, is_file, is_folder
@@ -32,7 +33,8 @@ _NANOSECONDS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a bag: its message type as ROS 2 writes it, such as sensor_msgs/msg/Image."""
+    """A topic of a bag: its message type as ROS 2 writes it, such as sensor_msgs/msg/Image, and why if its
+    messages cannot be read."""
 
     name: str
     type: str
@@ -47,6 +49,15 @@ class Entry:
     ordinal: int
     stamp: float
     """The header's stamp in seconds, or the time of recording where there is no header or its stamp is 0."""
+
+    frame: str = ""
+    """The frame in the header."""
+
+    publisher: str = ""
+    """The node that sent it, which only ROS 1 records."""
+
+    place: int = 0
+    """Grows in the order of recording: its time, or the place in the file if that time starts again."""
 
 
 class RosReader:
@@ -64,28 +75,26 @@ class RosReader:
         for file in path.iterdir() if is_folder(path) else [path]:
             if not is_folder(file):
                 check_regular(file, DatasetError)
-        highlevel, typesys = _library("rosbags.highlevel"), _library("rosbags.typesys")
+        _library("rosbags.highlevel")
         try:
             bound_unpacking()
-            # Before ROS Iron, bags hold no definitions of their messages; those read here never changed.
-            types = typesys.get_typestore(typesys.Stores.LATEST)
-            self._reader = highlevel.AnyReader(self.parts or [path], default_typestore=types)
-            self._reader.open()
+            self._reader, unread = open_tolerantly(self.parts or [path])
             self._connections: dict[str, list[Any]] = {}
             for connection in self._reader.connections:
                 self._connections.setdefault(connection.topic, []).append(connection)
-            self.topics = {
+            topics = {
                 name: Topic(name, each[0].msgtype, sum(connection.msgcount for connection in each))
-                for name, each in sorted(self._connections.items())
+                for name, each in self._connections.items()
             }
+            for each, why in unread:
+                topics.setdefault(each.topic, Topic(each.topic, f"{each.msgtype} ({why})", each.msgcount))
+            self.topics = dict(sorted(topics.items()))
             self.duration = max(0, self._reader.duration) / _NANOSECONDS if self.topics else 0.0
         except Exception as error:  # the library raises many kinds of errors
-            with contextlib.suppress(Exception):
-                self._reader.close()
             raise DatasetError(
                 f"{path}: cannot be read as a bag, it may be cut short: {said(error)}"
             ) from error
-        self._open = True
+        self._open, self.by_file = True, False
         times = [(each.start_time, each.end_time) for each in self._reader.readers]
         for (_, ended), (began, _), part in zip(times, times[1:], self.parts[1:], strict=False):
             if abs(began - ended) > LONGEST_PAUSE_S * _NANOSECONDS:
@@ -105,10 +114,21 @@ class RosReader:
     def messages(self, topic: str) -> Iterator[tuple[Entry, Any]]:
         """All messages of a topic in the order of recording. Raises DatasetError, naming file and topic."""
         previous, ordinal = None, 0
-        for recorded_ns, message in self._read(topic, None, None):
+        places = self.places(topic) if self.by_file else []
+        for number, (recorded_ns, message, publisher) in enumerate(self._read(topic, None, None)):
             ordinal = ordinal + 1 if recorded_ns == previous else 0
             previous = recorded_ns
-            yield Entry(recorded_ns, ordinal, _stamp(message, recorded_ns)), message
+            stamp, frame = _header(message, recorded_ns)
+            place = places[number][1] if number < len(places) else recorded_ns
+            yield Entry(recorded_ns, ordinal, stamp, frame, publisher, place), message
+
+    def places(self, topic: str) -> list[Place]:
+        """The places in the file of a topic's messages, in the order of ``messages``; none if its index is
+        damaged."""
+        try:
+            return places_of(self._reader.readers, topic, self.topics[topic].type)
+        except Exception:  # as on opening
+            return []
 
     def first(self, topic: str) -> Any | None:
         """The first message of a topic, None if there is none."""
@@ -117,18 +137,19 @@ class RosReader:
     def read(self, topic: str, entry: Entry) -> Any:
         """One message again. Raises DatasetError, which names file and topic."""
         found = self._read(topic, entry.recorded_ns, entry.recorded_ns + 1)
-        for ordinal, (_, message) in enumerate(found):
+        for ordinal, (_, message, _) in enumerate(found):
             if ordinal == entry.ordinal:
                 return message
         raise DatasetError(f"{self.path}: topic {topic}: a message is missing")
 
-    def _read(self, topic: str, start: int | None, stop: int | None) -> Iterator[tuple[int, Any]]:
+    def _read(self, topic: str, start: int | None, stop: int | None) -> Iterator[tuple[int, Any, str]]:
         try:
             found = self._reader.messages(self._connections[topic], start=start, stop=stop)
             for connection, recorded_ns, data in found:
                 if connection.msgtype != self.topics[topic].type:  # in a damaged file
                     raise ValueError(f"contains a {connection.msgtype}")
-                yield recorded_ns, self._reader.deserialize(data, connection.msgtype)
+                publisher = getattr(connection.ext, "callerid", None) or ""
+                yield recorded_ns, self._reader.deserialize(data, connection.msgtype), publisher
         except Exception as error:  # as on opening
             raise DatasetError(f"{self.path}: topic {topic}: cannot be read: {said(error)}") from error
 
@@ -155,7 +176,9 @@ def _library(name: str) -> Any:
     return library(name, "bags need", "ros", DatasetError)
 
 
-def _stamp(message: Any, recorded_ns: int) -> float:
+def _header(message: Any, recorded_ns: int) -> tuple[float, str]:
+    """Stamp and frame of a message."""
     header = getattr(message, "header", None)
-    ns = header_ns(header) if header is not None else 0
-    return (ns or recorded_ns) / _NANOSECONDS
+    if header is None:
+        return recorded_ns / _NANOSECONDS, ""
+    return (header_ns(header) or recorded_ns) / _NANOSECONDS, frame_name(header.frame_id)

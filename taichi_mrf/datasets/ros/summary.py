@@ -1,13 +1,14 @@
 """The contents of a bag for a user who wants to map it: topics, frames, and the options that choose them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from taichi_mrf.datasets.ros.bag import REALSENSE
 from taichi_mrf.datasets.ros.poses import pose_candidates
 from taichi_mrf.datasets.ros.reader import RosReader, Topic
-from taichi_mrf.datasets.ros.topics import DepthTopic, cloud_topics, depth_topics, message_frame, read_tree
+from taichi_mrf.datasets.ros.tf import Transforms, read_transforms, tree_of
+from taichi_mrf.datasets.ros.topics import DepthTopic, cloud_topics, depth_topics, message_frame
 from taichi_mrf.datasets.ros.transform_tree import TransformTree
 from taichi_mrf.datasets.timed_poses import TimedPoses
 from taichi_mrf.errors import DatasetError
@@ -41,20 +42,30 @@ def summarise(path: Path) -> BagSummary:
         topics = list(reader.topics.values())
         if any(topic.name.startswith(REALSENSE) for topic in topics):
             return BagSummary(topics, {}, reader.duration, [], [f"realsense:{path}?poses=FILE"], "")
-        depth, tree = depth_topics(reader), read_tree(reader)
+        depth, sent = depth_topics(reader), read_transforms(reader)
         remarks = {each.name: f"depth, {each.encoding}, frame {each.frame or 'unnamed'}" for each in depth}
         clouds = {name: message_frame(reader, name) for name in cloud_topics(reader)}
         remarks |= {name: f"points, frame {frame or 'unnamed'}" for name, frame in clouds.items()}
+        frames = clouds | {each.name: each.frame for each in depth} or {"": ""}
+        trees = {name: _tree(sent, name, frame) for name, frame in frames.items()}
         return BagSummary(
             topics,
             remarks,
             reader.duration,
-            _transforms(tree),
-            [*_sources(reader, tree, depth), *_cloud_sources(reader, tree, clouds, bool(depth))],
+            list(dict.fromkeys(words for tree in trees.values() for words in _transforms(tree))),
+            [*_sources(reader, trees, depth), *_cloud_sources(reader, trees, clouds, bool(depth))],
             "" if all(each.info for each in depth) else " --camera fx,fy,cx,cy",
         )
     finally:
         reader.close()
+
+
+def _tree(sent: dict[str, Transforms], topic: str, frame: str) -> TransformTree:
+    """The tree of a topic, without frames if the user must choose among several."""
+    try:
+        return tree_of(sent, topic, frame)
+    except DatasetError:
+        return TransformTree({})
 
 
 def _transforms(tree: TransformTree) -> list[str]:
@@ -62,11 +73,11 @@ def _transforms(tree: TransformTree) -> list[str]:
     for child, (parent, edge) in sorted(tree.edges.items()):
         moving = f"moving, {len(edge)} times" if isinstance(edge, TimedPoses) else "fixed"
         words.append(f"{parent} -> {child} ({moving})")
-    return words
+    return words + [dispute.problem for dispute in tree.disputed.values()]
 
 
 def _cloud_sources(
-    reader: RosReader, tree: TransformTree, clouds: dict[str, str], has_depth: bool
+    reader: RosReader, trees: Mapping[str, TransformTree], clouds: dict[str, str], has_depth: bool
 ) -> list[str]:
     """The same for each pair of a topic of point clouds and a source of poses."""
     sources = []
@@ -74,7 +85,7 @@ def _cloud_sources(
         points = [f"points={name}"] if has_depth or len(clouds) > 1 else []
         sources += [
             f"{reader.path}?{'&'.join(options)}" if options else str(reader.path)
-            for options in ([*points, *pose] for pose in _pose_options(reader, tree, frame))
+            for options in ([*points, *pose] for pose in _pose_options(reader, trees[name], frame))
         ]
     return sources
 
@@ -88,12 +99,12 @@ def _pose_options(reader: RosReader, tree: TransformTree, frame: str) -> list[li
     return [[]] if len(poses) == 1 else [[pose] for pose in poses or ["poses=FILE"]]
 
 
-def _sources(reader: RosReader, tree: TransformTree, depth: Sequence[DepthTopic]) -> list[str]:
+def _sources(reader: RosReader, trees: Mapping[str, TransformTree], depth: Sequence[DepthTopic]) -> list[str]:
     """A source name for each pair of a depth topic and a source of poses, with the options that are
     ambiguous."""
     sources = []
     for topic in depth:
-        for pose in _pose_options(reader, tree, topic.frame):
+        for pose in _pose_options(reader, trees[topic.name], topic.frame):
             options = [f"depth={topic.name}"] if len(depth) > 1 else []
             options += [f"info={topic.info[0]}"] if len(topic.info) > 1 else []
             options += pose

@@ -1,4 +1,4 @@
-"""Choosing among the contents of a bag: depth topics, cameras, pose topics and the tree of frames.
+"""Choosing among the contents of a bag: depth topics, cameras and pose topics.
 
 A single candidate is taken. Of several the user must choose one, and the error lists them as the options
 that choose them.
@@ -11,10 +11,7 @@ from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import frame_name
 from taichi_mrf.datasets.ros.point_cloud import POINT_CLOUD
 from taichi_mrf.datasets.ros.reader import RosReader
-from taichi_mrf.datasets.ros.transform_tree import Edge, TransformTree
-from taichi_mrf.datasets.timed_poses import TimedPoses
-from taichi_mrf.errors import DatasetError, KeyframeError
-from taichi_mrf.geometry.poses import Pose, as_pose
+from taichi_mrf.errors import DatasetError
 
 FROM_TF = "tf"
 """The value of the option ``pose`` for poses from the tree of frames."""
@@ -36,12 +33,22 @@ class DepthTopic:
         return any(part.startswith("image_rect") for part in self.name.split("/"))
 
 
-def depth_topics(reader: RosReader) -> list[DepthTopic]:
-    """The topics whose first message is a depth image (messages.is_depth)."""
+def image_topics(reader: RosReader) -> list[DepthTopic]:
+    """The topics of images as their first messages show them."""
     images = (messages.IMAGE, messages.COMPRESSED_IMAGE)
     names = [topic.name for topic in reader.topics.values() if topic.type in images and topic.messages]
-    found = [described(reader, name) for name in names]
-    return [topic for topic in found if messages.is_depth(topic.encoding, topic.name)]
+    return [described(reader, name) for name in names]
+
+
+def depth_topics(reader: RosReader) -> list[DepthTopic]:
+    """The topics whose first message is a depth image (messages.is_depth)."""
+    return [topic for topic in image_topics(reader) if messages.is_depth(topic.encoding, topic.name)]
+
+
+def packed_otherwise(reader: RosReader) -> list[str]:
+    """The topics of depth images that are packed in a way that is not read."""
+    depth = (messages.MILLIMETRES[0], messages.METRES)
+    return [t.name for t in image_topics(reader) if t.encoding.partition(";")[0].strip() in depth]
 
 
 def cloud_topics(reader: RosReader) -> list[str]:
@@ -111,40 +118,3 @@ def choose(reader: RosReader, option: str, wanted: str, candidates: Sequence[str
         raise DatasetError(f"{path}: contains no {what}; its topics: {topics}")
     choices = ", ".join(f"{option}={name}" for name in candidates)
     raise DatasetError(f"{path}: contains several {what}: choose one with ?{choices.replace(', ', ' or ?')}")
-
-
-def read_tree(reader: RosReader) -> TransformTree:
-    """All transforms of a bag's tf topics. Those on a topic called tf_static are fixed; the last
-    message counts."""
-    fixed: dict[str, tuple[str, Pose]] = {}
-    moving: dict[str, tuple[str, list[float], list[Pose]]] = {}
-    for topic in reader.topics.values():
-        if topic.type not in messages.TF:
-            continue
-        for entry, message in reader.messages(topic.name):
-            for transform in message.transforms:
-                parent, child = frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)
-                try:
-                    T_parent_child = as_pose(messages.pose_of(transform))
-                except KeyframeError:
-                    continue  # an uninitialised transform, which leaves a gap
-                if topic.name.endswith("tf_static"):
-                    fixed[child] = parent, T_parent_child
-                    continue
-                first_parent, stamps, poses = moving.setdefault(child, (parent, [], []))
-                if parent != first_parent:
-                    continue  # two publishers disagree; a frame has one parent
-                stamps.append(messages.header_ns(transform.header) / 1e9 or entry.stamp)
-                poses.append(T_parent_child)
-    edges: dict[str, tuple[str, Edge]] = {
-        child: (parent, TimedPoses(stamps, poses)) for child, (parent, stamps, poses) in moving.items()
-    }
-    return TransformTree(edges | fixed)
-
-
-def placed(reader: RosReader, to: str, of: str) -> Pose | None:
-    """T_to_of between two frames, (4, 4), None if tf has none or one that moves."""
-    tree = read_tree(reader)
-    if not {to, of} <= set(tree.frames) or not tree.connects(to, of) or tree.moves(to, of):
-        return None
-    return tree.lookup(to, of, 0.0, 0.0)

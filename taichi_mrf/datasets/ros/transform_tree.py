@@ -1,7 +1,8 @@
 """A tree of coordinate frames, as ROS keeps it: a fixed or moving transform connects each frame to its
 parent."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,12 +14,53 @@ Edge = Pose | TimedPoses
 """T_parent_child, (4, 4), or such poses with stamps."""
 
 
-class TransformTree:
-    """Frames and the transforms between them. ``edges`` maps a frame to its parent and T_parent_frame."""
+WORLDS = ("map", "odom", "world", "earth", "utm")
+"""Frames that are fixed by their names (REP 105), and no body."""
 
-    def __init__(self, edges: Mapping[str, tuple[str, Edge]]) -> None:
+
+@dataclass(frozen=True)
+class Dispute:
+    """A frame about which publishers disagree: what to say of it, and T_parent_frame by each parent."""
+
+    problem: str
+    edges: Mapping[str, Edge]
+
+
+class TransformTree:
+    """Frames and the transforms between them. ``edges`` maps a frame to its parent and T_parent_frame; frames
+    that are ``disputed`` are roots until one of their parents is chosen. ``apart`` are the namespaces of
+    other robots."""
+
+    def __init__(
+        self,
+        edges: Mapping[str, tuple[str, Edge]],
+        disputed: Mapping[str, Dispute] | None = None,
+        apart: Sequence[str] = (),
+    ) -> None:
         self.edges = dict(edges)
+        self.disputed = dict(disputed or {})
+        self.apart = tuple(apart)
         self._held: dict[str, Pose | None] = {}
+
+    def towards(self, *frames: str, named: bool = True) -> "TransformTree":
+        """The tree in which a disputed frame has the parent that leads to one of some frames, if only one
+        does, or that is one of them, if the user ``named`` them."""
+        tree = self
+        for child, dispute in self.disputed.items():
+            leading = [p for p in dispute.edges if named and p in frames] or [
+                p for p in dispute.edges if any(f and f in self.ancestors(p) for f in frames)
+            ]
+            if len(leading) == 1:
+                edges = {**tree.edges, child: (leading[0], dispute.edges[leading[0]])}
+                disputed = {f: each for f, each in tree.disputed.items() if f != child}
+                tree = TransformTree(edges, disputed, self.apart)
+        return tree
+
+    def check(self, frame: str) -> None:
+        """Raise DatasetError if the way from a frame to its root ends at a dispute."""
+        dispute = self.disputed.get(self.ancestors(frame)[-1])
+        if dispute is not None:
+            raise DatasetError(dispute.problem)
 
     @property
     def frames(self) -> list[str]:
@@ -48,13 +90,22 @@ class TransformTree:
         up, down = self._sides(a, b)
         return [self.edges[frame][1] for frame in (*up, *down)]
 
-    def body(self, frame: str) -> str:
-        """The highest frame that the frame is fixed to: that of the vehicle that carries a camera. A
-        transform that is sent again and again holds a mounting, if one above it moves."""
+    def body(self, frame: str, world: str = "") -> str:
+        """The highest frame that the frame is fixed to, also by a transform that is sent again and again:
+        that of the vehicle that carries a camera. It is below ``world``, in which it moves."""
         path = self.ancestors(frame)
-        timed = [each for each in path[:-1] if isinstance(self.edges[each][1], TimedPoses)]
-        moving = [each for each in timed if self._holds(each) is None]
-        return (moving or timed or path[-1:])[0]
+        tops = [i for i, each in enumerate(path) if each == world or each in WORLDS]
+        path = path[: max(1, min(tops))] if tops else path
+        moving = [each for each in path if each in self.edges and self._holds(each) is None]
+        return moving[0] if moving else path[-1]
+
+    def mounted(self, a: str, b: str) -> Pose | None:
+        """T_a_b, (4, 4), if transforms connect the frames that are the same at all times."""
+        if not {a, b} <= set(self.frames) or not self.connects(a, b):
+            return None
+        if any(self._holds(frame) is None for side in self._sides(a, b) for frame in side):
+            return None
+        return self.lookup(a, b, 0.0, 0.0)
 
     def lookup(self, target: str, source: str, stamp: float, largest_gap: float) -> Pose | None:
         """T_target_source, (4, 4), at a time in seconds; None where a moving transform on the way has no pose

@@ -1,0 +1,131 @@
+"""The messages of a bag's sensor that are mapped, and their poses."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+from taichi_mrf.datasets.options import ReadOptions
+from taichi_mrf.datasets.ros.poses import BagPoses, PoseChoice, find_poses
+from taichi_mrf.datasets.ros.reader import Entry, RosReader
+from taichi_mrf.datasets.ros.runs import BagRun, run_of
+from taichi_mrf.datasets.ros.tf import read_transforms, tree_of
+from taichi_mrf.datasets.ros.transform_tree import TransformTree
+from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.geometry.poses import Pose
+
+
+@dataclass(frozen=True)
+class BagSensor:
+    """The messages of a topic, ``what``, that are of one run, by their stamps. ``frame`` is the sensor's, by
+    the user's word or the first message; ``tree`` reads its tree of frames."""
+
+    reader: RosReader
+    topic: str
+    what: str
+    frame: str
+    entries: Sequence[Entry]
+    run: BagRun
+    tree: Callable[[], TransformTree]
+    notes: Sequence[str]
+
+    @property
+    def frames(self) -> Counter[str]:
+        """The frames of the messages, with their numbers: several are those of several sensors."""
+        return Counter(entry.frame for entry in self.entries)
+
+
+def find_sensor(reader: RosReader, topic: str, what: str, choice: PoseChoice) -> BagSensor:
+    """The messages of a topic that are read. Raises DatasetError, naming file and topic, if there is none, or
+    no run that the user wants, or if they are of several frames and of none that the user named."""
+    recorded = [entry for entry, _ in reader.messages(topic)]
+    if not recorded:  # in a damaged file, whose index counts some
+        raise DatasetError(f"{reader.path}: topic {topic} contains no message")
+    frames = Counter(entry.frame for entry in recorded)
+    notes = []
+    if choice.optical and len(frames) > 1:
+        if choice.optical not in frames:
+            raise DatasetError(f"{_several(reader, topic, what, frames)}: ?optical= names none of these")
+        recorded = [entry for entry in recorded if entry.frame == choice.optical]
+        notes.append(f"of {topic} the {len(recorded)} {what} of {choice.optical} are read")
+    run, entries, said = run_of(reader, topic, recorded, choice.run, what)
+    frame = choice.optical or entries[0].frame
+    return BagSensor(
+        reader,
+        topic,
+        what,
+        frame,
+        sorted(entries, key=lambda entry: entry.stamp),
+        run,
+        cache(lambda: _tree(reader, topic, frame, choice.tf, run)),
+        notes + said,
+    )
+
+
+def _tree(reader: RosReader, topic: str, frame: str, tf: str, run: BagRun) -> TransformTree:
+    try:
+        return tree_of(read_transforms(reader), topic, frame, tf, run)
+    except DatasetError as error:
+        raise DatasetError(f"{reader.path}: {str(error).removeprefix(f'{reader.path}: ')}") from error
+
+
+def poses_of(sensor: BagSensor, choice: PoseChoice) -> dict[str, BagPoses]:
+    """The poses of a topic's messages by their frames. Raises DatasetError, as find_poses, and if several
+    sensors share the topic and one of them has none."""
+    frames, found = sensor.frames, {}
+    for frame in frames:
+        try:
+            if len(frames) > 1 and choice.poses:
+                raise DatasetError(f"?poses={choice.poses} is for one sensor")
+            found[frame] = find_poses(sensor.reader, frame, choice, sensor.tree, sensor.run)
+            if len(frames) > 1 and found[frame].registered:
+                raise DatasetError(f"the data of {frame} are in the frame of the poses")
+        except DatasetError as error:
+            said = str(error).removeprefix(f"{sensor.reader.path}: ")
+            if len(frames) == 1:
+                raise DatasetError(f"{sensor.reader.path}: {said}") from error
+            several = _several(sensor.reader, sensor.topic, sensor.what, frames)
+            raise DatasetError(f"{several}: ?optical=FRAME reads those of one; {frame}: {said}") from error
+    return found
+
+
+def _several(reader: RosReader, topic: str, what: str, frames: Mapping[str, int]) -> str:
+    words = ", ".join(f"{frame or 'unnamed'} ({count})" for frame, count in frames.items())
+    return f"{reader.path}: topic {topic} has {what} of several frames, {words}, as of several sensors"
+
+
+Posed = list[tuple[int, Entry, Pose]]
+"""Messages with their numbers in the run and their poses."""
+
+
+def posed_by(
+    sensor: BagSensor, found: Mapping[str, BagPoses], options: ReadOptions
+) -> tuple[Posed, list[str]]:
+    """The messages that have a pose, and notes. Raises DatasetError if none has."""
+    gap, entries = largest_gap(options), sensor.entries
+    posed = [
+        (i, entry, pose)
+        for i, entry in enumerate(entries)
+        if (pose := found[entry.frame].at(entry.stamp, gap)) is not None
+    ]
+    if not posed:
+        sources = "; ".join(dict.fromkeys(each.source for each in found.values()))
+        raise DatasetError(
+            f"{sensor.reader.path}: none of {len(entries)} {sensor.what} of {sensor.topic} "
+            f"({entries[0].stamp:.3f} to {entries[-1].stamp:.3f} s) has poses within {gap:g} s on both sides "
+            f"({sources})"
+        )
+    notes = [*sensor.notes, *dict.fromkeys(note for each in found.values() for note in each.notes)]
+    dropped = len(entries) - len(posed)
+    if dropped:
+        notes.append(
+            f"{dropped} of {len(entries)} {sensor.what} of {sensor.topic} dropped: no poses within {gap:g} s "
+            "on both sides"
+        )
+    return posed, notes
+
+
+def largest_gap(options: ReadOptions) -> float:
+    """The largest time to a neighbouring pose, in seconds."""
+    return INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap

@@ -1,0 +1,97 @@
+"""Opening a bag in which some topics cannot be read.
+
+rosbags refuses a whole file for one channel of another encoding, or one message definition that it cannot
+parse. Here such topics are set aside, with the reason.
+"""
+
+import importlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from taichi_mrf.errors import said
+
+_ENCODINGS = ("cdr", "ros1", "")
+_IDL_RULE = "=" * 80 + "\n"
+
+
+def open_tolerantly(paths: Sequence[Path]) -> tuple[Any, list[tuple[Any, str]]]:
+    """An open AnyReader with the connections that can be read, and the others, each with the reason. Raises
+    errors of many kinds for a damaged file."""
+    highlevel, typesys = (
+        importlib.import_module("rosbags.highlevel"),
+        importlib.import_module("rosbags.typesys"),
+    )
+    _tolerate_schemas()
+    reader = highlevel.AnyReader(paths)
+    unread: list[tuple[Any, str]] = []
+    # Before ROS Iron, bags hold no definitions of their messages; those read here never changed.
+    known = typesys.get_typestore(typesys.Stores.LATEST).fielddefs if reader.is2 else {}
+
+    def open_types() -> None:
+        for each in reader.readers:
+            reader.stack.enter_context(each)
+        types: dict[str, Any] = {}
+        store = typesys.get_typestore(typesys.Stores.EMPTY)
+        found = []
+        for each in (each for part in reader.readers for each in part.connections):
+            try:
+                if getattr(each.ext, "serialization_format", "") not in _ENCODINGS:
+                    raise ValueError(f"its messages are {each.ext.serialization_format}")
+                types |= _defined(each, known, typesys)
+                found.append(each)
+            except Exception as error:  # the library raises many kinds of errors
+                unread.append((each, said(error)))
+        store.register(types)
+        for each in found:
+            if each.digest and each.msgdef.data and _digest(store, each.msgtype, reader.is2) != each.digest:
+                unread.append((each, "its messages were written with another definition"))
+            else:
+                reader.connections.append(each)
+        reader.typestore = store
+
+    reader._open = open_types
+    reader.open()
+    return reader, unread
+
+
+def _digest(store: Any, msgtype: str, is2: bool) -> str:
+    """The number by which a definition is known again, "" for one that names types which are not defined."""
+    try:
+        return str(store.hash_rihs01(msgtype) if is2 else store.generate_msgdef(msgtype)[1])
+    except Exception:
+        return ""
+
+
+def _defined(connection: Any, known: dict[str, Any], typesys: Any) -> dict[str, Any]:
+    """The types of a connection's messages, by its definition or those that are known."""
+    text, kind = connection.msgdef.data, connection.msgdef.format.name
+    if kind == "NONE":
+        return known
+    try:
+        if kind == "MSG":
+            return dict(typesys.get_types_from_msg(text, connection.msgtype))
+        if not text.startswith(f"{_IDL_RULE}IDL: "):
+            return dict(typesys.get_types_from_idl(text))
+        parts = [part.split("\n", 1)[1] for part in text.split(_IDL_RULE)[1:]]
+        return {name: each for part in parts for name, each in typesys.get_types_from_idl(part).items()}
+    except Exception:
+        if connection.msgtype in known:
+            return known
+        raise
+
+
+def _tolerate_schemas() -> None:
+    """Let rosbags read past MCAP's schemas that are not of ROS; to do so again changes nothing."""
+    mcap = importlib.import_module("rosbags.rosbag2.storage_mcap")
+    formats = importlib.import_module("rosbags.interfaces")
+    of_ros = {"ros2msg": "MSG", "ros2idl": "IDL", "omgidl": "IDL"}
+
+    def get_msgdef(schema: Any) -> Any:
+        kind = formats.MessageDefinitionFormat[of_ros.get(schema.encoding if schema else "", "NONE")]
+        return formats.MessageDefinition(kind, schema.data if kind.name != "NONE" else "")
+
+    def read_string(file: Any) -> str:
+        return str(mcap.read_bytes(file).decode(errors="replace"))
+
+    vars(mcap).update(get_msgdef=get_msgdef, read_string=read_string)

@@ -1,0 +1,384 @@
+"""Bags of several robots, publishers, runs and sensors: told apart, or refused with what tells them apart."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bag_clouds import LIDAR, points, send
+from inputs_bags import (
+    BODY,
+    CAMERA,
+    COUNT,
+    FRAME,
+    Bag,
+    Kind,
+    T_body_camera,
+    images,
+    mounted,
+    odometry,
+    stamp,
+    steps,
+    world_body,
+    writing,
+)
+
+from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.ros.reader import RosReader
+from taichi_mrf.datasets.runs import starts_of_runs
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.geometry.poses import Pose, look_at
+from taichi_mrf.sensor.camera import PinholeCamera
+
+Write = Callable[[Bag], None]
+AWAY = look_at([9.0, 3.0, 1.0], [2.0, 1.0, 0.0])
+"""Where the second robot's world is in the first one's."""
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Callable[..., Path]:
+    """Writes a ROS 1 bag, which names publishers."""
+
+    def write(*parts: Write) -> Path:
+        path = tmp_path / f"walk{len(list(tmp_path.iterdir()))}.bag"
+        with writing(path, "ros1") as bag:
+            for part in parts:
+                part(bag)
+        return path
+
+    return write
+
+
+def moving(topic: str = "/tf", T: Pose = AWAY, parent: str = "odom", node: str = "") -> Write:
+    """The transforms of a robot that moves from T."""
+
+    def write(bag: Bag) -> None:
+        bag.node = node
+        for i in range(COUNT):
+            bag.tf(topic, stamp(i) + 0.001 * bool(node), parent, BODY, T @ world_body(i))
+        bag.node = ""
+
+    return write
+
+
+def assert_poses(dataset: Dataset, T: Pose, count: int = COUNT) -> None:
+    assert len(dataset) == count
+    for i in range(count):
+        expected = T @ world_body(i) @ T_body_camera
+        np.testing.assert_allclose(dataset.read(i).T_world_camera, expected, atol=1e-9)
+
+
+def refused(source: object, *words: str) -> None:
+    with pytest.raises(DatasetError) as caught:
+        open_dataset(str(source))
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_each_robot_has_the_tree_of_its_namespace(make: Callable[..., Path]) -> None:
+    def write(bag: Bag) -> None:
+        for robot in ("/robot1", "/robot2"):
+            images(bag, f"{robot}/depth/image_raw")
+            bag.tf(f"{robot}/tf_static", 0.0, BODY, FRAME, T_body_camera)
+
+    both = make(write, moving("/robot1/tf", np.eye(4)), moving("/robot2/tf"))
+    assert_poses(open_dataset(f"{both}?depth=/robot1/depth/image_raw"), np.eye(4))
+    assert_poses(open_dataset(f"{both}?depth=/robot2/depth/image_raw"), AWAY)
+    assert_poses(open_dataset(f"{both}?depth=/robot1/depth/image_raw&tf=/robot2"), AWAY)
+    shared = make(images, mounted, moving("/robot1/tf", np.eye(4)), moving("/robot2/tf"))
+    refused(f"{shared}?tf=/robot3", "names no namespace or publisher", "/robot1/", "/robot2/")
+    refused(shared, f"several trees of frames contain {BODY}", "?tf=/robot1 or ?tf=/robot2")
+    assert_poses(open_dataset(f"{shared}?tf=/robot2"), AWAY)
+    first = (lambda bag: images(bag, "/robot1/depth/image_raw"), mounted)
+    assert_poses(open_dataset(make(*first, moving("/robot1/tf", np.eye(4)), moving("/robot2/tf"))), np.eye(4))
+    others = make(*first, moving("/robot2/tf"), lambda bag: odometry(bag, "/robot2/odom"))
+    refused(others, "contains no poses", "Those of other robots: ?pose=/robot2/odom")
+    unplaced = make(
+        images,
+        *(lambda bag, r=r: bag.tf(f"/{r}/tf_static", 0.0, BODY, FRAME, T_body_camera) for r in "ab"),
+        moving("/a/tf", np.eye(4)),
+        moving("/b/tf"),
+    )
+    refused(unplaced, f"several trees of frames contain {FRAME}", "?tf=/a or ?tf=/b")
+    assert_poses(open_dataset(f"{unplaced}?tf=/b"), AWAY)
+
+
+def test_publishers_that_disagree_are_chosen_among(make: Callable[..., Path]) -> None:
+    path = make(images, mounted, moving(T=np.eye(4)), moving(node="/other"))
+    refused(path, f"transforms of {BODY} in odom contradict each other", "?poses=FILE")
+    named = make(images, mounted, moving(T=np.eye(4), node="/one"), moving(node="/two"))
+    refused(named, "from /one, /two", "?tf=/one or ?tf=/two")
+    chosen = open_dataset(f"{named}?tf=/two")
+    expected = [(AWAY @ world_body(i) @ T_body_camera)[:3, 3] for i in range(1, COUNT)]
+    np.testing.assert_allclose([frame.T_world_camera[:3, 3] for frame in chosen], expected, atol=0.01)
+    agreeing = make(images, mounted, moving(T=np.eye(4)), moving(T=np.eye(4)))
+    assert_poses(open_dataset(agreeing), np.eye(4))
+    elsewhere = make(images, mounted, moving(T=np.eye(4)), moving(node="/other"), odometry)
+    assert_poses(open_dataset(elsewhere), np.eye(4))
+
+
+def test_parents_that_differ_are_chosen_among_by_the_fixed_frame(make: Callable[..., Path]) -> None:
+    path = make(images, mounted, moving(T=np.eye(4)), moving(parent="vicon"))
+    refused(path, f"{BODY} has several parents, odom, vicon", "?frame=odom or ?frame=vicon")
+    assert_poses(open_dataset(f"{path}?frame=vicon"), AWAY)
+    assert_poses(open_dataset(f"{path}?frame=odom"), np.eye(4))
+
+
+def test_mountings_that_contradict_each_other_are_refused(make: Callable[..., Path]) -> None:
+    def again(bag: Bag) -> None:
+        bag.tf("/tf_static", 0.0, BODY, FRAME, AWAY)
+
+    def masted(bag: Bag) -> None:
+        bag.tf("/tf_static", 0.0, BODY, "mast", AWAY)
+        bag.tf("/tf_static", 0.0, "mast", FRAME, AWAY)
+
+    refused(make(odometry, images, mounted, masted), f"{FRAME} has several parents, {BODY}, mast")
+    path = make(odometry, images, again, mounted)
+    refused(path, f"transforms of {FRAME} in {BODY} contradict each other", "?tf=last")
+    assert_poses(open_dataset(f"{path}?tf=last"), np.eye(4))
+
+
+def test_a_topic_of_poses_of_two_bodies_is_refused_or_chosen(make: Callable[..., Path]) -> None:
+    def both(bag: Bag) -> None:
+        for i in range(COUNT):
+            bag.odometry("/odom", stamp(i), "odom", BODY, world_body(i))
+            bag.odometry("/odom", stamp(i), "odom", "trailer", AWAY)
+
+    path = make(images, mounted, both)
+    refused(path, "topic /odom: poses are of several frames", f"?body={BODY} or ?body=trailer")
+    assert_poses(open_dataset(f"{path}?body={BODY}"), np.eye(4))
+
+    def same(bag: Bag) -> None:
+        for i in range(COUNT):
+            bag.odometry("/odom", stamp(i), "odom", BODY, world_body(i))
+            bag.odometry("/odom", stamp(i) + 0.01, "odom", BODY, AWAY @ world_body(i))
+
+    refused(make(images, mounted, same), "topic /odom: its poses jump to and fro")
+
+
+@pytest.mark.parametrize(
+    ("stamps", "starts"),
+    [
+        ([], []),
+        ([5.0], [0]),
+        ([0, 1, 2, 3], [0]),
+        ([0, 2, 4, 0, 2, 4], [0, 3]),
+        ([7, 8, 9, 1, 2, 0, 1], [0, 3, 5]),
+        ([5, 5.1, 4.5, 5.2], [0]),  # out of order
+        ([1, 2, 900, 3, 4], [0]),  # a stamp that is off
+        ([10, 11, 0, 12, 13], [0]),
+        ([1600000000, 1, 2, 3], [0, 1]),
+    ],
+)
+def test_runs_begin_where_the_clock_goes_back(stamps: list[float], starts: list[int]) -> None:
+    assert starts_of_runs(stamps) == starts
+
+
+LONG = 16
+"""Images of a run that lasts more than a second."""
+
+
+@pytest.mark.parametrize("by_tf", [True, False], ids=["tf", "topic"])
+@pytest.mark.parametrize(
+    ("kind", "is_recorders"), [("ros1", False), ("ros1", True), ("sqlite", True), ("mcap", True)]
+)
+def test_a_clock_that_starts_again_begins_a_run(
+    tmp_path: Path, kind: Kind, is_recorders: bool, by_tf: bool
+) -> None:
+    """The second run is shorter and elsewhere. Late transforms of the first arrive in it, or the recorder has
+    the same clock."""
+
+    def write(bag: Bag) -> None:
+        mounted(bag)
+        bag.camera_info("/camera/depth/camera_info", FRAME, CAMERA)
+        for run, T in enumerate((np.eye(4), AWAY)):
+            for i in range(LONG - run):
+                bag.latency = 0.05 if is_recorders else 10.0 * run + 0.05
+                bag.image("/camera/depth/image_raw", stamp(i), FRAME, steps(i + 7 * run), "16UC1")
+            for k in range(4 * LONG + 8):
+                bag.latency = 0.05 if is_recorders else 10.0 * run + (0.5 if run else 3.0)
+                i = 0.25 * k - 1
+                if by_tf:
+                    bag.tf("/tf", stamp(i), "odom", BODY, T @ world_body(i))
+                else:
+                    bag.odometry("/odom", stamp(i), "odom", BODY, T @ world_body(i))
+
+    path = tmp_path / ("walk.bag" if kind == "ros1" else "walk")
+    with writing(path, kind) as bag:
+        write(bag)
+    first = open_dataset(path)
+    assert_poses(first, np.eye(4), LONG)
+    (note,) = (note for note in first.notes if "clock starts again" in note)
+    assert "run 1 (" in note
+    assert f"{LONG - 1} images" in note
+    second = open_dataset(f"{path}?run=2")
+    assert_poses(second, AWAY, LONG - 1)
+    np.testing.assert_array_equal(second.read(2).depth_m, steps(9) / np.float32(1000))
+    refused(f"{path}?run=3", "there is no run 3; it has run 1 (")
+
+
+T_body_rear = look_at([-0.3, 0.1, 0.2], [-2.0, 0.0, 0.0])
+WIDE = PinholeCamera(16, 12, 9.0, 9.0, 7.5, 5.5)
+
+
+def two_cameras(bag: Bag) -> None:
+    for i in range(COUNT):
+        for frame, camera in ((FRAME, CAMERA), ("rear", WIDE)):
+            later = stamp(i) + 0.02 * (frame == "rear")
+            bag.camera_info("/camera/depth/camera_info", frame, camera, stamp=later)
+            bag.image("/camera/depth/image_raw", later, frame, steps(i), "16UC1")
+            bag.odometry("/odom", later, "odom", BODY, world_body(i))
+
+
+def test_sensors_that_share_a_topic_have_mountings_and_cameras_of_their_own(
+    make: Callable[..., Path],
+) -> None:
+    path = make(two_cameras, mounted, lambda bag: bag.tf("/tf_static", 0.0, BODY, "rear", T_body_rear))
+    dataset = open_dataset(path)
+    assert len(dataset) == 2 * COUNT
+    for k, frame in enumerate(dataset):
+        T_body_own, camera = ((T_body_camera, CAMERA), (T_body_rear, WIDE))[k % 2]
+        np.testing.assert_allclose(frame.T_world_camera, world_body(k // 2) @ T_body_own, atol=1e-9)
+        assert frame.camera == camera
+    one = make(two_cameras, mounted)
+    refused(one, f"images of several frames, {FRAME} ({COUNT}), rear ({COUNT})", "?optical=FRAME", "rear")
+    assert_poses(open_dataset(f"{one}?optical={FRAME}"), np.eye(4))
+
+
+def test_lidars_that_share_a_topic_have_mountings_of_their_own(make: Callable[..., Path]) -> None:
+    def write(bag: Bag) -> None:
+        for k in range(4):
+            send(bag, stamp(k), points(k), frame=(LIDAR, "rear")[k % 2])
+        for name, T in ((LIDAR, T_body_camera), ("rear", T_body_rear)):
+            bag.tf("/tf_static", 0.0, BODY, name, T)
+
+    for k, frame in enumerate(open_dataset(make(write, odometry))):
+        T_body_own = (T_body_camera, T_body_rear)[k % 2]
+        np.testing.assert_allclose(frame.T_world_camera, world_body(k) @ T_body_own, atol=1e-9)
+
+
+HALF = PinholeCamera(32, 24, 28.0, 30.0, 15.0, 11.0)
+
+
+@pytest.mark.parametrize(
+    ("camera", "more", "expected"),
+    [
+        (HALF, {"binning": (2, 2)}, PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)),
+        (HALF, {"part": (4, 6, 16, 12)}, PinholeCamera(16, 12, 28.0, 30.0, 11.0, 5.0)),
+        (
+            PinholeCamera(64, 48, 56.0, 60.0, 31.0, 23.0),
+            {"part": (8, 4, 32, 24), "binning": (2, 2)},
+            PinholeCamera(16, 12, 28.0, 30.0, 11.5, 9.5),
+        ),
+        (CAMERA, {"binning": (2, 2)}, CAMERA),  # a driver that states the camera of the binned images
+        (HALF, {}, HALF.scaled(0.5)),
+    ],
+)
+def test_a_camera_info_is_fitted_to_its_images(
+    make: Callable[..., Path], camera: PinholeCamera, more: dict, expected: PinholeCamera
+) -> None:
+    def write(bag: Bag) -> None:
+        images(bag, info=False)
+        bag.camera_info("/camera/depth/camera_info", FRAME, camera, **more)
+
+    dataset = open_dataset(make(write, odometry, mounted))
+    assert dataset.camera == dataset.read(1).camera == expected
+    is_fitted = camera == CAMERA or not more
+    assert any("is fitted to them" in note for note in dataset.notes) == is_fitted
+
+
+def test_a_camera_info_of_another_view_is_refused(make: Callable[..., Path]) -> None:
+    def write(bag: Bag) -> None:
+        images(bag, info=False)
+        bag.camera_info("/camera/depth/camera_info", FRAME, PinholeCamera(20, 12, 14.0, 15.0, 9.5, 5.5))
+
+    refused(make(write, odometry, mounted), "have 16 x 12 pixels", "20 x 12", "--camera fx,fy,cx,cy")
+
+
+def test_a_camera_info_a_moment_later_is_the_images(make: Callable[..., Path]) -> None:
+    def write(bag: Bag) -> None:
+        for i in range(COUNT):
+            bag.image("/camera/depth/image_raw", stamp(i), FRAME, steps(i), "16UC1")
+            bag.camera_info(
+                "/camera/depth/camera_info", FRAME, CAMERA if i < 2 else WIDE, stamp=stamp(i) + 0.04
+            )
+
+    dataset = open_dataset(make(write, odometry, mounted))
+    assert [frame.camera for frame in dataset] == [CAMERA, CAMERA, WIDE, WIDE, WIDE]
+
+
+@pytest.mark.parametrize("topic", ["/mavros/local_position/pose", "/robot_pose", "/amcl_pose", "/pose"])
+def test_poses_of_an_unknown_body_are_not_the_cameras(make: Callable[..., Path], topic: str) -> None:
+    def write(bag: Bag) -> None:
+        for i in range(COUNT):
+            bag.pose_stamped(topic, stamp(i), "map", world_body(i) @ T_body_camera)
+
+    path = make(images, write)
+    refused(path, f"topic {topic}", "names no body", f"?body={FRAME}")
+    assert_poses(open_dataset(f"{path}?body={FRAME}"), np.eye(4))
+
+
+def test_a_mounting_on_tf_below_a_topic_of_poses_is_used(make: Callable[..., Path]) -> None:
+    def write(bag: Bag) -> None:
+        for i in range(COUNT):
+            bag.pose_stamped("/pose", stamp(i), "map", world_body(i))
+            bag.tf("/tf", stamp(i), BODY, FRAME, T_body_camera)
+
+    assert_poses(open_dataset(make(images, write)), np.eye(4))
+
+
+def test_a_colour_camera_that_tf_places_again_and_again_is_used(make: Callable[..., Path]) -> None:
+    def write(bag: Bag) -> None:
+        bag.camera_info("/camera/color/camera_info", "color", CAMERA)
+        for i in range(COUNT):
+            bag.tf("/tf", stamp(i), FRAME, "color", T_body_rear)
+            bag.image("/camera/color/image_raw", stamp(i), "color", np.full((12, 16, 3), 9, np.uint8), "rgb8")
+
+    dataset = open_dataset(make(images, mounted, odometry, write))
+    assert any("brought to the depth camera's pixels" in note for note in dataset.notes)
+
+
+def test_colours_and_depth_without_frames_are_not_taken_for_one_camera(make: Callable[..., Path]) -> None:
+    def write(bag: Bag) -> None:
+        for name, camera in (("depth", CAMERA), ("color", WIDE)):
+            bag.camera_info(f"/camera/{name}/camera_info", "", camera)
+        for i in range(COUNT):
+            bag.image("/camera/depth/image_raw", stamp(i), "", steps(i), "16UC1")
+            bag.image("/camera/color/image_raw", stamp(i), "", np.full((12, 16, 3), 9, np.uint8), "rgb8")
+            bag.pose_stamped("/pose", stamp(i), "", world_body(i))
+
+    path = make(write)
+    refused(path, "names no body", "?optical=camera&body=camera")
+    dataset = open_dataset(f"{path}?optical=camera&body=camera")
+    np.testing.assert_allclose(dataset.read(1).T_world_camera, world_body(1), atol=1e-9)
+    assert any("neither it nor depth names a frame" in note for note in dataset.notes)
+
+
+def text(bag: Bag) -> None:
+    bag.send("/notes", "std_msgs/msg/String", stamp(0), data="hello")
+
+
+@pytest.mark.parametrize(
+    ("kind", "before", "after", "why"),
+    [
+        ("mcap", b"std_msgs/msg/String\x07\0\0\0ros2msg", b"std_msgs/msg/String\x07\0\0\0foreign", ""),
+        ("mcap", b"string data", b"str\xffng\xfe dat", ""),
+        ("mcap", b"/notes\x03\0\0\0cdr", b"/notes\x03\0\0\0bin", "are bin"),
+        ("ros1", b"string data", b"str{ng data", "Could not parse"),
+        ("ros1", b"string data", b"string date", "another definition"),
+    ],
+)
+def test_a_topic_that_cannot_be_read_does_not_matter_to_others(
+    tmp_path: Path, kind: Kind, before: bytes, after: bytes, why: str
+) -> None:
+    path = tmp_path / ("walk.bag" if kind == "ros1" else "walk")
+    with writing(path, kind) as bag:
+        for part in (text, images, odometry, mounted):
+            part(bag)
+    file = path if kind == "ros1" else next(path.glob("*.mcap"))
+    data = file.read_bytes()
+    assert before in data
+    file.write_bytes(data.replace(before, after))
+    assert_poses(open_dataset(file), np.eye(4))
+    assert why in RosReader(file).topics["/notes"].type
