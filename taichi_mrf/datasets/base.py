@@ -110,6 +110,11 @@ class Dataset(ABC):
         """Chance that a ray of this kind of sensor passes an occupied voxel; None for the default's 0."""
         return None
 
+    @property
+    def origin_m(self) -> NDArray[np.float64]:
+        """Where its frames' origin is in the recorded world, (3,) metres: add it to their coordinates."""
+        return np.zeros(3)
+
     def check_scale(self, poses_are_used: bool) -> list[str]:
         """Check the unit of depth, once the camera is final, and return notes; empty for a known unit."""
         return []
@@ -124,6 +129,11 @@ class Dataset(ABC):
             except FrameError:
                 found.append(found[-1] if found else 0.0)
         return found
+
+    def pose(self, index: int) -> Pose:
+        """T_world_camera, (4, 4), of one frame. This reads the frame, unless the source overrides it. Raises
+        what :meth:`read` raises."""
+        return self.read(index).T_world_camera
 
     def sensor_of(self, index: int) -> str:
         """The name of the sensor that took a frame (Frame.sensor), empty if there is only one."""

@@ -48,9 +48,18 @@ class Derived(Dataset):
         """The source's."""
         return self.source.recorded_pass_through
 
+    @property
+    def origin_m(self) -> NDArray[np.float64]:
+        """The source's."""
+        return self.source.origin_m
+
     def stamps(self) -> Sequence[float] | NDArray[np.float64]:
         """The source's."""
         return self.source.stamps()
+
+    def pose(self, index: int) -> Pose:
+        """The source's."""
+        return self.source.pose(index)
 
     def sensor_of(self, index: int) -> str:
         """The source's."""
@@ -68,11 +77,16 @@ class Reposed(Derived):
 
     poses: Mapping[int, Pose] = field(kw_only=True)
 
-    def read(self, index: int) -> Frame:
-        """The source's frame. Raises LostFrameError if it has no pose, and what the source raises."""
+    def pose(self, index: int) -> Pose:
+        """The frame's pose. Raises LostFrameError if it has none."""
         if index not in self.poses:
             raise LostFrameError(f"{self.frame_names[index]}: pose unknown (tracking was lost)")
-        return replace(self.source.read(index), T_world_camera=self.poses[index])
+        return self.poses[index]
+
+    def read(self, index: int) -> Frame:
+        """The source's frame. Raises LostFrameError if it has no pose, and what the source raises."""
+        T_world_camera = self.pose(index)
+        return replace(self.source.read(index), T_world_camera=T_world_camera)
 
 
 def reposed(dataset: Dataset, poses: Mapping[int, Pose]) -> Reposed:
@@ -95,6 +109,10 @@ class Chosen(Derived):
         """Those of the chosen frames."""
         stamps = self.source.stamps()
         return [float(stamps[index]) for index in self.indices]
+
+    def pose(self, index: int) -> Pose:
+        """The source's of that frame."""
+        return self.source.pose(self.indices[index])
 
     def sensor_of(self, index: int) -> str:
         """The source's of that frame."""

@@ -6,6 +6,7 @@ from typing import TypeVar, get_type_hints
 
 from taichi_mrf.config.files import parse_yaml
 from taichi_mrf.config.values import from_dict
+from taichi_mrf.datasets.conventions import AXIAL, Conventions, conventions_of
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -48,7 +49,20 @@ class ReadOptions:
     track: bool = False
     """Ignore recorded poses, and find them from the images while mapping."""
 
+    poses_are: str | None = None
+    """Conventions of the recorded poses (conventions.py), such as ``inverse,opengl``."""
+
+    mounting: tuple[float, ...] | None = None
+    """x y z qx qy qz qw of the camera in the frame that the poses are of."""
+
+    depth_is: str = AXIAL
+    """``axial``, or ``range`` for the distance along each pixel's ray."""
+
     def __post_init__(self) -> None:
+        try:
+            self.conventions  # noqa: B018 (it checks its words)
+        except ConfigError as error:
+            raise DatasetError(str(error)) from error
         scale = self.depth_scale
         if scale is not None and not (math.isfinite(scale) and scale > 0):
             raise DatasetError(f"depth_scale must be a positive number of steps per metre, not {scale}")
@@ -72,6 +86,11 @@ class ReadOptions:
         scale = self.image_scale
         if not (0 < scale <= 1 and abs(scale * round(1 / scale) - 1) < 0.01):
             raise DatasetError(f"image_scale must be 1, 0.5, 0.333, 0.25 or another 1/n, not {scale:g}")
+
+    @property
+    def conventions(self) -> Conventions:
+        """The conventions of poses and depths. Raises ConfigError."""
+        return conventions_of(self.poses_are, self.mounting, self.depth_is)
 
     @property
     def stride(self) -> int:

@@ -85,6 +85,16 @@ class Recording(Dataset):
         """When each frame was taken, in seconds."""
         return [frame.stamp for frame in self.frames]
 
+    def pose(self, index: int) -> Pose:
+        """The pose of one frame. Raises FrameError, which names the frame and the file."""
+        recorded = self.frames[index]
+        try:
+            return recorded.read_pose()
+        except KeyframeError as error:
+            raise FrameError(f"frame {recorded.name}: {recorded.pose_source}: {error}") from error
+        except DatasetError as error:
+            raise FrameError(f"frame {recorded.name}: {error}") from error
+
     def read(self, index: int) -> Frame:
         """Read one frame from disk.
 
@@ -95,12 +105,7 @@ class Recording(Dataset):
         if not 0 <= index < len(self.frames):
             raise IndexError(f"{self.name} has {len(self.frames)} frames, there is no frame {index}")
         recorded = self.frames[index]
-        try:
-            T_world_camera = recorded.read_pose()
-        except KeyframeError as error:
-            raise FrameError(f"frame {recorded.name}: {recorded.pose_source}: {error}") from error
-        except DatasetError as error:
-            raise FrameError(f"frame {recorded.name}: {error}") from error
+        T_world_camera = self.pose(index)
         color = sigma_m = None
         try:
             depth_m = read_depth(recorded.depth_file, self.steps_per_metre, self.camera)

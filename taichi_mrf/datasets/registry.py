@@ -10,6 +10,7 @@ from pathlib import Path
 
 from taichi_mrf.datasets import several_sensors
 from taichi_mrf.datasets.base import BuiltIn, Dataset, Format
+from taichi_mrf.datasets.conventions import AXIAL
 from taichi_mrf.datasets.formats import (
     frames_npz,
     numbered_depth,
@@ -22,6 +23,7 @@ from taichi_mrf.datasets.formats import (
 )
 from taichi_mrf.datasets.hints import hint_for
 from taichi_mrf.datasets.lidar import kitti_velodyne, las_trajectory, ouster, pcd_viewpoints, scan_folder
+from taichi_mrf.datasets.mended import mended
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.realsense import device
 from taichi_mrf.datasets.resampled import resampled
@@ -71,13 +73,19 @@ def open_dataset(
     undistort: tuple[float, ...] | None = None,
     image_scale: float = 1.0,
     track: bool = False,
+    poses_are: str | None = None,
+    mounting: tuple[float, ...] | None = None,
+    depth_is: str = AXIAL,
 ) -> Dataset:
     """Open a recording (a folder or a file) or a built-in source such as ``synthetic:room?frames=60``.
 
     The keywords are the fields of :class:`ReadOptions`. Warnings of this package become notes. Raises
     DatasetError, which names the source and the formats that were looked for.
     """
-    options = ReadOptions(camera, depth_scale, color, max_time_gap, intrinsics, undistort, image_scale, track)
+    options = ReadOptions(
+        camera, depth_scale, color, max_time_gap, intrinsics, undistort, image_scale, track,
+        poses_are, mounting, depth_is,
+    )  # fmt: skip
     path = Path(source)
     scheme = re.match(r"([a-z][a-z0-9_]+):", str(source))  # two letters at least: C:\ is a folder
     with collected_warnings() as warned:
@@ -135,11 +143,13 @@ def _as_asked(dataset: Dataset, options: ReadOptions) -> Dataset:
         except ConfigError as error:
             raise DatasetError(f"{dataset.name}: {error}") from error
         dataset.camera = PinholeCamera(recorded.width, recorded.height, *options.intrinsics)
-    dataset.notes += dataset.check_scale(not (dataset.tracked or options.track))
+    conventions = options.conventions
+    dataset.tracked = dataset.tracked or options.track
+    dataset.notes += dataset.check_scale(not (dataset.tracked or conventions.of_poses))
     distortion = dataset.distortion if options.undistort is None else options.undistort
     picked = resampled(dataset, distortion, options.stride)
-    picked.tracked = dataset.tracked or options.track
-    return picked
+    picked.tracked = dataset.tracked
+    return mended(picked, conventions, options.max_time_gap)
 
 
 def _path_and_query(source: str) -> tuple[Path, str]:

@@ -6,8 +6,9 @@ imported here, so that the command line's help stays fast.
 
 import math
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Literal
 
+from taichi_mrf.datasets.conventions import conventions_of
 from taichi_mrf.errors import ConfigError
 
 
@@ -30,6 +31,16 @@ class SourceFlags:
     max_time_gap: float | None = None
     """Largest difference in seconds between a depth image and the poses on either side of it."""
 
+    poses_are: str | None = None
+    """Conventions of the recorded poses, as 'taichi-mrf doctor' finds them, with commas between: inverse
+    (T_camera_world), wxyz (w first), opengl or ros (axes of the camera), late=SECONDS."""
+
+    mounting: str | None = None
+    """Where the camera is in the frame that the poses are of: x,y,z,qx,qy,qz,qw in metres."""
+
+    depth_is: Literal["axial", "range"] = "axial"
+    """Whether depth is along the optical axis, or the distance along each pixel's ray."""
+
     def words(self) -> list[str]:
         """The flags that differ from the defaults, as they are typed."""
         given = {field.name: getattr(self, field.name) for field in fields(self)}
@@ -41,13 +52,18 @@ class SourceFlags:
 
     def keywords(self) -> dict[str, Any]:
         """The same as arguments of ``open_dataset``. Raises ConfigError, which names the flag."""
-        return {
+        keywords: dict[str, Any] = {
             "depth_scale": self.depth_scale,
             "intrinsics": _numbers("--camera", self.camera, (4,), "fx,fy,cx,cy"),
             "undistort": _numbers("--undistort", self.undistort, (4, 5, 8), "k1,k2,p1,p2[,k3]"),
             "image_scale": self.image_scale,
             "max_time_gap": self.max_time_gap,
+            "poses_are": self.poses_are,
+            "mounting": _numbers("--mounting", self.mounting, (7,), "x,y,z,qx,qy,qz,qw"),
+            "depth_is": self.depth_is,
         }
+        conventions_of(keywords["poses_are"], keywords["mounting"], keywords["depth_is"])
+        return keywords
 
 
 def _numbers(flag: str, text: str | None, counts: tuple[int, ...], wanted: str) -> tuple[float, ...] | None:

@@ -63,7 +63,7 @@ def truth_of(dataset: Dataset, indices: Sequence[int]) -> VoxelTruth | None:
         return None
     source = dataset  # SyntheticRoom or MeshSequence, which alone have what follows
     depths = [source.clean_depth(index) for index in indices]  # type: ignore[attr-defined]
-    poses = [source.pose(index) for index in indices]  # type: ignore[attr-defined]
+    poses = [source.pose(index) for index in indices]
     return VoxelTruth(mesh, depths, poses, pinhole(dataset.camera, "the truth of a rendered scene"))
 
 

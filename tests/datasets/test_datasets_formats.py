@@ -7,13 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from datasets_recordings import (
+    CAMERA,
     CAMERA_TXT,
+    FORMATS,
     Content,
     arrays,
-    stamped_line,
+    write_freiburg,
+    write_house,
     write_log,
     write_npz,
     write_numbered,
+    write_redwood,
     write_replica,
     write_rows,
     write_scannet,
@@ -28,41 +32,6 @@ from taichi_mrf.datasets.rtabmap.depth import decode_depth
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
-
-CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
-MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
-
-
-def write_freiburg(path: Path, poses: list[Pose], first: int) -> None:
-    """As ICL-NUIM publishes it: left-handed, y up."""
-    path.write_text("\n".join(stamped_line(first + i, MIRROR @ T @ MIRROR) for i, T in enumerate(poses)))
-
-
-def write_redwood(folder: Path, content: Content) -> Path:
-    write_numbered(folder, content, place="depth")
-    write_log(folder / "livingroom1-traj.txt", content.poses)
-    return folder
-
-
-def write_icl(folder: Path, content: Content) -> Path:
-    write_numbered(folder, content, first=1)
-    write_freiburg(folder / "livingRoom2.gt.freiburg", content.poses, first=1)
-    return folder
-
-
-def write_house(folder: Path, content: Content) -> Path:
-    write_numbered(folder, content, first=180)
-    write_rows(folder / "T_world_camera.txt", content.poses)
-    return folder
-
-
-FORMATS = {  # writer, steps per metre, whether colour is written
-    "seven_scenes": (write_seven_scenes, 1000.0, True),
-    "tum": (write_tum, 5000.0, True),
-    "redwood": (write_redwood, 1000.0, True),
-    "icl": (write_icl, 5000.0, False),
-    "house": (write_house, 5000.0, False),
-}
 
 
 def assert_same(dataset: Dataset, content: Content, steps: float, colored: bool) -> None:

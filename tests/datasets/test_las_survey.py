@@ -81,7 +81,8 @@ def test_points_become_scans_from_where_they_were_measured(
 ) -> None:
     dataset = open_dataset(survey(offset_m=offset_m), max_time_gap=1.0)
     assert (dataset.frame_names, dataset.dropped) == (["000000", "000001", "000002"], 0)
-    origin = np.rint(np.array(offset_m) + FIRST[:3, 3]) if offset_m[0] else np.zeros(3)
+    origin = dataset.origin_m
+    np.testing.assert_array_equal(origin, np.rint(np.array(offset_m) / 1000) * 1000)
     for i in range(3):
         members = np.flatnonzero(((TIMES - START) / 0.1).astype(int) == i)
         stamp = (TIMES[members[0]] + TIMES[members[-1]]) / 2

@@ -17,6 +17,8 @@ SIZE = (12, 16)
 """(height, width) of the images."""
 
 CAMERA_TXT = "16 12 14 15 7.5 5.5"
+CAMERA = PinholeCamera(16, 12, 14.0, 15.0, 7.5, 5.5)
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass
@@ -230,3 +232,35 @@ def arrays(content: Content) -> dict[str, np.ndarray]:
 def write_npz(path: Path, values: dict[str, np.ndarray]) -> Path:
     np.savez_compressed(path, **values)  # type: ignore[arg-type]
     return path
+
+
+def write_freiburg(path: Path, poses: list[Pose], first: int) -> None:
+    """As ICL-NUIM publishes it: left-handed, y up."""
+    path.write_text("\n".join(stamped_line(first + i, MIRROR @ T @ MIRROR) for i, T in enumerate(poses)))
+
+
+def write_redwood(folder: Path, content: Content) -> Path:
+    write_numbered(folder, content, place="depth")
+    write_log(folder / "livingroom1-traj.txt", content.poses)
+    return folder
+
+
+def write_icl(folder: Path, content: Content) -> Path:
+    write_numbered(folder, content, first=1)
+    write_freiburg(folder / "livingRoom2.gt.freiburg", content.poses, first=1)
+    return folder
+
+
+def write_house(folder: Path, content: Content) -> Path:
+    write_numbered(folder, content, first=180)
+    write_rows(folder / "T_world_camera.txt", content.poses)
+    return folder
+
+
+FORMATS = {  # writer, steps per metre, whether colour is written
+    "seven_scenes": (write_seven_scenes, 1000.0, True),
+    "tum": (write_tum, 5000.0, True),
+    "redwood": (write_redwood, 1000.0, True),
+    "icl": (write_icl, 5000.0, False),
+    "house": (write_house, 5000.0, False),
+}

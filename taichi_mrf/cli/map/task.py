@@ -47,8 +47,8 @@ class MapTask:
     def open(self, color: bool) -> Dataset:
         """Open the sequence. Raises DatasetError."""
         flags = self.poses
-        how = {"follow": flags.follow, "track": flags.track_poses, "color": color}
-        return open_posed(self.source, flags.file, **how, **self.reading.keywords())
+        reading = {"color": color, **self.reading.keywords()}
+        return open_posed(self.source, flags.file, follow=flags.follow, track=flags.track_poses, **reading)
 
 
 def map_task(options: Map, source: str, out: Path) -> MapTask:

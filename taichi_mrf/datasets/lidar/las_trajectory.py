@@ -29,9 +29,6 @@ from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.system.files import is_file
 
 SUFFIXES = (".las", ".laz")
-NEAR_ORIGIN_M = 10_000.0
-"""Up to here the 32-bit numbers of maps are exact to a millimetre. Coordinates of a country are not."""
-
 _MOST_SCANS = 1 << 40
 
 
@@ -66,7 +63,6 @@ def open_survey(path: Path, query: str, options: ReadOptions) -> Dataset:
         )
     trajectory = read_timed_poses(poses_path)
     points_m, times = read_timed_las(path)
-    origin_m = _origin(trajectory)
     gap = INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
     scans, dropped = [], 0
     for number, members in _groups(path, times, chosen.seconds):
@@ -75,9 +71,8 @@ def open_survey(path: Path, query: str, options: ReadOptions) -> Dataset:
         if T_world_lidar is None:
             dropped += 1
             continue
-        T_world_lidar[:3, 3] -= origin_m
-        read = partial(_in_lidar_frame, points_m, members, origin_m, T_world_lidar)
-        starts = partial(_starts, trajectory, times, members, origin_m, T_world_lidar, gap)
+        read = partial(_in_lidar_frame, points_m, members, T_world_lidar)
+        starts = partial(_starts, trajectory, times, members, T_world_lidar, gap)
         scans.append(RecordedScan(f"{number:06d}", stamp, read, str(path), str(poses_path), starts))
     if not scans:
         raise DatasetError(
@@ -88,8 +83,6 @@ def open_survey(path: Path, query: str, options: ReadOptions) -> Dataset:
     notes = [f"{len(times)} points in {len(scans)} scans of {chosen.seconds:g} s"]
     if dropped:
         notes.append(f"{dropped} scans dropped: no poses within {gap:g} s on both sides")
-    if origin_m.any():
-        notes.append("the origin of the world is moved to {:.0f} {:.0f} {:.0f}".format(*origin_m))
     return lidar_scans(path.stem, scans, notes, dropped, options)
 
 
@@ -97,12 +90,6 @@ def _poses_beside(path: Path) -> Path | None:
     """The file of poses that is called as the points are."""
     beside = (path.with_suffix(suffix) for suffix in TEXTS)
     return next((file for file in beside if is_file(file) and is_trajectory(file)), None)
-
-
-def _origin(trajectory: TimedPoses) -> NDArray[np.float64]:
-    """What to subtract from coordinates, (3,): the first position in whole metres if it is far, else 0."""
-    first = np.rint(trajectory.poses[0, :3, 3])
-    return first if np.abs(first).max() > NEAR_ORIGIN_M else np.zeros(3)
 
 
 def _groups(
@@ -126,20 +113,17 @@ def _groups(
 def _in_lidar_frame(
     points_m: NDArray[np.float64],
     members: NDArray[np.int64],
-    origin_m: NDArray[np.float64],
     T_world_lidar: Pose,
 ) -> tuple[NDArray[np.float64], Pose]:
-    """The points of a scan in the lidar's frame, and the lidar's pose in the world that begins at
-    ``origin_m``."""
+    """The points of a scan in the lidar's frame, and the lidar's pose."""
     T_lidar_world = inverse(T_world_lidar)
-    return (points_m[members] - origin_m) @ T_lidar_world[:3, :3].T + T_lidar_world[:3, 3], T_world_lidar
+    return points_m[members] @ T_lidar_world[:3, :3].T + T_lidar_world[:3, 3], T_world_lidar
 
 
 def _starts(
     trajectory: TimedPoses,
     times: NDArray[np.float64],
     members: NDArray[np.int64],
-    origin_m: NDArray[np.float64],
     T_world_lidar: Pose,
     gap: float,
 ) -> NDArray[np.float64]:
@@ -149,7 +133,7 @@ def _starts(
     if not known.any():
         return np.zeros((len(members), 3))
     T_lidar_world = inverse(T_world_lidar)
-    starts = (poses[:, :3, 3] - origin_m) @ T_lidar_world[:3, :3].T + T_lidar_world[:3, 3]
+    starts = poses[:, :3, 3] @ T_lidar_world[:3, :3].T + T_lidar_world[:3, 3]
     moved = known & (np.ptp(starts[known], axis=0).max() > LIDAR_SIGMA_M)
     return np.where(moved[:, None], starts, 0.0)
 

@@ -5,8 +5,11 @@ import re
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from taichi_mrf.config.arguments import real
+from taichi_mrf.datasets.conventions import AS_USUAL, Conventions
+from taichi_mrf.datasets.mended import origin_of, pose_of
 from taichi_mrf.datasets.pose_sources.base import ChangedPoses, PoseSource
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses
 from taichi_mrf.errors import DatasetError, KeyframeError
@@ -26,11 +29,20 @@ class FramePoses:
     """The poses of a source as they were last read, by the frames of a recording."""
 
     def __init__(
-        self, source: PoseSource, frame_names: Sequence[str], largest_gap_s: float | None = None
+        self,
+        source: PoseSource,
+        frame_names: Sequence[str],
+        largest_gap_s: float | None = None,
+        conventions: Conventions = AS_USUAL,
     ) -> None:
         """``frame_names`` are those of the recording in order. Between stamps a pose is interpolated, if its
-        neighbours are at most ``largest_gap_s`` seconds away (0.1 by default)."""
+        neighbours are at most ``largest_gap_s`` seconds away (0.1 by default). The source's poses are in
+        these ``conventions``."""
         self.source = source
+        self.conventions = conventions
+        self.origin_m: NDArray[np.float64] | None = None
+        """Where the frames' origin is in the source's world, (3,) metres: near its first pose if that is far
+        away. None before there is one."""
         self._gap_s = INTERPOLATION_GAP if largest_gap_s is None else real(largest_gap_s, "largest_gap_s", 0)
         self._names = set(frame_names)
         self._by_index = dict(enumerate(frame_names))
@@ -77,7 +89,7 @@ class FramePoses:
             elif isinstance(key, int | np.integer):
                 numbered[int(key)] = pose
             else:
-                stamps.append(float(key))
+                stamps.append(float(key) - self.conventions.late_s)
                 timed.append(pose)
         name_of = self._name_of(numbered)
         self.unknown = [name for name in named if name not in self._names]
@@ -99,9 +111,13 @@ class FramePoses:
 
     def _checked(self, key: object, T: object) -> Pose:
         try:
-            return as_pose(T)  # type: ignore[arg-type]
+            found = pose_of(as_pose(T), self.conventions)  # type: ignore[arg-type]
         except KeyframeError as error:
             raise DatasetError(f"{self.source.name}: the pose of {key}: {error}") from error
+        if self.origin_m is None:
+            self.origin_m = origin_of(found[:3, 3])
+        found[:3, 3] -= self.origin_m
+        return found
 
     def _name_of(self, numbered: dict[int, Pose]) -> dict[int, str]:
         """The frames by number: the number in their names, or their index if that fits more poses."""

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.conventions import AS_USUAL, AXIAL, Conventions, conventions_of
 from taichi_mrf.datasets.derived import Derived
+from taichi_mrf.datasets.mended import moved_note
 from taichi_mrf.datasets.pose_sources.base import PoseSource
 from taichi_mrf.datasets.pose_sources.matching import FramePoses
 from taichi_mrf.datasets.pose_sources.registry import open_pose_source
@@ -42,6 +44,17 @@ class PosedFrames(Derived):
     def frame_names(self) -> Sequence[str]:
         """The source's, of the frames that are kept."""
         return self._names
+
+    @property
+    def origin_m(self) -> NDArray[np.float64]:
+        """That of the poses."""
+        return np.zeros(3) if self.poses.origin_m is None else self.poses.origin_m
+
+    def pose(self, index: int) -> Pose:
+        """The present pose of one frame. Raises what the source raises."""
+        kept = self.kept[index]
+        found = self.pose_now(self._names[index], float(self._stamps[kept]))
+        return self.source.pose(kept) if found is None else found
 
     def stamps(self) -> Sequence[float] | NDArray:
         """The source's, of the frames that are kept."""
@@ -94,7 +107,7 @@ class PosedFrames(Derived):
         """The recorded pose of one of the source's frames, None if it is broken or -1."""
         if index not in self._recorded and index >= 0:
             try:
-                self._recorded[index] = self.source.read(index).T_world_camera
+                self._recorded[index] = self.source.pose(index)
             except FrameError:
                 return None
         return self._recorded.get(index)
@@ -107,6 +120,7 @@ def posed_by(
     follow: bool = False,
     largest_gap_s: float | None = None,
     has_poses: bool = True,
+    conventions: Conventions = AS_USUAL,
 ) -> PosedFrames:
     """The frames of a dataset at the poses of a source.
 
@@ -114,6 +128,7 @@ def posed_by(
     out if the recording has none (``has_poses``). With ``follow`` mapping asks the source again and again,
     and moves keyframes (mapping/follow.py); it may then begin without any pose. Between two stamps a pose is
     interpolated, if both are at most ``largest_gap_s`` seconds away.
+    ``conventions`` are those of the source's poses.
 
     Raises DatasetError if the source cannot be read or has a pose for no frame, and for frames whose poses
     are found while mapping or are those of several sensors.
@@ -126,7 +141,7 @@ def posed_by(
     names = dataset.frame_names
     if len(names) and dataset.sensor_of(0):
         raise DatasetError(f"{dataset.name}: has several sensors, and {source.name} the poses of one")
-    poses = FramePoses(source, names, largest_gap_s)
+    poses = FramePoses(source, names, largest_gap_s, conventions)
     if isinstance(source, WatchedFile) and not follow:
         poses.take(source.read_now())
     else:
@@ -143,6 +158,7 @@ def posed_by(
         others = len(names) - len(posed)
         notes = [f"poses of {len(posed)} frames from {source.name}"]
         notes += [] if poses.warning is None else [poses.warning]
+        notes += [moved_note(poses.origin_m)] if poses.origin_m is not None and poses.origin_m.any() else []
         if others and has_poses:
             moved = "move with the last one before them"
             notes.append(f"{others} of {len(names)} frames have no pose there, and {moved}")
@@ -169,13 +185,18 @@ def open_posed(
     follow: bool = False,
     track: bool = False,
     max_time_gap: float | None = None,
+    poses_are: str | None = None,
+    mounting: tuple[float, ...] | None = None,
     **reading: Any,
 ) -> Dataset:
     """Open a recording, with the poses of a file if one is given; without ``follow`` it then need not have
-    poses of its own. ``follow`` is that of :func:`posed_by`, ``track`` and ``reading`` are
-    keywords of :func:`open_dataset`. Raises DatasetError."""
+    poses of its own. ``follow`` is that of :func:`posed_by`, the others are keywords of
+    :func:`open_dataset`; ``poses_are`` and ``mounting`` are of the file's poses. Raises DatasetError."""
     if poses is None:
-        return open_dataset(source, track=track, max_time_gap=max_time_gap, **reading)
+        return open_dataset(
+            source, track=track, max_time_gap=max_time_gap, poses_are=poses_are, mounting=mounting, **reading
+        )
+    conventions = conventions_of(poses_are, mounting, AXIAL)
     opened = open_pose_source(poses)
     keywords = {"max_time_gap": max_time_gap, **reading}
     has_poses = True
@@ -189,4 +210,11 @@ def open_posed(
         if follow:
             raise DatasetError(f"poses that change need some to begin with: {problem}") from problem
         dataset.tracked = has_poses = False
-    return posed_by(dataset, opened, follow=follow, largest_gap_s=max_time_gap, has_poses=has_poses)
+    return posed_by(
+        dataset,
+        opened,
+        follow=follow,
+        largest_gap_s=max_time_gap,
+        has_poses=has_poses,
+        conventions=conventions,
+    )

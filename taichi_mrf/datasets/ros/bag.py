@@ -119,6 +119,10 @@ class RosBag(Dataset):
         """When each frame was taken, in seconds."""
         return [entry.stamp for entry in self.entries]
 
+    def pose(self, index: int) -> Pose:
+        """The pose of one frame."""
+        return self.poses[index]
+
     def read(self, index: int) -> Frame:
         """Decode one image.
 

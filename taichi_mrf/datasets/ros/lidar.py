@@ -46,6 +46,10 @@ class LidarBag(LidarRecording):
         """When each frame was taken, in seconds."""
         return [entry.stamp for entry in self.entries]
 
+    def pose(self, index: int) -> Pose:
+        """The pose of one frame."""
+        return self.poses[index]
+
     def read(self, index: int) -> Frame:
         """Decode one cloud.
 
