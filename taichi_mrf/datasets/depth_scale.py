@@ -113,8 +113,8 @@ def _difference(
     some = slice(None, None, max(1, len(v) // _SAMPLES))
     v, u = v[some], u[some]
     points = camera.directions(u, v) * (first[v, u] / scale)[:, None]
-    expected, measured = seen_again(points, T_second_first, second / scale, camera)
-    both = measured > 0
+    seen = seen_again(points, T_second_first, second / scale, camera)
+    both = seen.measured > 0
     if both.sum() < min(_LEAST_SAMPLES, len(v) // 4):
         return float("nan")
-    return float(np.median(np.abs(expected[both] - measured[both]) / measured[both]))
+    return float(np.median(np.abs(seen.expected[both] - seen.measured[both]) / seen.measured[both]))

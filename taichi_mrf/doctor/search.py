@@ -1,6 +1,6 @@
-"""The search for the mistakes with which frames explain each other best."""
+"""The search for the reading of a recording with which its frames explain each other best."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from itertools import product
@@ -8,14 +8,14 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.overlap import seen_again
+from taichi_mrf.datasets.conventions import AXES
+from taichi_mrf.datasets.mended import pose_of
+from taichi_mrf.datasets.overlap import SeenAgain, seen_again
 from taichi_mrf.datasets.timed_poses import TimedPoses
-from taichi_mrf.doctor.mistakes import AXES, LENSES, UNITS, Mistakes
-from taichi_mrf.doctor.views import REACH_S, Sample, View
+from taichi_mrf.doctor.readings import LENSES, UNITS, Reading
+from taichi_mrf.doctor.views import REACH_S, Floats, Sample, View
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
-
-Floats = NDArray[np.float64]
 
 EXPLAINED = 0.04
 """Frames whose depths differ by less, as a share of depth, explain each other."""
@@ -23,177 +23,181 @@ EXPLAINED = 0.04
 _WORST = 0.2
 _EXPLAINING = 0.5
 _NOISE = 0.002
-_AS_WELL = 1.3
+_BETTER, _AS_WELL = 2.0, 1.3
 _FEWEST_PAIRS = 3
 _KEPT = 6
 _LATE_STEPS_S = (0.05, 0.01)
 
+Options = Callable[[Reading], list[Reading]]
+
 
 class Search:
-    """Tries mistakes on the pairs of a sample.
+    """Tries readings on the pairs of a sample, whose frames were read as ``given``.
 
     A pair's difference is the mean of |expected - measured|, as a share of the larger of the two, over the
-    half of the first frame's points that fit best; a point that the second frame does not see counts as much
-    as one that does not fit at all. So what lies behind something else does no harm, and a view that sees
-    nothing wins nothing.
+    half of a frame's points that fit best, seen from the one or the other frame, whichever fits better. A
+    point that is not seen again counts as one that does not fit at all. So what lies behind something else
+    does no harm, nor does what a camera leaves behind as it moves ahead, and a reading with which frames see
+    nothing of each other wins nothing.
     """
 
-    def __init__(self, sample: Sample, steps_per_metre: float) -> None:
-        """``steps_per_metre`` is the unit of the depth images as they were read."""
-        self.sample = sample
-        self.units = [steps_per_metre / steps for steps in UNITS if not np.isclose(steps, steps_per_metre)]
-        self._known: dict[Mistakes, Floats] = {}
+    def __init__(self, sample: Sample, given: Reading, steps_per_metre: float) -> None:
+        """``steps_per_metre`` is the unit of the depth images as they are read."""
+        self.sample, self.given = sample, given
+        self._units = [steps_per_metre / steps for steps in UNITS if not np.isclose(steps, steps_per_metre)]
+        self._known: dict[Reading, Floats] = {}
+        self._mended: dict[Reading, Floats] = {}
         self._least = np.full(len(sample.pairs), _WORST)
         self._place = {int(frame): place for place, frame in enumerate(sample.frames)}
         self._has_pinholes = any(isinstance(view.camera, PinholeCamera) for view in sample.views.values())
-        stamps = sample.stamps
-        gaps = np.diff(np.sort(stamps))
-        self._ordered = len(stamps) > 1 and bool((np.diff(stamps) > 0).all())
+        gaps = np.diff(sample.stamps)
+        self._has_stamps = len(gaps) > 0 and bool((gaps > 0).all())
         self._gap = 3 * float(np.median(gaps)) if len(gaps) else 0.0
 
-    def differences(self, mistakes: Mistakes) -> Floats:
-        """By how much the frames of each pair differ once the mistakes are undone, 0 to 0.2; NaN where a pose
-        is not known at the time."""
-        if mistakes not in self._known:
-            found = np.fromiter(self._differences(mistakes), np.float64)
-            self._known[mistakes], self._least = found, np.fmin(self._least, found)
-        return self._known[mistakes]
+    def differences(self, reading: Reading) -> Floats:
+        """By how much the frames of each pair differ, 0 to 0.2; NaN where a pose is not known at the time."""
+        if reading not in self._known:
+            found = np.fromiter(self._differences(reading), np.float64)
+            self._known[reading], self._least = found, np.fmin(self._least, found)
+        return self._known[reading]
 
-    def _differences(self, mistakes: Mistakes) -> Iterable[float]:
-        sample = self.sample
-        poses, known = mistakes.poses(sample.poses), np.ones(len(sample.poses), dtype=bool)
-        if mistakes.late_s:
-            timed = TimedPoses(sample.stamps, poses)
-            poses, known = timed.between(sample.stamps + mistakes.late_s, self._gap)
-        points = {frame: undone(view, mistakes) for frame, view in sample.views.items()}
-        for first, second in sample.pairs:
+    def moves(self, reading: Reading) -> Iterator[Pose | None]:
+        """T_second_first of each pair, None where a pose is not known at the time."""
+        of_poses = replace(reading, late_s=0.0, along_ray=False, factor=1.0, lens="")
+        if of_poses not in self._mended:
+            mended = [pose_of(T, of_poses) for T in self.sample.poses]
+            self._mended[of_poses] = np.array(mended).reshape(-1, 4, 4)
+        poses, known = self._mended[of_poses], np.ones(len(self.sample.poses), dtype=bool)
+        if reading.late_s:
+            stamps = self.sample.stamps
+            poses, known = TimedPoses(stamps, poses).between(stamps + reading.late_s, self._gap)
+        for first, second in self.sample.pairs:
             a, b = self._place[first], self._place[second]
-            if not (known[a] and known[b]):
+            yield inverse(poses[b]) @ poses[a] if known[a] and known[b] else None
+
+    def _differences(self, reading: Reading) -> Iterator[float]:
+        views = self.sample.views
+        points = {frame: points_of(view, reading) for frame, view in views.items()}
+        for (first, second), T in zip(self.sample.pairs, self.moves(reading), strict=True):
+            if T is None:
                 yield float("nan")
             else:
-                T = inverse(poses[b]) @ poses[a]
-                there = _difference(points[first], T, sample.views[second], mistakes)
-                back = _difference(points[second], inverse(T), sample.views[first], mistakes)
-                yield min(there, back)
+                there = _difference(points[first], T, views[second], reading)
+                yield min(there, _difference(points[second], inverse(T), views[first], reading))
 
     def usable(self) -> NDArray[np.bool_]:
         """The pairs that something that was tried explains: the others see different things."""
         return self._least <= EXPLAINED
 
-    def score(self, mistakes: Mistakes) -> float:
+    def score(self, reading: Reading) -> float:
         """The mean difference over the usable pairs; infinite if too few of them tell."""
-        found = self.differences(mistakes)
-        usable = self.usable()
+        found, usable = self.differences(reading), self.usable()
         told = usable & ~np.isnan(found)
         if told.sum() < max(_FEWEST_PAIRS, usable.sum() / 3):
             return float("inf")
-        whole = self.differences(replace(mistakes, late_s=0.0))
         # Of late poses some pairs are not known. What they lack is made up for, so that scores compare.
-        return float(found[told].mean() * (whole[usable].mean() + _NOISE) / (whole[told].mean() + _NOISE))
+        whole = self.differences(replace(reading, late_s=0.0)) + _NOISE
+        return float(found[told].mean() * whole[usable].mean() / whole[told].mean())
 
-    def clearly_better(self, one: Mistakes, other: Mistakes) -> bool:
-        """Whether frames explain each other with the one, and differ by more than twice as much with the other."""
-        return self.score(one) <= EXPLAINED and 2 * (self.score(one) + _NOISE) < self.score(other) + _NOISE
+    def clearly_better(self, one: Reading, other: Reading) -> bool:
+        """Whether frames explain each other with the one, and differ by more than twice as much with the
+        other."""
+        best = self.score(one)
+        return best <= EXPLAINED and _BETTER * (best + _NOISE) < self.score(other) + _NOISE
 
-    def best(self) -> Mistakes:
-        """The fewest mistakes that explain the frames; none unless they do so clearly better."""
-        none = Mistakes()
-        kept = self._best([none], self.of_poses_and_unit)
-        kept = self._best(kept, self.of_camera)
-        if self.score(kept[0]) > _NOISE:  # two mistakes at once: the first was sought in the presence of the other
-            kept = self._best(kept[: _KEPT // 2], self.of_poses_and_unit)
-            kept = self._best(kept[: _KEPT // 2], self.of_camera)
-        if self._ordered:
+    def best(self) -> Reading:
+        """The reading that explains the frames and differs least from the given one, which stays unless
+        another is clearly better."""
+        kept = self._best([self.given], self._of_poses_and_unit)
+        kept = self._best(kept, self._of_camera)
+        if self.score(kept[0]) > _NOISE:  # of two mistakes the first was sought in the presence of the second
+            kept = self._best(kept[: _KEPT // 2], self._of_poses_and_unit)
+            kept = self._best(kept[: _KEPT // 2], self._of_camera)
+        if self._has_stamps:
             for step in _LATE_STEPS_S:
-                kept = self._best(kept[: _KEPT // 2], partial(self.of_time, step=step))
-        best = self._simpler(kept[0])
-        return best if best != none and self.clearly_better(best, none) else none
+                kept = self._best(kept[: _KEPT // 2], partial(self._of_time, step=step))
+        best = kept[0]
+        for field in fields(Reading):
+            simpler = replace(best, **{field.name: getattr(self.given, field.name)})
+            if not self.clearly_better(best, simpler):
+                best = simpler
+        return best if self.clearly_better(best, self.given) else self.given
 
-    def undecided(self, best: Mistakes) -> list[str]:
-        """What other frames would have to show: assumptions whose contrary explains these as well as the best."""
+    def undecided(self, best: Reading) -> list[str]:
+        """The assumptions whose contrary explains the frames nearly as well as the best reading does."""
         others = {
-            "the direction of the poses": [replace(best, inverse=not best.inverse)],
+            "the direction of poses": [replace(best, inverse=not best.inverse)],
             "the order of quaternions": [replace(best, w_first=not best.w_first)],
-            "the axes of the camera frame": [replace(best, axes=axes) for axes in AXES if axes != best.axes],
+            "the axes of the camera": [replace(best, axes=a) for a in ("", *AXES) if a != best.axes],
             "the unit of depth": [replace(best, factor=best.factor * times) for times in (0.2, 5.0, 1000.0)],
-            "the time of the poses": [replace(best, late_s=best.late_s + late) for late in (-0.3, 0.3)],
+            "depth along the ray or the axis": [replace(best, along_ray=not best.along_ray)],
+            "the size of the intrinsics' images": [
+                replace(best, lens=a) for a in [*LENSES][:2] if a != best.lens
+            ],
         }
-        if self._has_pinholes:
-            others["depth along the ray or the axis"] = [replace(best, along_ray=not best.along_ray)]
-            others["the size of images that intrinsics are of"] = [
-                replace(best, lens=lens) for lens in [*LENSES][:2] if lens != best.lens
-            ]
-        for each in (other for several in others.values() for other in several):
+        if not self._has_pinholes:
+            others = dict([*others.items()][:-2])
+        late = [replace(best, late_s=best.late_s + late) for late in (-0.3, 0.3)] if self._has_stamps else []
+        for each in (other for tried in [*others.values(), late] for other in tried):
             self.differences(each)
         limit = _AS_WELL * (self.score(best) + _NOISE) - _NOISE
         found = [name for name, tried in others.items() if min(map(self.score, tried)) < limit]
-        timeless = not any(np.isfinite(self.score(late)) for late in others["the time of the poses"])
-        return [*found, "the time of the poses"] if timeless else found
+        times = [score for score in map(self.score, late) if np.isfinite(score)]
+        return found if times and min(times) >= limit else [*found, "the time of poses"]
 
-    def _best(self, kept: Sequence[Mistakes], options: Callable[[Mistakes], list[Mistakes]]) -> list[Mistakes]:
-        """The best of what an option makes of those kept, and these themselves."""
-        tried = dict.fromkeys(each for mistakes in kept for each in [mistakes, *options(mistakes)])
-        for mistakes in tried:
-            self.differences(mistakes)
+    def _best(self, kept: Sequence[Reading], options: Options) -> list[Reading]:
+        """The best of those kept and of what the options make of them; the given one stays among them."""
+        tried = dict.fromkeys(each for reading in kept for each in [reading, *options(reading)])
+        for reading in tried:
+            self.differences(reading)
         ranked = sorted(tried, key=self.score)[:_KEPT]
-        none = Mistakes()
-        return ranked if none in ranked else [*ranked, none]
+        return list(dict.fromkeys([*ranked, self.given]))
 
-    def _simpler(self, mistakes: Mistakes) -> Mistakes:
-        """The same without the mistakes that it does as well without."""
-        for field in fields(Mistakes):
-            without = replace(mistakes, **{field.name: field.default})
-            if without != mistakes and not self.clearly_better(mistakes, without):
-                mistakes = without
-        return mistakes
+    def _of_poses_and_unit(self, reading: Reading) -> list[Reading]:
+        ways = product((False, True), (False, True), ("", *AXES), (1.0, *self._units))
+        return [replace(reading, w_first=w, inverse=i, axes=a, factor=f) for w, i, a, f in ways]
 
-    def of_poses_and_unit(self, m: Mistakes) -> list[Mistakes]:
-        """Every way in which poses can be written, with every unit."""
-        ways = product((False, True), (False, True), AXES, (1.0, *self.units))
-        return [replace(m, inverse=i, w_first=w, axes=a, factor=f) for i, w, a, f in ways]
-
-    def of_camera(self, m: Mistakes) -> list[Mistakes]:
-        """Depth along the ray, and other intrinsics; nothing for what is no pinhole."""
+    def _of_camera(self, reading: Reading) -> list[Reading]:
         if not self._has_pinholes:
             return []
-        return [replace(m, along_ray=ray, lens=lens) for ray in (False, True) for lens in ("", *LENSES)]
+        return [replace(reading, along_ray=ray, lens=lens) for ray in (False, True) for lens in ("", *LENSES)]
 
-    def of_time(self, m: Mistakes, step: float) -> list[Mistakes]:
-        """Poses that are late or early: by anything at the first step, else by something near."""
+    def _of_time(self, reading: Reading, step: float) -> list[Reading]:
+        """Poses that are late or early: by up to a second at the first step, then by something near."""
         count = round((REACH_S if step == _LATE_STEPS_S[0] else _LATE_STEPS_S[0]) / step)
-        return [replace(m, late_s=round(m.late_s + i * step, 4)) for i in range(-count, count + 1)]
+        return [
+            replace(reading, late_s=round(reading.late_s + i * step, 4)) for i in range(-count, count + 1)
+        ]
 
 
-def undone(view: View, mistakes: Mistakes) -> Floats:
-    """The points (N, 3) of a view without the mistakes."""
+def points_of(view: View, reading: Reading) -> Floats:
+    """The points (N, 3) of a view in the camera frame."""
     camera = view.camera
     if not isinstance(camera, PinholeCamera):
-        return view.points * mistakes.factor
-    rays = mistakes.camera(camera).directions(view.u, view.v)
-    if mistakes.along_ray:
+        return view.points * reading.factor
+    rays = reading.camera_of(camera).directions(view.u, view.v)
+    if reading.along_ray:
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    return rays * (view.points[:, 2:] * mistakes.factor)
+    return rays * (view.points[:, 2:] * reading.factor)
 
 
-def seen_by(
-    points: Floats, T_second_first: Pose, view: View, mistakes: Mistakes
-) -> tuple[Floats, Floats]:
-    """Points (N, 3) of another view in this one: their expected and their measured depths (N,), as
-    overlap.seen_again has them."""
+def seen_by(view: View, points: Floats, T_second_first: Pose, reading: Reading) -> SeenAgain:
+    """The points (N, 3) of another view in this one."""
     camera = view.camera
     if isinstance(camera, PinholeCamera):
-        camera = mistakes.camera(camera)
-    expected, measured = seen_again(points, T_second_first, view.image, camera)
-    if mistakes.along_ray and isinstance(camera, PinholeCamera):
-        expected = np.linalg.norm(points @ T_second_first[:3, :3].T + T_second_first[:3, 3], axis=1)
-    return expected, measured * mistakes.factor
+        camera = reading.camera_of(camera)
+    seen = seen_again(points, T_second_first, view.image, camera)
+    if reading.along_ray and isinstance(camera, PinholeCamera):
+        ranges = np.linalg.norm(points @ T_second_first[:3, :3].T + T_second_first[:3, 3], axis=1)
+        seen = replace(seen, expected=ranges)
+    return replace(seen, measured=seen.measured * reading.factor)
 
 
-def _difference(points: Floats, T_second_first: Pose, view: View, mistakes: Mistakes) -> float:
-    expected, measured = seen_by(points, T_second_first, view, mistakes)
+def _difference(points: Floats, T_second_first: Pose, view: View, reading: Reading) -> float:
+    seen = seen_by(view, points, T_second_first, reading)
+    both = seen.measured > 0
+    expected, measured = seen.expected[both], seen.measured[both]
     off = np.full(len(points), _WORST)
-    both = measured > 0
-    share = np.abs(expected[both] - measured[both]) / np.maximum(expected[both], measured[both])
-    off[both] = np.minimum(share, _WORST)
+    off[both] = np.minimum(np.abs(expected - measured) / np.maximum(expected, measured), _WORST)
     count = max(1, int(_EXPLAINING * len(off)))
     return float(np.partition(off, count - 1)[:count].mean())

@@ -1,11 +1,12 @@
 """What the search needs of a recording: some of its frames thinned out, poses around them, and pairs.
 
-Pairs are chosen by how many frames lie between, and not by the poses, so that every assumption about the poses
-is tried on the same ones.
+Pairs are chosen by how many frames lie between, and not by the poses, so that every assumption about poses is
+tried on the same ones.
 """
 
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,8 +64,8 @@ class View:
 
 @dataclass(frozen=True)
 class Sample:
-    """``views`` by frame, ``pairs`` of them, and ``poses`` as recorded (M, 4, 4) at ``stamps`` (M,), which are
-    those of the frames ``frames`` (M,)."""
+    """``views`` by frame, and ``pairs`` of them; ``poses`` (M, 4, 4) as recorded and ``stamps`` (M,) of the
+    ``frames`` (M,)."""
 
     views: dict[int, View]
     pairs: list[tuple[int, int]]
@@ -79,33 +80,27 @@ def read_sample(dataset: Dataset) -> Sample:
     views: dict[int, View] = {}
     poses: dict[int, tuple[float, Pose]] = {}
 
-    def read(index: int, whole: bool) -> None:
-        if not 0 <= index < count or (index in views if whole else index in poses):
-            return
+    firsts = dict.fromkeys(np.linspace(0, count - 1, PLACES + 2).round().astype(int)[:-1].tolist())
+    pairs = [(i, i + apart) for apart in APART for i in firsts if i + apart < count]
+    for index in sorted({i for pair in pairs for i in pair}):
         try:
             frame = dataset.read(index)
         except FrameError:
-            return
+            continue
         poses[index] = (frame.stamp, frame.T_world_camera)
-        if whole:
-            view = view_of(frame)
-            if view is not None:
-                views[index] = view
-
-    firsts = np.unique(np.linspace(0, count - 1, PLACES + 2).round().astype(int)[:-1]) if count else []
-    pairs = [(int(i), int(i) + apart) for apart in APART for i in firsts if i + apart < count]
-    for index in sorted({i for pair in pairs for i in pair}):
-        read(index, whole=True)
+        view = view_of(frame)
+        if view is not None:
+            views[index] = view
+    stamps = dataset.stamps()
     for index in _neighbours(pairs, poses):
-        read(index, whole=False)
+        if 0 <= index < count and index not in poses:
+            with suppress(FrameError):
+                poses[index] = (float(stamps[index]), dataset.pose(index))
     frames = np.array(sorted(poses), dtype=np.int64)
-    return Sample(
-        views,
-        [(i, j) for i, j in pairs if i in views and j in views],
-        frames,
-        np.array([poses[i][0] for i in frames]),
-        np.array([poses[i][1] for i in frames]).reshape(-1, 4, 4),
-    )
+    T = np.array([poses[i][1] for i in frames]).reshape(-1, 4, 4)
+    T[:, :3, 3] += dataset.origin_m  # a pose is written in another way before its origin is moved
+    pairs = [(i, j) for i, j in pairs if i in views and j in views]
+    return Sample(views, pairs, frames, np.array([poses[i][0] for i in frames]), T)
 
 
 def _neighbours(pairs: list[tuple[int, int]], poses: dict[int, tuple[float, Pose]]) -> Iterable[int]:

@@ -1,16 +1,10 @@
-"""The usual mistakes of conventions, how each is undone, and the flag that undoes it."""
+"""The ways in which a recording may be understood: those that are usually mistaken for each other."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
-from taichi_mrf.datasets.timed_poses import quaternion
-from taichi_mrf.datasets.trajectories import rotation_of
+from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.sensor.camera import PinholeCamera
-
-Floats = NDArray[np.float64]
 
 UNITS = {
     1000.0: "millimetres",
@@ -23,13 +17,6 @@ UNITS = {
     1 / 0.3048: "feet",
 }
 """Steps per metre of depth, and whose they are."""
-
-AXES = {
-    "optical": np.eye(3),
-    "opengl": np.diag([1.0, -1.0, -1.0]),
-    "ros": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
-}
-"""The optical axes, as columns, in the frame whose poses were recorded."""
 
 
 def _resized(factor: float) -> Callable[[PinholeCamera], PinholeCamera]:
@@ -57,29 +44,15 @@ LENSES: dict[str, Callable[[PinholeCamera], PinholeCamera]] = {
 
 
 @dataclass(frozen=True)
-class Mistakes:
-    """What is wrong with a recording; the defaults are a right one. ``factor`` is what depths must be
-    multiplied by, ``lens`` a key of LENSES."""
+class Reading(Conventions):
+    """One way to understand a recording: its conventions, and what its unit and its intrinsics should be."""
 
-    inverse: bool = False
-    w_first: bool = False
-    axes: str = "optical"
-    late_s: float = 0.0
-    along_ray: bool = False
     factor: float = 1.0
+    """What depths as they are read must be multiplied by."""
+
     lens: str = ""
+    """A key of LENSES; empty if the intrinsics are right."""
 
-    def poses(self, recorded: Floats) -> Floats:
-        """T_world_camera (M, 4, 4) of recorded poses, but for their time."""
-        T = recorded.copy()
-        if self.w_first:
-            T[:, :3, :3] = rotation_of(np.roll(quaternion(T[:, :3, :3]), -1, axis=-1))
-        if self.inverse:
-            T[:, :3, :3] = T[:, :3, :3].transpose(0, 2, 1)
-            T[:, :3, 3] = -(T[:, :3, :3] @ T[:, :3, 3, None])[..., 0]
-        T[:, :3, :3] = T[:, :3, :3] @ AXES[self.axes]
-        return T
-
-    def camera(self, recorded: PinholeCamera) -> PinholeCamera:
+    def camera_of(self, recorded: PinholeCamera) -> PinholeCamera:
         """The camera that took the images."""
         return LENSES[self.lens](recorded) if self.lens else recorded
