@@ -9,7 +9,7 @@ from taichi_mrf.doctor.search import Search, points_of, seen_by
 from taichi_mrf.doctor.views import thinned
 from taichi_mrf.sensor.camera import PinholeCamera
 
-_POINTS = 60_000
+_POINTS = 200_000
 _WIDEST = 640
 _GAP = 8
 _AGREES = 0.05

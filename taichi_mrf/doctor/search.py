@@ -25,7 +25,8 @@ _EXPLAINING = 0.5
 _NOISE = 0.002
 _BETTER, _AS_WELL = 2.0, 1.3
 _FEWEST_PAIRS = 3
-_KEPT = 6
+_ROUNDS = 3
+_FEW, _MANY = 2, 8
 _LATE_STEPS_S = (0.05, 0.01)
 
 Options = Callable[[Reading], list[Reading]]
@@ -49,7 +50,9 @@ class Search:
         self._mended: dict[Reading, Floats] = {}
         self._least = np.full(len(sample.pairs), _WORST)
         self._place = {int(frame): place for place, frame in enumerate(sample.frames)}
-        self._has_pinholes = any(isinstance(view.camera, PinholeCamera) for view in sample.views.values())
+        cameras = [view.camera for view in sample.views.values() if isinstance(view.camera, PinholeCamera)]
+        of_lenses = {LENSES[lens](camera): lens for camera in cameras[:1] for lens in reversed(LENSES)}
+        self._lenses = [lens for camera, lens in of_lenses.items() if camera != cameras[0]]
         gaps = np.diff(sample.stamps)
         self._has_stamps = len(gaps) > 0 and bool((gaps > 0).all())
         self._gap = 3 * float(np.median(gaps)) if len(gaps) else 0.0
@@ -90,11 +93,11 @@ class Search:
         return self._least <= EXPLAINED
 
     def score(self, reading: Reading) -> float:
-        """The mean difference over the usable pairs; infinite if too few of them tell."""
+        """The mean difference over the usable pairs. If too few of them tell, one more than over all."""
         found, usable = self.differences(reading), self.usable()
         told = usable & ~np.isnan(found)
         if told.sum() < max(_FEWEST_PAIRS, usable.sum() / 3):
-            return float("inf")
+            return 1 + float(np.nan_to_num(found, nan=1.0).mean()) if len(found) else 2.0
         # Of late poses some pairs are not known. What they lack is made up for, so that scores compare.
         whole = self.differences(replace(reading, late_s=0.0)) + _NOISE
         return float(found[told].mean() * whole[usable].mean() / whole[told].mean())
@@ -108,14 +111,16 @@ class Search:
     def best(self) -> Reading:
         """The reading that explains the frames and differs least from the given one, which stays unless
         another is clearly better."""
-        kept = self._best([self.given], self._of_poses_and_unit)
-        kept = self._best(kept, self._of_camera)
-        if self.score(kept[0]) > _NOISE:  # of two mistakes the first was sought in the presence of the second
-            kept = self._best(kept[: _KEPT // 2], self._of_poses_and_unit)
-            kept = self._best(kept[: _KEPT // 2], self._of_camera)
+        kept, before = [self.given], None
+        # Of two mistakes the one is sought in the presence of the other, so what is found is sought again.
+        for _ in range(_ROUNDS):
+            kept = self._best(self._best(kept, self._of_poses_and_unit, _FEW), self._of_camera, _MANY)
+            if kept[0] == before or self.score(self.given) <= min(EXPLAINED, self.score(kept[0])):
+                break
+            before = kept[0]
         if self._has_stamps:
             for step in _LATE_STEPS_S:
-                kept = self._best(kept[: _KEPT // 2], partial(self._of_time, step=step))
+                kept = self._best(kept, partial(self._of_time, step=step), _FEW)
         best = kept[0]
         for field in fields(Reading):
             simpler = replace(best, **{field.name: getattr(self.given, field.name)})
@@ -135,32 +140,33 @@ class Search:
                 replace(best, lens=a) for a in [*LENSES][:2] if a != best.lens
             ],
         }
-        if not self._has_pinholes:
+        if not self._lenses:
             others = dict([*others.items()][:-2])
         late = [replace(best, late_s=best.late_s + late) for late in (-0.3, 0.3)] if self._has_stamps else []
         for each in (other for tried in [*others.values(), late] for other in tried):
             self.differences(each)
         limit = _AS_WELL * (self.score(best) + _NOISE) - _NOISE
         found = [name for name, tried in others.items() if min(map(self.score, tried)) < limit]
-        times = [score for score in map(self.score, late) if np.isfinite(score)]
+        times = [score for score in map(self.score, late) if score < 1]
         return found if times and min(times) >= limit else [*found, "the time of poses"]
 
-    def _best(self, kept: Sequence[Reading], options: Options) -> list[Reading]:
-        """The best of those kept and of what the options make of them; the given one stays among them."""
-        tried = dict.fromkeys(each for reading in kept for each in [reading, *options(reading)])
+    def _best(self, kept: Sequence[Reading], options: Options, count: int) -> list[Reading]:
+        """Those kept, and what options make of the first ``count`` and of the given one; the best first."""
+        taken = dict.fromkeys([*kept[:count], self.given])
+        tried = dict.fromkeys(each for reading in taken for each in [reading, *options(reading)])
         for reading in tried:
             self.differences(reading)
-        ranked = sorted(tried, key=self.score)[:_KEPT]
-        return list(dict.fromkeys([*ranked, self.given]))
+        return sorted(dict.fromkeys([*kept, *tried]), key=self.score)
 
     def _of_poses_and_unit(self, reading: Reading) -> list[Reading]:
         ways = product((False, True), (False, True), ("", *AXES), (1.0, *self._units))
         return [replace(reading, w_first=w, inverse=i, axes=a, factor=f) for w, i, a, f in ways]
 
     def _of_camera(self, reading: Reading) -> list[Reading]:
-        if not self._has_pinholes:
+        if not self._lenses:
             return []
-        return [replace(reading, along_ray=ray, lens=lens) for ray in (False, True) for lens in ("", *LENSES)]
+        ways = product((False, True), ("", *self._lenses))
+        return [replace(reading, along_ray=ray, lens=lens) for ray, lens in ways]
 
     def _of_time(self, reading: Reading, step: float) -> list[Reading]:
         """Poses that are late or early: by up to a second at the first step, then by something near."""

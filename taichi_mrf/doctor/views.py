@@ -20,10 +20,10 @@ from taichi_mrf.sensor.frame import Frame
 
 Floats = NDArray[np.float64]
 
-PLACES = 6
+PLACES = 5
 """Frames, evenly spread, that others are compared with."""
 
-APART = (1, 3, 9, 27)
+APART = (1, 2, 6, 24)
 """How many frames later the others were taken: one of them has moved far enough and still sees the same."""
 
 REACH_S = 1.0
@@ -45,7 +45,7 @@ class Sphere:
         """Column, row and range at which points (N, 3) are seen, (N, 3)."""
         x, y, z = points_m.T
         u = (np.arctan2(y, x) / np.pi + 1) * self.rows - 0.5
-        v = (np.arctan2(z, np.hypot(x, y)) / np.pi + 0.5) * self.rows - 0.5
+        v = (0.5 - np.arctan2(z, np.hypot(x, y)) / np.pi) * self.rows - 0.5
         inside = np.clip(u, 0, 2 * self.rows - 1), np.clip(v, 0, self.rows - 1)
         return np.stack([*inside, np.linalg.norm(points_m, axis=1)], axis=1)
 
@@ -80,7 +80,7 @@ def read_sample(dataset: Dataset) -> Sample:
     views: dict[int, View] = {}
     poses: dict[int, tuple[float, Pose]] = {}
 
-    firsts = dict.fromkeys(np.linspace(0, count - 1, PLACES + 2).round().astype(int)[:-1].tolist())
+    firsts = dict.fromkeys(np.linspace(0, count - 1, PLACES + 1).round().astype(int)[:-1].tolist())
     pairs = [(i, i + apart) for apart in APART for i in firsts if i + apart < count]
     for index in sorted({i for pair in pairs for i in pair}):
         try:

@@ -15,6 +15,18 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 ROS_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 """T_body_camera: x of the body is ahead, which is z of the camera."""
 
+FLAGS = {
+    "inverse": "--poses-are inverse",
+    "wxyz": "--poses-are wxyz",
+    "opengl": "--poses-are opengl",
+    "ros": "--poses-are ros",
+    "unit": "--depth-scale 1000",
+    "range": "--depth-is range",
+    "late": "--poses-are late=",
+    "intrinsics": "--camera ",
+}
+"""What mends them, or how it begins."""
+
 Break = Callable[[Sequence[Frame]], list[Frame]]
 
 
@@ -56,14 +68,15 @@ def of_camera(factor: float) -> Break:
     return lambda frames: [change(f) for f in frames]
 
 
+LATE_S = 0.3
 BREAKS: dict[str, Break] = {
     "inverse": of_poses(inverse),
     "wxyz": of_poses(_w_first),
     "opengl": of_poses(lambda T: T @ OPENGL),
     "ros": of_poses(lambda T: T @ inverse(ROS_OPTICAL)),
-    "unit": of_depth(lambda f: f.depth_m / 5),
+    "unit": of_depth(lambda f: np.rint(1000 * f.depth_m) / 5000),  # millimetres, read as TUM RGB-D's
     "range": of_depth(lambda f: f.depth_m * np.linalg.norm(f.camera.rays(), axis=-1)),
-    "late": late(0.3),
+    "late": late(LATE_S),
     "intrinsics": of_camera(2.0),
 }
 
