@@ -17,7 +17,7 @@ from taichi_mrf.doctor.views import REACH_S, Floats, Sample, View
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
 
-EXPLAINED = 0.04
+EXPLAINED = 0.03
 """Frames whose depths differ by less, as a share of depth, explain each other."""
 
 _WORST = 0.2
