@@ -11,7 +11,7 @@ from taichi_mrf.datasets.derived import Derived
 from taichi_mrf.datasets.mended import Mended
 from taichi_mrf.datasets.stereo.pairs import StereoPairs
 from taichi_mrf.doctor.readings import UNITS, Reading
-from taichi_mrf.doctor.search import EXPLAINED, Search
+from taichi_mrf.doctor.search import EXPLAINED, QUESTIONS, Search
 from taichi_mrf.doctor.views import Sample, read_sample
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -80,6 +80,9 @@ def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
     if best == given and before > EXPLAINED:
         return Diagnosis((), (_NO_READING,), given)
     undecided = tuple(search.undecided(best))
+    answered = [text for name, text in QUESTIONS.items() if getattr(best, name) != getattr(given, name)]
+    if set(answered) & set(undecided):  # such as depths so large that the camera stands still beside them
+        return Diagnosis((), (_NO_READING,), given)
     found = tuple(_findings(given, best, steps, source))
     return Diagnosis(found, undecided, best, before, search.score(best), search)
 

@@ -20,6 +20,17 @@ from taichi_mrf.sensor.camera import PinholeCamera
 EXPLAINED = 0.03
 """Frames whose depths differ by less, as a share of depth, explain each other."""
 
+QUESTIONS = {
+    "inverse": "the direction of poses",
+    "w_first": "the order of quaternions",
+    "axes": "the axes of the camera",
+    "factor": "the unit of depth",
+    "along_ray": "depth along the ray or the axis",
+    "lens": "the size of the intrinsics' images",
+    "late_s": "the time of poses",
+}
+"""What each field of a reading answers."""
+
 _WORST = 0.2
 _EXPLAINING = 0.5
 _NOISE = 0.002
@@ -131,14 +142,12 @@ class Search:
     def undecided(self, best: Reading) -> list[str]:
         """The assumptions whose contrary explains the frames nearly as well as the best reading does."""
         others = {
-            "the direction of poses": [replace(best, inverse=not best.inverse)],
-            "the order of quaternions": [replace(best, w_first=not best.w_first)],
-            "the axes of the camera": [replace(best, axes=a) for a in ("", *AXES) if a != best.axes],
-            "the unit of depth": [replace(best, factor=best.factor * times) for times in (0.2, 5.0, 1000.0)],
-            "depth along the ray or the axis": [replace(best, along_ray=not best.along_ray)],
-            "the size of the intrinsics' images": [
-                replace(best, lens=a) for a in [*LENSES][:2] if a != best.lens
-            ],
+            QUESTIONS["inverse"]: [replace(best, inverse=not best.inverse)],
+            QUESTIONS["w_first"]: [replace(best, w_first=not best.w_first)],
+            QUESTIONS["axes"]: [replace(best, axes=a) for a in ("", *AXES) if a != best.axes],
+            QUESTIONS["factor"]: [replace(best, factor=best.factor * times) for times in (0.2, 5.0, 1000.0)],
+            QUESTIONS["along_ray"]: [replace(best, along_ray=not best.along_ray)],
+            QUESTIONS["lens"]: [replace(best, lens=a) for a in [*LENSES][:2] if a != best.lens],
         }
         if not self._lenses:
             others = dict([*others.items()][:-2])
@@ -148,7 +157,7 @@ class Search:
         limit = _AS_WELL * (self.score(best) + _NOISE) - _NOISE
         found = [name for name, tried in others.items() if min(map(self.score, tried)) < limit]
         times = [score for score in map(self.score, late) if score < 1]
-        return found if times and min(times) >= limit else [*found, "the time of poses"]
+        return found if times and min(times) >= limit else [*found, QUESTIONS["late_s"]]
 
     def _best(self, kept: Sequence[Reading], options: Options, count: int) -> list[Reading]:
         """Those kept, and what options make of the first ``count`` and of the given one; the best first."""
