@@ -11,7 +11,7 @@ from taichi_mrf.calibration.from_recording import LearntSigma
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
-from taichi_mrf.datasets.formats import frames_npz
+from taichi_mrf.datasets.entries import holds_frames
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.source_flags import SourceFlags
@@ -87,7 +87,7 @@ def open_source(
     """
     runtime.init(config.runtime.arch, config.runtime.threads)
     path = Path(name)
-    if path.suffix == ".npz" and is_file(path) and not frames_npz.FORMAT.recognises(path):
+    if path.suffix == ".npz" and is_file(path) and not holds_frames(path):
         if poses is not None:
             raise ConfigError(
                 f"{path}: is a saved map, whose keyframes have poses: --poses is for a recording"

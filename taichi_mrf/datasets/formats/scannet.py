@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.color_camera import ColorCamera
 from taichi_mrf.datasets.hints import hint_for
 from taichi_mrf.datasets.images import DEPTH_SUFFIXES
@@ -42,11 +42,6 @@ STEPS_PER_METRE = 1000.0
 FRAMES_PER_SECOND = 30.0
 LOST = "inf"
 """The text in the pose file of an image that could not be tracked."""
-
-
-def recognises(folder: Path) -> bool:
-    """Whether there are a folder of depth images and one of poses."""
-    return (folder / "depth").is_dir() and (folder / "pose").is_dir()
 
 
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
@@ -145,11 +140,3 @@ def _lost(pose_file: Path) -> bool:
         return LOST in read_text(pose_file, DatasetError)
     except DatasetError:
         return False
-
-
-FORMAT = Format(
-    name=NAME,
-    looks_for="depth/N.png and pose/N.txt",
-    recognises=recognises,
-    open=open_folder,
-)

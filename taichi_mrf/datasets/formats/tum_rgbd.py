@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.intrinsics import PRIMESENSE, find_camera
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.pose_text import in_seconds
@@ -37,11 +37,6 @@ CAMERAS = {
     "freiburg3": PinholeCamera(width=640, height=480, fx=535.4, fy=539.2, cx=320.1, cy=247.6),
 }
 """The data set's calibrations of its three cameras, recognised by the folder's name."""
-
-
-def recognises(folder: Path) -> bool:
-    """Whether the folder has the list of depth images. Opening reports missing poses."""
-    return is_file(folder / DEPTH_LIST)
 
 
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
@@ -160,11 +155,3 @@ def _read_list(path: Path) -> list[tuple[float, Path]]:
     if not entries:
         raise DatasetError(f"{path}: lists no image")
     return sorted(entries)
-
-
-FORMAT = Format(
-    name=NAME,
-    looks_for="depth.txt and groundtruth.txt",
-    recognises=recognises,
-    open=open_folder,
-)
