@@ -34,6 +34,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "view_gain",
         "compare_maps",
     ),
+    "The page": ("live", "show"),
     "Files": ("open_dataset", "load_map", "ChunkedMap", "take_part", "export_map", "ExportOptions"),
     "Evaluation": ("accuracy",),
     "Configuration": ("Config",),

@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from taichi_mrf.sensor.own_evidence import sigma_of_confidence as sigma_of_confidence
     from taichi_mrf.sensor.ray_table import RayTable as RayTable
     from taichi_mrf.sensor.spherical import SphericalCamera as SphericalCamera
+    from taichi_mrf.session.own_loop import live as live
+    from taichi_mrf.session.own_loop import show as show
     from taichi_mrf.system.runtime import init as init
 
 __version__ = "0.1.0"
@@ -78,6 +80,8 @@ _PUBLIC = {
     "sigma_of_confidence": "taichi_mrf.sensor.own_evidence",
     "Frame": "taichi_mrf.sensor.frame",
     "open_dataset": "taichi_mrf.datasets",
+    "live": "taichi_mrf.session.own_loop",
+    "show": "taichi_mrf.session.own_loop",
     "Config": "taichi_mrf.config.schema",
     "TaichiMRFError": "taichi_mrf.errors",
 }

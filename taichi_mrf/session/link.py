@@ -6,11 +6,13 @@ thread writes the outbox to the pipe. Requests are read between two pieces of ma
 
 import multiprocessing
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
+from types import ModuleType
 from typing import Protocol
 
 from taichi_mrf.session.outbox import Outbox
@@ -63,7 +65,7 @@ class ViewerLink:
         self._process = context.Process(
             target=serve or _serve_page, args=(theirs, host, port), name="taichi-mrf viewer", daemon=True
         )
-        with _interrupts_ignored():
+        with _interrupts_ignored(), _main_left_alone():
             self._process.start()
         theirs.close()  # so that the connection ends with their process
         self._outbox = Outbox() if outbox is None else outbox
@@ -158,6 +160,18 @@ def _interrupts_ignored() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, saved)
+
+
+@contextmanager
+def _main_left_alone() -> Iterator[None]:
+    """Processes that are started in this block do not run the program's main module again, which may be a
+    user's script without a guard."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def _serve_page(connection: Connection, host: str, port: int) -> None:

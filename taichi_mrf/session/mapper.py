@@ -44,9 +44,12 @@ class Mapper:
     ``saved_unsettled``: the map comes from a file that was saved before its inference was complete.
     """
 
-    def __init__(self, m: OccupancyMap, first_id: int = 0, refiner: PoseRefiner | None = None) -> None:
+    def __init__(
+        self, m: OccupancyMap, first_id: int = 0, refiner: PoseRefiner | None = None, own: bool = False
+    ) -> None:
         """A map that may have keyframes already; the viewer's numbers begin at ``first_id``. ``refiner``
-        refines the map's poses, None if they stay."""
+        refines the map's poses, None if they stay. ``own``: another program makes the map; else one that has
+        keyframes comes from a file."""
         self.map, self.refiner = m, refiner
         self.inferred: InferReport | None = None
         self.roster = LiveKeyframes(next_id=first_id)
@@ -55,8 +58,9 @@ class Mapper:
                 keyframe, keyframe.rays, thumbnail(keyframe.camera, keyframe.depth_m), id, keyframe.stamp_s
             )
         # A map from a file has beliefs but no messages; an edit needs full inference first.
-        self.lacks_messages = bool(m.keyframes) and has_messages(m)
-        self.saved_unsettled = bool(m.keyframes) and not m.settled
+        from_file = bool(m.keyframes) and not own
+        self.lacks_messages = from_file and has_messages(m)
+        self.saved_unsettled = from_file and not m.settled
         self.unsettled = self.saved_unsettled or self.stale
         self.shown = ShownMap(m, opened=self.lacks_messages and not self.unsettled)
         self.edited = False
@@ -162,6 +166,27 @@ class Mapper:
         on = self.roster.with_state("on")
         nothing = np.zeros((0, 3), np.int32)
         return [self._frozen(entry, nothing) for entry in on if entry.map_id not in self.map.keyframes]
+
+    def done_elsewhere(self) -> list[messages.KeyframeInfo] | None:
+        """Note what another program has done to the map's keyframes since this was last called; returns
+        messages about those that it has added, moved or frozen, None if it has removed some."""
+        self.unsettled = self.cavities_changed = False  # that program infers, when it will
+        on = {self._map_id(entry): entry for entry in self.roster.with_state("on")}
+        gone = [id for id in on if id not in self.map.keyframes]
+        if any(id not in getattr(self.map, "frozen", ()) for id in gone):
+            return None
+        found = [self._frozen(on[id], np.zeros((0, 3), np.int32)) for id in gone]
+        for id, keyframe in self.map.keyframes.items():
+            entry = on.get(id)
+            if entry is None:
+                picture = thumbnail(keyframe.camera, keyframe.depth_m)
+                entry = self.roster.add(keyframe, keyframe.rays, picture, id, keyframe.stamp_s)
+            elif np.array_equal(entry.T_world_camera, keyframe.T_world_camera):
+                continue
+            else:
+                entry.T_world_camera = entry.T_home = keyframe.T_world_camera
+            found.append(self.describe(entry))
+        return found
 
     def renew(self) -> None:
         """Sweep the keyframes whose cavity has changed most, for at most RENEW_SECONDS."""

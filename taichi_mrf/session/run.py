@@ -83,7 +83,7 @@ class Run(SessionCore):
         if replay is not None and self.replay is not None:
             replay.set_speed(self.replay.speed)
         self.intake, self.replay = intake, replay
-        self.mapper = Mapper(intake.map, first_id, intake.refiner)
+        self.mapper = Mapper(intake.map, first_id, intake.refiner, source.own)
         self.follower = follower_of(m, source.dataset, source.config.poses)
         intake.result.followed = None if self.follower is None else self.follower.done
         self.progress = Progress()
@@ -120,6 +120,16 @@ class Run(SessionCore):
             self.show_camera(self.current)
         self.mapper.shown.start_over()
         self.publish()
+
+    def look_at_keyframes(self) -> None:
+        """Show what another program has done to its map's keyframes since the last call."""
+        changed = self.mapper.done_elsewhere()
+        if changed is None:
+            self.mapper = Mapper(self.mapper.map, self.mapper.roster.next_id, own=True)
+            self.send_everything()
+        else:
+            for info in changed:
+                self.send(info)
 
     def publish(self) -> None:
         """Send the changes of the map, and measure its size."""

@@ -74,14 +74,22 @@ class Session:
         state = self.state
         state.should_stop = should_stop
         while not state.is_over:
-            state.read_requests()
-            self._carry_out_waiting()
+            self.answer()
             if not state.is_over and not self._work():
                 if state.policy.leave_when_done and state.is_done:
                     return
                 state.show_activity(state.idle_activity, 1.0)
                 due = state.replay.due_in() if state.replay else None
                 state.link.wait(WAIT_SECONDS if due is None else min(due, WAIT_SECONDS))
+
+    def answer(self) -> None:
+        """Carry out what the page has asked for."""
+        self.state.read_requests()
+        self._carry_out_waiting()
+
+    def rest(self) -> None:
+        """Use a time without other work for what the page shows beside the map."""
+        self._extras.work(self._go_on)
 
     def reconnect(self, link: Link) -> None:
         """Go on with another viewer, which is sent the whole state."""

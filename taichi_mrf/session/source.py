@@ -46,7 +46,7 @@ class Source:
     """How to make the map (an empty one, or one from a file), and how to replay the frames, which a saved map
     does not have. ``tracked``: the poses of the frames are found by tracking. ``dataset`` is the recording,
     to check the map against its held-out frames; ``choice`` are the flags that chose its frames. ``learnt``:
-    how sigma was learnt from it, if it was."""
+    how sigma was learnt from it, if it was. ``own``: the map is another program's, which changes it."""
 
     name: str
     config: Config
@@ -56,6 +56,7 @@ class Source:
     dataset: Dataset | None = None
     choice: dict[str, Any] = field(default_factory=dict)
     learnt: LearntSigma | None = None
+    own: bool = False
 
     @property
     def hold_out(self) -> int:

@@ -1,0 +1,150 @@
+"""A page in the browser for a map that the caller's own program makes: ``live`` beside a loop, ``show`` for a
+map that is made.
+
+The program stays in command. What it does to the map is shown when it calls :meth:`LivePage.update`, which
+also carries out what the page's users have asked for: Taichi may be used by one thread only.
+"""
+
+import asyncio
+import sys
+import warnings
+import webbrowser
+from contextlib import suppress
+from types import TracebackType
+from typing import Any
+
+from taichi_mrf.config.arguments import ArgumentTypeError, shown
+from taichi_mrf.errors import ViewerError
+from taichi_mrf.methods.protocol import OccupancyMap
+from taichi_mrf.session.link import Link, ViewerLink
+from taichi_mrf.session.run import Policy
+from taichi_mrf.session.session import Session
+from taichi_mrf.session.source import Source
+from taichi_mrf.viewer.messages import Listening
+
+PORT = 8080
+
+IN_NOTEBOOK_S = 0.2
+"""Time between two updates while a notebook waits for its next cell."""
+
+_UP_TO_DATE = "the map as of the last update"
+
+
+class LivePage:
+    """A page that shows a map while it is made; use it as a context, or :meth:`close` it.
+
+    ``url`` is its address. A notebook shows the page below the cell that ends with it.
+    """
+
+    def __init__(
+        self,
+        m: OccupancyMap,
+        *,
+        port: int = PORT,
+        host: str = "127.0.0.1",
+        browser: bool = False,
+        link: Link | None = None,
+    ) -> None:
+        """Start the page of a map ``m``, which is not changed. If ``port`` is busy, another one is taken; 0
+        is any. ``browser`` opens one, and warns of the address if there is none. Raises ArgumentTypeError if
+        ``m`` is no map that keyframes can be added to, and ViewerError if the page cannot be served."""
+        if not hasattr(m, "add_keyframe"):
+            raise ArgumentTypeError(f"m must be a map that takes keyframes, such as MRFMap, not {shown(m)}")
+        self.url, self._revision = "", -1
+        self._viewer = None if link is not None else ViewerLink(host, port)
+        source = Source(type(m).__name__, m.config, lambda: m, own=True)
+        self._session = Session(source, link or self._viewer, Policy(), self._listening)  # type: ignore[arg-type]
+        while self._viewer is not None and not self.url:
+            self._answer()
+            if self._viewer.lost is not None:
+                self._viewer.close()
+                raise ViewerError(self._viewer.lost)
+            self._viewer.wait(0.1)
+        if browser and not webbrowser.open(self.url):
+            warnings.warn(f"no browser can be opened here; the map is at {self.url}", stacklevel=2)
+
+    def update(self) -> bool:
+        """Show what has been done to the map since the last call, and carry out what the page's users have
+        asked for; returns False once the page has ended. Call it after each keyframe, or every few. A call
+        that finds nothing done finds what is occupied, and the measured surface.
+        """
+        run = self._session.state
+        run.look_at_keyframes()
+        self._answer()
+        if not run.is_over:
+            run.publish()
+            revision = run.mapper.map.view.pool.revision
+            if revision == self._revision:
+                self._session.rest()
+            self._revision = revision
+            run.show_activity(_UP_TO_DATE, 1.0)
+        return not run.is_over
+
+    def serve(self) -> None:
+        """Answer the page until it ends or Ctrl-C is pressed. Edits are inferred at once, and the page shows
+        what is occupied."""
+        self.update()
+        with suppress(KeyboardInterrupt):
+            self._session.run(lambda: False)
+
+    def close(self) -> None:
+        """End the page; the map stays."""
+        if self._viewer is not None:
+            self._viewer.close()
+
+    def __enter__(self) -> "LivePage":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _repr_html_(self) -> str:
+        """The page inside a notebook, which keeps it up to date while it waits for its next cell."""
+        asyncio.get_running_loop().create_task(self._keep_up_to_date())
+        return f'<iframe src="{self.url}" width="100%" height="600" style="border: 0"></iframe>'
+
+    async def _keep_up_to_date(self) -> None:
+        while self.update():
+            await asyncio.sleep(IN_NOTEBOOK_S)
+
+    def _listening(self, where: Listening) -> None:
+        host = f"[{where.host}]" if ":" in where.host else where.host
+        self.url = f"http://{host}:{where.port}"
+
+    def _answer(self) -> None:
+        self._session.answer()
+
+
+def live(m: OccupancyMap, **options: Any) -> LivePage:
+    """Show a map in the browser while the caller's own loop makes it.
+
+    ``options`` are those of :class:`LivePage`. Example::
+
+        with tm.live(m) as page:
+            for depth_m, T_world_camera in camera:
+                m.renew([m.add_keyframe(depth_m, T_world_camera, intrinsics)])
+                page.update()
+    """
+    return LivePage(m, **options)
+
+
+def show(m: OccupancyMap, *, browser: bool = True, **options: Any) -> LivePage:
+    """Show a map in the browser: in a notebook below the cell, in a script until the page ends or Ctrl-C is
+    pressed. A script opens a ``browser``, and warns of the address if it does not. The other ``options`` are
+    those of :class:`LivePage`."""
+    if _in_notebook():
+        page = LivePage(m, **options)
+        page.update()
+        return page
+    with LivePage(m, browser=browser, **options) as page:
+        if not browser:
+            warnings.warn(f"the map is at {page.url}", stacklevel=2)
+        page.serve()
+        return page
+
+
+def _in_notebook() -> bool:
+    """Whether the program is a notebook's kernel, whose event loop runs between its cells."""
+    return "ipykernel" in sys.modules
