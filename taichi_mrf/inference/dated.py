@@ -160,8 +160,7 @@ class DatedBelief:
         self._outdated[slots] = True
 
     def read_frozen(self, slots: NDArray[np.int32]) -> tuple[NDArray[np.float32], NDArray[np.float64]] | None:
-        """Beliefs of frozen keyframes in some bricks and their stamps, to save them; None if nothing is
-        frozen."""
+        """Beliefs of frozen keyframes in some bricks and their stamps, to save them; None without any."""
         if self.frozen is None:
             return None
         out = np.zeros(len(slots) * VOXELS, np.float32)
