@@ -24,7 +24,7 @@ LOG_ODDS, CHUNKS = "log_odds", "chunks"
 COLORS, SURFACE, FIRST = "colors", "surface", "first_surface"
 
 EXTRAS = {COLORS: ("uint8", 4), SURFACE: ("float32", VALUES), FIRST: ("uint8", 1)}
-"""Extras that a store may hold of each voxel beside its log-odds, 0 for nothing: type and number of
+"""Extras of each voxel beside its log-odds that a store may hold, 0 for nothing: type and number of
 values."""
 
 _MOST_BYTES = 1_000_000

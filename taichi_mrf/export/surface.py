@@ -84,11 +84,8 @@ def photographed(m: ColoredMap, surface: Surface, of_voxels: bool) -> Surface:
 
 
 def smooth_surface(m: QueriedMap, level: float) -> Surface:
-    """Surface where the marginal is ``level``, by marching cubes (Lewiner et al. 2003) between the centres of
-    voxels. Unknown space counts as empty.
-
-    Unknown space counts as empty.
-    """
+    """Surface where the marginal is ``level``: marching cubes (Lewiner et al. 2003) between voxels' centres.
+    Unknown space counts as empty."""
     from skimage import measure  # slow to import
 
     vertices, triangles, values = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.float32)]
