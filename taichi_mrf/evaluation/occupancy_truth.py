@@ -27,7 +27,7 @@ from taichi_mrf.voxels.window import Window
 
 @dataclass(frozen=True)
 class OccupancyTruth:
-    """What is known for certain of the voxels of a window, one bit for each: :func:`occupancy_truth`."""
+    """Certain knowledge of the voxels of a window, one bit for each: :func:`occupancy_truth`."""
 
     window: Window
     occupied_marks: Marks
