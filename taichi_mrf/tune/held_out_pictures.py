@@ -1,5 +1,5 @@
-"""What the page shows of the held-out views: pictures of where a map is right, kept for every try, so that
-any two can be compared, and how measurements scatter around the expected depth."""
+"""Pictures of the held-out views for the page: where a map is right, kept for every try, so that any two can
+be compared, and how measurements scatter around the expected depth."""
 
 from collections.abc import Sequence
 
