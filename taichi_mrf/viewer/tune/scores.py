@@ -19,10 +19,10 @@ class Scores:
     """Share of pixels whose depth lies in the voxel of the likeliest surface; no surface counts as wrong."""
 
     accuracy_sigma: float
-    """The same for depths within 1.5 sigma of that voxel's middle, sigma being the voxel size."""
+    """Share of depths within 1.5 sigma of that voxel's middle, sigma being the voxel size."""
 
     accuracy_5cm: float
-    """The same for depths within 5 cm of it."""
+    """Share of depths within 5 cm of it."""
 
     unanswered: float
     """Share of pixels whose ray meets no surface."""
