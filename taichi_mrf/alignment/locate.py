@@ -143,7 +143,7 @@ class Locator:
             _not_carried_away(levels, T, prior, lever_m, observable)
             for T, prior in zip(guesses, priors, strict=True)
         ]
-        # Where depth determines too little, ends that fit alike differ in how far they are from their guess.
+        # Ends that fit alike differ in how far they are from their guess if depth determines too little.
         worth = max(end.equations.worth for end in ends)
         costs = [
             worth * end.equations.cost + prior.cost(end.T_world_camera)
@@ -179,8 +179,8 @@ class Locator:
 def _not_carried_away(
     levels: Sequence[PointToPlane], guess: Pose, prior: Recorded, lever_m: float, observable: float
 ) -> Aligned:
-    """End of a search from a guess; if that is far from there, without the directions that depth determines
-    badly, unless these change little."""
+    """End of a search from a guess. If it is far from there, directions that depth determines badly are left
+    out, unless they change little."""
     end = aligned(levels, guess, prior, lever_m, observable)
     if tangent_norms(guess, end.T_world_camera)[1] < CARRIED_M:
         return end
@@ -190,8 +190,8 @@ def _not_carried_away(
 
 
 def _judged(end: Aligned, reason: str, config: PoseConfig) -> Located:
-    """Verdict on an image whose search ended at a pose. It cannot be relied on for a ``reason``, if that is
-    not "", or because too little of it fits."""
+    """Verdict on an image whose search has ended: its pose cannot be relied on if ``reason`` is not "", or if
+    too little of the image fits."""
     overlap, agrees = end.equations.overlap, agreement(end.equations)
     if overlap < config.min_overlap:
         reason = (

@@ -100,7 +100,7 @@ def found_around(
         return places
 
     places = aligned_at(0, candidates(points, surface.planes(), around))
-    # Where depth tells little of the position, what is expected tells more: the same turned, but there.
+    # If depth tells little of the position, the expected one tells more: the same turn is tried there.
     turned = [place.end.T_world_camera.copy() for place in distinct(places, NEAR_M)[:2]]
     for T in turned:
         T[:3, 3] = around.expected_m

@@ -44,7 +44,7 @@ def unknown_entry_depths(rays: RayList) -> "ti.Ndarray":
 
 @dataclass(frozen=True)
 class CastRays:
-    """Input and output of the rays of one keyframe, as kernels take it: the scratch, ready in a ``with``
+    """Input and output of the rays of one keyframe, as kernels take them: the scratch, ready in a ``with``
     block."""
 
     view: Viewpoint

@@ -34,7 +34,7 @@ from taichi_mrf.viewer.messages import Bricks, CurrentCamera, Hello, KeyframeInf
 
 @dataclass(frozen=True)
 class Policy:
-    """Rules of what a run does on its own. ``keep_live``: most keyframes that are on before some are frozen,
+    """Rules that a run follows on its own. ``keep_live``: most keyframes that are on before some are frozen,
     None for no limit. ``out``: folder for the files that a user saves. ``leave_when_done``: end once the
     source has ended and the map is settled."""
 

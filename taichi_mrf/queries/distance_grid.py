@@ -1,4 +1,4 @@
-"""Memory of a distance field for each brick, and which of the brick's voxels are obstacles."""
+"""Storage of a distance field for each brick, and which of the brick's voxels are obstacles."""
 
 from dataclasses import dataclass
 

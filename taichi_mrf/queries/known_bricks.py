@@ -26,7 +26,7 @@ _LEAST_PROBABILITY = 1e-9
 
 
 class Placed(Protocol):
-    """A measurement with a pose."""
+    """Interface of a keyframe, as queries need it: its pose."""
 
     @property
     def T_world_camera(self) -> Pose: ...

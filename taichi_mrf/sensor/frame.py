@@ -68,7 +68,7 @@ class Frame:
         return OwnEvidence(noise, sigma_m, no_return)
 
     def own_in(self, config: Config) -> OwnEvidence:
-        """The part of it that a map with this configuration takes, and how uncertain the frame's pose is."""
+        """Evidence that a map with this configuration takes, and how uncertain the frame's pose is."""
         poses = config.poses
         covariance = checked_covariance(covariance_of(poses.doubt_translation, poses.doubt_rotation))
         return replace(self.own_for(config.sensor), pose_covariance=covariance)

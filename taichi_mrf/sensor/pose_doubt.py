@@ -108,7 +108,7 @@ def beside_edges(depth_m: NDArray[np.floating], camera: Camera, covariance: Cova
     if camera.pixels_per_radian == 0 or not measured.any():
         return np.zeros(camera.shape, bool)
     p, d = _points_and_rays(depth_m, camera)
-    # What is not along the ray is across it, in two directions.
+    # The rest of the variance is across the ray, in two directions.
     along = _variance_along(d / np.sqrt(_dot(d, d)), p, covariance)
     across = 0.5 * np.maximum(_total_variance(p, covariance) - along, 0.0)
     distances = np.where(measured, np.sqrt(_dot(p, p)), np.inf)

@@ -26,8 +26,8 @@ DEFLATE_RATIO = 1032
 """The highest compression ratio of deflate (zlib's technical details)."""
 
 _LEAST_BOUND, _LARGEST_RATIO = 1 << 28, 100
-"""Limits of the bytes read from a file: this many, or this many times its size on disk. Measurements pack
-three to ten times; only arrays of a single value pack a thousandfold."""
+"""Limits of what is read of a file: this many bytes, or this many times what it takes in the file.
+Measurements pack three to ten times; only arrays of a single value pack a thousandfold."""
 
 _CHUNK = 1 << 20
 _MOST_DIMENSIONS = 8

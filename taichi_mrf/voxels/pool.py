@@ -112,7 +112,7 @@ class BrickPool:
 
     @property
     def in_order(self) -> NDArray[np.int32]:
-        """Slots of the bricks that exist, in an order by coordinates that no history of the map changes."""
+        """Slots of the bricks that exist, by coordinates: the order does not depend on the history."""
         slots = self.in_use
         return slots[np.lexsort(self.bricks[slots].T)]
 

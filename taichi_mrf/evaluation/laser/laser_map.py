@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class LaserMap:
-    """Knowledge of each cell, (rows, columns); row 0 lies at the lowest y, column 0 at the lowest x."""
+    """States of the cells, (rows, columns); row 0 lies at the lowest y, column 0 at the lowest x."""
 
     occupied: NDArray[np.bool_]
     """The label of the cell."""

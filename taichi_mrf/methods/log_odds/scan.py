@@ -198,7 +198,7 @@ class _Pass(Struct):
 
 @dataclass(frozen=True)
 class _Tally(Bundle):
-    """Counter of rays, and whether it counts each one."""
+    """Count of rays for each voxel; with ``every_ray`` off only whether there are any."""
 
     tally: I64Array
     every_ray: Template

@@ -116,7 +116,7 @@ class _Door:
         )
 
     def _pages(self, pages: Pages, connection: ServerConnection, request: Request) -> Response | None:
-        """Responses of viser, and the pulse."""
+        """Response to a request: viser's, or the pulse."""
         if request.path.partition("?")[0] == PATH:
             return self._pulse.answer(connection)
         return pages(connection, request)

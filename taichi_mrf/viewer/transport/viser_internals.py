@@ -127,7 +127,7 @@ def awaits_picture(server: viser.ViserServer, client: int) -> bool:
 
 
 def guis(server: viser.ViserServer, client: int) -> Iterator[viser.GuiApi]:
-    """Owners of a client's widgets: everybody's page, and its own."""
+    """Places of a client's widgets: everybody's page, and its own."""
     yield server.gui
     handle = server.get_clients().get(client)
     if handle is not None:
