@@ -45,7 +45,7 @@ class Recorded:
 
 
 class KnownPoses(Protocol):
-    """Knowledge of the poses of some keyframes, in a fixed order, as a quadratic cost."""
+    """Known poses of some keyframes, in a fixed order, as a quadratic cost."""
 
     def add_to(self, equations: PoseEquations, poses: Sequence[Pose]) -> None:
         """Add the cost's derivatives at some poses."""

@@ -1,4 +1,4 @@
-"""Wide search for a sensor that sees around, metres and any turn from its last place: scan matching.
+"""Correlative scan matching: the wide search for a sensor that sees around, metres and any turn away.
 
 Floors and ceilings tell which way is up. Then every heading is tried at every place of a grid (Olson,
 "Real-time correlative scan matching", 2009). A pose counts the points of the scan that fall into, or next to,

@@ -30,7 +30,7 @@ KIND_NAMES = {"unseen": "old keyframes that it does not see", "seen": "old keyfr
 TARGET_NAMES = "target without re-inference", "target of all three"
 KERNELS_DRAWN = 8
 SHORTEST_MS = 0.01
-"""Begin of the logarithmic scale of kernels."""
+"""Lower end of the logarithmic scale of kernels."""
 _DPI = 120
 
 

@@ -67,10 +67,9 @@ class SensorConfig:
     """Rays end at this depth (metres). A measurement beyond it only marks the space up to it as free."""
 
     no_return: Literal["ignore", "free", "model"] = "ignore"
-    """How MRFMap uses the pixels that frames name as having got no return: not at all; as a free way up to
-    ``no_return_depth``; or as a chance, for each surface on the way, that it gave none, which ``model`` gives
-    by ``no_return_share``, ``no_return_depth`` and ``no_return_width``. A log-odds map knows ``free`` alone.
-    """
+    """How MRFMap uses pixels that frames name as having got no return: not at all; as a free way up to
+    ``no_return_depth``; or as a chance that each surface on the way gave none, which ``model`` gives by
+    ``no_return_share``, ``no_return_depth`` and ``no_return_width``. A log-odds map knows ``free`` alone."""
 
     no_return_share: float = in_files(0.3)
     """Chance that a near surface gives no return, below 0.5: the share of dark, wet and shiny ones."""

@@ -114,7 +114,7 @@ def mistakes_at_a_glance(dataset: Dataset, seconds: float = 1.0) -> list[str]:
 
 
 def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> list[Finding]:
-    """Findings of what the best reading has other than the given one. Those of poses have the flag of all."""
+    """Differences of the best reading from the given one. Those of poses have the flag of them all."""
     poses = next((flag for flag in best.flags() if flag.startswith("--poses-are")), "--poses-are ''")
     found = []
     if best.w_first != given.w_first:

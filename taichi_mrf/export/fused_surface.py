@@ -72,7 +72,7 @@ class SurfacedMap(QueriedMap, Protocol):
 
     @property
     def has_surface(self) -> bool:
-        """True if it holds that of all keyframes that it was made of."""
+        """True if it holds the surface of all keyframes that it was made of."""
         ...
 
     def surface(self) -> FusedSurface:

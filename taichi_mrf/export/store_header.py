@@ -24,8 +24,7 @@ LOG_ODDS, CHUNKS = "log_odds", "chunks"
 COLORS, SURFACE, FIRST = "colors", "surface", "first_surface"
 
 EXTRAS = {COLORS: ("uint8", 4), SURFACE: ("float32", VALUES), FIRST: ("uint8", 1)}
-"""Extras of each voxel beside its log-odds that a store may hold, 0 for nothing: type and number of
-values."""
+"""Extras that a store may hold of each voxel, 0 for nothing: the type and number of their values."""
 
 _MOST_BYTES = 1_000_000
 _LARGEST_VOXEL_M = 1000.0

@@ -24,7 +24,7 @@ EDGE_BYTES = 4 + 6 + 4
 """A cell's number; a beam's number and step in the cell's list; a message."""
 
 BEAM_BYTES = 4 + 4 + 28 + 3 * 4
-"""Bytes of a beam: the begin of its cells, whether it hit, its geometry; what a method keeps of it."""
+"""Bytes of a beam: the start of its cells, whether it hit, its geometry; what a method keeps of it."""
 
 CELL_BYTES = 4 + 4 + 4 * 8
 """Its degree, where its beams begin; what a method keeps of it."""

@@ -290,7 +290,7 @@ class Keyframe:
 
     @property
     def own(self) -> OwnEvidence:
-        """Its statements of its own measurements."""
+        """Evidence that it states of its own measurements."""
         return self.image.own
 
     @property

@@ -126,7 +126,7 @@ class MeasuringMap(OccupancyMap, Protocol):
 
     @property
     def has_surface(self) -> bool:
-        """True if no keyframe is missing in it."""
+        """True if no keyframe is missing in its surface."""
         ...
 
     def surface(self, between: Callable[[], object] = ...) -> FusedSurface:

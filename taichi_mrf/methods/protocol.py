@@ -35,7 +35,7 @@ class PosedDepth(Protocol):
     def depth_m(self) -> NDArray[np.float32]: ...
     @property
     def own(self) -> OwnEvidence:
-        """Its statements of its own measurements."""
+        """Evidence that it states of its own measurements."""
         ...
 
 

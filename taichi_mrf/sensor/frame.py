@@ -57,7 +57,7 @@ class Frame:
 
     @property
     def own(self) -> OwnEvidence:
-        """The frame's statements of its own measurements, as they were read."""
+        """Evidence that the frame states of its measurements, as it was read."""
         return OwnEvidence(self.noise, self.sigma_m, self.no_return)
 
     def own_for(self, sensor: SensorConfig) -> OwnEvidence:

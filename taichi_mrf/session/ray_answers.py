@@ -32,7 +32,7 @@ class PosedDepthImage:
     """The viewer's number of the keyframe, if it is one."""
 
     own: OwnEvidence = NOTHING
-    """The keyframe's statements of its measurements."""
+    """Evidence that the keyframe states of its measurements."""
 
     def noise_model(self, default: NoiseModel) -> NoiseModel:
         """The image's noise, if its map has the noise ``default``."""

@@ -1,5 +1,4 @@
-"""Readings of an MRFMap: its keyframes, and the map as it was believed at another time, or one layer of
-it."""
+"""Readings of an MRFMap: its keyframes, and the map as believed at another time, or one layer of it."""
 
 import math
 from collections.abc import Callable, Mapping
