@@ -79,7 +79,7 @@ _LONGEST = 200
 
 @contextmanager
 def collected_warnings() -> Iterator[list[warnings.WarningMessage]]:
-    """What this package warns of while the block runs, to be told in a report or as notes."""
+    """Warnings of this package while the block runs, to be told in a report or as notes."""
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("ignore")
         warnings.filterwarnings("always", category=UserWarning, module="taichi_mrf")

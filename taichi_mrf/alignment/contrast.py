@@ -1,4 +1,4 @@
-"""What of a colour image can be aligned: contrast, by how much each pixel is brighter than its surroundings.
+"""Contrast of a colour image, which can be aligned: how much brighter each pixel is than its surroundings.
 
 Exposure, shading and lamps that are near or far change brightness over wide areas; contrast stays. Images are
 thinned to two widths, so that a search can go from coarse to fine.

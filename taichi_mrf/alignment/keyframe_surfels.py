@@ -46,7 +46,7 @@ class KeyframeSurfels:
         self._frozen = merged(parts, self.cell_size)
 
     def frozen_in(self, chunks: NDArray[np.int32]) -> Surfels:
-        """What frozen keyframes have measured in some chunks of 64^3 cells, (n, 3)."""
+        """Surfels that frozen keyframes have measured in some chunks of 64^3 cells, (n, 3)."""
         if self._frozen is None:
             return merged([], self.cell_size)
         return self._frozen.chosen(self._inside(self._frozen, chunks))

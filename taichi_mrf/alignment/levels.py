@@ -74,7 +74,7 @@ def aligned_with_color(
     lever_m: float,
     observable: float,
 ) -> Aligned:
-    """The same with colour, coarse and fine, on the finer levels."""
+    """Pose at the end of a search that also uses colour, coarse and fine, on the finer levels."""
     found = Aligned(T_world_camera, levels[-1].linearised(T_world_camera), 0)
     for level, color in zip(levels[1:], colors, strict=True):
         T = found.T_world_camera

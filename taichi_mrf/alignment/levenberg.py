@@ -29,7 +29,7 @@ OBSERVABLE = 0.005
 
 @dataclass(frozen=True)
 class Aligned:
-    """Where a level ended, with the equations there and how many of the six directions were determined."""
+    """End of a level: its pose, the equations there and how many of the six directions were determined."""
 
     T_world_camera: Pose
     equations: NormalEquations

@@ -1,4 +1,4 @@
-"""Where a depth image that is no keyframe was taken: where it fits what keyframes have measured."""
+"""Pose of a depth image that is no keyframe: where it fits what keyframes have measured."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ OBSERVABLE = 0.0005
 drifts: with ten times as much a camera at 30 images a second slid 20 cm along a wall of the built-in room."""
 
 OBSERVABLE_BY_DEPTH = 0.005
-"""The same where the guess is seen in the colours, and right to a centimetre, and where depth would carry the
+"""OBSERVABLE where the guess is seen in the colours, and right to a centimetre, and depth would carry the
 camera far away. With a tenth of it, depth carries a handheld camera 32 cm away from where colours show it."""
 
 WELL = 0.7
@@ -66,7 +66,7 @@ AHEAD_M = 1.0
 
 @dataclass(frozen=True)
 class Located:
-    """Where an image was taken, the (4, 4) ``T_world_camera``; None if that is not known, for ``reason``.
+    """Pose of an image, the (4, 4) ``T_world_camera``; None if that is not known, for ``reason``.
 
     ``overlap`` is the share of its points with a surface near them, ``agreement`` the share of those that lie
     on it, by Tukey's measure; ``residual_m`` their RMS distance from it, and ``directions`` how many of the
@@ -143,7 +143,7 @@ class Locator:
             _not_carried_away(levels, T, prior, lever_m, observable)
             for T, prior in zip(guesses, priors, strict=True)
         ]
-        # Where depth determines too little, ends that fit alike differ in how far they are from their guess.
+        # Ends that fit alike differ in how far they are from their guess if depth determines too little.
         worth = max(end.equations.worth for end in ends)
         costs = [
             worth * end.equations.cost + prior.cost(end.T_world_camera)
@@ -179,8 +179,8 @@ class Locator:
 def _not_carried_away(
     levels: Sequence[PointToPlane], guess: Pose, prior: Recorded, lever_m: float, observable: float
 ) -> Aligned:
-    """Where a search from a guess ends, and if that is far from there, without the directions that depth
-    determines badly, unless these change little."""
+    """End of a search from a guess. If it is far from there, directions that depth determines badly are left
+    out, unless they change little."""
     end = aligned(levels, guess, prior, lever_m, observable)
     if tangent_norms(guess, end.T_world_camera)[1] < CARRIED_M:
         return end
@@ -190,8 +190,8 @@ def _not_carried_away(
 
 
 def _judged(end: Aligned, reason: str, config: PoseConfig) -> Located:
-    """What became of an image whose search ended at a pose that cannot be relied on for a ``reason``, if that
-    is not "", and if too little of it fits, for that."""
+    """Verdict on an image whose search has ended: its pose cannot be relied on if ``reason`` is not "", or if
+    too little of the image fits."""
     overlap, agrees = end.equations.overlap, agreement(end.equations)
     if overlap < config.min_overlap:
         reason = (

@@ -1,4 +1,4 @@
-"""Where a scan of a sensor that sees around was taken, if nothing near the guesses will do.
+"""Pose of a scan of a sensor that sees around, if nothing near the guesses will do.
 
 The poses that a wide search proposes are aligned from coarse to fine, fewer at each level. The one that fits
 best counts, unless another place fits almost as well: in a hall of equal bays a scan may lie in any.
@@ -32,9 +32,9 @@ FREE_M, FREE_RAD = 0.5, 0.2
 tells nothing."""
 
 UNMAPPED = 0.25
-"""What a point without a surface near it counts against a pose, of what one beside a surface does. A scan
-around the corner sees much that is not mapped yet. If that counted as much, one of 50 scans of a real
-building, two steps ahead of the map, would fit two places 6.5 m apart alike."""
+"""Cost of a point without a surface near it, relative to one beside a surface. A scan around the corner sees
+much that is not mapped yet. If that counted as much, one of 50 scans of a real building, two steps ahead of
+the map, would fit two places 6.5 m apart alike."""
 
 SURPRISE = 0.02
 """By how much better a pose has to fit for each squared spread between it and where it is expected. Without
@@ -67,7 +67,7 @@ FINER, FINEST = 8, 3
 
 @dataclass(frozen=True)
 class Place:
-    """Where an alignment ended, the share of the map that the scan looks ``through`` from there, and what the
+    """End of an alignment, the share of the map that the scan looks ``through`` from there, and what the
     place is ``worth``, at most 1."""
 
     end: Aligned
@@ -100,7 +100,7 @@ def found_around(
         return places
 
     places = aligned_at(0, candidates(points, surface.planes(), around))
-    # Where depth tells little of the position, what is expected tells more: the same turned, but there.
+    # If depth tells little of the position, the expected one tells more: the same turn is tried there.
     turned = [place.end.T_world_camera.copy() for place in distinct(places, NEAR_M)[:2]]
     for T in turned:
         T[:3, 3] = around.expected_m

@@ -87,7 +87,7 @@ def _followed(
 
 
 def _pose_of(points: NDArray[np.float64], seen: NDArray[np.float64], camera: PinholeCamera) -> Pose | None:
-    """Where a camera is that sees points (n, 3) at columns and rows (n, 2)."""
+    """Pose of a camera that sees points (n, 3) at columns and rows (n, 2); None if too few agree."""
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
     found, rotation, position, agree = cv2.solvePnPRansac(
         points, seen, K, None, reprojectionError=AGREE_PX, iterationsCount=200, confidence=0.999

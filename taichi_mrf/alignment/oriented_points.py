@@ -23,7 +23,7 @@ WINDOW = 0.016
 of that leaves so much noise in the normals that poses of small images are wrong by centimetres."""
 
 LEAST_WINDOW = 2
-"""The same in pixels, at least."""
+"""Least half side of that square, in pixels."""
 
 MOST_STEPS = 4
 """A wider square than this many pixels to each side is looked at in wider steps."""

@@ -17,7 +17,7 @@ from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.geometry.poses import Pose
 
 PAIR_SIGMA_M = 0.002
-"""What the alignment of two single images is worth along the direction that it determines best, in metres."""
+"""Sigma of the alignment of two single images along the direction that it determines best, in metres."""
 
 DETERMINED = 0.003
 """Least share of the largest eigenvalue that a direction needs to count as determined. Steps of a handheld
@@ -29,7 +29,7 @@ FEWEST_SURFELS = 50
 
 @dataclass(frozen=True)
 class PairFit:
-    """Where an image fits a surface: ``T_world_camera`` (4, 4), with the ``information`` (6, 6) of its twist
+    """Fit of an image to a surface: ``T_world_camera`` (4, 4), with the ``information`` (6, 6) of its twist
     in the camera's frame, 0 along directions that are not determined: there the pose is the guess.
     ``overlap``, ``agreement`` and ``directions`` as in Located; ``cost`` is what ends of searches are
     compared by."""

@@ -21,7 +21,7 @@ from taichi_mrf.alignment.point_to_plane import LARGEST_COST, TUKEY
 from taichi_mrf.geometry.poses import Pose
 
 COLOR_SIGMA_RAD = 5e-4
-"""What the alignment of two pictures is worth, in radians."""
+"""Sigma of the alignment of two pictures, in radians."""
 
 LEAST_POINTS = 20
 """Fewer points in the picture tell nothing."""

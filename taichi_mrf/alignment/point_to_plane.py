@@ -32,7 +32,7 @@ TUKEY = 4.685
 """Sigmas beyond which a residual has no weight (95% efficiency for normal errors)."""
 
 LARGEST_COST = TUKEY**2 / 6
-"""What a residual beyond that costs, and a point that has no surface near it."""
+"""Cost of a residual beyond that, and of a point that has no surface near it."""
 
 REACH = 0.6
 """Standard deviation, in cells, of the weight that a surfel has by its distance from a point."""

@@ -19,7 +19,7 @@ from taichi_mrf.config.schema import PoseConfig
 from taichi_mrf.geometry.poses import Pose, inverse
 
 SURFACE_SIGMA_M = 0.001
-"""What the alignment of two surfaces is worth, in metres."""
+"""Sigma of the alignment of two surfaces, in metres."""
 
 
 class Recorded:
@@ -45,7 +45,7 @@ class Recorded:
 
 
 class KnownPoses(Protocol):
-    """What is known of the poses of some keyframes, in a fixed order, as a quadratic cost."""
+    """Known poses of some keyframes, in a fixed order, as a quadratic cost."""
 
     def add_to(self, equations: PoseEquations, poses: Sequence[Pose]) -> None:
         """Add the cost's derivatives at some poses."""

@@ -23,7 +23,7 @@ IN_PLACE = 0.01
 
 @dataclass(frozen=True)
 class RefinedPose:
-    """What became of a keyframe's pose.
+    """Outcome of the refinement of a keyframe's pose.
 
     ``T_world_camera`` is where it stands now and ``T_before`` where it stood; ``translation_m`` and
     ``rotation_rad`` are how far it was moved. Residuals are the robust RMS distance of its points from the

@@ -52,7 +52,7 @@ def _rotation_vector(R: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _left_jacobian(omega: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What a rotation does to the translation of the same twist, (3, 3)."""
+    """Effect of a rotation on the translation of the same twist, (3, 3)."""
     angle = float(np.linalg.norm(omega))
     first, second = 0.5 - angle**2 / 24, 1 / 6 - angle**2 / 120
     if angle > _SMALL:

@@ -21,7 +21,7 @@ MARGIN_M, MARGIN = 0.3, 0.03
 """By how much a measurement has to be beyond a surface, in metres and as a share of range."""
 
 THROUGH_M = 0.1
-"""The same in metres for a camera, whose pixels are finer than those bins."""
+"""The margin in metres for a camera, whose pixels are finer than those bins."""
 
 LEAST_FACING = 0.3
 """Cosine of the largest angle at which a camera's rays meet a surface that counts."""

@@ -18,7 +18,7 @@ _HALF = 1 << 20
 """Cells are numbered from minus this along each axis, three times 21 bits in one int64."""
 
 ROUGHNESS = 0.2
-"""What a surface departs from a plane within a cell, and cells from each other, in cell sizes."""
+"""Departure of a surface from a plane within a cell, and of cells from each other, in cell sizes."""
 
 COHERENT = 0.8
 """Length of the mean of unit normals below which a cell holds an edge, or both sides of a sheet."""
@@ -50,7 +50,7 @@ class Surfels:
         return Surfels(self.keys[rows], self.sums[rows], self.cell_size)
 
     def coarser(self, factor: int) -> "Surfels":
-        """The same in cells ``factor`` times as wide."""
+        """The sums in cells ``factor`` times as wide."""
         if factor == 1:
             return self
         return _summed(_keys_of(self.cells // factor), self.sums, self.cell_size * factor)

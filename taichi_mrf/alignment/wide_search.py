@@ -1,4 +1,4 @@
-"""Where a sensor that sees around may be, metres and any turn from where it was: correlative scan matching.
+"""Correlative scan matching: the wide search for a sensor that sees around, metres and any turn away.
 
 Floors and ceilings tell which way is up. Then every heading is tried at every place of a grid (Olson,
 "Real-time correlative scan matching", 2009). A pose counts the points of the scan that fall into, or next to,
@@ -63,7 +63,7 @@ _FOUND_BY = float(np.cos(np.radians(40.0)))
 
 @dataclass(frozen=True)
 class Around:
-    """Where a wide search looks: up to ``reach_m`` from a (4, 4) pose, at the same height. ``up`` (3,) is
+    """Space of a wide search: up to ``reach_m`` from a (4, 4) pose, at the same height. ``up`` (3,) is
     upwards in the camera frame if it is held level. ``expected_m`` (3,) is where it should be by now, and
     ``spread_m`` the standard deviation of that."""
 
@@ -81,8 +81,8 @@ class Around:
 
 @dataclass(frozen=True)
 class CoarseGrid:
-    """Where there is a surface, and the normals it has: ``cells`` (nx * ny * nz) int32 has the bits of
-    _SIDES. ``lowest`` (3,) is the first cell in a level frame, ``shape`` (3,) how many there are."""
+    """Grid of surfaces and the normals they have: ``cells`` (nx * ny * nz) int32 has the bits of _SIDES.
+    ``lowest`` (3,) is the first cell in a level frame, ``shape`` (3,) how many there are."""
 
     cells: NDArray[np.int32]
     lowest: NDArray[np.int64]

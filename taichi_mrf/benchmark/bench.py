@@ -73,7 +73,7 @@ class BenchRow:
 
     @property
     def targets(self) -> tuple[float, float] | None:
-        """What these two should be at most, where that has been laid down."""
+        """Upper limits of these two, where they have been laid down."""
         return TARGETS.get(round(self.voxel_size, 6))
 
     def to_json(self) -> dict[str, Any]:
@@ -142,7 +142,7 @@ def bench_mapping(
 
 
 def octomap_available() -> bool:
-    """Whether OctoMap's Python binding (the extra ``bench``) is installed."""
+    """True if OctoMap's Python binding (the extra ``bench``) is installed."""
     try:
         import pyoctomap  # noqa: F401
     except ImportError:

@@ -1,4 +1,4 @@
-"""What ``taichi-mrf bench`` measured, drawn: stages beside OctoMap, kernels beside floors, growth."""
+"""Pictures of ``taichi-mrf bench``: stages beside OctoMap, kernels beside floors, growth."""
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -30,7 +30,7 @@ KIND_NAMES = {"unseen": "old keyframes that it does not see", "seen": "old keyfr
 TARGET_NAMES = "target without re-inference", "target of all three"
 KERNELS_DRAWN = 8
 SHORTEST_MS = 0.01
-"""Where the logarithmic scale of kernels begins."""
+"""Lower end of the logarithmic scale of kernels."""
 _DPI = 120
 
 

@@ -1,4 +1,4 @@
-"""What a new keyframe costs, and how much memory the map takes, as old keyframes become more.
+"""Cost of a new keyframe, and memory of the map, as old keyframes become more.
 
 A sequence is mapped in laps, each of which takes other frames of it. Either every lap is moved to a place of
 its own, far from all others, so that a new keyframe sees none of the earlier laps' keyframes; or all laps are
@@ -124,7 +124,7 @@ def measure_growth(
 
 
 def elsewhere(frame: Frame, place: int) -> Frame:
-    """The same frame taken at one of the 3 x 3 places."""
+    """Copy of the frame taken at one of the 3 x 3 places."""
     T_world_camera = frame.T_world_camera.copy()
     T_world_camera[:2, 3] += PLACES_APART_M * (np.array(divmod(place, 3)) - 1.0)
     return replace(frame, T_world_camera=T_world_camera)

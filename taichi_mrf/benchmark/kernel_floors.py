@@ -15,7 +15,7 @@ Floor = Callable[["Work"], float]
 
 @dataclass(frozen=True)
 class Work:
-    """What a keyframe gives its kernels to do.
+    """Work of a keyframe for its kernels.
 
     ``crossed``, ``surface``, ``created`` and ``visible`` are bricks (see inference/keyframe.py); ``met`` are
     the voxels that get a message, ``voxel_steps`` those crossed, each ray's counted. ``message_bytes`` are
@@ -40,7 +40,7 @@ class Work:
 
     @property
     def trace_bytes(self) -> float:
-        """What the trace moves, written once and read once."""
+        """Bytes of the trace, written once and read once."""
         return 0.0 if self.trace_in_cache else 2 * TRACE_BYTES * self.voxel_steps
 
 

@@ -1,4 +1,4 @@
-"""What a new keyframe costs a live map, stage by stage, in seconds of the clock and of the processors.
+"""Cost of a new keyframe in a live map, stage by stage, in seconds of the clock and of the processors.
 
 On a machine that runs other programs too, wall-clock time is of little use; the processors' time, all threads
 of the process together, still does.
@@ -38,7 +38,7 @@ class Seconds:
 
 @dataclass(frozen=True)
 class KeyframeCost:
-    """What one new keyframe has cost.
+    """Cost of one new keyframe.
 
     ``allocate`` chooses its rays, finds out which bricks they cross and makes those that are missing;
     ``own_sweep`` sends its messages; ``reinference`` sweeps those again to whom that was news, of whom there

@@ -1,4 +1,4 @@
-"""Where a new keyframe's time goes: every kernel by Taichi's own profiler, and the host by Python's.
+"""Profile of a new keyframe: every kernel by Taichi's own profiler, and the host by Python's.
 
 Taichi has to be started with ``runtime.init(profile=True)``. On Vulkan, where its profiler does not work with
 so many kernels, launches are timed instead (launches.py), which has a launch's own cost in it. Profiling
@@ -199,7 +199,7 @@ def _owners(function: Any, stats: dict[Any, Any], known: dict[Any, dict[str, flo
 
 
 def _title(function: tuple[str, int, str]) -> str | None:
-    """What a function's own time is listed as; ``None``: as its caller's."""
+    """Title under which a function's own time is listed; ``None``: as its caller's."""
     file, _, name = function
     if file.startswith((TAICHI, *WITHIN_TAICHI)):
         return IN_TAICHI
@@ -209,7 +209,7 @@ def _title(function: tuple[str, int, str]) -> str | None:
 
 
 def _work_of(m: MRFMap, created: int) -> Work:
-    """What the newest keyframe, which has just been swept, has given to do."""
+    """Work of the newest keyframe, which has just been swept."""
     k = m.keyframes[max(m.keyframes)]
     spoken = 0 if k.messages is None else int(np.count_nonzero(k.messages.to_numpy()))
     return Work(

@@ -168,7 +168,7 @@ def _signed_transform(obstacle: NDArray[np.bool_]) -> None:
 def _peers(
     m: MRFMap, points: NDArray[np.float64], starts: NDArray[np.float64], ways: NDArray[np.float64]
 ) -> dict[str, Rate]:
-    """The same map in OctoMap and Open3D, as far as they are installed."""
+    """Rates of OctoMap and Open3D on the same map, as far as they are installed."""
     missing, rates = missing_peers(), {}
     with tempfile.TemporaryDirectory() as folder:
         if "OctoMap" not in missing:
@@ -183,14 +183,14 @@ def _peers(
 
 
 def _octomap_search(path: Path, voxel_size: float, points: NDArray[np.float64]) -> Asked:
-    """What asks OctoMap for the states of points, in one call."""
+    """Function that asks OctoMap for the states of points, in one call."""
     tree = library("pyoctomap", "OctoMap's search needs", "bench").OcTree(voxel_size)
     tree.readBinary(str(path))
     return lambda: tree.getLabels(points)
 
 
 def _open3d_rays(path: Path, starts: NDArray[np.float64], ways: NDArray[np.float64]) -> Asked:
-    """What asks Open3D where rays meet the triangles of cubes."""
+    """Function that asks Open3D where rays meet the triangles of cubes."""
     open3d = library("open3d", "Open3D's rays need", "bench")
     scene = open3d.t.geometry.RaycastingScene()
     scene.add_triangles(open3d.t.geometry.TriangleMesh.from_legacy(open3d.io.read_triangle_mesh(str(path))))

@@ -30,7 +30,7 @@ class Curves:
         return np.sqrt(np.maximum(variance, 0.0))
 
     def in_metres(self, low: float, high: float) -> "Curves":
-        """The same curves over depth, where these are over depth scaled to -1 at ``low``, 1 at ``high``."""
+        """The curves over depth, where these are over depth scaled to -1 at ``low``, 1 at ``high``."""
         terms = self.coefficients.shape[1]
         line = np.array([-(low + high), 2.0]) / (high - low)
         change = np.zeros((terms, terms))

@@ -46,9 +46,9 @@ MAPS, MOST_MAPS = 3, 5
 """Maps that are made for the law, and with those for the prior, at most."""
 
 WILD = 1e-2
-"""Where rays are long (LONG_RAY), as outdoors, a prior of one surface in the mean length of a ray is tried,
-too, and with it this density of outliers per metre, since a prior that expects few surfaces cannot explain
-them."""
+"""Density of outliers per metre that is tried, too, where rays are long (LONG_RAY), as outdoors, with a prior
+of one surface in the mean length of a ray. A prior that expects few surfaces cannot explain outliers
+otherwise."""
 
 LEAST_GAIN = 0.1
 """Nats by which each held-out measurement must be likelier for a prior to take the place of the given one."""
@@ -181,7 +181,7 @@ def sigma_of_glance(
 
 
 def is_default_noise(dataset: Dataset, sensor: SensorConfig) -> bool:
-    """Whether neither the parameters nor the recording say anything of noise."""
+    """True if neither the parameters nor the recording say anything of noise."""
     own, default = dataset.recorded_sigma is not None or dataset.states_pixel_sigma, SensorConfig()
     return not own and all(getattr(sensor, name) == getattr(default, name) for name in NOISE)
 

@@ -57,7 +57,7 @@ class MotionCaptureConfig:
     """The time lag between the two streams is sought up to this many seconds either way."""
 
     largest_gap: float = 0.05
-    """Where poses of motion capture lie further apart than this (seconds), nothing is interpolated."""
+    """Largest gap between poses of motion capture (seconds); within a larger one nothing is interpolated."""
 
     least_correlation: float = 0.6
     """Least correlation of the board's speeds in the images with those in motion capture; below it the

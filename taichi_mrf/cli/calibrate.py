@@ -1,4 +1,4 @@
-"""What ``taichi-mrf calibrate`` does: find the ground truth, learn, write the files, print the report."""
+"""Command ``taichi-mrf calibrate``: find the ground truth, learn, write the files, print the report."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What ``taichi-mrf diff`` does: load two maps, compare them, write the changes, print a table."""
+"""Command ``taichi-mrf diff``: load two maps, compare them, write the changes, print a table."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What ``taichi-mrf doctor`` does: look at some frames, and say which flag mends what is odd."""
+"""Command ``taichi-mrf doctor``: look at some frames, and say which flag mends what is odd."""
 
 import json
 import shlex

@@ -1,4 +1,4 @@
-"""What ``taichi-mrf export`` does: check the names, load the map, write each file, print the list."""
+"""Command ``taichi-mrf export``: check the names, load the map, write each file, print the list."""
 
 import json
 import math

@@ -31,7 +31,7 @@ class Flag:
 
     @property
     def positional(self) -> bool:
-        """Whether it is an argument without a name."""
+        """True if it is an argument without a name."""
         return not self.name.startswith("--")
 
     def shown(self) -> str:
@@ -99,7 +99,7 @@ def _default(flag: Flag) -> str:
 
 
 def _metavar(hint: Any) -> str:
-    """What follows a flag of this type."""
+    """Placeholder for the value after a flag of this type."""
     if hint is bool:
         return ""
     if typing.get_origin(hint) is Literal:

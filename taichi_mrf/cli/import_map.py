@@ -1,4 +1,4 @@
-"""What ``taichi-mrf import`` does: read an OctoMap file, write it as a LogOddsMap, print its size."""
+"""Command ``taichi-mrf import``: read an OctoMap file, write it as a LogOddsMap, print its size."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""What ``taichi-mrf info`` says of a saved map: method, voxel size, extent, keyframes, configuration."""
+"""Facts of a saved map for ``taichi-mrf info``: method, voxel size, extent, keyframes, configuration."""
 
 import zipfile
 from collections.abc import Callable
@@ -25,7 +25,7 @@ Facts = dict[str, Any]
 
 
 def is_map(source: str) -> bool:
-    """Whether the name is that of a saved map: the file of a run, a map in chunks, a file of OctoMap's.
+    """True if the name is that of a saved map: the file of a run, a map in chunks, a file of OctoMap's.
 
     An .npz of other arrays, such as laser scans, is not a map.
     """
@@ -37,7 +37,7 @@ def is_map(source: str) -> bool:
 
 
 def map_facts(source: str) -> Facts:
-    """What is in a saved map, as plain values, lengths in metres. Raises MapFileError."""
+    """Facts of a saved map, as plain values, lengths in metres. Raises MapFileError."""
     path = Path(source)
     made = datetime.fromtimestamp(path.stat().st_mtime).astimezone().isoformat(timespec="seconds")
     return {"map": source, **_READERS[path.suffix.lower()](path), "written": made}

@@ -1,4 +1,4 @@
-"""What ``taichi-mrf live`` does: start the page, map, and leave the files when it ends."""
+"""Command ``taichi-mrf live``: start the page, map, and leave the files when it ends."""
 
 import time
 from collections.abc import Callable

@@ -84,7 +84,7 @@ def parse(arguments: Sequence[str]) -> tuple[Command, Any]:
 
 
 def in_one_line(box: str) -> str:
-    """What tyro says of arguments in a box of several lines: the first part of it, without the frame."""
+    """Message of tyro from a box of several lines about arguments: the first part, without the frame."""
     is_rule = re.compile(r"\s*[-─╰]{5,}").match
     lines = [line.strip("│").rstrip() for line in box.splitlines()[1:]]  # the first is a title
     first = itertools.takewhile(lambda line: not is_rule(line), itertools.dropwhile(is_rule, lines))
@@ -109,7 +109,7 @@ def _refuse_unknown_flags(program: str, command: Command, arguments: Sequence[st
 
 
 def _set_elsewhere(flag: str) -> str:
-    """Where a mapping parameter is set that has no flag, or what became of it; "" for all other flags."""
+    """Place where a mapping parameter without a flag is set, or what became of it; "" for all other flags."""
     owner: Any = config.Config
     flagged = filed = True
     path = flag.removeprefix("--").replace("-", "_")
@@ -127,7 +127,7 @@ def _set_elsewhere(flag: str) -> str:
 
 
 def overview() -> str:
-    """What the program is, and every command with the first sentence of its help."""
+    """Overview of the program: what it is, and every command with the first sentence of its help."""
     width = max(map(len, COMMANDS))
     lines = [f"usage: {PROGRAM} COMMAND ...", "", _ABOUT, "", "commands:"]
     lines += [f"  {name:{width}}  {_first_sentence(command.options)}" for name, command in COMMANDS.items()]

@@ -1,4 +1,4 @@
-"""What ``taichi-mrf tune`` does: start the page, try parameters, and leave the files when it ends."""
+"""Command ``taichi-mrf tune``: start the page, try parameters, and leave the files when it ends."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -97,7 +97,7 @@ def _page(options: Tune, print_line: PrintLine, stack: ExitStack) -> ViewerLink:
 def _learn_noise(
     settings: Config, dataset: "Dataset", choice: FrameChoice, progress: ProgressBar, request: StopRequest
 ) -> "LearntSigma":
-    """What the recording says of its noise, learnt from frames that score no map. Raises TaichiMRFError."""
+    """Noise learnt from those frames of the recording that score no map. Raises TaichiMRFError."""
     from taichi_mrf.cli.shared.learn_noise import learn_noise
     from taichi_mrf.datasets.derived import chosen
     from taichi_mrf.tune.working_set import split_indices

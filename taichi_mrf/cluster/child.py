@@ -53,7 +53,7 @@ def answer_to(payload: bytes) -> bytes:
 
 
 def pickled_task(function: Callable[[Any], Any], task: Any) -> bytes:
-    """What :func:`answer_to` takes."""
+    """Bytes of a function and its task, as :func:`answer_to` takes them."""
     return pickle.dumps((function, task))
 
 
@@ -72,7 +72,7 @@ def write_block(stream: IO[bytes], block: bytes) -> None:
 
 
 def read_block(stream: IO[bytes]) -> bytes | None:
-    """What :func:`write_block` wrote; None if the stream ends before the block does."""
+    """Block that :func:`write_block` wrote; None if the stream ends before the block does."""
     head = _read(stream, _LENGTH.size)
     if len(head) < _LENGTH.size:
         return None

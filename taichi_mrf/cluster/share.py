@@ -7,7 +7,7 @@ from taichi_mrf.system.devices import cores
 
 VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"
 THREADS = ("TI_CPU_MAX_NUM_THREADS", "QD_CPU_MAX_NUM_THREADS", "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
-"""What Taichi, NumPy's BLAS and OpenCV read; ``runtime.threads``, where it is given, wins over the first."""
+"""Variables that Taichi, NumPy's BLAS and OpenCV read; ``runtime.threads``, if given, overrides the first."""
 
 
 def gpus() -> list[str]:

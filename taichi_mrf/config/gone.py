@@ -45,8 +45,7 @@ it."""
 
 
 def note_gone(section: str, key: str, value: object) -> str | None:
-    """What to say of a parameter that is no more: nothing ("") if its value was the default; None if there
-    never was one of this name."""
+    """Note on a removed parameter: "" if its value was the default; None if none ever had this name."""
     known = GONE.get(section, {}).get(key)
     if known is None:
         return None

@@ -15,7 +15,7 @@ class Method:
     """A mapping method: its names, its section of the configuration, its class and what its maps can do."""
 
     name: str
-    """What ``Config.method``, ``--method`` and map files call it."""
+    """Name of the method in ``Config.method``, ``--method`` and map files."""
 
     summary: str
     """The method in a few words, for the help of ``--method``."""
@@ -27,8 +27,8 @@ class Method:
     """The field of ``Config`` that holds its parameters, its own or those of a method that it resembles."""
 
     map_class: str
-    """Where the class of its maps is, ``package.module:Class``. It is imported when the first map is made,
-    because it brings Taichi and its kernels."""
+    """Class of its maps, ``package.module:Class``. It is imported when the first map is made, because it
+    brings Taichi and its kernels."""
 
     sliders: tuple[Slider, ...] = ()
     """The parameters of its section that the tuning page offers, in the order of the page."""
@@ -61,7 +61,7 @@ class Method:
     live page shows its map of the same keyframes as the baseline. One method has this."""
 
     if_empty: str = ""
-    """What to try when a map of this method has no occupied voxel, as the end of a sentence."""
+    """Advice for a map of this method without occupied voxels, as the end of a sentence."""
 
     @property
     def class_name(self) -> str:

@@ -1,5 +1,5 @@
-"""Where a parameter can be set: all in Python, by far not all in files, and by flags what changes from run to
-run."""
+"""Places where a parameter can be set: all in Python, by far not all in files, and by flags those that change
+from run to run."""
 
 import dataclasses
 from typing import Any, TypeVar, cast
@@ -21,10 +21,10 @@ def in_python(default: T) -> T:
 
 
 def has_flag(field: "dataclasses.Field[Any]") -> bool:
-    """Whether a command has a flag for a field, or flags for its fields."""
+    """True if a command has a flag for a field, or flags for its fields."""
     return bool(field.metadata.get("flag", True))
 
 
 def is_in_files(field: "dataclasses.Field[Any]") -> bool:
-    """Whether a file of parameters may set a field."""
+    """True if a file of parameters may set a field."""
     return bool(field.metadata.get("file", True))

@@ -67,10 +67,9 @@ class SensorConfig:
     """Rays end at this depth (metres). A measurement beyond it only marks the space up to it as free."""
 
     no_return: Literal["ignore", "free", "model"] = "ignore"
-    """What MRFMap concludes where frames name the pixels that got no return: nothing; that the way up to
-    ``no_return_depth`` is free; or that each surface on the way has given none by chance, which ``model``
-    gives by ``no_return_share``, ``no_return_depth`` and ``no_return_width``. A log-odds map knows ``free``
-    alone."""
+    """How MRFMap uses pixels that frames name as having got no return: not at all; as a free way up to
+    ``no_return_depth``; or as a chance that each surface on the way gave none, which ``model`` gives by
+    ``no_return_share``, ``no_return_depth`` and ``no_return_width``. A log-odds map knows ``free`` alone."""
 
     no_return_share: float = in_files(0.3)
     """Chance that a near surface gives no return, below 0.5: the share of dark, wet and shiny ones."""
@@ -189,8 +188,8 @@ class VolumeConfig:
     """A voxel counts as unknown if its log-odds differ from the prior by less than this."""
 
     origin: tuple[float, float, float] = in_files((0.0, 0.0, 0.0))
-    """Where the map's origin is in the recorded world (metres), which is far away if that is a country's.
-    A recording sets it; files with room for it have coordinates of the recorded world."""
+    """The map's origin in the recorded world (metres), which is far away if that is a country's. A recording
+    sets it; files with room for it have coordinates of the recorded world."""
 
     def __post_init__(self) -> None:
         check_field((self.lower is None) == (self.upper is None), "volume.lower", "goes with volume.upper")
@@ -301,7 +300,7 @@ class Config:
 
 
 def without_window(config: Config) -> Config:
-    """The same parameters for a map that is in memory as a whole."""
+    """Copy of the parameters for a map that is in memory as a whole."""
     return dataclasses.replace(config, volume=dataclasses.replace(config.volume, window_m=0.0))
 
 
@@ -314,7 +313,7 @@ def load(path: str | Path) -> Config:
 
 
 def with_absolute_tables(config: Config, folder: Path) -> Config:
-    """The same configuration with the paths of noise tables, if relative, taken from ``folder``."""
+    """Copy of the configuration whose relative paths of noise tables are taken from ``folder``."""
     tables: dict[str, Any] = {
         name: str((folder / table).resolve())
         for name in ("sigma_table", "bias_table")

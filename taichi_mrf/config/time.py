@@ -37,7 +37,7 @@ class TimeConfig:
 
     @property
     def is_static(self) -> bool:
-        """Whether the world never changes."""
+        """True if the world never changes."""
         return self.half_life_s == 0
 
     @property

@@ -1,4 +1,4 @@
-"""What is odd of a recording, in words and in the flags that mend it."""
+"""Diagnosis of a recording: what is odd, in words and in the flags that mend it."""
 
 import math
 from dataclasses import asdict, dataclass, field, replace
@@ -99,8 +99,8 @@ def mistakes(dataset: Dataset) -> list[str]:
 
 
 def mistakes_at_a_glance(dataset: Dataset, seconds: float = 1.0) -> list[str]:
-    """The same, and soon, before anything is mapped: none if most of the frames that can be read in so many
-    seconds explain each other, or if they are too few to tell."""
+    """Mistakes of a recording, found soon, before anything is mapped: none if most of the frames that can be
+    read in so many seconds explain each other, or if they are too few to tell."""
     if dataset.endless or dataset.tracked:
         return []
     try:
@@ -114,7 +114,7 @@ def mistakes_at_a_glance(dataset: Dataset, seconds: float = 1.0) -> list[str]:
 
 
 def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> list[Finding]:
-    """What the best reading has other than the given one. Each finding of poses has the flag of them all."""
+    """Differences of the best reading from the given one. Those of poses have the flag of them all."""
     poses = next((flag for flag in best.flags() if flag.startswith("--poses-are")), "--poses-are ''")
     found = []
     if best.w_first != given.w_first:
@@ -152,7 +152,7 @@ def _steps(sample: Sample) -> float:
 
 
 def _swapped_images(source: Dataset) -> Finding | None:
-    """Whether far more of a stereo recording's pixels are matched with the left and right images swapped."""
+    """Finding if far more of a stereo recording's pixels match with the left and right images swapped."""
     if not isinstance(source, StereoPairs) or not len(source):
         return None
     swapped = [replace(p, left_file=p.right_file, right_file=p.left_file) for p in source.pairs]

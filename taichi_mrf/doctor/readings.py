@@ -40,7 +40,7 @@ LENSES: dict[str, Callable[[PinholeCamera], PinholeCamera]] = {
     "have fx and fy swapped": lambda k: replace(k, fx=k.fy, fy=k.fx),
     "have x and y swapped": lambda k: replace(k, fx=k.fy, fy=k.fx, cx=k.cy, cy=k.cx),
 }
-"""What is wrong with the intrinsics, and the camera that they should be."""
+"""Faults of intrinsics, and the camera that they should be."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Reading(Conventions):
     """One way to understand a recording: its conventions, and what its unit and its intrinsics should be."""
 
     factor: float = 1.0
-    """What depths as they are read must be multiplied by."""
+    """Factor by which depths as they are read must be multiplied."""
 
     lens: str = ""
     """A key of LENSES; empty if the intrinsics are right."""

@@ -32,7 +32,7 @@ QUESTIONS = {
     "lens": "the size of the intrinsics' images",
     "late_s": "the time of poses",
 }
-"""What each field of a reading answers."""
+"""Question that each field of a reading answers."""
 
 _WORST = 0.2
 _EXPLAINING = 0.5
@@ -116,7 +116,7 @@ class Search:
         return float(found[told].mean() * whole[usable].mean() / whole[told].mean())
 
     def clearly_better(self, one: Reading, other: Reading) -> bool:
-        """Whether frames explain each other with the one, and differ by more than twice as much with the
+        """True if frames explain each other with the one, and differ by more than twice as much with the
         other."""
         best = self.score(one)
         return best <= EXPLAINED and _BETTER * (best + _NOISE) < self.score(other) + _NOISE

@@ -1,4 +1,4 @@
-"""What the search needs of a recording: some of its frames thinned out, poses around them, and pairs.
+"""Sample of a recording for the search: some of its frames thinned out, poses around them, and pairs.
 
 Pairs are chosen by how many frames lie between, and not by the poses, so that every assumption about poses is
 tried on the same ones.

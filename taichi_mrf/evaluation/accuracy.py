@@ -32,7 +32,7 @@ a constant sigma of one voxel (section V). 5cm: within 5 cm of its middle (the p
 within 1.5 sigma of what the sensor would measure there, bias and sigma being the sensor's own."""
 
 NOT_JUDGED, NO_ANSWER, WRONG, RIGHT = 0, 1, 2, 3
-"""What a pixel of an accuracy image can be."""
+"""Values of a pixel of an accuracy image."""
 
 FACE = 0.01
 """A depth this share of a voxel outside the answer's voxel still counts as in it: surfaces like to lie
@@ -108,7 +108,7 @@ class JudgedView:
         return np.where(self.answered, self.survey.middle, np.float32(np.nan))
 
     def by_surface(self, surface_m: NDArray[np.float32]) -> "JudgedView":
-        """The same view judged by the map's measured surface: (H, W) its axial depth, NaN where it is not
+        """Copy of the view, judged by the map's measured surface: (H, W) its axial depth, NaN where it is not
         near the likeliest voxel (queries.measured_depth), which then stays the answer.
 
         ``voxel`` is half a voxel to each side of the surface. A measurement is distributed around it with the

@@ -41,7 +41,7 @@ def depth_error(rendered_m: NDArray[np.floating], measured_m: NDArray[np.floatin
 def pooled_depth_error(
     pairs: Iterable[tuple[NDArray[np.floating], NDArray[np.floating]]],
 ) -> DepthError:
-    """The same over the pixels of several (rendered, measured) images together.
+    """Depth error over the pixels of several (rendered, measured) images together.
 
     The residuals are pooled: a median of medians would weigh an almost empty image like a full one.
     """

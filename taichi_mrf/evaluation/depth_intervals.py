@@ -42,7 +42,7 @@ INTERVAL_PIXELS = 5_000
 
 @ti.dataclass
 class Prediction(Struct):
-    """What is known of a ray on its way from the camera; depths are axial, in metres."""
+    """State of a ray on its way from the camera; depths are axial, in metres."""
 
     voxels_per_depth: F32
     measured: F32
@@ -84,7 +84,7 @@ def probability_below(
 
 
 def view_below(view: View, judged: JudgedView, T_world_camera: Pose, camera: Camera) -> NDArray[np.float32]:
-    """The same, (n,), for some of the measurements of a judged view, evenly spread over its rows."""
+    """:func:`probability_below`, (n,), of some measurements of a judged view, evenly spread over its rows."""
     pixels = np.flatnonzero(judged.measured_m)
     some = np.zeros_like(judged.measured_m)
     kept = pixels[:: max(1, len(pixels) // INTERVAL_PIXELS)]
@@ -130,7 +130,7 @@ def _mean_below(low: F32, high: F32) -> F32:
 
 @dataclass(frozen=True)
 class _Predicted(Bundle):
-    """What a step along a ray reads: log-odds (pool * 512), how voxels dim the ray, and the noise of its
+    """Inputs of a step along a ray: log-odds (pool * 512), how voxels dim the ray, and the noise of its
     pixel."""
 
     belief: F32Array

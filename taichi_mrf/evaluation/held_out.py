@@ -26,7 +26,7 @@ class HeldOutCheck:
 
 
 class RenderedMap(Protocol):
-    """What predicts depth."""
+    """A map that predicts depth."""
 
     def render_depth(self, camera: Camera, T_world_camera: ArrayLike) -> NDArray[np.float32]: ...
 

@@ -1,4 +1,4 @@
-"""Whether a map's noise fits what held-out frames measured: a wrong noise file is noticed here."""
+"""Check of a map's noise against what held-out frames measured: a wrong noise file is noticed here."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -44,7 +44,7 @@ class NoiseCheck:
 
     @property
     def wrong(self) -> bool:
-        """Whether sigma is off."""
+        """True if sigma is off."""
         return self.law is not None
 
 

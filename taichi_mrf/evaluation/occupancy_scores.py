@@ -98,7 +98,7 @@ class OccupancyScores:
 
     @staticmethod
     def from_json(values: dict[str, Any]) -> "OccupancyScores":
-        """What :meth:`to_json` has given."""
+        """Scores from what :meth:`to_json` has given."""
         bins, roc = values["reliability"], values["roc"]
         reliability = ReliabilityBins(
             np.asarray(bins["edges"], np.float64),

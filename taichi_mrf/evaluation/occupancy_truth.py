@@ -27,7 +27,7 @@ from taichi_mrf.voxels.window import Window
 
 @dataclass(frozen=True)
 class OccupancyTruth:
-    """What is known for certain of the voxels of a window, one bit for each: :func:`occupancy_truth`."""
+    """True states of a window's voxels where they are certain, one bit each: :func:`occupancy_truth`."""
 
     window: Window
     occupied_marks: Marks

@@ -40,7 +40,7 @@ _LATEX = str.maketrans(
     {mark: rf"\{mark}" for mark in "&%_#${}"}
     | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 )
-"""What means something to LaTeX, as it is printed."""
+"""Replacements of the characters that mean something to LaTeX."""
 
 
 @dataclass(frozen=True)

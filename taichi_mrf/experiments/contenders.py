@@ -12,7 +12,7 @@ from taichi_mrf.experiments.scenes import Scene
 from taichi_mrf.methods.protocol import OccupancyMap
 
 VISIBILITY_TABLE_I: dict[str, Any] = {"visible_if_occluded": 0.2}
-"""Where Table I of Schauwecker & Zell differs from the defaults of VisibilityMap."""
+"""Differences of Table I of Schauwecker & Zell from the defaults of VisibilityMap."""
 
 BOTH: dict[str, dict[str, float]] = {"all leaves": {"empty_below": -1e30}, "occupied leaves": {}}
 """Readings of a recursive map: as the metric has it, every known voxel dims a ray; and as such maps are used,
@@ -41,7 +41,7 @@ class Contender:
 
 
 def row_name(contender: str, reading: str) -> str:
-    """What a contender's row is called."""
+    """Name of a contender's row."""
     return f"{contender}, {reading}" if reading else contender
 
 
@@ -56,7 +56,7 @@ def mrf(name: str = "MRFMap", **parameters: Any) -> Contender:
 
 
 def lidar_mrf(name: str = "MRFMap", **parameters: Any) -> Contender:
-    """The same with the chance that a lidar's beam passes an occupied voxel."""
+    """MRFMap as :func:`mrf` has it, with the chance that a lidar's beam passes an occupied voxel."""
     return mrf(name, pass_through=LIDAR_PASS_THROUGH, **parameters)
 
 

@@ -44,7 +44,7 @@ class Experiment:
     """Patterns of the parts to run, as ``room, 10 Hz`` or ``kitchen*``; empty for all."""
 
     def wants(self, part: str) -> bool:
-        """Whether a part is to be run."""
+        """True if a part is to be run."""
         return not self.only or any(fnmatchcase(part, pattern) for pattern in self.only)
 
 

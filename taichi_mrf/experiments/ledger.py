@@ -48,7 +48,7 @@ class Ledger:
             write_text(path, kept)
 
     def result(self, key: str, compute: Callable[[], Result]) -> Result:
-        """What is known under a key; computed and written down if nothing is yet. Raises MapFileError."""
+        """Result under a key; computed and written down if there is none yet. Raises MapFileError."""
         if key not in self.done:
             found = compute()
             line = json.dumps({"key": key, "result": found}) + "\n"

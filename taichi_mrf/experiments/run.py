@@ -84,7 +84,7 @@ def run_experiment(
 
 
 def _made_with(data: Path) -> dict[str, Any]:
-    """What results depend on beside their keys: the scenes, and the device, on which times depend."""
+    """Conditions of results beside their keys: the scenes, and the device, on which times depend."""
     choice = runtime.choice()
     return {
         "version": taichi_mrf.__version__,

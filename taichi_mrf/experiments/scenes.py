@@ -46,7 +46,7 @@ TURNED = ", turned"
 LIDAR_RANGE_M = 60.0
 
 _UNREADABLE = (OSError, ValueError, EOFError, zipfile.BadZipFile)
-"""What NumPy raises for a file that is missing or damaged."""
+"""Errors that NumPy raises for a file that is missing or damaged."""
 
 COFFIN_SEED = 100
 """View i of noise seed s is drawn with COFFIN_SEED + 1000 s + i."""

@@ -80,7 +80,7 @@ def run_table2(experiment: Experiment) -> tuple[list[Table], list[Path]]:
 def _results(
     experiment: Experiment, scene: Scene, keyframes: Sequence[int], voxel_size: float
 ) -> dict[str, Result]:
-    """What is known of each contender's map: figures of all views, and scores of its probabilities."""
+    """Results of each contender's map: figures of all views, and scores of its probabilities."""
     truths: list[OccupancyTruth] = []  # made when the first map needs it
 
     def compute(contender: Contender) -> Result:

@@ -148,11 +148,11 @@ class ChunkStore:
 
     @property
     def grows(self) -> bool:
-        """Whether chunks can be added to it (growing_store.py)."""
+        """True if chunks can be added to it (growing_store.py)."""
         return self._layout.lowest_chunk == (-FARTHEST,) * 3
 
     def file_of(self, chunk: Sequence[int], name: str = LOG_ODDS) -> Path:
-        """Where a chunk's log-odds, or one of its extras, are, from the store's folder."""
+        """File of a chunk's log-odds, or of one of its extras, from the store's folder."""
         last = () if name == LOG_ODDS else ("0",)
         return Path(name, "c", *map(str, self._place(chunk)), *last)
 

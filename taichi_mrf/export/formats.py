@@ -34,7 +34,7 @@ NO_SURFACE = (
     "the images of keyframes that measured the surface are not in the map, or not of all: map the recording "
     "anew with --keep-surface, or export from the map.npz of a run"
 )
-"""What is missing for a measured surface, and what to do."""
+"""Error for a missing measured surface, and its remedy."""
 
 
 class ExportedMap(StorableMap, Protocol):

@@ -72,7 +72,7 @@ class SurfacedMap(QueriedMap, Protocol):
 
     @property
     def has_surface(self) -> bool:
-        """Whether it holds that of all keyframes that it was made of."""
+        """True if it holds the surface of all keyframes that it was made of."""
         ...
 
     def surface(self) -> FusedSurface:
@@ -85,7 +85,7 @@ class SurfacedMap(QueriedMap, Protocol):
 
 
 def has_surface(m: QueriedMap) -> TypeGuard[SurfacedMap]:
-    """Whether a map holds what all keyframes that it was made of measured of the surface."""
+    """True if a map holds the measured surface of all keyframes that it was made of."""
     return bool(getattr(m, "has_surface", False))
 
 
@@ -188,7 +188,7 @@ def _boxes(field: DistanceSource) -> Iterator[tuple[NDArray[np.int64], Box, Box,
 
 
 def _all_corners(true: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Whether it is true at all 8 corners of each cell; one less along each axis."""
+    """True for a cell if all its 8 corners are true; one less along each axis."""
     for axis in range(3):
         true = np.moveaxis(true, axis, 0)
         true = np.moveaxis(true[1:] & true[:-1], 0, axis)

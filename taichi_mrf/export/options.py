@@ -24,16 +24,16 @@ class ExportOptions:
     """Write a .ply as a mesh by marching cubes, like .glb, .obj and .stl, not as points."""
 
     surface: Literal["auto", "rays", "marginal"] = "auto"
-    """What a mesh shows: rays is the surface that the keyframes' rays measured, below the size of voxels, and
-    marginal where the marginal is the threshold. auto is rays for a map that has keyframes, none frozen, and
-    for a .zarr that holds it. rays also puts it into a .zarr, as auto does after --keep-surface."""
+    """Surface of a mesh: rays is the one that the keyframes' rays measured, below the size of voxels, and
+    marginal lies where the marginal is the threshold. auto is rays for a map that has keyframes, none frozen,
+    and for a .zarr that holds it. rays also puts it into a .zarr, as auto does after --keep-surface."""
 
     cells: bool = True
-    """Where no voxel is likely enough but a cell of 2, 4 or 8 voxels is, show the cell: in a .ply as a point
-    with the property size, in cubes and .html as all its voxels, in .bt and .ot as a larger leaf."""
+    """Show a cell of 2, 4 or 8 voxels where it is likely enough and no voxel is: in a .ply as a point with
+    the property size, in cubes and .html as all its voxels, in .bt and .ot as a larger leaf."""
 
     color_by: Literal["auto", "marginal", "photo"] = "auto"
-    """What colours of .ply, .glb, .obj, .ot, .html and .zarr show: the marginals, or what cameras saw
+    """Source of the colours of .ply, .glb, .obj, .ot, .html and .zarr: the marginals, or what cameras saw
     (photo), if the map was made with colour images; auto is photo for such a map. .ot and .zarr have no
     colours of marginals."""
 

@@ -50,8 +50,7 @@ def write_voxels(
 
 
 def photo_at(m: QueriedMap, points: NDArray[np.floating]) -> NDArray[np.uint8] | None:
-    """What cameras saw at points (N, 3) in metres, for :func:`write_voxels`; None if the map has no
-    colours."""
+    """Colours that cameras saw at points (N, 3) in metres, for :func:`write_voxels`; None without any."""
     return shown_colors(m, points) if is_colored(m) else None
 
 

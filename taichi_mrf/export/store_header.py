@@ -24,7 +24,7 @@ LOG_ODDS, CHUNKS = "log_odds", "chunks"
 COLORS, SURFACE, FIRST = "colors", "surface", "first_surface"
 
 EXTRAS = {COLORS: ("uint8", 4), SURFACE: ("float32", VALUES), FIRST: ("uint8", 1)}
-"""What a store may hold of each voxel beside its log-odds, 0 for nothing: the type and number of values."""
+"""Extras that a store may hold of each voxel, 0 for nothing: the type and number of their values."""
 
 _MOST_BYTES = 1_000_000
 _LARGEST_VOXEL_M = 1000.0
@@ -35,10 +35,10 @@ _KEYS = {"name": "default", "configuration": {"separator": "/"}}
 
 @dataclass(frozen=True)
 class StoreHeader:
-    """What holds for all voxels: ``voxel_size`` in metres, the log-odds of the prior and of space that was
+    """Properties of all voxels: ``voxel_size`` in metres, the log-odds of the prior and of space that was
     seen to be free without a surface near, the evidence from which a voxel counts as known, the configuration
-    as YAML, the version of the package that made the map, and the name of the world axis that is up, empty
-    if it is unknown."""
+    as YAML, the version of the package that made the map, and the name of the world axis that is up, empty if
+    it is unknown."""
 
     voxel_size: float
     prior_log_odds: float

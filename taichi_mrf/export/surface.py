@@ -72,7 +72,7 @@ def voxel_surface(m: QueriedMap, threshold: float, cells: bool = False) -> Surfa
 
 
 def photographed(m: ColoredMap, surface: Surface, of_voxels: bool) -> Surface:
-    """The same surface in the colours that cameras saw. ``of_voxels``: it is a :func:`voxel_surface`."""
+    """The surface in the colours that cameras saw. ``of_voxels``: it is a :func:`voxel_surface`."""
     if of_voxels:
         corners = surface.vertices_m.reshape(-1, 4, 3)
         outwards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1]) / m.voxel_size**2
@@ -84,10 +84,8 @@ def photographed(m: ColoredMap, surface: Surface, of_voxels: bool) -> Surface:
 
 
 def smooth_surface(m: QueriedMap, level: float) -> Surface:
-    """Where the marginal is ``level``, by marching cubes (Lewiner et al. 2003) between the centres of voxels.
-
-    Unknown space counts as empty.
-    """
+    """Surface where the marginal is ``level``: marching cubes (Lewiner et al. 2003) between voxels' centres.
+    Unknown space counts as empty."""
     from skimage import measure  # slow to import
 
     vertices, triangles, values = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.float32)]

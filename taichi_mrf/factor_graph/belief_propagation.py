@@ -164,7 +164,7 @@ class BeliefPropagation:
         energies = (config.energy_explained, config.energy_free, config.energy_wrong)
         if graph.has_table:
             energies = (-graph.largest_energy, graph.largest_energy, 0.0)
-        # What is more certain than every energy and a beam's own message is as good as certain.
+        # A belief more certain than every energy and a beam's own message is as good as certain.
         self.most = int(FINE * (2 * (max(energies) - min(energies)) + 2 * 20))
 
     def iterate(self) -> float:

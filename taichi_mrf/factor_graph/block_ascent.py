@@ -38,7 +38,7 @@ MOST_GIVEN = 4000 * int(UNITS)
 
 @dataclass(frozen=True)
 class _Found(Bundle):
-    """What an iteration finds out, summed up over all beams."""
+    """Findings of an iteration, summed up over all beams."""
 
     given: I64Array
     """(cells): what beams give back."""

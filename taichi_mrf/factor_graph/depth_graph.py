@@ -41,7 +41,7 @@ from taichi_mrf.voxels.window import WindowIndex
 
 @dataclass(frozen=True)
 class _RayFactors(Bundle):
-    """What the factors of all rays have in common (InferenceConfig)."""
+    """Parameters of the factors of all rays (InferenceConfig)."""
 
     voxel_size: F32
     """Metres."""

@@ -90,7 +90,7 @@ def _choose_steps(
     ones: I32Array, degrees: I32Array, rest: I64Array, charged: I64Array, step: ti.f32,
     if_free: I32Array, if_occupied: I32Array, sums: I64Array, whole: Template,
 ):  # fmt: skip
-    """What each cell's multipliers grow by where a slave labels it free (``if_free``), and where occupied
+    """Growth of each cell's multipliers where a slave labels it free (``if_free``), and where occupied
     (``if_occupied``). All arrays are (cells), but ``sums`` (3); values are in units.
 
     ``ones`` of a cell's ``degrees`` slaves label it occupied. ``rest`` is minus the sum of a cell's

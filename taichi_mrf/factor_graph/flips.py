@@ -54,10 +54,8 @@ def after_flip(
 def flip_change(
     cell: I32, labels: Template, base: I32, firsts: Template, beam_base: I32, graph: Template, lists: Template
 ):
-    """What flipping ``cell`` adds to the energy, in units: a sum of integers, so the list's order is free.
-
-    ``graph`` is a BeamGraph, ``lists`` are its CellLists.
-    """
+    """Change of the energy by flipping ``cell``, in units: a sum of integers, so the list's order is free.
+    ``graph`` is a BeamGraph, ``lists`` are its CellLists."""
     occupied = labels[base + cell]
     change = ti.cast(0, ti.i64)
     for i in range(lists.begins[cell], lists.begins[cell + 1]):

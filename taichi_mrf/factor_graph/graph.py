@@ -24,7 +24,7 @@ EDGE_BYTES = 4 + 6 + 4
 """A cell's number; a beam's number and step in the cell's list; a message."""
 
 BEAM_BYTES = 4 + 4 + 28 + 3 * 4
-"""Where its cells begin, whether it hit, its geometry; what a method keeps of it."""
+"""Bytes of a beam: the start of its cells, whether it hit, its geometry; what a method keeps of it."""
 
 CELL_BYTES = 4 + 4 + 4 * 8
 """Its degree, where its beams begin; what a method keeps of it."""
@@ -67,14 +67,14 @@ class FactorGraph:
     """(beams,) int32: 1 where something returned."""
 
     model: ti.Ndarray
-    """What the sensor model needs of each beam: (beams, 7) float32, its origin, direction and range in cell
-    sizes from the grid's lowest corner; or, with ``has_table``, (edges + beams, 1) float32, its energies."""
+    """Sensor model of each beam: (beams, 7) float32, its origin, direction and range in cell sizes from the
+    grid's lowest corner; or, with ``has_table``, (edges + beams, 1) float32, its energies."""
 
     degrees: ti.Ndarray
     """(cells,) int32: the beams that cross a cell; 0 for a disconnected one."""
 
     has_table: bool = False
-    """Whether ``model`` holds the energies themselves: of beam f, from ``begins[f] + f`` on, one for each of
+    """True if ``model`` holds the energies themselves: of beam f, from ``begins[f] + f`` on, one for each of
     its cells to be the first occupied one, and one for none."""
 
     @cached_property

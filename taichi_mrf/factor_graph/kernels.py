@@ -8,7 +8,7 @@ from taichi_mrf.voxels.traversal import advance, enter, leave_at, make_ray, with
 
 @ti.dataclass
 class _Place(Struct):
-    """Where a beam's next cell is written."""
+    """Place for a beam's next cell."""
 
     next: ti.i32
 

@@ -24,7 +24,7 @@ from taichi_mrf.kernels.types import F32, I32, I32Array, I64Array, Template
 from taichi_mrf.system.compiler import ti
 
 PROPOSAL, ACCEPTANCE = 0, 1
-"""What a random number is for."""
+"""Purposes of a random number."""
 
 
 @ti.func

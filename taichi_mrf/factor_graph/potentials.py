@@ -159,7 +159,7 @@ class BeamGraph(Bundle):
 
     @ti.func
     def is_explained(self, beam: Beam, first: I32, energy: F32):
-        """Whether ``first`` is what the beam's measurement asks for."""
+        """True if ``first`` is what the beam's measurement asks for."""
         explained = ti.cast(first == beam.steps - beam.hit, ti.i32)
         if ti.static(self.kind == TABLE):
             least = energy

@@ -30,7 +30,7 @@ PROVED = 1e-9
 
 @dataclass(frozen=True)
 class Step:
-    """Where a method stands after an iteration."""
+    """State of a method after an iteration."""
 
     seconds: float
     """Since the method began, compiling kernels included."""
@@ -51,7 +51,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Solution:
-    """What a method found; the labelling is that of the least energy which it came across."""
+    """Result of a method; the labelling is that of the least energy which it came across."""
 
     labels: NDArray[np.uint8]
     """(cells,): 1 for occupied. A cell that no beam crosses is free."""
@@ -69,7 +69,7 @@ class Solution:
 
 
 class _Iterative(Protocol):
-    """What an iterative method is to :func:`solve`."""
+    """Interface of an iterative method, as :func:`solve` needs it."""
 
     def iterate(self) -> float: ...
 

@@ -26,7 +26,7 @@ class Workers(Bundle):
 
     @ti.func
     def begin(self, worker: I32, first: I32, end: I32):
-        """Where a worker's part of first .. end begins; it ends where the next worker's does."""
+        """Start of a worker's part of first .. end; it ends where the next worker's starts."""
         return first + ti.cast(ti.cast(end - first, ti.i64) * worker // self.number, ti.i32)
 
 

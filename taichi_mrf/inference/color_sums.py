@@ -66,8 +66,8 @@ class ColorSums:
 
 @dataclass(frozen=True)
 class ColorShare:
-    """What one or more keyframes give to voxels: ``bricks`` (n, 3) and ``numbers`` (n,) of the voxels, each
-    once, and their sums ``rg`` and ``bw`` (n,) as ColorSums has them."""
+    """Contribution of one or more keyframes to voxels: ``bricks`` (n, 3) and ``numbers`` (n,) of the voxels,
+    each once, and their sums ``rg`` and ``bw`` (n,) as ColorSums has them."""
 
     bricks: NDArray[np.int32]
     numbers: NDArray[np.int32]

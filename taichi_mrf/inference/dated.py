@@ -150,7 +150,7 @@ class DatedBelief:
     def restore_frozen(
         self, slots: NDArray[np.int32], belief: NDArray[np.float32], stamps_s: NDArray[np.float64]
     ) -> None:
-        """What frozen keyframes say of some bricks, (n, 512) log-odds as of (n) stamps: from a file."""
+        """Restore what frozen keyframes say of some bricks: (n, 512) log-odds as of (n) stamps."""
         if self.frozen is None:
             self.frozen = Channels.at_prior(self.pool.capacity, self.pool.prior_log_odds)
         flat = np.ascontiguousarray(belief, np.float32).reshape(-1)
@@ -160,7 +160,7 @@ class DatedBelief:
         self._outdated[slots] = True
 
     def read_frozen(self, slots: NDArray[np.int32]) -> tuple[NDArray[np.float32], NDArray[np.float64]] | None:
-        """The same, to save it; None if nothing is frozen."""
+        """Beliefs of frozen keyframes in some bricks and their stamps, to save them; None without any."""
         if self.frozen is None:
             return None
         out = np.zeros(len(slots) * VOXELS, np.float32)
@@ -246,7 +246,7 @@ class DatedBelief:
         runtime.settle()  # before the arrays of the call are dropped
 
     def _aging(self, seconds: NDArray[np.float64]) -> Aging:
-        """What some seconds do, (n); nothing where there are none, or nothing was known before."""
+        """Effect of some seconds, (n); none where they are 0 or nothing was known before."""
         seconds = np.where(np.isfinite(seconds), np.maximum(seconds, 0.0), 0.0)
         forgotten = -np.expm1(-2.0 * self.time.flip_rate * seconds)
         lasting = 0.5 ** (seconds / self.time.glimpse_half_life_s)

@@ -22,7 +22,7 @@ NEVER = -np.inf
 
 @dataclass(frozen=True)
 class Aging(Bundle):
-    """What time does to some bricks, (n) each."""
+    """Effect of time on some bricks, (n) each."""
 
     kept: F32Array
     """Chance that the state is that of then."""
@@ -73,7 +73,7 @@ def grown_channels(old: Channels, old_capacity: int, capacity: int) -> Channels:
 
 @ti.func
 def past(now: F32, shown: F32, prior: F32, aging: Template, brick: I32):
-    """What a voxel's past is still worth: evidence, as log-odds over the prior, and a glimpse beyond that."""
+    """Present worth of a voxel's past: evidence, as log-odds over the prior, and a glimpse beyond that."""
     evidence = now - prior
     if evidence != 0.0:
         evidence = faded(evidence, aging.kept[brick], aging.left[brick], aging.appeared[brick])
@@ -110,8 +110,8 @@ def fold_bricks(
 
 @ti.func
 def glimpse_of(evidence: F32, message: F32, prior: F32) -> F32:
-    """What is to be added to a voxel's log-odds so that they are what one view alone makes of it: above 0 if
-    that makes it occupied, and it was surely free before (``evidence``, log-odds over the prior)."""
+    """Addition to a voxel's log-odds that makes them what one view alone gives: above 0 if that view makes it
+    occupied, and it was surely free before (``evidence``, log-odds over the prior)."""
     glimpse = 0.0
     if prior + message > 0.0 and evidence < -SURELY_FREE:
         glimpse = -evidence

@@ -101,8 +101,8 @@ class DepthImage:
         return image.doubting(pose_covariance)
 
     def doubting(self, pose_covariance: Covariance | None) -> "DepthImage":
-        """The same image from a pose of another covariance (6, 6), None for an exact one: with the noise of
-        sensor and pose, and without the pixels that an edge may cross (sensor/pose_doubt.py). Raises
+        """Copy of the image from a pose of another covariance (6, 6), None for an exact one: with the noise
+        of sensor and pose, and without the pixels that an edge may cross (sensor/pose_doubt.py). Raises
         ConfigError if the noise is not made of polynomials."""
         image = self.at_certain_pose
         if pose_covariance is None:
@@ -193,7 +193,7 @@ class NoReturnRays:
 
 @dataclass(frozen=True)
 class Footprint:
-    """What a depth image's rays cross, which depends on its pose and on nothing else in the map.
+    """Bricks that a depth image's rays cross, which depend on its pose and on nothing else in the map.
 
     ``crossed`` are the window's cells (bricks) that any ray crosses, ``surface`` those among them near a
     measured surface, both ascending. ``longest`` bounds the voxels on any one ray.
@@ -290,7 +290,7 @@ class Keyframe:
 
     @property
     def own(self) -> OwnEvidence:
-        """What it states of its measurements."""
+        """Evidence that it states of its own measurements."""
         return self.image.own
 
     @property

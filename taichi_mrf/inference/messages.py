@@ -47,8 +47,8 @@ def withdraw_messages(
 
 
 def places_of(old: VisibleBricks, visible: VisibleBricks) -> NDArray[np.int32]:
-    """Where each brick of a list (n) stood on an older list of the same keyframe; -1 for one that was not on
-    it, or was another brick."""
+    """Index of each brick of a list (n) on an older list of the same keyframe; -1 for one that was not on it,
+    or was another brick."""
     if len(old.cells) == 0:
         return np.full(len(visible.cells), -1, np.int32)
     place = np.minimum(np.searchsorted(old.cells, visible.cells), len(old.cells) - 1)

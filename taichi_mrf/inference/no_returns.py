@@ -57,8 +57,8 @@ def send_no_returns(
 def take_where_unmeasured(
     number: I32, sums: I64Array, of_no_returns: I64Array, scale: F32, least: F32
 ) -> None:
-    """Where a keyframe's measured rays have crossed a voxel for no more than ``least`` voxel sizes, take the
-    sums of the rays without a return. Both are (visible bricks * 512), ``number`` long.
+    """Take the sums of the rays without a return where a keyframe's measured rays have crossed a voxel for no
+    more than ``least`` voxel sizes. Both are (visible bricks * 512), ``number`` long.
 
     Missing returns beside measured ones are no further evidence: the rays that meet one dark or wet surface
     have the same reason to give none.

@@ -1,4 +1,4 @@
-"""What the rays of a sweep (sum_product.py) share: their model, the voxels, and the trace."""
+"""Common parts of the rays of a sweep (sum_product.py): their model, the voxels, and the trace."""
 
 import math
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ inference."""
 
 @dataclass(frozen=True)
 class RayModel(Bundle):
-    """What all rays have in common (InferenceConfig)."""
+    """Model of all rays (InferenceConfig)."""
 
     voxel_size: F32
     """Metres."""
@@ -60,11 +60,11 @@ class RayModel(Bundle):
     """Chance that a ray passes through an occupied voxel."""
 
     passes: Template
-    """Whether that is more than 0."""
+    """True if ``pass_through`` is more than 0."""
 
     segment_lengths: Template
-    """Whether a voxel counts by the length of the ray's segment in it (section IV-A), or once, as eqs. 11 to
-    14 are printed."""
+    """True if a voxel counts by the length of the ray's segment in it (section IV-A); False if it counts
+    once, as eqs. 11 to 14 are printed."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +83,7 @@ class SweptVoxels(Bundle):
 
 @dataclass(frozen=True)
 class Trace(Bundle):
-    """What rays leave behind on the way out, for the way back: a part of ``longest`` steps for each
-    worker."""
+    """Record of rays on the way out, for the way back: a part of ``longest`` steps for each worker."""
 
     voxel: I32Array
     """(workers * longest): the voxel of each step."""

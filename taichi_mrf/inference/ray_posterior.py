@@ -50,8 +50,8 @@ class FreeLogs(Bundle):
     """log(1 - m) of each, or log(1 - (1 - s) m), at most 0; (bricks * 512)."""
 
     closed: I32Array
-    """Whether any voxel of a brick is likelier occupied than by the prior; (bricks). In front of the depths
-    that can have made its measurement, a ray passes through others as through empty space."""
+    """1 if any voxel of a brick is likelier occupied than by the prior; (bricks). In front of the depths that
+    can have made its measurement, a ray passes through others as through empty space."""
 
     @staticmethod
     def of(pool: BrickPool | PoolPart, model: RayModel) -> "FreeLogs":
@@ -98,12 +98,12 @@ class Sight(Bundle):
 
 @dataclass(frozen=True)
 class RayVisitor(Bundle):
-    """What is done with the rays of a keyframe. Subclasses have the fields that they need; all their methods
-    are ``ti.func``."""
+    """Visitor of the rays of a keyframe. Subclasses have the fields that they need; all their methods are
+    ``ti.func``."""
 
     @ti.func
     def wants(self, rays: Template, number: I32):
-        """Whether ray ``number`` of a list (keyframe.RayList) is followed."""
+        """True if ray ``number`` of a list (keyframe.RayList) is followed."""
         return 1
 
     @ti.func

@@ -24,7 +24,7 @@ from taichi_mrf.voxels.pool import BrickPool
 
 @dataclass(frozen=True)
 class InferProgress:
-    """Where inference stands, after each keyframe: both counts start at 1."""
+    """Progress of inference, after each keyframe: both counts start at 1."""
 
     sweep: int
     sweeps: int
@@ -35,7 +35,7 @@ class InferProgress:
 
 @dataclass(frozen=True)
 class InferReport:
-    """What inference did. ``residual`` is the share of the voxels seen whose marginal moved by more than
+    """Result of inference. ``residual`` is the share of the voxels seen whose marginal moved by more than
     0.01 in the last sweep; ``complete`` is False if a progress callback stopped it."""
 
     seconds: float
@@ -83,7 +83,7 @@ def driven(
 
 
 def content_key(keyframe: Keyframe) -> bytes:
-    """What a keyframe holds, as bytes to sort by: measurement, pose, camera and what it states of its
+    """Content of a keyframe, as bytes to sort by: measurement, pose, camera and what it states of its
     measurements, but not its number."""
     digest = hashlib.blake2b(keyframe.T_world_camera.tobytes(), digest_size=16)
     digest.update(repr(keyframe.camera).encode())
@@ -134,7 +134,7 @@ def sweep_steps(
 
 
 def _has_converged(keyframe: Keyframe, pool: BrickPool) -> bool:
-    """Whether a sweep over this keyframe would send the very messages that it has sent.
+    """True if a sweep over this keyframe would send the very messages that it has sent.
 
     They follow from the cavity, which is what all *others* believe: if no belief has changed since this
     keyframe's own last sweep, the cavity has not.

@@ -154,7 +154,7 @@ def send_messages(
                     entry_depths[i] = ahead.first
                 trace.steps[worker] += ahead.voxels
 
-                # What gets through to where the map ends may have met its surface there.
+                # A ray that gets through to the end of the map may have met its surface there.
                 behind = 0.0
                 if end < last:
                     behind = ahead.visibility * sensor.likelihood_beyond(measured, end, noise)

@@ -1,4 +1,4 @@
-"""What the rays of a keyframe say of the surface in and around each voxel: signed distances.
+"""Signed distances of voxels to the surface that a keyframe's rays measured in and around them.
 
 A voxel whose centre lies at depth t on a ray with the measurement z gets the distance
 

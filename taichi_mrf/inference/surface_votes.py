@@ -28,7 +28,7 @@ from taichi_mrf.voxels.traversal import walk_voxels
 from taichi_mrf.voxels.window import WindowIndex
 
 FOR, AGAINST = 3, 2
-"""What a vote for a voxel and one against it weigh: a voxel wins if more than two fifths of the rays that
+"""Weights of a vote for a voxel and of one against it: a voxel wins if more than two fifths of the rays that
 come as far take it for their surface. With half, walls have holes where voxels are finer than the noise."""
 
 GRAZED = 0.1

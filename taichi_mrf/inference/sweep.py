@@ -44,7 +44,7 @@ def unknown_entry_depths(rays: RayList) -> "ti.Ndarray":
 
 @dataclass(frozen=True)
 class CastRays:
-    """What the rays of one keyframe read and write, as kernels take it: the scratch, ready in a ``with``
+    """Input and output of the rays of one keyframe, as kernels take them: the scratch, ready in a ``with``
     block."""
 
     view: Viewpoint
@@ -174,7 +174,7 @@ class Sweeper:
         )
 
     def model(self) -> RayModel:
-        """What the rays of all keyframes share."""
+        """The model that the rays of all keyframes share."""
         return RayModel(
             voxel_size=self.voxel_size,
             max_depth=self.sensor.max_depth,

@@ -52,7 +52,7 @@ class ColorPass:
             sums.add_keyframe(slots, self._sweeper.sums, self._bw)
 
     def share(self, keyframe: Keyframe, pool: BrickPool) -> ColorShare:
-        """What a keyframe would add."""
+        """The colours that a keyframe would add."""
         visible = keyframe.visible
         n = len(visible.slots) * VOXELS if self._spread(keyframe, pool) else 0
         rg, bw = (a.to_numpy()[:n] for a in (self._sweeper.sums, self._bw))

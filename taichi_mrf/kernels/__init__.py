@@ -1,4 +1,4 @@
-"""What Taichi kernels share: argument types, arrays, strips of voxels, logarithms.
+"""Common parts of Taichi kernels: argument types, arrays, strips of voxels, logarithms.
 
 Uses `system`.
 """

@@ -74,7 +74,7 @@ def faded(evidence: F32, kept: F32, left: F32, appeared: F32) -> F32:
 
 @ti.func
 def moves(log_odds: F32, change: F32) -> I32:
-    """Whether a marginal changes by more than MOVED; never by more than a quarter of its log-odds' change."""
+    """True if a marginal changes by more than MOVED; never by more than a quarter of its log-odds' change."""
     far = 0
     if ti.abs(change) > 4.0 * MOVED:
         far = ti.abs(logistic(log_odds + change) - logistic(log_odds)) > MOVED

@@ -28,8 +28,8 @@ FINAL_AFTER_S = 10.0
 
 @dataclass
 class Followed:
-    """What a run has made of poses that changed: ``changes`` of the source were read, and keyframes were
-    moved ``moves`` times."""
+    """Outcome of following poses in a run: ``changes`` of the source were read, and keyframes were moved
+    ``moves`` times."""
 
     changes: int = 0
     moves: int = 0
@@ -56,7 +56,7 @@ class PoseFollower:
 
     @property
     def name(self) -> str:
-        """What messages call the source."""
+        """Name of the source in messages."""
         return self._poses.source.name
 
     @property
@@ -71,7 +71,7 @@ class PoseFollower:
 
     @property
     def is_final(self) -> bool:
-        """Whether the source has been unchanged for FINAL_AFTER_S and all keyframes have moved."""
+        """True if the source has been unchanged for FINAL_AFTER_S and all keyframes have moved."""
         return not self._left and self.quiet_s >= FINAL_AFTER_S
 
     def look(self, stamp_s: float = math.inf) -> bool:
@@ -123,7 +123,7 @@ class PoseFollower:
             self.done.moves += 1
 
     def unnamed(self) -> str | None:
-        """What a user should know of keyframes that the source has never named; None if it names all."""
+        """Note on keyframes that the source has never named; None if it names all."""
         keyframes = self.map.keyframes.values()
         count = sum(self._dataset.pose_now(each.name, each.stamp_s) is None for each in keyframes)
         if not count:
@@ -132,7 +132,7 @@ class PoseFollower:
         return f"{of} have no pose in {self.name}, and stay where they were recorded"
 
     def news(self) -> list[str]:
-        """What a user should be told and was not: a file that cannot be read, poses of unknown frames."""
+        """News that a user was not told yet: a file that cannot be read, poses of unknown frames."""
         found = []
         if self._poses.source.problem is not None:
             found.append(f"{self._poses.source.problem}; the poses read before it stay")
@@ -153,8 +153,8 @@ class PoseFollower:
 
 
 def follower_of(m: OccupancyMap, dataset: Dataset | None, config: PoseConfig) -> PoseFollower | None:
-    """What moves the keyframes of a map with the poses of its recording, None if these do not change. Raises
-    ConfigError as PoseFollower does."""
+    """Follower that moves the keyframes of a map with the poses of its recording, None if these do not
+    change. Raises ConfigError as PoseFollower does."""
     if not isinstance(dataset, PosedFrames) or not dataset.follows:
         return None
     return PoseFollower(m, dataset, config)

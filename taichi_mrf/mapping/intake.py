@@ -115,7 +115,7 @@ class Intake:
         self._expects_no_return = self.map.sensor.no_return != "ignore"  # until one that names no such pixels
 
     def passes_unread(self, number: int, index: int) -> bool:
-        """Whether the ``number``-th frame (from 1) is held out without being read, which the result notes by
+        """True if the ``number``-th frame (from 1) is held out without being read, which the result notes by
         its dataset ``index``. Frames whose poses are tracked are all read."""
         held_out = self.tracker is None and is_held_out(number, self._hold_out)
         if held_out:

@@ -268,6 +268,6 @@ class LoopCloser:
 def loop_closer_of(
     tracker: Tracker | None, config: PoseConfig, fixed: Callable[[], Collection[int]]
 ) -> LoopCloser | None:
-    """What closes the loops of a tracked camera, None if the configuration leaves them open. ``fixed`` as for
+    """Loop closer of a tracked camera, None if the configuration leaves loops open. ``fixed`` as for
     LoopCloser."""
     return LoopCloser(tracker, config, fixed) if tracker is not None and config.close_loops else None

@@ -1,4 +1,4 @@
-"""Where a tracked camera is carried by its momentum, and by what its accelerometer has measured since.
+"""Prediction of a tracked camera's place from its momentum, and from its accelerometer's measurements since.
 
 The velocity follows from the last two places and the accelerations between them; over the next step both
 are integrated. Gravity along the world's axes is learnt on the way, by a Kalman filter: the place that is

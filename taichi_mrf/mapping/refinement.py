@@ -23,7 +23,7 @@ from taichi_mrf.methods.protocol import MappedKeyframe, OccupancyMap
 
 @dataclass(frozen=True)
 class PoseChange:
-    """Where a keyframe was recorded, and where it stands in the map."""
+    """Pose of a keyframe as it was recorded, and as it stands in the map."""
 
     keyframe: int
     name: str

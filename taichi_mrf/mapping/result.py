@@ -1,4 +1,4 @@
-"""What a run of mapping has made of its frames: batch and live runs fill in the same record."""
+"""Result of a run of mapping: batch and live runs fill in the same record."""
 
 import time
 from collections.abc import Iterator

@@ -130,12 +130,12 @@ class AlignmentRounds(Settling[RoundStep, bool]):
 
 
 def has_settled(m: AligningMap, stood: Mapping[int, Pose]) -> bool:
-    """Whether no keyframe has moved far from where it stood."""
+    """True if no keyframe has moved far from where it stood."""
     keyframes = m.keyframes
     moved_m = [tangent_norms(T, keyframes[id].T_world_camera)[1] for id, T in stood.items()]
     return max(moved_m, default=0.0) < SETTLED * m.voxel_size
 
 
 def is_worse(before: float, after: float, loss: float) -> bool:
-    """Whether a round made the depth less likely by more than it may."""
+    """True if a round made the depth less likely by more than it may."""
     return not after > before - loss

@@ -9,7 +9,7 @@ from taichi_mrf.methods.capabilities import FreezingMap
 
 
 def is_held_out(number: int, hold_out: int) -> bool:
-    """Whether the ``number``-th frame (from 1) is held out: the middle one of each ``hold_out``, none with
+    """True if the ``number``-th frame (from 1) is held out: the middle one of each ``hold_out``, none with
     0."""
     return hold_out > 0 and (number - 1) % hold_out == hold_out // 2
 
@@ -27,7 +27,7 @@ class KeyframeSelector:
         self._last: dict[str, Pose] = {}  # of each sensor, T_world_camera of its last keyframe
 
     def wants(self, T_world_camera: Pose, sensor: str = "") -> bool:
-        """Whether a frame of a sensor with this pose, (4, 4), should become a keyframe. Does not change the
+        """True if a frame of a sensor with this pose, (4, 4), should become a keyframe. Does not change the
         selector."""
         if self._config.rotation == 0 and self._config.translation == 0:
             return True

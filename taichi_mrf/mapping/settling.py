@@ -39,7 +39,7 @@ class Settling(Generic[StepT, OutcomeT]):
         self._steps = steps
         self._stop: StopRequestedError | None = None
         self.outcome: OutcomeT | None = None
-        """What came of it, once there are no more steps."""
+        """Outcome of the work, once there are no more steps."""
 
     def stop(self, at_once: bool = False) -> None:
         """Stop after the step that was taken last. More steps follow only to leave a whole map; none do if it

@@ -75,7 +75,7 @@ class StepCheck:
 
     @property
     def disagrees(self) -> bool:
-        """Whether the ratio differs from one by more than errors of alignment explain."""
+        """True if the ratio differs from one by more than errors of alignment explain."""
         return abs(self.ratio - 1.0) > max(SMALLEST_DIFFERENCE, DEVIATIONS * self.deviation)
 
 

@@ -125,7 +125,7 @@ class Track:
         return poses
 
     def trajectory(self, m: OccupancyMap) -> list[tuple[float, Pose]]:
-        """The same with their stamps, in the order in which the frames came."""
+        """Poses of the track with their stamps, in the order in which the frames came."""
         return [(self.frames[index].stamp, T) for index, T in self.poses(m).items()]
 
 
@@ -258,7 +258,7 @@ class Tracker:
         return ahead if ahead <= LONGEST_AHEAD else None
 
     def _around(self, camera: Camera, stamp: float) -> Around:
-        """Where a sensor that sees around may be by now."""
+        """Space in which a sensor that sees around may be by now."""
         assert self._last is not None
         reach_m = min(AROUND_M + AROUND_LOST_M * self._lost, MOST_AROUND_M)
         T_last = self._pose(self._last)
@@ -269,8 +269,8 @@ class Tracker:
         return Around(T_last, camera.up, reach_m, expected_m, EXPECTED_M * (1 + self._lost))
 
     def _guesses(self, frame: Frame) -> list[Pose]:
-        """Where the camera may be if it stands still, where its accelerometer says, and if it moves on, which
-        is left out while the accelerometer is right."""
+        """Poses of the camera if it stands still, by its accelerometer, and if it moves on, which is left out
+        while the accelerometer is right."""
         assert self._last is not None
         T_last = self._pose(self._last)
         guesses = [T_last, *(carried := self._carried(frame))]
@@ -302,7 +302,7 @@ class Tracker:
         )
 
     def _carried(self, frame: Frame) -> list[Pose]:
-        """Where the camera is by its accelerometer, if that tells."""
+        """Pose of the camera by its accelerometer, if that tells."""
         if self._last is None or self._before is None:
             return []
         before, last = ((tracked.stamp, self._pose(tracked)) for tracked in (self._before, self._last))
@@ -310,7 +310,7 @@ class Tracker:
         return [] if T_world_camera is None else [T_world_camera]
 
     def _known_places(self, picture: Picture) -> list[Pose]:
-        """Where a lost camera may be: where it began, and where keyframes look like its picture."""
+        """Poses of a lost camera: where it began, and where keyframes look like its picture."""
         keyframes = self.map.keyframes
         likeness = self.appearances.likeness(picture)
         known = [id for id, how in likeness.items() if how > ALIKE and id in keyframes]
@@ -342,6 +342,6 @@ def keyframe_steps(config: KeyframeConfig) -> KeyframeConfig:
 
 
 def wants_color(config: Config, source: str, track: bool) -> bool:
-    """Whether the colour images of a source are to be read: for the map, or to ``track`` the camera."""
+    """True if the colour images of a source are to be read: for the map, or to ``track`` the camera."""
     tracked = track or f"poses={TRACK}" in source or (source.startswith(REALSENSE) and "poses=" not in source)
     return config.color or tracked

@@ -1,4 +1,4 @@
-"""What all maps share: the configuration, the bricks, and the answers to queries.
+"""Common base of all maps: the configuration, the bricks, and the answers to queries.
 
 A method adds how keyframes change the voxels. Each voxel holds one number, its log-odds of being occupied,
 in a pool of bricks that a registry allocates.
@@ -251,5 +251,5 @@ class BrickMap(Owned):
         return self.voxel_size, self._registry.topology, self._pool, self.seen_free_log_odds
 
     def _likely_grid(self) -> tuple[float, Topology, BrickPool, float]:
-        """The same with the probabilities that can be trusted most."""
+        """The voxels as queries take them, with the probabilities that can be trusted most."""
         return self._grid()

@@ -1,4 +1,4 @@
-"""What maps of some methods can do beyond OccupancyMap, and the questions that tell which map can.
+"""Abilities of maps of some methods beyond OccupancyMap, and the questions that tell which map has them.
 
 The rest of the program asks these questions instead of naming a class: the answer comes from the method's
 entry, and a type checker then knows the verbs.
@@ -51,7 +51,7 @@ class MessageMap(OccupancyMap, Protocol):
         ...
 
     def checkpoint(self) -> Checkpoint:
-        """What :meth:`restore` needs to undo an :meth:`infer` that was stopped."""
+        """State that :meth:`restore` needs to undo an :meth:`infer` that was stopped."""
         ...
 
     def restore(self, checkpoint: Checkpoint) -> None:
@@ -63,7 +63,7 @@ class FreezingMap(MessageMap, Protocol):
     """A map that can fold keyframes into itself for good."""
 
     window: MovingWindow | None
-    """What is kept in memory, if not the whole map (``volume.window_m``)."""
+    """Window that is kept in memory, if not the whole map (``volume.window_m``)."""
 
     @property
     def frozen(self) -> Mapping[int, str]:
@@ -109,7 +109,7 @@ class LayeredMap(OccupancyMap, Protocol):
         ...
 
     def changes(self, since_s: float) -> MapChange:
-        """What has changed since a time in seconds."""
+        """Changes since a time in seconds."""
         ...
 
 
@@ -126,7 +126,7 @@ class MeasuringMap(OccupancyMap, Protocol):
 
     @property
     def has_surface(self) -> bool:
-        """Whether no keyframe is missing in it."""
+        """True if no keyframe is missing in its surface."""
         ...
 
     def surface(self, between: Callable[[], object] = ...) -> FusedSurface:
@@ -135,12 +135,12 @@ class MeasuringMap(OccupancyMap, Protocol):
 
 
 def has_messages(m: OccupancyMap) -> TypeGuard[MessageMap]:
-    """Whether a map's keyframes keep messages."""
+    """True if a map's keyframes keep messages."""
     return m.METHOD.has_messages
 
 
 def can_freeze(m: OccupancyMap) -> TypeGuard[FreezingMap]:
-    """Whether a map can freeze keyframes."""
+    """True if a map can freeze keyframes."""
     return m.METHOD.can_freeze
 
 
@@ -150,25 +150,25 @@ def window_of(m: OccupancyMap) -> MovingWindow | None:
 
 
 def can_refine_poses(m: OccupancyMap) -> TypeGuard[AligningMap]:
-    """Whether a map can align keyframes, and so be tracked in."""
+    """True if a map can align keyframes, and so be tracked in."""
     return m.METHOD.can_refine_poses
 
 
 def has_layers(m: OccupancyMap) -> TypeGuard[LayeredMap]:
-    """Whether a map can be read as of another time and by layers. In a map of a static world they raise."""
+    """True if a map can be read as of another time and by layers. In a map of a static world they raise."""
     return m.METHOD.has_layers
 
 
 def has_dates(m: OccupancyMap) -> TypeGuard[LayeredMap]:
-    """Whether a map's world may change, so that it can be read as of another time and by layers."""
+    """True if a map's world may change, so that it can be read as of another time and by layers."""
     return m.view.pool.dated is not None
 
 
 def takes_colors(m: OccupancyMap) -> TypeGuard[PaintedMap]:
-    """Whether keyframes of a map may have colour images."""
+    """True if keyframes of a map may have colour images."""
     return m.METHOD.has_colors
 
 
 def measures_surface(m: OccupancyMap) -> TypeGuard[MeasuringMap]:
-    """Whether a map can make the surface that its keyframes measured."""
+    """True if a map can make the surface that its keyframes measured."""
     return m.METHOD.measures_surface

@@ -60,8 +60,8 @@ def _voxels_of(points: ArrayLike, voxel_size: float) -> NDArray[np.int64]:
 
 
 LogOdds = Literal["marginal", "decided", "calibrated"]
-"""What the log-odds of a map in chunks are: the marginals', those of what is occupied, or those that can be
-trusted as probabilities."""
+"""Kind of a chunked map's log-odds: the marginals', those of what is occupied, or those that can be trusted
+as probabilities."""
 
 
 class ChunkedMap:
@@ -90,7 +90,7 @@ class ChunkedMap:
 
     @property
     def holds_marginals(self) -> bool:
-        """Whether the log-odds are those of the marginals."""
+        """True if the log-odds are those of the marginals."""
         return self._by == "marginal"
 
     @cached_property
@@ -117,12 +117,12 @@ class ChunkedMap:
 
     @property
     def has_colors(self) -> bool:
-        """Whether the store holds the colours that cameras saw."""
+        """True if the store holds the colours that cameras saw."""
         return COLORS in self.store.extras
 
     @property
     def has_surface(self) -> bool:
-        """Whether the store holds what keyframes measured of the surface."""
+        """True if the store holds what keyframes measured of the surface."""
         return SURFACE in self.store.extras
 
     @property

@@ -104,7 +104,7 @@ class MapPart:
 
     @property
     def has_colors(self) -> bool:
-        """Whether the map holds the colours that cameras saw."""
+        """True if the map holds the colours that cameras saw."""
         return self.source.has_colors
 
     @tensors.in_kind("points")
@@ -114,8 +114,8 @@ class MapPart:
         return self.source.colors(points)
 
     def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """The same for the voxels of some bricks of ``view.pool``, (n,) slots -> (n, 512, 4); none where a
-        slot is -1."""
+        """Colours of the voxels of some bricks of ``view.pool``, (n,) slots -> (n, 512, 4); none where a slot
+        is -1."""
         out = np.zeros((len(slots), VOXELS, 4), np.uint8)
         here = np.flatnonzero(slots >= 0)
         voxels = np.indices((BRICK,) * 3).reshape(3, -1).T + 0.5
@@ -128,7 +128,7 @@ class MapPart:
 
     @property
     def has_surface(self) -> bool:
-        """Whether the map holds what keyframes measured of the surface."""
+        """True if the map holds what keyframes measured of the surface."""
         return self.source.has_surface
 
     def surface(self) -> FusedSurface:
@@ -172,7 +172,7 @@ class MapPart:
 
 
 class _PartIndex:
-    """Where the bricks of a part are in its pool, and which have been crossed, for queries."""
+    """Index of a part's bricks in its pool, and which have been crossed, for queries."""
 
     def __init__(self, reader: BrickReader, free_bricks: NDArray[np.int32]) -> None:
         self.slots, self._free = reader.slots, np.sort(grid_keys(free_bricks))

@@ -77,7 +77,7 @@ class StoredKeyframe:
 
 @dataclass(frozen=True)
 class MapHeader:
-    """What the files of all methods hold; ``config.method`` names the method. ``settled`` says whether the
+    """Contents of the files of all methods; ``config.method`` names the method. ``settled`` says whether the
     voxels are those that a full inference of these keyframes gives; ``up`` is the world axis that is up, None
     if it is unknown."""
 

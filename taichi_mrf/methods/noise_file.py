@@ -1,4 +1,4 @@
-"""What map files hold of noise: the map's noise model, and what keyframes state of their own."""
+"""Noise in map files: the map's noise model, and the evidence that keyframes state of their own."""
 
 from typing import Any
 
@@ -37,7 +37,7 @@ def read_noise(file: NpzFile, prefix: str = "") -> NoiseModel:
 
 
 def evidence_arrays(own: OwnEvidence, prefix: str) -> dict[str, NDArray[Any]]:
-    """What a keyframe states of its measurements; no arrays if it states nothing."""
+    """Arrays of the evidence that a keyframe states; none if it states nothing."""
     arrays = {} if own.noise is None else noise_arrays(own.noise, prefix)
     if own.sigma_m is not None:
         arrays[f"{prefix}sigma_m"] = own.sigma_m
@@ -49,7 +49,7 @@ def evidence_arrays(own: OwnEvidence, prefix: str) -> dict[str, NDArray[Any]]:
 
 
 def read_evidence(file: NpzFile, prefix: str, camera: Camera) -> OwnEvidence:
-    """What :func:`evidence_arrays` has saved of a keyframe."""
+    """Evidence of a keyframe that :func:`evidence_arrays` has saved."""
     noise = read_noise(file, prefix) if f"{prefix}noise_sigma" in file else None
     sigma_m = None
     if f"{prefix}sigma_m" in file:

@@ -35,7 +35,7 @@ class PosedDepth(Protocol):
     def depth_m(self) -> NDArray[np.float32]: ...
     @property
     def own(self) -> OwnEvidence:
-        """What it states of its measurements."""
+        """Evidence that it states of its own measurements."""
         ...
 
 
@@ -87,12 +87,12 @@ class OccupancyMap(Protocol):
 
     @property
     def stale(self) -> bool:
-        """Whether the last removals and moves show only after :meth:`infer`."""
+        """True if the last removals and moves show only after :meth:`infer`."""
         ...
 
     @property
     def settled(self) -> bool:
-        """Whether a full :meth:`infer` would leave the map as it is."""
+        """True if a full :meth:`infer` would leave the map as it is."""
         ...
 
     def crossed_bricks(self, id: int) -> NDArray[np.int32]:

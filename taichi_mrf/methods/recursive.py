@@ -107,7 +107,7 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
 
     @property
     def _takes_no_return(self) -> bool:
-        """Whether pixels that got no return change the map."""
+        """True if pixels that got no return change the map."""
         return False
 
     @property
@@ -122,12 +122,12 @@ class RecursiveMap(BrickMap, ABC, Generic[FootprintT]):
 
     @property
     def stale(self) -> bool:
-        """Whether keyframes were removed or moved since the voxels were last computed."""
+        """True if keyframes were removed or moved since the voxels were last computed."""
         return self._stale
 
     @property
     def settled(self) -> bool:
-        """Whether the voxels are those that the keyframes give."""
+        """True if the voxels are those that the keyframes give."""
         return not self._stale
 
     def crossed_bricks(self, id: int) -> NDArray[np.int32]:

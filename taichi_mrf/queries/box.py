@@ -51,7 +51,7 @@ class BoxOfVoxels:
         return (np.array(self.lowest, np.float64) + self.state.shape) * self.voxel_size
 
     def centres(self, axis: int) -> NDArray[np.float64]:
-        """Where the voxels' centres lie along an axis, in metres."""
+        """Centres of the voxels along an axis, in metres."""
         return (
             self.lowest[axis] + np.arange(self.state.shape[axis], dtype=np.float64) + 0.5
         ) * self.voxel_size

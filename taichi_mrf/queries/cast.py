@@ -1,4 +1,4 @@
-"""Where rays meet something: many rays at once, with a stated policy for unknown space."""
+"""Ray casting: many rays at once, with a stated policy for unknown space."""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -20,7 +20,7 @@ from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_voxels
 from taichi_mrf.voxels.window import Window
 
 Unknown = Literal["free", "stop", "hit"]
-"""What a ray does where it comes to unknown space: pass, end there without a hit, or count it as a hit."""
+"""Policy of a ray that comes to unknown space: pass, end there without a hit, or count it as a hit."""
 
 _POLICIES: dict[str, int] = {"free": 0, "stop": 1, "hit": 2}
 _PASSED, _HIT, _STOPPED = 0, 1, 2
@@ -33,9 +33,9 @@ the time that four rays save."""
 
 @dataclass(frozen=True)
 class RayHits:
-    """Where rays end: ``hit`` (N,) whether they met something, ``range`` (N,) float32 how far they came in
-    metres, ``point`` (N, 3) float64 where that is in the world; ``in_unknown`` (N,) whether it was unknown
-    space that ended them. A ray that nothing ends comes as far as the largest range."""
+    """Ends of rays: ``hit`` (N,) is True where a ray met something, ``range`` (N,) float32 its length in
+    metres, ``point`` (N, 3) float64 its end in the world; ``in_unknown`` (N,) is True where unknown space
+    ended it. A ray that nothing ends comes as far as the largest range."""
 
     hit: NDArray[np.bool_]
     range: NDArray[np.float32]

@@ -1,4 +1,4 @@
-"""What differs between two maps, voxel by voxel."""
+"""Difference between two maps, voxel by voxel."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""What appeared and what left between two maps: clusters of voxels that were free and are occupied, or the
+"""Things that appeared or left between two maps: clusters of voxels that were free and are occupied, or the
 reverse."""
 
 from dataclasses import dataclass, replace
@@ -39,8 +39,8 @@ class ChangedThing:
 
 
 def without_slack(change: MapChange, a: QueriedMap, b: QueriedMap, core: int = CORE_VOXELS) -> MapChange:
-    """What appeared and left from map a to map b, without what can be a surface of the other map that has
-    shifted a little: clusters of which fewer than ``core`` voxels are clear of those surfaces."""
+    """Voxels that appeared or left from map a to map b, without what can be a surface of the other map that
+    has shifted a little: clusters of which fewer than ``core`` voxels are clear of those surfaces."""
     voxels = np.floor(change.points / a.voxel_size).astype(np.int32)
     kept = np.zeros(len(voxels), np.bool_)
     for before, after, other in ((FREE, OCCUPIED, a), (OCCUPIED, FREE, b)):
@@ -58,9 +58,9 @@ def without_slack(change: MapChange, a: QueriedMap, b: QueriedMap, core: int = C
 def find_changed_things(
     change: MapChange, voxel_size: float, min_voxels: int = 1, reach_m: float | None = None
 ) -> list[ChangedThing]:
-    """What appeared (free before, occupied after) and what left (occupied before, free after), the largest
-    first, without clusters of less than ``min_voxels``. What was unknown before is new to the map, but need
-    not be new.
+    """Things that appeared (free before, occupied after) or left (occupied before, free after), the largest
+    first, without clusters of less than ``min_voxels``. Space that was unknown before is new to the map, but
+    need not be new.
 
     ``voxel_size`` is that of the maps, in metres. Voxels belong together if they touch; with ``reach_m`` also
     those in touching cells of that size (metres), so that the seen parts of one object are one thing.

@@ -18,7 +18,7 @@ SLACK_M = 0.15
 """A surface may be so far from where it was, centre to centre, in metres."""
 
 SLACK_VOXELS = 3
-"""The same for voxels that are larger than a third of it."""
+"""The slack in voxels, for voxels that are larger than a third of SLACK_M."""
 
 CELL_VOXELS = 2
 """Voxels in touching cells of so many voxels a side are one cluster, so that the parts of a thing count
@@ -74,7 +74,7 @@ class Surfaces:
     def _clear(
         self, voxels: NDArray[np.int32], bricks: NDArray[np.int32], owner: NDArray[np.intp]
     ) -> NDArray[np.bool_]:
-        """The same for voxels of some bricks (k, 3), each by its ``owner`` among them (n,)."""
+        """:meth:`clear` for voxels of some bricks (k, 3), each by its ``owner`` among them (n,)."""
         slots, place = np.unique(self._around(bricks), return_inverse=True)
         place = place.reshape(len(bricks), -1)
         occupied = np.zeros((len(slots), VOXELS), np.bool_)

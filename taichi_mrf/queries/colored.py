@@ -21,7 +21,7 @@ class ColoredMap(QueriedMap, Protocol):
 
     @property
     def has_colors(self) -> bool:
-        """Whether any voxel may have a colour."""
+        """True if any voxel may have a colour."""
         ...
 
     def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
@@ -34,7 +34,7 @@ class ColoredMap(QueriedMap, Protocol):
 
 
 def is_colored(m: QueriedMap) -> TypeGuard[ColoredMap]:
-    """Whether a map's voxels have colours."""
+    """True if a map's voxels have colours."""
     return bool(getattr(m, "has_colors", False))
 
 

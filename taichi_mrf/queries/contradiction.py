@@ -100,7 +100,7 @@ def _best_likelihood(sigma: NDArray[np.float64], voxel_size: float) -> NDArray[n
 
 
 def _passed_surface(survey: SurfaceSurvey, surface_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Where the ray's likeliest surface lies in front of the measured one, and was expected to stop it."""
+    """True where the ray's likeliest surface lies before the measured one, and was expected to stop it."""
     stopped = (survey.visibility < 0.5) & (survey.far > 0)
     return stopped & (survey.far < surface_m)
 

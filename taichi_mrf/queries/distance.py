@@ -121,9 +121,9 @@ class DistanceField(Owned):
 
     @tensors.in_kind("points", on_device=True)
     def distance_and_gradient(self, points: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The same, and its change for each metre along x, y and z, (N, 3) float32: it points away from the
-        nearest obstacle, with a length of nearly 1, and is 0 where the distance is cut off. Raises
-        ConfigError."""
+        """Distances of points as :meth:`distance` has them, and their gradients: the change for each metre
+        along x, y and z, (N, 3) float32. A gradient points away from the nearest obstacle, with a length of
+        nearly 1, and is 0 where the distance is cut off. Raises ConfigError."""
         given = tensors.real_array(points, "points", ("N", 3))
         out, gradient = tensors.empty(given, given.shape[:1]), tensors.empty(given, given.shape)
         if len(given):

@@ -1,4 +1,4 @@
-"""Where a distance field keeps what it knows of a brick, and which of the brick's voxels are obstacles."""
+"""Storage of a distance field for each brick, and which of the brick's voxels are obstacles."""
 
 from dataclasses import dataclass
 
@@ -29,12 +29,12 @@ lies between eight voxels is read from one brick."""
 UNKNOWN_BITS, FLIPPED_BITS = 8, 16
 ALL_BITS = (1 << BRICK) - 1
 KEPT_BITS = (1 << FLIPPED_BITS) - 1
-"""Where a column of voxels has its bits (FieldGrid.classes)."""
+"""Bits of a column of voxels (FieldGrid.classes)."""
 
 
 @dataclass(frozen=True)
 class FieldGrid(Bundle):
-    """Where the bricks of a field are, and what space without bricks is."""
+    """Slots of a field's bricks, and the class of space without bricks."""
 
     shape: IVec3
     """Size of the window in bricks."""
@@ -47,7 +47,7 @@ class FieldGrid(Bundle):
     known in the next 8, and those that have just become so, or known again, in the next 8."""
 
     outside_class: I32
-    """The same of a column in unknown space."""
+    """The entry of ``classes`` for a column in unknown space."""
 
     reach: I32
     """How many voxels a minimum looks to either side."""
@@ -71,7 +71,7 @@ class FieldGrid(Bundle):
 
     @ti.func
     def column(self, cell: IVec3, number: I32):
-        """What the voxels of a column of a brick are."""
+        """Class of the voxels of a column of a brick."""
         slot = self.slot(cell)
         found = 0
         if slot >= 0:
@@ -104,8 +104,8 @@ def classify_bricks(
     belief: F32Array, sources: I32Array, cells: I32Array, prior: F32, min_evidence: F32,
     obstacles_unknown: I32, distances_unknown: I32, grid: FieldGrid, found: I32Array, changed: I32Array,
 ) -> None:  # fmt: skip
-    """What the voxels of some bricks are now, into ``found`` (n * 64), and which bricks differ from
-    ``grid.classes``: ``changed`` (n) becomes 1 there.
+    """Write the classes of the voxels of some bricks into ``found`` (n * 64), and 1 into ``changed`` (n) for
+    the bricks that differ from ``grid.classes``.
 
     ``belief`` (pool * 512) are the map's log-odds, ``sources`` (n) the bricks' slots in its pool, GONE or
     SEEN_FREE, ``cells`` (n) their numbers in the window. ``obstacles_unknown`` and ``distances_unknown`` tell

@@ -153,7 +153,7 @@ def read_distances(points: Template, field: FieldValues, out: F32Array) -> None:
 
 @kernel
 def read_gradients(points: Template, field: FieldValues, out: F32Array, gradient: F32Array2) -> None:
-    """The same, and the gradients into ``gradient`` (N, 3), 0 where there is no distance."""
+    """Distances as in :func:`read_distances`, and ``gradient`` (N, 3), 0 where there is no distance."""
     for i in range(out.shape[0]):
         whole, share = points.split(i)
         found = field.at(whole, share)

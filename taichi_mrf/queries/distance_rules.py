@@ -1,4 +1,4 @@
-"""What counts as an obstacle for a distance field, what unknown space is to it, and how far distances go."""
+"""Rules of a distance field: which voxels are obstacles, what unknown space is, and how far distances go."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -10,7 +10,7 @@ from taichi_mrf.errors import ConfigError
 from taichi_mrf.voxels.layout import BRICK
 
 UnknownSpace = Literal["free", "occupied", "unknown"]
-"""What unknown voxels are: no obstacles, obstacles, or no obstacles but without a distance themselves."""
+"""Role of unknown voxels: no obstacles, obstacles, or no obstacles but without a distance themselves."""
 
 MOST_REACH = 1024
 """Voxels that distances may reach, at most."""
@@ -18,8 +18,8 @@ MOST_REACH = 1024
 
 @dataclass(frozen=True)
 class SpaceRules:
-    """What counts as an obstacle and how far distances go: ``reach`` in voxels, and the distance in metres of
-    each square of voxels, ``metres`` ((reach + 1)^2 + 1)."""
+    """Rules in voxels: the role of unknown space, the ``reach`` in voxels, and the distance in metres of each
+    square of voxels, ``metres`` ((reach + 1)^2 + 1)."""
 
     unknown: UnknownSpace
     reach: int

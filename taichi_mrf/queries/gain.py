@@ -101,7 +101,7 @@ class _Look(Struct):
 
 @dataclass(frozen=True)
 class _Learnt(Bundle):
-    """What a step along a ray reads: log-odds (pool * 512), and how voxels dim the ray."""
+    """Inputs of a step along a ray: log-odds (pool * 512), and how voxels dim the ray."""
 
     belief: F32Array
     occlusion: Occlusion

@@ -42,7 +42,7 @@ class RaysInPlace(Bundle):
 
     @ti.func
     def origin(self, i: I32):
-        """Where ray i begins, in metres."""
+        """Origin of ray i, in metres."""
         k = i * self.origin_step
         return DVec3(self.origins[k, 0], self.origins[k, 1], self.origins[k, 2])
 
@@ -60,7 +60,7 @@ class RaysInPlace(Bundle):
 
     @ti.func
     def start(self, i: I32):
-        """Where ray i begins, in voxels from the window's corner."""
+        """Origin of ray i, in voxels from the window's corner."""
         return ti.cast(self.origin(i) / self.voxel_size - self.lowest, ti.f32)
 
     @ti.func

@@ -26,14 +26,14 @@ _LEAST_PROBABILITY = 1e-9
 
 
 class Placed(Protocol):
-    """What has been taken from somewhere."""
+    """Interface of a keyframe, as queries need it: its pose."""
 
     @property
     def T_world_camera(self) -> Pose: ...
 
 
 class QueriedMap(Protocol):
-    """What queries over space need of a map; every map of methods/protocol.py has it."""
+    """Interface of a map, as queries over space need it; every map of methods/protocol.py has it."""
 
     voxel_size: float
     view: View

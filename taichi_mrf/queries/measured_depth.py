@@ -1,4 +1,4 @@
-"""Where rays meet the surface that keyframes measured, near their likeliest voxel.
+"""Depth at which rays meet the surface that keyframes measured, near their likeliest voxel.
 
 The likeliest voxel of a ray (eq. 18) is as coarse as the grid, and lies before the surface where sigma is
 wider than a voxel. The measured surface is where the mean of the signed distances passes through 0
@@ -30,7 +30,7 @@ from taichi_mrf.voxels.traversal import Space, Viewpoint, clip, pixel_ray, withi
 from taichi_mrf.voxels.window import Window, WindowIndex
 
 Answer = Literal["surface", "omega"]
-"""Where rays end: on the measured surface near their likeliest voxel, or in that voxel alone."""
+"""End of a ray: on the measured surface near its likeliest voxel, or in that voxel alone."""
 
 NEAR_VOXELS, NEAR_M = 1.5, 0.075
 """How far the likeliest voxel of a ray and its surface may lie apart, along the surface's normal, to be the
@@ -158,7 +158,7 @@ def _crossing(
 
 @ti.func
 def _may_be(ray: Template, depth: F32, to_voxels: F32, space: Template, free: Template) -> I32:
-    """Whether the map does not take all voxels of a ray around a depth for free."""
+    """True unless the map takes all voxels of a ray around a depth for free."""
     may = 0
     for k in range(-AROUND, AROUND + 1):
         voxel = ti.cast(ti.floor(ray.origin + (depth + k / to_voxels) * ray.direction), ti.i32)

@@ -1,4 +1,4 @@
-"""What a single ray meets on its way through the map, voxel by voxel (the curves of the paper's Fig. 7)."""
+"""Profile of a single ray through the map, voxel by voxel (the curves of the paper's Fig. 7)."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from taichi_mrf.voxels.traversal import Space, clip, make_ray, walk_voxels
 
 @dataclass(frozen=True)
 class RayProfile:
-    """What a ray meets, voxel by voxel, where bricks exist; all arrays (N,) float32.
+    """Profile of a ray, voxel by voxel, where bricks exist; all arrays (N,) float32.
 
     ``distance`` is the range in metres to the middle of the ray's segment in the voxel, ``length`` the
     segment's length in metres; ``occupancy`` the marginal, ``visibility`` what is left of the ray at the
@@ -31,7 +31,7 @@ class RayProfile:
 
 @dataclass(frozen=True)
 class ProfileArrays(Bundle):
-    """Where a ray's profile is written, one entry for each voxel: arrays (N,) as in RayProfile."""
+    """Output of a ray's profile, one entry for each voxel: arrays (N,) as in RayProfile."""
 
     distance: F32Array
     length: F32Array

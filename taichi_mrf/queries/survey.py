@@ -25,7 +25,7 @@ OPAQUE = 1e-3
 
 @dataclass(frozen=True)
 class SurfaceSurvey:
-    """What a view's rays meet, all (H, W) float32.
+    """Surfaces that a view's rays meet, all (H, W) float32.
 
     ``near`` and ``far`` bound the ray's segment in the voxel with the largest omega, 0 where the ray meets
     nothing; ``visibility`` is what is left of the ray at its end; ``expected`` the mean depth of the
@@ -64,7 +64,7 @@ class Medium(Bundle):
 
 @dataclass(frozen=True)
 class Answers(Bundle):
-    """Where a survey is written: arrays (H * W), as in SurfaceSurvey."""
+    """Output of a survey: arrays (H * W), as in SurfaceSurvey."""
 
     near: F32Array
     far: F32Array
@@ -90,7 +90,7 @@ class RaySurvey(Struct):
 
 @dataclass(frozen=True)
 class _Surveyed(Bundle):
-    """What a step of the survey reads."""
+    """Inputs of a step of the survey."""
 
     belief: F32Array
     medium: Medium

@@ -73,7 +73,7 @@ class _Voxels(Bundle):
 
 
 class BrickIndex(Protocol):
-    """Where bricks are, and which rays have crossed; part of a Topology."""
+    """Index of bricks and of the rays that have crossed them; part of a Topology."""
 
     def slots(self, bricks: NDArray[np.int32]) -> NDArray[np.int32]: ...
 

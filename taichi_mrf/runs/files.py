@@ -13,7 +13,7 @@ PICTURE_FILES = ("surface.png", "perspective.png", "top_view.png", "depth.png")
 
 
 def holds_run(folder: Path) -> bool:
-    """Whether a folder holds files of a run, complete or not."""
+    """True if a folder holds files of a run, complete or not."""
     return any((folder / name).exists() for name in (MAP_FILE, VOXEL_FILE, CONFIG_FILE, REPORT_FILE))
 
 

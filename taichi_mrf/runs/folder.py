@@ -55,11 +55,11 @@ Advance = Callable[[str, int, int], None]
 
 
 class Haste(Protocol):
-    """Whether a run has to end within seconds, as after SIGTERM."""
+    """Interface to ask if a run has to end within seconds, as after SIGTERM."""
 
     @property
     def hurried(self) -> bool:
-        """Whether it has to."""
+        """True if the run has to end."""
         ...
 
     def cutting_short(self) -> AbstractContextManager[None]:
@@ -80,7 +80,7 @@ NO_HASTE: Haste = _NoHaste()
 
 @dataclass
 class RunFacts:
-    """What a run's report says besides its result: the ``source`` as it was asked for, the parameters, the
+    """Facts of a run's report besides its result: the ``source`` as it was asked for, the parameters, the
     recording (None for a saved map), further entries (``choice``), the unreadable frames of the run that this
     one resumes, warnings to be listed as notes, and how sigma was learnt, if it was."""
 

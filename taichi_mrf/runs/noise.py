@@ -1,4 +1,4 @@
-"""What a run says of its noise: whether held-out frames agree with it, and what was learnt of it."""
+"""Noise section of a run's report: whether held-out frames agree with it, and what was learnt of it."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -42,7 +42,7 @@ def noise_report(
 
 
 def contradicts(check: NoiseCheck | LearntSigma | None) -> bool:
-    """Whether held-out frames contradict their map so much that no sensor's noise explains it."""
+    """True if held-out frames contradict their map so much that no sensor's noise explains it."""
     return check is not None and check.factor > NO_NOISE
 
 
@@ -52,7 +52,7 @@ def noise_notes(
     learnt: LearntSigma | None,
     mistakes: Sequence[str] = (),
 ) -> list[str]:
-    """The same in sentences; ``mistakes`` are what a doctor finds in a recording that contradicts its map."""
+    """Notes on a run's noise; ``mistakes`` are those that a doctor finds if recording and map disagree."""
     notes = []
     if learnt is not None and learnt.law == SigmaLaw(1.0, 0.0):
         notes.append(f"Sigma stays as stated: {learnt.frames} held-out frames agree with it.")

@@ -1,4 +1,4 @@
-"""What an accelerometer beside the camera has measured, and which way is up if the camera is held still."""
+"""Measurements of an accelerometer beside the camera, and which way is up if the camera is held still."""
 
 from dataclasses import dataclass
 
@@ -43,5 +43,5 @@ def upwards(accelerations: NDArray[np.float64]) -> NDArray[np.float64] | None:
 
 
 def upwards_at(samples: AccelerationSamples, first_s: float) -> NDArray[np.float64] | None:
-    """The same by the samples around the first image, at ``first_s``."""
+    """Upwards as :func:`upwards` has it, by the samples around the first image, at ``first_s``."""
     return upwards(samples.accelerations_m_s2[np.abs(samples.stamps_s - first_s) <= AT_REST_S])

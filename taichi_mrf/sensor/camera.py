@@ -23,7 +23,7 @@ _NO_SKEW = 1e-6
 
 @runtime_checkable
 class Camera(Protocol):
-    """What mapping asks of a camera.
+    """Interface of a camera, as mapping needs it.
 
     A camera is immutable, equal to another that maps pixels to the same rays, and so is its ``repr``.
     Depth is the parameter of a ray along its direction: axial depth if directions have z = 1, range if they
@@ -124,7 +124,7 @@ class PinholeCamera:
         return self.height, self.width
 
     def scaled(self, factor: float) -> "PinholeCamera":
-        """The same view with ``factor`` times as many pixels along each side."""
+        """Camera of the same view with ``factor`` times as many pixels along each side."""
         width, height = max(1, round(self.width * factor)), max(1, round(self.height * factor))
         sx, sy = width / self.width, height / self.height
         return replace(
@@ -227,7 +227,7 @@ def forwards(camera: Camera) -> NDArray[np.float64]:
 
 
 def sees_around(camera: Camera) -> bool:
-    """Whether a camera sees more than about 220 of the 360 degrees around it."""
+    """True if a camera sees more than about 220 of the 360 degrees around it."""
     u, v = (np.unique(np.linspace(0, n - 1, 256).round()) for n in (camera.width, camera.height))
     rays, up = (
         camera.directions(u[None, :], v[:: max(1, len(v) // 16), None]).reshape(-1, 3),

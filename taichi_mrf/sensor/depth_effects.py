@@ -1,4 +1,4 @@
-"""What a depth camera's view of a surface depends on: its tilt, its edges, and where it is sampled.
+"""Effects on a depth camera's view of a surface: its tilt, its edges, and where it is sampled.
 
 All functions take clean axial depth in metres, (H, W) float64, where 0 means that there is no surface.
 """

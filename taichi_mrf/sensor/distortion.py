@@ -53,7 +53,7 @@ class DistortedCamera(RayTable):
                 rays[left, :, :2] += off[left] / (pinhole.fx, pinhole.fy)
         found = rays.reshape(*pinhole.shape, 3)
         wrong = ~(np.abs(off).max(axis=(1, 2)) <= _CLOSE_PX).reshape(pinhole.shape)
-        # Where the image is folded, other pixels have the ray.
+        # Other pixels have the ray where the image is folded.
         wrong[:, 1:] |= np.diff(found[..., 0], axis=1) <= 0
         wrong[1:] |= np.diff(found[..., 1], axis=0) <= 0
         if wrong.any():

@@ -57,7 +57,7 @@ class Frame:
 
     @property
     def own(self) -> OwnEvidence:
-        """What the frame states of its measurements, as it was read."""
+        """Evidence that the frame states of its measurements, as it was read."""
         return OwnEvidence(self.noise, self.sigma_m, self.no_return)
 
     def own_for(self, sensor: SensorConfig) -> OwnEvidence:
@@ -68,13 +68,13 @@ class Frame:
         return OwnEvidence(noise, sigma_m, no_return)
 
     def own_in(self, config: Config) -> OwnEvidence:
-        """What a map with this configuration takes: the same, and how uncertain the frame's pose is."""
+        """Evidence that a map with this configuration takes, and how uncertain the frame's pose is."""
         poses = config.poses
         covariance = checked_covariance(covariance_of(poses.doubt_translation, poses.doubt_rotation))
         return replace(self.own_for(config.sensor), pose_covariance=covariance)
 
     def tells_anything(self, sensor: SensorConfig) -> bool:
-        """Whether it holds a measurement, or a pixel without a return that such a map takes notice of."""
+        """True if it holds a measurement, or a pixel without a return that such a map takes notice of."""
         missing = self.own_for(sensor).no_return
         return bool((self.depth_m > 0).any() or (missing is not None and missing.any()))
 

@@ -36,7 +36,7 @@ class Sensor(Bundle):
 
     @property
     def moving(self) -> bool:
-        """Whether rays have an ``origin`` (CameraRays.moving)."""
+        """True if rays have an ``origin`` (CameraRays.moving)."""
         return self.camera.moving
 
     @ti.func
@@ -46,7 +46,7 @@ class Sensor(Bundle):
 
     @ti.func
     def origin(self, u: F32, v: F32):
-        """Where the ray through (u, v) of a moving camera starts, in metres in the camera frame."""
+        """Start of the ray through (u, v) of a moving camera, in metres in the camera frame."""
         return self.camera.origin(u, v)
 
     @ti.func

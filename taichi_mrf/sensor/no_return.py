@@ -56,7 +56,7 @@ class NoReturnLaw:
 
     @staticmethod
     def of(config: SensorConfig) -> "NoReturnLaw | None":
-        """What a configuration states; None if missing returns are ignored, or count nowhere."""
+        """The law that a configuration states; None if missing returns are ignored, or count nowhere."""
         share, depth, width = config.no_return_share, config.no_return_depth, config.no_return_width
         if config.no_return == "ignore":
             return None

@@ -33,7 +33,7 @@ class NoReturnHere(Struct):
 
 @dataclass(frozen=True)
 class NoReturnChance(SensorNoise):
-    """The same law for all pixels."""
+    """One law of missing returns for all pixels."""
 
     share: F32
     depth: F32

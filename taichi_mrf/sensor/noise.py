@@ -1,4 +1,4 @@
-"""What is known of a sensor's error: bias and standard deviation as functions of axial depth.
+"""Model of a sensor's error: bias and standard deviation as functions of axial depth.
 
 ``bias`` is the mean of measured minus true depth, ``sigma`` the standard deviation of the measured
 depth; both are polynomials of the true axial depth in metres, for the whole image or for each square
@@ -77,7 +77,7 @@ class NoiseTable:
 
 @runtime_checkable
 class NoiseModel(Protocol):
-    """What MRFMap asks of a noise model.
+    """Interface of a noise model, as MRFMap needs it.
 
     What :meth:`table` returns may be of any class with the methods ``at_pixels``, ``largest`` and ``sensor``
     of NoiseTable, and need not hold polynomials.
@@ -88,7 +88,7 @@ class NoiseModel(Protocol):
 
 
 class PolynomialNoise:
-    """The same bias and sigma for every pixel, as polynomials of axial depth."""
+    """One bias and sigma for every pixel, as polynomials of axial depth."""
 
     def __init__(self, sigma: Sequence[float], bias: Sequence[float] = (0.0,)) -> None:
         """Coefficients in ascending powers of depth; metres."""
@@ -139,7 +139,7 @@ class PatchNoise:
             raise ConfigError(f"{path}: {error}") from error
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """What :meth:`load` reads, by name. Raises ConfigError for a camera that is no pinhole."""
+        """Arrays that :meth:`load` reads, by name. Raises ConfigError for a camera that is no pinhole."""
         k = pinhole(self.camera, "a file of noise tables")
         camera = np.array([k.width, k.height, k.fx, k.fy, k.cx, k.cy], np.float64)
         return {"sigma": self.sigma, "bias": self.bias, "patch": np.array(self.patch), "camera": camera}

@@ -1,4 +1,4 @@
-"""Where the rays of a camera start, which is not its centre if it moves while it measures.
+"""Starting points of a camera's rays, which differ from its centre if it moves while it measures.
 
 A moving camera has ``origins_m`` as RayTable has them; the rays of every other camera start at its centre.
 """
@@ -14,8 +14,8 @@ Points = NDArray[np.float64]
 
 
 def origins_of(camera: Camera) -> Points | None:
-    """Where a camera's rays start, (1, W, 3) or (H, W, 3) metres in the camera frame; None if all start at
-    its centre."""
+    """Starting points of a camera's rays, (1, W, 3) or (H, W, 3) metres in the camera frame; None if all
+    start at its centre."""
     origins = getattr(camera, "origins_m", None)
     return None if origins is None else np.asarray(origins, np.float64)
 
@@ -27,8 +27,8 @@ def points_at(camera: Camera, depth_m: NDArray[np.floating]) -> Points:
 
 
 def starts_at(camera: Camera, u: ArrayLike, v: ArrayLike) -> Points:
-    """Where the rays through columns and rows start, (..., 3) metres in the camera frame; (3,) zeros if all
-    start at its centre."""
+    """Starting points of the rays through columns and rows, (..., 3) metres in the camera frame; (3,) zeros
+    if all start at its centre."""
     if origins_of(camera) is None:
         return np.zeros(3)
     starts: Points = camera.origins(u, v)  # type: ignore[attr-defined]

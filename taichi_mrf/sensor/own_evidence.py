@@ -1,4 +1,4 @@
-"""What one keyframe states of its own measurements, in place of what its map assumes of all."""
+"""Evidence that one keyframe states of its own measurements, in place of what its map assumes of all."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -46,7 +46,7 @@ class OwnEvidence:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def content(self) -> bytes:
-        """What it states, as bytes to sort by; empty if it states nothing."""
+        """The evidence as bytes to sort by; empty if there is none."""
         noise = self.noise
         parts = [] if noise is None else [type(noise).__name__.encode(), *map(_bytes, vars(noise).values())]
         arrays = (self.sigma_m, self.no_return, self.pose_covariance)

@@ -69,7 +69,7 @@ class SensorNoise(Bundle):
     whatever a pixel needs."""
 
     own_sigmas: ClassVar[bool] = False
-    """Whether pixels of one patch differ: then there is a ``sigma_level``, as ScaledTable has it."""
+    """True if pixels of one patch differ: then there is a ``sigma_level``, as ScaledTable has it."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What the uncertainty of a keyframe's pose does to its rays: a sigma of depth, and pixels to leave out.
+"""Effect of an uncertain keyframe pose on its rays: a sigma of depth, and pixels to leave out.
 
 A motion of the camera by a small twist xi = (rho, omega) moves a point p that it has measured by
 rho + omega x p. Around p the surface is a plane, n . q = 1. The ray d of the pixel, kept where the recorded
@@ -108,7 +108,7 @@ def beside_edges(depth_m: NDArray[np.floating], camera: Camera, covariance: Cova
     if camera.pixels_per_radian == 0 or not measured.any():
         return np.zeros(camera.shape, bool)
     p, d = _points_and_rays(depth_m, camera)
-    # What is not along the ray is across it, in two directions.
+    # The rest of the variance is across the ray, in two directions.
     along = _variance_along(d / np.sqrt(_dot(d, d)), p, covariance)
     across = 0.5 * np.maximum(_total_variance(p, covariance) - along, 0.0)
     distances = np.where(measured, np.sqrt(_dot(p, p)), np.inf)
@@ -123,7 +123,7 @@ def beside_edges(depth_m: NDArray[np.floating], camera: Camera, covariance: Cova
 
 
 def _points_and_rays(depth_m: NDArray[np.floating], camera: Camera) -> tuple[Image, Image]:
-    """What pixels have measured and the rays through them, (3, H, W) in the camera's frame."""
+    """Measured points of pixels and the rays through them, (3, H, W) in the camera's frame."""
     points, rays = points_at(camera, depth_m), camera.rays()
     return np.moveaxis(points, -1, 0).copy(), np.moveaxis(rays, -1, 0).copy()
 
@@ -135,7 +135,7 @@ def _variance_along(e: Image, p: Image, covariance: Covariance) -> Image:
 
 
 def _total_variance(p: Image, covariance: Covariance) -> Image:
-    """The same for all three axes together: the trace of J C J' with J = (1, -[p]x)."""
+    """Sum of the variances (H, W) along all three axes: the trace of J C J' with J = (1, -[p]x)."""
     A, B, D = covariance[:3, :3], covariance[:3, 3:], covariance[3:, 3:]
     twice = 2.0 * np.array([B[1, 2] - B[2, 1], B[2, 0] - B[0, 2], B[0, 1] - B[1, 0]])
     points = p.reshape(3, -1)

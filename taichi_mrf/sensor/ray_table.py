@@ -47,7 +47,7 @@ class RayTable:
         if given.ndim not in (2, 3) or given.shape[-1] != 3 or given.size == 0:
             raise ConfigError(f"directions must be of shape (H, W, 3) or (N, 3), not {given.shape}")
         self.has_pattern: bool = given.ndim == 3
-        """Whether neighbours in the image are neighbours in space."""
+        """True if neighbours in the image are neighbours in space."""
         with np.errstate(over="ignore"):
             self._table = np.ascontiguousarray(given, np.float32).reshape((-1, *given.shape[-2:]))
         lengths = np.linalg.norm(self.rays(), axis=-1)
@@ -56,7 +56,7 @@ class RayTable:
             v, u = np.argwhere(wrong)[0]
             raise ConfigError(f"the direction of column {u}, row {v} is not finite or has no length")
         self.measures_range = bool((np.abs(lengths - 1.0) < _UNIT).all())
-        """Whether depth is range: all directions have the length 1."""
+        """True if depth is range: all directions have the length 1."""
         self._table.flags.writeable = False
         self._origins = None if origins_m is None else self._checked_origins(origins_m)
         self._hulls: dict[int, NDArray[np.float64]] = {}
@@ -144,8 +144,8 @@ class RayTable:
 
     @property
     def origins_m(self) -> NDArray[np.float32] | None:
-        """Where rays start, (1, W, 3) if all rows share them, otherwise (H, W, 3), in metres in the camera
-        frame, read-only; None if all start at the camera's centre."""
+        """Starting points of rays, (1, W, 3) if all rows share them, otherwise (H, W, 3), in metres in the
+        camera frame, read-only; None if all start at the camera's centre."""
         return self._origins
 
     @cached_property
@@ -201,8 +201,8 @@ class RayTable:
         return between
 
     def origins(self, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
-        """Where the rays through columns and rows start, (..., 3) metres in the camera frame; the arguments
-        are those of :meth:`directions`."""
+        """Starting points of the rays through columns and rows, (..., 3) metres in the camera frame; the
+        arguments are those of :meth:`directions`."""
         origins = np.zeros((1, self.width, 3), np.float32) if self._origins is None else self._origins
         return _interpolated(np.broadcast_to(origins, self._table.shape), u, v)[0]
 
@@ -299,7 +299,7 @@ class RayTable:
 def _interpolated(
     table: NDArray[np.float32], u: ArrayLike, v: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """What an (H, W, 3) table has at columns and rows that broadcast with each other, (..., 3), linear
+    """Values of an (H, W, 3) table at columns and rows that broadcast with each other, (..., 3), linear
     between pixels, and which of these are pixels, (..., 1)."""
     height, width = table.shape[:2]
     columns, lines = np.broadcast_arrays(np.asarray(u, np.float64), np.asarray(v, np.float64))

@@ -25,7 +25,7 @@ class CameraRays(Bundle):
     """A ti.func, as MovingTableRays has it, if the camera is ``moving``."""
 
     moving: ClassVar[bool] = False
-    """Whether rays start at places of their own, which ``origin`` gives. Otherwise all start at the camera's
+    """True if rays start at places of their own, which ``origin`` gives. Otherwise all start at the camera's
     centre, and kernels are compiled without ``origin``."""
 
     @ti.func
@@ -136,8 +136,8 @@ class MovingTableRays(TableRays):
 
     @ti.func
     def origin(self, u: F32, v: F32):
-        """Where the ray through column u and row v starts, in metres in the camera frame; between pixels
-        linear in both."""
+        """Start of the ray through column u and row v, in metres in the camera frame; between pixels linear
+        in both."""
         left, top = ti.cast(ti.floor(u), ti.i32), ti.cast(ti.floor(v), ti.i32)
         a, b = u - left, v - top
         start = self._start(left, top)

@@ -56,7 +56,7 @@ class SphericalCamera(RayTable):
 
     @property
     def azimuth_offsets_rad(self) -> NDArray[np.float64]:
-        """What each row adds to the azimuths, (H,)."""
+        """Angle that each row adds to the azimuths, (H,)."""
         return self._beams[2].copy()
 
     def __reduce__(self) -> tuple[Any, ...]:

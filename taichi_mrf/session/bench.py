@@ -1,4 +1,4 @@
-"""What a keyframe costs the viewer: time on the server, and bytes to each browser.
+"""Cost of a keyframe for the viewer: time on the server, and bytes to each browser.
 
 The page's own parts are used with a real server and one client that only reads, so that the bytes are
 those that went over the wire.

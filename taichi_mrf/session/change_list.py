@@ -1,5 +1,5 @@
-"""What appeared in the scene and what left it, as the page lists it: the map now against the map as it was
-believed at the last comparison."""
+"""List of what appeared in the scene or left it, for the page: the map now against the map as it was believed
+at the last comparison."""
 
 import math
 import time

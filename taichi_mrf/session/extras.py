@@ -60,7 +60,7 @@ class Extras:
 
     @property
     def need_messages(self) -> bool:
-        """Whether the page shows what only messages tell: who sees a voxel, and its colour."""
+        """True if the page shows what only messages tell: who sees a voxel, and its colour."""
         return self._watch.counts or self._watch.colors
 
     def start_again_for_viewer(self) -> None:
@@ -178,14 +178,14 @@ class Extras:
 
     @property
     def _is_at_rest(self) -> bool:
-        """Whether no frames are read, and neither inference nor alignment follows, after which all that is
+        """True if no frames are read, and neither inference nor alignment follows, after which all that is
         made of the map would be made again."""
         run, mapper = self._run, self._run.mapper
         aligning = mapper.unaligned and mapper.refiner is not None and not run.has_frames_left
         return not (run.is_replaying or mapper.unsettled or aligning)
 
     def _between(self, go_on: GoOn, doing: str, wanted: Callable[[], bool]) -> Callable[[], None]:
-        """What is called between steps of long work: now and then it carries out requests, and it raises
+        """Callback between steps of long work: now and then it carries out requests, and it raises
         StopRequestedError if the work is to end."""
         asked = time.monotonic()
 

@@ -32,7 +32,7 @@ Serve = Callable[[Connection, str, int], None]
 
 
 class Link(Protocol):
-    """What a session needs of the connection to its viewer."""
+    """Interface of the connection to a session's viewer."""
 
     @property
     def lost(self) -> str | None:
@@ -175,7 +175,7 @@ def _main_left_alone() -> Iterator[None]:
 
 
 def _serve_page(connection: Connection, host: str, port: int) -> None:
-    """What runs in the viewer's process. Imported late: the page's libraries are of no use to mapping."""
+    """Main function of the viewer's process. Imported late: mapping needs none of the page's libraries."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     from taichi_mrf.viewer.live.page import Page
     from taichi_mrf.viewer.transport.process import run_viewer

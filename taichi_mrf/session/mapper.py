@@ -74,7 +74,7 @@ class Mapper:
 
     @property
     def stale(self) -> bool:
-        """Whether the map does not show the last edits until it is settled."""
+        """True if the map does not show the last edits until it is settled."""
         return self.map.stale
 
     def enter(self, added: Added) -> LiveKeyframe:

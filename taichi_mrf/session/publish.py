@@ -52,10 +52,8 @@ class Publisher:
         self._all = True
 
     def changes(self, touched: NDArray[np.int32] | None = None) -> Bricks | None:
-        """What has changed since the last call, None if nothing has. The first time that is the whole map.
-
-        ``touched`` are the slots, ascending, that may have changed; by default the pool is asked.
-        """
+        """Changes since the last call, None if there are none. The first time that is the whole map.
+        ``touched`` are the slots, ascending, that may have changed; by default the pool is asked."""
         touched = self._pool.take_touched() if touched is None else touched
         slots, self._all = (self._pool.in_use if self._all else touched), False
         parts = [self._changed(slots[i : i + _AT_ONCE]) for i in range(0, len(slots), _AT_ONCE)]
@@ -120,7 +118,7 @@ class Publisher:
 
 
 class _SentBricks:
-    """What was sent to the viewer, by brick: rows of arrays that grow."""
+    """Bricks that were sent to the viewer: rows of arrays that grow."""
 
     def __init__(self) -> None:
         self._rows: dict[int, int] = {}

@@ -1,4 +1,4 @@
-"""What the ray of a pixel, or through a point in the map, meets: the answer to a click."""
+"""Answer to a click: what the ray of a pixel, or through a point in the map, meets."""
 
 import dataclasses
 from collections.abc import Iterable, Sequence
@@ -32,7 +32,7 @@ class PosedDepthImage:
     """The viewer's number of the keyframe, if it is one."""
 
     own: OwnEvidence = NOTHING
-    """What the keyframe states of its measurements."""
+    """Evidence that the keyframe states of its measurements."""
 
     def noise_model(self, default: NoiseModel) -> NoiseModel:
         """The image's noise, if its map has the noise ``default``."""
@@ -128,7 +128,7 @@ def _profiled(
 
 
 def _sees(m: OccupancyMap, image: PosedDepthImage, u: float, v: float, depth_m: float) -> bool:
-    """Whether the measurement at a pixel leaves the view free up to a depth."""
+    """True if the measurement at a pixel leaves the view free up to a depth."""
     column, row = _nearest(image.camera, u, v)
     measured = float(image.depth_m[row, column])
     if measured <= 0:

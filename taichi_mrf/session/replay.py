@@ -53,7 +53,7 @@ class Replay:
         self._later_s = 0.0
         """How much later than recorded the frames of this pass are."""
         self.has_pace = not dataset.endless
-        """Whether frames can come faster or slower: not those of a camera, or without a stamp."""
+        """True if frames can come faster or slower: not those of a camera, or without a stamp."""
         self._begin: tuple[float, float] | None = None
         """A time on the clock, and the stamp of the frame that was due then."""
         self.set_speed(speed)

@@ -1,4 +1,4 @@
-"""What each request of the viewer does. An error in one becomes a notice for the user."""
+"""Answers to the viewer's requests. An error in one becomes a notice for the user."""
 
 import tempfile
 from collections.abc import Callable
@@ -38,7 +38,7 @@ _FILES = {"map": MAP_FILE, "ply": VOXEL_FILE, "mesh": MESH_FILE}
 
 
 def resumes_replay(request: Request) -> bool:
-    """Whether a request starts a paused replay again."""
+    """True if a request starts a paused replay again."""
     return isinstance(request, Step) or (isinstance(request, Pause) and not request.on)
 
 

@@ -34,7 +34,7 @@ from taichi_mrf.viewer.messages import Bricks, CurrentCamera, Hello, KeyframeInf
 
 @dataclass(frozen=True)
 class Policy:
-    """What a run does on its own. ``keep_live``: most keyframes that are on before some are frozen,
+    """Rules that a run follows on its own. ``keep_live``: most keyframes that are on before some are frozen,
     None for no limit. ``out``: folder for the files that a user saves. ``leave_when_done``: end once the
     source has ended and the map is settled."""
 
@@ -176,7 +176,7 @@ class Run(SessionCore):
             self.stepping = False
 
     def result(self) -> MappingResult:
-        """What the run has made so far, as a batch run reports it."""
+        """Result of the run so far, as a batch run reports it."""
         result, replay, inferred = self.intake.result, self.replay, self.mapper.inferred
         result.interrupted, result.full = not self.is_done, self.full
         if replay is not None:
@@ -197,19 +197,19 @@ class Run(SessionCore):
 
     @property
     def has_frames_left(self) -> bool:
-        """Whether the source has not ended."""
+        """True if the source has not ended."""
         return self.replay is not None and not self.replay.finished
 
     @property
     def is_replaying(self) -> bool:
-        """Whether frames are being replayed, or a single step was asked for."""
+        """True if frames are being replayed, or a single step was asked for."""
         return (
             self.replay is not None and not self.replay.finished and (self.stepping or not self.replay.paused)
         )
 
     @property
     def is_done(self) -> bool:
-        """Whether all frames are in the map, or as many as there is room for, and it is the one that they
+        """True if all frames are in the map, or as many as there is room for, and it is the one that they
         give."""
         frames_left = self.has_frames_left and self.full is None
         poses_may_change = self.follower is not None and not self.follower.is_final

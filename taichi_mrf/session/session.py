@@ -134,7 +134,7 @@ class Session:
 
     @property
     def _needs_messages(self) -> bool:
-        """Whether an edit or what the page shows waits for the messages of a map from a file."""
+        """True if an edit or what the page shows waits for the messages of a map from a file."""
         mapper = self.state.mapper
         wanted = (
             self.state.inbox.has_edits() or self._extras.need_messages or mapper.shown.stamp_s is not None

@@ -1,4 +1,4 @@
-"""What live and tuning sessions share: the link to the page, and the requests that wait.
+"""Common core of live and tuning sessions: the link to the page, and the requests that wait.
 
 One thread does all of a session's work, because Taichi may be used by one thread only. Between two pieces of
 work it reads the page's requests. Requests that arrive faster than they are carried out do not pile up: a
@@ -68,7 +68,7 @@ class Inbox:
         return self._waiting[0]
 
     def has_edits(self) -> bool:
-        """Whether a request that changes the map is waiting."""
+        """True if a request that changes the map is waiting."""
         return any(isinstance(request, EDITS) for request in self._waiting)
 
     def __len__(self) -> int:
@@ -79,7 +79,7 @@ class Inbox:
 
 
 def _subject(request: Request) -> Hashable:
-    """What a request is about."""
+    """Subject of a request."""
     if isinstance(request, OF_ONE_KEYFRAME):
         return "keyframe", request.keyframe
     if isinstance(request, Pause | Step):
@@ -106,7 +106,7 @@ class SessionCore:
 
     @property
     def is_over(self) -> bool:
-        """Whether to stop working: after a signal, after Quit, or when the page is lost."""
+        """True if work has to stop: after a signal, after Quit, or when the page is lost."""
         return self.should_stop() or self.ended or self.link.lost is not None
 
     def read_requests(self) -> None:

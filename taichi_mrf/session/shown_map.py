@@ -1,5 +1,5 @@
-"""What the page shows of the map: as it is believed now or was believed at another time, with its dynamic
-voxels as a layer of their own.
+"""Map as the page shows it: as it is believed now or was believed at another time, with its dynamic voxels as
+a layer of their own.
 
 The past is read again only from time to time, because that takes all messages. What is occupied now takes a
 pass over new keyframes' rays: it is found when there is time, and until then marginals are shown; a map that
@@ -66,7 +66,7 @@ class ShownMap:
 
     @property
     def has_dates(self) -> bool:
-        """Whether the map can be shown as of another time."""
+        """True if the map can be shown as of another time."""
         return self._dynamic is not None
 
     def show(self, stamp_s: float | None) -> None:
@@ -79,8 +79,8 @@ class ShownMap:
                 self._look_again()
 
     def changes(self) -> list[Bricks]:
-        """What has changed of each layer since the last call. While the past is shown it is nothing, and
-        :meth:`renew` follows. Votes are those of an earlier map, and marginals take their place."""
+        """Changes of each layer since the last call; empty while a past time is shown, and :meth:`renew`
+        follows. Votes are those of an earlier map, and marginals take their place."""
         self._outdated = self.stamp_s is not None
         if self._outdated or self._held_back == self._pool.revision:
             return []
@@ -90,7 +90,7 @@ class ShownMap:
 
     @property
     def lacks_decisions(self) -> bool:
-        """Whether :meth:`decide` has something to do."""
+        """True if :meth:`decide` has something to do."""
         able = has_layers(self.map) and not self._undecided
         return able and self.stamp_s is None and self._decided_of != self._pool.revision
 

@@ -34,7 +34,7 @@ class ShownSurface:
 
     @property
     def is_current(self) -> bool:
-        """Whether the map has not changed since the last try."""
+        """True if the map has not changed since the last try."""
         return self._tried_at == self._state
 
     def news(self, between: Callable[[], object]) -> list[Update]:

@@ -1,4 +1,4 @@
-"""What a live run maps: a recording or a camera with a new map, or a saved map."""
+"""Source of a live run: a recording or a camera with a new map, or a saved map."""
 
 import dataclasses
 from collections.abc import Callable

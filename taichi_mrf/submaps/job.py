@@ -1,4 +1,4 @@
-"""What all tasks of a run read, in one JSON file of its folder: the source, the parameters and the plan."""
+"""Common input of a run's tasks, one JSON file of its folder: the source, the parameters and the plan."""
 
 import json
 from dataclasses import asdict, dataclass

@@ -44,7 +44,7 @@ class PartialMap(MRFMap):
         return found
 
     def slots(self, bricks: Bricks) -> NDArray[np.int32]:
-        """Where bricks (n, 3) are in the pool, (n,); -1 for those that do not exist."""
+        """Slots of bricks (n, 3) in the pool, (n,); -1 for those that do not exist."""
         return self._registry.topology.slots(bricks)
 
     def bricks(self) -> Bricks:

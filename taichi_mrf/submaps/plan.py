@@ -22,8 +22,8 @@ Cell = tuple[int, int]
 
 @dataclass(frozen=True)
 class SeenKeyframe:
-    """What the plan needs of a keyframe: its index in the dataset, where the camera was, in metres, and the
-    chunks (n, 3) that its rays cross; ``up`` is the world axis that is up in its image."""
+    """Part of a keyframe that the plan needs: its index in the dataset, where the camera was, in metres, and
+    the chunks (n, 3) that its rays cross; ``up`` is the world axis that is up in its image."""
 
     index: int
     centre_m: tuple[float, float, float]
@@ -51,7 +51,7 @@ class Plan:
         return cells_of_chunks(bricks // CHUNK, self.chunks_across)
 
     def is_core(self, number: int, bricks: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Whether a submap owns each of the bricks (n, 3), (n,)."""
+        """True for each of the bricks (n, 3) that a submap owns, (n,)."""
         return (self.cells_of(bricks) == self.submaps[number].cell).all(axis=1)
 
     def neighbours(self, number: int) -> dict[int, tuple[int, ...]]:

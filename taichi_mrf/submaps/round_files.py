@@ -48,7 +48,7 @@ class SubmapReport:
 
     @property
     def has_nothing(self) -> bool:
-        """Whether rays only pass through: there is nothing to infer."""
+        """True if rays only pass through: there is nothing to infer."""
         return not self.core_bricks and not self.surface_bricks
 
 

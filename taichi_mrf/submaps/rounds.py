@@ -59,7 +59,7 @@ class RoundReport:
 
 @dataclass
 class SubmapsResult:
-    """What :func:`map_in_submaps` made: the job, its rounds, and the ``seconds`` of each stage."""
+    """Result of :func:`map_in_submaps`: the job, its rounds, and the ``seconds`` of each stage."""
 
     job: Job
     rounds: list[RoundReport] = field(default_factory=list)
@@ -257,7 +257,7 @@ def _merge(folder: Path, job: Job, round: int, path: Path) -> None:
 
 
 def _wanted(config: Config) -> tuple[tuple[str, bool], ...]:
-    """What a store may hold beside log-odds, and whether it does."""
+    """Extras that a store may hold beside log-odds, and whether it does."""
     return (COLORS, config.color), (SURFACE, config.keep_surface), (FIRST, config.keep_surface)
 
 

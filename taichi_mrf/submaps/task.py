@@ -84,7 +84,7 @@ def infer_submap(
 
 
 def is_idle(task: SubmapTask) -> bool:
-    """Whether the result is that of the round before: rays only pass through this column, and they are the
+    """True if the result is that of the round before: rays only pass through this column, and they are the
     same in every round."""
     before = round_path(Path(task.folder), task.round - 1, task.submap)
     return task.round > 0 and read_report(before).has_nothing

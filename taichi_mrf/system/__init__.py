@@ -1,4 +1,4 @@
-"""What the program needs of the machine: Taichi's runtime, devices, memory, files, optional libraries.
+"""Interface to the machine: Taichi's runtime, devices, memory, files, optional libraries.
 
 Uses no other package of the program; every package may use it.
 """

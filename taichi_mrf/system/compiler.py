@@ -32,13 +32,13 @@ VARIABLE = "TAICHI_MRF_COMPILER"
 class _Compiler:
     title: str
     install: str
-    """What pip installs."""
+    """Name of the package that pip installs."""
     prefix: str
     """Of its environment variables."""
     banner: str
     """The environment variable that keeps it from printing when it is loaded."""
     cache: tuple[str, ...]
-    """Where its compiled kernels lie within XDG_CACHE_HOME."""
+    """Folder of its compiled kernels within XDG_CACHE_HOME."""
     runtime: str
     """The attribute of its module ``lang.impl`` that is the runtime."""
     program: str
@@ -52,7 +52,7 @@ class _Compiler:
     data_type: str
     """The function of ``lang.util`` that turns NumPy's types into the compiler's."""
     frees_vectors: bool
-    """Whether the memory of an array of vectors is given back with the array."""
+    """True if the memory of an array of vectors is freed with the array."""
 
 
 COMPILERS = {
@@ -119,7 +119,7 @@ def variable(setting: str) -> str:
 
 
 def is_loaded() -> bool:
-    """Whether the compiler is in memory, by this package or by the program around it."""
+    """True if the compiler is in memory, loaded by this package or by the program around it."""
     return name() in sys.modules
 
 
@@ -130,7 +130,7 @@ def runtime_place() -> tuple[Any, str]:
 
 
 def program() -> Any:
-    """What runs kernels and owns the memory; None before ``ti.init``."""
+    """Object that runs kernels and owns the memory; None before ``ti.init``."""
     implementation, attribute = runtime_place()
     return getattr(getattr(implementation, attribute, None), COMPILERS[name()].program, None)
 
@@ -182,7 +182,7 @@ def pass_whole(base: type) -> None:
 
 
 def frees_vectors() -> bool:
-    """Whether the memory of an array of vectors is given back with the array."""
+    """True if the memory of an array of vectors is freed with the array."""
     return COMPILERS[name()].frees_vectors
 
 

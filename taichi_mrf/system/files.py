@@ -29,22 +29,22 @@ _FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
 def exists(path: str | Path) -> bool:
-    """Whether there is anything at a path; False also for a path that is too long or that may not be seen."""
+    """True if a path exists; False also for a path that is too long or that may not be seen."""
     return os.path.exists(path)
 
 
 def is_file(path: str | Path) -> bool:
-    """Whether a path is a regular file, or a link to one."""
+    """True if a path is a regular file, or a link to one."""
     return os.path.isfile(path)
 
 
 def is_folder(path: str | Path) -> bool:
-    """Whether a path is a folder, or a link to one."""
+    """True if a path is a folder, or a link to one."""
     return os.path.isdir(path)
 
 
 def kind_of(mode: int) -> str | None:
-    """What is at a path, by its ``st_mode``, if it is no regular file: "a FIFO", "a device"."""
+    """Kind of thing at a path, by its ``st_mode``: "a FIFO", "a device"; None for a regular file."""
     return None if stat.S_ISREG(mode) else _KINDS.get(stat.S_IFMT(mode), "something else")
 
 

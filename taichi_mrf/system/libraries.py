@@ -23,5 +23,5 @@ def library(name: str, who_needs: str, extra: str, error: type[TaichiMRFError] =
 
 
 def installed(*names: str) -> bool:
-    """Whether all of some modules can be loaded."""
+    """True if all the modules can be loaded."""
     return all(importlib.util.find_spec(name) is not None for name in names)

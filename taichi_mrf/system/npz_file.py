@@ -26,8 +26,8 @@ DEFLATE_RATIO = 1032
 """The highest compression ratio of deflate (zlib's technical details)."""
 
 _LEAST_BOUND, _LARGEST_RATIO = 1 << 28, 100
-"""What is read of a file may be this large, or this many times what it takes in the file. Measurements pack
-three to ten times; only arrays of a single value pack a thousandfold."""
+"""Limits of what is read of a file: this many bytes, or this many times what it takes in the file.
+Measurements pack three to ten times; only arrays of a single value pack a thousandfold."""
 
 _CHUNK = 1 << 20
 _MOST_DIMENSIONS = 8
@@ -173,7 +173,7 @@ def open_npz(path: Path, error: ErrorType, what: str) -> Iterator[NpzFile]:
 
 
 def _is_text(array: NDArray[np.str_]) -> bool:
-    """Whether every character is in Unicode; Python raises SystemError for others."""
+    """True if every character is in Unicode; Python raises SystemError for others."""
     if array.dtype.itemsize == 0:
         return True
     codes = np.ascontiguousarray(array).reshape(-1).view(np.dtype("u4").newbyteorder(array.dtype.byteorder))

@@ -30,7 +30,7 @@ class _Owner:
 
 _owner: _Owner | None = None
 _forked = False
-"""Whether this process was forked from one in which Taichi runs."""
+"""True in a process that was forked from one in which Taichi runs."""
 
 
 def claim() -> None:

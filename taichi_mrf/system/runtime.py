@@ -47,7 +47,7 @@ class Backend:
 
 @dataclass(frozen=True)
 class BackendStatus:
-    """Whether a backend could be used here: its device, or the problem."""
+    """Result of trying a backend on this machine: its device, or the problem."""
 
     name: str
     device: str | None
@@ -99,14 +99,14 @@ def init(arch: str = "auto", threads: int = 0, debug: bool = False, profile: boo
 
 
 def _profiles_kernels() -> bool:
-    """Whether Taichi was started with its kernel profiler, which it has on all backends but Vulkan."""
+    """True if Taichi was started with its kernel profiler, which it has on all backends but Vulkan."""
     from taichi_mrf.system.compiler import ti
 
     return active() == "vulkan" or bool(ti.cfg.kernel_profiler)
 
 
 def choice() -> Backend | None:
-    """What :func:`init` chose and why, or None before it."""
+    """Backend that :func:`init` chose and why, or None before it."""
     return _chosen
 
 

@@ -50,8 +50,8 @@ def cache_folder() -> str | None:
 
 
 def first_run_note() -> str | None:
-    """What to say before kernels are compiled for the first time, which takes a while; None if there are some
-    in their folder, or if none are kept. Look before Taichi is started."""
+    """Note that the first compilation of kernels takes a while; None if there are compiled kernels in their
+    folder, or if none are kept. Look before Taichi is started."""
     folder = cache_folder()
     if folder is None or os.environ.get(compiler.variable("OFFLINE_CACHE")) == "0":
         return None
@@ -69,7 +69,7 @@ def cache_problem() -> str | None:
 
 
 def _choose_cache() -> None:
-    """Where the usual folder cannot be used, take a private one among the temporary files."""
+    """Choose a private folder among the temporary files if the usual one cannot be used."""
     global cache_note
     usual = cache_folder()
     if usual is None or not _is_writable(usual):
@@ -100,7 +100,7 @@ def _choose_matplotlib_folder() -> None:
 
 
 def _is_writable(folder: str) -> bool:
-    """Whether a folder can be written to, or made."""
+    """True if a folder can be written to, or made."""
     path = os.path.abspath(folder)
     while not os.path.lexists(path):
         path = os.path.dirname(path)

@@ -76,8 +76,8 @@ def numbers(value: Any, name: str) -> Any:
 
 
 def real_array(value: Any, name: str, shape: tuple[int | str, ...]) -> Any:
-    """The same of a shape, a name for any length. Raises ConfigError for another shape or numbers that are
-    not finite."""
+    """Numbers as :func:`numbers` gives them, of a shape; a name stands for any length. Raises ConfigError for
+    another shape or numbers that are not finite."""
     given = numbers(value, name)
     if len(given.shape) != len(shape) or any(
         isinstance(want, int) and n != want for n, want in zip(given.shape, shape, strict=True)

@@ -1,5 +1,5 @@
-"""What the page shows of the held-out views: pictures of where a map is right, kept for every try, so that
-any two can be compared, and how measurements scatter around the expected depth."""
+"""Pictures of the held-out views for the page: where a map is right, kept for every try, so that any two can
+be compared, and how measurements scatter around the expected depth."""
 
 from collections.abc import Sequence
 
@@ -110,7 +110,7 @@ def _packed(view: JudgedView, frame: Frame, pixel_stride: int) -> tuple[bytes, f
     judged = view.accuracy("1.5sigma")
     picture = unrolled(frame.camera).image(judged.image, NOT_JUDGED)
     step = max(_step(picture), pixel_stride)
-    # Where only some pixels were judged the picture is of these.
+    # The picture is of the judged pixels alone.
     first = min(pixel_stride // 2, min(picture.shape) - 1)
     small = np.ascontiguousarray(picture[first::step, first::step])
     return cv2.imencode(".png", small.astype(np.uint8))[1].tobytes(), judged.score, judged.unanswered

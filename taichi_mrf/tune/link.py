@@ -54,7 +54,7 @@ class NoPage:
 
 
 def _serve_page(connection: Connection, host: str, port: int) -> None:
-    """What runs in the page's process. Imported late: its libraries are of no use to mapping."""
+    """Main function of the page's process. Imported late: mapping needs none of its libraries."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     from taichi_mrf.viewer.transport.process import run_viewer
     from taichi_mrf.viewer.tune.page import TunePage

@@ -76,11 +76,11 @@ class Search:
 
     @property
     def done(self) -> bool:
-        """Whether all tries were made."""
+        """True if all tries were made."""
         return self.told >= self.tries
 
     def ask(self) -> Config:
-        """What to try next; the same until :meth:`tell`."""
+        """Configuration to try next; the same until :meth:`tell`."""
         while self._asked is None:
             trial = self._study.ask()
             config = self.start

@@ -44,7 +44,7 @@ from taichi_mrf.viewer.tune.messages import (
 
 @dataclass(frozen=True)
 class Policy:
-    """What a session does without being asked. ``out``: folder for the files that a user saves.
+    """Rules that a session follows without being asked. ``out``: folder for the files that a user saves.
     ``search_stride``: the automatic search looks at every so many-th pixel, 0 for that of a first look.
     ``leave_when_done``: end with the search."""
 

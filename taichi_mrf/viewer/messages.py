@@ -56,17 +56,17 @@ class Hello(Update):
     parameters: str
     """The effective configuration as YAML."""
     can_freeze: bool = True
-    """Whether the map's method can freeze keyframes."""
+    """True if the map's method can freeze keyframes."""
     has_dates: bool = False
-    """Whether the map can be shown as of another time."""
+    """True if the map can be shown as of another time."""
     has_colors: bool = False
-    """Whether voxels have the colours that cameras saw."""
+    """True if voxels have the colours that cameras saw."""
     has_surface: bool = False
-    """Whether the map can make the surface that its keyframes measured."""
+    """True if the map can make the surface that its keyframes measured."""
     counts_keyframes: bool = True
-    """Whether the map knows how many keyframes see a voxel."""
+    """True if the map knows how many keyframes see a voxel."""
     has_frames: bool = True
-    """Whether the map is made from frames, and is not one from a file."""
+    """True if the map is made from frames, and is not one from a file."""
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,7 @@ class SceneChange:
 
 @dataclass(frozen=True)
 class SceneChanges(Update):
-    """What has appeared and left lately, the latest first."""
+    """Things that have appeared or left lately, the latest first."""
 
     changes: tuple[SceneChange, ...]
 

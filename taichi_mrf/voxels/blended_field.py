@@ -12,9 +12,9 @@ AROUND = 27
 
 @ti.func
 def voxel_around(around: Template, place: I32, cell: IVec3) -> I32:
-    """Where the voxel ``cell``, counted from the first of the brick at ``place``, from -8 to 15 along each
-    axis, stands among those of some rows of bricks, -1 where there is none. ``around`` (places * 27) are the
-    rows of the bricks around each place."""
+    """Index of the voxel ``cell`` among those of some rows of bricks, -1 where there is none. ``cell`` counts
+    from the first voxel of the brick at ``place``, from -8 to 15 along each axis; ``around`` (places * 27)
+    are the rows of the bricks around each place."""
     row = around[place * AROUND + flat((cell >> 3) + 1, IVec3(3))]
     found = -1
     if row >= 0:

@@ -85,7 +85,7 @@ def _halves(values: NDArray[np.float32], axis: int) -> tuple[NDArray[np.float32]
 
 
 def _any_of_eight(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Whether any of the eight parts of a cell has a flag: (n, k^3) of the parts -> (n, (k / 2)^3)."""
+    """True for a cell if any of its eight parts has a flag: (n, k^3) of the parts -> (n, (k / 2)^3)."""
     half = round(flags.shape[1] ** (1 / 3)) // 2
     parts = flags.reshape(-1, half, 2, half, 2, half, 2)
     return parts.any(axis=(2, 4, 6)).reshape(len(flags), half**3)

@@ -13,7 +13,7 @@ NO_COLOR = 128
 """Each of red, green and blue of a voxel whose colour no camera saw, beside others that have one."""
 
 PHOTO_NOTE = f"color is what cameras saw, {NO_COLOR} {NO_COLOR} {NO_COLOR} where none did"
-"""What the colours in a file mean, for its header."""
+"""Meaning of the colours in a file, for its header."""
 
 
 def viridis() -> NDArray[np.uint8]:

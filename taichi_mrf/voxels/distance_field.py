@@ -31,7 +31,7 @@ MARGIN = 1
 
 
 class DistanceSource(Protocol):
-    """Where signed distances are read from, a box at a time: memory, or a map in chunks."""
+    """Source of signed distances, read a box at a time: memory, or a map in chunks."""
 
     @property
     def chunks(self) -> NDArray[np.int32]:

@@ -56,8 +56,8 @@ def grid_keys(cells: NDArray[np.integer] | NDArray[np.floating]) -> NDArray[np.i
 
 
 def rows_around(cells: NDArray[np.int32], keys: NDArray[np.int64], reach: int = 1) -> NDArray[np.int32]:
-    """Where cells (n, 3) and those up to ``reach`` away along each axis stand among ascending ``keys``
-    (:func:`grid_keys`): (n, (2 reach + 1)^3), x slowest, -1 where there is none."""
+    """Index among ascending ``keys`` (:func:`grid_keys`) of cells (n, 3) and of those up to ``reach`` away
+    along each axis: (n, (2 reach + 1)^3), x slowest, -1 where there is none."""
     steps = np.indices((2 * reach + 1,) * 3).reshape(3, -1).T - reach
     wanted = grid_keys((cells[:, None] + steps).reshape(-1, 3))
     if not len(keys):

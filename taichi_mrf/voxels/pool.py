@@ -41,7 +41,7 @@ class PoolSnapshot:
 
 
 class Dated(Protocol):
-    """What takes the place of the sums of messages for queries, in a map whose evidence has a date."""
+    """Log-odds that queries read instead of the sums of messages, in a map whose evidence has a date."""
 
     def current(self) -> "ti.Ndarray":
         """The log-odds of all voxels (capacity * 512), brought up to date."""
@@ -112,7 +112,7 @@ class BrickPool:
 
     @property
     def in_order(self) -> NDArray[np.int32]:
-        """The same, by the bricks' coordinates: an order that follows from the map, whatever its history."""
+        """Slots of the bricks that exist, by coordinates: the order does not depend on the history."""
         slots = self.in_use
         return slots[np.lexsort(self.bricks[slots].T)]
 
@@ -226,7 +226,7 @@ class BrickPool:
         return out.reshape(-1, VOXELS)
 
     def showing_others(self, log_odds: "ti.Ndarray") -> "BrickPool":
-        """The same bricks, whose beliefs are other log-odds (capacity * 512)."""
+        """View of these bricks whose beliefs are other log-odds (capacity * 512)."""
         other = copy.copy(self)
         other._shown = log_odds
         return other

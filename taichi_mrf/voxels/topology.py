@@ -125,7 +125,7 @@ class _Tree:
 
     @ti.func
     def in_span(self, cell: IVec4) -> I32:
-        """Whether a cell lies within the tree."""
+        """True if a cell lies within the tree."""
         return ti.min(cell[0], cell[1], cell[2]) >= 0 and (
             ti.max(cell[0], cell[1], cell[2]) < 2 * self.HALF_SPAN
         )
@@ -163,7 +163,7 @@ class _Tree:
 
     @ti.kernel
     def locate(self, points: AnyArray2, voxel_size: F64, voxels: I32Array, layer: I32):
-        """Where in the pool the voxels of points (N, 3) in metres are, into ``voxels`` (N), as
+        """Write the places in the pool of the voxels of points (N, 3) in metres into ``voxels`` (N), as
         Topology.locate has it."""
         for i in range(voxels.shape[0]):
             voxel = IVec3(0)
@@ -233,7 +233,7 @@ class SparseTopology:
 
     @classmethod
     def all_taken(cls) -> bool:
-        """Whether no layer is left for another map."""
+        """True if no layer is left for another map."""
         return cls.tree is not None and not cls.tree.unused
 
     def anchor(self, brick: Bricks) -> None:

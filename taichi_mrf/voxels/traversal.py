@@ -43,7 +43,7 @@ class Space(Bundle):
 
 @dataclass(frozen=True)
 class Viewpoint(Bundle):
-    """Where a camera stands in a window (Window.viewpoint)."""
+    """Pose of a camera in a window (Window.viewpoint)."""
 
     centre: Vec3
     """The camera's centre, in voxels from the window's corner. Rays start there unless the camera is
@@ -65,7 +65,7 @@ class Ray(Struct):
 
 @ti.dataclass
 class Walk(Struct):
-    """Where a ray stands on one level: its cell, and the t at which it leaves it through each axis."""
+    """Position of a ray on one level: its cell, and the t at which it leaves it through each axis."""
 
     cell: IVec3
     leave: Vec3
@@ -86,7 +86,7 @@ def make_ray(origin: Vec3, direction: Vec3) -> Ray:
 
 @ti.func
 def ray_start(sensor: Template, view: Template, u: F32, v: F32) -> Vec3:
-    """Where the ray of pixel (u, v) starts: the camera's centre, unless the camera moves while it measures
+    """Start of the ray of pixel (u, v): the camera's centre, unless the camera moves while it measures
     (sensor/rays.py)."""
     start = view.centre
     if ti.static(sensor.moving):
@@ -147,13 +147,13 @@ def advance(ray: Ray, walk: Template, nearest: F32, size: Template):
 
 @ti.func
 def within(cell: IVec3, count: IVec3) -> I32:
-    """Whether a cell lies among ``count`` cells."""
+    """True if a cell lies among ``count`` cells."""
     return cell.min() >= 0 and (count - cell).min() > 0
 
 
 @ti.func
 def inside_eight(cell: IVec3) -> I32:
-    """Whether a cell lies among the 8^3 of its parent: a voxel in a brick, a brick in a chunk."""
+    """True if a cell lies among the 8^3 of its parent: a voxel in a brick, a brick in a chunk."""
     return ((cell[0] | cell[1] | cell[2]) & -8) == 0
 
 
@@ -211,7 +211,7 @@ def walk_bricks(
 
 @dataclass(frozen=True)
 class InBricks(Bundle):
-    """What :func:`walk_voxels` takes along through the bricks."""
+    """Arguments that :func:`walk_voxels` takes along through the bricks."""
 
     space: Space
     visit: Template

@@ -59,7 +59,7 @@ def mark_triangles(
 
 @ti.func
 def _overlap(p: Vec3, q: Vec3, facing: F32, x: F32, y: F32, size: F32) -> I32:
-    """Whether a triangle with corners (p, q) and the square from (x, y) on overlap, where their bounding
+    """True if a triangle with corners (p, q) and the square from (x, y) on overlap, where their bounding
     boxes do. ``facing`` is the sense in which the corners follow each other."""
     sense = 1.0 if facing >= 0.0 else -1.0
     overlap = 1

@@ -1,1 +1,1 @@
-"""What `taichi-mrf bench` does."""
+"""The command ``taichi-mrf bench``."""

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Measured = tuple[list[Table], list[dict[str, Any]], "Callable[[], Figure] | None"]
-"""What was measured: tables to print, figures to write, and what draws them, if they can be drawn."""
+"""Measurements: tables to print, figures to write, and what draws them, if they can be drawn."""
 
 
 class _Run:

@@ -1,1 +1,1 @@
-"""What `taichi-mrf laser` does."""
+"""The command ``taichi-mrf laser``."""

@@ -31,7 +31,7 @@ _DPI = 120
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one method found."""
+    """Result of one method."""
 
     solution: Solution
     map: LaserMap

@@ -1,4 +1,4 @@
-"""What ``taichi-mrf laser`` does: read scans, build the graph, solve it, judge, write, print."""
+"""Command ``taichi-mrf laser``: read scans, build the graph, solve it, judge, write, print."""
 
 import dataclasses
 import time
@@ -34,7 +34,7 @@ from taichi_mrf.system.atomic import write_text
 CONFIG_FILE, REPORT_FILE = "config.yaml", "report.json"
 
 _NO_RETURN_IS_FREE = {"auto": None, "free": True, "ignore": False}
-"""Whether --no-returns takes a beam without a return as free; None leaves it to the scans' reader."""
+"""True if --no-returns takes a beam without a return as free; None leaves it to the scans' reader."""
 
 
 def run_laser(options: Laser) -> int:

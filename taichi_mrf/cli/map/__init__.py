@@ -1,1 +1,1 @@
-"""What `taichi-mrf map` does."""
+"""The command ``taichi-mrf map``."""

@@ -62,7 +62,7 @@ def _changed_parameters(task: MapTask) -> list[str]:
 
 
 def _learns_noise(task: MapTask) -> bool:
-    """Whether the run in its folder, if it is the same, has learnt its noise."""
+    """True if the run in its folder, if it is the same, has learnt its noise."""
     noise = (report_in(task.out) or {}).get("noise") or {}
     return task.noise.is_learnt or (task.noise.is_checked and noise.get("learnt") is not None)
 

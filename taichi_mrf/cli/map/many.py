@@ -1,4 +1,4 @@
-"""What ``taichi-mrf map`` does with several sources, or on a cluster: a task for each, and a summary."""
+"""Command ``taichi-mrf map`` with several sources, or on a cluster: a task for each, and a summary."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -100,7 +100,7 @@ def run_many(options: Map) -> int:
 
 
 def _did_not_fit(outcome: Outcome | None) -> bool:
-    """Whether memory ran out, and the map so far was saved."""
+    """True if memory ran out, and the map so far was saved."""
     return outcome is not None and outcome.report is not None and bool(outcome.report.get("did_not_fit"))
 
 

@@ -1,4 +1,4 @@
-"""What ``taichi-mrf map`` does: map a sequence, check the map, write the files, print the report."""
+"""Command ``taichi-mrf map``: map a sequence, check the map, write the files, print the report."""
 
 import math
 import time
@@ -127,8 +127,8 @@ def map_to_folder(
 def _learn_noise(
     task: MapTask, dataset: Dataset, settings: Config, progress: ProgressBar, request: StopRequest
 ) -> LearntSigma | None:
-    """What the recording says of its noise, if that was asked for, or if it contradicts the default. A
-    resumed run has learnt it."""
+    """Noise learnt from the recording, if that was asked for, or if it contradicts the default. A resumed run
+    has learnt it."""
     if task.resume and (task.out / CONFIG_FILE).is_file():
         return None
     learnt = None
@@ -144,7 +144,7 @@ def _learn_noise(
 
 
 def listener_of(progress: ProgressBar) -> Listener:
-    """What shows the events of the pipeline."""
+    """Listener that shows the events of the pipeline."""
 
     def listen(event: Event) -> None:
         if isinstance(event, FrameOffered):

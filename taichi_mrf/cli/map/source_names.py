@@ -36,7 +36,7 @@ def folder_names(sources: Sequence[str]) -> list[str]:
 
 
 def _from_short_to_long(source: str) -> list[str]:
-    """What the source could be called."""
+    """Possible names of the source."""
     path, mark, _ = source.partition("?")
     if exists(Path(source)):
         path, mark = source, ""

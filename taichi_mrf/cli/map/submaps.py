@@ -1,4 +1,4 @@
-"""What ``taichi-mrf map --submap-size`` does: a long sequence in submaps, and one map in chunks out."""
+"""Command ``taichi-mrf map --submap-size``: a long sequence in submaps, and one map in chunks out."""
 
 from pathlib import Path
 from typing import Any

@@ -55,7 +55,7 @@ def summary_json(rows: Sequence[Row], facts: dict[str, Any]) -> str:
 
 
 def summary_csv(rows: Sequence[Row]) -> str:
-    """The same as a table for spreadsheets; what is not known is empty."""
+    """The summary as a table for spreadsheets; what is not known is empty."""
     text = io.StringIO()
     writer = csv.DictWriter(text, [field.name for field in fields(Row)], lineterminator="\n")
     writer.writeheader()

@@ -40,7 +40,7 @@ class MapTask:
         return self.source
 
     def choice(self) -> dict[str, Any]:
-        """What was asked for besides the parameters; the report says it too."""
+        """Choices besides the parameters; the report says them too."""
         noise = {} if self.noise == NoiseFlags() else {"noise_from": self.noise.origin}
         return {"every": self.every, "limit": self.limit, **noise, **self.poses.choice()}
 

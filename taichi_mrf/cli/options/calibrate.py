@@ -52,7 +52,7 @@ class Calibrate:
     """Integer steps per metre in the measured depth."""
 
     true_depth_scale: float | None = None
-    """The same for the true depth, where it differs."""
+    """Steps per metre in the true depth, where they differ."""
 
     no_returns: bool = False
     """Learn the chance that a surface gives no return too (``sensor.no_return: model``), from pixels that

@@ -43,7 +43,7 @@ def mapping_parameters(arguments: Sequence[str]) -> Config:
 
 
 def live_parameters(arguments: Sequence[str]) -> Config:
-    """The same for a live run, whose world changes, unless the file sets ``time.half_life_s``. Raises
+    """The parameters for a live run, whose world changes, unless the file sets ``time.half_life_s``. Raises
     ConfigError."""
     path, config = _files(arguments).config, mapping_parameters(arguments)
     if path is not None and "half_life_s" in _section(path, "time"):
@@ -68,7 +68,7 @@ def load_laser_config(path: Path) -> LaserConfig:
 
 
 def _section(path: Path, name: str) -> dict[str, object]:
-    """What a file that has been read without errors sets in a section."""
+    """Entries that a file, which has been read without errors, sets in a section."""
     return (read_yaml(find_config(path)) or {}).get(name) or {}
 
 

@@ -48,7 +48,7 @@ class Eval:
     """How much is printed."""
 
     runtime: RuntimeConfig = field(default_factory=RuntimeConfig)
-    """Where the kernels run."""
+    """Device that runs the kernels."""
 
     def __post_init__(self) -> None:
         check_least(self, limit=1)

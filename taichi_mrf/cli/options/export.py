@@ -26,7 +26,7 @@ class Export:
     """The files to write."""
 
     layer: Literal["static", "dynamic", "both"] = "both"
-    """What to write of a map whose world may change: what was there all along (static), what is there now
+    """Part to write of a map whose world may change: what was there all along (static), what is there now
     although it was free (dynamic), or both."""
 
     at: Annotated[float | None, tyro.conf.arg(metavar="SECONDS")] = None
@@ -44,7 +44,7 @@ class Export:
     options: Annotated[ExportOptions, tyro.conf.arg(name=""), tyro.conf.FlagCreatePairsOff] = field(
         default_factory=ExportOptions
     )
-    """What the files contain."""
+    """Contents of the files."""
 
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print what was written as JSON."""

@@ -55,7 +55,7 @@ class Laser:
     """Skip unreadable scans and count them in the report, instead of stopping at the first."""
 
     no_returns: Literal["auto", "free", "ignore"] = "auto"
-    """What a beam without a return means: its path is free, or nothing (ignore). auto ignores those of CARMEN
+    """Meaning of a beam without a return: its path is free, or nothing (ignore). auto ignores those of CARMEN
     logs, most of which met glass or dark surfaces, and uses the others."""
 
     no_return_range: Annotated[float | None, tyro.conf.arg(metavar="METRES")] = None
@@ -75,7 +75,7 @@ class Laser:
     """Parameters."""
 
     runtime: RuntimeConfig = field(default_factory=RuntimeConfig)
-    """Where the kernels run."""
+    """Device that runs the kernels."""
 
     def __post_init__(self) -> None:
         check_least(self, every=1, limit=1)
@@ -102,7 +102,7 @@ class Laser:
         return width, height
 
     def runs(self) -> dict[str, LaserConfig]:
-        """What is to be run, by name: one method, all of them, or the steps. Raises ConfigError."""
+        """Settings to run, by name: one method, all of them, or the steps. Raises ConfigError."""
         if self.compare:
             return {name: replace(self.settings, method=name) for name in get_args(Method)}
         if self.steps is None:

@@ -75,7 +75,7 @@ class Live:
     """How SOURCE's poses are used."""
 
     noise: Annotated[NoiseFlags, tyro.conf.arg(name="")] = field(default_factory=NoiseFlags)
-    """Where sigma comes from."""
+    """Source of sigma."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
     """How much is printed."""

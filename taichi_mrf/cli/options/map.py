@@ -75,7 +75,7 @@ class Map:
     nothing changes."""
 
     noise: Annotated[NoiseFlags, tyro.conf.arg(name="")] = field(default_factory=NoiseFlags)
-    """Where sigma comes from."""
+    """Source of sigma."""
 
     pictures: bool = True
     """Draw the measured surface, the map from above, and its depth against the measured depth."""

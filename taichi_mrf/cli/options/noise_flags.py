@@ -10,7 +10,7 @@ from taichi_mrf.errors import ConfigError
 
 @dataclass(frozen=True)
 class NoiseFlags:
-    """Where sigma comes from."""
+    """Source of sigma."""
 
     origin: Annotated[Literal["checked", "given", "auto"], tyro.conf.arg(name="noise")] = "checked"
     """auto learns sigma from up to 60 frames first (DIR/sensor.yaml keeps it for other recordings); checked,
@@ -18,12 +18,12 @@ class NoiseFlags:
 
     @property
     def is_learnt(self) -> bool:
-        """Whether sigma is to be learnt."""
+        """True if sigma is to be learnt."""
         return self.origin == "auto"
 
     @property
     def is_checked(self) -> bool:
-        """Whether it is to be learnt if it is the default and held-out frames contradict it."""
+        """True if it is to be learnt if it is the default and held-out frames contradict it."""
         return self.origin == "checked"
 
     def refuse_with(self, **flags: object) -> None:

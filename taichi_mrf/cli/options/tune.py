@@ -79,7 +79,7 @@ class Tune:
     """How SOURCE is read."""
 
     noise: Annotated[NoiseFlags, tyro.conf.arg(name="")] = field(default_factory=NoiseFlags)
-    """Where sigma comes from."""
+    """Source of sigma."""
 
     printing: Annotated[Verbosity, tyro.conf.arg(name="")] = field(default_factory=Verbosity)
     """How much is printed."""

@@ -1,1 +1,1 @@
-"""What several commands need: signals, the folder of a run, tables, progress."""
+"""Common parts of several commands: signals, the folder of a run, tables, progress."""

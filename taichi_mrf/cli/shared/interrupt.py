@@ -27,13 +27,13 @@ _HANG_UP = getattr(signal, "SIGHUP", None)  # not on Windows
 
 
 class StopRequest:
-    """Whether the run was asked to stop, and how; an instance is called to ask."""
+    """Request to end the run, and how; an instance is called to ask if there is one."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
         """The signal that came first."""
         self.aborted = False
-        """Whether the user has asked the run to end at once, without its results."""
+        """True if the user has asked the run to end at once, without its results."""
         self._hurried_at: float | None = None
         self._cuts_short = False
 
@@ -42,11 +42,11 @@ class StopRequest:
 
     @property
     def hurried(self) -> bool:
-        """Whether the run has to end within seconds (SIGTERM, SIGHUP)."""
+        """True if the run has to end within seconds (SIGTERM, SIGHUP)."""
         return self._hurried_at is not None
 
     def out_of_time(self) -> bool:
-        """Whether computing has to end now, so that enough time is left to save."""
+        """True if computing has to end now, so that enough time is left to save."""
         return self._hurried_at is not None and time.monotonic() - self._hurried_at > INFER_SECONDS
 
     @contextmanager
@@ -91,8 +91,8 @@ def stop_on_signals(announce: Callable[[str], None], keeps: bool = True) -> Iter
 
 @contextmanager
 def interrupt_on_signals(announce: Callable[[str], None]) -> Iterator[StopRequest]:
-    """The same for work that other processes do: already the first signal raises KeyboardInterrupt, for the
-    waiting to end."""
+    """:func:`stop_on_signals` for work that other processes do: already the first signal raises
+    KeyboardInterrupt, for the waiting to end."""
     with _handled(announce, keeps=True, raise_at_once=True) as request:
         yield request
 

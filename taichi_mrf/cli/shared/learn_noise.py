@@ -1,4 +1,4 @@
-"""What ``--noise auto`` does before map, live and tune begin, with its progress on the terminal."""
+"""Work of ``--noise auto`` before map, live and tune begin, with its progress on the terminal."""
 
 from taichi_mrf.calibration.from_recording import MOST_MAPS, LearntSigma, learn_sigma
 from taichi_mrf.cli.shared.interrupt import StopRequest

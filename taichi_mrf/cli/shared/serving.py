@@ -1,4 +1,4 @@
-"""What the commands with a page share: who can reach it, its address, and the priority of processes."""
+"""Common parts of commands with a page: who can reach it, its address, and the priority of processes."""
 
 import os
 import webbrowser

@@ -31,7 +31,7 @@ class Terminal(Console):
         super().__init__(stderr=stderr, quiet=quiet, markup=False, highlight=False, emoji=False)
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """What every string becomes that is printed or stands in a table."""
+        """Text of a string that is printed or stands in a table."""
         return super().render_str(printable(text), **options)
 
     def print_line(self, text: str, style: str | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Where a floor plan lies in the frame of the scans: by what share of the beams end on its walls."""
+"""Pose of a floor plan in the frame of the scans, found by the share of the beams that end on its walls."""
 
 from dataclasses import dataclass
 
@@ -31,10 +31,10 @@ class Registration:
     """Share of the short beams that end within a pixel of a wall."""
 
     on_walls_unshifted: float
-    """The same for the plan as it was given."""
+    """That share for the plan as it was given."""
 
     walled_edge: bool
-    """Whether the plan's edge is a wall, as around the world of Player/Stage."""
+    """True if the plan's edge is a wall, as around the world of Player/Stage."""
 
     beyond_edge: float
     """Share of all beams that ended outside the plan's image, which decides this."""
@@ -52,7 +52,7 @@ class Registration:
 
 
 def end_points(scans: LaserScans, longest_m: float = np.inf) -> NDArray[np.float64]:
-    """Where the beams ended that came back and are not longer, (P, 2) metres."""
+    """End points of the beams that came back and are not longer, (P, 2) metres."""
     angle = scans.pose_x_y_theta[:, 2:] + scans.angle_rad
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     ends = scans.pose_x_y_theta[:, None, :2] + scans.range_m[..., None] * direction

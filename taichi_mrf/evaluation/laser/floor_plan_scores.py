@@ -11,7 +11,7 @@ from taichi_mrf.datasets.laser.plan_image import FloorPlan
 from taichi_mrf.evaluation.laser.laser_map import LaserMap
 
 HIDDEN, FREE, OCCUPIED = -1, 0, 1
-"""What a cell truly is; hidden is what the robot cannot get to, such as the inside of a solid."""
+"""True states of a cell; hidden is what the robot cannot get to, such as the inside of a solid."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class FloorPlanScores:
 
 
 def true_cells(plan: FloorPlan, laser_map: LaserMap, way_x_y: NDArray[np.float64]) -> NDArray[np.int8]:
-    """What each of the map's cells is by the plan, (rows, columns): OCCUPIED if a pixel of wall lies in it,
+    """State of each of the map's cells by the plan, (rows, columns): OCCUPIED if a pixel of wall lies in it,
     FREE if it is open and can be reached from the robot's way (P, 2), HIDDEN otherwise."""
     reached = _reachable(plan, way_x_y)
     rows, columns = laser_map.occupied.shape

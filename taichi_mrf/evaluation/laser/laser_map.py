@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class LaserMap:
-    """What is known of each cell, (rows, columns); row 0 lies at the lowest y, column 0 at the lowest x."""
+    """States of the cells, (rows, columns); row 0 lies at the lowest y, column 0 at the lowest x."""
 
     occupied: NDArray[np.bool_]
     """The label of the cell."""
 
     seen: NDArray[np.bool_]
-    """Whether a beam touches the cell; the others are unknown."""
+    """True if a beam touches the cell; the others are unknown."""
 
     marginals: NDArray[np.float32] | None
     """Probability of occupied, for the methods that give one."""

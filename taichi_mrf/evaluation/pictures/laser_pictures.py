@@ -24,7 +24,7 @@ METHOD_NAMES = {
     "dd": "dual decomposition",
     "dd-block": "dual decomposition, block ascent",
 }
-"""What the methods are called in full."""
+"""Full names of the methods."""
 
 _UNKNOWN_GREY = 0.8
 _WAY_COLOR = "#1f4fd8"

@@ -1,4 +1,4 @@
-"""What pictures of a whole map from outside have in common: camera, light, background, colours of heights."""
+"""Common parts of pictures of a whole map from outside: camera, light, background, colours of heights."""
 
 from typing import TYPE_CHECKING
 

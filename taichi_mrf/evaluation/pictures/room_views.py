@@ -39,7 +39,7 @@ _SURFACE = "the measured surface"
 
 @dataclass(frozen=True)
 class DrawnMap:
-    """What is drawn of a map, world frame, metres. At least one voxel."""
+    """Parts of a map that are drawn, world frame, metres. At least one voxel."""
 
     centres: NDArray[np.floating]
     """Centres of the occupied voxels, (N, 3)."""
@@ -54,7 +54,7 @@ class DrawnMap:
     """Unit vector that points up, (3,)."""
 
     T_world_cameras: Sequence[Pose]
-    """Where the keyframes were taken, in their order."""
+    """Poses of the keyframes, in their order."""
 
 
 def top_view(room: DrawnMap, surface: DrawnSurface | None = None) -> "Figure":
@@ -103,7 +103,7 @@ def _voxels_from_above(
 def _surface_from_above(
     surface: DrawnSurface, room: DrawnMap, camera: PinholeCamera, pose: Pose
 ) -> tuple[NDArray[np.uint8], float]:
-    """The same of the surface; what was seen from below faces away."""
+    """Picture of the surface from above and its range of heights; what was seen from below faces away."""
     triangles, vertices_m = surface.triangles, smooth_borders(surface.vertices_m, surface.triangles)
     colors, height_range = height_colors(vertices_m @ room.up, room.voxel_size)
     image = cast_triangles(vertices_m, triangles, camera, pose)

@@ -67,7 +67,7 @@ def shaded_triangles(
 
 
 def _mixed(shares: NDArray[np.float32], of_corners: NDArray[Any]) -> NDArray[np.float32]:
-    """What three corners have, (n, 3, 3), by their shares (n, 3)."""
+    """Values of three corners, (n, 3, 3), mixed by their shares (n, 3)."""
     return np.einsum("nk,nkc->nc", shares, of_corners.astype(np.float32))
 
 

@@ -31,7 +31,7 @@ _RINGS = 2
 _NEIGHBOURS = np.array([(i << 42) + (j << 21) + k for i, j, k in np.ndindex(3, 3, 3)], dtype=np.int64) - (
     (1 << 42) + (1 << 21) + 1
 )
-"""What to add to a cell's key for itself and the 26 cells around it."""
+"""Steps from a cell's key to its own and to those of the 26 cells around it."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Surfaces:
         return out
 
     def thickened(self) -> "Surfaces":
-        """The same with the cells around: a mapped surface is some voxels thick, and seen from one side."""
+        """Surfaces with the cells around: a mapped surface is some voxels thick, and seen from one side."""
         keys, normals = self.keys, self.normals
         for _ in range(_RINGS):
             around = (keys[:, None] + _NEIGHBOURS).ravel()

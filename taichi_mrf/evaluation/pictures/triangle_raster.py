@@ -20,7 +20,7 @@ _NOTHING = np.uint64(0x7F800000FFFFFFFF)
 
 @dataclass(frozen=True)
 class TriangleImage:
-    """What the pixels see: ``depth_m`` (H, W) axial, NaN where there is nothing; ``index`` (H, W) of the
+    """Image of triangles: ``depth_m`` (H, W) axial, NaN where there is nothing; ``index`` (H, W) of the
     triangle, -1 for none; ``shares`` (H, W, 3) of its three corners at the pixel."""
 
     depth_m: NDArray[np.float32]

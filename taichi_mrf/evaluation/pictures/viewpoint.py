@@ -64,7 +64,7 @@ def overview_pose(
 def _coarse(
     centres: NDArray[np.floating], normals: NDArray[np.floating], voxel_size: float
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], float]:
-    """The same shape in at most _CANDIDATE_CELLS larger cells: what candidates are judged by."""
+    """Shape of the map in at most _CANDIDATE_CELLS larger cells: what candidates are judged by."""
     cell_size = voxel_size
     while True:
         keys = cell_keys(centres, cell_size)

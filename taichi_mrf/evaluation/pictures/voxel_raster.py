@@ -32,7 +32,7 @@ _NOTHING = np.uint64(0x7F800000FFFFFFFF)
 
 @dataclass(frozen=True)
 class VoxelImage:
-    """What the pixels see, all (H, W, ...)."""
+    """Image of voxels, all (H, W, ...)."""
 
     depth_m: NDArray[np.float32]
     """Axial depth of the point where the ray enters the voxel, NaN where it meets none."""

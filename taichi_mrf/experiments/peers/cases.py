@@ -63,7 +63,7 @@ class PeerScene:
 
     @property
     def selects(self) -> bool:
-        """Whether there are fewer keyframes than frames."""
+        """True if there are fewer keyframes than frames."""
         return len(keyframes([self._made[0].views[i] for i in self.mapped])) < len(self.mapped)
 
     @cached_property

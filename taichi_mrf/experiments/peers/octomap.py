@@ -53,7 +53,7 @@ class OctomapPeer:
         return self._read.cells(points_m)
 
     def mesh(self) -> Mesh:
-        """Where the probability is one half."""
+        """Surface where the probability is one half."""
         return self._read.mesh()
 
     @property

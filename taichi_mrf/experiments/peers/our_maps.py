@@ -126,7 +126,7 @@ class RecursivePeer:
         return {"": _cells(self.map, points_m)}
 
     def mesh(self) -> Mesh:
-        """Where the probability is one half."""
+        """Surface where the probability is one half."""
         surface = smooth_surface(self.map, 0.5)
         return surface.vertices_m, surface.triangles
 

@@ -1,4 +1,4 @@
-"""What the comparison asks of a mapping system, whoever made it, and its settings, from fast to thorough."""
+"""Interface of a mapping system in the comparison, and its settings, from fast to thorough."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,7 +15,7 @@ Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 
 @dataclass(frozen=True)
 class Answers:
-    """What a map predicts of a held-out view: the axial depth of the first surface (H, W) in metres, NaN
+    """Predictions of a map for a held-out view: the axial depth of the first surface (H, W) in metres, NaN
     where there is none, and the mean log density of what was measured, in nats with metres."""
 
     depth_m: NDArray[np.floating]
@@ -42,7 +42,7 @@ class Peer(Protocol):
         """Prepare a frame in the system's own form, which is not timed; calling the result maps it."""
 
     def conclude(self) -> None:
-        """What is done once after the last frame; it is timed."""
+        """Do what is done once after the last frame; it is timed."""
 
     def answers(self, view: SceneView) -> Mapping[str, Answers]:
         """The prediction of a view, by the name of the reading of the map."""
@@ -70,7 +70,7 @@ class Knob:
     standard: bool = False
 
     def of_keyframes(self) -> "Knob":
-        """The same on keyframes alone."""
+        """Copy of the setting, on keyframes alone."""
         return replace(self, name=f"{self.name}, keyframes", selected=True, standard=False)
 
 

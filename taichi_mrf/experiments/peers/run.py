@@ -21,8 +21,8 @@ from taichi_mrf.system.atomic import atomic_path
 
 
 def run_peers(experiment: Experiment) -> tuple[list[Table], list[Path]]:
-    """What each system reaches within a budget of time, all settings, states and meshes, MRFMap's profile,
-    and a plot for each scene.
+    """Results of each system within a budget of time, all settings, states and meshes, MRFMap's profile, and
+    a plot for each scene.
 
     A part, for --only, is a scene, a voxel size and a system, such as "kitchen, 5 cm, OctoMap".
     """

@@ -65,7 +65,7 @@ def budgets(rows: Sequence[Row]) -> Table:
 
 
 def settings(rows: Sequence[Row]) -> Table:
-    """What each setting costs, and how well it answers held-out views."""
+    """Table of what each setting costs, and how well it answers held-out views."""
     entries: list[list[Entry]] = []
     for row in rows:
         result = row.result
@@ -108,7 +108,7 @@ def states(rows: Sequence[Row]) -> Table:
 
 
 def profile(rows: Sequence[Row]) -> Table:
-    """Where MRFMap's time goes."""
+    """Table of where MRFMap's time goes."""
     ours = [row for row in rows if row.system == MRF]
     stages = list(dict.fromkeys(name for row in ours for name in row.result["stages_ms"]))
     entries: list[list[Entry]] = [

@@ -60,8 +60,8 @@ class TsdfPeer:
         """Nothing is left to do."""
 
     def answers(self, view: SceneView) -> Mapping[str, Answers]:
-        """Where rays first meet its mesh. Its own casting of rays through blocks (0.20) leaves pixels out or
-        ends the process where blocks lie around the camera."""
+        """Depths at which rays first meet its mesh. Its own casting of rays through blocks (0.20) leaves
+        pixels out or ends the process where blocks lie around the camera."""
         found = self._surface.render_depth(view.camera or self._scene.camera, view.T_world_camera)
         depth_m = np.where(found > 0, found, np.nan)
         return {"": Answers(depth_m, self._log_likelihood(view, depth_m))}

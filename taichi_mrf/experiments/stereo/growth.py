@@ -22,7 +22,7 @@ CORRIDOR_M = 25.0
 """Length of the corridor in front of the camera."""
 
 CORRIDOR_WALLS_M = ((-1.13, 1.27), (-1.38, 1.12))
-"""Where its walls and its ceiling and floor lie from the camera: 2.4 m wide and 2.5 m high, off the grid."""
+"""Walls, ceiling and floor of the corridor from the camera: 2.4 m wide and 2.5 m high, off the grid."""
 
 CORRIDOR_CAMERA = PinholeCamera(320, 240, 270.0, 270.0, 159.5, 119.5)
 PAPER_M, PAPER_UPDATES = 10.0, 65

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PICTURE_COVERAGE = 0.8
-"""What the maps in the picture cover at least, if they can."""
+"""Share that the maps in the picture cover at least, if they can."""
 
 DRAWN = ("OctoMap-style, Table I", "visibility map, at once", "MRFMap")
 

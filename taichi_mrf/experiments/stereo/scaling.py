@@ -53,7 +53,7 @@ def _warm_up(contender: Contender, scene: Scene, voxel_size: float) -> None:
 
 
 def time_octomap(scene: Scene, voxel_size: float, views: int) -> Result:
-    """The same for OctoMap itself, with the paper's parameters for it; ``voxels`` are its nodes."""
+    """Time and memory of OctoMap itself, with the paper's parameters for it; ``voxels`` are its nodes."""
     import pyoctomap
 
     tree = pyoctomap.OcTree(voxel_size)

@@ -35,7 +35,7 @@ class OneStart(Bundle):
 
     @ti.func
     def of(self, ray: I32) -> Vec3:
-        """Where a ray starts."""
+        """Start of a ray."""
         return self.centre
 
 
@@ -48,7 +48,7 @@ class OwnStarts(Bundle):
 
     @ti.func
     def of(self, ray: I32) -> Vec3:
-        """Where a ray starts."""
+        """Start of a ray."""
         return Vec3(self.places[ray, 0], self.places[ray, 1], self.places[ray, 2])
 
 

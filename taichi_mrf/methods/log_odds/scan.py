@@ -147,7 +147,7 @@ def _end_voxel(end: Vec4) -> IVec3:
 
 @ti.func
 def _in_box(voxel: IVec3, lower: Vec3, upper: Vec3) -> I32:
-    """Whether a voxel lies in the mapped box."""
+    """True if a voxel lies in the mapped box."""
     centre = ti.cast(voxel, ti.f32) + 0.5
     return (centre - lower).min() > 0.0 and (upper - centre).min() > 0.0
 
@@ -198,7 +198,7 @@ class _Pass(Struct):
 
 @dataclass(frozen=True)
 class _Tally(Bundle):
-    """Where rays are counted, and whether each one is."""
+    """Count of rays for each voxel; with ``every_ray`` off only whether there are any."""
 
     tally: I64Array
     every_ray: Template

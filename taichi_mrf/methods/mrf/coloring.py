@@ -49,7 +49,7 @@ class MapColors:
         return some
 
     def __bool__(self) -> bool:
-        """Whether any voxel may have a colour."""
+        """True if any voxel may have a colour."""
         with_images = any(keyframe.color is not None for keyframe in self._keyframes.values())
         return with_images or len(self.frozen.numbers) > 0 or (self.is_current and bool(self._colors.any()))
 
@@ -104,7 +104,7 @@ class MapColors:
         self._counted.pop(keyframe.id, None)  # its share stays in the sums
 
     def frozen_in(self, chunks: NDArray[np.int32]) -> ColorShare:
-        """What frozen keyframes gave to the voxels of some chunks, (n, 3)."""
+        """Colours that frozen keyframes gave to the voxels of some chunks, (n, 3)."""
         return self.frozen.chosen(self._inside(chunks))
 
     def release(self, chunks: NDArray[np.int32]) -> None:
@@ -131,7 +131,7 @@ class MapColors:
 
     @property
     def is_current(self) -> bool:
-        """Whether the colours are known that belong to the beliefs as they are now."""
+        """True if the colours are known that belong to the beliefs as they are now."""
         return self._found_at == self._state
 
     @property

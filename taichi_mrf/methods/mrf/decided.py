@@ -1,4 +1,4 @@
-"""What is occupied in an MRFMap: voxels whose marginal is over one half, and those that win the vote of the
+"""Occupied voxels of an MRFMap: those whose marginal is over one half, and those that win the vote of the
 rays.
 
 A wall that is seen with a sigma of several voxels has no voxel that is more likely occupied than not, and yet

@@ -1,4 +1,4 @@
-"""What the rays of frozen keyframes have measured, kept for the surface and for what is occupied.
+"""Measurements of the rays of frozen keyframes, kept for the surface and for what is occupied.
 
 A keyframe's weights and distances (inference/surface_rays.py) and its votes (inference/surface_votes.py) are
 taken with the marginals as they are when it is frozen, and rounded to integers. So what is kept is a sum over
@@ -47,7 +47,7 @@ class RayShare:
         return RayShare(self.distances.plus(other.distances), self.votes.plus(other.votes))
 
     def in_chunks(self, chunks: NDArray[np.int32], inside: bool = True) -> "RayShare":
-        """What lies in some chunks (n, 3), or what does not."""
+        """The part of it in some chunks (n, 3), or the part outside of them."""
         both = (self.distances, self.votes)
         return RayShare(*(sums.chosen(sums.inside(chunks) == inside) for sums in both))
 
@@ -59,7 +59,7 @@ class RayShare:
 
 
 class KeptRays:
-    """What the frozen keyframes of one map have left."""
+    """Distances and votes of the frozen keyframes of one map."""
 
     def __init__(self, wanted: bool) -> None:
         """Unless it is ``wanted``, nothing is kept."""
@@ -73,8 +73,8 @@ class KeptRays:
         models: tuple[RayModel, RayModel],
         volume: VolumeConfig,
     ) -> RayShare:
-        """What a keyframe, which is about to be frozen, leaves, with the bricks that it sees now; ``models``
-        are those of its rays for the surface and for votes."""
+        """Distances and votes of a keyframe that is about to be frozen, with the bricks that it sees now;
+        ``models`` are those of its rays for the surface and for votes."""
         # Only the keyframe's own bricks are looked at, however large the map is.
         part = pool.part(visible.slots)
         seen = [(keyframe, replace(visible, slots=part.in_use, arrays=None))]

@@ -37,7 +37,7 @@ class KeyframeAllocator:
     bounds: KeyframeBounds
     budget: MemoryBudget
     dated: DatedBelief | None = None
-    """What follows the messages if evidence has a date."""
+    """Dated beliefs that follow the messages, if evidence has a date."""
 
     def place(self, id: int, name: str, image: DepthImage, T_world_camera: Pose, stamp_s: float) -> Keyframe:
         """Find the bricks that a keyframe's rays cross and claim those near its surfaces. Raises

@@ -24,8 +24,8 @@ class Moving:
 
     @staticmethod
     def of(pool: BrickPool, shown: BrickPool, voxel_size: float) -> "Moving":
-        """What moves in a pool whose beliefs are those of ``shown``, the same bricks: what is occupied,
-        although all evidence together makes it less likely than the prior, and stands clear of the surfaces
+        """Moving voxels of a pool whose beliefs are those of ``shown``, the same bricks: they are occupied,
+        although all evidence together makes them less likely than the prior, and stand clear of the surfaces
         of all evidence."""
         counts = np.zeros(max(1, pool.capacity), np.int32)
         _count_contradicted(pool.total, shown.belief, counts, pool.prior_log_odds)

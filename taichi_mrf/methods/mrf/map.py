@@ -124,7 +124,7 @@ class MRFMap(PosedMRF):
 
     @property
     def settled(self) -> bool:
-        """Whether the marginals are those of a full :meth:`infer` with the configured sweeps: it was not
+        """True if the marginals are those of a full :meth:`infer` with the configured sweeps: it was not
         stopped, and no keyframe changed since."""
         return self._settled
 
@@ -274,7 +274,7 @@ class MRFMap(PosedMRF):
         self._messages_lost, self._settled = bool(self._keyframes), False
 
     def checkpoint(self) -> Checkpoint:
-        """What :meth:`restore` needs to undo a full :meth:`infer` that ``progress`` has stopped."""
+        """State that :meth:`restore` needs to undo a full :meth:`infer` that ``progress`` has stopped."""
         return take_checkpoint(self._pool, self._keyframes.values(), self._messages_lost, self._settled)
 
     def restore(self, checkpoint: Checkpoint) -> None:

@@ -72,23 +72,23 @@ class MapReading(BrickMap):
 
     @property
     def has_colors(self) -> bool:
-        """Whether any voxel may have a colour."""
+        """True if any voxel may have a colour."""
         return bool(self._colors)
 
     @tensors.in_kind("points")
     def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
-        """What cameras saw of the voxels at (N, 3) points in metres by the time that is read, (N, 4)."""
+        """Colours that cameras saw at (N, 3) points in metres by the time that is read, (N, 4)."""
         self._check()
         return self._colors.at(points)
 
     def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """The same for the voxels of some bricks of the pool, (n,) slots -> (n, 512, 4)."""
+        """Colours of the voxels of some bricks of the pool, (n,) slots -> (n, 512, 4)."""
         self._check()
         return self._colors.within(slots)
 
     @property
     def has_surface(self) -> bool:
-        """Whether there is a surface of all keyframes that the reading was made of."""
+        """True if there is a surface of all keyframes that the reading was made of."""
         if self._rays is None:
             return self._source.has_surface
         frozen = self._rays.with_frozen and bool(self._source.frozen)

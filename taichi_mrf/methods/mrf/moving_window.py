@@ -61,7 +61,7 @@ _NONE = np.zeros(0, np.int64)
 
 
 class WindowedMap(StorableMap, Protocol):
-    """What the window needs of its map."""
+    """Interface of a map, as its window needs it."""
 
     @property
     def keyframes(self) -> Mapping[int, Keyframe]: ...
@@ -244,7 +244,7 @@ class MovingWindow:
         self._chunks = self.parked.chunks
 
     def _contents(self, chunks: NDArray[np.int32], slots: NDArray[np.int32]) -> dict[Chunk, ParkedChunk]:
-        """What frozen keyframes have left in some chunks (n, 3), whose bricks are in ``slots``."""
+        """Contents that frozen keyframes have left in some chunks (n, 3), whose bricks are in ``slots``."""
         pool, frozen_crossed = self._registry.pool, self._registry.frozen_crossed
         pool.keep_evidence()
         surfels = self._surface.frozen_in(chunks)

@@ -80,7 +80,7 @@ class ParkedChunks:
         self._names |= names
 
     def read(self, chunk: Chunk, voxel_size: float) -> ParkedChunk:
-        """What a chunk's file holds. Raises MapFileError."""
+        """Contents of a chunk's file. Raises MapFileError."""
         assert self.folder is not None
         return read_parked(self.folder / PARKED / self._names[chunk], chunk, voxel_size)
 

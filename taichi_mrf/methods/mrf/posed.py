@@ -43,10 +43,10 @@ different directions from the same place are far apart."""
 
 @dataclass(frozen=True)
 class PoseUpdate:
-    """What :meth:`PosedMRF.update_poses` has done: the keyframes that it ``moved``, those that it ``kept``
-    where they were because their pose has hardly changed, and the new poses (4, 4) for which time was over,
-    which are ``left`` for the next call. ``report`` is that of the sweeps after all motions, or, if some are
-    left, of those sweeps that were made."""
+    """Result of :meth:`PosedMRF.update_poses`: the keyframes that it ``moved``, those that it ``kept`` where
+    they were because their pose has hardly changed, and the new poses (4, 4) for which time was over, which
+    are ``left`` for the next call. ``report`` is that of the sweeps after all motions, or, if some are left,
+    of those sweeps that were made."""
 
     moved: tuple[int, ...]
     kept: tuple[int, ...]
@@ -55,7 +55,7 @@ class PoseUpdate:
 
     @property
     def complete(self) -> bool:
-        """Whether all poses are in the map, and no keyframe's evidence is out of date."""
+        """True if all poses are in the map, and no keyframe's evidence is out of date."""
         return not self.left and self.report.complete
 
 
@@ -165,7 +165,7 @@ class PosedMRF(ReadableMRF):
         return PoseUpdate(tuple(moved), kept, left, report)
 
     def _has_covariance(self, id: int, pose_covariance: Covariance | None) -> bool:
-        """Whether a keyframe's covariance is this one already; True for None."""
+        """True if a keyframe's covariance is this one already, or if this one is None."""
         own = self._keyframes[id].own.pose_covariance
         return pose_covariance is None or np.array_equal(EXACT if own is None else own, pose_covariance)
 

@@ -1,5 +1,4 @@
-"""What can be read of an MRFMap: its keyframes, and the map as it was believed at another time, or one layer
-of it."""
+"""Readings of an MRFMap: its keyframes, and the map as believed at another time, or one layer of it."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -83,19 +82,19 @@ class ReadableMRF(WithSurface):
 
     @property
     def has_colors(self) -> bool:
-        """Whether any voxel may have a colour: a keyframe has been added with a colour image."""
+        """True if any voxel may have a colour: a keyframe has been added with a colour image."""
         return bool(self._colors)
 
     @tensors.in_kind("points")
     def colors(self, points: ArrayLike) -> NDArray[np.uint8]:
-        """What cameras saw of the voxels at (N, 3) points in metres, (N, 4) uint8: red, green, blue, and how
-        much of the voxel they have seen, 0 for nothing. Each pixel's colour goes to the voxels on its ray by
-        the probability that they are what it saw, as of the last :meth:`infer`."""
+        """Colours that cameras saw of the voxels at (N, 3) points in metres, (N, 4) uint8: red, green, blue,
+        and how much of the voxel they have seen, 0 for nothing. Each pixel's colour goes to the voxels on its
+        ray by the probability that they are what it saw, as of the last :meth:`infer`."""
         self._prepare_colors()
         return self._colors.at(points)
 
     def colors_in(self, slots: NDArray[np.int32]) -> NDArray[np.uint8]:
-        """The same for the voxels of some bricks of ``view.pool``, (n,) slots -> (n, 512, 4)."""
+        """Colours of the voxels of some bricks of ``view.pool``, (n,) slots -> (n, 512, 4)."""
         self._prepare_colors()
         return self._colors.within(slots)
 
@@ -257,7 +256,7 @@ class ReadableMRF(WithSurface):
         return self._decisions.winners(self._settled)
 
     def changes(self, since_s: float) -> MapChange:
-        """What differs between the map as it was believed at a time in seconds and as it is now: its
+        """Difference between the map as it was believed at a time in seconds and as it is now: its
         ``appeared`` and ``vanished`` are voxels that were free and are occupied, and the reverse; ``points``,
         ``before`` and ``after`` list all voxels whose state has changed, also those that were seen first
         since then. Raises ConfigError in a map of a static world."""

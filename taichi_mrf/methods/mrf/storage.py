@@ -148,12 +148,12 @@ def read_contents(path: Path) -> MapContents:
 
 
 def dated_arrays(belief: NDArray[np.float32], stamps: NDArray[np.float64]) -> dict[str, NDArray]:
-    """What frozen keyframes say of the voxels of some bricks, (n, 512), and as of when (n), for a file."""
+    """Arrays of a file: beliefs of frozen keyframes in some bricks, (n, 512), and as of when, (n)."""
     return {"frozen_belief": belief, "frozen_stamps": np.maximum(stamps, _BEFORE_ALL)}
 
 
 def read_dated(file: NpzFile, bricks: int) -> tuple[NDArray[np.float32], NDArray[np.float64]] | None:
-    """The same from a file; None if there is none."""
+    """Beliefs of frozen keyframes in a file's bricks, and as of when; None if it has none."""
     if "frozen_belief" not in file:
         return None
     belief = file.array("frozen_belief", "f", (bricks, VOXELS))
@@ -162,13 +162,13 @@ def read_dated(file: NpzFile, bricks: int) -> tuple[NDArray[np.float32], NDArray
 
 
 def color_arrays(share: ColorShare) -> dict[str, NDArray]:
-    """What frozen keyframes gave to the colours of voxels, for a file; nothing if it is nothing."""
+    """Arrays of a file: colours by frozen keyframes; none without any."""
     arrays: dict[str, NDArray] = {f"frozen_color_{name}": getattr(share, name) for name in _SHARE}
     return arrays if len(share.numbers) else {}
 
 
 def read_color_share(path: Path, file: NpzFile, bricks: NDArray[np.int32]) -> ColorShare:
-    """The same from a file whose bricks (n, 3) are given. Raises MapFileError if it names others."""
+    """Colours by frozen keyframes, from a file with bricks (n, 3). Raises MapFileError if it names others."""
     if "frozen_color_numbers" not in file:
         return ColorShare.nothing()
     numbers = file.integers("frozen_color_numbers", (None,), 0, VOXELS - 1).astype(np.int32)
@@ -186,7 +186,7 @@ def read_color_share(path: Path, file: NpzFile, bricks: NDArray[np.int32]) -> Co
 
 
 def ray_arrays(share: RayShare) -> dict[str, NDArray]:
-    """What frozen keyframes measured, for a file; nothing if it is nothing."""
+    """Arrays of a file: rays of frozen keyframes; none without any."""
     arrays: dict[str, NDArray] = {}
     for name, found in (("distance", share.distances), ("vote", share.votes)):
         if len(found.bricks):
@@ -195,7 +195,7 @@ def ray_arrays(share: RayShare) -> dict[str, NDArray]:
 
 
 def read_rays(path: Path, file: NpzFile) -> RayShare:
-    """The same from a file. Raises MapFileError for sums that no keyframes have left."""
+    """Rays of frozen keyframes in a file. Raises MapFileError for sums that no keyframes have left."""
     return RayShare(_read_sums(path, file, "distance", VALUES), _read_sums(path, file, "vote", 1))
 
 

@@ -28,7 +28,7 @@ OUTLIERS = 0.01
 
 
 LEAST = 0.5
-"""Where no marginal reaches this share of the prior, there is no surface."""
+"""Least marginal of a surface, as a share of the prior: where none reaches it, there is no surface."""
 
 FREE = 0.05
 """A ray passes a surface in the midst of voxels below this share of the prior. It is lower than LEAST, since
@@ -78,12 +78,12 @@ class WithSurface(BrickMap):
 
     @property
     def keeps_surface(self) -> bool:
-        """Whether frozen keyframes leave what they measured of the surface."""
+        """True if frozen keyframes leave what they measured of the surface."""
         return self._kept.wanted
 
     @property
     def has_surface(self) -> bool:
-        """Whether there is a surface of all keyframes that the map was made of: none is frozen, or what
+        """True if there is a surface of all keyframes that the map was made of: none is frozen, or what
         frozen ones measured is kept (``keep_surface``)."""
         return bool(self._keyframes or self._frozen) and (self.keeps_surface or not self._frozen)
 

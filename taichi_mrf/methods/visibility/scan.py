@@ -89,7 +89,7 @@ class RayLimits(Bundle):
     """P(V) of a voxel that is occluded by its neighbours, if the one before it on the ray is visible."""
 
     if_clear: F32
-    """The same of a voxel that is not."""
+    """P(V) of a voxel that is not occluded, if the one before it on the ray is visible."""
 
     q_min: F32
     """P(V) below which a ray ends."""
@@ -132,7 +132,7 @@ Occluded = OccludedFromCentre | OccludedFromRay
 
 @dataclass(frozen=True)
 class _Followed(Bundle):
-    """What a step along a ray reads and writes."""
+    """Input and output of a step along a ray."""
 
     ray: Template
     occluded: Template

@@ -134,12 +134,12 @@ class Beams(Bundle):
 
     @ti.func
     def direction(self, i: I32) -> Vec3:
-        """Where a beam points."""
+        """Direction of a beam."""
         return Vec3(self.beams[i, 0], self.beams[i, 1], self.beams[i, 2])
 
     @ti.func
     def reach(self, direction: Vec3, angle: F32, enough: F32) -> I32:
-        """Whether a beam within ``angle`` radians of a direction of length 1, or one not much further off,
+        """True if a beam within ``angle`` radians of a direction of length 1, or one not much further off,
         reaches ``enough`` metres."""
         found = 0
         box = self.coarse.around(direction, angle)

@@ -43,11 +43,11 @@ class BeamModel(Bundle):
     scaling_occupied: F32
 
     whole: I32
-    """Whether w is 1 for every beam."""
+    """True if w is 1 for every beam."""
 
     @ti.func
     def log_odds(self, distance: F32, measured: F32, angle: F32) -> F32:
-        """What a beam that measured a range adds to the log-odds of a point."""
+        """Change of a point's log-odds by a beam that measured a range."""
         f = (distance - measured) / self.range_sigma
         r = -0.5
         if f > -3.0:  # most voxels lie far in front of the surface

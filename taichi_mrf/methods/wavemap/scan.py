@@ -54,7 +54,7 @@ HALF_DIAGONAL = 0.5 * math.sqrt(3.0)
 
 @dataclass(frozen=True)
 class Place(Bundle):
-    """Where the sensor stands in a window, and which part of that is mapped."""
+    """Pose of the sensor in a window, and which part of that is mapped."""
 
     centre: Vec3
     """The sensor, in voxels from the window's corner."""
@@ -150,7 +150,7 @@ def _cell(number: I32, shape: IVec3) -> IVec3:
 
 @ti.func
 def _is_reached(beams: Template, place: Template, cell: IVec3, size: Template, angle: F32) -> I32:
-    """Whether a beam reaches the centre of any voxel in a mapped cell of ``size`` voxels a side."""
+    """True if a beam reaches the centre of any voxel in a mapped cell of ``size`` voxels a side."""
     corner = ti.cast(cell, ti.f32) * size
     reached = 0
     if (corner + size - place.lower).min() > 0.0 and (place.upper - corner).min() > 0.0:
@@ -213,7 +213,7 @@ def _last(nearest: Template, most: I32) -> F32:
 
 @ti.func
 def _change(beams: Template, model: Template, way: Vec3, angle: F32, most: I32) -> F32:
-    """What the beams nearest to a point say of it; ``way`` goes there from the sensor, in metres."""
+    """Log-odds that the beams nearest to a point add; ``way`` goes there from the sensor, in metres."""
     change, distance = 0.0, way.norm()
     if distance > AT_SENSOR_M:
         nearest = _Nearest(way / distance, Vec4(angle * angle), IVec4(NO_BEAM))

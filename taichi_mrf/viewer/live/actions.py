@@ -1,4 +1,4 @@
-"""What a user can do on the live page, as events for the page."""
+"""Actions of a user on the live page, as events for the page."""
 
 from dataclasses import dataclass
 from enum import Enum, auto

@@ -24,7 +24,7 @@ from taichi_mrf.viewer.scene.picking import first_pixel, first_voxel
 from taichi_mrf.viewer.transport.inbox import Inbox
 
 _PLAIN = ViewOptions(show="voxels")
-"""What the mapping process sends unless it is asked for more."""
+"""Options that the mapping process serves unless it is asked for more."""
 
 
 class Page(BasePage[Panel]):
@@ -258,8 +258,8 @@ class Page(BasePage[Panel]):
             self.ask(m.RayThrough((point[0], point[1], point[2]), click.origin, chosen))
 
     def _extras(self, options: ViewOptions) -> tuple[bool, bool, bool, bool]:
-        """Whether the options need the baseline's map, the counts of keyframes, the colours of voxels, and
-        the measured surface, which has colours of its own."""
+        """True for each thing that the options need: the baseline's map, the counts of keyframes, the colours
+        of voxels, and the measured surface, which has colours of its own."""
         by, surface = options.color_by, options.show == "surface"
         instead = surface and self.map is not None and not self.map.growing
         return options.show_baseline, by == "keyframes", by == "photo" and not instead, surface

@@ -64,7 +64,7 @@ _TIME_OPTIONS = ("dynamic",)
 
 @dataclass(frozen=True)
 class Question:
-    """What a user is asked before something that cannot be undone: ``yes`` does it, by ``action``."""
+    """Question before something that cannot be undone: ``yes`` does it, by ``action``."""
 
     title: str
     text: str
@@ -302,7 +302,7 @@ class Panel(BasePanel):
 
 
 def _colors_of(hello: Hello) -> tuple[ColorBy, ...]:
-    """What the colour can show of a map."""
+    """Choices of what the colour shows of a map."""
     found = list(OF_BELIEFS)
     if hello.counts_keyframes:
         found.append("keyframes")

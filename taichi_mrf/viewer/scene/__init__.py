@@ -1,4 +1,4 @@
-"""What both pages share: the base page, its panel, and what is drawn in 3D (voxels, cuts, keyframes, rays).
+"""Common parts of both pages: the base page, its panel, and the 3D scene (voxels, cuts, keyframes, rays).
 
 Uses `viewer.transport` and the packages below `viewer`.
 """

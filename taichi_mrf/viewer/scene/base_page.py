@@ -1,4 +1,4 @@
-"""What the live page and the tuning page share: one inbox, one thread, one scene.
+"""Base of the live page and the tuning page: one inbox, one thread, one scene.
 
 All updates from the mapping process and all events from browsers go into one inbox and are handled on one
 thread, so no two threads ever change the same node. A page registers a handler for each kind of item and for
@@ -56,7 +56,7 @@ class BasePage(Generic[P]):
         self._scale: Scale | None = None
         self._with_baseline = False
         self.actions: dict[Enum, Callable[[int], None]] = {}
-        """What each action does, given the client that asked for it."""
+        """Function of each action, given the client that asked for it."""
         self.handlers: dict[type, Callable[[Any], None]] = {
             m.Notice: self.notify,
             m.File: lambda file: self.downloads.send(file.client, file.name, file.content),
@@ -64,7 +64,7 @@ class BasePage(Generic[P]):
             Used: lambda used: self.actions[used.action](used.client),
             Joined: lambda joined: self.viewpoint.joined(joined.client),
         }
-        """What is done with each kind of update and event; other kinds are ignored."""
+        """Handler of each kind of update and event; other kinds are ignored."""
         self._show_theme()
         server.scene.set_background_image(_backdrop(), format="png")
         server.scene.configure_default_lights(cast_shadow=False)

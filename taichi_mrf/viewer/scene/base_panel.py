@@ -22,7 +22,7 @@ _COUNTED = {
     "dynamic": "dynamic",
     "baseline": "of the baseline",
 }
-"""What is counted beside voxels or the surface, and its words."""
+"""Layers that are counted beside voxels or the surface, and their words."""
 
 
 class BasePanel:
@@ -40,7 +40,7 @@ class BasePanel:
         raise NotImplementedError
 
     def options_moved(self) -> None:
-        """What widgets of view options call when one of them was used."""
+        """Callback of the widgets of view options, for when one of them was used."""
         self._tell(OptionsMoved())
 
     def add_counts(self) -> None:
@@ -106,7 +106,7 @@ class BasePanel:
 
 
 def _activity_html(text: str) -> str:
-    """What is being done, in an element that the page hides while nothing answers it."""
+    """Activity in an element that the page hides while nothing answers it."""
     return f'<p class="{ACTIVITY}" style="margin:0.5em 0.75em">{in_html(text)}</p>'
 
 

@@ -143,7 +143,7 @@ def legend_html(scale: Scale) -> str:
 
 
 def dynamic_legend_html() -> str:
-    """What the colour of dynamic voxels means, for the page."""
+    """Legend of the colour of dynamic voxels, for the page."""
     red, green, blue = DYNAMIC_COLOR
     return (
         '<div style="padding:0 0.75em;font-size:0.85em"><span style="display:inline-block;width:0.8em;'

@@ -114,7 +114,7 @@ class KeyframeLayer:
         self.chosen: int | None = None
         self.gizmo: viser.TransformControlsHandle | None = None
         self.held = False
-        """Whether a user is dragging the gizmo."""
+        """True while a user drags the gizmo."""
         self._frusta: dict[int, viser.CameraFrustumHandle | viser.LineSegmentsHandle] = {}
         self._on_spheres: dict[int, viser.PointCloudHandle] = {}
         """The pictures of keyframes that have no frustum."""

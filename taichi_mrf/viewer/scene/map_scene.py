@@ -46,7 +46,7 @@ class MapScene:
         self._voxels = server.scene.add_frame("/voxels", show_axes=False)
         self._surface_wanted = False
         self.growing = False
-        """Whether frames are read: a surface that was made before lacks what they add."""
+        """True while frames are read: a surface that was made before lacks what they add."""
         self._cut_plane = CutPlane(server.scene, hello.voxel_size)
         self._brick_lines = BrickLines(server.scene, hello.voxel_size)
         self._dirty: dict[Layer, set[ChunkKey]] = {"map": set(), "baseline": set()}
@@ -68,7 +68,7 @@ class MapScene:
 
     @property
     def shows_surface(self) -> bool:
-        """Whether the measured surface is shown in the place of voxels: not while the map grows."""
+        """True if the measured surface is shown in the place of voxels: not while the map grows."""
         return self._surface_wanted and self.surface.is_complete and not self.growing
 
     def box_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:

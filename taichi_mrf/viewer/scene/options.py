@@ -8,7 +8,7 @@ from taichi_mrf.config.sliders import Range
 
 ColorBy = Literal["marginal", "height", "uncertainty", "keyframes", "photo"]
 OF_BELIEFS: tuple[ColorBy, ...] = ("marginal", "height", "uncertainty")
-"""What the colour can show of every map."""
+"""Choices of what the colour shows of every map."""
 Show = Literal["surface", "voxels"]
 CutAxis = Literal["none", "x", "y", "z"]
 
@@ -22,8 +22,8 @@ class ViewOptions:
     surface is made when no frames are read, at the end or while paused; until then voxels are shown."""
 
     color_by: ColorBy = "height"
-    """What the colour shows: the probability, the height, the uncertainty (of a voxel its entropy,
-    of the surface its standard deviation), the number of keyframes whose rays pass through the voxel, or what
+    """Meaning of the colour: the probability, the height, the uncertainty (of a voxel its entropy, of the
+    surface its standard deviation), the number of keyframes whose rays pass through the voxel, or what
     cameras saw (photo)."""
 
     threshold: Annotated[float, Range(0.02, 0.99, 0.01)] = 0.5

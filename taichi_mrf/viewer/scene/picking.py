@@ -1,4 +1,4 @@
-"""What a click into the scene hits: a voxel, or a pixel of a keyframe's picture."""
+"""Target of a click into the scene: a voxel, or a pixel of a keyframe's picture."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

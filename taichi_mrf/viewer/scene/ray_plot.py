@@ -17,7 +17,7 @@ _STEP_M = 1e-6
 _BEFORE_M = 0.75
 """The plot begins this far in front of the surface."""
 
-# What is drawn later lies on top.
+# Later series lie on top.
 _SERIES = (
     uplot.Series(label="range (m)"),
     uplot.Series(label="measured ± sigma", stroke="#e69f00", fill="#e69f0055", width=1),

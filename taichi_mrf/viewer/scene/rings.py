@@ -11,8 +11,8 @@ CLOSED = 3.0
 
 
 def on_sphere(camera: Camera, radius_m: float) -> NDArray[np.float32]:
-    """Where the pixels of a camera lie on a sphere around it, (H, W, 3), metres, camera frame. Each pixel of
-    a moving camera lies as far from where its ray starts."""
+    """Pixels of a camera on a sphere around it, (H, W, 3), metres, camera frame. Each pixel of a moving
+    camera lies as far from where its ray starts."""
     rays, origins = camera.rays(), origins_of(camera)
     points = radius_m * rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     return (points if origins is None else points + origins).astype(np.float32)

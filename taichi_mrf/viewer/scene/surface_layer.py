@@ -40,12 +40,12 @@ class SurfaceLayer:
 
     @property
     def is_stale(self) -> bool:
-        """Whether :meth:`prepare` has something to do."""
+        """True if :meth:`prepare` has something to do."""
         return bool(self._stale)
 
     @property
     def is_complete(self) -> bool:
-        """Whether there is a surface, and all of it has been taken in."""
+        """True if there is a surface, and all of it has been taken in."""
         return self._view is not None and bool(self.patches)
 
     @property
@@ -169,6 +169,6 @@ class SurfaceLayer:
 
 
 def _is_like(view: SurfaceView, other: SurfaceView) -> bool:
-    """Whether colours by height are nearly the same."""
+    """True if colours by height are nearly the same."""
     one, two = (np.array([each.floor_m, each.floor_m + each.range_m]) for each in (view, other))
     return bool((np.abs(one - two) < 0.02 * view.range_m).all()) and float(view.up @ other.up) > 0.999

@@ -16,7 +16,7 @@ NOTICEABLE = 12
 
 @dataclass(frozen=True)
 class Look:
-    """What decides how a chunk looks: with equal looks, a voxel that has not changed looks the same."""
+    """Settings of a chunk's look: if they are equal, a voxel that has not changed looks the same."""
 
     log_odds: float
     cut: Cut | None
@@ -25,14 +25,14 @@ class Look:
     """In voxels."""
     shade: bool
     dynamic: bool
-    """Whether dynamic voxels have a colour of their own."""
+    """True if dynamic voxels have a colour of their own."""
     up: tuple[int, int]
     """The axis that points up, and 1 or -1 for its direction."""
 
 
 @dataclass
 class _Sent:
-    """What clients have of a chunk. ``exact`` is false if colours have changed a little since."""
+    """Voxels of a chunk that clients have. ``exact`` is false if colours have changed a little since."""
 
     cells: NDArray[np.uint8]
     colors: NDArray[np.uint8]
@@ -110,7 +110,7 @@ class VoxelLayer:
             self._take_out(key)
 
     def _ahead(self) -> list[_Sent]:
-        """What clients have of each chunk once everything prepared has been sent."""
+        """Voxels of each chunk that clients have once everything prepared has been sent."""
         ahead: dict[ChunkKey, _Sent | None] = {**self._sent, **self._prepared}
         return [each for each in ahead.values() if each is not None]
 

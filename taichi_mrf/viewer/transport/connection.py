@@ -113,7 +113,7 @@ class GuardedConnection(ServerConnection):
             cut_off.cancel()
 
     def _is_within_size(self, received: int) -> bool:
-        """Whether the message that is arriving has not outgrown its bound, with the ``received`` bytes of it
+        """True if the message that is arriving has not outgrown its bound, with the ``received`` bytes of it
         or of those before it. A picture that was asked for may be large, once.
 
         One read can end a message and begin the next, so the bytes of the picture are counted as well.

@@ -38,7 +38,7 @@ class Downloads:
 
     @property
     def is_recording(self) -> bool:
-        """Whether the scene is being recorded."""
+        """True if the scene is being recorded."""
         return self._recording is not None
 
     def send(self, client: int, name: str, content: bytes) -> None:
@@ -99,7 +99,7 @@ class Downloads:
         self.send(client, "view.png", cv2.imencode(".png", np.ascontiguousarray(bgra))[1].tobytes())
 
     def _begin(self, client: int, kind: str) -> bool:
-        """Whether no file of this kind is being made for this client yet; from now on one is."""
+        """True if no file of this kind is being made for this client yet; from now on one is."""
         with self._lock:
             is_new = (client, kind) not in self._begun
             self._begun.add((client, kind))

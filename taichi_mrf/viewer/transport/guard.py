@@ -45,11 +45,11 @@ class Gate:
         return next((ClientId(id) for id, each in connections.items() if each is connection), None)
 
     def awaits_picture(self, client_id: ClientId) -> bool:
-        """Whether a picture was asked of this client and has not arrived."""
+        """True if a picture was asked of this client and has not arrived."""
         return internals.awaits_picture(self._server, client_id)
 
     def may_be_unfinished(self, client_id: ClientId, message: AnyClientMessage) -> bool:
-        """Whether the message may be a number that is still being typed: one outside the range of its widget,
+        """True if the message may be a number that is still being typed: one outside the range of its widget,
         as the 0 of 0.8 is, and any of a vector, each of whose values may move a keyframe."""
         if not isinstance(message, WidgetUpdate):
             return False

@@ -1,5 +1,5 @@
-"""Whether the page still has a server and a mapping process behind it: what the server says, and a script in
-the page that asks.
+"""Check that the page still has a server and a mapping process behind it: the server's answer, and a script
+in the page that asks.
 
 viser's client notices only that its socket is closed, and a process that is stopped closes nothing. It keeps
 the last words of the panel, which may be "done". So the script asks each second, says in words what does not
@@ -90,7 +90,7 @@ SOURCE = f"'sha256-{base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).d
 
 
 class Pulse:
-    """What the page's script is told: whether the mapping process still speaks."""
+    """Answer to the page's script: whether the mapping process still speaks."""
 
     def __init__(self, mapper: int | None = None) -> None:
         """``mapper`` is the number of the mapping process, None without one."""
@@ -110,7 +110,7 @@ class Pulse:
 
 
 def _is_stopped(process: int) -> bool:
-    """Whether a signal has stopped the process; False where the system does not say (other than Linux)."""
+    """True if a signal has stopped the process; False where the system does not say (other than Linux)."""
     try:
         status = Path(f"/proc/{process}/stat").read_text()
     except OSError:

@@ -116,7 +116,7 @@ class _Door:
         )
 
     def _pages(self, pages: Pages, connection: ServerConnection, request: Request) -> Response | None:
-        """What viser serves, and the pulse."""
+        """Response to a request: viser's, or the pulse."""
         if request.path.partition("?")[0] == PATH:
             return self._pulse.answer(connection)
         return pages(connection, request)
@@ -173,5 +173,5 @@ def _listen(host: str, port: int) -> socket.socket:
 
 
 def _log_quietly(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """What goes wrong in viser's event loop; asyncio would print a traceback."""
+    """Log an error in viser's event loop; asyncio would print a traceback."""
     LOGGER.warning("%s", context["message"], exc_info=context.get("exception"))

@@ -55,7 +55,7 @@ SERVER: dict[str, type] = {
     "scene._active_transform_drag_handles": dict,
     "scene._owner_id": str,
 }
-"""What is read of a server, and its type."""
+"""Attributes that are read of a server, and their types."""
 
 WIDGET: dict[str, type] = {
     "_impl.gui_api": viser.GuiApi,
@@ -64,13 +64,13 @@ WIDGET: dict[str, type] = {
     "_impl.uuid": str,
     "_impl.props": object,
 }
-"""What is read of a widget."""
+"""Attributes that are read of a widget."""
 
 CLIENT: dict[str, type] = {"_websock_connection._incoming_handlers": dict}
-"""What is read of a client."""
+"""Attributes that are read of a client."""
 
 TAB: dict[str, type] = {"_parent": viser.GuiTabGroupHandle}
-"""What is read of a tab."""
+"""Attributes that are read of a tab."""
 
 _PATCHING = threading.RLock()
 """Held while something that viser uses is replaced."""
@@ -119,7 +119,7 @@ def tell_value(server: viser.ViserServer, client: int, uuid: str, value: Any) ->
 
 
 def awaits_picture(server: viser.ViserServer, client: int) -> bool:
-    """Whether this client was asked for a picture and has not sent it."""
+    """True if this client was asked for a picture and has not sent it."""
     handle = server.get_clients().get(client)
     return handle is not None and bool(
         handle._websock_connection._incoming_handlers.get(GetRenderResponseMessage)
@@ -127,7 +127,7 @@ def awaits_picture(server: viser.ViserServer, client: int) -> bool:
 
 
 def guis(server: viser.ViserServer, client: int) -> Iterator[viser.GuiApi]:
-    """Where widgets of a client can be: on everybody's page, and on its own."""
+    """Places of a client's widgets: everybody's page, and its own."""
     yield server.gui
     handle = server.get_clients().get(client)
     if handle is not None:
@@ -141,17 +141,17 @@ def input_widget(server: viser.ViserServer, client: int, uuid: str) -> Widget | 
 
 
 def has_command(server: viser.ViserServer, client: int, uuid: str) -> bool:
-    """Whether the client's page has a command of this name."""
+    """True if the client's page has a command of this name."""
     return any(uuid in gui._command_handle_from_uuid for gui in guis(server, client))
 
 
 def is_button(widget: Widget) -> bool:
-    """Whether a widget is a button, which has no value to correct."""
+    """True if a widget is a button, which has no value to correct."""
     return widget._impl.is_button
 
 
 def can_be_used(widget: Widget) -> bool:
-    """Whether a person could use it: enabled, and shown together with all that it lies in."""
+    """True if a person could use it: enabled, and shown together with all that it lies in."""
     if widget.disabled or not widget.visible:
         return False
     gui, uuid = widget._impl.gui_api, widget._impl.parent_container_id
@@ -186,7 +186,7 @@ def node(scene: viser.SceneApi, name: str) -> viser.SceneNodeHandle | None:
 
 
 def holds_gizmo(scene: viser.SceneApi, client: int, name: str) -> bool:
-    """Whether this client is dragging the gizmo of this name."""
+    """True if this client is dragging the gizmo of this name."""
     return (ClientId(client), name) in scene._active_transform_drag_handles
 
 

@@ -49,7 +49,7 @@ def value_to_set(widget: Widget, sent: WidgetValue) -> Any | None:
 
 
 def is_out_of_range(widget: Widget, sent: WidgetValue) -> bool:
-    """Whether ``sent`` is a number that the slider or field cannot show."""
+    """True if ``sent`` is a number that the slider or field cannot show."""
     if not isinstance(widget, viser.GuiSliderHandle | viser.GuiNumberHandle) or not _is_number(sent):
         return False
     assert isinstance(sent, int | float)
@@ -57,7 +57,7 @@ def is_out_of_range(widget: Widget, sent: WidgetValue) -> bool:
 
 
 def is_same(sent: Any, taken: Any) -> bool:
-    """Whether a client that shows ``sent`` shows what is in force, but for the last bits of a float."""
+    """True if a client that shows ``sent`` shows what is in force, but for the last bits of a float."""
     if isinstance(sent, list) and isinstance(taken, tuple):
         return len(sent) == len(taken) and all(map(is_same, sent, taken))
     if _is_number(sent) and _is_number(taken):

@@ -1,4 +1,4 @@
-"""What a user can do on the tuning page, as events for the page."""
+"""Actions of a user on the tuning page, as events for the page."""
 
 from dataclasses import dataclass
 from enum import Enum, auto

@@ -64,7 +64,7 @@ class KnobWidgets:
 
 
 def shown_value(knob: Knob, config: Config) -> Any:
-    """What a knob's widget shows: the value or its power of ten, clamped to the range."""
+    """Value that a knob's widget shows: the parameter's or its power of ten, clamped to the range."""
     value = knob.value_of(config)
     if knob.range is None:
         return value

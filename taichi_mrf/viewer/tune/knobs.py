@@ -51,7 +51,7 @@ class Knob:
         return f"{text} ({unit})" if unit else text
 
     def applies(self, config: Config) -> bool:
-        """Whether the parameter changes anything under this configuration."""
+        """True if the parameter changes anything under this configuration."""
         return self.method in (None, config.method) and self.counts(config)
 
     def value_of(self, config: Config) -> Any:

@@ -13,7 +13,7 @@ from taichi_mrf.viewer.messages import Request, Update
 from taichi_mrf.viewer.tune.scores import Scores
 
 By = Literal["start", "hand", "search"]
-"""Where the parameters of a try come from: the start, the user, or the automatic search."""
+"""Source of the parameters of a try: the start, the user, or the automatic search."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Tuning(Update):
 
 @dataclass(frozen=True)
 class Activity(Update):
-    """What is being done, and how much of it is done (0 to 1)."""
+    """Activity of the session, and how much of it is done (0 to 1)."""
 
     text: str
     share: float
@@ -105,8 +105,8 @@ class Residuals(Update):
 
 @dataclass(frozen=True)
 class HeldOutView(Update):
-    """Where the map is right in one held-out view; the same for the reference, if there is one, and what
-    changed between the two. Pictures are (h, w, 3) uint8."""
+    """Accuracy of the map in one held-out view, and of the reference, if there is one, and what changed
+    between the two. Pictures are (h, w, 3) uint8."""
 
     name: str
     measured: NDArray[np.uint8]

@@ -109,7 +109,7 @@ class TunePanel(BasePanel):
         self.noise.follow(config.sensor)
 
     def show_tuning(self, tuning: Tuning) -> None:
-        """What is tuned, on which frames."""
+        """Show what is tuned, on which frames."""
         choice = tuning.choice
         for name, handle in self._frames.handles.items():
             if name == "first":

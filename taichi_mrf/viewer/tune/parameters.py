@@ -19,8 +19,8 @@ _NAME = re.compile(r"([a-z_]+(?:\.[a-z_]+)*)(?:\[(\d)\])?")
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """Where a parameter stands: the ``path`` of fields, and which coefficient of a polynomial, None for
-    a single value. ``hint`` is the type of one value, ``help`` the field's docstring."""
+    """Place of a parameter: the ``path`` of fields, and which coefficient of a polynomial, None for a single
+    value. ``hint`` is the type of one value, ``help`` the field's docstring."""
 
     name: str
     path: tuple[str, ...]
@@ -29,7 +29,7 @@ class Parameter:
     help: str
 
     def value_of(self, config: Config) -> Any:
-        """What the parameter is; a coefficient beyond the polynomial's last is 0."""
+        """Value of the parameter; a coefficient beyond the polynomial's last is 0."""
         value: Any = config
         for field in self.path:
             value = getattr(value, field)

@@ -19,10 +19,10 @@ class Scores:
     """Share of pixels whose depth lies in the voxel of the likeliest surface; no surface counts as wrong."""
 
     accuracy_sigma: float
-    """The same for depths within 1.5 sigma of that voxel's middle, sigma being the voxel size."""
+    """Share of pixels whose depth lies within 1.5 sigma (the voxel size) of that voxel's middle."""
 
     accuracy_5cm: float
-    """The same for depths within 5 cm of it."""
+    """Share of pixels whose depth lies within 5 cm of that voxel's middle."""
 
     unanswered: float
     """Share of pixels whose ray meets no surface."""

@@ -54,7 +54,7 @@ def table_html(tries: Sequence[Tried], shown: int | None, pinned: int | None) ->
 
 
 def changes(first: Config, config: Config) -> str:
-    """What a configuration changed from the first, as text."""
+    """Changes of a configuration from the first, as text."""
     names = differences(first, config)
     if not names:
         return "first parameters"
