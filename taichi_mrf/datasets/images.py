@@ -62,7 +62,7 @@ def look_at_depth(path: Path, camera: PinholeCamera) -> tuple[bool, float]:
 
 def share_of_largest(steps: NDArray) -> float:
     """The share of pixels that have the largest value of whole numbers."""
-    return float((steps == np.iinfo(steps.dtype).max).mean()) if steps.dtype.kind == "u" else 0.0
+    return float((steps == np.iinfo(steps.dtype).max).mean()) if steps.dtype.kind in "ui" else 0.0
 
 
 def note_of_largest(shares: Sequence[float]) -> list[str]:
@@ -72,7 +72,7 @@ def note_of_largest(shares: Sequence[float]) -> list[str]:
     return [f"depth: {said}, which is no measurement"] if share > _MANY else []
 
 
-def measured(steps: NDArray[np.unsignedinteger]) -> NDArray[np.unsignedinteger]:
+def measured(steps: NDArray[np.integer]) -> NDArray[np.integer]:
     """Depth in whole steps with 0 where there is no measurement: in no format is the largest value of the
     type one. Cameras and drivers write it for what is too far, too near or unknown."""
     return np.where(steps == np.iinfo(steps.dtype).max, steps.dtype.type(0), steps)

@@ -90,6 +90,14 @@ def hidden(points: Points, place: NDArray[np.float64]) -> float:
     return float((range_m > _BEHIND * nearest[where]).mean())
 
 
+def of_sensor(points: Points, T_world_sensor: Pose) -> Points:
+    """Points (N, 3) of the world's frame in the sensor's."""
+    T = inverse(T_world_sensor)
+    with np.errstate(invalid="ignore", over="ignore"):
+        moved: Points = points @ T[:3, :3].T + T[:3, 3]
+    return moved
+
+
 def finite(points: Points) -> Points:
     """The points that are measurements."""
     return points[np.isfinite(points).all(axis=1) & points.any(axis=1)]

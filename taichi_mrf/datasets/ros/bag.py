@@ -16,6 +16,8 @@ import numpy as np
 
 from taichi_mrf.datasets.base import Dataset, Format, start_pose
 from taichi_mrf.datasets.confidence import L515
+from taichi_mrf.datasets.depth_scale import check_metres
+from taichi_mrf.datasets.images import note_of_largest
 from taichi_mrf.datasets.lidar.scans import refuse_image_options
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
@@ -34,6 +36,7 @@ from taichi_mrf.datasets.ros.topics import (
     cloud_topics,
     depth_topics,
     described,
+    no_depth,
     packed_otherwise,
 )
 from taichi_mrf.errors import DatasetError, FrameError
@@ -46,6 +49,10 @@ from taichi_mrf.sensor.ray_table import RayTable
 
 REALSENSE = "/device_0/sensor_"
 """The beginning of topics in the files of Intel's library, whose messages differ from those of ROS."""
+
+
+_LOOKED_AT = 4
+"""Images whose numbers are looked at when a bag is opened."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +128,21 @@ class RosBag(Dataset):
     def pose(self, index: int) -> Pose:
         """The pose of one frame."""
         return self.poses[index]
+
+    def check_scale(self, poses_are_used: bool) -> list[str]:
+        """A note of whole numbers that are no measurements. Raises DatasetError for floats that are no
+        metres."""
+        shares, depths = [], []
+        for entry in self.entries[:: max(1, len(self.entries) // _LOOKED_AT)][:_LOOKED_AT]:
+            try:
+                message = self.reader.read(self.topic, entry)
+                shares.append(messages.share_without(message))
+                depths.append(messages.depth_image(message, None))
+            except DatasetError:  # reported when its frame is read
+                continue
+        if self.depth_scale is None:
+            check_metres(depths, f"{self.reader.path}: topic {self.topic}")
+        return note_of_largest(shares)
 
     def read(self, index: int) -> Frame:
         """Decode one image.
@@ -270,6 +292,8 @@ def _open_lidar(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> 
 def _depth_topic(reader: RosReader, wanted: str) -> DepthTopic:
     topics = {topic.name: topic for topic in depth_topics(reader)}
     unread = [] if topics else packed_otherwise(reader)
+    if not (topics or unread or wanted):
+        raise DatasetError(f"{reader.path}: {no_depth(reader)}")
     what = f"topics of depth images ({messages.ENCODINGS})"
     name = choose(reader, "depth", wanted, [*topics, *unread], what)
     topic = topics.get(name) or described(reader, name)
