@@ -55,7 +55,11 @@ class FramesNpz(Dataset):
     _loaded: tuple[Path, NDArray, NDArray | None] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        self._places = [(part, i) for part in self.parts for i in range(len(part.poses))]
+        every = [(part, i) for part in self.parts for i in range(len(part.poses))]
+        self._places = [(part, i) for part, i in every if np.isfinite(part.poses[i]).all()] or every
+        if len(self._places) < len(every):
+            self.dropped = len(every) - len(self._places)
+            self.notes.append(f"{self.dropped} of {len(every)} images dropped: tracking was lost ({POSE})")
         self._names = [
             f"{part.path.stem}-{i:06d}" if len(part.poses) > 1 else part.path.stem for part, i in self._places
         ]

@@ -49,13 +49,14 @@ def open_folder(path: Path, options: ReadOptions) -> Dataset:
         stamps = read_times(folder / TIMES)
     else:
         notes.append(f"no {TIMES} in {folder}: assumed {SECONDS_PER_SCAN:g} s from one scan to the next")
+    by_number = {int(pose.key): pose for pose in poses.poses}
     found: list[tuple[Path, float, RecordedPose]] = []
     for file in files:
         number = number_of(file)
-        if number is None or number >= len(poses.poses) or (stamps is not None and number >= len(stamps)):
+        if number not in by_number or (stamps is not None and number >= len(stamps)):
             continue
         stamp = SECONDS_PER_SCAN * number if stamps is None else stamps[number]
-        found.append((file, stamp, poses.poses[number]))
+        found.append((file, stamp, by_number[number]))
     world = in_world(
         len(found), lambda i: _pose(found[i][2], T_camera_lidar), lambda i: read_cloud(found[i][0])
     )
@@ -118,8 +119,8 @@ def _poses(folder: Path) -> Trajectory:
             f"{folder}: no poses of its scans; looked for {POSES} and ../../poses/{folder.name}.txt"
         )
     trajectory = read_trajectory(path)
-    if trajectory.layout != "rows":
-        raise DatasetError(f"{path}: expected a 3 x 4 matrix, row by row, in each line")
+    if trajectory.layout == "stamped":
+        raise DatasetError(f"{path}: expected a 3 x 4 matrix, row by row, in each line, or behind its number")
     return trajectory
 
 
