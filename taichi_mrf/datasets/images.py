@@ -65,7 +65,8 @@ def look_at_depth(path: Path, camera: PinholeCamera) -> tuple[bool, float]:
 
 def share_of_largest(steps: NDArray) -> float:
     """The share of pixels that have the largest value of whole numbers."""
-    return float((steps == np.iinfo(steps.dtype).max).mean()) if steps.dtype.kind in "ui" else 0.0
+    is_whole = steps.ndim == 2 and steps.dtype.kind in "ui" and steps.itemsize == 2
+    return float((steps == np.iinfo(steps.dtype).max).mean()) if is_whole else 0.0
 
 
 def note_of_largest(shares: Sequence[float]) -> list[str]:

@@ -133,7 +133,7 @@ class RosBag(Dataset):
         """A note of whole numbers that are no measurements. Raises DatasetError for floats that are no
         metres."""
         shares, depths = [], []
-        for entry in self.entries[:: max(1, len(self.entries) // _LOOKED_AT)][:_LOOKED_AT]:
+        for entry in self.entries[:: -(-len(self.entries) // _LOOKED_AT)]:
             try:
                 message = self.reader.read(self.topic, entry)
                 shares.append(messages.share_without(message))
