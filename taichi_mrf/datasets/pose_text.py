@@ -70,10 +70,12 @@ def split(lines: list[str]) -> tuple[Columns | None, list[tuple[int, str]]]:
     for number, line in enumerate(lines, start=1):
         text = line.strip()
         mark = _COMMENT.match(text)
+        if not text:
+            continue
         is_head = mark is not None or (not found and not any(map(_is_number, _cells(text))))
         if not is_head:
             found.append((number, text))
-        elif text and not found:
+        elif not found:
             columns = _named(text[mark.end() :] if mark else text) or columns
     return columns, found
 

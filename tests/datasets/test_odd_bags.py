@@ -30,7 +30,7 @@ from inputs_bags import (
 
 from taichi_mrf.datasets import Dataset, open_dataset
 from taichi_mrf.errors import DatasetError
-from taichi_mrf.geometry.poses import Pose
+from taichi_mrf.geometry.poses import Pose, look_at
 
 T_MAP_ODOM = np.array([[0.0, -1, 0, 3], [1, 0, 0, 1], [0, 0, 1, 0], [0, 0, 0, 1]])
 TOPIC = "/camera/depth/image_raw"
@@ -288,3 +288,39 @@ def test_where_stamps_stand_still_the_times_of_recording_count(tmp_path: Path) -
     dataset = open_dataset(write(tmp_path, content))
     assert f"the stamps of {TOPIC} stand still: the times of recording are taken" in dataset.notes
     check_poses(dataset)
+
+
+T_LINK_CAMERA = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+EYES = [look_at([0.15 * i - 0.8, 0.3, 0.1], [0.15 * i + 0.2, 1.1, -0.1]) for i in range(COUNT)]
+
+
+def seen(i: int) -> np.ndarray:
+    """Millimetres of the walls of a box, 5 x 4 x 3 m, from inside."""
+    ways = CAMERA.rays() @ EYES[i][:3, :3].T
+    walls = (np.sign(ways) * [2.5, 2.0, 1.5] - EYES[i][:3, 3]) / ways
+    return np.rint(walls.min(axis=-1) * 1000).astype(np.uint16)
+
+
+@pytest.mark.parametrize("source", ["tf", "odometry", "pose"])
+@pytest.mark.parametrize("is_body", [True, False])
+def test_poses_of_a_camera_link_are_turned_if_images_agree_so(
+    tmp_path: Path, source: str, is_body: bool
+) -> None:
+    frame = FRAME if source == "pose" else "camera_link"
+
+    def content(bag: Bag) -> None:
+        bag.camera_info("/camera/depth/camera_info", frame, CAMERA)
+        for i, T in enumerate(EYES):
+            T_link = T @ T_LINK_CAMERA.T if is_body else T
+            bag.image(TOPIC, stamp(i), frame, seen(i), "16UC1")
+            if source == "tf":
+                bag.tf("/tf", stamp(i), "odom", frame, T_link)
+            elif source == "odometry":
+                bag.odometry("/odom", stamp(i), "odom", frame, T_link)
+            else:
+                bag.pose_stamped("/camera/pose", stamp(i), "odom", T_link)
+
+    dataset = open_dataset(write(tmp_path, content))
+    for frame_read, T in zip(dataset, EYES, strict=True):
+        np.testing.assert_allclose(frame_read.T_world_camera, T, atol=1e-6)
+    assert any("of a body, x ahead and z up" in note for note in dataset.notes) == is_body

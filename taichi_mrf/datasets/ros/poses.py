@@ -68,13 +68,15 @@ class PoseChoice:
 class BagPoses:
     """``at(stamp, largest_gap)`` is T_fixed_camera, (4, 4), or None; ``source`` names the origin of the
     poses and the time that they span, ``stamps`` are theirs, if known. ``registered``: the sensor's data are
-    not in its own frame but in the fixed one, where an odometry has put them."""
+    not in its own frame but in the fixed one, where an odometry has put them. ``assumed``: nothing says that
+    the poses are of the sensor's own axes."""
 
     at: Callable[[float, float], Pose | None]
     source: str
     notes: list[str] = field(default_factory=list)
     registered: bool = False
     stamps: Sequence[float] | NDArray[np.float64] = ()
+    assumed: bool = False
 
 
 def pose_candidates(reader: RosReader, tree: TransformTree, optical: str) -> list[str]:
@@ -203,7 +205,8 @@ def _from_topic(
             return None
         return T_fixed_parent @ T_parent_body @ T_body_optical
 
-    return BagPoses(at, f"{name}: {_span(timed)}", notes, stamps=timed.stamps)
+    assumed = body == optical and child != optical
+    return BagPoses(at, f"{name}: {_span(timed)}", notes, stamps=timed.stamps, assumed=assumed)
 
 
 def _of_odometry(

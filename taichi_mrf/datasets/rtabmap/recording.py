@@ -157,7 +157,7 @@ def _posed_nodes(database: RtabmapDatabase, track: bool = False) -> tuple[list[P
         (longest, count), *others = sessions
         left_out = ", ".join(f"{session} ({nodes} nodes)" for session, nodes in others)
         notes.append(
-            f"session {longest} ({count} nodes) is read, and not {left_out}: each has an odometry of its own; "
+            f"session {longest} ({count} nodes) is read, not {left_out}: each has an odometry of its own; "
             "optimise them in RTAB-Map to have all"
         )
         without += len(found) - count
