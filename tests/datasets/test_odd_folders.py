@@ -92,6 +92,7 @@ NUMBERED: dict[str, Callable[[Path], object]] = {
     "decimal commas": poses(lambda i: row_of(CONTENT.poses[i][:3]).replace(".", ",")),
     "numbers of frames": poses(lambda i: f"{i} {row_of(CONTENT.poses[i][:3])}"),
     "numbers of frames and 4 x 4": poses(lambda i: f"{i} {row_of(CONTENT.poses[i])}"),
+    "blank lines": poses(lambda i: row_of(CONTENT.poses[i][:3]) + "\n"),
     "times": poses(lambda i: stamped_line(0.1 * i, CONTENT.poses[i])),
     "files of macOS": lambda folder: (folder / "depth" / "._00001.png").write_bytes(b"\0\5\x16\7"),
 }
