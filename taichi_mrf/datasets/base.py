@@ -4,6 +4,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,9 +32,14 @@ def start_pose(up: NDArray[np.float64] | None = None) -> Pose:
     return T
 
 
+def when_called(place: str) -> Callable[..., Any]:
+    """The function at a place, "module:function", which is imported when it is called."""
+    return lambda *arguments: resolve_name(place)(*arguments)
+
+
 @dataclass(frozen=True)
 class Format:
-    """A kind of recording in a folder or a file: its entry in the registry (registry.py)."""
+    """A kind of recording in a folder or a file: its entry in the list (entries.py), or a plug (plugs.py)."""
 
     name: str
 
@@ -42,17 +49,17 @@ class Format:
     recognises: Callable[[Path], bool]
     """Whether a folder or a file is of this format, even if some of its files are missing or damaged."""
 
-    open: Callable[[Path, ReadOptions], "Dataset"]
-    """List the frames. Raises DatasetError, which names the file."""
+    open: Callable[..., "Dataset"]
+    """``(path, options)``, a ReadOptions, lists the frames. Raises DatasetError, which names the file."""
 
-    open_with_query: Callable[[Path, str, ReadOptions], "Dataset"] | None = None
-    """The same with options after a question mark in the source's name; None if the format has none."""
+    takes_query: bool = False
+    """Whether ``open`` is ``(path, query, options)``: with the text after a question mark in the name."""
 
 
 @dataclass(frozen=True)
 class BuiltIn:
-    """A source that is not a file: its entry in the registry. ``open`` gets the text after the question mark
-    in the source's name, or after a name that ends in a colon."""
+    """A source that is not a file: its entry in the list (entries.py). ``open`` gets the text after the
+    question mark in the source's name, or after a name that ends in a colon."""
 
     name: str
     open: Callable[[str, ReadOptions], "Dataset"]

@@ -9,8 +9,8 @@ import numpy as np
 
 from taichi_mrf.config.files import parse_yaml
 from taichi_mrf.config.values import from_dict
-from taichi_mrf.datasets.formats.open3d_json import read_intrinsics
 from taichi_mrf.datasets.images import as_numbers, at_size, image_size
+from taichi_mrf.datasets.open3d_json import read_intrinsics
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.errors import ConfigError, DatasetError, said
 from taichi_mrf.sensor.camera import PinholeCamera

@@ -1,65 +1,23 @@
-"""Every source of frames there is, and which of them opens a given source.
-
-A new format of recordings is a module that ends with ``FORMAT = Format(...)`` and its line in FORMATS; the
-first entry that recognises a folder or a file opens it.
-"""
+"""Sources of frames are opened here: folders and files by the first plug (plugs.py), else the first entry
+(entries.py) that recognises them, and the built-in sources by their names."""
 
 import difflib
 import re
+import warnings
 from pathlib import Path
+from pkgutil import resolve_name
 
-from taichi_mrf.datasets import several_sensors
-from taichi_mrf.datasets.base import BuiltIn, Dataset, Format
+from taichi_mrf.datasets.base import Dataset, Format
 from taichi_mrf.datasets.conventions import AXIAL
-from taichi_mrf.datasets.formats import (
-    frames_npz,
-    numbered_depth,
-    record3d,
-    replica,
-    scannet,
-    seven_scenes,
-    stray_scanner,
-    tum_rgbd,
-)
-from taichi_mrf.datasets.hints import hint_for
-from taichi_mrf.datasets.lidar import kitti_velodyne, las_trajectory, ouster, scan_folder
+from taichi_mrf.datasets.entries import BUILT_IN, FORMATS
 from taichi_mrf.datasets.mended import mended
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.datasets.realsense import device
+from taichi_mrf.datasets.plugs import plugs
 from taichi_mrf.datasets.resampled import resampled
-from taichi_mrf.datasets.ros import bag
-from taichi_mrf.datasets.rtabmap import recording as rtabmap
-from taichi_mrf.datasets.stereo import kitti, rig_file
-from taichi_mrf.datasets.synthetic import corridor, mesh_sequence, ring, room
+from taichi_mrf.datasets.ros.names import is_bag
 from taichi_mrf.errors import ConfigError, DatasetError, collected_warnings
 from taichi_mrf.sensor.camera import PinholeCamera, pinhole
 from taichi_mrf.system.files import exists, is_folder
-
-FORMATS: tuple[Format, ...] = (
-    several_sensors.format_of(lambda source, **options: open_dataset(source, **options)),
-    seven_scenes.FORMAT,
-    tum_rgbd.FORMAT,
-    scannet.FORMAT,
-    replica.FORMAT,
-    stray_scanner.FORMAT,
-    record3d.FORMAT,
-    numbered_depth.FORMAT,
-    kitti.FORMAT,
-    bag.FORMAT,
-    kitti_velodyne.FORMAT,
-    scan_folder.FORMAT,
-    las_trajectory.FORMAT,
-    ouster.FORMAT,
-    rtabmap.FORMAT,
-    frames_npz.FORMAT,
-    rig_file.FORMAT,
-)
-
-BUILT_IN: dict[str, BuiltIn] = {
-    each.name: each
-    for each in (room.BUILT_IN, corridor.BUILT_IN, ring.BUILT_IN, mesh_sequence.BUILT_IN, device.BUILT_IN)
-}
-
 
 _FEW = 5
 """A folder around a recording has fewer things in it, such as a text about it."""
@@ -106,7 +64,7 @@ def open_dataset(
 
 def recognise(path: Path) -> Format | None:
     """The format of a folder or a file, or None."""
-    return next((each for each in FORMATS if each.recognises(path)), None)
+    return next((each for each in _formats() if each.recognises(path)), None)
 
 
 def format_name(source: str | Path) -> str:
@@ -135,7 +93,7 @@ def is_rendered(source: str) -> bool:
 def bag_path(source: str) -> Path | None:
     """The bag that a source names, None if it is something else."""
     path, _ = _path_and_query(source)
-    return path if bag.FORMAT.recognises(path) else None
+    return path if is_bag(path) else None
 
 
 def _as_asked(dataset: Dataset, options: ReadOptions) -> Dataset:
@@ -167,6 +125,8 @@ def _open_path(source: str, options: ReadOptions) -> Dataset:
         raise DatasetError(
             f"{path}: no such folder or file, and no built-in source of that name ({', '.join(BUILT_IN)})"
         )
+    for problem in plugs()[1]:
+        warnings.warn(problem, stacklevel=2)
     found = recognise(path)
     if found is None and (inside := _only_inside(path)) is not None:
         dataset = _open_path(f"{inside}?{query}" if query else str(inside), options)
@@ -176,24 +136,24 @@ def _open_path(source: str, options: ReadOptions) -> Dataset:
         raise DatasetError(_not_recognised(path))
     if is_folder(path):
         path = path.resolve()
-    if not query:
-        return found.open(path, options)
-    if found.open_with_query is None:
+    if found.takes_query:
+        return found.open(path, query, options)
+    if query:
         raise DatasetError(f"{path}: takes no options after a question mark; bags and built-in sources do")
-    return found.open_with_query(path, query, options)
+    return found.open(path, options)
 
 
 def _not_recognised(path: Path) -> str:
     """Why a path cannot be opened, and what to do."""
     if is_folder(path):
         children = sorted(path.iterdir())
-        inside = [child.name for child in children if bag.FORMAT.recognises(child) or _is_recording(child)]
+        inside = [child.name for child in children if is_bag(child) or _is_recording(child)]
         if inside:
             return f"{path}: contains several recordings; pass one of: {', '.join(inside[:8])}"
-    hint = hint_for(path)
+    hint = resolve_name("taichi_mrf.datasets.hints:hint_for")(path)
     if hint is not None:
         return f"{path}: {hint}"
-    looked_for = "; ".join(f"{each.name}: {each.looks_for}" for each in FORMATS)
+    looked_for = "; ".join([*(f"{each.name}: {each.looks_for}" for each in _formats()), *plugs()[1]])
     if not is_folder(path):
         return (
             f"{path}: unsupported file type; for a recording of many files pass its folder. "
@@ -210,11 +170,16 @@ def _only_inside(path: Path) -> Path | None:
     if not is_folder(path):
         return None
     children = [child for child in path.iterdir() if not child.name.startswith((".", "__"))]
-    inside = [child for child in children if bag.FORMAT.recognises(child) or _is_recording(child)]
+    inside = [child for child in children if is_bag(child) or _is_recording(child)]
     folders = [child for child in children if is_folder(child)]
     if inside:
         return inside[0] if len(inside) == 1 else None
     return _only_inside(folders[0]) if len(folders) == 1 and len(children) < _FEW else None
+
+
+def _formats() -> tuple[Format, ...]:
+    """Plugs first: they may read what one of the entries would take."""
+    return (*plugs()[0], *FORMATS)
 
 
 def _is_recording(path: Path) -> bool:

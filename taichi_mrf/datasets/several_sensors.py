@@ -16,7 +16,7 @@ sensors must count from one beginning, at poses in one world. Each frame states 
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -26,14 +26,14 @@ from numpy.typing import NDArray
 from taichi_mrf.config.files import read_yaml
 from taichi_mrf.config.schema import SensorConfig
 from taichi_mrf.config.values import check_field, from_dict
-from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.options import ReadOptions
+from taichi_mrf.datasets.registry import open_dataset
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.sensor.noise import PolynomialNoise
-from taichi_mrf.system.files import is_file
 
 SUFFIXES = (".yaml", ".yml")
 _SOURCE = re.compile(r"[a-z][a-z0-9_]+:")
@@ -156,27 +156,7 @@ class SeveralSensors(Dataset):
         )
 
 
-def recognises(path: Path) -> bool:
-    """Whether a YAML file has an entry ``sensors``."""
-    if path.suffix not in SUFFIXES or not is_file(path):
-        return False
-    try:
-        values = read_yaml(path)
-    except ConfigError:
-        return False
-    return isinstance(values, dict) and "sensors" in values
-
-
-def format_of(open_source: Callable[..., Dataset]) -> Format:
-    """The entry in the registry; ``open_source`` opens the recording of one sensor."""
-
-    def open_file(path: Path, options: ReadOptions) -> SeveralSensors:
-        return _open_file(path, options, open_source)
-
-    return Format("several sensors", "a .yaml file with a list of sensors", recognises, open_file)
-
-
-def _open_file(path: Path, options: ReadOptions, open_source: Callable[..., Dataset]) -> SeveralSensors:
+def open_file(path: Path, options: ReadOptions) -> SeveralSensors:
     """Open the recordings of all sensors. Raises DatasetError, which names the file and the sensor."""
     _refuse(path, options)
     try:
@@ -191,7 +171,7 @@ def _open_file(path: Path, options: ReadOptions, open_source: Callable[..., Data
     sensors, places, stamps = [], [], []
     for number, (entry, name) in enumerate(zip(described.sensors, names, strict=True)):
         try:
-            sensor = _open_sensor(path, entry, name, options, open_source)
+            sensor = _open_sensor(path, entry, name, options)
         except (ConfigError, DatasetError, KeyframeError) as error:
             raise DatasetError(f"{path}: {name}: {error}") from error
         indices = np.arange(0, len(sensor.dataset), entry.every)
@@ -210,16 +190,14 @@ def _open_file(path: Path, options: ReadOptions, open_source: Callable[..., Data
     )
 
 
-def _open_sensor(
-    path: Path, entry: SensorEntry, name: str, options: ReadOptions, open_source: Callable[..., Dataset]
-) -> RecordedSensor:
+def _open_sensor(path: Path, entry: SensorEntry, name: str, options: ReadOptions) -> RecordedSensor:
     source = entry.source
     if not Path(source).is_absolute() and not _SOURCE.match(source):
         source = str(path.parent / source)
     keywords = entry.reading.keywords()
     if keywords["max_time_gap"] is None:
         keywords["max_time_gap"] = options.max_time_gap
-    dataset = open_source(source, color=options.color, **keywords)
+    dataset = open_dataset(source, color=options.color, **keywords)
     if dataset.endless or dataset.tracked:
         raise DatasetError("only recordings with poses can be put together")
     sigma = entry.sigma or dataset.recorded_sigma

@@ -11,7 +11,7 @@ from taichi_mrf.datasets.derived import Derived
 from taichi_mrf.datasets.mended import Mended
 from taichi_mrf.datasets.stereo.pairs import StereoPairs
 from taichi_mrf.doctor.readings import UNITS, Reading
-from taichi_mrf.doctor.search import EXPLAINED, QUESTIONS, Search
+from taichi_mrf.doctor.search import EXPLAINED, FEWEST_PAIRS, QUESTIONS, Search
 from taichi_mrf.doctor.views import Sample, read_sample
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -25,6 +25,8 @@ _NO_READING = (
     "how it is written: the frames that were looked at see different things, or contradict each other in a "
     "way that none of the usual mistakes explains"
 )
+_CONTRADICTING = 2 * EXPLAINED
+_MOST_EXPLAINED = 0.5
 _FEW_MATCHED, _MORE_MATCHED = 0.25, 2.0
 _WHOLE_STEP = 0.02
 
@@ -77,7 +79,7 @@ def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
     search = Search(sample, given, steps)
     best = search.best()
     before = search.score(given)
-    if best == given and before > EXPLAINED:
+    if best == given and before > _CONTRADICTING:
         return Diagnosis((), (_NO_READING,), given)
     undecided = tuple(search.undecided(best))
     answered = [text for name, text in QUESTIONS.items() if getattr(best, name) != getattr(given, name)]
@@ -85,6 +87,30 @@ def diagnose(dataset: Dataset, said: Conventions = AS_USUAL) -> Diagnosis:
         return Diagnosis((), (_NO_READING,), given)
     found = tuple(_findings(given, best, steps, source))
     return Diagnosis(found, undecided, best, before, search.score(best), search)
+
+
+def mistakes(dataset: Dataset) -> list[str]:
+    """The findings in words: none for a source that cannot be looked at."""
+    try:
+        found = diagnose(dataset).findings
+    except DatasetError:
+        return []
+    return [f"{each.text} ({each.flag} mends it)" if each.flag else each.text for each in found]
+
+
+def mistakes_at_a_glance(dataset: Dataset, seconds: float = 1.0) -> list[str]:
+    """The same, and soon, before anything is mapped: none if most of the frames that can be read in so many
+    seconds explain each other, or if they are too few to tell."""
+    if dataset.endless or dataset.tracked:
+        return []
+    try:
+        search = Search(read_sample(dataset, seconds), Reading(), 1.0)
+    except DatasetError:
+        return []
+    off = search.differences(Reading())
+    if len(off) < FEWEST_PAIRS or (off <= EXPLAINED).mean() >= _MOST_EXPLAINED:
+        return []
+    return mistakes(dataset)
 
 
 def _findings(given: Reading, best: Reading, steps: float, source: Dataset) -> list[Finding]:

@@ -20,6 +20,9 @@ from taichi_mrf.sensor.camera import PinholeCamera
 EXPLAINED = 0.03
 """Frames whose depths differ by less, as a share of depth, explain each other."""
 
+FEWEST_PAIRS = 3
+"""Fewer pairs of frames do not tell a reading from another."""
+
 QUESTIONS = {
     "inverse": "the direction of poses",
     "w_first": "the order of quaternions",
@@ -35,7 +38,6 @@ _WORST = 0.2
 _EXPLAINING = 0.5
 _NOISE = 0.002
 _BETTER, _AS_WELL = 2.0, 1.3
-_FEWEST_PAIRS = 3
 _ROUNDS = 3
 _FEW, _MANY = 2, 8
 _LATE_STEPS_S = (0.05, 0.01)
@@ -107,7 +109,7 @@ class Search:
         """The mean difference over the usable pairs. If too few of them tell, one more than over all."""
         found, usable = self.differences(reading), self.usable()
         told = usable & ~np.isnan(found)
-        if told.sum() < max(_FEWEST_PAIRS, usable.sum() / 3):
+        if told.sum() < max(FEWEST_PAIRS, usable.sum() / 3):
             return 1 + float(np.nan_to_num(found, nan=1.0).mean()) if len(found) else 2.0
         # Of late poses some pairs are not known. What they lack is made up for, so that scores compare.
         whole = self.differences(replace(reading, late_s=0.0)) + _NOISE

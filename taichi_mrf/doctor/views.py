@@ -4,6 +4,7 @@ Pairs are chosen by how many frames lie between, and not by the poses, so that e
 tried on the same ones.
 """
 
+import math
 import time
 from collections.abc import Iterable
 from contextlib import suppress
@@ -74,8 +75,10 @@ class Sample:
     poses: Floats
 
 
-def read_sample(dataset: Dataset) -> Sample:
-    """Read some frames; broken ones are passed over. Raises DatasetError if the source cannot be read."""
+def read_sample(dataset: Dataset, seconds: float = math.inf) -> Sample:
+    """Read some frames; broken ones are passed over, and those that are left after so many seconds. Raises
+    DatasetError if the source cannot be read."""
+    begin = time.monotonic()
     count = len(dataset)
     views: dict[int, View] = {}
     poses: dict[int, tuple[float, Pose]] = {}
@@ -83,6 +86,8 @@ def read_sample(dataset: Dataset) -> Sample:
     firsts = dict.fromkeys(np.linspace(0, count - 1, PLACES + 1).round().astype(int)[:-1].tolist())
     pairs = [(i, i + apart) for apart in APART for i in firsts if i + apart < count]
     for index in sorted({i for pair in pairs for i in pair}):
+        if time.monotonic() - begin > seconds:
+            break
         try:
             frame = dataset.read(index)
         except FrameError:
@@ -92,7 +97,7 @@ def read_sample(dataset: Dataset) -> Sample:
         if view is not None:
             views[index] = view
     stamps = dataset.stamps()
-    for index in _neighbours(pairs, poses):
+    for index in _neighbours(pairs, poses) if seconds == math.inf else ():
         if 0 <= index < count and index not in poses:
             with suppress(FrameError):
                 poses[index] = (float(stamps[index]), dataset.pose(index))

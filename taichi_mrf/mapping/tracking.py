@@ -27,8 +27,8 @@ from taichi_mrf.alignment.se3 import moved, twist
 from taichi_mrf.alignment.wide_search import Around
 from taichi_mrf.config.registry import methods_with
 from taichi_mrf.config.schema import Config, KeyframeConfig, PoseConfig
+from taichi_mrf.datasets.entries import REALSENSE
 from taichi_mrf.datasets.options import TRACK
-from taichi_mrf.datasets.realsense.device import NAME as CAMERA
 from taichi_mrf.errors import ConfigError, LostFrameError
 from taichi_mrf.geometry.poses import Pose, as_pose, inverse
 from taichi_mrf.inference.keyframe import DepthImage, checked_depth
@@ -343,5 +343,5 @@ def keyframe_steps(config: KeyframeConfig) -> KeyframeConfig:
 
 def wants_color(config: Config, source: str, track: bool) -> bool:
     """Whether the colour images of a source are to be read: for the map, or to ``track`` the camera."""
-    tracked = track or f"poses={TRACK}" in source or (source.startswith(CAMERA) and "poses=" not in source)
+    tracked = track or f"poses={TRACK}" in source or (source.startswith(REALSENSE) and "poses=" not in source)
     return config.color or tracked

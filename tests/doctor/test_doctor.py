@@ -14,13 +14,16 @@ from console import carry_out
 from datasets_recordings import stamped_line, write_image
 from kitti_street import write_kitti
 
+from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import open_dataset
+from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.synthetic.analytic_render import render
-from taichi_mrf.doctor.diagnosis import Diagnosis, diagnose
+from taichi_mrf.doctor.diagnosis import Diagnosis, diagnose, mistakes_at_a_glance
 from taichi_mrf.doctor.picture import overlap
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import look_at
 from taichi_mrf.sensor.frame import Frame
+from taichi_mrf.session.source import open_source
 
 SHARED = {
     "seven_scenes_redkitchen": 100,
@@ -184,3 +187,28 @@ def test_the_flags_that_are_named_mend_a_recording(
     facts = json.loads(capsys.readouterr().out)
     assert [each["flag"] for each in facts["findings"]] == ["--poses-are inverse,opengl"]
     assert facts["difference_mended"] < facts["difference"] / 2
+
+
+@pytest.mark.parametrize("noise", ["checked", "auto"])
+def test_map_names_the_mistake_and_learns_no_noise_from_it(
+    room: list[Frame], noise: str, tmp_path: Path
+) -> None:
+    folder = write_tum(tmp_path / "mine", broken(room, "inverse"))
+    out = tmp_path / "out"
+    coarse = ("--voxel-size", 0.2, "--no-pictures", "--depth-scale", 1000, "--noise", noise, "--quiet")
+    assert carry_out("map", folder, "--out", out, *coarse) == 0
+    report = json.loads((out / "report.json").read_text())
+    (note,) = [note for note in report["notes"] if "contradict" in note]
+    assert note.endswith("poses are T_camera_world (--poses-are inverse mends it).")
+    assert report["noise"]["learnt"] is None
+    assert "--noise auto" not in " ".join(report["notes"])
+
+
+def test_a_glance_sees_the_mistake_too_before_live_begins(room: list[Frame], tmp_path: Path) -> None:
+    assert mistakes_at_a_glance(of_frames(room)) == []
+    folder = write_tum(tmp_path / "mine", broken(room, "opengl"))
+    reading = SourceFlags(depth_scale=1000)
+    _, notes = open_source(str(folder), Config(), every=1, limit=None, speed=1.0, loop=False, reading=reading)
+    (note,) = [note for note in notes if "contradict" in note]
+    assert "OpenGL" in note
+    assert note.endswith("(--poses-are opengl mends it)")

@@ -8,7 +8,6 @@ before. ``stamp`` (N,) in seconds and ``color`` (N, H, W, 3) uint8 RGB may be le
 """
 
 import math
-import zipfile
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -17,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, Format, start_pose
+from taichi_mrf.datasets.base import Dataset, start_pose
 from taichi_mrf.datasets.depth_scale import check_metres
 from taichi_mrf.datasets.images import measured, note_of_largest, share_of_largest
 from taichi_mrf.datasets.intrinsics import of_this_size, own_cameras
@@ -26,7 +25,7 @@ from taichi_mrf.errors import ConfigError, DatasetError, FrameError, KeyframeErr
 from taichi_mrf.geometry.poses import as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.system.files import is_file, is_folder
+from taichi_mrf.system.files import is_folder
 from taichi_mrf.system.npz_file import NpzFile, open_npz
 
 DEPTH, POSE, MATRIX, STAMP, COLOR, SCALE = "depth_m", "T_world_camera", "K", "stamp", "color", "depth_scale"
@@ -121,19 +120,6 @@ class FramesNpz(Dataset):
                     color = file[COLOR].reshape(count, *camera.shape, 3)
             self._loaded = part.path, depth, color
         return self._loaded[1], self._loaded[2]
-
-
-def recognises(path: Path) -> bool:
-    """Whether an npz file, or the first of a folder, holds frames, and not a map or something else."""
-    if is_folder(path):
-        path = next(iter(sorted(path.glob("*.npz"))), path)
-    if path.suffix != ".npz" or not is_file(path):
-        return False
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return {f"{DEPTH}.npy", f"{POSE}.npy"} & set(archive.namelist()) != set()
-    except Exception:  # zipfile's parser raises many kinds; opening the file names the problem
-        return path.suffix == ".npz"
 
 
 def open_npz_frames(path: Path, options: ReadOptions) -> FramesNpz:
@@ -256,11 +242,3 @@ def _number(file: NpzFile, path: Path, name: str) -> float:
     if found.size != 1:
         raise DatasetError(f"{path}: {name} is {found.shape}; expected one number")
     return float(found.reshape(-1)[0])
-
-
-FORMAT = Format(
-    name="npz",
-    looks_for="*.npz with depth_m, T_world_camera and K",
-    recognises=recognises,
-    open=open_npz_frames,
-)

@@ -23,12 +23,13 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.datasets.base import Dataset, Format
-from taichi_mrf.datasets.formats.open3d_json import is_trajectory_json, read_trajectory_json
+from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.entries import NUMBERED_FILES, NUMBERED_IMAGE, numbered_images
 from taichi_mrf.datasets.formats.tum_rgbd import LARGEST_GAP, associate
 from taichi_mrf.datasets.hints import image_hint, pose_files_hint
 from taichi_mrf.datasets.images import holds_depth
 from taichi_mrf.datasets.intrinsics import CAMERA_FILES, PRIMESENSE, find_camera, own_cameras
+from taichi_mrf.datasets.open3d_json import is_trajectory_json, read_trajectory_json
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.pose_text import in_seconds
 from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
@@ -39,25 +40,16 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import is_file
 
 NAME = "ICL-NUIM / Redwood"
-LOOKS_FOR = "NNNN.png (here or in depth/) and a trajectory (.log, .json, .freiburg or rows of matrices)"
 ICL_NUIM = PinholeCamera(width=640, height=480, fx=481.2, fy=480.0, cx=319.5, cy=239.5)
 FRAMES_PER_SECOND = 30.0
 COLOR_FOLDERS = ("rgb", "color", "image")
 
-_IMAGE = re.compile(  # Redwood's own scans append a stamp in microseconds
-    r"(depth[-_]?|(?:frame|image|img)[-_]?)?(\d+)(-\d+)?\.(?:png|tiff?)", re.IGNORECASE
-)
 _MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
-
-
-def recognises(folder: Path) -> bool:
-    """Whether there are numbered PNGs. Opening reports a missing trajectory."""
-    return bool(_numbered_images(folder))
 
 
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     """List the images in the order of their numbers, each with its pose of the trajectory."""
-    images = _numbered_images(folder)
+    images = numbered_images(folder)
     trajectory = _find_trajectory(folder, list(images.values()))
     gap = LARGEST_GAP if options.max_time_gap is None else options.max_time_gap
     poses, notes = _poses_by_number(list(images), trajectory, gap)
@@ -97,22 +89,6 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     )
 
 
-def _numbered_images(folder: Path) -> dict[int, Path]:
-    """Number -> depth image, ascending."""
-    for place in (folder / "depth", folder):
-        if place.is_dir():
-            found = [(m, path) for path in place.iterdir() if (m := _IMAGE.fullmatch(path.name))]
-            kinds = {(match[1] or "")[:1].lower() for match, _ in found}
-            if place == folder:  # where images of other names are colours
-                kinds &= {"", "d"}
-            if kinds:
-                kind = next(each for each in ("d", "", *sorted(kinds)) if each in kinds)
-                return dict(
-                    sorted((int(m[2]), path) for m, path in found if (m[1] or "")[:1].lower() == kind)
-                )
-    return {}
-
-
 def _find_trajectory(folder: Path, images: Sequence[Path]) -> Trajectory:
     """The only trajectory of a recording."""
     suffixes = (".txt", ".log", ".freiburg")
@@ -128,7 +104,7 @@ def _find_trajectory(folder: Path, images: Sequence[Path]) -> Trajectory:
         raise DatasetError(f"{folder}: {image_hint(images[:2], 'holds images')}")
     if not candidates:
         raise DatasetError(
-            f"{folder}: numbered images without a trajectory; looked for {LOOKS_FOR}{_unread(folder)}"
+            f"{folder}: numbered images without a trajectory; looked for {NUMBERED_FILES}{_unread(folder)}"
         )
     if len(candidates) > 1:
         names = ", ".join(path.name for path in candidates)
@@ -216,7 +192,7 @@ def _frame(
 def _stamp(path: Path, number: int, trajectory: Trajectory) -> float:
     """When an image was taken, in seconds: from its name if it tells, else from its number. Files of
     matrices do not tell how many there are in a second."""
-    named = _IMAGE.fullmatch(path.name)
+    named = NUMBERED_IMAGE.fullmatch(path.name)
     if named is not None and named[3] is not None:
         return int(named[3][1:]) / 1e6
     if in_seconds(number) != number:
@@ -229,11 +205,3 @@ def _read_pose(path: Path, pose: RecordedPose | None, mirror: bool) -> Pose:
         raise DatasetError(f"{path}: has no pose for this image")
     T_world_camera = pose.T_world_camera()
     return _MIRROR_Y @ T_world_camera @ _MIRROR_Y if mirror else T_world_camera
-
-
-FORMAT = Format(
-    name=NAME,
-    looks_for=LOOKS_FOR,
-    recognises=recognises,
-    open=open_folder,
-)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, Format, start_pose
+from taichi_mrf.datasets.base import Dataset, start_pose
 from taichi_mrf.datasets.color_camera import ColorCamera
 from taichi_mrf.datasets.confidence import ARKIT
 from taichi_mrf.datasets.formats.record3d_files import (
@@ -37,7 +37,7 @@ from taichi_mrf.errors import DatasetError, FrameError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.system.files import is_file, is_folder
+from taichi_mrf.system.files import is_file
 
 SUFFIX, METADATA, IMAGES = ".r3d", "metadata", "rgbd"
 _MOST_METADATA, _MOST_IMAGE = 1 << 27, 1 << 26
@@ -152,13 +152,6 @@ class Record3D(Dataset):
         return ColorCamera(scaled, np.eye(4)).registered(image, depth_m, camera)
 
 
-def recognises(path: Path) -> bool:
-    """Whether a file ends in .r3d, or a folder holds what is in one."""
-    if is_file(path):
-        return path.suffix.lower() == SUFFIX
-    return is_file(path / METADATA) and is_folder(path / IMAGES)
-
-
 def open_recording(path: Path, options: ReadOptions) -> Record3D:
     """List the frames in the order of their numbers. Raises DatasetError, which names the file and the entry
     of its metadata, also for a recording without poses, unless they are to be tracked."""
@@ -265,11 +258,3 @@ def _of_depth(camera: PinholeCamera, shape: tuple[int, int]) -> PinholeCamera:
             f"{camera.width} x {camera.height}"
         )
     return scaled
-
-
-FORMAT = Format(
-    name="Record3D",
-    looks_for=f"*{SUFFIX}, or a folder with {METADATA} and {IMAGES}/N.depth",
-    recognises=recognises,
-    open=open_recording,
-)

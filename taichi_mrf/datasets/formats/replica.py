@@ -9,7 +9,7 @@ import json
 import re
 from pathlib import Path
 
-from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.intrinsics import find_camera
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
@@ -25,12 +25,6 @@ PARAMETERS, POSES = "cam_params.json", "traj.txt"
 FRAMES_PER_SECOND = 30.0
 
 _DEPTH = re.compile(r"depth(\d+)\.png")
-
-
-def recognises(folder: Path) -> bool:
-    """Whether there are depth images with such names. Opening reports missing poses."""
-    results = folder / "results"
-    return results.is_dir() and any(_DEPTH.fullmatch(path.name) for path in results.iterdir())
 
 
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
@@ -88,11 +82,3 @@ def _read_parameters(path: Path) -> tuple[PinholeCamera, float]:
     if not 0 < scale < float("inf"):
         raise DatasetError(f"{path}: scale must be a positive number of steps per metre, not {scale:g}")
     return camera, scale
-
-
-FORMAT = Format(
-    name=NAME,
-    looks_for="results/depthNNNNNN.png and traj.txt",
-    recognises=recognises,
-    open=open_folder,
-)

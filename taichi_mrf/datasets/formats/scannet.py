@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.color_camera import ColorCamera
 from taichi_mrf.datasets.hints import hint_for
 from taichi_mrf.datasets.images import DEPTH_SUFFIXES
@@ -40,11 +40,6 @@ COLOR_CAMERA = PinholeCamera(width=1296, height=968, fx=1170.187988, fy=1170.187
 COLOR_INTRINSICS = "intrinsic/intrinsic_color.txt"
 STEPS_PER_METRE = 1000.0
 FRAMES_PER_SECOND = 30.0
-
-
-def recognises(folder: Path) -> bool:
-    """Whether there are a folder of depth images and one of poses."""
-    return (folder / "depth").is_dir() and (folder / "pose").is_dir()
 
 
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
@@ -136,11 +131,3 @@ def _frame(folder: Path, path: Path, camera: PinholeCamera | None) -> RecordedFr
         color_file=next((color for color in colors if color.is_file()), None),
         camera=camera,
     )
-
-
-FORMAT = Format(
-    name=NAME,
-    looks_for="depth/N.png and pose/N.txt",
-    recognises=recognises,
-    open=open_folder,
-)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.color_camera import ColorCamera
 from taichi_mrf.datasets.hints import pose_files_hint
 from taichi_mrf.datasets.intrinsics import find_camera
@@ -41,11 +41,6 @@ STEPS_PER_METRE = 1000.0
 FRAMES_PER_SECOND = 30.0
 
 _FILE = re.compile(r"(frame-(\d+))\.(depth\.png|pose\.txt)")
-
-
-def recognises(folder: Path) -> bool:
-    """Whether the folder contains at least one depth image or pose with such a name."""
-    return folder.is_dir() and any(_FILE.fullmatch(path.name) for path in folder.iterdir())
 
 
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
@@ -93,11 +88,3 @@ def _frame(folder: Path, name: str, number: int) -> RecordedFrame:
         pose_source=str(pose_file),
         color_file=next((path for path in colors if path.is_file()), None),
     )
-
-
-FORMAT = Format(
-    name=NAME,
-    looks_for="frame-NNNNNN.depth.png and frame-NNNNNN.pose.txt",
-    recognises=recognises,
-    open=open_folder,
-)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.confidence import ARKIT
 from taichi_mrf.datasets.intrinsics import own_cameras
 from taichi_mrf.datasets.options import ReadOptions
@@ -24,17 +24,12 @@ from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
 from taichi_mrf.datasets.trajectories import RecordedPose
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.system.files import is_file, is_folder, read_text
+from taichi_mrf.system.files import is_file, read_text
 
 DEPTH, CONFIDENCE, MATRIX, ODOMETRY = "depth", "confidence", "camera_matrix.csv", "odometry.csv"
 COLOR_SIZE, DEPTH_WIDTH = (1920, 1440), 256
 _COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 _INTRINSICS = ("fx", "fy", "cx", "cy")
-
-
-def recognises(folder: Path) -> bool:
-    """Whether there are depth images, a camera matrix and odometry, damaged or not."""
-    return is_folder(folder / DEPTH) and is_file(folder / MATRIX) and is_file(folder / ODOMETRY)
 
 
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
@@ -126,11 +121,3 @@ def _own_camera(intrinsics: list[float]) -> PinholeCamera | None:
     except ConfigError:
         return None
     return own and own.scaled(DEPTH_WIDTH / COLOR_SIZE[0])
-
-
-FORMAT = Format(
-    name="Stray Scanner",
-    looks_for=f"{DEPTH}/NNNNNN.png with {MATRIX} and {ODOMETRY}",
-    recognises=recognises,
-    open=open_folder,
-)

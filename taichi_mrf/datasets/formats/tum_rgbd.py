@@ -14,8 +14,8 @@ from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
-from taichi_mrf.datasets.base import Dataset, Format
-from taichi_mrf.datasets.images import DEPTH_SUFFIXES
+from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.entries import stamped_images
 from taichi_mrf.datasets.intrinsics import PRIMESENSE, find_camera
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.pose_text import in_seconds
@@ -24,13 +24,12 @@ from taichi_mrf.datasets.timed_poses import apart_in_words
 from taichi_mrf.datasets.trajectories import RecordedPose, is_trajectory, read_trajectory
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.system.files import is_file, is_folder, read_text
+from taichi_mrf.system.files import is_file, read_text
 
 NAME = "TUM RGB-D"
 STEPS_PER_METRE = 5000.0
 LARGEST_GAP = 0.02
 """Default of the largest time in seconds between a depth image and its pose."""
-_STAMP = re.compile(r"\d+\.\d+")
 LONGEST_NAME = 255
 """Bytes; common file systems allow no longer names."""
 DEPTH_LIST, COLOR_LIST, POSES = "depth.txt", "rgb.txt", "groundtruth.txt"
@@ -43,15 +42,9 @@ CAMERAS = {
 """The data set's calibrations of its three cameras, recognised by the folder's name."""
 
 
-def recognises(folder: Path) -> bool:
-    """Whether the folder has the list of depth images, or images that are called by their stamps. Opening
-    reports missing poses."""
-    return is_file(folder / DEPTH_LIST) or bool(_stamped_images(folder))
-
-
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     """List the depth images that have a pose within the largest gap, by their stamps."""
-    depth = _read_list(folder / DEPTH_LIST) if is_file(folder / DEPTH_LIST) else _stamped_images(folder)
+    depth = _read_list(folder / DEPTH_LIST) if is_file(folder / DEPTH_LIST) else stamped_images(folder)
     poses = _poses(folder)
     trajectory = read_trajectory(poses)
     if trajectory.layout != "stamped":
@@ -102,15 +95,6 @@ def _poses(folder: Path) -> Path:
         return others[0] if others else folder / POSES
     names = ", ".join(path.name for path in others) or "no other file of poses is there"
     raise DatasetError(f"{folder / POSES}: is missing; {DEPTH_LIST} needs it for the poses ({names})")
-
-
-def _stamped_images(folder: Path) -> list[tuple[float, Path]]:
-    """The depth images of a folder without a list that are called by their stamps in seconds, ascending."""
-    place = folder / "depth"
-    if not (is_folder(place) and is_file(folder / POSES)):
-        return []
-    found = [(p, _STAMP.fullmatch(p.stem)) for p in place.iterdir() if p.suffix.lower() in DEPTH_SUFFIXES]
-    return sorted((float(match[0]), path) for path, match in found if match)
 
 
 def associate(stamps: Sequence[float], others: Sequence[float], largest_gap: float) -> list[int | None]:
@@ -205,11 +189,3 @@ def _beside(folder: Path, name: str) -> Path:
         return moved if is_file(moved) else path
     except OSError:  # a name that is too long
         return path
-
-
-FORMAT = Format(
-    name=NAME,
-    looks_for="depth.txt and groundtruth.txt",
-    recognises=recognises,
-    open=open_folder,
-)

@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.entries import velodyne_sequence
 from taichi_mrf.datasets.lidar.clouds import natural, number_of, read_cloud
 from taichi_mrf.datasets.lidar.registered import in_world, of_sensor
 from taichi_mrf.datasets.lidar.scans import SECONDS_PER_SCAN, RecordedScan, lidar_scans
@@ -31,15 +32,9 @@ SCANS, CALIBRATION, POSES, TIMES = "velodyne", "calib.txt", "poses.txt", "times.
 _TO_CAMERA = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")
 
 
-def recognises(path: Path) -> bool:
-    """Whether a folder has velodyne/NNN.bin beside calib.txt, damaged or not."""
-    folder = _sequence(path)
-    return folder is not None and is_file(folder / CALIBRATION) and bool(_scans(folder))
-
-
 def open_folder(path: Path, options: ReadOptions) -> Dataset:
     """List the scans in the order of their numbers. Raises DatasetError, which names the file and line."""
-    folder = _sequence(path)
+    folder = velodyne_sequence(path)
     assert folder is not None
     files = _scans(folder)
     T_camera_lidar = read_calibration(folder / CALIBRATION)
@@ -94,13 +89,6 @@ def read_calibration(path: Path) -> Pose:
         raise DatasetError(f"{path}: Tr: {error}") from error
 
 
-def _sequence(path: Path) -> Path | None:
-    """The folder of a sequence, from its own path or that of its scans."""
-    if not is_folder(path):
-        return None
-    return path.parent if path.name == SCANS and not is_folder(path / SCANS) else path
-
-
 def _scans(folder: Path) -> list[Path]:
     place = folder / SCANS
     found = (
@@ -134,11 +122,3 @@ def _read(
 ) -> tuple[NDArray[np.float64], Pose]:
     points_m, T_world_lidar = read_cloud(file), _pose(pose, T_camera_lidar)
     return of_sensor(points_m, T_world_lidar) if world else points_m, T_world_lidar
-
-
-FORMAT = Format(
-    name="KITTI velodyne",
-    looks_for="velodyne/NNNNNN.bin with calib.txt and poses.txt",
-    recognises=recognises,
-    open=open_folder,
-)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.config.values import check_field
-from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.lidar.las_file import read_timed_las
 from taichi_mrf.datasets.lidar.recording import LIDAR_SIGMA_M
 from taichi_mrf.datasets.lidar.scan_poses import TEXTS
@@ -44,11 +44,6 @@ class SurveyOptions:
 
     def __post_init__(self) -> None:
         check_field(self.seconds > 0, "seconds", f"must be positive, not {self.seconds:g}")
-
-
-def recognises(path: Path) -> bool:
-    """Whether it is a file with one of these endings."""
-    return path.suffix.lower() in SUFFIXES and is_file(path)
 
 
 def open_survey(path: Path, query: str, options: ReadOptions) -> Dataset:
@@ -136,12 +131,3 @@ def _starts(
     starts = poses[:, :3, 3] @ T_lidar_world[:3, :3].T + T_lidar_world[:3, 3]
     moved = known & (np.ptp(starts[known], axis=0).max() > LIDAR_SIGMA_M)
     return np.where(moved[:, None], starts, 0.0)
-
-
-FORMAT = Format(
-    name="LAS survey",
-    looks_for="*.las or *.laz, with the file of the lidar's poses",
-    recognises=recognises,
-    open=lambda path, options: open_survey(path, "", options),
-    open_with_query=open_survey,
-)

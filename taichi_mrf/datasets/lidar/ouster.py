@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Format
 from taichi_mrf.datasets.lidar.beams import Beams
 from taichi_mrf.datasets.lidar.motion import Motion, PoseAt, Scan
 from taichi_mrf.datasets.lidar.ouster_files import OSF, check_recording
@@ -25,7 +24,7 @@ from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_
 from taichi_mrf.errors import DatasetError, FrameError, KeyframeError, said
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.system.files import check_regular, is_file
+from taichi_mrf.system.files import check_regular
 from taichi_mrf.system.libraries import library
 
 SUFFIXES = (OSF, ".pcap")
@@ -158,11 +157,6 @@ def columns_of(source: Any, number: int, sensor: int) -> Columns | None:
     return Columns(range_m, stamps, valid, TimedPoses(stamps[valid], poses[valid] @ extrinsic))
 
 
-def recognises(path: Path) -> bool:
-    """Whether a file is one of these, by its ending."""
-    return path.suffix.lower() in SUFFIXES and is_file(path)
-
-
 def open_recording(path: Path, query: str, options: ReadOptions) -> OusterScans:
     """Open a recording with the options after the question mark of its name, and read the stamps of its
     scans.
@@ -252,12 +246,3 @@ def _beams(path: Path, source: Any, sensor: int) -> Beams:
 def _of_sensor(frames: Any, sensor: int) -> Any | None:
     """The scan of one sensor in what the source gives at a time."""
     return next(iter([frame for i, frame in enumerate(frames) if i == sensor]), None)
-
-
-FORMAT = Format(
-    name="Ouster",
-    looks_for="*.osf, or *.pcap with its .json",
-    recognises=recognises,
-    open=lambda path, options: open_recording(path, "", options),
-    open_with_query=open_recording,
-)

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.config.values import check_field
-from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.entries import CLOUD_PLACES
 from taichi_mrf.datasets.lidar.clouds import READERS, is_cloud, natural, read_cloud
 from taichi_mrf.datasets.lidar.pcd_file import read_pcd_header
 from taichi_mrf.datasets.lidar.registered import MOST_HIDDEN, finite, hidden, in_world, of_sensor
@@ -25,10 +26,6 @@ from taichi_mrf.datasets.options import ReadOptions, parse_options
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.system.files import is_file, is_folder
-
-PLACES = ("", "scans", "clouds", "lidar", "velodyne", "pcd", "ply", "las")
-"""Where clouds are in a folder."""
-
 
 PCD = ".pcd"
 SENSOR, WORLD = "sensor", "world"
@@ -99,7 +96,7 @@ def clouds_of(folder: Path) -> list[Path]:
     is one itself."""
     if is_file(folder):
         return [folder] if folder.suffix.lower() in READERS else []
-    for place in PLACES:
+    for place in CLOUD_PLACES:
         if not is_folder(folder / place):
             continue
         files = [
@@ -173,13 +170,3 @@ def _frame_of(clouds: list[Path], poses: dict[Path, ScanPose], viewpoints: bool)
 def _scan(cloud: Path, pose: ScanPose, world: bool) -> tuple[NDArray[np.float64], Pose]:
     points_m, T_world_sensor = read_cloud(cloud), pose.read()
     return of_sensor(points_m, T_world_sensor) if world else points_m, T_world_sensor
-
-
-FORMAT = Format(
-    name="lidar scans",
-    looks_for=f"scan-NNN.npz (xyz), *.ply, *.pcd, *.las or *.bin with {POSES_NPZ} or a file of poses; "
-    "*.pcd with VIEWPOINT",
-    recognises=recognises,
-    open=lambda path, options: open_folder(path, "", options),
-    open_with_query=open_folder,
-)

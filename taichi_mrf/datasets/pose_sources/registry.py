@@ -7,12 +7,13 @@ recognises a file opens it.
 from collections.abc import Callable
 from pathlib import Path
 
-from taichi_mrf.datasets.formats.open3d_json import is_trajectory_json, read_trajectory_json
+from taichi_mrf.datasets.base import when_called
+from taichi_mrf.datasets.open3d_json import is_trajectory_json, read_trajectory_json
 from taichi_mrf.datasets.pose_sources.base import ChangedPoses, FrameKey, PoseKind, PoseSource
 from taichi_mrf.datasets.pose_sources.graph_file import SUFFIXES, is_pose_graph, read_pose_graph
 from taichi_mrf.datasets.pose_sources.watched import WatchedFile
-from taichi_mrf.datasets.ros.pose_history import KIND as BAG
-from taichi_mrf.datasets.rtabmap.recording import KIND as RTABMAP
+from taichi_mrf.datasets.ros.names import METADATA, is_bag
+from taichi_mrf.datasets.ros.names import SUFFIXES as BAGS
 from taichi_mrf.datasets.trajectories import Trajectory, read_trajectory, valid_poses
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.system.files import exists, is_folder
@@ -40,6 +41,18 @@ def _graph_poses(path: Path) -> ChangedPoses:
     return {int(number): T for number, T in read_pose_graph(path, with_edges=False).poses.items()}
 
 
+BAG = PoseKind(
+    "ROS bag",
+    f"a bag ({', '.join(BAGS)}, or a folder with {METADATA}) with a Path, tf or poses",
+    is_bag,
+    when_called("taichi_mrf.datasets.ros.pose_history:open_history"),
+)
+RTABMAP = PoseKind(
+    "RTAB-Map",
+    "a database (.db)",
+    lambda path: path.suffix == ".db",
+    when_called("taichi_mrf.datasets.rtabmap.recording:open_poses"),
+)
 GRAPH = PoseKind(
     "pose graph",
     f"VERTEX_SE3:QUAT or VERTEX3 lines ({', '.join(SUFFIXES)})",

@@ -15,7 +15,8 @@ from typing import Any, overload
 
 import numpy as np
 
-from taichi_mrf.datasets.base import BuiltIn, Dataset, start_pose
+from taichi_mrf.datasets.base import Dataset, start_pose
+from taichi_mrf.datasets.entries import REALSENSE
 from taichi_mrf.datasets.images import measured
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.realsense.motion import MotionModule, motion_or_note, recorded_motion
@@ -27,8 +28,6 @@ from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
 from taichi_mrf.system.files import exists, is_file
 from taichi_mrf.system.libraries import library
-
-NAME = "realsense:"
 
 TIMEOUT_MS = 500
 """A camera that delivers nothing for this long has missed an image; after MISSES in a row it is lost."""
@@ -120,7 +119,7 @@ class RealSenseCamera(Dataset):
         except RuntimeError as error:
             self.misses += 1
             if self.misses >= MISSES:
-                raise DatasetError(f"{NAME} the camera is lost: {error}") from error
+                raise DatasetError(f"{REALSENSE} the camera is lost: {error}") from error
             raise FrameError(f"{name}: no image from the camera: {error}") from error
         self.misses = 0
         if steps.shape != self.camera.shape:
@@ -154,15 +153,15 @@ def open_realsense(text: str, options: ReadOptions) -> Dataset:
     """
     file, wanted = _file_and_options(text)
     if options.depth_scale is not None:
-        raise DatasetError(f"{NAME} takes no depth_scale: the camera reports its own")
+        raise DatasetError(f"{REALSENSE} takes no depth_scale: the camera reports its own")
     tracked = options.track or wanted.poses == TRACK
     from_file = not tracked and wanted.poses != STILL
     trajectory = read_timed_poses(Path(wanted.poses)) if from_file else None
-    rs = library("pyrealsense2", f"{NAME} needs", "realsense", DatasetError)
+    rs = library("pyrealsense2", f"{REALSENSE} needs", "realsense", DatasetError)
     gap = INTERPOLATION_GAP if options.max_time_gap is None else options.max_time_gap
     source: RealSenseCamera | RealSenseRecording
     if wanted.imu not in ("", NO_IMU):
-        raise DatasetError(f"{NAME}{file}: imu may be {NO_IMU}, not {wanted.imu!r}")
+        raise DatasetError(f"{REALSENSE}{file}: imu may be {NO_IMU}, not {wanted.imu!r}")
     with_imu = tracked and wanted.imu != NO_IMU
     if file:
         source = _open_recording(rs, Path(file), trajectory, gap, options, with_imu)
@@ -180,7 +179,7 @@ def _file_and_options(text: str) -> tuple[str, RealSenseOptions]:
     file, mark, query = text.partition("?")
     if not mark and "=" in text and not exists(Path(text)):
         file, query = "", text
-    return file, parse_options(RealSenseOptions, query, f"{NAME}{file}")
+    return file, parse_options(RealSenseOptions, query, f"{REALSENSE}{file}")
 
 
 def _open_camera(
@@ -201,7 +200,7 @@ def _open_camera(
     if started is None or isinstance(started, str):
         started = _started(rs, wanted, color=False)
     if isinstance(started, str):
-        raise DatasetError(f"{NAME} cannot be started: {started}")
+        raise DatasetError(f"{REALSENSE} cannot be started: {started}")
     pipeline, profile = started
     depth, motion = profile.get_stream(rs.stream.depth), None
     if with_imu:
@@ -210,7 +209,7 @@ def _open_camera(
     stream = depth.as_video_stream_profile().get_intrinsics()
     camera = PinholeCamera(stream.width, stream.height, stream.fx, stream.fy, stream.ppx, stream.ppy)
     source = RealSenseCamera(
-        NAME,
+        REALSENSE,
         options.camera or camera,
         notes=notes,
         pipeline=pipeline,
@@ -243,7 +242,7 @@ def _open_recording(
     rs: Any, path: Path, trajectory: TimedPoses | None, gap: float, options: ReadOptions, with_imu: bool
 ) -> RealSenseRecording:
     if not is_file(path):
-        raise DatasetError(f"{NAME}{path}: no such file")
+        raise DatasetError(f"{REALSENSE}{path}: no such file")
     player = Player(rs, path, options.color)
     images = [listed for listed, _ in player.images()]
     if not images:
@@ -280,6 +279,3 @@ def _open_recording(
     )
     weakref.finalize(source, player.close)
     return source
-
-
-BUILT_IN = BuiltIn(NAME, open_realsense)

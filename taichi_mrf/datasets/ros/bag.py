@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, Format, start_pose
+from taichi_mrf.datasets.base import Dataset, start_pose
 from taichi_mrf.datasets.confidence import L515
 from taichi_mrf.datasets.conventions import Conventions
 from taichi_mrf.datasets.depth_scale import check_metres, gather
@@ -31,7 +31,7 @@ from taichi_mrf.datasets.ros.imu import BagImu, find_imu
 from taichi_mrf.datasets.ros.lidar import LidarBag
 from taichi_mrf.datasets.ros.point_cloud import POINT_CLOUD
 from taichi_mrf.datasets.ros.poses import PoseChoice
-from taichi_mrf.datasets.ros.reader import METADATA, SUFFIXES, Entry, RosReader, is_bag
+from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.sensor import find_sensor, largest_gap, posed_by, poses_of
 from taichi_mrf.datasets.ros.topics import (
     DepthTopic,
@@ -331,12 +331,3 @@ def _depth_topic(reader: RosReader, wanted: str) -> DepthTopic:
     except DatasetError as error:
         raise DatasetError(f"{reader.path}: topic {name}: {error}") from error
     return topic
-
-
-FORMAT = Format(
-    name="ROS bag",
-    looks_for=f"{', '.join(SUFFIXES)} or the folder of a ROS 2 bag with {METADATA}, or of a split one",
-    recognises=is_bag,
-    open=lambda path, options: open_bag(path, "", options),
-    open_with_query=open_bag,
-)

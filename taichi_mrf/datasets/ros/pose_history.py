@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from taichi_mrf.datasets.options import parse_options
-from taichi_mrf.datasets.pose_sources.base import ChangedPoses, FrameKey, PoseKind
+from taichi_mrf.datasets.pose_sources.base import ChangedPoses, FrameKey
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.messages import PATH
 from taichi_mrf.datasets.ros.poses import PoseChoice, body_of, find_poses, must_connect, pose_candidates
-from taichi_mrf.datasets.ros.reader import METADATA, SUFFIXES, Entry, RosReader, is_bag
+from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun
 from taichi_mrf.datasets.ros.sensor import BagSensor, find_sensor
 from taichi_mrf.datasets.ros.tf import read_transforms, tree_of
@@ -204,11 +204,3 @@ def _thinned(stamps: np.ndarray) -> list[float]:
         if not kept or stamp - kept[-1] >= LEAST_STEP_S:
             kept.append(stamp)
     return kept
-
-
-KIND = PoseKind(
-    "ROS bag",
-    f"a bag ({', '.join(SUFFIXES)}, or a folder with {METADATA}) with a Path, tf or poses",
-    is_bag,
-    open_history,
-)

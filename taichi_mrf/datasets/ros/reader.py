@@ -12,18 +12,15 @@ from typing import Any
 
 from taichi_mrf.datasets.ros.file_order import Place, places_of
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
-from taichi_mrf.datasets.ros.tolerance import METADATA, ROS1, files_of, msgtype_of, open_tolerantly
+from taichi_mrf.datasets.ros.names import METADATA, parts_of
+from taichi_mrf.datasets.ros.tolerance import ROS1, files_of, msgtype_of, open_tolerantly
 from taichi_mrf.datasets.ros.unpacking import bound_unpacking
 from taichi_mrf.errors import DatasetError, said
-from taichi_mrf.system.files import check_regular, is_file, is_folder
+from taichi_mrf.system.files import check_regular, is_folder
 from taichi_mrf.system.libraries import library
 
-SUFFIXES = (".bag", ".mcap", ".db3")
 LONGEST_PAUSE_S = 5.0
 """Between the files of a recording that was split while it ran."""
-
-_NUMBERED = re.compile(r"(.*?)(?:\d{4}(?:-\d\d){5})?_(\d+)")
-"""The name of such a file: a beginning, for ROS 1 the time at which it was opened, and its number."""
 
 _NANOSECONDS = 1_000_000_000
 
@@ -155,26 +152,6 @@ class RosReader:
                 yield recorded_ns, message, publisher
         except Exception as error:  # as on opening
             raise DatasetError(f"{self.path}: topic {topic}: cannot be read: {said(error)}") from error
-
-
-def is_bag(path: Path) -> bool:
-    """Whether a path looks like a bag: a file by its name, a folder by its metadata or its split files."""
-    return path.suffix in SUFFIXES if is_file(path) else is_file(path / METADATA) or bool(parts_of(path))
-
-
-def parts_of(path: Path) -> list[Path]:
-    """The files of a recording that was split, NAME_0.bag, NAME_1.bag, ..., in a folder without metadata, in
-    their order; none for any other path."""
-    if not is_folder(path) or is_file(path / METADATA):
-        return []
-    files = [file for file in path.iterdir() if file.suffix in SUFFIXES]
-    found = {file: _NUMBERED.fullmatch(file.stem) for file in files}
-    parts = {int(match[2]): file for file, match in found.items() if match is not None}
-    kinds = {(match[1], file.suffix) for file, match in found.items() if match is not None}
-    numbers = sorted(parts)  # a recorder with little space deletes the first files
-    follow = numbers[-1:] == [number + len(files) - 1 for number in numbers[:1]]
-    is_one = len(kinds) == 1 and len(files) == len(parts) > 1 and follow
-    return [parts[number] for number in numbers] if is_one else []
 
 
 def _unreadable(problem: str) -> str:

@@ -10,11 +10,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from taichi_mrf.datasets.ros.names import METADATA
 from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.system.files import is_file, read_text
-
-METADATA = "metadata.yaml"
-"""A folder with this file is a ROS 2 bag."""
 
 ROS1 = "ros1"
 _ENCODINGS = ("cdr", ROS1, "")

@@ -13,20 +13,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, Format, start_pose
+from taichi_mrf.datasets.base import Dataset, start_pose
 from taichi_mrf.datasets.color_camera import without_black
 from taichi_mrf.datasets.images import decode_color, decode_unchanged, note_of_largest, share_of_largest
 from taichi_mrf.datasets.options import ReadOptions
-from taichi_mrf.datasets.pose_sources.base import ChangedPoses, PoseKind, PoseSource
+from taichi_mrf.datasets.pose_sources.base import ChangedPoses, PoseSource
 from taichi_mrf.datasets.pose_sources.watched import WatchedFile
 from taichi_mrf.datasets.rtabmap.calibration import NodeCamera, node_camera
-from taichi_mrf.datasets.rtabmap.database import LOOP_CLOSURES, SUFFIX, Node, RtabmapDatabase
+from taichi_mrf.datasets.rtabmap.database import LOOP_CLOSURES, Node, RtabmapDatabase
 from taichi_mrf.datasets.rtabmap.depth import decode_depth, depth_size
 from taichi_mrf.errors import ConfigError, DatasetError, FrameError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.sensor.frame import Frame
-from taichi_mrf.system.files import is_file
 
 NAME = "RTAB-Map"
 STEPS_PER_METRE = 1000.0
@@ -175,16 +174,7 @@ def changing_poses(path: Path) -> ChangedPoses:
     return {each.node.stamp: each.T_world_camera for each in nodes}
 
 
-def _open_poses(path: Path, query: str) -> PoseSource:
+def open_poses(path: Path, query: str) -> PoseSource:
     if query:
         raise DatasetError(f"{path}: takes no options after a question mark; bags do")
     return WatchedFile(path, changing_poses, beside=("-wal", "-journal"), is_text=False)
-
-
-def recognises(path: Path) -> bool:
-    """Whether a file is called as RTAB-Map's are."""
-    return path.suffix == SUFFIX and is_file(path)
-
-
-FORMAT = Format(NAME, f"a database ({SUFFIX})", recognises, open_database)
-KIND = PoseKind(NAME, f"a database ({SUFFIX})", lambda path: path.suffix == SUFFIX, _open_poses)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.stereo.matching import StereoRig
 from taichi_mrf.datasets.stereo.pairs import RecordedPair, StereoPairs, first_size, noise_note, read_times
@@ -30,11 +30,6 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".pgm")
 
 _SAME = 1e-6
 """Largest difference, relative to the focal length, of matrix entries that count as equal."""
-
-
-def recognises(folder: Path) -> bool:
-    """Whether both image folders exist. Opening reports a missing calibration or missing poses."""
-    return any((folder / left).is_dir() and (folder / right).is_dir() for left, right in FOLDERS)
 
 
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
@@ -152,11 +147,3 @@ def _projection(path: Path, name: str, rows: dict[str, list[str]]) -> NDArray[np
             f"{path}: {name} must be 12 finite numbers (a 3 x 4 matrix), it has {len(numbers)}"
         )
     return numbers.reshape(3, 4)
-
-
-FORMAT = Format(
-    name="KITTI stereo",
-    looks_for="image_l and image_r (or image_0 and image_1) with calib.txt and poses.txt",
-    recognises=recognises,
-    open=open_folder,
-)

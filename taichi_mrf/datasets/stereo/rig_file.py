@@ -24,7 +24,7 @@ import numpy as np
 
 from taichi_mrf.config.files import read_yaml
 from taichi_mrf.config.values import from_dict
-from taichi_mrf.datasets.base import Dataset, Format
+from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.stereo.matching import StereoMatching, StereoRig
 from taichi_mrf.datasets.stereo.pairs import RecordedPair, StereoPairs, first_size, noise_note, read_times
@@ -32,7 +32,6 @@ from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses, read_
 from taichi_mrf.datasets.trajectories import RecordedPose, read_trajectory
 from taichi_mrf.errors import ConfigError, DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.system.files import is_file
 
 SUFFIXES = (".yaml", ".yml")
 SECONDS_PER_PAIR = 0.1
@@ -211,11 +210,3 @@ def _interpolated(
         else []
     )
     return pairs, notes, dropped
-
-
-FORMAT = Format(
-    name="stereo pairs",
-    looks_for=".yaml that describes stereo pairs",
-    recognises=lambda path: is_file(path) and path.suffix in SUFFIXES,
-    open=open_file,
-)

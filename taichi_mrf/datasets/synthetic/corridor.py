@@ -10,7 +10,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import BuiltIn
 from taichi_mrf.datasets.options import ReadOptions, parse_options
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene
 from taichi_mrf.datasets.synthetic.corridor_plan import corridor_scene, pose_on_way, waypoints
@@ -72,6 +71,3 @@ def open_synthetic_corridor(query: str, options: ReadOptions) -> SyntheticCorrid
         raise DatasetError(f"{NAME}: takes no depth_scale: its depth is in metres")
     corridor = parse_options(CorridorOptions, query, NAME)
     return SyntheticCorridor(NAME, options.camera or corridor.camera(), options=corridor, color=options.color)
-
-
-BUILT_IN = BuiltIn(NAME, open_synthetic_corridor, rendered=True)

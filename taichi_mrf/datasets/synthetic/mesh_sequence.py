@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.base import BuiltIn, Dataset
+from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.intrinsics import PRIMESENSE
 from taichi_mrf.datasets.options import ReadOptions, parse_options
 from taichi_mrf.datasets.synthetic.mesh_scene import MeshScene, load_mesh
@@ -144,6 +144,3 @@ def open_mesh(source: str, options: ReadOptions) -> MeshSequence:
         trajectory=trajectory,
         options=chosen,
     )
-
-
-BUILT_IN = BuiltIn(NAME, open_mesh)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
-from taichi_mrf.datasets.base import BuiltIn
 from taichi_mrf.datasets.options import ReadOptions, parse_options
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene
 from taichi_mrf.datasets.synthetic.rendered_sequence import RenderedSequence, RenderOptions
@@ -75,6 +74,3 @@ def open_synthetic_ring(query: str, options: ReadOptions) -> SyntheticRing:
         raise DatasetError(f"{NAME}: takes no depth_scale: its depth is in metres")
     ring = parse_options(RingOptions, query, NAME)
     return SyntheticRing(NAME, options.camera or ring.camera(), options=ring, color=options.color)
-
-
-BUILT_IN = BuiltIn(NAME, open_synthetic_ring, rendered=True)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
-from taichi_mrf.datasets.base import BuiltIn
 from taichi_mrf.datasets.options import ReadOptions, parse_options
 from taichi_mrf.datasets.synthetic.analytic_scene import Scene
 from taichi_mrf.datasets.synthetic.moving_room import moving_room
@@ -76,6 +75,3 @@ def open_synthetic_room(query: str, options: ReadOptions) -> SyntheticRoom:
         raise DatasetError(f"{NAME}: takes no depth_scale: its depth is in metres")
     room = parse_options(RoomOptions, query, NAME)
     return SyntheticRoom(NAME, options.camera or room.camera(), options=room, color=options.color)
-
-
-BUILT_IN = BuiltIn(NAME, open_synthetic_room, rendered=True)

@@ -11,13 +11,13 @@ from taichi_mrf.calibration.from_recording import LearntSigma
 from taichi_mrf.config.registry import METHODS
 from taichi_mrf.config.schema import Config
 from taichi_mrf.datasets import Dataset
-from taichi_mrf.datasets.formats import frames_npz
+from taichi_mrf.datasets.entries import holds_frames
 from taichi_mrf.datasets.pose_sources.posed import open_posed
 from taichi_mrf.datasets.recorded_noise import with_recorded_noise
 from taichi_mrf.datasets.source_flags import SourceFlags
 from taichi_mrf.datasets.unused_color import note_unused_color
+from taichi_mrf.doctor.diagnosis import mistakes_at_a_glance
 from taichi_mrf.errors import ConfigError
-from taichi_mrf.live.replay import Replay
 from taichi_mrf.mapping.intake import hold_out_of
 from taichi_mrf.mapping.tracking import wants_color
 from taichi_mrf.methods.map_file import open_map_file, read_header
@@ -25,6 +25,7 @@ from taichi_mrf.methods.mrf.parked_chunks import folder_beside
 from taichi_mrf.methods.protocol import OccupancyMap
 from taichi_mrf.methods.registry import create_map, load_map
 from taichi_mrf.runs.noise import noise_notes
+from taichi_mrf.session.replay import Replay
 from taichi_mrf.system import runtime
 from taichi_mrf.system.files import is_file
 
@@ -86,7 +87,7 @@ def open_source(
     """
     runtime.init(config.runtime.arch, config.runtime.threads)
     path = Path(name)
-    if path.suffix == ".npz" and is_file(path) and not frames_npz.FORMAT.recognises(path):
+    if path.suffix == ".npz" and is_file(path) and not holds_frames(path):
         if poses is not None:
             raise ConfigError(
                 f"{path}: is a saved map, whose keyframes have poses: --poses is for a recording"
@@ -112,6 +113,8 @@ def open_source(
     if not config.color and METHODS[config.method].has_colors:
         note_unused_color(dataset, name, reading or SourceFlags())
     config = with_recorded_noise(config, dataset)
+    found = mistakes_at_a_glance(dataset)
+    dataset.notes += [f"frames contradict each other: {'; '.join(found)}"] if found else []
     learnt = None if learn_noise is None else learn_noise(dataset, config)
     if learnt is not None:
         config = learnt.put_into(config)
