@@ -22,8 +22,11 @@ USUAL = (1000.0, 5000.0)
 PLAUSIBLE_MEDIAN_M = (0.1, 100.0)
 """A median depth outside this range is reported as implausible."""
 
+_NO_METRES = 250.0
+"""A median of floats above this is one of millimetres."""
+
 _PLACES = 4
-_LEAST_BASELINE_M, _LARGEST_TURN = 0.1, 0.5
+_LEAST_BASELINE_M, _LARGEST_TURN = 0.1, 1.0
 _FARTHEST_NEIGHBOUR = 60
 _SAMPLES = 4000
 _LEAST_SAMPLES = 200
@@ -48,6 +51,17 @@ class Evidence:
         best = min(self.disagreement, key=self.disagreement.__getitem__)
         found, given = self.disagreement[best], self.disagreement[steps_per_metre]
         return best if found <= _AGREES and given >= _TIMES_BETTER * found and given > _AGREES / 3 else None
+
+
+def check_metres(depths: Sequence[Image], where: str) -> None:
+    """Raise DatasetError, whose text begins with ``where``, if floats (H, W) are no plausible metres."""
+    values = np.concatenate([depth[np.isfinite(depth) & (depth > 0)] for depth in depths] or [np.zeros(0)])
+    median = float(np.median(values)) if len(values) else 0.0
+    if median > _NO_METRES:
+        raise DatasetError(
+            f"{where}: the numbers have a median of {median:.4g}, which are hardly metres: --depth-scale "
+            "1000 takes them for millimetres, --depth-scale 1 for metres all the same"
+        )
 
 
 def gather(

@@ -17,8 +17,12 @@ from taichi_mrf.system.files import is_file, is_folder
 
 HERE = "taichi_mrf.datasets"
 REALSENSE = "realsense:"
-NUMBERED_IMAGE = re.compile(r"(\d+)(-\d+)?\.(?:png|tiff?)")
-"""The name of an image: a number. Redwood's own scans append a stamp in microseconds."""
+NUMBERED_IMAGE = re.compile(
+    r"(depth[-_]?|(?:frame|image|img)[-_]?)?(\d+)(-\d+)?\.(?:png|tiff?)", re.IGNORECASE
+)
+"""The name of an image: a number, perhaps behind a word. Redwood's own scans append microseconds."""
+
+_STAMPED_IMAGE = re.compile(r"(\d+\.\d+)\.(?:png|tiff?)", re.IGNORECASE)
 
 NUMBERED_FILES = "NNNN.png (here or in depth/) and a trajectory (.log, .json, .freiburg or rows of matrices)"
 
@@ -34,9 +38,23 @@ def numbered_images(folder: Path) -> dict[int, Path]:
     for place in (folder / "depth", folder):
         if place.is_dir():
             found = [(m, path) for path in place.iterdir() if (m := NUMBERED_IMAGE.fullmatch(path.name))]
-            if found:
-                return dict(sorted((int(match[1]), path) for match, path in found))
+            kinds = {(match[1] or "")[:1].lower() for match, _ in found}
+            if place == folder:  # where images of other names are colours
+                kinds &= {"", "d"}
+            if kinds:
+                kind = next(each for each in ("d", "", *sorted(kinds)) if each in kinds)
+                return dict(
+                    sorted((int(m[2]), path) for m, path in found if (m[1] or "")[:1].lower() == kind)
+                )
     return {}
+
+
+def stamped_images(folder: Path) -> list[tuple[float, Path]]:
+    """The images in depth/ that are called by their stamps in seconds, ascending, beside TUM's poses."""
+    if not (is_folder(folder / "depth") and is_file(folder / "groundtruth.txt")):
+        return []
+    found = [(_STAMPED_IMAGE.fullmatch(path.name), path) for path in (folder / "depth").iterdir()]
+    return sorted((float(match[1]), path) for match, path in found if match)
 
 
 def velodyne_sequence(path: Path) -> Path | None:
@@ -98,7 +116,7 @@ FORMATS: tuple[Format, ...] = (
     Format(
         "TUM RGB-D",
         "depth.txt and groundtruth.txt",
-        _has("depth.txt"),
+        lambda path: _has("depth.txt")(path) or bool(stamped_images(path)),
         when_called(f"{HERE}.formats.tum_rgbd:open_folder"),
     ),
     Format(

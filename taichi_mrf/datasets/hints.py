@@ -28,7 +28,7 @@ LIDAR_POSES = (
     "or .bin for each and poses.npz or a file of poses beside them, KITTI's from velodyne/ with calib.txt "
     "and poses.txt"
 )
-_POSE_TEXTS = (".txt", ".pose", ".cam", ".info")
+_POSE_TEXTS = (".txt", ".pose", ".cam", ".info", ".json")
 
 
 AS_NPZ = (
@@ -47,7 +47,7 @@ _BY_ENDING = {
         (".bt", ".ot"), "contains an OctoMap ({name}), not depth images; taichi-mrf import reads it"
     ),
     **dict.fromkeys(
-        (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".7z", ".rar"),
+        (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst", ".zstd", ".7z", ".rar"),
         "is an archive; unpack it, and pass the folder or the file in it",
     ),
     **dict.fromkeys(
@@ -69,8 +69,10 @@ _BY_ENDING = {
         "contains a mesh ({name}), not depth images; converted to .ply or .glb, 'mesh:FILE?poses=FILE' "
         "renders depth images of it",
     ),
+    ".active": "was not closed by its recorder; 'rosbag reindex' mends it, then call it .bag",
     ".sens": "is ScanNet's packed format; extract it to depth/, pose/ and intrinsic/ with ScanNet's tools",
 }
+_POSES_ONLY = "and no depth images"
 _IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".pgm", ".ppm")
 _LOOKED_AT = 20
 
@@ -91,15 +93,15 @@ def hint_for(path: Path) -> str | None:
         names = ", ".join(child.name for child in scans[:8])
         return f"contains 2D laser scans; pass one of {names} to taichi-mrf laser"
     kinds = {kind for child in children if (kind := _kind(child))}
-    if len(kinds) == 1:
-        return kinds.pop()
     below = [file for child in sorted(path.iterdir()) if is_folder(child) for file in _first_files(child)]
+    images = [file for file in children[:_LOOKED_AT] + below if file.suffix.lower() in _IMAGES]
+    if len(kinds) == 1 and not (images and _POSES_ONLY in next(iter(kinds))):
+        return kinds.pop()
     unread = [
         file for file in children[:_LOOKED_AT] + below if file.suffix.lower() in (".exr", ".npy", ".pfm")
     ]
     if unread:
         return _kind(unread[0])
-    images = [file for file in children[:_LOOKED_AT] + below if file.suffix.lower() in _IMAGES]
     return image_hint(images, "holds images") if images else None
 
 
@@ -132,7 +134,7 @@ def _kind(path: Path) -> str | None:
         )
     if suffix in (".txt", ".csv", ".json", ".log", ".tum", ".freiburg") and is_trajectory(path):
         return (
-            f"contains poses ({path.name}) and no depth images; pass the recording that they are of, with "
+            f"contains poses ({path.name}) {_POSES_ONLY}; pass the recording that they are of, with "
             f"--poses {shlex.quote(str(path))}"
         )
     if suffix == ".npz":
@@ -172,6 +174,12 @@ def pose_files_hint(folder: Path, images: Sequence[Path], remedy: str = ONE_FILE
 
 def _pose_file_hint(texts: Sequence[Path], remedy: str) -> str | None:
     """The hint, if the first file looks like the numbers of one frame."""
+    if texts[0].suffix == ".json":
+        return (
+            f"{len(texts)} files such as {texts[0].name} may hold the pose and the camera of one image each, "
+            f"in a layout that is not read: {remedy}, and pass --camera fx,fy,cx,cy and --depth-scale (1000 "
+            "for millimetres). Poses of ARKit (Polycam, 3D Scanner App) want --poses-are opengl"
+        )
     try:
         text = read_text(texts[0], DatasetError)
     except DatasetError:

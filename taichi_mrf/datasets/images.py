@@ -4,6 +4,7 @@ import struct
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -20,6 +21,8 @@ DEPTH_SUFFIXES = (".png", ".tif", ".tiff")
 
 _MANY = 0.03
 """Share of pixels with the largest value of which a note is made."""
+
+Kind = TypeVar("Kind", bound=np.integer)
 
 MOST_PIXELS = 1 << 27
 """Far more than a camera has; a packed image of a few megabytes may claim a hundred times as many."""
@@ -62,7 +65,8 @@ def look_at_depth(path: Path, camera: PinholeCamera) -> tuple[bool, float]:
 
 def share_of_largest(steps: NDArray) -> float:
     """The share of pixels that have the largest value of whole numbers."""
-    return float((steps == np.iinfo(steps.dtype).max).mean()) if steps.dtype.kind == "u" else 0.0
+    is_whole = steps.ndim == 2 and steps.dtype.kind in "ui" and steps.itemsize == 2
+    return float((steps == np.iinfo(steps.dtype).max).mean()) if is_whole else 0.0
 
 
 def note_of_largest(shares: Sequence[float]) -> list[str]:
@@ -72,7 +76,7 @@ def note_of_largest(shares: Sequence[float]) -> list[str]:
     return [f"depth: {said}, which is no measurement"] if share > _MANY else []
 
 
-def measured(steps: NDArray[np.unsignedinteger]) -> NDArray[np.unsignedinteger]:
+def measured(steps: NDArray[Kind]) -> NDArray[Kind]:
     """Depth in whole steps with 0 where there is no measurement: in no format is the largest value of the
     type one. Cameras and drivers write it for what is too far, too near or unknown."""
     return np.where(steps == np.iinfo(steps.dtype).max, steps.dtype.type(0), steps)
@@ -108,6 +112,11 @@ def _of_16_bit(image: NDArray, where: str) -> NDArray[np.uint16]:
         raise DatasetError(
             f"{where}: not a depth image: expected 16-bit grey, "
             f"found {8 * image.dtype.itemsize}-bit with {channels} channel{'s' if channels > 1 else ''}"
+            + (
+                "; a picture of depth in colours or 8 bits has lost the measurements"
+                if image.itemsize == 1
+                else ""
+            )
         )
     return measured(image)
 

@@ -34,6 +34,7 @@ CAMERA_FILES = (
     "K.txt",
     "cam_K.txt",
     "camera_intrinsic.json",
+    "intrinsic.json",
     "intrinsics.json",
 )
 """camera.yaml: width, height, fx, fy, cx, cy by name; .json: Open3D's; the others: any layout of

@@ -16,6 +16,9 @@ from taichi_mrf.system.files import read_text
 Line = tuple[int, list[float]]
 """A line's number in its file (from 1) and its numbers."""
 
+_COUNTS, _DECIMAL = (7, 8, 12, 13, 16, 17), re.compile(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?")
+"""Numbers a line, of which each may have a decimal comma, where blanks separate them."""
+
 _AROUND = " \t\"'"
 _COMMENT = re.compile(r"(?:#|%|//)+")
 _UNIT = re.compile(r"[\[(].*?[\])]")
@@ -67,10 +70,12 @@ def split(lines: list[str]) -> tuple[Columns | None, list[tuple[int, str]]]:
     for number, line in enumerate(lines, start=1):
         text = line.strip()
         mark = _COMMENT.match(text)
+        if not text:
+            continue
         is_head = mark is not None or (not found and not any(map(_is_number, _cells(text))))
         if not is_head:
             found.append((number, text))
-        elif text and not found:
+        elif not found:
             columns = _named(text[mark.end() :] if mark else text) or columns
     return columns, found
 
@@ -130,6 +135,9 @@ def _field(name: str) -> str | None:
 
 
 def _cells(text: str) -> list[str]:
+    words = text.split()
+    if len(words) in _COUNTS and all(map(_DECIMAL.fullmatch, words)) and "," in text:
+        return [word.replace(",", ".") for word in words]
     return [cell for word in re.split(r"[,;\s]+", text) if (cell := word.strip(_AROUND))]
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -142,7 +143,7 @@ class Recording(Dataset):
     ) -> NDArray[np.uint8]:
         """The colours of the depth image's pixels. Raises DatasetError."""
         if self.color_camera is None:
-            return without_black(read_color(path, camera))
+            return without_black(_of_size(read_color(path), path, camera))
         color = read_color(path, self.color_camera.camera)
         return self.color_camera.registered(color, depth_m, camera)
 
@@ -194,6 +195,23 @@ class Recording(Dataset):
                 "which is not plausible; check --depth-scale"
             )
         return notes
+
+
+def _of_size(color: NDArray[np.uint8], path: Path, camera: PinholeCamera) -> NDArray[np.uint8]:
+    """A registered colour image with the depth image's pixels. Raises DatasetError if it is not the same
+    view."""
+    (height, width), (rows, columns) = camera.shape, color.shape[:2]
+    if (rows, columns) == (height, width):
+        return color
+    if columns < width or abs(columns * height - rows * width) > 0.01 * rows * width:
+        raise DatasetError(
+            f"{path}: the colour image has {columns} x {rows} pixels, depth {width} x {height}, which is not "
+            "the same view; without --color only depth is read"
+        )
+    scaled: NDArray[np.uint8] = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA).astype(
+        np.uint8
+    )
+    return scaled
 
 
 def _evidence(found: Evidence, steps_per_metre: float) -> str:

@@ -19,6 +19,9 @@ from taichi_mrf.errors import ConfigError, DatasetError, collected_warnings
 from taichi_mrf.sensor.camera import PinholeCamera, pinhole
 from taichi_mrf.system.files import exists, is_folder
 
+_FEW = 5
+"""A folder around a recording has fewer things in it, such as a text about it."""
+
 
 def open_dataset(
     source: str | Path,
@@ -68,7 +71,7 @@ def format_name(source: str | Path) -> str:
     """The name of a source's format, for a source that can be opened."""
     path, _ = _path_and_query(str(source))
     if exists(path):
-        found = recognise(path)
+        found = recognise(_only_inside(path) or path)
         return found.name if found is not None else "unknown"
     return str(source).partition("?")[0]
 
@@ -125,6 +128,10 @@ def _open_path(source: str, options: ReadOptions) -> Dataset:
     for problem in plugs()[1]:
         warnings.warn(problem, stacklevel=2)
     found = recognise(path)
+    if found is None and (inside := _only_inside(path)) is not None:
+        dataset = _open_path(f"{inside}?{query}" if query else str(inside), options)
+        dataset.notes.insert(0, f"the recording is {inside}")
+        return dataset
     if found is None:
         raise DatasetError(_not_recognised(path))
     if is_folder(path):
@@ -155,6 +162,19 @@ def _not_recognised(path: Path) -> str:
     if not children:
         return f"{path}: the folder is empty; looked for {looked_for}"
     return f"{path}: no recording found; looked for {looked_for}"
+
+
+def _only_inside(path: Path) -> Path | None:
+    """The only recording in a folder, as of an archive that was unpacked into a folder of its own name, or in
+    the only folder in it; None if there are none or several."""
+    if not is_folder(path):
+        return None
+    children = [child for child in path.iterdir() if not child.name.startswith((".", "__"))]
+    inside = [child for child in children if is_bag(child) or _is_recording(child)]
+    folders = [child for child in children if is_folder(child)]
+    if inside:
+        return inside[0] if len(inside) == 1 else None
+    return _only_inside(folders[0]) if len(folders) == 1 and len(children) < _FEW else None
 
 
 def _formats() -> tuple[Format, ...]:

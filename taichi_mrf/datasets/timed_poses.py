@@ -26,6 +26,24 @@ _NEARLY_EQUAL = 1e-9
 """Below this angle (radians) the chord stands for the arc, whose formula divides by its sine."""
 
 
+def apart_in_words(stamps: Sequence[float], posed: Sequence[float] | NDArray, gap: float) -> str:
+    """Why no image has a pose, by the ``stamps`` of both in seconds, and the remedy; empty if not known."""
+    if not len(stamps) or not len(posed):
+        return ""
+    first, last, begin, end = min(stamps), max(stamps), min(posed), max(posed)
+    if last < begin or first > end:
+        return (
+            f": the clocks of images and poses are {abs(begin - first):.3f} s apart; poses with the stamps "
+            "of the images are needed, as ?poses=FILE of a bag"
+        )
+    usual = float(np.median(np.diff(np.unique(posed)))) if len(posed) > 1 else 0.0
+    return (
+        f": poses are {usual:.3g} s apart; --max-time-gap {usual:.2g} interpolates that far"
+        if usual > gap
+        else ""
+    )
+
+
 class TimedPoses:
     """A trajectory that interpolates the pose at any time inside it.
 

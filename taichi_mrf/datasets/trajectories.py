@@ -4,13 +4,14 @@
   names of columns (EuRoC). Stamps are seconds; ms, us or ns since 1970 are told by their size
 - ``rows``: the 3 x 4 or 4 x 4 matrix, row by row, or tx ty tz qx qy qz qw, in one line for each frame
 - ``log``: Choi's format (Redwood): a line of three integers, the first being the frame's number, then
-  the four rows of the 4 x 4 matrix
+  the four rows of the 4 x 4 matrix; or KITTI-360's lines of the number and the matrix
 
 Separators, comments and names of columns: pose_text.py. A broken layout is an error at once; a pose
 that is not a rigid transform is an error only when that pose is read, so that a recording with one bad pose
 can still be used.
 """
 
+import re
 import warnings
 from dataclasses import dataclass
 from itertools import pairwise
@@ -25,7 +26,7 @@ from taichi_mrf.datasets.runs import starts_of_runs
 from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, as_pose
 from taichi_mrf.sensor.camera import PinholeCamera
-from taichi_mrf.system.files import decoded, is_file, open_regular
+from taichi_mrf.system.files import decoded, is_file, open_regular, read_text
 
 Layout = Literal["stamped", "rows", "log"]
 
@@ -46,6 +47,11 @@ class RecordedPose:
     values: NDArray[np.float64]
     source: str
     camera: PinholeCamera | None = None
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether its numbers say that tracking was lost: NaN, infinity, or a quaternion of zeros."""
+        return not (np.isfinite(self.values).all() and self.values.reshape(-1)[3:].any())
 
     def T_world_camera(self) -> Pose:
         """The pose, (4, 4), its rotation projected. Raises KeyframeError if it is no rigid transform."""
@@ -73,9 +79,20 @@ def read_trajectory(path: Path) -> Trajectory:
         raise DatasetError(f"{path}: contains no pose")
     columns = len(lines[0][1])
     if columns == 8:
-        poses = _longest_run(path, tuple(_stamped(path, line) for line in lines))
+        known = [line for line in lines if np.isfinite(line[1][0])]
+        if not known:
+            raise DatasetError(f"{path} line {lines[0][0]}: the stamp is not finite")
+        if len(known) < len(lines):
+            left_out = len(lines) - len(known)
+            warnings.warn(
+                f"{left_out} of {len(lines)} poses of {path} are left out: their stamps are not finite",
+                stacklevel=2,
+            )
+        poses = _longest_run(path, tuple(_stamped(path, line) for line in known))
         _warn_of_twice(path, poses)
         return Trajectory(path, "stamped", poses)
+    if columns in (13, 17):  # KITTI-360: the frame's number, and the matrix
+        return Trajectory(path, "log", tuple(_numbered(path, line) for line in lines))
     if columns in (7, 12, 16):
         return Trajectory(path, "rows", tuple(_row(path, i, line) for i, line in enumerate(lines)))
     if columns == 3:
@@ -83,8 +100,8 @@ def read_trajectory(path: Path) -> Trajectory:
         return Trajectory(path, "log", tuple(_log_block(path, block) for block in blocks))
     raise DatasetError(
         f"{path} line {lines[0][0]}: {columns} numbers; expected 8 (stamp, position, quaternion), 7 (without "
-        "stamp), 12 or 16 (a matrix), or 3 (the head of a .log block); a first line such as "
-        "'stamp,tx,ty,tz,qw,qx,qy,qz' may name other columns"
+        "stamp), 12 or 16 (a matrix), 13 or 17 (its number and a matrix), or 3 (the head of a .log block); "
+        "a first line such as 'stamp,tx,ty,tz,qw,qx,qy,qz' may name other columns"
     )
 
 
@@ -138,7 +155,15 @@ def is_trajectory(path: Path) -> bool:
     counts = [len(numbers) for numbers in head]
     if counts[:1] == [7]:
         return bool(abs(np.linalg.norm(head[0][3:]) - 1) < _UNIT_LENGTH)
-    return counts == [3, 4, 4, 4, 4] or (bool(counts) and counts[0] in (8, 12, 16))
+    return counts == [3, 4, 4, 4, 4] or (bool(counts) and counts[0] in (8, 12, 13, 16, 17))
+
+
+def is_lost(pose_file: Path) -> bool:
+    """Whether the numbers of a pose's own file say that tracking was lost (-inf, nan, -1.#IND)."""
+    try:
+        return re.search(r"inf|nan|#ind", read_text(pose_file, DatasetError), re.IGNORECASE) is not None
+    except DatasetError:
+        return False
 
 
 def read_matrix_file(path: Path) -> Pose:
@@ -185,8 +210,6 @@ def rotation_of(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
 def _stamped(path: Path, line: Line) -> RecordedPose:
     number, values = line
     _expect(path, line, 8)
-    if not np.isfinite(values[0]):
-        raise DatasetError(f"{path} line {number}: the stamp is not finite")
     return RecordedPose(in_seconds(values[0]), np.array(values[1:], float), f"{path} line {number}")
 
 
@@ -196,6 +219,15 @@ def _row(path: Path, index: int, line: Line) -> RecordedPose:
         _expect(path, line, 12)
     pose = np.array(values, float)
     return RecordedPose(index, pose if len(pose) == 7 else pose.reshape(-1, 4), f"{path} line {number}")
+
+
+def _numbered(path: Path, line: Line) -> RecordedPose:
+    number, values = line
+    if len(values) not in (13, 17):
+        _expect(path, line, 13)
+    if not float(values[0]).is_integer():
+        raise DatasetError(f"{path} line {number}: {values[0]} is no number of a frame")
+    return RecordedPose(values[0], np.reshape(values[1:], (-1, 4)).astype(float), f"{path} line {number}")
 
 
 def _warn_of_twice(path: Path, poses: tuple[RecordedPose, ...]) -> None:

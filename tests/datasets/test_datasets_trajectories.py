@@ -90,7 +90,7 @@ GOOD = "0 1 2 3 0 0 0 1"
     [
         ([GOOD, "1 1 2 3 0 0 1"], "line 2: 7 numbers, expected 8"),
         (["# head", GOOD, "1 1 2 three 0 0 0 1"], "line 3: contains something that is not a number"),
-        ([GOOD, "nan 1 2 3 0 0 0 1"], "line 2: the stamp is not finite"),
+        (["nan 1 2 3 0 0 0 1"], "line 1: the stamp is not finite"),
         (["1 2 3 4 5"], "line 1: 5 numbers"),
         (["# nothing else"], "contains no pose"),
         (["0 0 1", "1 0 0 0", "0 1 0 0"], "line 1: the file ends inside this pose"),

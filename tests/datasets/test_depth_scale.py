@@ -23,15 +23,19 @@ def room_depth_m(T_world_camera: Pose) -> np.ndarray:
     return np.nanmin(np.where(directions == 0, np.inf, to_walls), axis=-1)
 
 
-def walk(frames: int, step_m: float) -> list[Pose]:
+def walk(frames: int, step_m: float, turn: float = 0.0) -> list[Pose]:
+    """It turns by so many radians from one frame to the next."""
     eyes = [np.array([step_m * i - 0.8, 0.3 - step_m * i / 2, 0.1]) for i in range(frames)]
-    return [look_at(eye, (eye[0] + 1, eye[1] + 0.8, -0.2)) for eye in eyes]
+    ahead = [(1 + 0.8j) * np.exp(1j * turn * i) for i in range(frames)]
+    return [look_at(e, (e[0] + a.real, e[1] + a.imag, -0.2)) for e, a in zip(eyes, ahead, strict=True)]
 
 
-def write_room(folder: Path, steps_per_metre: float, step_m: float = 0.04, layout: str = "rows") -> Path:
+def write_room(
+    folder: Path, steps_per_metre: float, step_m: float = 0.04, layout: str = "rows", turn: float = 0.0
+) -> Path:
     """A walk through the room as numbered images with K.txt."""
     folder.mkdir()
-    poses = walk(30, step_m)
+    poses = walk(30, step_m, turn)
     for number, pose in enumerate(poses):
         steps = np.rint(room_depth_m(pose) * steps_per_metre).astype(np.uint16)
         write_image(folder / f"{number:04d}.png", steps)
@@ -83,3 +87,9 @@ def test_depths_that_cannot_be(tmp_path: Path) -> None:
     (note,) = open_dataset(folder, depth_scale=100_000.0).notes
     assert "make a median depth of 0.0" in note
     assert "not plausible; check --depth-scale" in note
+
+
+def test_the_scale_is_found_where_the_camera_turns_fast(tmp_path: Path) -> None:
+    dataset = open_dataset(write_room(tmp_path / "mine", 1000.0, step_m=0.11, turn=0.6))
+    assert any("found by comparing neighbouring frames" in note for note in dataset.notes)
+    np.testing.assert_allclose(dataset.read(3).depth_m, room_depth_m(walk(4, 0.11, 0.6)[3]), atol=1e-3)

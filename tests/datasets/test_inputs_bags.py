@@ -459,7 +459,7 @@ def only_color(bag: Bag) -> None:
 
 
 BAD: dict[str, tuple[tuple[Write, ...], str, tuple[str, ...]]] = {
-    "no depth": ((only_color,), "", ("topics of depth images", "16UC1", "/camera/color/image_raw (Image)")),
+    "no depth": ((only_color,), "", ("topics of depth images", "16UC1", "/camera/color/image_raw (rgb8)")),
     "colour as depth": (
         (only_color,),
         "?depth=/camera/color/image_raw",

@@ -66,6 +66,30 @@ def test_the_frame_of_points_is_found(tmp_path: Path, suffix: str, frame: str) -
     assert len(told) == (frame == "world")
 
 
+@pytest.mark.parametrize(
+    ("mistake", "flag"), [("inverse", "--poses-are inverse"), ("camera", "--mounting 0,0,0,")]
+)
+def test_poses_of_another_convention_are_named(tmp_path: Path, mistake: str, flag: str) -> None:
+    C = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    poses = [np.linalg.inv(T) if mistake == "inverse" else C @ T @ C.T for T in ROOM.poses]
+    dataset = open_dataset(write(tmp_path, "ply", ROOM.clouds, poses))
+    assert any("clouds fit together best if" in note and flag in note for note in dataset.notes)
+
+
+@pytest.mark.parametrize("frame", ["sensor", "world"])
+def test_the_frame_of_points_of_kitti_is_found(tmp_path: Path, frame: str) -> None:
+    T_camera_lidar = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    poses = [T_camera_lidar @ T @ T_camera_lidar.T for T in ROOM.poses]
+    write(tmp_path, "bin", [], poses)
+    (tmp_path / "velodyne").mkdir()
+    for i, cloud in enumerate(ROOM.clouds if frame == "sensor" else ROOM.in_world()):
+        write_bin(tmp_path / "velodyne" / f"{i:06d}.bin", cloud)
+    (tmp_path / "calib.txt").write_text(f"Tr: {row_of(T_camera_lidar[:3])}")
+    dataset = open_dataset(tmp_path)
+    check_rays(dataset)
+    assert any("points are in the world's frame" in note for note in dataset.notes) == (frame == "world")
+
+
 @pytest.mark.parametrize("frame", ["sensor", "world"])
 def test_the_frame_of_points_with_viewpoints_is_found(tmp_path: Path, frame: str) -> None:
     clouds = ROOM.clouds if frame == "sensor" else ROOM.in_world()

@@ -70,6 +70,21 @@ def test_nodes_are_frames_at_the_odometry_s_poses(tmp_path: Path) -> None:
     assert len(tracked) == 5
 
 
+@pytest.mark.parametrize("optimised", [False, True])
+def test_of_sessions_that_are_not_optimised_the_longest_is_read(tmp_path: Path, optimised: bool) -> None:
+    database = filled(tmp_path / "walk.db")
+    for id in (7, 8):
+        largest = np.full(CAMERA.shape, 65535, np.uint16)
+        database.add(id, 200.0 + id, BODY[0], encoded(largest), calibration(CAMERA), session=1)
+    if optimised:
+        database.optimise({id: pose() for id in (1, 2, 3, 4, 7, 8)})
+    dataset = open_dataset(tmp_path / "walk.db")
+    assert (len(dataset), dataset.dropped) == ((6, 0) if optimised else (4, 2))
+    said = " ".join(dataset.notes)
+    assert ("session 0 (4 nodes) is read, not 1 (2 nodes)" in said) != optimised
+    assert ("33% of the pixels of 3 frames looked at have the largest number" in said) == optimised
+
+
 def test_optimised_poses_count_and_other_nodes_are_dropped(tmp_path: Path) -> None:
     path = tmp_path / "walk.db"
     database = filled(path)

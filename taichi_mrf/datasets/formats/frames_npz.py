@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset, start_pose
+from taichi_mrf.datasets.depth_scale import check_metres
 from taichi_mrf.datasets.images import measured, note_of_largest, share_of_largest
 from taichi_mrf.datasets.intrinsics import of_this_size, own_cameras
 from taichi_mrf.datasets.options import ReadOptions
@@ -44,15 +45,20 @@ class Part:
 @dataclass
 class FramesNpz(Dataset):
     """The frames of one or more files, with cameras of their ``own`` unless the caller's holds for all. The
-    images of the file that was read last are kept in memory."""
+    images of the file that was read last are kept in memory. The caller may have given the depth's scale."""
 
     parts: Sequence[Part] = field(kw_only=True)
     color: bool = True
     own: bool = False
+    scale_given: bool = False
     _loaded: tuple[Path, NDArray, NDArray | None] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        self._places = [(part, i) for part in self.parts for i in range(len(part.poses))]
+        every = [(part, i) for part in self.parts for i in range(len(part.poses))]
+        self._places = [(part, i) for part, i in every if np.isfinite(part.poses[i]).all()] or every
+        if len(self._places) < len(every):
+            self.dropped = len(every) - len(self._places)
+            self.notes.append(f"{self.dropped} of {len(every)} images dropped: tracking was lost ({POSE})")
         self._names = [
             f"{part.path.stem}-{i:06d}" if len(part.poses) > 1 else part.path.stem for part, i in self._places
         ]
@@ -72,6 +78,8 @@ class FramesNpz(Dataset):
             depth, _ = self._images(self.parts[0])
         except DatasetError:  # reported when a frame is read
             return []
+        if depth.dtype.kind == "f" and self.parts[0].steps_per_metre == 1 and not self.scale_given:
+            check_metres(list(depth[:: max(1, len(depth) // 4)]), f"{self.parts[0].path}: {DEPTH}")
         return note_of_largest([share_of_largest(image) for image in depth[:: max(1, len(depth) // 4)]])
 
     def read(self, index: int) -> Frame:
@@ -123,7 +131,8 @@ def open_npz_frames(path: Path, options: ReadOptions) -> FramesNpz:
     for each in paths:
         parts.append(_read_part(each, options, first=sum(len(part.poses) for part in parts)))
     own = options.camera is None and options.intrinsics is None
-    return FramesNpz(name, parts[0].cameras[0], parts=parts, color=options.color, own=own)
+    given = options.depth_scale is not None
+    return FramesNpz(name, parts[0].cameras[0], parts=parts, color=options.color, own=own, scale_given=given)
 
 
 def _read_part(path: Path, options: ReadOptions, first: int) -> Part:

@@ -15,6 +15,7 @@ A camera file in the folder or the caller's options replace all of these. An ass
 against the poses (depth_scale.py), and the notes name what was assumed.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -36,6 +37,7 @@ from taichi_mrf.datasets.trajectories import RecordedPose, Trajectory, is_trajec
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.sensor.camera import PinholeCamera
+from taichi_mrf.system.files import is_file
 
 NAME = "ICL-NUIM / Redwood"
 ICL_NUIM = PinholeCamera(width=640, height=480, fx=481.2, fy=480.0, cx=319.5, cy=239.5)
@@ -54,7 +56,10 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     left_handed = trajectory.path.suffix == ".freiburg"
     if left_handed:
         notes.append(f"{trajectory.path.name}: mirrored in y, out of ICL-NUIM's left-handed world")
-    posed = [number for number in images if number in poses]
+    lost = [number for number, pose in poses.items() if pose is not None and pose.is_lost]
+    if lost:
+        notes.append(f"{len(lost)} of {len(images)} images dropped: tracking was lost")
+    posed = [number for number in images if number in poses and number not in lost]
     found = [poses[number] for number in posed]
     own = own_cameras([None if pose is None else pose.camera for pose in found], options)
     frames = [
@@ -98,7 +103,9 @@ def _find_trajectory(folder: Path, images: Sequence[Path]) -> Trajectory:
     if not candidates and not any(map(holds_depth, images[:2])):
         raise DatasetError(f"{folder}: {image_hint(images[:2], 'holds images')}")
     if not candidates:
-        raise DatasetError(f"{folder}: numbered images without a trajectory; looked for {NUMBERED_FILES}")
+        raise DatasetError(
+            f"{folder}: numbered images without a trajectory; looked for {NUMBERED_FILES}{_unread(folder)}"
+        )
     if len(candidates) > 1:
         names = ", ".join(path.name for path in candidates)
         raise DatasetError(
@@ -107,6 +114,22 @@ def _find_trajectory(folder: Path, images: Sequence[Path]) -> Trajectory:
     if candidates[0].suffix == ".json":
         return read_trajectory_json(candidates[0])
     return read_trajectory(candidates[0])
+
+
+def _unread(folder: Path) -> str:
+    """What is wrong with a text file whose name says that it holds poses, in words."""
+    if is_file(folder / "transforms.json"):
+        return (
+            ". transforms.json, as nerfstudio has it, is not read: write its transform_matrix, row by row, "
+            "into poses.txt, and pass --poses-are opengl and --camera fl_x,fl_y,cx,cy"
+        )
+    for path in sorted(folder.glob("*.txt")):
+        if re.search("pose|traj|groundtruth", path.name, re.IGNORECASE):
+            try:
+                read_trajectory(path)
+            except DatasetError as error:
+                return f". {error}"
+    return ""
 
 
 def _poses_by_number(
@@ -126,6 +149,15 @@ def _poses_by_number(
         dropped = len(numbers) - len(timed)
         note = f"{dropped} of {len(numbers)} images dropped: no unused pose within {gap:g} s in {name}"
         return dict(timed), [note] if dropped else []
+    if trajectory.layout == "stamped" and not all(float(key).is_integer() for key in by_key):
+        if len(poses) != len(numbers):
+            raise DatasetError(
+                f"{trajectory.path}: its stamps are times, images are numbered, and there are {len(numbers)} "
+                f"of these and {len(poses)} poses, so which belong together is not known; name the images by "
+                "their stamps, or give one pose for each"
+            )
+        ordered = sorted(poses, key=lambda pose: pose.key)
+        return dict(zip(numbers, ordered, strict=True)), [f"poses of {name} are taken in their order"]
     if trajectory.layout == "stamped":
         first_key, last_key = min(by_key), max(by_key)
         inside = [number for number in numbers if first_key <= number <= last_key]
@@ -135,6 +167,9 @@ def _poses_by_number(
     if len(poses) == len(numbers):
         return dict(zip(numbers, poses, strict=True)), []
     # With poses for all numbers, images were taken out of the recording; with fewer, the poses end early.
+    if trajectory.layout == "log" and set(by_key) < set(numbers):
+        note = f"{len(numbers) - len(by_key)} of {len(numbers)} images dropped: {name} has no pose for them"
+        return {number: by_key[number] for number in numbers if number in by_key}, [note]
     first = 0 if numbers[-1] <= max(by_key) else numbers[0]
     note = f"{len(numbers)} images but {len(poses)} poses in {name}: took pose 0 for image {first}, and so on"
     return {number: by_key.get(number - first) for number in numbers}, [note]
@@ -158,8 +193,8 @@ def _stamp(path: Path, number: int, trajectory: Trajectory) -> float:
     """When an image was taken, in seconds: from its name if it tells, else from its number. Files of
     matrices do not tell how many there are in a second."""
     named = NUMBERED_IMAGE.fullmatch(path.name)
-    if named is not None and named[2] is not None:
-        return int(named[2][1:]) / 1e6
+    if named is not None and named[3] is not None:
+        return int(named[3][1:]) / 1e6
     if in_seconds(number) != number:
         return in_seconds(number)
     return float(number) if trajectory.layout == "rows" else number / FRAMES_PER_SECOND

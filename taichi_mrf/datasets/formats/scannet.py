@@ -23,7 +23,7 @@ from taichi_mrf.datasets.images import DEPTH_SUFFIXES
 from taichi_mrf.datasets.intrinsics import find_camera, own_cameras, read_camera
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
-from taichi_mrf.datasets.trajectories import read_matrix_file
+from taichi_mrf.datasets.trajectories import is_lost, read_matrix_file
 from taichi_mrf.errors import DatasetError, KeyframeError
 from taichi_mrf.geometry.poses import Pose, inverse
 from taichi_mrf.sensor.camera import PinholeCamera
@@ -40,8 +40,6 @@ COLOR_CAMERA = PinholeCamera(width=1296, height=968, fx=1170.187988, fy=1170.187
 COLOR_INTRINSICS = "intrinsic/intrinsic_color.txt"
 STEPS_PER_METRE = 1000.0
 FRAMES_PER_SECOND = 30.0
-LOST = "inf"
-"""The text in the pose file of an image that could not be tracked."""
 
 
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
@@ -58,7 +56,7 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     if not images:
         hint = hint_for(folder / "depth")
         raise DatasetError(f"{folder / 'depth'}: {hint or 'contains no N.png'}")
-    tracked = [path for path in images if not _lost(folder / "pose" / f"{path.stem}.txt")]
+    tracked = [path for path in images if not is_lost(folder / "pose" / f"{path.stem}.txt")]
     if not tracked:
         raise DatasetError(f"{folder / 'pose'}: tracking was lost in all {len(images)} images")
     if options.camera is None and options.intrinsics is None and (folder / INTRINSICS).is_file():
@@ -133,10 +131,3 @@ def _frame(folder: Path, path: Path, camera: PinholeCamera | None) -> RecordedFr
         color_file=next((color for color in colors if color.is_file()), None),
         camera=camera,
     )
-
-
-def _lost(pose_file: Path) -> bool:
-    try:
-        return LOST in read_text(pose_file, DatasetError)
-    except DatasetError:
-        return False

@@ -18,7 +18,7 @@ from taichi_mrf.datasets.hints import pose_files_hint
 from taichi_mrf.datasets.intrinsics import find_camera
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
-from taichi_mrf.datasets.trajectories import read_matrix_file
+from taichi_mrf.datasets.trajectories import is_lost, read_matrix_file
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 
@@ -56,12 +56,19 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         hint = pose_files_hint(folder, [folder / f"{name}.depth.png" for name in numbers], remedy)
         if hint is not None:
             raise DatasetError(f"{folder}: {hint}")
-    frames = [_frame(folder, name, numbers[name]) for name in sorted(numbers, key=lambda n: (numbers[n], n))]
+    tracked = [name for name in numbers if not is_lost(folder / f"{name}.pose.txt")]
+    if not tracked:
+        raise DatasetError(f"{folder}: tracking was lost in all {len(numbers)} images")
+    frames = [_frame(folder, name, numbers[name]) for name in sorted(tracked, key=lambda n: (numbers[n], n))]
     camera, notes = find_camera(folder, options, CAMERA, NAME, (frame.depth_file for frame in frames))
+    dropped = len(numbers) - len(tracked)
+    if dropped:
+        notes.append(f"{dropped} of {len(numbers)} images dropped: tracking was lost")
     return Recording(
         name=folder.name,
         camera=camera,
         notes=notes,
+        dropped=dropped,
         frames=frames,
         steps_per_metre=options.depth_scale or STEPS_PER_METRE,
         scale_source=ASKED if options.depth_scale else NAME,

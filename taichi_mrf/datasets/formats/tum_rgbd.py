@@ -8,17 +8,20 @@ and counted.
 
 import math
 import os
+import re
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
 from taichi_mrf.datasets.base import Dataset
+from taichi_mrf.datasets.entries import stamped_images
 from taichi_mrf.datasets.intrinsics import PRIMESENSE, find_camera
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.pose_text import in_seconds
 from taichi_mrf.datasets.recording import ASKED, RecordedFrame, Recording
-from taichi_mrf.datasets.trajectories import RecordedPose, read_trajectory
+from taichi_mrf.datasets.timed_poses import apart_in_words
+from taichi_mrf.datasets.trajectories import RecordedPose, is_trajectory, read_trajectory
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.sensor.camera import PinholeCamera
 from taichi_mrf.system.files import is_file, read_text
@@ -41,17 +44,17 @@ CAMERAS = {
 
 def open_folder(folder: Path, options: ReadOptions) -> Dataset:
     """List the depth images that have a pose within the largest gap, by their stamps."""
-    if not is_file(folder / POSES):
-        raise DatasetError(f"{folder / POSES}: is missing; {DEPTH_LIST} needs it for the poses")
-    depth = _read_list(folder / DEPTH_LIST)
-    trajectory = read_trajectory(folder / POSES)
+    depth = _read_list(folder / DEPTH_LIST) if is_file(folder / DEPTH_LIST) else stamped_images(folder)
+    poses = _poses(folder)
+    trajectory = read_trajectory(poses)
     if trajectory.layout != "stamped":
         raise DatasetError(f"{trajectory.path}: expected lines of stamp tx ty tz qx qy qz qw")
     gap = LARGEST_GAP if options.max_time_gap is None else options.max_time_gap
     stamps = [stamp for stamp, _ in depth]
-    partners = associate(stamps, [pose.key for pose in trajectory.poses], gap)
+    known = [pose for pose in trajectory.poses if not pose.is_lost]
+    partners = associate(stamps, [pose.key for pose in known], gap)
     matched = [
-        (stamp, path, trajectory.poses[partner])
+        (stamp, path, known[partner])
         for (stamp, path), partner in zip(depth, partners, strict=True)
         if partner is not None
     ]
@@ -59,13 +62,17 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         first, last = trajectory.poses[0].key, trajectory.poses[-1].key
         raise DatasetError(
             f"{folder}: none of {len(depth)} depth images ({stamps[0]:.3f} to {stamps[-1]:.3f} s) has a pose "
-            f"within {gap:g} s ({POSES}: {first:.3f} to {last:.3f} s)"
+            f"within {gap:g} s ({poses.name}: {first:.3f} to {last:.3f} s)"
+            + apart_in_words(stamps, [pose.key for pose in trajectory.poses], gap)
         )
+    lost = len(trajectory.poses) - len(known)
     colors = _colors(folder, [stamp for stamp, _, _ in matched], options, gap)
     frames = [_frame(*parts, color) for parts, color in zip(matched, colors, strict=True)]
     default, default_name = _default_camera(folder)
     camera, notes = find_camera(folder, options, default, default_name, (f.depth_file for f in frames))
     dropped = len(depth) - len(frames)
+    if lost:
+        notes.append(f"{lost} of {len(trajectory.poses)} poses of {poses.name} left out: tracking was lost")
     if dropped:
         notes.append(f"{dropped} of {len(depth)} depth images dropped: no unused pose within {gap:g} s")
     return Recording(
@@ -78,6 +85,16 @@ def open_folder(folder: Path, options: ReadOptions) -> Dataset:
         scale_source=ASKED if options.depth_scale else NAME,
         color=options.color,
     )
+
+
+def _poses(folder: Path) -> Path:
+    """The file of poses, or the only other one in the folder, as SLAM programs call theirs otherwise. Raises
+    DatasetError if there is none."""
+    others = [] if is_file(folder / POSES) else [p for p in folder.glob("*.txt") if is_trajectory(p)]
+    if is_file(folder / POSES) or len(others) == 1:
+        return others[0] if others else folder / POSES
+    names = ", ".join(path.name for path in others) or "no other file of poses is there"
+    raise DatasetError(f"{folder / POSES}: is missing; {DEPTH_LIST} needs it for the poses ({names})")
 
 
 def associate(stamps: Sequence[float], others: Sequence[float], largest_gap: float) -> list[int | None]:
@@ -135,15 +152,18 @@ def _default_camera(folder: Path) -> tuple[PinholeCamera, str]:
 
 
 def _read_list(path: Path) -> list[tuple[float, Path]]:
-    """``stamp file`` lines, sorted by stamp; the files are relative to the list's folder."""
+    """``stamp file`` lines, sorted by stamp; the files are relative to the list's folder, also where they had
+    another place on another computer."""
     lines = read_text(path, DatasetError).splitlines()
-    entries = []
+    entries: list[tuple[float, Path]] = []
     for number, line in enumerate(lines, start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        words = line.split(maxsplit=1)
+        words = re.split(r"[\s,;]+", line.strip(), maxsplit=1)
+        if not entries and re.match(r"\W*(time|stamp)", words[0], re.IGNORECASE):
+            continue  # names of columns
         try:
-            stamp, file = float(words[0]), path.parent / words[1].strip()
+            stamp, file = float(words[0]), _beside(path.parent, words[1].strip(" \t\"'"))
         except (ValueError, IndexError):
             raise DatasetError(f"{path} line {number}: expected a stamp and a file name") from None
         if not math.isfinite(stamp):
@@ -155,3 +175,17 @@ def _read_list(path: Path) -> list[tuple[float, Path]]:
     if not entries:
         raise DatasetError(f"{path}: lists no image")
     return sorted(entries)
+
+
+def _beside(folder: Path, name: str) -> Path:
+    """A listed file; with a path of another computer that with the same last folder and name, if it is
+    there."""
+    path = folder / name
+    try:
+        parts = PureWindowsPath(name).parts
+        if len(parts) < 2 or is_file(path):
+            return path
+        moved = folder.joinpath(*parts[-2:])
+        return moved if is_file(moved) else path
+    except OSError:  # a name that is too long
+        return path

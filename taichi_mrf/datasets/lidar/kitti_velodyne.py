@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.entries import velodyne_sequence
 from taichi_mrf.datasets.lidar.clouds import natural, number_of, read_cloud
+from taichi_mrf.datasets.lidar.registered import in_world, of_sensor
 from taichi_mrf.datasets.lidar.scans import SECONDS_PER_SCAN, RecordedScan, lidar_scans
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.stereo.pairs import read_times
@@ -43,15 +44,27 @@ def open_folder(path: Path, options: ReadOptions) -> Dataset:
         stamps = read_times(folder / TIMES)
     else:
         notes.append(f"no {TIMES} in {folder}: assumed {SECONDS_PER_SCAN:g} s from one scan to the next")
-    scans = []
+    by_number = {int(pose.key): pose for pose in poses.poses}
+    found: list[tuple[Path, float, RecordedPose]] = []
     for file in files:
         number = number_of(file)
-        if number is None or number >= len(poses.poses) or (stamps is not None and number >= len(stamps)):
+        if number not in by_number or (stamps is not None and number >= len(stamps)):
             continue
         stamp = SECONDS_PER_SCAN * number if stamps is None else stamps[number]
-        pose = poses.poses[number]
-        read = partial(_read, file, pose, T_camera_lidar)
-        scans.append(RecordedScan(file.stem, stamp, read, str(file), pose.source))
+        found.append((file, stamp, by_number[number]))
+    world = in_world(
+        len(found), lambda i: _pose(found[i][2], T_camera_lidar), lambda i: read_cloud(found[i][0])
+    )
+    if world:
+        notes.append(
+            "points are in the world's frame: clouds fit together as they are; rays begin at the poses"
+        )
+    scans = [
+        RecordedScan(
+            file.stem, stamp, partial(_read, file, pose, T_camera_lidar, world), str(file), pose.source
+        )
+        for file, stamp, pose in found
+    ]
     dropped = len(files) - len(scans)
     if not scans:
         raise DatasetError(f"{poses.path}: has a pose for none of the {len(files)} scans in {folder / SCANS}")
@@ -94,11 +107,18 @@ def _poses(folder: Path) -> Trajectory:
             f"{folder}: no poses of its scans; looked for {POSES} and ../../poses/{folder.name}.txt"
         )
     trajectory = read_trajectory(path)
-    if trajectory.layout != "rows":
-        raise DatasetError(f"{path}: expected a 3 x 4 matrix, row by row, in each line")
+    if trajectory.layout == "stamped":
+        raise DatasetError(f"{path}: expected a 3 x 4 matrix, row by row, in each line, or behind its number")
     return trajectory
 
 
-def _read(file: Path, pose: RecordedPose, T_camera_lidar: Pose) -> tuple[NDArray[np.float64], Pose]:
-    T_world_lidar = inverse(T_camera_lidar) @ pose.T_world_camera() @ T_camera_lidar
-    return read_cloud(file), T_world_lidar
+def _pose(pose: RecordedPose, T_camera_lidar: Pose) -> Pose:
+    T_world_lidar: Pose = inverse(T_camera_lidar) @ pose.T_world_camera() @ T_camera_lidar
+    return T_world_lidar
+
+
+def _read(
+    file: Path, pose: RecordedPose, T_camera_lidar: Pose, world: bool | None
+) -> tuple[NDArray[np.float64], Pose]:
+    points_m, T_world_lidar = read_cloud(file), _pose(pose, T_camera_lidar)
+    return of_sensor(points_m, T_world_lidar) if world else points_m, T_world_lidar

@@ -1,5 +1,6 @@
 """What every recording of a lidar says of its sensor, whatever its format."""
 
+import warnings
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -46,6 +47,13 @@ class LidarRecording(Dataset):
 
 def reach_of(range_m: NDArray[np.floating]) -> float:
     """How far ranges, 0 for none, go: all but the thousandth of them that may be damaged, rounded up to tens
-    of metres, and at most MOST_REACH_M."""
+    of metres, and at most MOST_REACH_M. Warns if most go further."""
+    median_m = float(np.median(range_m[range_m > 0]))
+    if median_m > MOST_REACH_M:
+        warnings.warn(
+            f"half of the points of the first scan are further than {median_m:.0f} m: points are read as "
+            "metres, so divide them by 1000 if they are millimetres; else set sensor.max_depth",
+            stacklevel=3,
+        )
     reach_m = np.quantile(range_m[range_m > 0], 0.999)
     return float(min(max(1.0, np.ceil(reach_m / _REACH_STEP_M)) * _REACH_STEP_M, MOST_REACH_M))

@@ -4,6 +4,7 @@ Files do not tell. Registered clouds of neighbouring scans overlap as they are, 
 poses; and a scan lies around the place of its sensor, which sees all of its points and none behind another.
 """
 
+import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -37,6 +38,12 @@ MOST_HIDDEN = 0.25
 _T_CAMERA_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 """Of a camera that looks along the lidar's x."""
 
+_MISTAKES = (
+    "the poses are those of the world in the sensor: --poses-are inverse",
+    "the poses are a camera's, z ahead: KITTI's calib.txt belongs beside velodyne, else "
+    "--mounting 0,0,0,0.5,-0.5,0.5,0.5",
+)
+
 Points = NDArray[np.float64]
 
 
@@ -46,7 +53,8 @@ def in_world(
     """Whether points are in the world's frame (True) or in the sensor's (False), None if nothing tells.
 
     Looks at a few scans. ``read_pose`` gives T_world_sensor and ``read_points`` points (N, 3) as they are in
-    their file; scans that cannot be read (DatasetError, KeyframeError) are passed over.
+    their file; scans that cannot be read (DatasetError, KeyframeError) are passed over. Warns if poses are
+    clearly the inverse, or a camera's.
     """
     votes, overlaps = [], []
     for first in np.unique(np.linspace(0, count, _PLACES + 1).astype(int)[:_PLACES]) if count else []:
@@ -71,6 +79,8 @@ def in_world(
     # With wrong poses clouds of the sensor's frame may fit better as they are.
     if as_they_are < min(_FITS_M, *(each / _CLEARLY for each in (posed, *wrong))):
         return True
+    if min(wrong) < min(_FITS_M, posed / _TWICE, as_they_are / _TWICE):
+        warnings.warn(f"clouds fit together best if {_MISTAKES[int(np.argmin(wrong))]}", stacklevel=2)
     return False if _CLEARLY * posed < as_they_are else None
 
 
@@ -88,6 +98,14 @@ def hidden(points: Points, place: NDArray[np.float64]) -> float:
     nearest = np.full(where.max() + 1, np.inf)
     np.minimum.at(nearest, where, range_m)
     return float((range_m > _BEHIND * nearest[where]).mean())
+
+
+def of_sensor(points: Points, T_world_sensor: Pose) -> Points:
+    """Points (N, 3) of the world's frame in the sensor's."""
+    T = inverse(T_world_sensor)
+    with np.errstate(invalid="ignore", over="ignore"):
+        moved: Points = points @ T[:3, :3].T + T[:3, 3]
+    return moved
 
 
 def finite(points: Points) -> Points:

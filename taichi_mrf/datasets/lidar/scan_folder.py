@@ -19,12 +19,12 @@ from taichi_mrf.datasets.base import Dataset
 from taichi_mrf.datasets.entries import CLOUD_PLACES
 from taichi_mrf.datasets.lidar.clouds import READERS, is_cloud, natural, read_cloud
 from taichi_mrf.datasets.lidar.pcd_file import read_pcd_header
-from taichi_mrf.datasets.lidar.registered import MOST_HIDDEN, finite, hidden, in_world
+from taichi_mrf.datasets.lidar.registered import MOST_HIDDEN, finite, hidden, in_world, of_sensor
 from taichi_mrf.datasets.lidar.scan_poses import POSES_NPZ, ScanPose, find_poses, poses_of
 from taichi_mrf.datasets.lidar.scans import SECONDS_PER_SCAN, RecordedScan, lidar_scans
 from taichi_mrf.datasets.options import ReadOptions, parse_options
 from taichi_mrf.errors import DatasetError
-from taichi_mrf.geometry.poses import Pose, inverse
+from taichi_mrf.geometry.poses import Pose
 from taichi_mrf.system.files import is_file, is_folder
 
 PCD = ".pcd"
@@ -169,8 +169,4 @@ def _frame_of(clouds: list[Path], poses: dict[Path, ScanPose], viewpoints: bool)
 
 def _scan(cloud: Path, pose: ScanPose, world: bool) -> tuple[NDArray[np.float64], Pose]:
     points_m, T_world_sensor = read_cloud(cloud), pose.read()
-    if world:
-        T_sensor_world = inverse(T_world_sensor)
-        with np.errstate(invalid="ignore", over="ignore"):
-            points_m = points_m @ T_sensor_world[:3, :3].T + T_sensor_world[:3, 3]
-    return points_m, T_world_sensor
+    return of_sensor(points_m, T_world_sensor) if world else points_m, T_world_sensor

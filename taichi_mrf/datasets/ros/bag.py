@@ -13,10 +13,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset, start_pose
 from taichi_mrf.datasets.confidence import L515
+from taichi_mrf.datasets.conventions import Conventions
+from taichi_mrf.datasets.depth_scale import check_metres, gather
+from taichi_mrf.datasets.images import note_of_largest
 from taichi_mrf.datasets.lidar.scans import refuse_image_options
+from taichi_mrf.datasets.mended import pose_of
 from taichi_mrf.datasets.options import TRACK, ReadOptions, parse_options
 from taichi_mrf.datasets.ros import messages
 from taichi_mrf.datasets.ros.cameras import BagCameras, find_cameras
@@ -34,6 +39,7 @@ from taichi_mrf.datasets.ros.topics import (
     cloud_topics,
     depth_topics,
     described,
+    no_depth,
     packed_otherwise,
 )
 from taichi_mrf.errors import DatasetError, FrameError
@@ -46,6 +52,13 @@ from taichi_mrf.sensor.ray_table import RayTable
 
 REALSENSE = "/device_0/sensor_"
 """The beginning of topics in the files of Intel's library, whose messages differ from those of ROS."""
+
+
+_AGREE = 0.03
+"""Neighbouring images whose depths differ by less, as a share of them, agree."""
+
+_LOOKED_AT = 4
+"""Images whose numbers are looked at when a bag is opened."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +134,40 @@ class RosBag(Dataset):
     def pose(self, index: int) -> Pose:
         """The pose of one frame."""
         return self.poses[index]
+
+    def check_scale(self, poses_are_used: bool) -> list[str]:
+        """A note of whole numbers that are no measurements. Raises DatasetError for floats that are no
+        metres."""
+        shares, depths = [], []
+        for entry in self.entries[:: -(-len(self.entries) // _LOOKED_AT)]:
+            try:
+                message = self.reader.read(self.topic, entry)
+                shares.append(messages.share_without(message))
+                depths.append(messages.depth_image(message, None))
+            except DatasetError:  # reported when its frame is read
+                continue
+        if self.depth_scale is None:
+            check_metres(depths, f"{self.reader.path}: topic {self.topic}")
+        return note_of_largest(shares)
+
+    def look_at_axes(self, frame: str) -> None:
+        """Take the poses for those of a body's axes, x ahead and z up, if neighbouring images agree clearly
+        better so: names such as camera_link are used for both."""
+        turned = [pose_of(T, Conventions(axes="ros")) for T in self.poses]
+        found = [
+            gather(len(poses), poses.__getitem__, self._metres, self.camera, (1.0,)).disagreement
+            for poses in (self.poses, turned)
+        ]
+        if all(found) and found[1][1.0] < min(_AGREE, 0.5 * found[0][1.0]):
+            self.poses = turned
+            self.notes.append(
+                f"poses of {frame or 'the camera'} are taken for those of a body, x ahead and z up: "
+                f"neighbouring images differ by {found[1][1.0]:.1%} so, by {found[0][1.0]:.1%} as they are; "
+                "?body=FRAME or ?optical=FRAME takes them as they are"
+            )
+
+    def _metres(self, index: int) -> NDArray[np.float32]:
+        return messages.depth_image(self.reader.read(self.topic, self.entries[index]), self.depth_scale)
 
     def read(self, index: int) -> Frame:
         """Decode one image.
@@ -214,7 +261,7 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
         imu = find_imu(reader, chosen.imu, sensor, stamps[0])
         poses = [start_pose(imu.up)] * len(posed)
         notes += imu.notes
-    return RosBag(
+    bag = RosBag(
         name=reader.path.stem,
         camera=cameras.first,
         cameras=cameras,
@@ -233,6 +280,10 @@ def _open(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> Datase
         gyro=imu.gyro,
         acceleration=imu.acceleration,
     )
+    doubtful = any(each.assumed or "optical" not in frame.lower() for frame, each in found.items())
+    if doubtful and not (tracked or chosen.optical or chosen.body or options.conventions.of_poses):
+        bag.look_at_axes(depth.frame)
+    return bag
 
 
 def _open_lidar(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> LidarBag:
@@ -270,6 +321,8 @@ def _open_lidar(reader: RosReader, chosen: BagOptions, options: ReadOptions) -> 
 def _depth_topic(reader: RosReader, wanted: str) -> DepthTopic:
     topics = {topic.name: topic for topic in depth_topics(reader)}
     unread = [] if topics else packed_otherwise(reader)
+    if not (topics or unread or wanted):
+        raise DatasetError(f"{reader.path}: {no_depth(reader)}")
     what = f"topics of depth images ({messages.ENCODINGS})"
     name = choose(reader, "depth", wanted, [*topics, *unread], what)
     topic = topics.get(name) or described(reader, name)

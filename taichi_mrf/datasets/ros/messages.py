@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_mrf.datasets.images import PNG_SIGNATURE, decode_16_bit, decode_color, measured
+from taichi_mrf.datasets.images import PNG_SIGNATURE, decode_16_bit, decode_color, measured, share_of_largest
 from taichi_mrf.datasets.ros.rvl import decode_rvl
 from taichi_mrf.datasets.trajectories import pose_from_quaternion
 from taichi_mrf.errors import DatasetError
@@ -30,7 +30,8 @@ PATH = "nav_msgs/msg/Path"
 POSES = (ODOMETRY, POSE_STAMPED, POSE_WITH_COVARIANCE, TRANSFORM_STAMPED)
 TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
-MILLIMETRES = ("16UC1", "mono16")
+SIGNED = "16SC1"
+MILLIMETRES = ("16UC1", "mono16", SIGNED)
 METRES = "32FC1"
 PNG = "png"
 """The format of a CompressedImage that is a plain 16-bit PNG file: millimetres."""
@@ -71,15 +72,22 @@ def check_depth(encoding: str) -> None:
         )
 
 
-def is_depth(encoding: str, topic: str) -> bool:
-    """Whether images of this encoding on a topic are depth. mono16 and plain PNG count if the topic's name
-    contains depth, because infrared images are so too."""
-    kind = encoding.partition(";")[0].strip()
+def may_be_depth(encoding: str) -> bool:
+    """Whether an image of this encoding can be read as depth."""
     try:
         check_depth(encoding)
     except DatasetError:
         return False
-    return kind in (MILLIMETRES[0], METRES) or "depth" in topic.lower()
+    return True
+
+
+def is_depth(encoding: str, topic: str) -> bool:
+    """Whether images of this encoding on a topic are depth. mono16 and plain PNG count if the topic's name
+    contains depth, because infrared images are so too."""
+    kind = encoding.partition(";")[0].strip()
+    if not may_be_depth(encoding):
+        return False
+    return kind in (MILLIMETRES[0], SIGNED, METRES) or "depth" in topic.lower()
 
 
 def depth_image(message: Any, depth_scale: float | None) -> NDArray[np.float32]:
@@ -89,20 +97,27 @@ def depth_image(message: Any, depth_scale: float | None) -> NDArray[np.float32]:
     not name the topic, for a wrong encoding and for data that do not fit it.
     """
     values, steps = _compressed(message) if hasattr(message, "format") else _raw(message)
+    values = measured(values) if values.dtype.kind in "ui" else values
     depth_m = values.astype(np.float32) / np.float32(depth_scale or steps)
     depth_m[~np.isfinite(depth_m) | (depth_m < 0)] = 0.0
     return depth_m
 
 
+def share_without(message: Any) -> float:
+    """The share of the pixels of an Image that have the largest whole number, which is no measurement."""
+    raw = None if hasattr(message, "format") else _raw(message)[0]
+    return 0.0 if raw is None else share_of_largest(raw)
+
+
 def _raw(message: Any) -> tuple[NDArray, float]:
     """The values of an Image, (H, W), and how many of their steps are a metre."""
-    kinds = {**dict.fromkeys(MILLIMETRES, ("u2", STEPS_PER_METRE)), METRES: ("f4", 1.0)}
+    kinds = dict.fromkeys(MILLIMETRES, ("u2", STEPS_PER_METRE))
+    kinds |= {METRES: ("f4", 1.0), SIGNED: ("i2", STEPS_PER_METRE)}
     if message.encoding not in kinds:
         raise DatasetError(f"encoding {message.encoding!r} is not depth; supported are {ENCODINGS}")
     kind, steps = kinds[message.encoding]
     dtype = np.dtype(f"{'>' if message.is_bigendian else '<'}{kind}")
-    values = _rows(message, dtype.itemsize).view(dtype)
-    return (measured(values) if kind == "u2" else values), steps
+    return _rows(message, dtype.itemsize).view(dtype), steps
 
 
 def _rows(message: Any, pixel_bytes: int) -> NDArray[np.uint8]:

@@ -28,5 +28,7 @@ def parts_of(path: Path) -> list[Path]:
     found = {file: _NUMBERED.fullmatch(file.stem) for file in files}
     parts = {int(match[2]): file for file, match in found.items() if match is not None}
     kinds = {(match[1], file.suffix) for file, match in found.items() if match is not None}
-    is_one = len(kinds) == 1 and len(files) > 1 and sorted(parts) == list(range(len(files)))
-    return [parts[number] for number in sorted(parts)] if is_one else []
+    numbers = sorted(parts)  # a recorder with little space deletes the first files
+    follow = numbers[-1:] == [number + len(files) - 1 for number in numbers[:1]]
+    is_one = len(kinds) == 1 and len(files) == len(parts) > 1 and follow
+    return [parts[number] for number in numbers] if is_one else []

@@ -31,6 +31,7 @@ from taichi_mrf.datasets.ros.topics import (
     cloud_topics,
     depth_topics,
     message_frame,
+    path_topics,
 )
 from taichi_mrf.datasets.ros.transform_tree import TransformTree
 from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, TimedPoses
@@ -87,11 +88,11 @@ def _open(reader: RosReader, choice: PoseChoice) -> PoseHistory:
     run = sensor.run if sensor else BagRun()
     tree = sensor.tree() if sensor else tree_of(read_transforms(reader), "", optical, choice.tf)
     tree = tree.towards(choice.frame, choice.body)
-    paths = [topic.name for topic in reader.topics.values() if topic.type == PATH and topic.messages]
+    paths = path_topics(reader)
     wanted = choice.pose
     if not wanted and len(paths) != 1:
         others = pose_candidates(reader, tree, optical) if optical else []
-        wanted = choose(reader, "pose", "", [*paths, *others], "topics of poses")
+        wanted = choose(reader, "pose", "", list(dict.fromkeys([*paths, *others])), "topics of poses")
     name = wanted or paths[0]
     if name == FROM_TF:
         return _from_tree(reader, tree, optical, choice)

@@ -7,18 +7,23 @@
 - Without any of these, mapping finds the poses from the images.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import start_pose
 from taichi_mrf.datasets.options import TRACK
 from taichi_mrf.datasets.ros import messages
-from taichi_mrf.datasets.ros.messages import frame_name
+from taichi_mrf.datasets.ros.messages import frame_name, header_ns
 from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun
 from taichi_mrf.datasets.ros.tf import alternates
-from taichi_mrf.datasets.ros.topics import FROM_TF, choose, pose_topics
+from taichi_mrf.datasets.ros.topics import FROM_TF, choose, path_topics, pose_topics
 from taichi_mrf.datasets.ros.transform_tree import TransformTree
 from taichi_mrf.datasets.timed_poses import TimedPoses, read_timed_poses
 from taichi_mrf.errors import DatasetError, KeyframeError
@@ -62,13 +67,16 @@ class PoseChoice:
 @dataclass
 class BagPoses:
     """``at(stamp, largest_gap)`` is T_fixed_camera, (4, 4), or None; ``source`` names the origin of the
-    poses and the time that they span. ``registered``: the sensor's data are not in its own frame but in the
-    fixed one, where an odometry has put them."""
+    poses and the time that they span, ``stamps`` are theirs, if known. ``registered``: the sensor's data are
+    not in its own frame but in the fixed one, where an odometry has put them. ``assumed``: nothing says that
+    the poses are of the sensor's own axes."""
 
     at: Callable[[float, float], Pose | None]
     source: str
     notes: list[str] = field(default_factory=list)
     registered: bool = False
+    stamps: Sequence[float] | NDArray[np.float64] = ()
+    assumed: bool = False
 
 
 def pose_candidates(reader: RosReader, tree: TransformTree, optical: str) -> list[str]:
@@ -77,6 +85,8 @@ def pose_candidates(reader: RosReader, tree: TransformTree, optical: str) -> lis
     disagree."""
     root = tree.ancestors(optical)[-1]
     topics = [name for name in pose_topics(reader) if not _is_apart(name, tree)]
+    if not topics and not tree.moves(root, optical):
+        topics = [name for name in path_topics(reader) if not _is_apart(name, tree)]
     if not topics:
         tree.check(optical)
     by_tf = tree.moves(root, optical) and (not topics or tree.mounted(root, optical) is None)
@@ -105,10 +115,13 @@ def find_poses(
         return BagPoses(lambda stamp, largest_gap: start_pose(), "found from the images")
     if choice.poses:
         timed = read_timed_poses(Path(choice.poses))
-        return BagPoses(timed.at, f"{choice.poses}: {_span(timed)}")
+        return BagPoses(timed.at, f"{choice.poses}: {_span(timed)}", stamps=timed.stamps)
     tree = read().towards(choice.frame, choice.body)
     optical = choice.optical or frame
     candidates = pose_candidates(reader, tree, optical)
+    below = tree.moving_below(optical) if optical and not choice.optical else []
+    if not candidates and below and choice.pose in ("", FROM_TF):
+        return _of_body(reader, tree, optical, below, choice)
     if not candidates and not choice.pose:
         problem = NO_POSES.format(path=reader.path, frame=optical or "camera frame")
         others = [name for name in pose_topics(reader) if _is_apart(name, tree)]
@@ -142,6 +155,27 @@ def _from_tree(reader: RosReader, tree: TransformTree, optical: str, choice: Pos
         lambda stamp, gap: tree.lookup(fixed, optical, stamp, gap),
         f"tf from {fixed} to {optical}: {span}",
         [note],
+        stamps=max(moving, key=len, default=()),
+    )
+
+
+def _of_body(
+    reader: RosReader, tree: TransformTree, fixed: str, below: list[str], choice: PoseChoice
+) -> BagPoses:
+    """The poses of a body of the tree, from whose place the data were moved to the ``fixed`` frame. Raises
+    DatasetError if several may be it."""
+    body = choice.body or below[0]
+    if body not in below or (len(below) > 1 and not choice.body):
+        raise DatasetError(
+            f"{reader.path}: the messages are of {fixed}, in which tf's frames {', '.join(below)} move: rays "
+            "begin where the sensor was, and ?body=FRAME says which of these it is"
+        )
+    if choice.frame not in ("", fixed):
+        raise DatasetError(f"{reader.path}: the messages are of {fixed}, so the map is: leave out ?frame=")
+    note = f"poses in {fixed} from tf, of {body}, from where the data were moved to {fixed}"
+    note += "; ?body=FRAME sets another"
+    return BagPoses(
+        lambda stamp, gap: tree.lookup(fixed, body, stamp, gap), f"tf from {fixed} to {body}", [note], True
     )
 
 
@@ -152,11 +186,9 @@ def _from_topic(
     tree = tree.towards(choice.body or child, named=False)
     if choice.body:
         must_connect(reader, tree, choice.body, optical)
+    if optical and not choice.optical and tree.is_world_of(optical, parent, choice.body or child):
+        return _of_odometry(tree, optical, parent, choice.body or child or "the sensor", timed, notes, name)
     fixed = choice.frame or parent
-    if optical and not choice.optical and optical == parent == fixed:
-        body = choice.body or child or "the sensor"
-        notes.append(f"poses in {fixed} from {name}, of {body}, from where the data were moved to {fixed}")
-        return BagPoses(timed.at, f"{name}: {_span(timed)}", notes, registered=True)
     try:
         body, body_note = body_of(tree, optical, choice.body or child, name, parent)
     except DatasetError as error:
@@ -173,7 +205,28 @@ def _from_topic(
             return None
         return T_fixed_parent @ T_parent_body @ T_body_optical
 
-    return BagPoses(at, f"{name}: {_span(timed)}", notes)
+    assumed = body == optical and child != optical
+    return BagPoses(at, f"{name}: {_span(timed)}", notes, stamps=timed.stamps, assumed=assumed)
+
+
+def _of_odometry(
+    tree: TransformTree,
+    fixed: str,
+    parent: str,
+    body: str,
+    timed: TimedPoses,
+    notes: list[str],
+    name: str,
+) -> BagPoses:
+    """The poses of a body in ``parent`` as those in the ``fixed`` frame that the data were moved to."""
+    notes.append(f"poses in {fixed} from {name}, of {body}, from where the data were moved to {fixed}")
+
+    def at(stamp: float, largest_gap: float) -> Pose | None:
+        T_fixed_parent = tree.lookup(fixed, parent, stamp, largest_gap)
+        T_parent_body = timed.at(stamp, largest_gap)
+        return None if T_fixed_parent is None or T_parent_body is None else T_fixed_parent @ T_parent_body
+
+    return BagPoses(at, f"{name}: {_span(timed)}", notes, registered=True)
 
 
 def _read_poses(
@@ -182,13 +235,13 @@ def _read_poses(
     """A topic's poses, the frame that they are in, the frame that they are of (empty if not given), and
     notes. Raises DatasetError if they are of several bodies."""
     topic = reader.topics[name]
-    if topic.type not in messages.POSES:
+    if topic.type not in (*messages.POSES, messages.PATH):
         raise DatasetError(
             f"{reader.path}: topic {name} is of type {topic.type}; poses are {', '.join(messages.POSES)}"
         )
     sent: dict[tuple[str, str], list[tuple[Entry, Pose]]] = {}
     broken = 0
-    for entry, message in reader.messages(name):
+    for entry, message in _of_path(reader, name) if topic.type == messages.PATH else reader.messages(name):
         try:
             pose = as_pose(messages.pose_of(message))
         except KeyframeError:
@@ -210,6 +263,15 @@ def _read_poses(
         )
     notes = [f"{broken} messages of {name} left out: not finite, or no rotation"] if broken else []
     return TimedPoses(stamps, poses), parent, child, notes
+
+
+def _of_path(reader: RosReader, name: str) -> Iterator[tuple[Entry, Any]]:
+    """The poses of the last message of a Path, which has all of them."""
+    for entry, message in deque(reader.messages(name), maxlen=1):
+        for i, each in enumerate(message.poses):
+            stamp = header_ns(each.header) / 1e9 or entry.stamp
+            frame = frame_name(each.header.frame_id) or entry.frame
+            yield replace(entry, ordinal=i, stamp=stamp, frame=frame), each
 
 
 Sent = list[tuple[Entry, Pose]]

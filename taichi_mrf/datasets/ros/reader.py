@@ -4,6 +4,7 @@ It needs no ROS, and comes with the extra ``ros``. Its errors become
 DatasetError here; the rest of the package sees topics by name and messages as objects with their fields.
 """
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +12,8 @@ from typing import Any
 
 from taichi_mrf.datasets.ros.file_order import Place, places_of
 from taichi_mrf.datasets.ros.messages import frame_name, header_ns
-from taichi_mrf.datasets.ros.names import parts_of
-from taichi_mrf.datasets.ros.tolerance import open_tolerantly
+from taichi_mrf.datasets.ros.names import METADATA, parts_of
+from taichi_mrf.datasets.ros.tolerance import ROS1, files_of, msgtype_of, open_tolerantly
 from taichi_mrf.datasets.ros.unpacking import bound_unpacking
 from taichi_mrf.errors import DatasetError, said
 from taichi_mrf.system.files import check_regular, is_folder
@@ -71,7 +72,7 @@ class RosReader:
         _library("rosbags.highlevel")
         try:
             bound_unpacking()
-            self._reader, unread = open_tolerantly(self.parts or [path])
+            self._reader, unread = open_tolerantly(self.parts or files_of(path) or [path])
             self._connections: dict[str, list[Any]] = {}
             for connection in self._reader.connections:
                 self._connections.setdefault(connection.topic, []).append(connection)
@@ -84,9 +85,7 @@ class RosReader:
             self.topics = dict(sorted(topics.items()))
             self.duration = max(0, self._reader.duration) / _NANOSECONDS if self.topics else 0.0
         except Exception as error:  # the library raises many kinds of errors
-            raise DatasetError(
-                f"{path}: cannot be read as a bag, it may be cut short: {said(error)}"
-            ) from error
+            raise DatasetError(f"{path}: {_unreadable(said(error))}") from error
         self._open, self.by_file = True, False
         times = [(each.start_time, each.end_time) for each in self._reader.readers]
         for (_, ended), (began, _), part in zip(times, times[1:], self.parts[1:], strict=False):
@@ -139,12 +138,39 @@ class RosReader:
         try:
             found = self._reader.messages(self._connections[topic], start=start, stop=stop)
             for connection, recorded_ns, data in found:
-                if connection.msgtype != self.topics[topic].type:  # in a damaged file
-                    raise ValueError(f"contains a {connection.msgtype}")
+                msgtype = msgtype_of(connection)
+                if msgtype != self.topics[topic].type:  # in a damaged file
+                    raise ValueError(f"contains a {msgtype}")
                 publisher = getattr(connection.ext, "callerid", None) or ""
-                yield recorded_ns, self._reader.deserialize(data, connection.msgtype), publisher
+                is_ros1 = getattr(connection.ext, "serialization_format", "") == ROS1
+                store = self._reader.typestore
+                message = (
+                    store.deserialize_ros1(data, msgtype)
+                    if is_ros1
+                    else self._reader.deserialize(data, msgtype)
+                )
+                yield recorded_ns, message, publisher
         except Exception as error:  # as on opening
             raise DatasetError(f"{self.path}: topic {topic}: cannot be read: {said(error)}") from error
+
+
+def _unreadable(problem: str) -> str:
+    """Why rosbags cannot open a file, and the remedy."""
+    missing = re.search(r"files are missing: \[(.*)\]", problem)
+    if missing:
+        names = ", ".join(Path(each.strip("' ")).name for each in missing[1].split(","))
+        return (
+            f"its {METADATA} names files that are not there, {names}: add them; without it the files "
+            "that are there are read"
+        )
+    if "magic is invalid" in problem and "end magic" not in problem:
+        return "is no bag, whatever its name; a pointer of git-lfs, or a download that failed, looks so"
+    if "empty" in problem:
+        return "is an empty file"
+    return (
+        f"cannot be read as a bag, it is damaged or cut short: {problem}; 'rosbag reindex', 'ros2 bag "
+        "reindex' or 'mcap recover' may mend a recording that was not closed"
+    )
 
 
 def _library(name: str) -> Any:

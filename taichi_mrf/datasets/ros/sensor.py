@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 from taichi_mrf.datasets.options import ReadOptions
@@ -11,7 +11,7 @@ from taichi_mrf.datasets.ros.reader import Entry, RosReader
 from taichi_mrf.datasets.ros.runs import BagRun, run_of
 from taichi_mrf.datasets.ros.tf import read_transforms, tree_of
 from taichi_mrf.datasets.ros.transform_tree import TransformTree
-from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP
+from taichi_mrf.datasets.timed_poses import INTERPOLATION_GAP, apart_in_words
 from taichi_mrf.errors import DatasetError
 from taichi_mrf.geometry.poses import Pose
 
@@ -49,6 +49,9 @@ def find_sensor(reader: RosReader, topic: str, what: str, choice: PoseChoice) ->
             raise DatasetError(f"{_several(reader, topic, what, frames)}: ?optical= names none of these")
         recorded = [entry for entry in recorded if entry.frame == choice.optical]
         notes.append(f"of {topic} the {len(recorded)} {what} of {choice.optical} are read")
+    if len(recorded) > 2 and 2 * len({(entry.frame, entry.stamp) for entry in recorded}) < len(recorded):
+        recorded = [replace(entry, stamp=entry.recorded_ns / 1e9) for entry in recorded]
+        notes.append(f"the stamps of {topic} stand still: the times of recording are taken")
     run, entries, said = run_of(reader, topic, recorded, choice.run, what)
     frame = choice.optical or entries[0].frame
     return BagSensor(
@@ -114,7 +117,7 @@ def posed_by(
         raise DatasetError(
             f"{sensor.reader.path}: none of {len(entries)} {sensor.what} of {sensor.topic} "
             f"({entries[0].stamp:.3f} to {entries[-1].stamp:.3f} s) has poses within {gap:g} s on both sides "
-            f"({sources})"
+            f"({sources})" + _why_none([entry.stamp for entry in entries], found, gap)
         )
     notes = [*sensor.notes, *dict.fromkeys(note for each in found.values() for note in each.notes)]
     dropped = len(entries) - len(posed)
@@ -124,6 +127,12 @@ def posed_by(
             "on both sides"
         )
     return posed, notes
+
+
+def _why_none(stamps: Sequence[float], found: Mapping[str, BagPoses], gap: float) -> str:
+    """What keeps images and poses apart, and the remedy, in words."""
+    known = next((each.stamps for each in found.values() if len(each.stamps)), ())
+    return apart_in_words(stamps, known, gap)
 
 
 def largest_gap(options: ReadOptions) -> float:

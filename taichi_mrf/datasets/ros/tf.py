@@ -70,6 +70,14 @@ def tree_of(
     disputed: dict[str, Dispute] = {}
     transforms, apart = _of_sensor(sent, topic, frame, named)
     for child, rows in transforms.items():
+        valid = [each for each in rows if np.isfinite(each.pose).all()]
+        if not valid:
+            problem = (
+                f"tf: the transform of {child} in {rows[0].parent} is none: not finite, or a quaternion of 0"
+            )
+            disputed[child] = Dispute(f"{problem}; ?poses=FILE takes poses of the sensor itself", {})
+            continue
+        rows = valid
         preferred = [each for each in rows if tf and each.publisher == tf] or rows
         found = _edge(child, preferred, tf == LAST, run or BagRun())
         if isinstance(found, Dispute):
@@ -93,7 +101,7 @@ def read_transforms(reader: RosReader) -> dict[str, Transforms]:
                 try:
                     pose = as_pose(messages.pose_of(each))
                 except KeyframeError:
-                    continue  # an uninitialised transform, which leaves a gap
+                    pose = np.full((4, 4), np.nan)  # an uninitialised transform, which leaves a gap
                 stamp = messages.header_ns(each.header) / 1e9 or entry.stamp
                 if parent and child:
                     transforms[child].append(

@@ -5,13 +5,17 @@ parse. Here such topics are set aside, with the reason.
 """
 
 import importlib
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from taichi_mrf.errors import said
+from taichi_mrf.datasets.ros.names import METADATA
+from taichi_mrf.errors import DatasetError, said
+from taichi_mrf.system.files import is_file, read_text
 
-_ENCODINGS = ("cdr", "ros1", "")
+ROS1 = "ros1"
+_ENCODINGS = ("cdr", ROS1, "")
 _IDL_RULE = "=" * 80 + "\n"
 
 
@@ -38,6 +42,7 @@ def open_tolerantly(paths: Sequence[Path]) -> tuple[Any, list[tuple[Any, str]]]:
             try:
                 if getattr(each.ext, "serialization_format", "") not in _ENCODINGS:
                     raise ValueError(f"its messages are {each.ext.serialization_format}")
+                each = each._replace(msgtype=msgtype_of(each))
                 types |= _defined(each, known, typesys)
                 found.append(each)
             except Exception as error:  # the library raises many kinds of errors
@@ -53,6 +58,24 @@ def open_tolerantly(paths: Sequence[Path]) -> tuple[Any, list[tuple[Any, str]]]:
     reader._open = open_types
     reader.open()
     return reader, unread
+
+
+def msgtype_of(connection: Any) -> str:
+    """The type of a connection's messages as ROS 2 writes it; in an MCAP file converted from ROS 1 it is
+    written in another way."""
+    package, _, name = connection.msgtype.partition("/")
+    is_ros1 = getattr(connection.ext, "serialization_format", "") == ROS1 and "/" not in name
+    return f"{package}/msg/{name}" if is_ros1 else connection.msgtype
+
+
+def files_of(folder: Path) -> list[Path]:
+    """The files of a ROS 2 bag, if its metadata list topics of other encodings, for which rosbags refuses the
+    folder; none otherwise."""
+    text = read_text(folder / METADATA, DatasetError) if is_file(folder / METADATA) else ""
+    is_packed = re.search(r"compression_mode: *['\"]?(file|message)", text, re.IGNORECASE)
+    if is_packed or set(re.findall(r"serialization_format: *['\"]?(\w+)", text)) <= {"cdr"}:
+        return []
+    return sorted(file for file in folder.iterdir() if file.suffix in (".mcap", ".db3"))
 
 
 def _digest(store: Any, msgtype: str, is2: bool) -> str:
@@ -85,13 +108,15 @@ def _tolerate_schemas() -> None:
     """Let rosbags read past MCAP's schemas that are not of ROS; to do so again changes nothing."""
     mcap = importlib.import_module("rosbags.rosbag2.storage_mcap")
     formats = importlib.import_module("rosbags.interfaces")
-    of_ros = {"ros2msg": "MSG", "ros2idl": "IDL", "omgidl": "IDL"}
+    of_ros = {"ros2msg": "MSG", "ros1msg": "MSG", "ros2idl": "IDL", "omgidl": "IDL"}
 
     def get_msgdef(schema: Any) -> Any:
         kind = formats.MessageDefinitionFormat[of_ros.get(schema.encoding if schema else "", "NONE")]
         return formats.MessageDefinition(kind, schema.data if kind.name != "NONE" else "")
 
     def read_string(file: Any) -> str:
-        return str(mcap.read_bytes(file).decode(errors="replace"))
+        is_profile = file.tell() == 0  # the first field of the first record; rosbags wants "ros2" there
+        text = str(mcap.read_bytes(file).decode(errors="replace"))
+        return "ros2" if is_profile else text
 
     vars(mcap).update(get_msgdef=get_msgdef, read_string=read_string)

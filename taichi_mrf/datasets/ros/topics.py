@@ -13,6 +13,7 @@ from taichi_mrf.datasets.ros.point_cloud import POINT_CLOUD
 from taichi_mrf.datasets.ros.reader import RosReader
 from taichi_mrf.errors import DatasetError
 
+LASER_SCAN = "sensor_msgs/msg/LaserScan"
 FROM_TF = "tf"
 """The value of the option ``pose`` for poses from the tree of frames."""
 
@@ -49,6 +50,21 @@ def packed_otherwise(reader: RosReader) -> list[str]:
     """The topics of depth images that are packed in a way that is not read."""
     depth = (messages.MILLIMETRES[0], messages.METRES)
     return [t.name for t in image_topics(reader) if t.encoding.partition(";")[0].strip() in depth]
+
+
+def no_depth(reader: RosReader) -> str:
+    """What a bag without topics of depth images contains, and which of it might be read."""
+    images = {topic.name: topic.encoding for topic in image_topics(reader)}
+    held = [f"{t.name} ({images.get(t.name) or t.type.rpartition('/')[2]})" for t in reader.topics.values()]
+    text = (
+        f"contains no topics of depth images ({messages.ENCODINGS}); its topics: {', '.join(held) or 'none'}"
+    )
+    maybe = [name for name, encoding in images.items() if messages.may_be_depth(encoding)]
+    if maybe:
+        text += f". {' or '.join(f'?depth={name}' for name in maybe)} takes those images for depth"
+    if any(topic.type == LASER_SCAN for topic in reader.topics.values()):
+        text += ". LaserScans are not read from bags; taichi-mrf laser reads CARMEN logs and .npz"
+    return text
 
 
 def cloud_topics(reader: RosReader) -> list[str]:
@@ -94,6 +110,11 @@ def _shared_parts(a: str, b: str) -> int:
 def pose_topics(reader: RosReader) -> list[str]:
     """The topics whose messages are poses of one body."""
     return [t.name for t in reader.topics.values() if t.type in messages.POSES and t.messages]
+
+
+def path_topics(reader: RosReader) -> list[str]:
+    """The topics whose messages are all poses of a body so far."""
+    return [t.name for t in reader.topics.values() if t.type == messages.PATH and t.messages]
 
 
 def choose(reader: RosReader, option: str, wanted: str, candidates: Sequence[str], what: str) -> str:

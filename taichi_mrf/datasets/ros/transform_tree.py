@@ -81,6 +81,19 @@ class TransformTree:
         """Whether two frames are connected."""
         return a == b or self.ancestors(a)[-1] == self.ancestors(b)[-1]
 
+    def is_world_of(self, frame: str, parent: str, body: str) -> bool:
+        """Whether a frame is fixed where poses of a ``body`` in ``parent`` are: the parent, one above it, or
+        one that is fixed to it and not to the body."""
+        if frame == parent or frame in self.ancestors(parent):
+            return True
+        return self.mounted(parent, frame) is not None and self.mounted(body, frame) is None
+
+    def moving_below(self, frame: str) -> list[str]:
+        """The lowest frames that move in a frame; of those fixed to each other the one that moves."""
+        below = [each for each in self.edges if frame in self.ancestors(each)[1:] and self.moves(frame, each)]
+        bodies = dict.fromkeys(self.body(each, frame) for each in below)
+        return [each for each in bodies if not any(each in self.ancestors(o)[1:] for o in bodies)]
+
     def moves(self, a: str, b: str) -> bool:
         """Whether a transform on the way from one connected frame to the other changes with time."""
         return any(isinstance(edge, TimedPoses) for edge in self.between(a, b))

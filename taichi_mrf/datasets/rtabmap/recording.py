@@ -5,6 +5,7 @@ of a database without any, the odometry's. Depth is registered to the colour cam
 RTAB-Map 0.11 to 0.23 define them.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from taichi_mrf.datasets.base import Dataset, start_pose
 from taichi_mrf.datasets.color_camera import without_black
-from taichi_mrf.datasets.images import decode_color
+from taichi_mrf.datasets.images import decode_color, decode_unchanged, note_of_largest, share_of_largest
 from taichi_mrf.datasets.options import ReadOptions
 from taichi_mrf.datasets.pose_sources.base import ChangedPoses, PoseSource
 from taichi_mrf.datasets.pose_sources.watched import WatchedFile
@@ -28,6 +29,8 @@ from taichi_mrf.sensor.frame import Frame
 
 NAME = "RTAB-Map"
 STEPS_PER_METRE = 1000.0
+_LOOKED_AT = 4
+"""Images whose numbers are looked at when a database is opened."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,17 @@ class RtabmapRecording(Dataset):
     def stamps(self) -> Sequence[float]:
         """When each node was made, in seconds."""
         return [each.node.stamp for each in self.nodes]
+
+    def check_scale(self, poses_are_used: bool) -> list[str]:
+        """A note of whole numbers that are no measurements; the unit is known."""
+        shares = []
+        for each in self.nodes[:: -(-len(self.nodes) // _LOOKED_AT)]:
+            try:
+                depth, _ = self.database.images(each.node.id, color=False)
+                shares.append(share_of_largest(decode_unchanged(depth, NAME)))
+            except DatasetError:  # of another kind than PNG, or reported when its frame is read
+                continue
+        return note_of_largest(shares)
 
     def read(self, index: int) -> Frame:
         """Decode a node's images. Raises FrameError, which names the node and the file, if they are damaged;
@@ -134,16 +148,19 @@ def _posed_nodes(database: RtabmapDatabase, track: bool = False) -> tuple[list[P
         camera = node_camera(blob, version, f"{database.path}: node {id}")
         T_world_camera = T_world_body if track else T_world_body @ camera.T_body_camera
         found.append(PosedNode(node, camera, T_world_camera))
-    sessions = len({each.node.session for each in found})
-    if track:
-        return found, without, []
-    if optimised:
+    if optimised and not track:
         return found, without, ["poses as RTAB-Map last optimised them"]
-    notes = ["poses of the odometry: the database holds no optimised ones"]
-    if sessions > 1:
+    notes = [] if track else ["poses of the odometry: the database holds no optimised ones"]
+    sessions = Counter(each.node.session for each in found).most_common()
+    if len(sessions) > 1:
+        (longest, count), *others = sessions
+        left_out = ", ".join(f"{session} ({nodes} nodes)" for session, nodes in others)
         notes.append(
-            f"{sessions} sessions, each with an odometry of its own: optimise them in RTAB-Map first"
+            f"session {longest} ({count} nodes) is read, not {left_out}: each has an odometry of its own; "
+            "optimise them in RTAB-Map to have all"
         )
+        without += len(found) - count
+        found = [each for each in found if each.node.session == longest]
     return found, without, notes
 
 

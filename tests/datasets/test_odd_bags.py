@@ -1,0 +1,326 @@
+"""Bags that are not as a recorder of ROS 2 leaves them, and data in the world's frame, each read or refused
+with the remedy."""
+
+import shutil
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import bag_clouds
+import numpy as np
+import pytest
+from inputs_bags import (
+    BODY,
+    CAMERA,
+    COUNT,
+    FRAME,
+    START,
+    Bag,
+    Kind,
+    T_body_camera,
+    images,
+    mounted,
+    odometry,
+    plain,
+    stamp,
+    steps,
+    world_body,
+    writing,
+)
+
+from taichi_mrf.datasets import Dataset, open_dataset
+from taichi_mrf.errors import DatasetError
+from taichi_mrf.geometry.poses import Pose, look_at
+
+T_MAP_ODOM = np.array([[0.0, -1, 0, 3], [1, 0, 0, 1], [0, 0, 1, 0], [0, 0, 0, 1]])
+TOPIC = "/camera/depth/image_raw"
+
+
+def write(tmp_path: Path, content: Callable[[Bag], None], kind: Kind = "mcap", name: str = "walk") -> Path:
+    path = tmp_path / (f"{name}.bag" if kind == "ros1" else name)
+    with writing(path, kind) as bag:
+        content(bag)
+    return path
+
+
+def check_poses(dataset: Dataset, T_fixed: Pose | None = None, mount: Pose | None = None) -> None:
+    mount = T_body_camera if mount is None else mount
+    assert len(dataset) == COUNT
+    for i, frame in enumerate(dataset):
+        T = (np.eye(4) if T_fixed is None else T_fixed) @ world_body(i) @ mount
+        np.testing.assert_allclose(frame.T_world_camera, T, atol=1e-6)
+
+
+def in_map(bag: Bag) -> None:
+    """Clouds that were moved to the frame map from the place of the body, and its way by tf."""
+    for i in range(COUNT):
+        T = T_MAP_ODOM @ world_body(i)
+        bag_clouds.send(bag, stamp(i), bag_clouds.points(i) @ T[:3, :3].T + T[:3, 3], frame="map")
+
+
+def moving_tf(bag: Bag, parent: str = "map", T: Pose = T_MAP_ODOM, child: str = BODY) -> None:
+    for i in range(COUNT):
+        bag.tf("/tf", stamp(i), parent, child, T @ world_body(i))
+
+
+def by_odometry(bag: Bag) -> None:
+    odometry(bag)
+    bag.tf("/tf_static", 0.0, "map", "odom", T_MAP_ODOM)
+
+
+def by_both(bag: Bag) -> None:
+    by_odometry(bag)
+    moving_tf(bag, "odom", np.eye(4))
+
+
+@pytest.mark.parametrize("poses", [moving_tf, by_odometry, by_both])
+def test_clouds_in_the_fixed_frame_of_tf_are_cast_from_the_body(
+    tmp_path: Path, poses: Callable[[Bag], None]
+) -> None:
+    dataset = open_dataset(write(tmp_path, lambda bag: (in_map(bag), poses(bag))))
+    check_poses(dataset, T_MAP_ODOM, np.eye(4))
+    ranges = np.sort(dataset.read(0).depth_m[dataset.read(0).depth_m > 0])
+    expected = np.sort(np.linalg.norm(bag_clouds.points(0), axis=-1)[~bag_clouds.LOST])
+    np.testing.assert_allclose(ranges, expected, atol=1e-4)
+
+
+def test_of_several_bodies_in_the_frame_of_the_clouds_the_user_chooses(tmp_path: Path) -> None:
+    def content(bag: Bag) -> None:
+        in_map(bag)
+        moving_tf(bag)
+        moving_tf(bag, T=np.eye(4), child="other")
+
+    path = write(tmp_path, content)
+    with pytest.raises(DatasetError, match=rf"are of map, in which tf's frames {BODY}, other move.*\?body="):
+        open_dataset(path)
+    check_poses(open_dataset(f"{path}?body={BODY}"), T_MAP_ODOM, np.eye(4))
+
+
+def raw_mcap(path: Path, profile: str, encoding: str, content: Callable[[Bag], None]) -> None:
+    """An MCAP file without chunks and index, as programs other than rosbag2 write it, beside a channel of
+    another kind."""
+
+    def record(kind: int, data: bytes) -> bytes:
+        return struct.pack("<BQ", kind, len(data)) + data
+
+    def text(value: str) -> bytes:
+        return struct.pack("<I", len(value.encode())) + value.encode()
+
+    channels, sent, is_ros1 = {"/foxglove": ("foxglove.RawImage", "protobuf", "", "protobuf")}, [], False
+    sent.append((0, "/foxglove", b"\x01"))
+    is_ros1 = encoding == "ros1"
+    with writing(path.with_suffix(".bag" if is_ros1 else ""), "ros1" if is_ros1 else "mcap") as bag:
+
+        def send(topic: str, name: str, at: float, **fields: object) -> None:
+            definition = bag.types.generate_msgdef(name, ros_version=1 if is_ros1 else 2)[0]
+            name_there = name.replace("/msg/", "/") if is_ros1 else name
+            channels[topic] = (name_there, "ros1msg" if is_ros1 else "ros2msg", definition, encoding)
+            serialize = bag.types.serialize_ros1 if is_ros1 else bag.types.serialize_cdr
+            sent.append(
+                (round((START + at) * 1e9), topic, bytes(serialize(bag.message(name, **fields), name)))
+            )
+
+        bag.send = send  # type: ignore[method-assign]
+        content(bag)
+    names, out = list(channels), b"\x89MCAP0\r\n" + record(1, text(profile) + text("test"))
+    for i, (topic, (name, kind, definition, packed)) in enumerate(channels.items(), start=1):
+        out += record(3, struct.pack("<H", i) + text(name) + text(kind) + text(definition))
+        out += record(4, struct.pack("<HH", i, i) + text(topic) + text(packed) + text(""))
+    for at, topic, data in sorted(sent, key=lambda each: each[0]):
+        out += record(5, struct.pack("<HIQQ", names.index(topic) + 1, 0, at, at) + data)
+    out += record(15, bytes(4)) + record(2, bytes(20)) + b"\x89MCAP0\r\n"
+    path.write_bytes(out)
+
+
+@pytest.mark.parametrize(("profile", "encoding"), [("", "cdr"), ("x", "cdr"), ("ros1", "ros1")])
+def test_mcap_files_of_any_profile_are_read(tmp_path: Path, profile: str, encoding: str) -> None:
+    raw_mcap(tmp_path / "walk.mcap", profile, encoding, plain)
+    dataset = open_dataset(tmp_path / "walk.mcap")
+    check_poses(dataset)
+    np.testing.assert_allclose(dataset.read(2).depth_m, steps(2) / np.float32(1000))
+
+
+def test_topics_of_another_encoding_in_the_metadata_are_passed_over(tmp_path: Path) -> None:
+    path = write(tmp_path, lambda bag: (plain(bag), odometry(bag, "/other")))
+    text = (path / "metadata.yaml").read_text()
+    before, mark, after = text.rpartition("serialization_format: cdr")
+    assert mark
+    (path / "metadata.yaml").write_text(f"{before}serialization_format: json{after}")
+    check_poses(open_dataset(f"{path}?pose=/odom"))
+
+
+def test_parts_of_a_recording_whose_first_files_are_gone_are_read_together(tmp_path: Path) -> None:
+    for number, part in ((3, range(2)), (4, range(2, COUNT))):
+
+        def content(bag: Bag, part: range = part) -> None:
+            mounted(bag)
+            for i in part:
+                bag.image(TOPIC, stamp(i), FRAME, steps(i), "16UC1")
+                bag.odometry("/odom", stamp(i), "odom", BODY, world_body(i))
+
+        folder = write(tmp_path, content, "sqlite", f"part{number}")
+        (tmp_path / "walk").mkdir(exist_ok=True)
+        shutil.move(next(folder.glob("*.db3")), tmp_path / "walk" / f"walk_{number}.db3")
+    check_poses(open_dataset(tmp_path / "walk", intrinsics=(14.0, 15.0, 7.5, 5.5)))
+
+
+def absent(path: Path) -> Path:
+    next(path.glob("*.mcap")).rename(path / "other.mcap")
+    return path
+
+
+def cut(path: Path) -> Path:
+    file = next(path.glob("*.mcap"))
+    file.write_bytes(file.read_bytes()[:-100])
+    return file
+
+
+def pointer(path: Path) -> Path:
+    (path / "walk.bag").write_text("version https://git-lfs.github.com/spec/v1\n")
+    return path / "walk.bag"
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (absent, "metadata.yaml names files that are not there, walk.mcap: add them"),
+        (pointer, "is no bag, whatever its name; a pointer of git-lfs"),
+        (cut, "damaged or cut short.*mcap recover"),
+    ],
+)
+def test_a_bag_that_cannot_be_opened_says_why(
+    tmp_path: Path, damage: Callable[[Path], Path], words: str
+) -> None:
+    path = damage(write(tmp_path, plain))
+    with pytest.raises(DatasetError, match=words) as caught:
+        open_dataset(path)
+    assert ("cut short" in str(caught.value)) == (damage is cut)
+
+
+def but(
+    bag: Bag, image: Callable[[int], np.ndarray] = steps, encoding: str = "16UC1", late: float = 0.0
+) -> None:
+    """A plain bag with other images, or by another clock."""
+    bag.camera_info("/camera/depth/camera_info", FRAME, CAMERA)
+    for i in range(COUNT):
+        bag.image(TOPIC, stamp(i) + late, FRAME, image(i), encoding)
+    odometry(bag)
+    mounted(bag)
+
+
+def other_kinds(bag: Bag) -> None:
+    bag.image("/range", 1.0, FRAME, steps(0), "mono16")
+    bag.image("/jet", 1.0, FRAME, np.zeros((12, 16, 3), np.uint8), "bgr8")
+
+
+def slow(bag: Bag) -> None:
+    images(bag)
+    mounted(bag)
+    for i in (0, 1):
+        bag.odometry("/odom", 0.95 + i, "odom", BODY, world_body(i))
+
+
+REFUSED: dict[str, tuple[Callable[[Bag], object], str]] = {
+    "encodings": (other_kinds, r"/jet \(bgr8\), /range \(mono16\)\. \?depth=/range takes"),
+    "millimetres": (
+        lambda bag: but(bag, lambda i: steps(i).astype(np.float32), "32FC1"),
+        "hardly metres: --depth-scale 1000",
+    ),
+    "clocks": (lambda bag: but(bag, late=-1000.0), r"clocks of images and poses are 1000\.000 s apart"),
+    "slow": (slow, r"poses are 1 s apart; --max-time-gap 1 "),
+    "path": (lambda bag: (images(bag), path_of(bag)), rf"/path: it names no body.*\?body={FRAME}"),
+}
+
+
+def path_of(bag: Bag) -> None:
+    poses = {stamp(i): world_body(i) @ T_body_camera for i in range(COUNT)}
+    bag.path("/path", 2.0, "map", poses)
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_missing_is_named_with_the_remedy(tmp_path: Path, case: str) -> None:
+    content, words = REFUSED[case]
+    with pytest.raises(DatasetError, match=words):
+        open_dataset(write(tmp_path, content))
+
+
+def test_the_last_message_of_a_path_has_the_poses(tmp_path: Path) -> None:
+    path = write(tmp_path, lambda bag: (images(bag), path_of(bag)))
+    check_poses(open_dataset(f"{path}?body={FRAME}"))
+
+
+def test_a_mounting_that_is_no_pose_is_named(tmp_path: Path) -> None:
+    def content(bag: Bag) -> None:
+        images(bag)
+        odometry(bag)
+        rotation = bag.message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=0.0)
+        place = bag.message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+        transform = bag.message(
+            "geometry_msgs/msg/TransformStamped",
+            header=bag.header(0.0, BODY),
+            child_frame_id=FRAME,
+            transform=bag.message("geometry_msgs/msg/Transform", translation=place, rotation=rotation),
+        )
+        bag.send("/tf_static", "tf2_msgs/msg/TFMessage", 0.0, transforms=[transform])
+
+    with pytest.raises(DatasetError, match=rf"transform of {FRAME} in {BODY} is none.*quaternion of 0"):
+        open_dataset(write(tmp_path, content))
+
+
+def test_signed_millimetres_and_the_largest_value(tmp_path: Path) -> None:
+    def image(i: int) -> np.ndarray:
+        depth = steps(i).astype(np.int16)
+        depth[:2], depth[2] = np.iinfo(np.int16).max, -5
+        return depth
+
+    dataset = open_dataset(write(tmp_path, lambda bag: but(bag, image, "16SC1")))
+    assert any("17% of the pixels of 3 frames looked at have the largest number" in n for n in dataset.notes)
+    expected = np.where(np.arange(12)[:, None] < 3, 0, steps(1)) / np.float32(1000)
+    np.testing.assert_allclose(dataset.read(1).depth_m, expected)
+
+
+def test_where_stamps_stand_still_the_times_of_recording_count(tmp_path: Path) -> None:
+    def content(bag: Bag) -> None:
+        header, bag.latency = bag.header, 0.0
+        bag.header = lambda at, frame: header(7.0 if frame == FRAME else at, frame)  # type: ignore[method-assign]
+        plain(bag)
+
+    dataset = open_dataset(write(tmp_path, content))
+    assert f"the stamps of {TOPIC} stand still: the times of recording are taken" in dataset.notes
+    check_poses(dataset)
+
+
+T_LINK_CAMERA = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+EYES = [look_at([0.15 * i - 0.8, 0.3, 0.1], [0.15 * i + 0.2, 1.1, -0.1]) for i in range(COUNT)]
+
+
+def seen(i: int) -> np.ndarray:
+    """Millimetres of the walls of a box, 5 x 4 x 3 m, from inside."""
+    ways = CAMERA.rays() @ EYES[i][:3, :3].T
+    walls = (np.sign(ways) * [2.5, 2.0, 1.5] - EYES[i][:3, 3]) / ways
+    return np.rint(walls.min(axis=-1) * 1000).astype(np.uint16)
+
+
+@pytest.mark.parametrize("source", ["tf", "odometry", "pose"])
+@pytest.mark.parametrize("is_body", [True, False])
+def test_poses_of_a_camera_link_are_turned_if_images_agree_so(
+    tmp_path: Path, source: str, is_body: bool
+) -> None:
+    frame = FRAME if source == "pose" else "camera_link"
+
+    def content(bag: Bag) -> None:
+        bag.camera_info("/camera/depth/camera_info", frame, CAMERA)
+        for i, T in enumerate(EYES):
+            T_link = T @ T_LINK_CAMERA.T if is_body else T
+            bag.image(TOPIC, stamp(i), frame, seen(i), "16UC1")
+            if source == "tf":
+                bag.tf("/tf", stamp(i), "odom", frame, T_link)
+            elif source == "odometry":
+                bag.odometry("/odom", stamp(i), "odom", frame, T_link)
+            else:
+                bag.pose_stamped("/camera/pose", stamp(i), "odom", T_link)
+
+    dataset = open_dataset(write(tmp_path, content))
+    for frame_read, T in zip(dataset, EYES, strict=True):
+        np.testing.assert_allclose(frame_read.T_world_camera, T, atol=1e-6)
+    assert any("of a body, x ahead and z up" in note for note in dataset.notes) == is_body
